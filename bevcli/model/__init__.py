@@ -1,0 +1,1 @@
+"""BEVFormer in plain PyTorch, one block of the paper a file."""
