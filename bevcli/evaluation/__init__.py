@@ -1,0 +1,1 @@
+"""The nuScenes detection metrics, and IoU of BEV maps."""

@@ -1,0 +1,60 @@
+"""The BEV grid: cells <-> metres in the bev frame, and the heights of the pillars."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bevcli.geometry.transforms import Array
+
+
+@dataclass(frozen=True)
+class BevGrid:
+    """rows x columns cells over x_range_m x y_range_m. Cell (row, column) has the index row * columns + column.
+
+    Columns run along x, rows along y, both from the smallest to the largest.
+    """
+
+    rows: int
+    columns: int
+    x_range_m: tuple[float, float] = (-51.2, 51.2)
+    y_range_m: tuple[float, float] = (-51.2, 51.2)
+    z_range_m: tuple[float, float] = (-5.0, 3.0)
+    pillar_points: int = 4
+
+    @property
+    def cell_size_m(self) -> tuple[float, float]:
+        """Extent of a cell along x and y."""
+        x0, x1 = self.x_range_m
+        y0, y1 = self.y_range_m
+        return (x1 - x0) / self.columns, (y1 - y0) / self.rows
+
+    def cell_centers(self) -> Array:
+        """(rows, columns, 2) x, y of the cells' centres in metres."""
+        size_x, size_y = self.cell_size_m
+        x = self.x_range_m[0] + (np.arange(self.columns) + 0.5) * size_x
+        y = self.y_range_m[0] + (np.arange(self.rows) + 0.5) * size_y
+        return np.stack(np.meshgrid(x, y), axis=-1)
+
+    def pillar_heights(self) -> Array:
+        """(Z,) heights in metres: evenly from half a metre above the lower end to half a metre below the upper."""
+        z0, z1 = self.z_range_m
+        return z0 + np.linspace(0.5, (z1 - z0) - 0.5, self.pillar_points)
+
+    def pillars(self) -> Array:
+        """(rows, columns, Z, 3) the 3D reference points of every cell, bev frame, metres."""
+        centers, heights = self.cell_centers(), self.pillar_heights()
+        points = np.empty((self.rows, self.columns, self.pillar_points, 3))
+        points[..., :2] = centers[:, :, None, :]
+        points[..., 2] = heights
+        return points
+
+    def cell_of(self, points_xy: ArrayLike) -> np.ndarray:
+        """Points (..., 2) in metres -> (..., 2) row, column; -1, -1 outside the grid."""
+        p = np.asarray(points_xy, dtype=np.float64)
+        low = np.array([self.x_range_m[0], self.y_range_m[0]])
+        cell = np.floor((p - low) / np.array(self.cell_size_m)).astype(np.int64)[..., ::-1]
+        inside = ((cell >= 0) & (cell < np.array([self.rows, self.columns]))).all(-1)
+        return np.where(inside[..., None], cell, -1)

@@ -1,0 +1,106 @@
+"""Where the vehicle was over time: poses and kinematics, interpolated at any time that the rows cover."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.errors import InputError
+from bevcli.geometry.transforms import Array, Pose, interpolate, inverse, rotation_from_quaternion
+
+GRAVITY = 9.81  # m/s², what an accelerometer at rest shows along z
+TOLERANCE_NS = 50_000_000  # how far outside the rows a time may lie; the nearest row is taken
+
+
+@dataclass(frozen=True)
+class Kinematics:
+    """What the vehicle's sensors say, each (3,) in the ego frame: m/s² with gravity, rad/s, m/s."""
+
+    acceleration: Array
+    angular_rate: Array
+    velocity: Array
+
+
+@dataclass(frozen=True)
+class EgoMotion:
+    """Poses world_from_ego at T times.
+
+    timestamps_ns: (T,) int64, strictly increasing. translations: (T, 3). quaternions: (T, 4) as stored.
+    accelerations, angular_rates, velocities: (T, 3) in the ego frame.
+    """
+
+    timestamps_ns: NDArray[np.int64]
+    translations: Array
+    quaternions: Array
+    accelerations: Array
+    angular_rates: Array
+    velocities: Array
+
+    def pose_at(self, timestamp_ns: int) -> Pose:
+        """world_from_ego at a time: linear and slerp; an exact row is returned as stored.
+
+        Raises InputError when the time lies more than 50 ms outside the rows.
+        """
+        row, fraction = self._locate(timestamp_ns)
+        start = Pose(self.translations[row], self.quaternions[row])
+        if fraction == 0:
+            return start
+        return interpolate(start, Pose(self.translations[row + 1], self.quaternions[row + 1]), fraction)
+
+    def kinematics_at(self, timestamp_ns: int) -> Kinematics:
+        """Acceleration, angular rate and velocity at a time, interpolated linearly."""
+        row, fraction = self._locate(timestamp_ns)
+        later = min(row + 1, len(self.timestamps_ns) - 1)
+
+        def mix(column: Array) -> Array:
+            return column[row] + fraction * (column[later] - column[row])
+
+        return Kinematics(mix(self.accelerations), mix(self.angular_rates), mix(self.velocities))
+
+    def _locate(self, timestamp_ns: int) -> tuple[int, float]:
+        times = self.timestamps_ns
+        first, last = int(times[0]), int(times[-1])
+        if timestamp_ns < first - TOLERANCE_NS or timestamp_ns > last + TOLERANCE_NS:
+            raise InputError(
+                f"ego-motion covers {first} to {last} ns, but a picture or frame is at {timestamp_ns} ns "
+                "(at most 50 ms outside is allowed): extend it or cut the frames"
+            )
+        clipped = min(max(timestamp_ns, first), last)
+        row = int(np.searchsorted(times, clipped, side="right")) - 1
+        if row == len(times) - 1:
+            return row, 0.0
+        return row, (clipped - int(times[row])) / (int(times[row + 1]) - int(times[row]))
+
+
+def derive_kinematics(
+    timestamps_ns: NDArray[np.int64], translations: Array, quaternions: Array
+) -> tuple[Array, Array, Array]:
+    """Accelerations with gravity, angular rates and velocities, each (T, 3) in the ego frame, from T poses.
+
+    By differences over time; zero (and gravity) where there is one row.
+    """
+    count = len(timestamps_ns)
+    rotations = np.stack([rotation_from_quaternion(q) for q in quaternions])
+    gravity = np.array([0.0, 0.0, GRAVITY])
+    if count < 2:
+        return np.einsum("tji,j->ti", rotations, gravity), np.zeros((count, 3)), np.zeros((count, 3))
+    seconds = (timestamps_ns - timestamps_ns[0]) / 1e9
+    velocity = np.gradient(translations, seconds, axis=0)
+    acceleration = np.gradient(velocity, seconds, axis=0) + gravity
+    derivative = np.gradient(rotations, seconds, axis=0)
+    skew = np.einsum("tji,tjk->tik", rotations, derivative)  # R^T dR/dt, skew up to discretisation
+    rates = np.stack(
+        [skew[:, 2, 1] - skew[:, 1, 2], skew[:, 0, 2] - skew[:, 2, 0], skew[:, 1, 0] - skew[:, 0, 1]], axis=-1
+    )
+    return (
+        np.einsum("tji,tj->ti", rotations, acceleration),
+        rates / 2,
+        np.einsum("tji,tj->ti", rotations, velocity),
+    )
+
+
+def current_from_previous(current: Pose, previous: Pose) -> Array:
+    """(4, 4) that moves points of the earlier ego frame to the present one; both poses are world_from_ego."""
+    return inverse(current.matrix) @ previous.matrix

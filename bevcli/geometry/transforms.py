@@ -1,0 +1,148 @@
+"""Rigid transforms as 4x4 float64 matrices `a_from_b`, and poses that keep their stored quaternion.
+
+Quaternions are (w, x, y, z). Rotations are right-handed; yaw is counter-clockwise about z, 0 along x.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where frame b stands in frame a, with the quaternion as stored (its sign is kept: w may be negative).
+
+    translation: (3,) metres. quaternion: (4,) w, x, y, z, of norm 1.
+    """
+
+    translation: Array
+    quaternion: Array
+
+    @property
+    def matrix(self) -> Array:
+        """(4, 4) a_from_b."""
+        return rigid(self.translation, rotation_from_quaternion(self.quaternion))
+
+    @property
+    def yaw(self) -> float:
+        """Yaw in radians, in (-pi, pi]."""
+        return yaw_of_quaternion(self.quaternion)
+
+    @staticmethod
+    def from_matrix(a_from_b: ArrayLike) -> Pose:
+        """A pose from a (4, 4) rigid matrix; the quaternion gets w >= 0."""
+        matrix = np.asarray(a_from_b, dtype=np.float64)
+        return Pose(matrix[:3, 3].copy(), quaternion_from_rotation(matrix[:3, :3]))
+
+    @staticmethod
+    def identity() -> Pose:
+        """The pose in which both frames coincide."""
+        return Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+
+
+def rigid(translation: ArrayLike = (0, 0, 0), rotation: ArrayLike | None = None) -> Array:
+    """(4, 4) a_from_b of a translation (3,) in metres and a rotation (3, 3), default none."""
+    matrix = np.eye(4)
+    matrix[:3, 3] = np.asarray(translation, dtype=np.float64)
+    if rotation is not None:
+        matrix[:3, :3] = np.asarray(rotation, dtype=np.float64)
+    return matrix
+
+
+def inverse(a_from_b: ArrayLike) -> Array:
+    """(..., 4, 4) b_from_a of rigid transforms, by transposition."""
+    matrix = np.asarray(a_from_b, dtype=np.float64)
+    result = np.zeros_like(matrix)
+    rotation = np.swapaxes(matrix[..., :3, :3], -1, -2)
+    result[..., :3, :3] = rotation
+    result[..., :3, 3] = -(rotation @ matrix[..., :3, 3:])[..., 0]
+    result[..., 3, 3] = 1
+    return result
+
+
+def apply(a_from_b: ArrayLike, points_b: ArrayLike) -> Array:
+    """Points (..., 3) in b, moved to a: (..., 3)."""
+    matrix = np.asarray(a_from_b, dtype=np.float64)
+    return np.asarray(points_b, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def rotation_from_quaternion(quaternion: ArrayLike) -> Array:
+    """(3, 3) rotation of a quaternion (w, x, y, z), normalised first."""
+    q = np.asarray(quaternion, dtype=np.float64)
+    w, x, y, z = q / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def quaternion_from_rotation(rotation: ArrayLike) -> Array:
+    """(4,) w, x, y, z with w >= 0 of a rotation (3, 3): the largest eigenvector of Bar-Itzhack's matrix."""
+    r = np.asarray(rotation, dtype=np.float64)
+    k = np.array(
+        [
+            [r[0, 0] + r[1, 1] + r[2, 2], 0, 0, 0],
+            [r[2, 1] - r[1, 2], r[0, 0] - r[1, 1] - r[2, 2], 0, 0],
+            [r[0, 2] - r[2, 0], r[1, 0] + r[0, 1], r[1, 1] - r[0, 0] - r[2, 2], 0],
+            [r[1, 0] - r[0, 1], r[2, 0] + r[0, 2], r[2, 1] + r[1, 2], r[2, 2] - r[0, 0] - r[1, 1]],
+        ]
+    )
+    vector = np.linalg.eigh(k)[1][:, -1]  # eigh reads the lower triangle
+    return -vector if vector[0] < 0 else vector
+
+
+def rotation_about_z(yaw: float) -> Array:
+    """(3, 3) rotation by `yaw` radians, counter-clockwise about z."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def yaw_of_quaternion(quaternion: ArrayLike) -> float:
+    """Yaw in radians, in (-pi, pi], of a quaternion (w, x, y, z) of norm 1."""
+    w, x, y, z = np.asarray(quaternion, dtype=np.float64)
+    return float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+
+
+def yaw_of_rotation(rotation: ArrayLike) -> float:
+    """Yaw in radians, in (-pi, pi], of the x axis of a rotation (3, 3) seen from above."""
+    r = np.asarray(rotation, dtype=np.float64)
+    return float(np.arctan2(r[1, 0], r[0, 0]))
+
+
+def wrap_angle(angle: ArrayLike) -> Array:
+    """Angles in radians wrapped to [-pi, pi)."""
+    return (np.asarray(angle, dtype=np.float64) + np.pi) % (2 * np.pi) - np.pi
+
+
+def slerp(start: ArrayLike, end: ArrayLike, fraction: float) -> Array:
+    """Quaternion (4,) between two, along the shorter way; it takes the sign of `start`."""
+    a, b = (np.asarray(q, dtype=np.float64) for q in (start, end))
+    cosine = float(a @ b)
+    if cosine < 0:
+        b, cosine = -b, -cosine
+    angle = np.arccos(min(cosine, 1.0))
+    if angle < 1e-8:
+        mixed = a + fraction * (b - a)
+    else:
+        mixed = (np.sin((1 - fraction) * angle) * a + np.sin(fraction * angle) * b) / np.sin(angle)
+    return mixed / np.linalg.norm(mixed)
+
+
+def interpolate(start: Pose, end: Pose, fraction: float) -> Pose:
+    """The pose at `fraction` (0 to 1) of the way: translation linear, rotation by slerp."""
+    translation = start.translation + fraction * (end.translation - start.translation)
+    return Pose(translation, slerp(start.quaternion, end.quaternion, fraction))
+
+
+def stack(poses: Sequence[Pose]) -> Array:
+    """(F, 4, 4) matrices of F poses."""
+    return np.stack([pose.matrix for pose in poses])

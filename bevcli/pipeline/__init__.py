@@ -1,0 +1,1 @@
+"""From a Sequence to Predictions, frame by frame."""

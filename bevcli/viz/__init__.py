@@ -1,0 +1,1 @@
+"""Recordings, pictures and videos of what the model sees."""
