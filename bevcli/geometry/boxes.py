@@ -100,8 +100,9 @@ class Boxes3D:
         return np.stack([x, y, local[..., 2]], axis=-1) + self.centers[:, None, :]
 
     def _map(self, change: Callable[[NDArray], NDArray]) -> Boxes3D:
-        columns: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
-        return replace(self, **{name: None if c is None else change(c) for name, c in columns.items()})
+        columns = {f.name: getattr(self, f.name) for f in fields(self)}
+        changed: dict[str, Any] = {name: None if c is None else change(c) for name, c in columns.items()}
+        return replace(self, **changed)
 
 
 # The twelve edges of `Boxes3D.corners`, as pairs of corner indices.

@@ -1,0 +1,49 @@
+"""`bevcli`: the commands, and what becomes of mistakes.
+
+Exit codes: 0 success, 1 a mistake in the input, 2 a mistake in usage (click's own), 130 interrupted; a command
+may have one of its own. No command module imports torch, OpenCV or rerun before it is called.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import typer
+
+from bevcli import __version__
+from bevcli.errors import BevcliError
+
+app = typer.Typer(
+    help="Run BEVFormer on sequences from any camera rig, and see what it sees.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"bevcli {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Run BEVFormer on sequences from any camera rig, and see what it sees."""
+
+
+def run_app() -> None:
+    """The console entry point: a user's mistake is one line on stderr and exit code 1, never a traceback."""
+    try:
+        app()
+    except BevcliError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)
+    except BrokenPipeError:
+        sys.stderr.close()  # whoever read our output has gone; there is nobody left to tell
+        sys.exit(0)
