@@ -5,15 +5,22 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.decoder import DecoderConfig
+from bevcli.model.attention_probe import AttentionProbe
+from bevcli.model.bev_queries import BevQueries
+from bevcli.model.decoder import Decoder, DecoderConfig
+from bevcli.model.detection_head import DetectionHead
 from bevcli.model.ego_motion_inputs import EgoMotionConfig
-from bevcli.model.encoder import EncoderConfig
-from bevcli.model.fpn import FPNConfig
+from bevcli.model.encoder import Encoder, EncoderConfig
+from bevcli.model.fpn import FPN, FPNConfig
+from bevcli.model.history_alignment import rotate_history
 from bevcli.model.image_config import ImageConfig
-from bevcli.model.resnet import ResNetConfig
+from bevcli.model.image_tokens import ImageTokens, ImageTokensConfig
+from bevcli.model.pillar_projection import PillarProjection, find_hits, project_pillars
+from bevcli.model.resnet import ResNet, ResNetConfig
 
 
 @dataclass(frozen=True)
@@ -38,9 +45,24 @@ class BEVFormerConfig:
     heads: tuple[Literal["detection"], ...] = ("detection",)
     backbone: ResNetConfig = field(default_factory=ResNetConfig)
     neck: FPNConfig = field(default_factory=FPNConfig)
+    image_tokens: ImageTokensConfig = field(default_factory=ImageTokensConfig)
     ego_motion: EgoMotionConfig = field(default_factory=EgoMotionConfig)
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     decoder: DecoderConfig = field(default_factory=DecoderConfig)
+
+    def __post_init__(self) -> None:
+        grid, levels = self.bev_grid, self.neck.levels
+        if min(grid.rows, grid.columns, grid.pillar_points) < 1:
+            raise ValueError("bev_grid needs at least one row, column and pillar point")
+        if self.channels % 2 or self.channels % self.encoder.heads or self.channels % self.decoder.heads:
+            raise ValueError(f"channels is {self.channels}; it must be even and a multiple of the attention heads")
+        if self.encoder.spatial_points % grid.pillar_points:
+            raise ValueError("encoder.spatial_points must be a multiple of bev_grid.pillar_points")
+        if not len(self.backbone.output_stages) <= levels <= self.image_tokens.level_embeddings:
+            raise ValueError(
+                f"neck.levels is {levels}; expected at least the number of backbone.output_stages, "
+                f"at most image_tokens.level_embeddings"
+            )
 
 
 @dataclass(frozen=True)
@@ -76,3 +98,55 @@ class BEVFormerOutputs:
     bev: Tensor
     class_logits: Tensor
     box_codes: Tensor
+
+
+class BEVFormer(nn.Module):
+    """The whole model; its parts in the order of the paper's figure 2."""
+
+    pillars: Tensor
+
+    def __init__(self, config: BEVFormerConfig) -> None:
+        super().__init__()
+        self.config = config
+        grid, channels, levels = config.bev_grid, config.channels, config.neck.levels
+        bev_shape = (grid.rows, grid.columns)
+        self.backbone = ResNet(config.backbone)
+        self.neck = FPN(config.backbone.output_channels(), channels, config.neck)
+        self.image_tokens = ImageTokens(len(config.cameras), channels, config.image_tokens)
+        self.bev_queries = BevQueries(grid, channels, config.ego_motion.can_bus)
+        self.encoder = Encoder(config.encoder, channels, levels, grid, config.ego_motion.history_shift)
+        self.decoder = Decoder(config.decoder, channels, bev_shape)
+        self.detection_head = DetectionHead(config.decoder.layers, channels, len(config.classes), grid)
+        pillars = torch.as_tensor(grid.pillars(), dtype=torch.float32).flatten(0, 1)  # (Y·X, Z, 3)
+        self.register_buffer("pillars", pillars, persistent=False)
+
+    def forward(
+        self, inputs: BEVFormerInputs, history: Tensor | None = None, probe: AttentionProbe | None = None
+    ) -> BEVFormerOutputs:
+        """One step. history: (B, Y·X, C), the BEV map of the previous frame, or None at the start of a scene.
+
+        probe: filled with what one encoder layer looked at.
+        """
+        maps = self.neck(self.backbone(inputs.images.flatten(0, 1)))
+        image_features = self.image_tokens(maps, inputs.camera_index)
+        bev = self.encoder(
+            self.bev_queries(inputs.can_bus),
+            self.bev_queries.position(),
+            image_features,
+            find_hits(self.project_pillars(inputs)),
+            None if history is None else self.align_history(history, inputs.rotation_deg),
+            inputs.shift,
+            probe,
+        )
+        class_logits, box_codes = self.decoder(bev, self.detection_head)
+        return BEVFormerOutputs(bev, class_logits, box_codes)
+
+    def project_pillars(self, inputs: BEVFormerInputs) -> PillarProjection:
+        """Where the pillars appear in the cameras of these inputs, and where they are visible."""
+        image_size = (inputs.images.shape[-2], inputs.images.shape[-1])
+        return project_pillars(inputs.image_from_bev, self.pillars, image_size, inputs.has_picture)
+
+    def align_history(self, history: Tensor, rotation_deg: Tensor) -> Tensor:
+        """The history map (B, Y·X, C), turned by rotation_deg (B,)."""
+        center = self.config.ego_motion.history_rotation_center
+        return rotate_history(history, rotation_deg, self.config.bev_grid, center)

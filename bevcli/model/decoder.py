@@ -4,10 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
+from torch import Tensor, nn
+
+from bevcli.model.deformable_attention import DeformableAttention, deformable_attention, sampling_locations
+from bevcli.model.detection_head import DetectionHead
+from bevcli.model.feed_forward import FeedForward
+
 
 @dataclass(frozen=True)
 class DecoderConfig:
-    """queries: object queries. points: sampling points a head of the cross-attention into the BEV map."""
+    """queries: object queries. points: sampling points a head of the cross-attention into the BEV map.
+
+    max_boxes: how many of the best-scored boxes are decoded.
+    """
 
     layers: int = 6
     heads: int = 8
@@ -16,3 +26,63 @@ class DecoderConfig:
     feed_forward_width: int = 512
     dropout: float = 0.1
     max_boxes: int = 300
+
+
+class Decoder(nn.Module):
+    """Object queries that look at the BEV map and move their reference points to the objects."""
+
+    def __init__(self, config: DecoderConfig, channels: int, bev_shape: tuple[int, int]) -> None:
+        super().__init__()
+        # Of each object query the position half, then the content half.
+        self.query_embedding = nn.Parameter(torch.randn(config.queries, 2 * channels))
+        self.reference_points = nn.Linear(channels, 3)
+        self.layers = nn.ModuleList(DecoderLayer(config, channels, bev_shape) for _ in range(config.layers))
+        nn.init.xavier_uniform_(self.reference_points.weight)
+        nn.init.zeros_(self.reference_points.bias)
+
+    def forward(self, bev: Tensor, head: DetectionHead) -> tuple[Tensor, Tensor]:
+        """bev: (B, Y·X, C). Returns class logits (L, B, Q, classes) and box codes (L, B, Q, 10), one a layer."""
+        position, query = self.query_embedding.expand(len(bev), -1, -1).chunk(2, dim=-1)  # (B, Q, C) each
+        reference_points = self.reference_points(position).float().sigmoid()  # (B, Q, 3)
+        class_logits, box_codes = [], []
+        for index, layer in enumerate(self.layers):
+            query = layer(query, position, reference_points[..., :2], bev)
+            logits, codes, refined = head(index, query, reference_points)
+            class_logits.append(logits)
+            box_codes.append(codes)
+            reference_points = refined.detach()
+        return torch.stack(class_logits), torch.stack(box_codes)
+
+
+class DecoderLayer(nn.Module):
+    """Self-attention among the objects, deformable cross-attention into the BEV map, feed-forward network."""
+
+    def __init__(self, config: DecoderConfig, channels: int, bev_shape: tuple[int, int]) -> None:
+        super().__init__()
+        self.level_shapes = (bev_shape,)
+        dropout = config.dropout
+        self.self_attention = nn.MultiheadAttention(channels, config.heads, dropout, batch_first=True)
+        self.cross_attention = DeformableAttention(channels, channels, config.heads, config.points)
+        self.feed_forward = FeedForward(channels, config.feed_forward_width, dropout)
+        self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(3))
+        self.dropout = nn.Dropout(dropout)
+        nn.init.xavier_uniform_(self.self_attention.out_proj.weight)
+
+    def forward(self, query: Tensor, position: Tensor, reference_points: Tensor, bev: Tensor) -> Tensor:
+        """query, position: (B, Q, C). reference_points: (B, Q, 2). bev: (B, Y·X, C). Returns (B, Q, C)."""
+        placed = query + position
+        attended, _ = self.self_attention(placed, placed, query, need_weights=False)
+        query = self.norms[0](query + self.dropout(attended))
+        looked = self._look_at_bev(query + position, reference_points, bev)
+        query = self.norms[1](query + self.dropout(looked))
+        return self.norms[2](query + self.feed_forward(query))
+
+    def _look_at_bev(self, query: Tensor, reference_points: Tensor, bev: Tensor) -> Tensor:
+        batch, queries, _ = query.shape
+        offsets, weights = self.cross_attention.look(query)  # (B, Q, heads, 1, 1, P, 2)
+        locations = sampling_locations(reference_points[:, :, None, None, None], offsets[:, :, :, 0], self.level_shapes)
+        values = self.cross_attention.project_values(bev)
+        sampled = deformable_attention(
+            values, self.level_shapes, locations.flatten(0, 1), weights[:, :, :, 0].flatten(0, 1), [queries] * batch
+        )
+        return self.cross_attention.output_projection(sampled.unflatten(0, (batch, queries)))

@@ -13,6 +13,8 @@ from bevcli.geometry.transforms import Array, Pose, yaw_of_quaternion
 
 CAN_BUS_SIZE = 18
 
+RotationCenter = Literal["original", "center"] | tuple[float, float]
+
 
 @dataclass(frozen=True)
 class EgoMotionConfig:
@@ -32,7 +34,7 @@ class EgoMotionConfig:
     shift: bool = True
     rotation: bool = True
     history_shift: Literal["both", "history"] = "both"
-    history_rotation_center: Literal["original", "center"] | tuple[float, float] = "original"
+    history_rotation_center: RotationCenter = "original"
     can_bus_quaternion: Literal["w", "wxyz"] = "w"
 
 
@@ -87,7 +89,7 @@ def heading_deg(quaternion: ArrayLike) -> float:
 
 
 def _history_shift(moved: Array, yaw_deg: float, grid: BevGrid) -> Array:
-    """A translation (3,) in world metres, seen from the ego: (2,) right, ahead, as shares of the BEV's extent."""
+    """A translation (3,) in world metres as (2,) right and ahead of the ego, in shares of the BEV's extent."""
     distance = np.hypot(moved[0], moved[1])
     angle = np.radians(yaw_deg) - np.arctan2(moved[1], moved[0])
     extent_x = grid.x_range_m[1] - grid.x_range_m[0]

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+import torch.nn.functional as F
+from torch import Tensor, nn
 
 
 @dataclass(frozen=True)
@@ -10,3 +14,28 @@ class FPNConfig:
     """levels: maps that the neck puts out. Those beyond the backbone's come from stride-2 convolutions."""
 
     levels: int = 1
+
+
+class FPN(nn.Module):
+    """Backbone maps to maps of one width, coarse context added top-down; no norm and no activation."""
+
+    def __init__(self, in_channels: Sequence[int], channels: int, config: FPNConfig) -> None:
+        super().__init__()
+        extra = config.levels - len(in_channels)
+        self.lateral = nn.ModuleList(nn.Conv2d(c, channels, 1) for c in in_channels)
+        self.output = nn.ModuleList(nn.Conv2d(channels, channels, 3, padding=1) for _ in in_channels)
+        self.extra = nn.ModuleList(nn.Conv2d(channels, channels, 3, stride=2, padding=1) for _ in range(extra))
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.xavier_uniform_(module.weight)
+                nn.init.zeros_(module.bias)  # type: ignore[arg-type]
+
+    def forward(self, maps: Sequence[Tensor]) -> list[Tensor]:
+        """maps: (B, C_i, H_i, W_i), fine to coarse -> `levels` maps (B, C, H_i, W_i), fine to coarse."""
+        merged = [lateral(x) for lateral, x in zip(self.lateral, maps, strict=True)]
+        for i in range(len(merged) - 1, 0, -1):
+            merged[i - 1] = merged[i - 1] + F.interpolate(merged[i], size=merged[i - 1].shape[-2:], mode="nearest")
+        outputs = [output(x) for output, x in zip(self.output, merged, strict=True)]
+        for convolution in self.extra:
+            outputs.append(convolution(outputs[-1]))
+        return outputs

@@ -5,6 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
+
 
 @dataclass(frozen=True)
 class ResNetConfig:
@@ -30,3 +35,81 @@ class ResNetConfig:
     def output_channels(self) -> tuple[int, ...]:
         """Channels of the map of each output stage."""
         return tuple(4 * self.width * 2 ** (stage - 1) for stage in self.output_stages)
+
+
+class ResNet(nn.Module):
+    """Pictures to feature maps at strides 4, 8, 16 and 32; only the configured stages' maps are returned."""
+
+    def __init__(self, config: ResNetConfig) -> None:
+        super().__init__()
+        self.output_stages = config.output_stages
+        width = config.width
+        self.conv1 = nn.Conv2d(3, width, 7, stride=2, padding=3, bias=False)
+        self.bn1 = nn.BatchNorm2d(width)
+        self.pool = nn.MaxPool2d(3, stride=2, padding=1)
+        stages = []
+        in_channels = width
+        for stage, blocks in enumerate(config.blocks[: max(config.output_stages)], start=1):
+            channels = width * 2 ** (stage - 1)
+            stages.append(_stage(in_channels, channels, blocks, stage, config))
+            in_channels = 4 * channels
+        self.stages = nn.ModuleList(stages)
+        nn.init.kaiming_normal_(self.conv1.weight, mode="fan_out", nonlinearity="relu")
+
+    def forward(self, images: Tensor) -> list[Tensor]:
+        """images: (B, 3, H, W), H and W multiples of 32 -> a map (B, C_s, H / 2^(s+1), W / 2^(s+1)) a stage s."""
+        x = self.pool(F.relu(self.bn1(self.conv1(images))))
+        maps = []
+        for stage, blocks in enumerate(self.stages, start=1):
+            x = blocks(x)
+            if stage in self.output_stages:
+                maps.append(x)
+        return maps
+
+
+class Bottleneck(nn.Module):
+    """1x1, 3x3, 1x1, each with batch norm, beside a shortcut."""
+
+    def __init__(
+        self, in_channels: int, channels: int, stride: int, style: Literal["pytorch", "caffe"], deformable: bool
+    ) -> None:
+        super().__init__()
+        stride1, stride2 = (stride, 1) if style == "caffe" else (1, stride)
+        self.conv1 = nn.Conv2d(in_channels, channels, 1, stride1, bias=False)
+        self.bn1 = nn.BatchNorm2d(channels)
+        self.conv2: nn.Module
+        if deformable:
+            self.conv2 = ModulatedDeformableConvolution(channels, channels, stride2)
+        else:
+            self.conv2 = nn.Conv2d(channels, channels, 3, stride2, padding=1, bias=False)
+        self.bn2 = nn.BatchNorm2d(channels)
+        self.conv3 = nn.Conv2d(channels, 4 * channels, 1, bias=False)
+        self.bn3 = nn.BatchNorm2d(4 * channels)
+        self.downsample: nn.Module = nn.Identity()
+        if stride != 1 or in_channels != 4 * channels:
+            shortcut = nn.Conv2d(in_channels, 4 * channels, 1, stride, bias=False)
+            self.downsample = nn.Sequential(shortcut, nn.BatchNorm2d(4 * channels))
+        self._initialize()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """x: (B, in_channels, H, W) -> (B, 4 · channels, H / stride, W / stride)."""
+        y = F.relu(self.bn1(self.conv1(x)))
+        y = F.relu(self.bn2(self.conv2(y)))
+        return F.relu(self.bn3(self.conv3(y)) + self.downsample(x))
+
+    def _initialize(self) -> None:
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d) and module.bias is None:
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+        # A fresh block is the identity, which lets deep stacks start to train.
+        nn.init.zeros_(self.bn3.weight)
+
+
+def _stage(in_channels: int, channels: int, blocks: int, stage: int, config: ResNetConfig) -> nn.Sequential:
+    deformable = stage in config.deformable_stages
+    layers = []
+    for block in range(blocks):
+        stride = 2 if block == 0 and stage > 1 else 1
+        layers.append(Bottleneck(in_channels, channels, stride, config.style, deformable))
+        in_channels = 4 * channels
+    return nn.Sequential(*layers)

@@ -1,0 +1,136 @@
+"""A TOML file to frozen dataclasses; an unknown key or a wrong type is an error that names file and key."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import tomllib
+import types
+import typing
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from bevcli.errors import ConfigError
+from bevcli.model.bevformer import BEVFormerConfig
+
+T = TypeVar("T")
+
+
+def known_models() -> tuple[str, ...]:
+    """The names of the models whose TOML files come with the package."""
+    files = resources.files("bevcli").joinpath("configs").iterdir()
+    return tuple(sorted(Path(file.name).stem for file in files if file.name.endswith(".toml")))
+
+
+def load_config(name_or_path: str | Path) -> BEVFormerConfig:
+    """The model of a known name ("tiny"), or of a file whose name ends in .toml.
+
+    Raises ConfigError when there is none, or when its contents are wrong.
+    """
+    name = str(name_or_path)
+    if name.endswith(".toml"):
+        path = Path(name)
+        if not path.is_file():
+            raise ConfigError(f"{path}: no such model file; known models are {', '.join(known_models())}")
+        return parse_config(_read(path), name, BEVFormerConfig)
+    if name not in known_models():
+        known = ", ".join(known_models())
+        raise ConfigError(f'model "{name}" is unknown; expected one of {known}, or a file FILE.toml')
+    file = f"{name}.toml"
+    text = resources.files("bevcli").joinpath("configs", file).read_text(encoding="utf-8")
+    return parse_config(text, file, BEVFormerConfig)
+
+
+def parse_config(text: str, file: str, kind: type[T]) -> T:
+    """TOML text to a dataclass of that kind, nested dataclasses as tables; `file` is named in errors."""
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{file}: is no valid TOML: {error}") from error
+    return _dataclass(table, kind, file, "")
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from error
+
+
+def _dataclass(table: dict[str, Any], kind: type[T], file: str, prefix: str) -> T:
+    fields = {field.name: field for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    hints = typing.get_type_hints(kind)
+    for key in table.keys() - fields.keys():
+        raise ConfigError(f'{file}: unknown key "{prefix}{key}"; {_nearest(key, list(fields))}')
+    values = {key: _value(value, hints[key], file, prefix + key) for key, value in table.items()}
+    for name, field in fields.items():
+        optional = field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
+        if name not in values and not optional:
+            raise ConfigError(f'{file}: "{prefix}{name}" is missing; expected {_say(hints[name])}')
+    try:
+        return kind(**values)
+    except ValueError as error:
+        where = f"[{prefix[:-1]}]: " if prefix else ""
+        raise ConfigError(f"{file}: {where}{error}") from error
+
+
+def _value(value: Any, kind: Any, file: str, key: str) -> Any:
+    if dataclasses.is_dataclass(kind) and isinstance(value, dict):
+        return _dataclass(value, typing.cast(type, kind), file, f"{key}.")
+    if not _fits(value, kind):
+        raise ConfigError(f'{file}: "{key}" must be {_say(kind)}, but is {value!r}')
+    return _converted(value, kind)
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    """Whether a TOML value can stand for a type: a scalar, Literal, tuple, or a union of these."""
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is Literal:
+        return value in arguments and not isinstance(value, bool)
+    if origin in (typing.Union, types.UnionType):
+        return any(_fits(value, argument) for argument in arguments)
+    if origin is tuple:
+        if not isinstance(value, list):
+            return False
+        kinds = _element_kinds(arguments, len(value))
+        return len(kinds) == len(value) and all(map(_fits, value, kinds))
+    if kind is float:
+        return type(value) in (int, float) and math.isfinite(value)
+    return type(value) is kind
+
+
+def _converted(value: Any, kind: Any) -> Any:
+    """A value that fits, as that type: lists become tuples, whole numbers floats where floats are asked."""
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin in (typing.Union, types.UnionType):
+        return _converted(value, next(argument for argument in arguments if _fits(value, argument)))
+    if origin is tuple:
+        return tuple(map(_converted, value, _element_kinds(arguments, len(value))))
+    return float(value) if kind is float else value
+
+
+def _element_kinds(arguments: tuple[Any, ...], length: int) -> tuple[Any, ...]:
+    """The types of a tuple's elements: tuple[int, ...] takes any length."""
+    return (arguments[0],) * length if arguments[-1] is Ellipsis else arguments
+
+
+def _say(kind: Any) -> str:
+    """A type in words for an error message."""
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is Literal:
+        return " or ".join(f'"{argument}"' for argument in arguments)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(_say(argument) for argument in arguments if argument is not type(None))
+    if origin is tuple:
+        if arguments[-1] is Ellipsis:
+            return f"a list, each element {_say(arguments[0])}"
+        return f"a list of {len(arguments)}, each element {_say(arguments[0])}"
+    names = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
+    return names.get(kind, "a table")
+
+
+def _nearest(key: str, known: list[str]) -> str:
+    match = difflib.get_close_matches(key, known, n=1)
+    return f'did you mean "{match[0]}"?' if match else f"expected one of {', '.join(known)}"

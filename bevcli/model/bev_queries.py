@@ -1,0 +1,49 @@
+"""BEV queries: one learned vector a BEV cell, its position code, and what the can-bus says."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from bevcli.geometry.bev_grid import BevGrid
+from bevcli.model.ego_motion_inputs import CAN_BUS_SIZE
+
+
+class BevQueries(nn.Module):
+    """The queries that enter the encoder; the same at every step but for the can-bus embedding."""
+
+    def __init__(self, grid: BevGrid, channels: int, can_bus: bool) -> None:
+        super().__init__()
+        self.embedding = nn.Parameter(torch.randn(grid.rows * grid.columns, channels))
+        self.row_embedding = nn.Parameter(torch.rand(grid.rows, channels // 2))
+        self.column_embedding = nn.Parameter(torch.rand(grid.columns, channels // 2))
+        self.can_bus_embedding = can_bus_embedding(channels) if can_bus else None
+
+    def forward(self, can_bus: Tensor) -> Tensor:
+        """can_bus: (B, 18) -> BEV queries (B, Y·X, C)."""
+        if self.can_bus_embedding is None:
+            return self.embedding.expand(len(can_bus), -1, -1)
+        return self.embedding + self.can_bus_embedding(can_bus)[:, None]
+
+    def position(self) -> Tensor:
+        """The position code (Y·X, C) of the cells: the column's (x) half, then the row's (y)."""
+        rows, columns = len(self.row_embedding), len(self.column_embedding)
+        x = self.column_embedding.expand(rows, -1, -1)
+        y = self.row_embedding[:, None].expand(-1, columns, -1)
+        return torch.cat([x, y], dim=-1).flatten(0, 1)
+
+
+def can_bus_embedding(channels: int) -> nn.Sequential:
+    """(B, 18) can-bus numbers -> (B, C)."""
+    layers = nn.Sequential(
+        nn.Linear(CAN_BUS_SIZE, channels // 2),
+        nn.ReLU(),
+        nn.Linear(channels // 2, channels),
+        nn.ReLU(),
+        nn.LayerNorm(channels),
+    )
+    for layer in layers:
+        if isinstance(layer, nn.Linear):
+            nn.init.xavier_uniform_(layer.weight)
+            nn.init.zeros_(layer.bias)
+    return layers

@@ -1,0 +1,52 @@
+"""Box codes of the detection head <-> Boxes3D in the bev frame, both directions.
+
+A code is (cx, cy, log w, log l, cz, log h, sin, cos, vx, vy). Its angle runs clockwise from -y, as in the
+original: yaw = -angle - pi/2, with yaw counter-clockwise from +x.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.transforms import Array, wrap_angle
+from bevcli.model.bevformer import BEVFormerConfig, BEVFormerOutputs
+
+
+def decode(outputs: BEVFormerOutputs, config: BEVFormerConfig) -> list[Boxes3D]:
+    """The best boxes of the last decoder layer, one Boxes3D a batch element, by falling score, bev frame.
+
+    At most config.decoder.max_boxes, without suppression of overlaps: the model learned not to repeat itself.
+    A query appears once for each of its classes that is among the best scores.
+    """
+    classes = np.asarray(config.classes)
+    scores = outputs.class_logits[-1].detach().float().sigmoid().flatten(1)  # (B, Q · classes)
+    best, index = scores.topk(min(config.decoder.max_boxes, scores.shape[1]))
+    query, label = index // len(classes), index % len(classes)
+    last_codes = outputs.box_codes[-1].detach()
+    codes = last_codes.gather(1, query[..., None].expand(-1, -1, last_codes.shape[-1]))
+    return [
+        _boxes(code.double().cpu().numpy(), classes[names.cpu().numpy()], score.double().cpu().numpy())
+        for code, names, score in zip(codes, label, best, strict=True)
+    ]
+
+
+def encode(boxes: Boxes3D) -> Array:
+    """Boxes in the bev frame -> codes (N, 10), the targets of training; unknown velocities stay NaN."""
+    length, width, height = boxes.sizes_lwh.T
+    angle = -boxes.yaws - np.pi / 2
+    x, y, z = boxes.centers.T
+    columns = [x, y, np.log(width), np.log(length), z, np.log(height), np.sin(angle), np.cos(angle)]
+    return np.concatenate([np.stack(columns, axis=-1), boxes.velocities], axis=-1)
+
+
+def _boxes(code: Array, classes: np.ndarray, scores: Array) -> Boxes3D:
+    angle = np.arctan2(code[:, 6], code[:, 7])
+    return Boxes3D(
+        centers=code[:, [0, 1, 4]],
+        sizes_lwh=np.exp(code[:, [3, 2, 5]]),
+        yaws=wrap_angle(-angle - np.pi / 2),
+        velocities=code[:, 8:],
+        classes=classes,
+        scores=scores,
+    )
