@@ -104,13 +104,49 @@ class Sequence(Protocol):
 
 
 @dataclass(frozen=True)
+class CameraSamples:
+    """Where spatial cross-attention looked in one camera's picture.
+
+    pixels: (K, 2) in the picture as it was read (not the network's input), may lie outside of it.
+    weights: (K,) attention weights, not negative; over all cameras of a probe they sum to about 1.
+    """
+
+    pixels: Array
+    weights: Array
+
+
+@dataclass(frozen=True)
+class Probe:
+    """One BEV cell that was asked where it looks.
+
+    cell_center: (2,) x, y of its centre in the bev frame, metres. cameras: name -> samples, of the cameras it hits.
+    """
+
+    cell_center: Array
+    cameras: Mapping[str, CameraSamples]
+
+
+@dataclass(frozen=True)
+class AttentionView:
+    """What a frame's attention did, where the model was asked.
+
+    history_weight: (rows, columns) 0 to 1, how much each cell took from the previous BEV map in temporal
+    self-attention, rows from the smallest y; None where no history was used. probes: in the order asked for.
+    """
+
+    history_weight: Array | None = None
+    probes: tuple[Probe, ...] = ()
+
+
+@dataclass(frozen=True)
 class Prediction:
     """What the model says of one frame.
 
     boxes: all decoded boxes, best first, in the bev frame, with classes and scores.
     bev: (Y*X, C) tensor, cell index row * columns + column, rows from the smallest y; None where no picture came.
-    segmentation: of the model's segmentation head, where it has one.
-    started_anew: no history was used. skipped: no picture at all; boxes are empty and the state was passed on.
+    started_anew: why no history was used ("first frame", "new scene", …), "" where it was.
+    skipped: no picture at all; boxes are empty and the state was passed on.
+    segmentation: of the model's segmentation head, where it has one. attention: where the run asked for it.
     stage_seconds: time per stage of the pipeline, in the order of the work.
     """
 
@@ -120,9 +156,10 @@ class Prediction:
     world_from_ego: Pose
     grid: BevGrid
     bev: Tensor | None
-    started_anew: bool
+    started_anew: str
     skipped: bool = False
     segmentation: BevMap | None = None
+    attention: AttentionView | None = None
     stage_seconds: Mapping[str, float] = field(default_factory=dict)
 
     @property

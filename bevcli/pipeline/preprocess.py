@@ -1,0 +1,123 @@
+"""Frame -> the network's input. Picture and calibration change together, here and nowhere else."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from bevcli.frame import Frame
+from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.geometry.transforms import Array, inverse
+from bevcli.model.bevformer import BEVFormerConfig
+from bevcli.model.image_config import ImageConfig
+from bevcli.pipeline.camera_assignment import CameraAssignment, assign_cameras
+
+LensMaps = tuple[NDArray[np.float32], NDArray[np.float32]]
+
+
+@dataclass(frozen=True)
+class PreparedFrame:
+    """A frame and what the network takes of it.
+
+    assignment: the cameras of the N axes below. scales: (N,) network pixels per pixel of the picture.
+    images: (1, N, 3, H, W) float32, zero where a picture is missing. image_from_bev: (1, N, 4, 4) float32.
+    camera_index: (N,) int64. has_picture: (1, N) bool.
+    """
+
+    frame: Frame
+    assignment: CameraAssignment
+    scales: tuple[float, ...]
+    images: Tensor
+    image_from_bev: Tensor
+    camera_index: Tensor
+    has_picture: Tensor
+
+
+class Preprocessor:
+    """Prepares the frames of a sequence for one model. Lens maps are kept while the rig stays the same.
+
+    chosen_cameras: camera -> the model's camera whose embedding it takes, where viewing direction should not decide.
+    """
+
+    def __init__(self, config: BEVFormerConfig, chosen_cameras: Mapping[str, str] | None = None) -> None:
+        self.config = config
+        self._chosen_cameras = chosen_cameras
+        self._rig: CameraRig | None = None
+        self._lens_maps: dict[str, LensMaps] = {}
+        self._assignment = CameraAssignment((), ())
+
+    def __call__(self, frame: Frame) -> PreparedFrame:
+        """Pictures undistorted, resized, normalised and padded; projections to match."""
+        self._use_rig(frame.rig)
+        image, names = self.config.image, self._assignment.cameras
+        width, height = image.padded_size
+        images = torch.zeros(1, len(names), 3, height, width)
+        for place, name in enumerate(names):
+            if name in frame.pictures:
+                pixels = self._undistorted(frame.pictures[name].pixels_bgr, frame.rig[name])
+                network_picture(pixels, image, out=images[0, place].numpy())
+        scales = tuple(network_scale(frame.rig[name], image) for name in names)
+        matrices = [image_from_bev(frame, name) for name in names]
+        scaled = [np.diag([scale, scale, 1.0, 1.0]) @ m for scale, m in zip(scales, matrices, strict=True)]
+        return PreparedFrame(
+            frame=frame,
+            assignment=self._assignment,
+            scales=scales,
+            images=images,
+            image_from_bev=torch.from_numpy(np.stack(scaled)).float()[None],
+            camera_index=torch.tensor([self.config.cameras.index(name) for name in self._assignment.embeddings]),
+            has_picture=torch.tensor([[name in frame.pictures for name in names]]),
+        )
+
+    def _use_rig(self, rig: CameraRig) -> None:
+        if rig is self._rig:
+            return
+        self._rig, self._lens_maps = rig, {}
+        self._assignment = assign_cameras(rig, self.config.cameras, self._chosen_cameras)
+
+    def _undistorted(self, pixels: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
+        if camera.distortion is None:
+            return pixels
+        if camera.name not in self._lens_maps:
+            map_x, map_y = camera.undistort_maps()
+            self._lens_maps[camera.name] = (np.nan_to_num(map_x, nan=-1e4), np.nan_to_num(map_y, nan=-1e4))
+        maps = self._lens_maps[camera.name]
+        return cv2.remap(pixels, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT).astype(np.uint8, copy=False)
+
+
+def network_scale(camera: Camera, image: ImageConfig) -> float:
+    """Network pixels per pixel of the camera's picture: the largest at which it fits into the model's size."""
+    return min(image.size[0] / camera.width, image.size[1] / camera.height)
+
+
+def network_picture(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: NDArray[np.float32]) -> None:
+    """Writes a picture (H, W, 3) uint8 BGR, resized and normalised, to the top left of `out` (3, H', W'), zeros before.
+
+    Resized in float, which commutes with the original's order (normalise, then resize) up to rounding.
+    """
+    height, width = pixels_bgr.shape[:2]
+    scale = min(image.size[0] / width, image.size[1] / height)
+    new_width, new_height = round(width * scale), round(height * scale)
+    resized = cv2.resize(pixels_bgr.astype(np.float32), (new_width, new_height), interpolation=cv2.INTER_LINEAR)
+    if image.color_order == "rgb":
+        resized = resized[..., ::-1]
+    planes = resized.transpose(2, 0, 1)
+    mean, std = (np.asarray(values, dtype=np.float32)[:, None, None] for values in (image.mean, image.std))
+    np.divide(planes - mean, std, out=out[:, :new_height, :new_width])
+
+
+def image_from_bev(frame: Frame, camera_name: str) -> Array:
+    """(4, 4) float64: from the bev frame at the frame's time to pixels of the undistorted picture at the camera's time.
+
+    A point (x, y, z, 1) becomes (u d, v d, d, 1).
+    """
+    camera = frame.rig[camera_name]
+    camera_ego_from_world = inverse(frame.world_from_ego_at[camera_name].matrix)
+    ego_from_ego = camera_ego_from_world @ frame.world_from_ego.matrix
+    return camera.image_from_camera @ camera.camera_from_ego @ ego_from_ego @ frame.rig.ego_from_bev

@@ -1,0 +1,29 @@
+"""Work of the next frames done in the background while the model is busy with this one."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import islice
+from typing import TypeVar
+
+S = TypeVar("S")
+T = TypeVar("T")
+
+
+def read_ahead(work: Callable[[S], T], items: Iterable[S], depth: int = 2) -> Iterator[T]:
+    """Yields work(item) for every item, in order, worked out in one background thread up to `depth` items ahead.
+
+    An exception in `work` is raised at its item. Stopping early leaves nothing running but the item at work.
+    """
+    source = iter(items)
+    pool = ThreadPoolExecutor(1, thread_name_prefix="read-ahead")
+    pending: deque[Future[T]] = deque(pool.submit(work, item) for item in islice(source, depth))
+    try:
+        while pending:
+            result = pending.popleft().result()
+            pending.extend(pool.submit(work, item) for item in islice(source, 1))
+            yield result
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)

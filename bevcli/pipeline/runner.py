@@ -1,0 +1,156 @@
+"""The recurrent run: frame by frame, each BEV map the next frame's history."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from collections.abc import Sequence as Items
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from bevcli.frame import AttentionView, Frame, FrameStamp, Prediction, Sequence
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.transforms import Pose
+from bevcli.model.attention_probe import AttentionProbe
+from bevcli.model.bevformer import BEVFormer, BEVFormerInputs
+from bevcli.model.box_coding import decode
+from bevcli.model.ego_motion_inputs import ego_motion_inputs
+from bevcli.pipeline.attention import attention_view, probe_cells
+from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
+from bevcli.pipeline.read_ahead import read_ahead
+from bevcli.pipeline.stage_clock import StageClock
+
+Precision = Literal["fp32", "bf16", "fp16"]
+_AUTOCAST = {"bf16": torch.bfloat16, "fp16": torch.float16}
+
+
+@dataclass(frozen=True)
+class BevState:
+    """All that a run remembers from one frame to the next. bev: (1, Y·X, C); pose: world_from_ego, then."""
+
+    bev: Tensor
+    pose: Pose
+    stamp: FrameStamp
+
+
+@dataclass(frozen=True)
+class StepOptions:
+    """precision: of the network's arithmetic. temporal: whether history is used.
+
+    ask_attention: whether predictions carry an AttentionView. probes: x, y in metres, bev frame, the cells asked.
+    """
+
+    precision: Precision = "fp32"
+    temporal: bool = True
+    ask_attention: bool = False
+    probes: tuple[tuple[float, float], ...] = ()
+
+
+class Runner:
+    """A model on a device, and how it is to be run. It keeps nothing between frames: `BevState` goes in and out."""
+
+    def __init__(self, model: BEVFormer, device: torch.device, options: StepOptions | None = None) -> None:
+        self.model = model.to(device).eval()
+        self.config = model.config
+        self.device = device
+        self.options = StepOptions() if options is None else options
+        self.clock = StageClock(model, device)
+
+    @torch.inference_mode()
+    def step(self, state: BevState | None, prepared: PreparedFrame) -> tuple[BevState | None, Prediction]:
+        """One frame. A frame without any picture passes the state on: the next alignment spans it."""
+        frame = prepared.frame
+        started_anew = self._reason_to_start_anew(state, frame.stamp)
+        if started_anew:
+            state = None
+        if not frame.pictures:
+            return state, self._prediction(frame, started_anew, Boxes3D.empty(), None)
+        self.clock.start()
+        probe = self._probe(frame)
+        with self._autocast():
+            inputs = self._inputs(prepared, state)
+            outputs = self.model(inputs, None if state is None else state.bev, probe)
+        boxes = decode(outputs, self.config)[0]
+        self.clock.mark("box_decoding")
+        view = None if probe is None else attention_view(probe, prepared, self.config)
+        prediction = self._prediction(frame, started_anew, boxes, outputs.bev[0], view)
+        return BevState(outputs.bev, frame.world_from_ego, frame.stamp), prediction
+
+    def run(
+        self, sequence: Sequence, places: Items[int], preprocessor: Preprocessor, state: BevState | None = None
+    ) -> Iterator[tuple[Frame, Prediction, BevState | None]]:
+        """The frames at these places, read and prepared ahead; nothing is kept of a frame once it is yielded."""
+
+        def prepare(place: int) -> PreparedFrame:
+            return preprocessor(sequence.load(place))
+
+        for prepared in read_ahead(prepare, places):
+            state, prediction = self.step(state, prepared)
+            yield prepared.frame, prediction, state
+
+    def _reason_to_start_anew(self, state: BevState | None, stamp: FrameStamp) -> str:
+        if not self.options.temporal:
+            return "history is off"
+        if state is None:
+            return "first frame"
+        if stamp.scene != state.stamp.scene:
+            return "new scene"
+        seconds = (stamp.timestamp_ns - state.stamp.timestamp_ns) / 1e9
+        return f"gap of {seconds:.1f} s" if not 0 < seconds <= self.config.max_gap_s else ""
+
+    def _inputs(self, prepared: PreparedFrame, state: BevState | None) -> BEVFormerInputs:
+        frame = prepared.frame
+        motion = ego_motion_inputs(
+            frame.world_from_ego,
+            None if state is None else state.pose,
+            frame.kinematics.acceleration,
+            frame.kinematics.angular_rate,
+            frame.kinematics.velocity,
+            self.config.bev_grid,
+            self.config.ego_motion,
+        )
+        tensors = (
+            prepared.images,
+            prepared.image_from_bev,
+            prepared.camera_index,
+            prepared.has_picture,
+            torch.from_numpy(motion.can_bus)[None],
+            torch.from_numpy(motion.shift)[None],
+            torch.tensor([motion.rotation_deg], dtype=torch.float32),
+        )
+        return BEVFormerInputs(*(tensor.to(self.device, non_blocking=True) for tensor in tensors))
+
+    def _probe(self, frame: Frame) -> AttentionProbe | None:
+        if not self.options.ask_attention:
+            return None
+        cells = probe_cells(self.options.probes, self.config.bev_grid)
+        return AttentionProbe(layer=self.config.encoder.layers - 1, cells=cells.to(self.device))
+
+    def _autocast(self) -> contextlib.AbstractContextManager[object]:
+        if self.options.precision == "fp32":
+            return contextlib.nullcontext()
+        return torch.autocast(self.device.type, _AUTOCAST[self.options.precision])
+
+    def _prediction(
+        self,
+        frame: Frame,
+        started_anew: str,
+        boxes: Boxes3D,
+        bev: Tensor | None,
+        attention: AttentionView | None = None,
+    ) -> Prediction:
+        return Prediction(
+            stamp=frame.stamp,
+            boxes=boxes,
+            ego_from_bev=frame.rig.ego_from_bev,
+            world_from_ego=frame.world_from_ego,
+            grid=self.config.bev_grid,
+            bev=bev,
+            started_anew=started_anew,
+            skipped=bev is None,
+            attention=attention,
+            stage_seconds={} if bev is None else self.clock.read(),
+        )
