@@ -138,7 +138,9 @@ class BEVFormer(nn.Module):
             inputs.shift,
             probe,
         )
-        class_logits, box_codes = self.decoder(bev, self.detection_head)
+        # Boxes are refined in steps finer than half precision can tell.
+        with torch.autocast(bev.device.type, enabled=False):
+            class_logits, box_codes = self.decoder(bev.float(), self.detection_head)
         return BEVFormerOutputs(bev, class_logits, box_codes)
 
     def project_pillars(self, inputs: BEVFormerInputs) -> PillarProjection:

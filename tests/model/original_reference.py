@@ -1,0 +1,129 @@
+"""What the original BEVFormer was given and what it answered, kept in tests/data.
+
+golden_inputs.json: rig and poses of four frames. golden_keys.json: names and shapes of the official weights.
+golden_tiny.npz: the original's numbers with weights and pictures by the rule of stated_rule.py, the BEV maps on every
+23rd cell, the codes and logits of every 9th query.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from stated_rule import rule_picture, rule_tensor
+
+from bevcli.checkpoints import from_official
+from bevcli.config import load_config
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.transforms import Pose
+from bevcli.model.bevformer import BEVFormer, BEVFormerConfig, BEVFormerInputs
+from bevcli.model.ego_motion_inputs import EgoMotionInputs, ego_motion_inputs
+
+DATA = Path(__file__).parents[1] / "data"
+STEM_GAIN = {"tiny": 1.0, "small": 1 / 57, "base": 1 / 57}
+
+
+@cache
+def frames() -> list[dict[str, Any]]:
+    """The four frames; 0 to 2 are one scene, 3 is another."""
+    return json.loads((DATA / "golden_inputs.json").read_text())["infos"]
+
+
+def official_shapes(model: str) -> dict[str, tuple[int, ...]]:
+    """Shapes of the official weights by key."""
+    keys = json.loads((DATA / "golden_keys.json").read_text())[model]
+    return {key: tuple(shape) for key, shape in keys.items()}
+
+
+def official_state(model: str) -> dict[str, torch.Tensor]:
+    """Official weights by the rule."""
+    shapes = official_shapes(model)
+    return {key: torch.from_numpy(rule_tensor(key, shape, STEM_GAIN[model])) for key, shape in shapes.items()}
+
+
+def rule_model(name: str, history_shift: str) -> BEVFormer:
+    """A model with weights by the rule, in evaluation mode."""
+    config = load_config(name)
+    motion = replace(config.ego_motion, history_shift=history_shift)
+    model = BEVFormer(replace(config, ego_motion=motion)).eval()
+    model.load_state_dict(from_official(official_state(name)))
+    return model
+
+
+def with_history_shift(model: BEVFormer, history_shift: str) -> BEVFormer:
+    """The same weights with the other history shift."""
+    motion = replace(model.config.ego_motion, history_shift=history_shift)
+    other = BEVFormer(replace(model.config, ego_motion=motion)).eval()
+    other.load_state_dict(model.state_dict())
+    return other
+
+
+def image_from_bev(frame: int, config: BEVFormerConfig) -> np.ndarray:
+    """(N, 4, 4) bev metres to network-input pixels, by textbook formulas."""
+    matrices = []
+    for name in config.cameras:
+        camera = frames()[frame]["cams"][name]
+        bev_from_camera = np.eye(4)
+        bev_from_camera[:3, :3] = camera["sensor2lidar_rotation"]
+        bev_from_camera[:3, 3] = camera["sensor2lidar_translation"]
+        image_from_camera = np.eye(4)
+        image_from_camera[:3, :3] = camera["cam_intrinsic"]
+        scale = np.diag([config.image.size[0] / 1600, config.image.size[1] / 900, 1, 1])
+        matrices.append(scale @ image_from_camera @ np.linalg.inv(bev_from_camera))
+    return np.stack(matrices)
+
+
+def network_image(frame: int, camera: str, config: BEVFormerConfig) -> np.ndarray:
+    """(3, H, W) normalised, resized, padded."""
+    picture = rule_picture(frame, camera).astype(np.float32)
+    if config.image.color_order == "rgb":
+        picture = picture[..., ::-1]
+    normalised = (picture - np.float32(config.image.mean)) / np.float32(config.image.std)
+    resized = cv2.resize(normalised, config.image.size, interpolation=cv2.INTER_LINEAR)
+    padded = np.pad(resized, ((0, -resized.shape[0] % 32), (0, -resized.shape[1] % 32), (0, 0)))
+    return padded.transpose(2, 0, 1)
+
+
+def pose(frame: int) -> Pose:
+    """world_from_ego of a frame."""
+    info = frames()[frame]
+    return Pose(np.array(info["ego2global_translation"]), np.array(info["ego2global_rotation"]))
+
+
+def motion(frame: int, config: BEVFormerConfig) -> EgoMotionInputs:
+    """The ego-motion inputs of a frame."""
+    previous = pose(frame - 1) if frame in (1, 2) else None
+    can_bus = np.array(frames()[frame]["can_bus"])
+    sensors = can_bus[7:10], can_bus[10:13], can_bus[13:16]
+    return ego_motion_inputs(pose(frame), previous, *sensors, config.bev_grid, config.ego_motion)
+
+
+def inputs(frame: int, config: BEVFormerConfig) -> BEVFormerInputs:
+    """The network's inputs for one of the four frames."""
+    moved = motion(frame, config)
+    images = np.stack([network_image(frame, name, config) for name in config.cameras])
+    return BEVFormerInputs(
+        images=torch.from_numpy(images)[None],
+        image_from_bev=torch.from_numpy(image_from_bev(frame, config)).float()[None],
+        camera_index=torch.arange(len(config.cameras)),
+        has_picture=torch.ones(1, len(config.cameras), dtype=torch.bool),
+        can_bus=torch.from_numpy(moved.can_bus)[None],
+        shift=torch.from_numpy(moved.shift)[None],
+        rotation_deg=torch.tensor([moved.rotation_deg]),
+    )
+
+
+def match_boxes(boxes: Boxes3D, expected: np.ndarray, labels: np.ndarray, classes: Sequence[str]) -> list[int]:
+    """For each expected box the row of ours with its class and the nearest centre: scores may tie."""
+    distance = np.linalg.norm(expected[:, None, :3] - boxes.centers[None], axis=-1)
+    other_class = np.array(classes)[labels][:, None] != boxes.classes[None]
+    rows = np.where(other_class, np.inf, distance).argmin(axis=1).tolist()
+    assert len(set(rows)) == len(boxes)
+    return rows

@@ -1,0 +1,75 @@
+"""The tiny model answers as the original does, on the numbers kept in tests/data (float32, CPU)."""
+
+from __future__ import annotations
+
+import numpy as np
+import original_reference as original
+import pytest
+import torch
+
+from bevcli.geometry.transforms import wrap_angle
+from bevcli.model.bevformer import BEVFormer, BEVFormerOutputs
+from bevcli.model.box_coding import decode
+
+KEPT = np.load(original.DATA / "golden_tiny.npz")
+
+
+@pytest.fixture(scope="module")
+def model() -> BEVFormer:
+    return original.rule_model("tiny", "history")
+
+
+@pytest.fixture(scope="module")
+def answers(model: BEVFormer) -> dict[str, BEVFormerOutputs]:
+    """Frames 0 and 1 in the version "history", frame 1 in the version "both"; frame 0 has no history to shift."""
+    shifts_both = original.with_history_shift(model, "both")
+    with torch.inference_mode():
+        first = model(original.inputs(0, model.config))
+        second = original.inputs(1, model.config)
+        return {
+            "history_0": first,
+            "history_1": model(second, first.bev),
+            "both_1": shifts_both(second, first.bev),
+        }
+
+
+@pytest.mark.parametrize("step", ["history_0", "history_1", "both_1"])
+def test_bev_map_and_head_outputs_equal_the_originals(answers: dict[str, BEVFormerOutputs], step: str) -> None:
+    outputs = answers[step]
+    np.testing.assert_allclose(outputs.bev[0, ::23], KEPT[f"{step}_bev"], atol=1e-3)
+    np.testing.assert_allclose(outputs.class_logits[:, 0, ::9], KEPT[f"{step}_class_logits"], atol=1e-3)
+    np.testing.assert_allclose(outputs.box_codes[:, 0, ::9], KEPT[f"{step}_box_codes"], atol=1e-2)
+
+
+@pytest.mark.parametrize("step", ["history_0", "history_1", "both_1"])
+def test_decoded_boxes_equal_the_originals(model: BEVFormer, answers: dict[str, BEVFormerOutputs], step: str) -> None:
+    boxes = decode(answers[step], model.config)[0]
+    expected, scores, labels = (KEPT[f"{step}_{name}"] for name in ("boxes", "scores", "labels"))
+    np.testing.assert_allclose(boxes.scores, scores, atol=1e-4)
+    row = original.match_boxes(boxes, expected, labels, model.config.classes)
+    np.testing.assert_allclose(boxes.centers[row], expected[:, :3], atol=1e-2)
+    np.testing.assert_allclose(boxes.sizes_lwh[row], expected[:, [4, 3, 5]], rtol=1e-3)
+    # The original's yaw runs clockwise from -y.
+    np.testing.assert_allclose(wrap_angle(boxes.yaws[row] + expected[:, 6] + np.pi / 2), 0, atol=1e-3)
+    np.testing.assert_allclose(boxes.velocities[row], expected[:, 7:], atol=1e-3)
+
+
+def test_the_two_versions_of_the_history_shift_differ(answers: dict[str, BEVFormerOutputs]) -> None:
+    assert (answers["history_1"].bev - answers["both_1"].bev).abs().mean() > 0.1
+
+
+def test_pillars_appear_where_the_original_projects_them(model: BEVFormer) -> None:
+    projection = model.project_pillars(original.inputs(0, model.config))
+    visible = projection.visible[0].numpy()
+    bits = np.unpackbits(KEPT["visible_bits"])[: visible.size].reshape(visible.shape).astype(bool)
+    assert np.array_equal(visible, bits)
+    seen = visible[:, ::23]
+    points = projection.reference_points[0, :, ::23].numpy()
+    np.testing.assert_allclose(points[seen], KEPT["reference_points"][seen], atol=1e-5)
+
+
+@pytest.mark.parametrize("frame", [0, 1, 2, 3])
+def test_ego_motion_inputs_equal_the_originals(model: BEVFormer, frame: int) -> None:
+    inputs = original.motion(frame, model.config)
+    np.testing.assert_allclose(inputs.can_bus, KEPT[f"history_{frame}_can_bus"], rtol=1e-6, atol=2e-5)
+    np.testing.assert_allclose(inputs.shift, KEPT[f"history_{frame}_shift"], atol=1e-7)
