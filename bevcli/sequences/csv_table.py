@@ -1,0 +1,101 @@
+"""Strict CSV reading: a header of known columns, rows of the same length, and errors that name line and column."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from bevcli.errors import InputError
+
+
+@dataclass(frozen=True)
+class CsvRow:
+    """One row: where it stands, and its cells by column, stripped."""
+
+    path: Path
+    line: int
+    cells: dict[str, str]
+
+    def error(self, column: str, what: str) -> InputError:
+        """A mistake in this row's cell, to be raised."""
+        return InputError(f"{self.path}: line {self.line}, column {column}: {what}")
+
+    def integer(self, column: str) -> int:
+        """The cell as an integer of any size. Raises InputError otherwise."""
+        text = self.cells[column]
+        digits = text.removeprefix("-")
+        if not (digits.isascii() and digits.isdigit()):
+            raise self.error(column, f'expected an integer, found "{text}": write it without point or exponent')
+        return int(text)
+
+    def number(self, column: str) -> float:
+        """The cell as a finite number. Raises InputError otherwise."""
+        text = self.cells[column]
+        try:
+            value = float(text)
+        except ValueError:
+            raise self.error(column, f'expected a number, found "{text}"') from None
+        if not math.isfinite(value):
+            raise self.error(column, f'expected a finite number, found "{text}": remove or mend the row')
+        return value
+
+
+@dataclass(frozen=True)
+class CsvTable:
+    """A file's header and its rows in order."""
+
+    path: Path
+    columns: tuple[str, ...]
+    rows: tuple[CsvRow, ...]
+
+
+def read_csv(path: Path, required: Iterable[str], optional: Iterable[str] = ()) -> CsvTable:
+    """Read a CSV file with a header (UTF-8, commas).
+
+    Raises InputError where the file is missing or no text, a required column is missing, a column is unknown or
+    twice there, a row has another number of cells than the header, or no row follows.
+    """
+    required = tuple(required)
+    lines = _lines(path)
+    if not lines:
+        raise InputError(f"{path}: the file is empty (expected a header with {', '.join(required)})")
+    columns = tuple(cell.strip() for cell in lines[0][1])
+    _check_columns(path, columns, required, tuple(optional))
+    rows = tuple(_row(path, columns, line, cells) for line, cells in lines[1:])
+    if not rows:
+        raise InputError(f"{path}: no rows below the header (expected at least one)")
+    return CsvTable(path, columns, rows)
+
+
+def _lines(path: Path) -> list[tuple[int, list[str]]]:
+    """Line number and cells of every line that is not blank."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.reader(file)
+            return [(reader.line_num, cells) for cells in reader if cells]
+    except FileNotFoundError:
+        raise InputError(f"{path}: the file is missing") from None
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: cannot be read as CSV ({error})") from None
+
+
+def _check_columns(path: Path, columns: tuple[str, ...], required: tuple[str, ...], optional: tuple[str, ...]) -> None:
+    missing = [name for name in required if name not in columns]
+    if missing:
+        raise InputError(f'{path}: column "{missing[0]}" is missing (found: {", ".join(columns)})')
+    known = {*required, *optional}
+    unknown = [name for name in columns if name not in known]
+    if unknown:
+        raise InputError(f'{path}: unknown column "{unknown[0]}" (known: {", ".join((*required, *optional))})')
+    twice = [name for name in columns if columns.count(name) > 1]
+    if twice:
+        raise InputError(f'{path}: column "{twice[0]}" stands twice in the header')
+
+
+def _row(path: Path, columns: tuple[str, ...], line: int, cells: list[str]) -> CsvRow:
+    if len(cells) != len(columns):
+        raise InputError(f"{path}: line {line} has {len(cells)} cells (expected {len(columns)}, as in the header)")
+    return CsvRow(path, line, {name: cell.strip() for name, cell in zip(columns, cells, strict=True)})

@@ -1,0 +1,131 @@
+"""The pictures of one frame, decoded side by side: from files, or from videos read front to back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.errors import InputError
+from bevcli.frame import Picture
+from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.sequences.video import VideoReader
+
+DECODING_THREADS = 6
+PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png")
+VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".webm", ".mov", ".m4v")
+# A picture is shown and calibrated as its pixels are stored: an EXIF orientation would turn it away from both.
+DECODE_FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+
+
+@dataclass(frozen=True)
+class PictureSource:
+    """Where one picture is, and when it was taken. `video_index`: its number in the video `path`, from 0."""
+
+    path: Path
+    timestamp_ns: int
+    video_index: int | None = None
+
+    def __str__(self) -> str:
+        return str(self.path) if self.video_index is None else f"{self.path}#{self.video_index}"
+
+
+class UnreadablePicture(Exception):
+    """A picture is missing or broken; the message is the reason."""
+
+
+class PictureReader:
+    """Reads the pictures of frames in order. With `strict`, one that is missing or broken is an InputError."""
+
+    def __init__(self, *, strict: bool = False) -> None:
+        self._strict = strict
+        self._videos: dict[str, VideoReader] = {}  # by camera: each reader serves one thread at a time
+        self._threads = ThreadPoolExecutor(DECODING_THREADS, thread_name_prefix="decode")
+
+    def read(
+        self, sources: Mapping[str, PictureSource], rig: CameraRig, dropped: Mapping[str, str]
+    ) -> tuple[dict[str, Picture], dict[str, str]]:
+        """The pictures by camera, and why others are missing: `dropped` (known before) and what turned up.
+
+        Raises InputError for a picture of another size than the calibration's.
+        """
+        if self._strict and dropped:
+            camera, reason = next(iter(dropped.items()))
+            raise InputError(f"camera {camera}: {reason}: add the picture, or run without --strict")
+        tasks = {name: self._threads.submit(self._read_one, source, rig[name]) for name, source in sources.items()}
+        pictures: dict[str, Picture] = {}
+        reasons = dict(dropped)
+        for name, task in tasks.items():
+            try:
+                pictures[name] = task.result()
+            except UnreadablePicture as unreadable:
+                if self._strict:
+                    hint = "mend the picture, or run without --strict"
+                    raise InputError(f"camera {name}: {unreadable}: {hint}") from None
+                reasons[name] = str(unreadable)
+        return pictures, reasons
+
+    def _read_one(self, source: PictureSource, camera: Camera) -> Picture:
+        if source.video_index is None:
+            picture = _read_file(source)
+        else:
+            picture = Picture(source.timestamp_ns, self._read_video(source, camera.name))
+        height, width = picture.pixels_bgr.shape[:2]
+        if (width, height) != (camera.width, camera.height):
+            raise InputError(
+                f"{source}: camera {camera.name}: the picture is {width}x{height} (expected {camera.width}x"
+                f"{camera.height}, as the calibration says): give pictures and calibration of the same size"
+            )
+        return picture
+
+    def _read_video(self, source: PictureSource, camera: str) -> NDArray[np.uint8]:
+        reader = self._videos.get(camera)
+        if reader is None or reader.path != source.path:
+            reader = self._videos[camera] = VideoReader(source.path)
+        assert source.video_index is not None
+        try:
+            return reader.read(source.video_index)
+        except InputError as error:
+            raise UnreadablePicture(str(error)) from None
+
+
+def _read_file(source: PictureSource) -> Picture:
+    try:
+        encoded = source.path.read_bytes()
+    except FileNotFoundError:
+        raise UnreadablePicture(f"{source.path} is missing") from None
+    except OSError as error:
+        raise UnreadablePicture(f"{source.path} cannot be read ({error.strerror})") from None
+    media_type = media_type_of(encoded)
+    pixels = decode(encoded)
+    if pixels is None:
+        raise UnreadablePicture(f"{source.path} is not a whole picture")
+    return Picture(source.timestamp_ns, pixels, encoded if media_type else None, media_type)
+
+
+def decode(encoded: bytes) -> NDArray[np.uint8] | None:
+    """(H, W, 3) BGR of a picture's bytes, or None where they are no picture or one cut short."""
+    if not encoded or _is_cut_short(encoded):
+        return None
+    pixels = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), DECODE_FLAGS)
+    return None if pixels is None else pixels.astype(np.uint8, copy=False)
+
+
+def media_type_of(encoded: bytes) -> str | None:
+    """What a viewer needs to know of the bytes: "image/jpeg", "image/png", or None for another format."""
+    if encoded.startswith(b"\xff\xd8\xff"):
+        return "image/jpeg"
+    return "image/png" if encoded.startswith(b"\x89PNG\r\n") else None
+
+
+def _is_cut_short(encoded: bytes) -> bool:
+    """Whether a JPEG or PNG lacks its end; OpenCV decodes the rest to grey without a word."""
+    kind = media_type_of(encoded)
+    if kind == "image/jpeg":
+        return encoded.rfind(b"\xff\xd9") < encoded.rfind(b"\xff\xda")  # end of image before the last scan's start
+    return kind == "image/png" and b"IEND" not in encoded[-64:]

@@ -1,0 +1,79 @@
+"""Thinning to the rate that a model was trained at: speed and history depend on the time between frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bevcli.frame import FrameStamp
+
+# Between these ratios to the wanted rate a scene counts as being at that rate: keyframe times jitter.
+SLOWEST_RATIO, FASTEST_RATIO = 0.75, 1.5
+
+
+@dataclass(frozen=True)
+class Thinning:
+    """The places (into the stamps) that are kept, and what the user should know, "" for nothing."""
+
+    places: tuple[int, ...]
+    note: str
+
+
+def thin(stamps: Sequence[FrameStamp], rate_hz: float) -> Thinning:
+    """Keep, scene by scene, the frames nearest to a regular beat of `rate_hz` that starts at the scene's first frame.
+
+    A scene at about this rate is kept whole; a slower one too, and the note says so.
+    """
+    kept: list[int] = []
+    slowest = np.inf
+    for places in scenes_of(stamps):
+        times = np.array([stamps[place].timestamp_ns for place in places], dtype=np.int64)
+        ratio = median_rate_hz(times) / rate_hz
+        slowest = min(slowest, ratio)
+        chosen = _nearest_to_beat(times, rate_hz) if ratio > FASTEST_RATIO else range(len(places))
+        kept += [places[index] for index in chosen]
+    return Thinning(tuple(kept), _note(len(stamps), len(kept), slowest, rate_hz))
+
+
+def every(stamps: Sequence[FrameStamp], step: int) -> tuple[int, ...]:
+    """The places of every `step`-th frame of each scene, from its first."""
+    return tuple(place for places in scenes_of(stamps) for place in places[::step])
+
+
+def scenes_of(stamps: Sequence[FrameStamp]) -> Iterator[list[int]]:
+    """The places of each run of frames that share a scene."""
+    start = 0
+    for place in range(1, len(stamps) + 1):
+        if place == len(stamps) or stamps[place].scene != stamps[start].scene:
+            yield list(range(start, place))
+            start = place
+
+
+def median_rate_hz(times_ns: np.ndarray) -> float:
+    """Frames a second by the middle gap of times (T,) int64 ns; infinite of a single frame, which has no rate."""
+    return float(1e9 / np.median(np.diff(times_ns))) if len(times_ns) > 1 else np.inf
+
+
+def _nearest_to_beat(times_ns: np.ndarray, rate_hz: float) -> list[int]:
+    seconds = (times_ns - times_ns[0]) / 1e9
+    beats = np.arange(0, seconds[-1] + 0.5 / rate_hz, 1 / rate_hz)
+    later = np.clip(np.searchsorted(seconds, beats), 1, len(seconds) - 1)
+    earlier = later - 1
+    nearest = np.where(beats - seconds[earlier] <= seconds[later] - beats, earlier, later)
+    # A beat in a hole of the recording has no frame of its own: its nearest one belongs to another beat.
+    near = np.abs(seconds[nearest] - beats) <= 0.5 / rate_hz
+    return np.unique(nearest[near]).tolist()
+
+
+def _note(total: int, kept: int, slowest_ratio: float, rate_hz: float) -> str:
+    notes = []
+    if kept < total:
+        notes.append(f"{kept} of {total} frames are used: the model was trained at {rate_hz:g} frames a second")
+    if slowest_ratio < SLOWEST_RATIO:
+        notes.append(
+            f"the input has {slowest_ratio * rate_hz:.2g} frames a second, the model was trained at {rate_hz:g}: "
+            "expect worse velocities and history"
+        )
+    return "; ".join(notes)

@@ -1,0 +1,98 @@
+"""timing.toml: when pictures were taken, for folders whose frames.csv does not say it.
+
+start_ns = 1533151603547590000   # time of the first picture; 0 if left out
+rate_hz = 12.0                   # pictures a second; videos: what the file states if left out
+[cameras.CAM_BACK]               # where one camera differs
+offset_ns = 25000000             # its first picture is this much later than start_ns
+rate_hz = 24.0
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from bevcli.errors import InputError
+
+FILE_NAME = "timing.toml"
+
+
+@dataclass(frozen=True)
+class CameraTiming:
+    """Where one camera differs: offset_ns from the common start; rate_hz None: the common one."""
+
+    offset_ns: int = 0
+    rate_hz: float | None = None
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Start and rate of numbered pictures or videos. rate_hz None: not stated."""
+
+    start_ns: int = 0
+    rate_hz: float | None = None
+    cameras: Mapping[str, CameraTiming] = field(default_factory=dict)
+
+    def rate_of(self, camera: str) -> float | None:
+        """Pictures a second of one camera, None where nothing is stated."""
+        own = self.cameras.get(camera, CameraTiming()).rate_hz
+        return self.rate_hz if own is None else own
+
+    def time_of(self, camera: str, number: int, rate_hz: float) -> int:
+        """Nanoseconds of a camera's picture `number`, counted from 0."""
+        offset = self.cameras.get(camera, CameraTiming()).offset_ns
+        return self.start_ns + offset + round(number * 1e9 / rate_hz)
+
+
+def read_timing(folder: Path, cameras: tuple[str, ...]) -> Timing:
+    """The folder's timing.toml, or the defaults where there is none.
+
+    Raises InputError for broken TOML, unknown keys or cameras, and values of the wrong kind.
+    """
+    path = folder / FILE_NAME
+    if not path.is_file():
+        return Timing()
+    try:
+        stated = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as TOML ({error})") from None
+    _check_keys(path, "", stated, ("start_ns", "rate_hz", "cameras"))
+    own = stated.get("cameras", {})
+    if not isinstance(own, dict):
+        raise InputError(f'{path}: "cameras" holds a table for each camera, as [cameras.{cameras[0]}]')
+    _check_keys(path, "cameras.", own, cameras)
+    by_camera = {name: _camera(path, name, table) for name, table in own.items()}
+    return Timing(_integer(path, "", stated, "start_ns"), _rate(path, "", stated), by_camera)
+
+
+def _camera(path: Path, name: str, table: Any) -> CameraTiming:
+    where = f"cameras.{name}."
+    if not isinstance(table, dict):
+        raise InputError(f"{path}: cameras.{name}: expected a table, as [cameras.{name}]")
+    _check_keys(path, where, table, ("offset_ns", "rate_hz"))
+    return CameraTiming(_integer(path, where, table, "offset_ns"), _rate(path, where, table))
+
+
+def _check_keys(path: Path, where: str, table: Mapping[str, Any], known: tuple[str, ...]) -> None:
+    for key in table:
+        if key not in known:
+            raise InputError(f'{path}: unknown key "{where}{key}" (known: {", ".join(known)})')
+
+
+def _integer(path: Path, where: str, table: Mapping[str, Any], key: str) -> int:
+    value = table.get(key, 0)
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise InputError(f"{path}: {where}{key}: expected an integer (nanoseconds), found {value!r}")
+    return value
+
+
+def _rate(path: Path, where: str, table: Mapping[str, Any]) -> float | None:
+    value = table.get("rate_hz")
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < 10_000:
+        raise InputError(f"{path}: {where}rate_hz: expected pictures a second over 0, found {value!r}")
+    return float(value)
