@@ -1,0 +1,170 @@
+"""Boxes as JSON objects, one a box, and back to columns; a frame's boxes are checked together, so it is fast."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.errors import InputError
+from bevcli.geometry.boxes import CLASSES, Boxes3D
+from bevcli.geometry.transforms import Array
+
+KEYS = frozenset(
+    ("class", "center", "size_lwh", "yaw", "velocity", "score", "attribute", "instance", "visibility", "num_points")
+)
+_UNKNOWN_VELOCITY = [None, None]
+
+
+def boxes_from_json(objects: Any, where: str) -> Boxes3D:
+    """Read a list of N box objects; a velocity that is missing or null becomes NaN.
+
+    where: what stands before the message ("boxes.json: frame 3"). Raises InputError naming the first wrong box.
+    """
+    if not isinstance(objects, list):
+        raise InputError(f'{where}: "boxes" must be a list, found {objects!r:.40}')
+    if not objects:
+        return Boxes3D.empty()
+    _check_keys(objects, where)
+    boxes = Boxes3D(
+        centers=_numbers([box["center"] for box in objects], 3, f"{where}: box", "center"),
+        sizes_lwh=_numbers([box["size_lwh"] for box in objects], 3, f"{where}: box", "size_lwh"),
+        yaws=_numbers([box["yaw"] for box in objects], 1, f"{where}: box", "yaw"),
+        velocities=_velocities([box.get("velocity") for box in objects], where),
+        classes=np.array([box["class"] for box in objects]),
+        scores=_scores(objects, where),
+        attributes=_names(objects, "attribute", where),
+        instances=_names(objects, "instance", where),
+        visibilities=_visibilities(objects, where),
+        num_points=_num_points(objects, where),
+    )
+    for key, column in (("center", boxes.centers), ("size_lwh", boxes.sizes_lwh), ("yaw", boxes.yaws)):
+        _require(np.isfinite(column), column, f"{where}: box", key, "finite numbers")
+    _require(boxes.sizes_lwh > 0, boxes.sizes_lwh, f"{where}: box", "size_lwh", "lengths above 0")
+    return boxes
+
+
+def boxes_to_json(boxes: Boxes3D) -> list[dict[str, Any]]:
+    """N box objects; what is unknown (NaN visibility, "" names, -1 points) is left out, NaN velocities are null."""
+    velocities = [[None if math.isnan(v) else v for v in row] for row in boxes.velocities.tolist()]
+    columns: dict[str, list[Any]] = {
+        "class": boxes.classes.tolist(),
+        "center": boxes.centers.tolist(),
+        "size_lwh": boxes.sizes_lwh.tolist(),
+        "yaw": boxes.yaws.tolist(),
+        "velocity": velocities,
+    }
+    objects: list[dict[str, Any]] = [
+        dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)
+    ]
+    optional = (
+        ("score", boxes.scores, lambda value: True),
+        ("attribute", boxes.attributes, lambda value: value != ""),
+        ("instance", boxes.instances, lambda value: value != ""),
+        ("visibility", boxes.visibilities, lambda value: not math.isnan(value)),
+        ("num_points", boxes.num_points, lambda value: value >= 0),
+    )
+    for key, column, known in optional:
+        if column is not None:
+            for box, value in zip(objects, column.tolist(), strict=True):
+                if known(value):
+                    box[key] = value
+    return objects
+
+
+def _check_keys(objects: Sequence[Any], where: str) -> None:
+    for place, box in enumerate(objects):
+        if not isinstance(box, dict):
+            raise InputError(f"{where}: box {place}: expected an object, found {box!r:.40}")
+        for key in ("class", "center", "size_lwh", "yaw"):
+            if key not in box:
+                raise InputError(f'{where}: box {place}: "{key}" is missing (found: {", ".join(box)})')
+        if box["class"] not in CLASSES:  # a tuple, because a list or object is found here too and has no hash
+            raise InputError(
+                f"{where}: box {place}: unknown class {box['class']!r:.40} (expected one of {', '.join(CLASSES)})"
+            )
+        if not KEYS.issuperset(box):
+            unknown = next(key for key in box if key not in KEYS)
+            raise InputError(f'{where}: box {place}: unknown key "{unknown}" (known: {", ".join(sorted(KEYS))})')
+
+
+def _numbers(values: list[Any], width: int, where: str, key: str) -> Array:
+    """(N, width), or (N,) for width 1; where null is allowed it is NaN already."""
+    shape = (len(values),) if width == 1 else (len(values), width)
+    try:
+        array = np.asarray(values)
+    except ValueError:  # ragged lists
+        array = np.asarray(None)
+    if array.shape == shape and array.dtype.kind in "iuf":
+        return array.astype(np.float64, copy=False)
+    if len(values) == 1:
+        raise InputError(f"{where} 0: {key}: {_expected(width)}, found {values[0]!r:.60}")
+    for place, value in enumerate(values):
+        single = np.asarray(value, dtype=object) if isinstance(value, list) else np.asarray(value)
+        entries = value if isinstance(value, list) else [value]
+        fits = single.shape == shape[1:] and all(type(entry) in (int, float) for entry in entries)
+        if not fits:
+            raise InputError(f"{where} {place}: {key}: {_expected(width)}, found {value!r:.60}")
+    return np.asarray(values, dtype=np.float64)  # integers too large for int64
+
+
+def _expected(width: int) -> str:
+    return "expected a number" if width == 1 else f"expected {width} numbers"
+
+
+def _require(good: NDArray[np.bool_], column: Array, where: str, key: str, expected: str) -> None:
+    if not good.all():
+        place = int(np.argmin(good.reshape(len(good), -1).all(axis=1)))
+        raise InputError(f"{where} {place}: {key}: expected {expected}, found {column[place].tolist()}")
+
+
+def _velocities(values: list[Any], where: str) -> Array:
+    with_nan = [
+        [math.nan if number is None else number for number in value] if isinstance(value, list) else value
+        for value in (_UNKNOWN_VELOCITY if value is None else value for value in values)
+    ]
+    return _numbers(with_nan, 2, f"{where}: box", "velocity")
+
+
+def _scores(objects: Sequence[dict[str, Any]], where: str) -> Array | None:
+    if not any("score" in box for box in objects):
+        return None
+    for place, box in enumerate(objects):
+        if "score" not in box:
+            raise InputError(f'{where}: box {place}: "score" is missing (other boxes of the frame have one)')
+    scores = _numbers([box["score"] for box in objects], 1, f"{where}: box", "score")
+    _require((scores >= 0) & (scores <= 1), scores, f"{where}: box", "score", "0 to 1")
+    return scores
+
+
+def _visibilities(objects: Sequence[dict[str, Any]], where: str) -> Array | None:
+    if not any("visibility" in box for box in objects):
+        return None
+    values = [box.get("visibility") for box in objects]
+    numbers = _numbers([math.nan if v is None else v for v in values], 1, f"{where}: box", "visibility")
+    good = np.isnan(numbers) | ((numbers >= 0) & (numbers <= 1))
+    _require(good, numbers, f"{where}: box", "visibility", "0 to 1")
+    return numbers
+
+
+def _num_points(objects: Sequence[dict[str, Any]], where: str) -> NDArray[np.int64] | None:
+    if not any("num_points" in box for box in objects):
+        return None
+    values = [box.get("num_points", -1) for box in objects]
+    for place, value in enumerate(values):
+        if type(value) is not int or ("num_points" in objects[place] and value < 0):
+            raise InputError(f"{where}: box {place}: num_points: expected an integer from 0 up, found {value!r:.40}")
+    return np.array(values, dtype=np.int64)
+
+
+def _names(objects: Sequence[dict[str, Any]], key: str, where: str) -> NDArray[np.str_] | None:
+    if not any(key in box for box in objects):
+        return None
+    values = [box.get(key) or "" for box in objects]
+    for place, value in enumerate(values):
+        if not isinstance(value, str):
+            raise InputError(f"{where}: box {place}: {key}: expected a text, found {value!r:.40}")
+    return np.array(values)

@@ -1,0 +1,171 @@
+"""Boxes files: what is written is read back, at every moment of the writing, and mistakes are named in one line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bevcli.errors import InputError, OutputError
+from bevcli.frame import FrameStamp
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.transforms import Pose
+from bevcli.sequences.boxes_file import BoxesWriter, FrameBoxes, read_boxes
+
+POSE = Pose(np.array([600.25, -3.5, 0.125]), np.array([-0.6, 0.0, 0.0, 0.8]))
+
+
+def some_boxes() -> Boxes3D:
+    return Boxes3D(
+        centers=np.array([[1.0, 2.0, 3.0], [1e3 / 3, -5.0, 0.1]]),
+        sizes_lwh=np.array([[4.5, 1.9, 1.6], [0.5, 0.6, 1.7]]),
+        yaws=np.array([0.1, -3.0]),
+        velocities=np.array([[1.5, -0.5], [np.nan, np.nan]]),
+        classes=np.array(["car", "pedestrian"]),
+        scores=np.array([0.9, 1 / 3]),
+        attributes=np.array(["vehicle.moving", ""]),
+        instances=np.array(["a", ""]),
+        visibilities=np.array([0.25, np.nan]),
+        num_points=np.array([7, -1]),
+    )
+
+
+def frame(index: int, boxes: Boxes3D, **extras: Any) -> FrameBoxes:
+    return FrameBoxes(FrameStamp(index, "street", 1_533_151_603_547_590_000 + index), POSE, boxes, extras)
+
+
+def assert_same(found: Boxes3D, expected: Boxes3D) -> None:
+    for name in vars(expected):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
+
+
+def test_what_is_written_is_read_back_exactly(tmp_path: Path) -> None:
+    path = tmp_path / "predictions.json"
+    with BoxesWriter(path, "world", {"model": "tiny", "untrained": True}, ego_from_bev=POSE) as writer:
+        writer.write(frame(3, some_boxes(), sample_token="t3"))
+        writer.write(frame(4, Boxes3D.empty(), skipped=True))
+    found = read_boxes(path)
+    assert found.frame_of_reference == "world"
+    assert found.extras == {"model": "tiny", "untrained": True}
+    assert found.ego_from_bev is not None
+    np.testing.assert_array_equal(found.ego_from_bev.matrix, POSE.matrix)
+    assert [f.stamp for f in found.frames] == [frame(3, Boxes3D.empty()).stamp, frame(4, Boxes3D.empty()).stamp]
+    assert [dict(f.extras) for f in found.frames] == [{"sample_token": "t3"}, {"skipped": True}]
+    assert found.frames[0].world_from_ego is not None
+    np.testing.assert_array_equal(found.frames[0].world_from_ego.quaternion, POSE.quaternion)
+    assert_same(found.frames[0].boxes, some_boxes())
+    assert len(found.frames[1].boxes) == 0
+
+
+def test_the_file_is_whole_after_every_frame(tmp_path: Path) -> None:
+    path = tmp_path / "predictions.json"
+    with BoxesWriter(path, "world") as writer:
+        for count in range(3):
+            assert len(read_boxes(path).frames) == count
+            writer.write(frame(count, some_boxes()))
+    assert len(read_boxes(path).frames) == 3
+
+
+def test_a_number_that_is_not_finite_is_refused_and_leaves_the_file_whole(tmp_path: Path) -> None:
+    path = tmp_path / "predictions.json"
+    broken = some_boxes().transformed(np.full((4, 4), np.nan))
+    with BoxesWriter(path, "world") as writer:
+        writer.write(frame(0, some_boxes()))
+        with pytest.raises(OutputError, match="frame 1: a box or pose has a number that is not finite"):
+            writer.write(frame(1, broken))
+    assert len(read_boxes(path).frames) == 1
+
+
+def good_file() -> dict[str, Any]:
+    box = {"class": "car", "center": [1, 2, 3], "size_lwh": [4, 2, 1.5], "yaw": 0}
+    row = {
+        "frame": 5,
+        "timestamp_ns": 1,
+        "world_from_ego": {"translation": [0, 0, 0], "rotation": np.eye(3).tolist()},
+        "boxes": [dict(box), dict(box)],
+    }
+    return {"format": "bevcli-boxes/1", "frame_of_reference": "world", "frames": [row]}
+
+
+def test_only_the_necessary_keys_are_needed(tmp_path: Path) -> None:
+    path = tmp_path / "boxes.json"
+    path.write_text(json.dumps(good_file()))
+    boxes = read_boxes(path).frames[0].boxes
+    assert len(boxes) == 2
+    assert np.isnan(boxes.velocities).all()
+    assert boxes.scores is None
+    assert boxes.num_points is None
+
+
+def in_box(key: str, value: Any) -> Any:
+    def plant(content: dict[str, Any]) -> None:
+        content["frames"][0]["boxes"][1][key] = value
+
+    return plant
+
+
+def in_frame(key: str, value: Any) -> Any:
+    def plant(content: dict[str, Any]) -> None:
+        content["frames"][0][key] = value
+
+    return plant
+
+
+def repeat_the_frame(content: dict[str, Any]) -> None:
+    content["frames"].append(content["frames"][0])
+
+
+MISTAKES = {
+    "unknown class": (in_box("class", "tank"), r"frame 5: box 1: unknown class 'tank' \(expected one of car"),
+    "class is a list": (in_box("class", []), "frame 5: box 1: unknown class"),
+    "unknown key": (in_box("heading", 1), 'frame 5: box 1: unknown key "heading"'),
+    "two numbers": (in_box("center", [1, 2]), "frame 5: box 1: center: expected 3 numbers, found"),
+    "a text": (in_box("center", [1, 2, "3"]), "frame 5: box 1: center: expected 3 numbers"),
+    "a null": (in_box("center", [1, 2, None]), "frame 5: box 1: center: expected 3 numbers"),
+    "NaN centre": (in_box("center", [1, 2, float("nan")]), "frame 5: box 1: center: expected finite"),
+    "infinite yaw": (in_box("yaw", float("inf")), "frame 5: box 1: yaw: expected finite"),
+    "yaw is a list": (in_box("yaw", [0.0]), "frame 5: box 1: yaw: expected a number"),
+    "flat box": (in_box("size_lwh", [4, 0, 1]), "frame 5: box 1: size_lwh: expected lengths above 0"),
+    "one speed": (in_box("velocity", [1]), "frame 5: box 1: velocity: expected 2 numbers"),
+    "score of one box": (in_box("score", 0.5), 'frame 5: box 0: "score" is missing'),
+    "visibility in percent": (in_box("visibility", 40), "frame 5: box 1: visibility: expected 0 to 1"),
+    "half a point": (in_box("num_points", 0.5), "frame 5: box 1: num_points: expected an integer"),
+    "attribute": (in_box("attribute", 3), "frame 5: box 1: attribute: expected a text"),
+    "time is a float": (in_frame("timestamp_ns", 1.5), '"timestamp_ns" must be an integer, found 1.5'),
+    "no pose": (in_frame("world_from_ego", None), 'frame 5: "world_from_ego" is missing'),
+    "norm": (
+        in_frame("world_from_ego", {"translation": [0, 0, 0], "rotation_wxyz": [1, 1, 0, 0]}),
+        "frame 5: world_from_ego: rotation_wxyz has norm 1.41421",
+    ),
+    "boxes no list": (in_frame("boxes", {}), 'frame 5: "boxes" must be a list'),
+    "twice": (repeat_the_frame, 'frame 5: scene "" has 1 ns twice'),
+    "format": (lambda content: content.update(format="coco"), "not a boxes file"),
+    "frame of reference": (lambda c: c.update(frame_of_reference="lidar"), "must be world, ego or bev, found 'lidar'"),
+    "no frames": (lambda content: content.pop("frames"), '"frames" is missing'),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_is_named_in_one_line(tmp_path: Path, name: str) -> None:
+    plant, message = MISTAKES[name]
+    content = good_file()
+    plant(content)
+    path = tmp_path / "boxes.json"
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=message) as caught:
+        read_boxes(path)
+    assert "\n" not in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '"boxes"', "\xff"])
+def test_a_file_that_is_no_boxes_file(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "boxes.json"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(InputError, match=r"boxes\.json: "):
+        read_boxes(path)
+    with pytest.raises(InputError, match="is missing"):
+        read_boxes(tmp_path / "other.json")
