@@ -12,6 +12,8 @@ from typing import Annotated
 import typer
 
 from bevcli import __version__
+from bevcli.cli.run import run
+from bevcli.cli.weights import weights_app
 from bevcli.errors import BevcliError
 
 app = typer.Typer(
@@ -35,6 +37,10 @@ def root(
     ] = False,
 ) -> None:
     """Run BEVFormer on sequences from any camera rig, and see what it sees."""
+
+
+app.command()(run)
+app.add_typer(weights_app, name="weights")
 
 
 def run_app() -> None:

@@ -60,9 +60,8 @@ def choose_device(name: str) -> torch.device:
     return torch.device("cuda" if available and name != "cpu" else "cpu")
 
 
-def choose_precision(name: str | None, device: torch.device) -> Precision:
+def choose_precision(chosen: Precision | None, device: torch.device) -> Precision:
     """The user's choice, or fp32 on the CPU and bf16 on a GPU."""
-    if name is None:
-        return "bf16" if device.type == "cuda" else "fp32"
-    choices: dict[str, Precision] = {"fp32": "fp32", "bf16": "bf16", "fp16": "fp16"}
-    return choices[name]
+    if chosen is not None:
+        return chosen
+    return "bf16" if device.type == "cuda" else "fp32"

@@ -1,0 +1,83 @@
+"""Which frames of which input a run takes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from bevcli.errors import InputError
+from bevcli.frame import Sequence
+from bevcli.model.bevformer import BEVFormerConfig
+from bevcli.sequences.open import open_sequence
+from bevcli.sequences.rate import every, thin
+from bevcli.sequences.selection import select
+
+
+@dataclass(frozen=True)
+class InputChoices:
+    """What the user said about the input; see `bevcli run --help`."""
+
+    frames: str | None = None
+    rate: str | None = None
+    every: int | None = None
+    static: bool = False
+    temporal: bool = True
+    strict: bool = False
+    scenes: tuple[str, ...] = ()
+    version: str | None = None
+    split: str | None = None
+    sweeps: bool = False
+
+
+def choose_frames(path: Path, choices: InputChoices, config: BEVFormerConfig) -> Sequence:
+    """The input at `path`, thinned to the model's rate unless said otherwise, then cut to the places asked for.
+
+    Raises InputError.
+    """
+    sequence = open_sequence(
+        path,
+        ego_motion="static" if choices.static else "required" if choices.temporal else "none",
+        strict=choices.strict,
+        scenes=choices.scenes,
+        version=choices.version,
+        split=choices.split,
+        sweeps=choices.sweeps,
+    )
+    sequence = _thinned(sequence, choices, config)
+    return select(sequence, frame_range(choices.frames, len(sequence.stamps)))
+
+
+def frame_range(text: str | None, count: int) -> range:
+    """ "A:B" of `count` places, B exclusive, either may be left out; clipped. Raises InputError where none is left."""
+    if text is None:
+        return range(count)
+    parts = text.split(":")
+    if len(parts) != 2 or not all(part == "" or part.isdecimal() for part in parts):
+        raise InputError(f'--frames "{text}": expected A:B with whole numbers, as 0:10 or 5:')
+    places = range(count)[int(parts[0] or 0) : int(parts[1] or count)]
+    if not places:
+        raise InputError(f"--frames {text}: no frame is in this range (the sequence has {count}: 0:{count})")
+    return places
+
+
+def _thinned(sequence: Sequence, choices: InputChoices, config: BEVFormerConfig) -> Sequence:
+    if choices.every is not None:
+        if choices.rate is not None:
+            raise InputError("--rate and --every exclude each other: give one of them")
+        return select(sequence, every(sequence.stamps, choices.every))
+    if choices.rate == "all":
+        return sequence
+    thinning = thin(sequence.stamps, _rate_hz(choices.rate, config))
+    return select(sequence, thinning.places, (thinning.note,) if thinning.note else ())
+
+
+def _rate_hz(text: str | None, config: BEVFormerConfig) -> float:
+    if text is None:
+        return config.rate_hz
+    try:
+        rate_hz = float(text)
+    except ValueError:
+        rate_hz = 0.0
+    if not 0 < rate_hz < float("inf"):
+        raise InputError(f'--rate "{text}": expected frames a second, as 2, or all')
+    return rate_hz

@@ -1,0 +1,58 @@
+import subprocess
+import sys
+
+import pytest
+
+import bevcli
+
+HEAVY = ("torch", "cv2", "rerun", "matplotlib", "trimesh", "scipy", "numba")
+
+
+def bevcli_command(*arguments, **options):
+    return subprocess.run(
+        [sys.executable, "-m", "bevcli", *arguments], capture_output=True, text=True, check=False, **options
+    )
+
+
+def test_help_imports_nothing_heavy():
+    code = f"import sys, bevcli.cli.main; print([m for m in sys.modules if m in {HEAVY!r}])"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
+
+
+def test_version():
+    assert bevcli_command("--version").stdout.strip() == f"bevcli {bevcli.__version__}"
+
+
+def test_a_mistake_in_usage_exits_2():
+    assert bevcli_command("run").returncode == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("run", "nowhere", "--untrained"), "nowhere"),
+        (("run", "nowhere", "--model", "tinny", "--untrained"), "tinny"),
+        (("run", "nowhere"), "--untrained"),
+        (("weights", "inspect", "nowhere.pth"), "nowhere.pth"),
+    ],
+)
+def test_a_mistake_in_the_input_is_one_line_and_exits_1(arguments, message, tmp_path):
+    done = bevcli_command(*arguments, cwd=tmp_path)
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+    assert message in done.stderr
+
+
+def test_an_interrupt_exits_130(tmp_path):
+    code = (
+        "import os, signal, typer, bevcli.cli.main as main\n"
+        "@main.app.command()\n"
+        "def wait(): os.kill(os.getpid(), signal.SIGINT)\n"
+        "main.run_app()\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, "wait"], capture_output=True, text=True, check=False, env=os.environ
+    )
+    assert done.returncode == 130
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,54 @@
+import numpy as np
+import pytest
+
+from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
+from bevcli.geometry.transforms import inverse, rigid, rotation_about_z
+
+
+def some_boxes(count=5):
+    random = np.random.default_rng(3)
+    return Boxes3D(
+        centers=random.normal(size=(count, 3)),
+        sizes_lwh=random.uniform(1, 4, (count, 3)),
+        yaws=random.uniform(-3, 3, count),
+        velocities=random.normal(size=(count, 2)),
+        classes=np.array(["car"] * count),
+        scores=random.uniform(size=count),
+    )
+
+
+def test_corners_of_a_box_by_hand():
+    box = Boxes3D(
+        np.array([[10.0, 0, 1]]), np.array([[4.0, 2, 2]]), np.array([np.pi / 2]), np.zeros((1, 2)), np.array(["car"])
+    )
+    corners = box.corners()[0]
+    assert corners[0] == pytest.approx([9, 2, 0])  # front left, bottom: ahead is +y, left is -x
+    assert corners[7] == pytest.approx([11, 2, 2])  # front right, top
+    assert {tuple(np.round(c, 9)) for c in corners} == {(x, y, z) for x in (9, 11) for y in (-2, 2) for z in (0, 2)}
+
+
+def test_edges_have_the_lengths_of_the_sizes():
+    boxes = some_boxes()
+    lengths = [np.linalg.norm(boxes.corners()[:, a] - boxes.corners()[:, b], axis=1) for a, b in BOX_EDGES]
+    assert np.sort(np.stack(lengths, 1), axis=1) == pytest.approx(
+        np.sort(np.repeat(boxes.sizes_lwh, 4, axis=1), axis=1)
+    )
+
+
+def test_transforming_moves_corners_like_points_and_comes_back():
+    a_from_b = rigid((3, -1, 0.5), rotation_about_z(0.7))
+    boxes = some_boxes()
+    moved = boxes.transformed(a_from_b)
+    assert moved.corners() == pytest.approx(boxes.corners() @ a_from_b[:3, :3].T + a_from_b[:3, 3])
+    back = moved.transformed(inverse(a_from_b))
+    assert back.velocities == pytest.approx(boxes.velocities)
+    assert np.cos(back.yaws - boxes.yaws) == pytest.approx(1)
+
+
+def test_selecting_and_joining_keep_every_column_in_step():
+    boxes = some_boxes()
+    joined = Boxes3D.concatenate([boxes[[3, 1]], Boxes3D.empty(), boxes[boxes.scores > 2]])
+    assert joined.centers == pytest.approx(boxes.centers[[3, 1]])
+    assert joined.scores == pytest.approx(boxes.scores[[3, 1]])
+    assert joined.instances is None
+    assert len(Boxes3D.concatenate([])) == 0

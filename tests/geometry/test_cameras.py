@@ -1,0 +1,89 @@
+import cv2
+import numpy as np
+import pytest
+
+from bevcli.geometry.cameras import Camera, Distortion, default_ego_from_bev, undistort
+from bevcli.geometry.transforms import apply, rigid
+
+INTRINSICS = np.array([[500.0, 0, 400], [0, 510, 300], [0, 0, 1]])
+LOOKING_FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # ego_from_camera rotation
+BROWN = (-0.3, 0.1, 0.001, -0.002, 0.01)
+FISHEYE = (0.02, -0.01, 0.003, -0.001)
+
+
+def camera(distortion=None):
+    return Camera("CAM", 800, 600, INTRINSICS, rigid((1.5, 0, 1.6), LOOKING_FORWARD), distortion)
+
+
+def points_in_view(count=200):
+    return np.random.default_rng(2).uniform([-2, -1, 3], [2, 1, 9], size=(count, 3))
+
+
+def test_a_point_straight_ahead_falls_on_the_principal_point():
+    pixels, depth = camera().project_ego([11.5, 0, 1.6])
+    assert pixels == pytest.approx([400, 300])
+    assert depth == pytest.approx(10)
+
+
+def test_left_is_left_and_up_is_up():
+    pixels, _ = camera().project_ego([[11.5, 2, 1.6], [11.5, 0, 3.6]])
+    assert pixels == pytest.approx(np.array([[300, 300], [400, 198]]))
+
+
+def test_pinhole_agrees_with_opencv():
+    expected = cv2.projectPoints(points_in_view(), np.zeros(3), np.zeros(3), INTRINSICS, None)[0][:, 0]
+    assert camera().project(points_in_view())[0] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("coefficients", [BROWN[:4], BROWN, (*BROWN, 0.02, 0.01, 0.003)])
+def test_brown_conrady_agrees_with_opencv(coefficients):
+    lens = Distortion("brown_conrady", coefficients)
+    expected = cv2.projectPoints(points_in_view(), np.zeros(3), np.zeros(3), INTRINSICS, np.array(coefficients))[0]
+    assert camera(lens).project(points_in_view())[0] == pytest.approx(expected[:, 0], abs=1e-9)
+
+
+def test_kannala_brandt_agrees_with_opencv():
+    points = points_in_view() * [3, 3, 1]
+    expected = cv2.fisheye.projectPoints(points[None], np.zeros(3), np.zeros(3), INTRINSICS, np.array(FISHEYE))[0]
+    assert camera(Distortion("kannala_brandt", FISHEYE)).project(points)[0] == pytest.approx(expected[0], abs=1e-9)
+
+
+def test_points_behind_the_camera_have_no_pixel():
+    pixels, depth = camera().project([[0.0, 0, -5], [0, 0, 0], [0, 0, 5]])
+    assert np.isnan(pixels[:2]).all()
+    assert camera().contains(pixels, depth).tolist() == [False, False, True]
+
+
+def test_a_lens_that_folds_back_gives_no_pixel_beyond_the_fold():
+    pixels, _ = camera(Distortion("brown_conrady", (-0.3, 0, 0, 0))).project([[8.0, 0, 4]])
+    assert np.isnan(pixels).all()
+
+
+@pytest.mark.parametrize("lens", [Distortion("brown_conrady", BROWN), Distortion("kannala_brandt", FISHEYE)])
+def test_undistorting_moves_a_drawn_point_to_its_pinhole_place(lens):
+    point = np.array([0.8, -0.5, 4.0])
+    picture = np.zeros((600, 800, 3), np.uint8)
+    seen, _ = camera(lens).project(point)
+    cv2.circle(picture, np.round(seen * 16).astype(int).tolist(), 6 * 16, (255, 255, 255), -1, shift=4)
+    mended = undistort(picture, camera(lens))[..., 0]
+    ys, xs = np.nonzero(mended > 127)
+    expected, _ = camera().project(point)
+    assert (xs.mean(), ys.mean()) == pytest.approx(expected, abs=0.5)
+
+
+def test_scaling_and_cropping_move_pixels_with_the_picture():
+    pixels, _ = camera().project(points_in_view())
+    assert camera().scaled(0.5).project(points_in_view())[0] == pytest.approx(pixels / 2)
+    assert camera().cropped(100, 50, 300, 200).project(points_in_view())[0] == pytest.approx(pixels - [100, 50])
+    assert (camera().scaled(0.5).width, camera().cropped(100, 50, 300, 200).height) == (400, 200)
+
+
+def test_viewing_direction_and_field_of_view():
+    assert camera().yaw == pytest.approx(0)
+    assert camera().fov_deg[0] == pytest.approx(2 * np.degrees(np.arctan(400 / 500)))
+
+
+def test_the_default_bev_frame_has_y_ahead_and_x_to_the_right():
+    assert apply(default_ego_from_bev(), [[0.0, 10, 0], [3, 0, 0]]) == pytest.approx(
+        np.array([[10.94, 0, 1.84], [0.94, -3, 1.84]])
+    )

@@ -1,0 +1,51 @@
+import numpy as np
+import pytest
+
+from bevcli.errors import InputError
+from bevcli.geometry.ego_motion import EgoMotion, current_from_previous, derive_kinematics
+from bevcli.geometry.transforms import Pose, apply
+
+
+def circle_drive(radius=20.0, speed=8.0, count=200, step_s=0.02):
+    """A drive on a circle: constant speed, turning left."""
+    seconds = np.arange(count) * step_s
+    yaws = seconds * speed / radius
+    translations = np.stack([radius * np.sin(yaws), radius * (1 - np.cos(yaws)), 0 * yaws], axis=-1)
+    quaternions = np.stack([np.cos(yaws / 2), 0 * yaws, 0 * yaws, np.sin(yaws / 2)], axis=-1)
+    times = (seconds * 1e9).astype(np.int64) + 1_533_151_603_000_000_001
+    return EgoMotion(times, translations, quaternions, *derive_kinematics(times, translations, quaternions))
+
+
+def test_derived_kinematics_of_a_circle():
+    drive = circle_drive()
+    at = drive.kinematics_at(int(drive.timestamps_ns[100]))
+    assert at.velocity == pytest.approx([8, 0, 0], abs=0.01)
+    assert at.angular_rate == pytest.approx([0, 0, 0.4], abs=0.001)
+    assert at.acceleration == pytest.approx([0, 3.2, 9.81], abs=0.01)  # v²/r to the left, and gravity
+
+
+def test_a_rows_time_gives_the_row_as_stored_and_times_are_exact_integers():
+    drive = circle_drive()
+    pose = drive.pose_at(int(drive.timestamps_ns[7]))
+    assert (pose.translation == drive.translations[7]).all()
+    assert (pose.quaternion == drive.quaternions[7]).all()
+
+
+def test_between_rows_the_pose_lies_between():
+    drive = circle_drive(step_s=0.5, count=4)
+    middle = (int(drive.timestamps_ns[0]) + int(drive.timestamps_ns[1])) // 2
+    assert drive.pose_at(middle).yaw == pytest.approx(0.1)
+
+
+def test_times_outside_are_refused_beyond_50_ms():
+    drive = circle_drive()
+    last = int(drive.timestamps_ns[-1])
+    assert (drive.pose_at(last + 50_000_000).translation == drive.translations[-1]).all()
+    with pytest.raises(InputError, match="50 ms"):
+        drive.pose_at(last + 50_000_001)
+
+
+def test_a_standing_point_moves_backwards_in_the_frame_of_a_driving_vehicle():
+    previous = Pose(np.array([5.0, 0, 0]), np.array([1.0, 0, 0, 0]))
+    current = Pose(np.array([7.0, 0, 0]), np.array([1.0, 0, 0, 0]))
+    assert apply(current_from_previous(current, previous), [10.0, 1, 0]) == pytest.approx([8, 1, 0])
