@@ -1,0 +1,91 @@
+"""A small drive written by hand, and the real one where it is at hand."""
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+CAMERAS = ("CAM_FRONT", "CAM_BACK")
+SIZE = (64, 36)
+FRONT_WXYZ, BACK_WXYZ = [0.5, -0.5, 0.5, -0.5], [0.5, -0.5, -0.5, 0.5]
+
+
+def picture_of(camera: str, number: int) -> np.ndarray:
+    """A picture that tells camera and number apart from all others, with smooth and sharp parts."""
+    u, v = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
+    seed = CAMERAS.index(camera) * 40 + number * 7
+    return np.stack([u * 3 + seed, v * 5 + seed, (u // 4 + v // 4 + number) % 2 * 200], axis=-1).astype(np.uint8)
+
+
+def _calibration() -> dict:
+    def camera(rotation: list[float], x: float) -> dict:
+        return {
+            "width": SIZE[0],
+            "height": SIZE[1],
+            "intrinsics": [[50.0, 0, 31.5], [0, 50.0, 17.5], [0, 0, 1]],
+            "ego_from_camera": {"translation": [x, 0.0, 1.5], "rotation_wxyz": rotation},
+        }
+
+    cameras = {"CAM_FRONT": camera(FRONT_WXYZ, 1.7), "CAM_BACK": camera(BACK_WXYZ, 0.0)}
+    bev = {"translation": [1, 0, 1.8], "rotation_wxyz": [0.5**0.5, 0, 0, -(0.5**0.5)]}
+    return {"format": "bevcli-calibration/1", "ego_from_bev": bev, "cameras": cameras}
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> Path:
+    """Four frames, 2 a second from 1 s on, two cameras, driving straight along x at 10 m/s; the back camera 20 ms late.
+
+    Frame numbers 10 to 13; pictures are PNG.
+    """
+    folder = tmp_path / "drive"
+    for camera in CAMERAS:
+        (folder / "images" / camera).mkdir(parents=True)
+        for number in range(4):
+            cv2.imwrite(str(folder / "images" / camera / f"{number}.png"), picture_of(camera, number))
+    (folder / "calibration.json").write_text(json.dumps(_calibration()))
+    rows = ["frame,timestamp_ns,CAM_FRONT,CAM_BACK,CAM_BACK.timestamp_ns"]
+    for number in range(4):
+        time = 1_000_000_000 + number * 500_000_000
+        pictures = f"images/CAM_FRONT/{number}.png,images/CAM_BACK/{number}.png"
+        rows.append(f"{10 + number},{time},{pictures},{time + 20_000_000}")
+    (folder / "frames.csv").write_text("\n".join(rows) + "\n")
+    motion = ["timestamp_ns,x,y,z,qw,qx,qy,qz"]
+    motion += [f"{time},{time / 1e8},0,0,1,0,0,0" for time in range(900_000_000, 2_700_000_000, 100_000_000)]
+    (folder / "ego_motion.csv").write_text("\n".join(motion) + "\n")
+    return folder
+
+
+@pytest.fixture
+def edit(drive: Path) -> Callable[[str, str, str], Path]:
+    """Replace a text in one of the drive's files, which must be there, and give the drive's folder."""
+
+    def replace(file: str, old: str, new: str) -> Path:
+        text = (drive / file).read_text()
+        assert old in text
+        (drive / file).write_text(text.replace(old, new, 1))
+        return drive
+
+    return replace
+
+
+def _shared(part: str) -> Path:
+    root = os.environ.get("BEVCLI_SHARED")
+    if not root:
+        pytest.skip("BEVCLI_SHARED does not name the folder with the real data")
+    return Path(root) / "data" / part
+
+
+@pytest.fixture
+def real_drive() -> Path:
+    """The real nuScenes drive as a native folder: four keyframes, six cameras."""
+    return _shared("nuscenes-scene-0103")
+
+
+@pytest.fixture
+def nuscenes_root() -> Path:
+    """The same four keyframes as a nuScenes dataset root."""
+    return _shared("nuscenes-mini-4")

@@ -1,0 +1,186 @@
+"""Mistakes in a native folder: one line each, with the file and the camera, line or column."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from bevcli.errors import InputError
+from bevcli.sequences.open import InputOptions, open_sequence
+
+
+def message(folder, options=InputOptions(), place=0):
+    """The one line that opening the folder, or loading a frame of it, ends with."""
+    with pytest.raises(InputError) as caught:
+        open_sequence(folder, options).load(place)
+    line = str(caught.value)
+    assert "\n" not in line
+    return line
+
+
+def test_missing_folder(tmp_path):
+    assert str(tmp_path / "nothing") in message(tmp_path / "nothing")
+
+
+def test_a_folder_of_something_else(tmp_path):
+    assert "no sequence folder" in message(tmp_path)
+
+
+def test_a_file_in_place_of_a_folder(drive):
+    assert "is a file" in message(drive / "frames.csv")
+
+
+@pytest.mark.parametrize("file", ["calibration.json", "ego_motion.csv"])
+def test_missing_file(drive, file):
+    (drive / file).unlink()
+    line = message(drive)
+    assert f"{drive / file}" in line
+    assert "missing" in line
+
+
+def test_missing_ego_motion_says_what_to_do(drive):
+    (drive / "ego_motion.csv").unlink()
+    assert "--static" in message(drive)
+    assert "--no-temporal" in message(drive)
+
+
+def test_neither_table_nor_pictures(drive):
+    (drive / "frames.csv").unlink()
+    shutil.rmtree(drive / "images")
+    line = message(drive)
+    assert "frames.csv" in line
+    assert "images" in line
+    assert "videos" in line
+
+
+@pytest.mark.parametrize("content", ["{", "[]", "\xff"])
+def test_broken_json(drive, content):
+    (drive / "calibration.json").write_bytes(content.encode("latin-1"))
+    assert "calibration.json" in message(drive)
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "expected"),
+    [
+        ("frames.csv", "timestamp_ns,", "time,", ["timestamp_ns", "missing"]),
+        ("frames.csv", "CAM_BACK.timestamp_ns", "CAM_LEFT.timestamp_ns", ["unknown column", "CAM_LEFT.timestamp_ns"]),
+        ("frames.csv", "CAM_BACK.timestamp_ns", "CAM_BACK", ["CAM_BACK", "twice"]),
+        ("frames.csv", "11,", "11,7,", ["line 3", "6 cells", "expected 5"]),
+        ("frames.csv", "1500000000,images", "1.5e9,images", ["line 3", "timestamp_ns", '"1.5e9"', "integer"]),
+        ("frames.csv", "1500000000,images", ",images", ["line 3", "timestamp_ns", '""', "integer"]),
+        ("frames.csv", "1500000000,images", "1000000000,images", ["line 3", "1000000000", "does not come after"]),
+        ("frames.csv", "1500000000,images", "2000000001,images", ["line 4", "2000000001", "does not come after"]),
+        ("frames.csv", "1520000000", "nan", ["line 3", "CAM_BACK.timestamp_ns", '"nan"']),
+        ("frames.csv", "\n11,", "\n10,", ["line 3", "frame", "10", "line 2"]),
+        ("frames.csv", "\n11,", "\n-1,", ["line 3", "frame", "negative"]),
+        ("frames.csv", "2520000000", "2670000000", ["ego_motion.csv", "CAM_BACK", "2670000000", "frames.csv: line 5"]),
+        ("ego_motion.csv", "qz\n", "qz,ax,ay\n", ["line 2", "8 cells", "expected 10"]),
+        ("ego_motion.csv", "qw,qx", "qx,qw2", ["ego_motion.csv", "qw", "missing"]),
+        ("ego_motion.csv", "1000000000,10.0", "1000000000,nan", ["line 3", "column x", "finite", "nan"]),
+        ("ego_motion.csv", "1000000000,10.0", "1000000000,ten", ["line 3", "column x", '"ten"']),
+        ("ego_motion.csv", "1000000000,10.0", "900000000,10.0", ["line 3", "timestamp_ns", "900000000"]),
+        ("ego_motion.csv", "1000000000,10.0", "1000000000.0,10.0", ["line 3", "timestamp_ns", "integer"]),
+        ("ego_motion.csv", "10.0,0,0,1,0,0,0", "10.0,0,0,0.99,0,0,0", ["line 3", "norm is 0.99"]),
+        ("ego_motion.csv", "10.0,0,0,1,0,0,0", "10.0,0,0,0,0,0,0", ["line 3", "norm is 0"]),
+    ],
+)
+def test_wrong_cells_and_columns(edit, file, old, new, expected):
+    line = message(edit(file, old, new))
+    assert file in line
+    for part in expected:
+        assert part in line
+
+
+def test_optional_columns_come_in_groups(drive):
+    rows = (drive / "ego_motion.csv").read_text().splitlines()
+    (drive / "ego_motion.csv").write_text("\n".join([rows[0] + ",vx", *(row + ",1" for row in rows[1:])]))
+    line = message(drive)
+    assert "vx, vy, vz" in line
+    assert "only vx" in line
+
+
+@pytest.mark.parametrize("file", ["frames.csv", "ego_motion.csv"])
+@pytest.mark.parametrize("rows", [0, 1])
+def test_no_rows(drive, file, rows):
+    text = (drive / file).read_text().splitlines(keepends=True)
+    (drive / file).write_text("".join(text[:rows]))
+    line = message(drive)
+    assert file in line
+    assert ("no rows" if rows else "empty") in line
+
+
+def test_a_camera_without_a_column(drive):
+    rows = (drive / "frames.csv").read_text().splitlines()
+    (drive / "frames.csv").write_text("\n".join(",".join(row.split(",")[:3]) for row in rows))
+    line = message(drive)
+    assert "frames.csv: camera CAM_BACK" in line
+
+
+def test_a_column_without_a_camera(drive):
+    calibration = json.loads((drive / "calibration.json").read_text())
+    del calibration["cameras"]["CAM_BACK"]
+    (drive / "calibration.json").write_text(json.dumps(calibration))
+    assert 'unknown column "CAM_BACK"' in message(drive)
+
+
+def test_a_picture_of_another_size(drive):
+    cv2.imwrite(str(drive / "images/CAM_BACK/2.png"), np.zeros((30, 64, 3), np.uint8))
+    line = message(drive, place=2)
+    assert "CAM_BACK/2.png" in line
+    assert "64x30" in line
+    assert "64x36" in line
+
+
+@pytest.mark.parametrize("content", [None, b"no picture"], ids=["missing", "unreadable"])
+def test_strict_makes_a_bad_picture_an_error(drive, content):
+    path = drive / "images/CAM_BACK/1.png"
+    path.unlink() if content is None else path.write_bytes(content)
+    line = message(drive, InputOptions(strict=True), place=1)
+    assert "camera CAM_BACK" in line
+    assert str(path) in line
+
+
+def test_strict_makes_an_empty_cell_an_error(edit):
+    line = message(edit("frames.csv", "images/CAM_BACK/1.png", ""), InputOptions(strict=True), place=1)
+    assert "CAM_BACK" in line
+    assert "frames.csv" in line
+
+
+def test_no_such_scene(drive):
+    assert 'no scene "x"' in message(drive, InputOptions(scene="x"))
+
+
+def test_cameras_with_different_sets_of_names(drive):
+    (drive / "frames.csv").unlink()
+    (drive / "images/CAM_BACK/2.png").unlink()
+    line = message(drive)
+    assert "CAM_BACK" in line
+    assert "first is 2" in line
+
+
+def test_names_that_are_no_numbers(drive):
+    (drive / "frames.csv").unlink()
+    (drive / "images/CAM_BACK/2.png").rename(drive / "images/CAM_BACK/two.png")
+    assert "two.png" in message(drive)
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        ("rate_hz = 0", "rate_hz"),
+        ("rate_hz = true", "rate_hz"),
+        ("start_ns = 1.5", "start_ns"),
+        ("fps = 2", '"fps"'),
+        ("[cameras.CAM_UP]\noffset_ns = 1", '"cameras.CAM_UP"'),
+        ("[cameras.CAM_BACK]\noffset_s = 1", '"cameras.CAM_BACK.offset_s"'),
+        ("rate_hz =", "TOML"),
+    ],
+)
+def test_wrong_timing(drive, content, expected):
+    (drive / "frames.csv").unlink()
+    (drive / "timing.toml").write_text(content)
+    line = message(drive)
+    assert "timing.toml" in line
+    assert expected in line
