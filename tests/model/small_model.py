@@ -1,0 +1,69 @@
+"""A BEVFormer of some thousand weights, and made-up inputs for it."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from bevcli.geometry.bev_grid import BevGrid
+from bevcli.model.bevformer import BEVFormer, BEVFormerConfig, BEVFormerInputs
+from bevcli.model.decoder import DecoderConfig
+from bevcli.model.encoder import EncoderConfig
+from bevcli.model.fpn import FPNConfig
+from bevcli.model.image_config import ImageConfig
+from bevcli.model.image_tokens import ImageTokensConfig
+from bevcli.model.resnet import ResNetConfig
+
+CAMERAS = ("FRONT", "BACK")
+HEIGHT, WIDTH = 64, 96
+
+
+def small_config(**changes: object) -> BEVFormerConfig:
+    """Two cameras, two feature levels, 6 x 8 cells over 24 x 32 m."""
+    settings: dict[str, object] = {
+        "name": "small-for-tests",
+        "classes": ("car", "pedestrian", "barrier"),
+        "cameras": CAMERAS,
+        "image": ImageConfig((WIDTH, HEIGHT), (120, 120, 120), (60, 60, 60), "rgb"),
+        "bev_grid": BevGrid(6, 8, x_range_m=(-16, 16), y_range_m=(-12, 12), z_range_m=(-3, 2), pillar_points=2),
+        "channels": 32,
+        "backbone": ResNetConfig((1, 1, 1, 1), "pytorch", output_stages=(3, 4), deformable_stages=(4,), width=8),
+        "neck": FPNConfig(levels=3),
+        "image_tokens": ImageTokensConfig(level_embeddings=3),
+        "encoder": EncoderConfig(2, heads=4, temporal_points=2, spatial_points=4, feed_forward_width=48),
+        "decoder": DecoderConfig(2, heads=4, points=2, queries=12, feed_forward_width=48, max_boxes=10),
+    }
+    return BEVFormerConfig(**{**settings, **changes})  # type: ignore[arg-type]
+
+
+def small_model(seed: int = 0, **changes: object) -> BEVFormer:
+    """In evaluation mode, with every weight drawn at random, so that nothing is hidden by a zero."""
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        model = BEVFormer(small_config(**changes)).eval()
+        with torch.no_grad():
+            for parameter in model.parameters():
+                parameter.add_(0.1 * torch.randn(parameter.shape))
+    return model
+
+
+def small_inputs(seed: int = 0, batch: int = 1) -> BEVFormerInputs:
+    """Random pictures, one camera looking along y and one against it, a slightly moved vehicle."""
+    random = torch.Generator().manual_seed(seed)
+    projections = torch.from_numpy(np.stack([_image_from_bev(1.0), _image_from_bev(-1.0)])).float()
+    return BEVFormerInputs(
+        images=torch.randn(batch, 2, 3, HEIGHT, WIDTH, generator=random),
+        image_from_bev=projections.expand(batch, -1, -1, -1) + 0.1 * torch.randn(batch, 1, 1, 1, generator=random),
+        camera_index=torch.arange(2),
+        has_picture=torch.ones(batch, 2, dtype=torch.bool),
+        can_bus=torch.randn(batch, 18, generator=random),
+        shift=0.1 * torch.randn(batch, 2, generator=random),
+        rotation_deg=20 * torch.randn(batch, generator=random),
+    )
+
+
+def _image_from_bev(direction: float) -> np.ndarray:
+    """A camera at the origin of the bev frame that looks along +y (1) or -y (-1), 90 degrees wide."""
+    image_from_camera = np.array([[WIDTH / 2, 0, WIDTH / 2, 0], [0, WIDTH / 2, HEIGHT / 2, 0], [0, 0, 1, 0]])
+    camera_from_bev = np.array([[direction, 0, 0, 0], [0, 0, -1, 0], [0, direction, 0, 0], [0, 0, 0, 1.0]])
+    return np.concatenate([image_from_camera @ camera_from_bev, [[0, 0, 0, 1]]])

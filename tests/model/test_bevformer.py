@@ -1,0 +1,148 @@
+"""The whole model: its state goes in and comes out, and nothing else is remembered."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import pytest
+import torch
+from small_model import small_inputs, small_model
+
+from bevcli.model.attention_probe import AttentionProbe
+from bevcli.model.bevformer import BEVFormer, BEVFormerInputs, BEVFormerOutputs
+
+
+def drive(model: BEVFormer, seeds: list[int], history: torch.Tensor | None = None) -> list[BEVFormerOutputs]:
+    """The outputs of frames with these seeds, the BEV map handed on."""
+    outputs = []
+    with torch.inference_mode():
+        for seed in seeds:
+            outputs.append(model(small_inputs(seed), history))
+            history = outputs[-1].bev
+    return outputs
+
+
+def assert_same(a: BEVFormerOutputs, b: BEVFormerOutputs) -> None:
+    for name in ("bev", "class_logits", "box_codes"):
+        torch.testing.assert_close(getattr(a, name), getattr(b, name), atol=1e-5, rtol=1e-5)
+
+
+def test_outputs_have_the_stated_shapes() -> None:
+    outputs = small_model()(small_inputs(batch=2))
+    assert outputs.bev.shape == (2, 48, 32)
+    assert outputs.class_logits.shape == (2, 2, 12, 3)
+    assert outputs.box_codes.shape == (2, 2, 12, 10)
+
+
+def test_a_drive_cut_in_two_equals_the_whole() -> None:
+    model = small_model()
+    whole = drive(model, [0, 1, 2, 3])
+    start = drive(model, [0, 1])
+    for a, b in zip(whole, start + drive(model, [2, 3], start[-1].bev), strict=True):
+        assert_same(a, b)
+
+
+def test_a_new_scene_equals_a_fresh_start() -> None:
+    model = small_model()
+    drive(model, [0, 1])
+    assert_same(drive(model, [2])[0], drive(small_model(), [2])[0])
+
+
+def test_history_changes_the_answer() -> None:
+    with_history, without = drive(small_model(), [0, 1])[1], drive(small_model(), [1])[0]
+    assert (with_history.bev - without.bev).abs().mean() > 0.01
+
+
+@pytest.mark.parametrize("with_history", [False, True])
+def test_a_batch_of_two_equals_two_batches_of_one(with_history: bool) -> None:
+    model, inputs = small_model(), small_inputs(batch=2)
+    history = torch.randn(2, 48, 32) if with_history else None
+    together = model(inputs, history)
+    for i in range(2):
+        alone = model(_row(inputs, i), None if history is None else history[i : i + 1])
+        torch.testing.assert_close(together.bev[i], alone.bev[0], atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(together.box_codes[:, i], alone.box_codes[:, 0], atol=1e-4, rtol=1e-4)
+
+
+def test_the_order_of_the_cameras_does_not_matter() -> None:
+    model, inputs = small_model(), small_inputs()
+    swap = torch.tensor([1, 0])
+    swapped = replace(
+        inputs,
+        images=inputs.images[:, swap],
+        image_from_bev=inputs.image_from_bev[:, swap],
+        camera_index=inputs.camera_index[swap],
+    )
+    assert_same(model(inputs), model(swapped))
+
+
+def test_a_camera_without_a_picture_is_not_looked_at() -> None:
+    model, inputs = small_model(), replace(small_inputs(), has_picture=torch.tensor([[True, False]]))
+    other_pixels = inputs.images.clone()
+    other_pixels[:, 1] = 3
+    assert_same(model(inputs), model(replace(inputs, images=other_pixels)))
+    assert not model.project_pillars(inputs).hit[0, 1].any()
+
+
+def test_no_picture_at_all_still_gives_an_answer() -> None:
+    inputs = replace(small_inputs(), has_picture=torch.zeros(1, 2, dtype=torch.bool))
+    assert small_model()(inputs).box_codes.isfinite().all()
+
+
+def test_every_parameter_receives_a_gradient() -> None:
+    model = small_model().train()
+    outputs = model(small_inputs(), torch.randn(1, 48, 32))
+    (outputs.class_logits.square().mean() + outputs.box_codes.square().mean()).backward()
+    without = [name for name, parameter in model.named_parameters() if parameter.grad is None]
+    assert without == []
+
+
+def test_classes_start_at_a_score_of_a_hundredth() -> None:
+    torch.manual_seed(0)
+    model = BEVFormer(small_model().config)
+    for branch in model.detection_head.class_branches:
+        torch.testing.assert_close(branch[-1].bias.sigmoid(), torch.full((3,), 0.01))
+
+
+def test_box_centers_lie_in_the_range() -> None:
+    codes = small_model()(small_inputs()).box_codes
+    assert (codes[..., 0].abs() <= 16).all()
+    assert (codes[..., 1].abs() <= 12).all()
+    assert ((codes[..., 4] >= -3) & (codes[..., 4] <= 2)).all()
+
+
+def test_bfloat16_autocast_keeps_boxes_in_float32_and_near() -> None:
+    model, inputs = small_model(), small_inputs()
+    with torch.inference_mode():
+        exact = model(inputs)
+        with torch.autocast("cpu", torch.bfloat16):
+            half = model(inputs)
+    assert half.box_codes.dtype == torch.float32
+    assert (half.box_codes - exact.box_codes).abs().mean() < 0.05
+
+
+def test_a_probe_tells_what_a_layer_looked_at_and_changes_nothing() -> None:
+    model, inputs, history = small_model(), small_inputs(), torch.randn(1, 48, 32)
+    probe = AttentionProbe(layer=1, cells=torch.tensor([9, 40]))
+    assert_same(model(inputs, history, probe), model(inputs, history))
+    assert probe.spatial is not None
+    assert set(probe.spatial.cell.tolist()) <= {9, 40}
+    hit = model.project_pillars(inputs).hit[0]
+    assert len(probe.spatial.cell) == hit[:, [9, 40]].sum()
+    torch.testing.assert_close(
+        probe.spatial.weights.sum((-1, -2)), torch.ones(len(probe.spatial.cell), 4), atol=1e-5, rtol=1e-5
+    )
+    assert probe.history_share is not None
+    assert ((probe.history_share > 0) & (probe.history_share < 1)).all()
+
+
+def test_without_history_a_probe_tells_no_share_of_it() -> None:
+    probe = AttentionProbe(layer=0, cells=torch.tensor([0]))
+    small_model()(small_inputs(), None, probe)
+    assert probe.history_share is None
+
+
+def _row(inputs: BEVFormerInputs, i: int) -> BEVFormerInputs:
+    """The inputs of one batch element."""
+    rows = {field.name: getattr(inputs, field.name)[i : i + 1] for field in fields(inputs)}
+    return BEVFormerInputs(**{**rows, "camera_index": inputs.camera_index})
