@@ -1,0 +1,193 @@
+"""The city's plan: an endless grid of streets, gently bent, in which everything else finds its place.
+
+Plan coordinates are straight: streets of axis 0 run along x, of axis 1 along y. `CityPlan.bend` moves plan points to
+the world, where streets curve and the whole is turned by a random angle. Whatever is drawn for an index is drawn
+from a stream of its own, so that the plan does not depend on the order in which it is asked.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bevcli.geometry.transforms import Array
+
+KERB_M = 0.15  # height of kerbs
+CORNER_M = 5.0  # radius of the kerb at a junction
+CROSSING_FROM_M, CROSSING_TO_M = 1.5, 5.0  # a pedestrian crossing, measured from the junction's box
+STOP_LINE_M = 6.2
+
+
+@dataclass(frozen=True)
+class Street:
+    """Cross-section of one street, the same on both sides. Widths in metres; lanes counts one direction.
+
+    position: of its centre line across its axis. bike_m: a strip for bicycles right of the lanes.
+    """
+
+    axis: int
+    index: int
+    position: float
+    lanes: int
+    lane_m: float
+    bike_m: float
+    parking_m: float
+    sidewalk_m: float
+    trees: bool
+    painted_bike: bool
+
+    @property
+    def half_width(self) -> float:
+        """From the centre line to the kerb."""
+        return self.lanes * self.lane_m + self.bike_m + self.parking_m
+
+    def lane_offset(self, lane: int) -> float:
+        """From the centre line to the middle of a lane, 0 the innermost."""
+        return self.lane_m * (lane + 0.5)
+
+
+@dataclass(frozen=True)
+class Block:
+    """The land between four streets, in plan coordinates: low and high corner of what kerbs enclose."""
+
+    column: int
+    row: int
+    low: tuple[float, float]
+    high: tuple[float, float]
+    sidewalks: tuple[float, float, float, float]  # widths: south, east, north, west
+
+
+class CityPlan:
+    """The endless plan of one seed."""
+
+    def __init__(self, seed: int) -> None:
+        self.seed = seed
+        rng = self.stream("bend")
+        self._angle = rng.uniform(0, 2 * np.pi)
+        self._amplitude = rng.uniform(1.0, 7.0, 2)
+        self._period = rng.uniform(170, 280, 2)
+        self._phase = rng.uniform(0, 2 * np.pi, 2)
+        self.street = lru_cache(maxsize=None)(self._street)
+        self._position = lru_cache(maxsize=None)(self._make_position)
+
+    def stream(self, purpose: str, *indices: int) -> np.random.Generator:
+        """Random numbers of one purpose and place, independent of all others."""
+        name = int.from_bytes(purpose.encode()[:12].ljust(12, b"."), "big")
+        entropy = [self.seed, name, *(index + 2**20 for index in indices)]
+        return np.random.Generator(np.random.PCG64(np.random.SeedSequence(entropy)))
+
+    def bend(self, points: ArrayLike) -> Array:
+        """Plan points (..., 2) -> world (..., 2)."""
+        p = np.asarray(points, dtype=np.float64)
+        x = p[..., 0] + self._amplitude[0] * np.sin(2 * np.pi * p[..., 1] / self._period[0] + self._phase[0])
+        y = p[..., 1] + self._amplitude[1] * np.sin(2 * np.pi * p[..., 0] / self._period[1] + self._phase[1])
+        c, s = np.cos(self._angle), np.sin(self._angle)
+        return np.stack([c * x - s * y, s * x + c * y], axis=-1)
+
+    def unbend(self, points: ArrayLike) -> Array:
+        """World (..., 2) -> plan points, by fixed-point iteration (the bend is gentle)."""
+        w = np.asarray(points, dtype=np.float64)
+        c, s = np.cos(self._angle), np.sin(self._angle)
+        target = np.stack([c * w[..., 0] + s * w[..., 1], -s * w[..., 0] + c * w[..., 1]], axis=-1)
+        p = target.copy()
+        for _ in range(12):
+            x = target[..., 0] - self._amplitude[0] * np.sin(2 * np.pi * p[..., 1] / self._period[0] + self._phase[0])
+            y = target[..., 1] - self._amplitude[1] * np.sin(2 * np.pi * p[..., 0] / self._period[1] + self._phase[1])
+            p = np.stack([x, y], axis=-1)
+        return p
+
+    def heading(self, point: ArrayLike, direction: ArrayLike) -> float:
+        """World yaw of a plan direction (2,) at a plan point (2,), radians."""
+        p, d = np.asarray(point, dtype=np.float64), np.asarray(direction, dtype=np.float64)
+        ahead, behind = self.bend(p + 0.05 * d), self.bend(p - 0.05 * d)
+        return float(np.arctan2(ahead[1] - behind[1], ahead[0] - behind[0]))
+
+    def _make_position(self, axis: int, index: int) -> float:
+        if index == 0:
+            return 0.0
+        previous = index - 1 if index > 0 else index + 1
+        gap = self.stream("spacing", axis, max(index, previous)).uniform(62, 108)
+        return self._position(axis, previous) + (gap if index > 0 else -gap)
+
+    def _street(self, axis: int, index: int) -> Street:
+        rng = self.stream("street", axis, index)
+        lanes = int(rng.choice([1, 2], p=[0.6, 0.4]))
+        return Street(
+            axis, index, self._position(axis, index), lanes, float(rng.uniform(3.3, 3.6)), 1.5,
+            2.4 if rng.random() < 0.75 else 0.0, float(rng.uniform(3.2, 5.2)), bool(rng.random() < 0.75),
+            bool(rng.random() < 0.6),
+        )  # fmt: skip
+
+    def block(self, column: int, row: int) -> Block:
+        """The block east of street (1, column) and north of street (0, row)."""
+        west, east = self.street(1, column), self.street(1, column + 1)
+        south, north = self.street(0, row), self.street(0, row + 1)
+        return Block(
+            column, row,
+            (west.position + west.half_width, south.position + south.half_width),
+            (east.position - east.half_width, north.position - north.half_width),
+            (south.sidewalk_m, east.sidewalk_m, north.sidewalk_m, west.sidewalk_m),
+        )  # fmt: skip
+
+    def streets_between(self, axis: int, low: float, high: float) -> list[Street]:
+        """Streets of an axis whose kerbs reach into low to high across it."""
+        index = self.nearest(axis, low) - 1
+        found = []
+        while True:
+            street = self.street(axis, index)
+            if street.position - street.half_width > high:
+                return found
+            if street.position + street.half_width >= low:
+                found.append(street)
+            index += 1
+
+    def nearest(self, axis: int, position: float) -> int:
+        """Index of the street of an axis whose centre line is nearest to a position across it."""
+        index = round(position / 85)
+        while self._position(axis, index) > position:
+            index -= 1
+        while self._position(axis, index + 1) < position:
+            index += 1
+        before, after = self._position(axis, index), self._position(axis, index + 1)
+        return index if position - before <= after - position else index + 1
+
+    def ground_height(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Height (...,) of the ground at plan points (..., 2): 0 on roads, KERB_M inside blocks, a ramp at kerbs."""
+        p = np.asarray(points, dtype=np.float64)
+        distance = np.full(p.shape[:-1], np.inf)
+        for axis in (0, 1):
+            across = p[..., 1 - axis]
+            low, high = float(across.min()) - 60, float(across.max()) + 60
+            for street in self.streets_between(axis, low, high):
+                distance = np.minimum(distance, np.abs(across - street.position) - street.half_width)
+        return KERB_M * np.clip(distance / 0.3 + 0.5, 0, 1)
+
+
+def rounded_rectangle(
+    low: tuple[float, float], high: tuple[float, float], radius: float, step: float = 6.0
+) -> Array:
+    """(P, 2) counter-clockwise outline with round corners, its sides cut into pieces of at most `step` metres."""
+    (x0, y0), (x1, y1) = low, high
+    radius = min(radius, (x1 - x0) / 2, (y1 - y0) / 2)
+    centers = [(x1 - radius, y0 + radius, -np.pi / 2), (x1 - radius, y1 - radius, 0.0),
+               (x0 + radius, y1 - radius, np.pi / 2), (x0 + radius, y0 + radius, np.pi)]  # fmt: skip
+    corners = []
+    for cx, cy, start in centers:
+        angle = start + np.linspace(0, np.pi / 2, 7)
+        corners.append(np.stack([cx + radius * np.cos(angle), cy + radius * np.sin(angle)], -1))
+    pieces = []
+    for this, following in zip(corners, corners[1:] + corners[:1], strict=True):
+        pieces.append(this)
+        count = max(int(np.linalg.norm(following[0] - this[-1]) / step), 1)
+        pieces.append(this[-1] + (following[0] - this[-1]) * (np.arange(1, count) / count)[:, None])
+    return np.concatenate(pieces)
+
+
+def along(start: ArrayLike, end: ArrayLike, step: float = 4.0) -> Array:
+    """(P, 2) points from start to end, at most `step` metres apart, both ends included."""
+    a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
+    count = max(int(np.ceil(np.linalg.norm(b - a) / step)), 1)
+    return a + (b - a) * np.linspace(0, 1, count + 1)[:, None]

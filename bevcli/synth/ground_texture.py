@@ -1,0 +1,117 @@
+"""The ground's texture: a window of painted ground around the vehicle, with mip levels, sampled per pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from bevcli.synth.facades import scramble
+from bevcli.synth.ground_plan import ASPHALT, GroundPiece
+from bevcli.synth.palette import linear
+
+SUBPIXEL_BITS = 4
+LEVELS = 6
+
+
+@dataclass(frozen=True)
+class GroundTexture:
+    """texels: (K, 3) uint8 of all levels, square root of linear light, coarser levels after finer ones.
+
+    offsets: (LEVELS,) first texel of each level. origin: (x, y) of the first texel's corner, metres, rows along y.
+    size: texels a side of the finest level, a multiple of 2^(LEVELS - 1).
+    """
+
+    texels: NDArray[np.uint8]
+    offsets: NDArray[np.int64]
+    origin: tuple[float, float]
+    texel_m: float
+    size: int
+
+
+def paint_ground(pieces: list[GroundPiece], center: ArrayLike, extent_m: float, texel_m: float) -> GroundTexture:
+    """Paint a square of `extent_m` around a world point (2,)."""
+    block = 2 ** (LEVELS - 1)
+    size = int(round(extent_m / texel_m / block)) * block
+    origin = np.asarray(center, dtype=np.float64) - size * texel_m / 2
+    canvas = np.empty((size, size, 3), np.uint8)
+    canvas[:] = _stored(ASPHALT)
+    for piece in pieces:
+        for paint in piece.paints:
+            fill(canvas, (paint.outline - origin) / texel_m - 0.5, _stored(paint.color))
+    levels = [canvas]
+    for _ in range(LEVELS - 1):
+        levels.append(cv2.resize(levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+    counts = [level.shape[0] ** 2 for level in levels]
+    offsets = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
+    texels = np.concatenate([level.reshape(-1, 3) for level in levels])
+    return GroundTexture(texels, offsets, (float(origin[0]), float(origin[1])), texel_m, size)
+
+
+def fill(canvas: NDArray[np.uint8], outline: NDArray[np.float64], color: tuple[int, ...] | int) -> None:
+    """Fill a polygon (P, 2), in pixels of x and y, into a picture with sub-pixel edges, in place."""
+    low, high = outline.min(0), outline.max(0)
+    if high[0] < 0 or high[1] < 0 or low[0] > canvas.shape[1] or low[1] > canvas.shape[0]:
+        return
+    fixed = np.round(outline * 2**SUBPIXEL_BITS).astype(np.int32)
+    smooth = cv2.LINE_AA if canvas.ndim == 3 else cv2.LINE_8
+    cv2.fillPoly(canvas, [fixed], color, smooth, SUBPIXEL_BITS)
+
+
+def _stored(color: tuple[int, int, int]) -> tuple[int, ...]:
+    return tuple(int(round(float(np.sqrt(c)) * 255)) for c in linear(color))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def sample_ground(texels, offsets, origin_x, origin_y, texel_m, size, x, y, across, along, rx, ry, out):
+    """Linear albedo at (x, y) into out (3,); returns the grain, a relative brightness of the rough surface.
+
+    across, along: metres that the pixel spans, `along` in the direction (rx, ry); up to four samples are spread over it.
+    """
+    flat = np.sqrt(rx * rx + ry * ry) + 1e-9
+    samples = min(max(int(along / across), 1), 4)
+    width = max(across, along / samples * 0.5)
+    level = 0
+    span = texel_m * 1.4
+    while width > span and level < offsets.shape[0] - 1:
+        level += 1
+        span *= 2
+    n = size >> level
+    scale = 1.0 / (texel_m * (1 << level))
+    out[0] = out[1] = out[2] = 0.0
+    for i in range(samples):
+        shift = ((i + 0.5) / samples - 0.5) * along
+        u = (x + shift * rx / flat - origin_x) * scale - 0.5
+        v = (y + shift * ry / flat - origin_y) * scale - 0.5
+        u, v = min(max(u, 0.0), n - 1.001), min(max(v, 0.0), n - 1.001)
+        iu, iv = int(u), int(v)
+        wu, wv = u - iu, v - iv
+        at = offsets[level] + iv * n + iu
+        for c in range(3):
+            value = (texels[at, c] * (1 - wu) + texels[at + 1, c] * wu) * (1 - wv) + (
+                texels[at + n, c] * (1 - wu) + texels[at + n + 1, c] * wu
+            ) * wv
+            out[c] += value * value
+    for c in range(3):
+        out[c] /= 65025.0 * samples
+    grain = 0.0
+    if width < 0.05:
+        fine = scramble(int(np.floor(x * 45)), int(np.floor(y * 45))) % 256 / 255.0 - 0.5
+        grain += 0.22 * fine * min(1.0, (0.05 - width) / 0.035)
+    if width < 1.0:
+        grain += 0.2 * (_smooth_noise(x * 0.9, y * 0.9) - 0.5) * min(1.0, (1.0 - width) / 0.5)
+    grain += 0.22 * (_smooth_noise(x * 0.13, y * 0.13) - 0.5)
+    return grain
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _smooth_noise(x, y):
+    iu, iv = int(np.floor(x)), int(np.floor(y))
+    wu, wv = x - iu, y - iv
+    wu, wv = wu * wu * (3 - 2 * wu), wv * wv * (3 - 2 * wv)
+    a, b = scramble(iu, iv) & 1023, scramble(iu + 1, iv) & 1023
+    c, d = scramble(iu, iv + 1) & 1023, scramble(iu + 1, iv + 1) & 1023
+    return ((a * (1 - wu) + b * wu) * (1 - wv) + (c * (1 - wu) + d * wu) * wv) / 1023.0

@@ -1,0 +1,42 @@
+"""Colours: sRGB as people name them, linear as light adds them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Color = tuple[int, int, int]  # sRGB, 0 to 255
+
+CAR_PAINTS: tuple[Color, ...] = (
+    (235, 236, 238), (196, 199, 203), (120, 124, 130), (62, 66, 72), (26, 28, 32), (170, 28, 30), (120, 22, 30),
+    (28, 60, 128), (52, 108, 176), (22, 40, 70), (34, 84, 62), (214, 178, 40), (204, 98, 32), (150, 132, 104),
+    (108, 80, 58), (92, 132, 142),
+)  # fmt: skip
+TRUCK_PAINTS: tuple[Color, ...] = (
+    (238, 238, 236), (228, 228, 224), (196, 40, 34), (30, 84, 160), (226, 168, 30), (44, 112, 72), (104, 108, 112),
+    (232, 120, 36),
+)  # fmt: skip
+BUS_PAINTS: tuple[Color, ...] = (
+    (224, 60, 44), (36, 98, 176), (240, 190, 40), (240, 240, 236), (48, 140, 92), (128, 52, 120), (52, 168, 178),
+)  # fmt: skip
+MACHINE_PAINTS: tuple[Color, ...] = ((236, 176, 24), (232, 140, 20), (222, 92, 28), (236, 200, 60), (188, 190, 60))
+CLOTHES: tuple[Color, ...] = (
+    (40, 42, 48), (70, 76, 88), (132, 136, 142), (204, 202, 196), (150, 40, 44), (40, 70, 130), (78, 112, 160),
+    (58, 96, 70), (188, 148, 60), (120, 72, 110), (196, 112, 92), (96, 76, 60),
+)  # fmt: skip
+
+
+def linear(color: ArrayLike) -> NDArray[np.float32]:
+    """sRGB (..., 3) of 0 to 255 -> linear (..., 3) of 0 to 1."""
+    c = np.asarray(color, dtype=np.float64) / 255
+    return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def display_table(size: int = 4096, limit: float = 1.6) -> NDArray[np.uint8]:
+    """(size,) sRGB bytes of linear light from 0 to `limit`, with a soft shoulder for what is brighter than white."""
+    light = np.linspace(0, limit, size)
+    shoulder = 0.7
+    rolled = shoulder + (1 - shoulder) * (1 - np.exp(-(light - shoulder) / (1 - shoulder)))
+    mapped = np.where(light < shoulder, light, rolled)
+    encoded = np.where(mapped <= 0.0031308, 12.92 * mapped, 1.055 * mapped ** (1 / 2.4) - 0.055)
+    return np.clip(np.round(encoded * 255), 0, 255).astype(np.uint8)

@@ -1,0 +1,232 @@
+"""The z-buffer rasteriser: world triangles -> which triangle each pixel sees, and how far away it is.
+
+Deferred: nothing is shaded here, so every pixel is shaded once. Because each object's triangles come in one run,
+the pixels that an object would cover if it stood alone are counted in the same pass.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from bevcli.geometry.cameras import Camera
+from bevcli.geometry.transforms import Array
+
+NEAR_M = 0.1  # triangles are cut where they come nearer to the camera's plane
+
+
+@dataclass(frozen=True)
+class VisibilityBuffer:
+    """What each pixel of one picture sees.
+
+    triangles: (H, W) int32 index of the nearest triangle, -1 for none. inverse_depth: (H, W) float32, 1/m.
+    unoccluded: (O,) int64 pixels that each object would cover alone in the picture.
+    """
+
+    triangles: NDArray[np.int32]
+    inverse_depth: NDArray[np.float32]
+    unoccluded: NDArray[np.int64]
+
+
+def rasterise(
+    corners: NDArray[np.float32],
+    runs: NDArray[np.int64],
+    run_objects: NDArray[np.int32],
+    run_spheres: NDArray[np.float32],
+    camera: Camera,
+    camera_from_world: Array,
+    object_count: int,
+) -> VisibilityBuffer:
+    """Rasterise triangles into one picture. The camera's distortion is not applied.
+
+    corners: (T, 3, 3) world metres, counter-clockwise seen from outside; back faces are not drawn.
+    runs: (R, 2) first and last-plus-one triangle of each run. run_objects: (R,) object that the run belongs to,
+    -1 for none; the runs of one object follow each other. run_spheres: (R, 4) bounding sphere x, y, z, radius.
+    camera_from_world: (4, 4).
+    """
+    shape = (camera.height, camera.width)
+    triangles = np.full(shape, -1, np.int32)
+    inverse_depth = np.zeros(shape, np.float32)
+    stamps = np.full(shape, -1, np.int32)
+    unoccluded = np.zeros(object_count, np.int64)
+    k = camera.intrinsics
+    pinhole = np.array([k[0, 0], k[0, 1], k[0, 2], k[1, 1], k[1, 2]])
+    _rasterise_runs(
+        corners, runs, run_objects, run_spheres, np.ascontiguousarray(camera_from_world[:3]), pinhole,
+        triangles, inverse_depth, stamps, unoccluded,
+    )  # fmt: skip
+    return VisibilityBuffer(triangles, inverse_depth, unoccluded)
+
+
+@njit(cache=True, nogil=True)
+def _rasterise_runs(corners, runs, run_objects, run_spheres, camera_from_world, pinhole,
+                    triangles, inverse_depth, stamps, unoccluded):  # fmt: skip
+    height, width = triangles.shape
+    slope_x = max(pinhole[2], width - pinhole[2]) / pinhole[0] + abs(pinhole[1] / pinhole[0])
+    slope_y = max(pinhole[4], height - pinhole[4]) / pinhole[3]
+    reach_x, reach_y = np.sqrt(1 + slope_x**2), np.sqrt(1 + slope_y**2)
+    p = np.empty((3, 3))
+    cut = np.empty((4, 3))
+    center = np.empty(3)
+    for run in range(runs.shape[0]):
+        radius = run_spheres[run, 3]
+        for axis in range(3):
+            row = camera_from_world[axis]
+            center[axis] = (
+                row[0] * run_spheres[run, 0] + row[1] * run_spheres[run, 1] + row[2] * run_spheres[run, 2] + row[3]
+            )
+        if center[2] + radius < NEAR_M:
+            continue
+        if abs(center[0]) > slope_x * center[2] + radius * reach_x:
+            continue
+        if abs(center[1]) > slope_y * center[2] + radius * reach_y:
+            continue
+        owner = run_objects[run]
+        for t in range(runs[run, 0], runs[run, 1]):
+            for i in range(3):
+                for axis in range(3):
+                    row = camera_from_world[axis]
+                    p[i, axis] = (
+                        row[0] * corners[t, i, 0] + row[1] * corners[t, i, 1] + row[2] * corners[t, i, 2] + row[3]
+                    )
+            if p[0, 2] < NEAR_M and p[1, 2] < NEAR_M and p[2, 2] < NEAR_M:
+                continue
+            _draw_triangle(p, cut, t, owner, pinhole, triangles, inverse_depth, stamps, unoccluded)
+
+
+@njit(cache=True, nogil=True)
+def _draw_triangle(p, cut, t, owner, pinhole, triangles, inverse_depth, stamps, unoccluded):
+    """One triangle p (3, 3) in the camera frame: 1/z is affine over the picture, so its plane gives it exactly."""
+    ax, ay, az = p[1, 0] - p[0, 0], p[1, 1] - p[0, 1], p[1, 2] - p[0, 2]
+    bx, by, bz = p[2, 0] - p[0, 0], p[2, 1] - p[0, 1], p[2, 2] - p[0, 2]
+    nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    distance = nx * p[0, 0] + ny * p[0, 1] + nz * p[0, 2]
+    if distance >= -1e-12:  # seen from behind or edge-on
+        return
+    fx, skew, cx, fy, cy = pinhole
+    gu = nx / fx / distance
+    gv = (ny - nx * skew / fx) / fy / distance
+    g0 = nz / distance - gu * cx - gv * cy
+    if p[0, 2] >= NEAR_M and p[1, 2] >= NEAR_M and p[2, 2] >= NEAR_M:
+        _fill(p[0], p[1], p[2], pinhole, gu, gv, g0, t, owner, triangles, inverse_depth, stamps, unoccluded)
+        return
+    count = 0
+    for i in range(3):  # Sutherland-Hodgman against the near plane
+        j = (i + 1) % 3
+        if p[i, 2] >= NEAR_M:
+            cut[count] = p[i]
+            count += 1
+        if (p[i, 2] >= NEAR_M) != (p[j, 2] >= NEAR_M):
+            w = (NEAR_M - p[i, 2]) / (p[j, 2] - p[i, 2])
+            cut[count] = p[i] + w * (p[j] - p[i])
+            count += 1
+    for i in range(1, count - 1):
+        _fill(cut[0], cut[i], cut[i + 1], pinhole, gu, gv, g0, t, owner, triangles, inverse_depth, stamps, unoccluded)
+
+
+@njit(cache=True, nogil=True)
+def _fill(a, b, c, pinhole, gu, gv, g0, t, owner, triangles, inverse_depth, stamps, unoccluded):
+    """Scan the rows that the triangle's picture spans; each of its edges bounds the columns of a row."""
+    fx, skew, cx, fy, cy = pinhole
+    height, width = triangles.shape
+    u0, v0 = (fx * a[0] + skew * a[1]) / a[2] + cx, fy * a[1] / a[2] + cy
+    u1, v1 = (fx * b[0] + skew * b[1]) / b[2] + cx, fy * b[1] / b[2] + cy
+    u2, v2 = (fx * c[0] + skew * c[1]) / c[2] + cx, fy * c[1] / c[2] + cy
+    area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)
+    if area == 0.0:
+        return
+    top = int(np.ceil(max(min(v0, v1, v2), 0.0)))
+    bottom = int(np.floor(min(max(v0, v1, v2), height - 1.0)))
+    left_most, right_most = max(min(u0, u1, u2), 0.0), min(max(u0, u1, u2), width - 1.0)
+    if left_most > right_most:
+        return
+    sign = 1.0 if area > 0 else -1.0
+    e0u, e0v = -(v1 - v0) * sign, (u1 - u0) * sign
+    e1u, e1v = -(v2 - v1) * sign, (u2 - u1) * sign
+    e2u, e2v = -(v0 - v2) * sign, (u0 - u2) * sign
+    for v in range(top, bottom + 1):
+        low, high = left_most, right_most
+        low, high = _narrow(low, high, e0u, -e0v * (v - v0), u0)
+        low, high = _narrow(low, high, e1u, -e1v * (v - v1), u1)
+        low, high = _narrow(low, high, e2u, -e2v * (v - v2), u2)
+        if low > high:
+            continue
+        start, stop = int(np.ceil(low)), int(np.floor(high)) + 1
+        base = gv * v + g0
+        for u in range(start, stop):
+            nearness = np.float32(gu * u + base)
+            if owner >= 0 and stamps[v, u] != owner:
+                stamps[v, u] = owner
+                unoccluded[owner] += 1
+            if nearness > inverse_depth[v, u]:
+                inverse_depth[v, u] = nearness
+                triangles[v, u] = t
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _narrow(low, high, slope, needed, origin):
+    """The part of [low, high] where slope * (u - origin) >= needed."""
+    if slope > 0:
+        return max(low, origin + needed / slope), high
+    if slope < 0:
+        return low, min(high, origin + needed / slope)
+    if needed > 0:
+        return 1.0, 0.0
+    return low, high
+
+
+def heights_from_sun(
+    corners: NDArray[np.float32], shear: tuple[float, float], origin: tuple[float, float], texel_m: float, size: int
+) -> NDArray[np.float32]:
+    """How high the light is blocked over each ground point: a shadow map, sheared along the light.
+
+    corners: (T, 3, 3) world metres. shear: metres that a shadow moves in x and y for each metre of height.
+    A point at height h over (x, y) lies in shadow where the map at (x, y) + h * shear exceeds h.
+    Returns (size, size) float32 metres, rows along y from origin; -1 where nothing blocks.
+    """
+    heights = np.full((size, size), -1.0, np.float32)
+    add_heights_from_sun(corners, shear, origin, texel_m, heights)
+    return heights
+
+
+def add_heights_from_sun(
+    corners: NDArray[np.float32],
+    shear: tuple[float, float],
+    origin: tuple[float, float],
+    texel_m: float,
+    heights: NDArray[np.float32],
+) -> None:
+    """Draw more triangles into a map of `heights_from_sun`, in place."""
+    _rasterise_heights(corners, shear[0], shear[1], origin[0], origin[1], 1.0 / texel_m, heights)
+
+
+@njit(cache=True, nogil=True)
+def _rasterise_heights(corners, shear_x, shear_y, origin_x, origin_y, scale, heights):
+    size = heights.shape[0]
+    q = np.empty((3, 3))
+    for t in range(corners.shape[0]):
+        for i in range(3):
+            z = corners[t, i, 2]
+            q[i, 0] = (corners[t, i, 0] + shear_x * z - origin_x) * scale - 0.5
+            q[i, 1] = (corners[t, i, 1] + shear_y * z - origin_y) * scale - 0.5
+            q[i, 2] = z
+        low_u, high_u = min(q[0, 0], q[1, 0], q[2, 0]), max(q[0, 0], q[1, 0], q[2, 0])
+        low_v, high_v = min(q[0, 1], q[1, 1], q[2, 1]), max(q[0, 1], q[1, 1], q[2, 1])
+        if high_u < 0 or high_v < 0 or low_u > size - 1 or low_v > size - 1:
+            continue
+        area = (q[1, 0] - q[0, 0]) * (q[2, 1] - q[0, 1]) - (q[2, 0] - q[0, 0]) * (q[1, 1] - q[0, 1])
+        if area <= 0:  # for a closed mesh the side towards the sun is enough
+            continue
+        du = ((q[1, 2] - q[0, 2]) * (q[2, 1] - q[0, 1]) - (q[2, 2] - q[0, 2]) * (q[1, 1] - q[0, 1])) / area
+        dv = ((q[2, 2] - q[0, 2]) * (q[1, 0] - q[0, 0]) - (q[1, 2] - q[0, 2]) * (q[2, 0] - q[0, 0])) / area
+        for v in range(int(np.ceil(max(low_v, 0.0))), int(np.floor(min(high_v, size - 1.0))) + 1):
+            low, high = max(low_u, 0.0), min(high_u, size - 1.0)
+            for i in range(3):
+                j = (i + 1) % 3
+                low, high = _narrow(low, high, -(q[j, 1] - q[i, 1]), -(q[j, 0] - q[i, 0]) * (v - q[i, 1]), q[i, 0])
+            base = q[0, 2] + dv * (v - q[0, 1]) - du * q[0, 0]
+            for u in range(int(np.ceil(low)), int(np.floor(high)) + 1):
+                heights[v, u] = max(heights[v, u], np.float32(base + du * u))
