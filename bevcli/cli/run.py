@@ -56,9 +56,7 @@ def run(
     strict: Annotated[
         bool, typer.Option("--strict", help="A missing picture is an error, not a warning.", rich_help_panel=INPUT)
     ] = False,
-    scene: Annotated[
-        list[str] | None, typer.Option(help="nuScenes: only this scene. Repeatable.", rich_help_panel=INPUT)
-    ] = None,
+    scene: Annotated[str | None, typer.Option(help="Only this scene.", rich_help_panel=INPUT)] = None,
     version: Annotated[
         str | None, typer.Option(help="nuScenes: which tables, as v1.0-mini.", rich_help_panel=INPUT)
     ] = None,
@@ -105,16 +103,17 @@ def run(
     The output folder gets recording.rrd (open it with `bevcli viz`), predictions.json (all boxes, whatever their
     score) and summary.json.
     """
-    from bevcli.cli.run_input import InputChoices, choose_frames
+    from bevcli.cli.run_input import FrameChoice, choose_frames, ego_motion_use
     from bevcli.cli.run_job import Job, run_job
     from bevcli.pipeline.model_loading import choose_device, choose_precision, load_model
     from bevcli.pipeline.runner import StepOptions
+    from bevcli.sequences.open import InputOptions
     from bevcli.viz.options import RecordingOptions
 
     recording = RecordingOptions(record, bev, score, tuple(map(parse_probe, probe or ())), live)
     loaded = load_model(model, weights, untrained=untrained)
-    choices = InputChoices(frames, rate, every, static, temporal, strict, tuple(scene or ()), version, split, sweeps)
-    drive = choose_frames(sequence, choices, loaded.model.config)
+    options = InputOptions(ego_motion=ego_motion_use(static=static, temporal=temporal), strict=strict, scene=scene)
+    drive = choose_frames(sequence, options, FrameChoice(frames, rate, every), loaded.model.config)
     target = choose_device(device)
     step = StepOptions(
         choose_precision(precision, target),

@@ -8,43 +8,35 @@ from pathlib import Path
 from bevcli.errors import InputError
 from bevcli.frame import Sequence
 from bevcli.model.bevformer import BEVFormerConfig
-from bevcli.sequences.open import open_sequence
+from bevcli.sequences.folder import EgoMotionUse
+from bevcli.sequences.open import InputOptions, open_sequence
 from bevcli.sequences.rate import every, thin
 from bevcli.sequences.selection import select
 
 
 @dataclass(frozen=True)
-class InputChoices:
-    """What the user said about the input; see `bevcli run --help`."""
+class FrameChoice:
+    """Which frames of the input a run takes, as the user said it; see `bevcli run --help`."""
 
     frames: str | None = None
     rate: str | None = None
     every: int | None = None
-    static: bool = False
-    temporal: bool = True
-    strict: bool = False
-    scenes: tuple[str, ...] = ()
-    version: str | None = None
-    split: str | None = None
-    sweeps: bool = False
 
 
-def choose_frames(path: Path, choices: InputChoices, config: BEVFormerConfig) -> Sequence:
+def ego_motion_use(*, static: bool, temporal: bool) -> EgoMotionUse:
+    """What --static and --no-temporal mean for ego_motion.csv."""
+    if static:
+        return "static"
+    return "required" if temporal else "none"
+
+
+def choose_frames(path: Path, options: InputOptions, choice: FrameChoice, config: BEVFormerConfig) -> Sequence:
     """The input at `path`, thinned to the model's rate unless said otherwise, then cut to the places asked for.
 
     Raises InputError.
     """
-    sequence = open_sequence(
-        path,
-        ego_motion="static" if choices.static else "required" if choices.temporal else "none",
-        strict=choices.strict,
-        scenes=choices.scenes,
-        version=choices.version,
-        split=choices.split,
-        sweeps=choices.sweeps,
-    )
-    sequence = _thinned(sequence, choices, config)
-    return select(sequence, frame_range(choices.frames, len(sequence.stamps)))
+    sequence = _thinned(open_sequence(path, options), choice, config)
+    return select(sequence, frame_range(choice.frames, len(sequence.stamps)))
 
 
 def frame_range(text: str | None, count: int) -> range:
@@ -60,14 +52,14 @@ def frame_range(text: str | None, count: int) -> range:
     return places
 
 
-def _thinned(sequence: Sequence, choices: InputChoices, config: BEVFormerConfig) -> Sequence:
-    if choices.every is not None:
-        if choices.rate is not None:
+def _thinned(sequence: Sequence, choice: FrameChoice, config: BEVFormerConfig) -> Sequence:
+    if choice.every is not None:
+        if choice.rate is not None:
             raise InputError("--rate and --every exclude each other: give one of them")
-        return select(sequence, every(sequence.stamps, choices.every))
-    if choices.rate == "all":
+        return select(sequence, every(sequence.stamps, choice.every))
+    if choice.rate == "all":
         return sequence
-    thinning = thin(sequence.stamps, _rate_hz(choices.rate, config))
+    thinning = thin(sequence.stamps, _rate_hz(choice.rate, config))
     return select(sequence, thinning.places, (thinning.note,) if thinning.note else ())
 
 

@@ -51,8 +51,6 @@ def test_an_interrupt_exits_130(tmp_path):
         "def wait(): os.kill(os.getpid(), signal.SIGINT)\n"
         "main.run_app()\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, "wait"], capture_output=True, text=True, check=False, env=os.environ
-    )
+    done = subprocess.run([sys.executable, "-c", code, "wait"], capture_output=True, text=True, check=False)
     assert done.returncode == 130
     assert "Traceback" not in done.stderr

@@ -1,0 +1,106 @@
+import numpy as np
+import pytest
+import torch
+from conftest import MemorySequence, WithoutPictures, make_rig
+
+from bevcli.errors import InputError
+from bevcli.geometry.transforms import apply
+from bevcli.pipeline.camera_assignment import NUSCENES_YAWS_DEG
+from bevcli.pipeline.preprocess import Preprocessor
+from bevcli.pipeline.runner import Runner, StepOptions
+
+CPU = torch.device("cpu")
+
+
+def run(model, sequence, places=None, state=None, **options):
+    runner = Runner(model, CPU, StepOptions(**options))
+    places = range(len(sequence.stamps)) if places is None else places
+    predictions = []
+    for _, prediction, after in runner.run(sequence, places, Preprocessor(model.config), state):
+        predictions.append(prediction)
+        state = after
+    return predictions, state
+
+
+def assert_same(one, other):
+    assert one.bev.numpy() == pytest.approx(other.bev.numpy(), abs=1e-6)
+    assert one.boxes.centers == pytest.approx(other.boxes.centers, abs=1e-5)
+    assert one.boxes.scores == pytest.approx(other.boxes.scores, abs=1e-6)
+
+
+def test_history_matters(mini_model):
+    sequence = MemorySequence(2)
+    with_history, without = run(mini_model, sequence)[0][1], run(mini_model, sequence, temporal=False)[0][1]
+    assert (with_history.bev - without.bev).abs().max() > 1e-3
+    assert (with_history.started_anew, without.started_anew) == ("", "history is off")
+
+
+def test_a_run_cut_in_two_equals_the_whole(mini_model):
+    sequence = MemorySequence(4)
+    whole, _ = run(mini_model, sequence)
+    first, state = run(mini_model, sequence, range(2))
+    second, _ = run(mini_model, sequence, range(2, 4), state)
+    for one, other in zip(whole, first + second, strict=True):
+        assert_same(one, other)
+
+
+def test_a_new_scene_equals_a_fresh_start(mini_model):
+    whole, _ = run(mini_model, MemorySequence(4, scenes="aabb"))
+    fresh, _ = run(mini_model, MemorySequence(4, scenes="aabb"), range(2, 4))
+    assert [p.started_anew for p in whole] == ["first frame", "", "new scene", ""]
+    assert_same(whole[2], fresh[0])
+    assert_same(whole[3], fresh[1])
+
+
+def test_a_gap_in_time_starts_anew(mini_model):
+    predictions, _ = run(mini_model, MemorySequence(2, step_s=2.5))
+    assert predictions[1].started_anew == "gap of 2.5 s"
+
+
+def test_a_frame_without_pictures_passes_the_state_on(mini_model):
+    sequence = WithoutPictures({1: "all"}, count=3)
+    predictions, _ = run(mini_model, sequence)
+    assert [p.skipped for p in predictions] == [False, True, False]
+    assert len(predictions[1].boxes) == 0
+    assert predictions[2].started_anew == ""
+    spanned, _ = run(mini_model, MemorySequence(3), [0, 2])
+    assert_same(predictions[2], spanned[1])
+
+
+@pytest.mark.parametrize(
+    "yaws", [{"CAM_FRONT": 0.0}, dict(list(NUSCENES_YAWS_DEG.items())[:5]), {**NUSCENES_YAWS_DEG, "seventh": 90.0}]
+)
+def test_any_number_of_cameras_runs(mini_model, yaws):
+    predictions, _ = run(mini_model, MemorySequence(2, rig=make_rig(yaws)))
+    assert all(np.isfinite(p.boxes.centers).all() and len(p.boxes) == 20 for p in predictions)
+
+
+def test_boxes_move_to_the_world_by_the_pose_of_their_frame(mini_model):
+    sequence = MemorySequence(2)
+    prediction = run(mini_model, sequence)[0][1]
+    matrix = sequence.pose(1).matrix @ sequence.rig.ego_from_bev
+    assert prediction.boxes_world.centers == pytest.approx(apply(matrix, prediction.boxes.centers))
+
+
+def test_the_probe_answers_in_pixels_and_shares(mini_model):
+    predictions, _ = run(mini_model, MemorySequence(2), ask_attention=True, probes=((0.0, 12.0),))
+    view = predictions[1].attention
+    assert predictions[0].attention.history_weight is None
+    assert view.history_weight.shape == (12, 10)
+    assert view.history_weight.min() >= 0
+    assert view.history_weight.max() <= 1
+    samples = view.probes[0].cameras["CAM_FRONT"]
+    assert sum(camera.weights.sum() for camera in view.probes[0].cameras.values()) == pytest.approx(1)
+    # Freshly made offsets stay near the pillar, which stands ahead of the camera: near the picture's middle column.
+    assert np.average(samples.pixels[:, 0], weights=samples.weights) == pytest.approx(160, abs=60)
+
+
+def test_a_probe_outside_the_map_is_a_mistake(mini_model):
+    with pytest.raises(InputError, match="outside the BEV map"):
+        run(mini_model, MemorySequence(1), ask_attention=True, probes=((100.0, 0.0),))
+
+
+def test_every_stage_is_timed(mini_model):
+    prediction = run(mini_model, MemorySequence(1))[0][0]
+    assert list(prediction.stage_seconds) == ["backbone", "neck", "encoder", "decoder", "box_decoding"]
+    assert all(seconds > 0 for seconds in prediction.stage_seconds.values())
