@@ -1,0 +1,57 @@
+"""Where things lie in a recording: the entity paths, which writers, readers and the blueprint share.
+
+`world` is the drive's world frame, moved so that it starts at the first frame's ego position (the viewer computes in
+float32). `bev` is a flat picture of the bev frame in metres: to the right x, downwards -y.
+"""
+
+from __future__ import annotations
+
+WORLD = "world"
+EGO = "world/ego"
+VEHICLE = "world/ego/vehicle"
+RANGE_RINGS = "world/ego/range_rings"
+BEV_ON_GROUND = "world/ego/bev_map"
+PILLARS = "world/ego/pillars"
+PROBES = "world/ego/probes"
+TRAJECTORY = "world/trajectory"
+BOXES = "world/boxes"
+VELOCITY = "world/boxes/velocity"
+FALSE_BOXES = "world/boxes/false"
+GROUND_TRUTH = "world/ground_truth"
+MISSED = "world/ground_truth/missed"
+
+BEV = "bev"
+BEV_FEATURES = "bev/features"
+BEV_SEGMENTATION = "bev/segmentation"
+BEV_HISTORY = "bev/history"
+BEV_RINGS = "bev/range_rings"
+BEV_VEHICLE = "bev/vehicle"
+BEV_BOXES = "bev/boxes"
+BEV_VELOCITY = "bev/boxes/velocity"
+BEV_FALSE = "bev/boxes/false"
+BEV_GROUND_TRUTH = "bev/ground_truth"
+BEV_MISSED = "bev/ground_truth/missed"
+BEV_PROBES = "bev/probes"
+
+STAGE_CURVES = "curves/time_per_stage"
+BOX_CURVES = "curves/boxes_per_class"
+EVENTS = "events"
+RUN = "run"
+
+FRAME_TIMELINE = "frame"
+TIME_TIMELINE = "time"
+
+
+def camera(name: str) -> str:
+    """The entity of a camera: its pose, pinhole and all that is drawn in its picture."""
+    return f"world/cameras/{name}"
+
+
+def picture(name: str) -> str:
+    """The entity of a camera's picture."""
+    return f"{camera(name)}/picture"
+
+
+def overlay(name: str, kind: str) -> str:
+    """The entity of what is drawn into a camera's picture: boxes, labels, ground_truth, pillars, probes."""
+    return f"{camera(name)}/{kind}"

@@ -1,0 +1,53 @@
+"""The colours of classes, ground truth and heights. Colours are RGB, 0 to 255."""
+
+from __future__ import annotations
+
+import colorsys
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Color = tuple[int, int, int]
+
+# Vehicles warm or cold by size, people and their wheels apart from them, street furniture pale.
+CLASS_COLORS: dict[str, Color] = {
+    "car": (255, 158, 44),
+    "truck": (255, 99, 71),
+    "construction_vehicle": (233, 150, 122),
+    "bus": (240, 108, 190),
+    "trailer": (255, 140, 140),
+    "barrier": (150, 160, 175),
+    "motorcycle": (178, 130, 255),
+    "bicycle": (96, 165, 255),
+    "pedestrian": (70, 222, 190),
+    "traffic_cone": (245, 222, 90),
+}
+GROUND_TRUTH_COLOR: Color = (235, 238, 245)
+MISSED_COLOR: Color = (255, 45, 85)
+FALSE_COLOR: Color = (255, 45, 85)
+EGO_COLOR: Color = (90, 200, 250)
+RING_COLOR: Color = (92, 98, 112)
+MAP_COLORS: dict[str, Color] = {
+    "drivable_road": (62, 70, 84),
+    "lane_boundary": (235, 235, 225),
+    "pedestrian_crossing": (120, 150, 205),
+    "vehicle": (255, 158, 44),
+}
+
+
+def class_color(name: str, place: int) -> Color:
+    """A class's colour; a class that is not nuScenes' gets one by its place among the model's classes."""
+    if name in CLASS_COLORS:
+        return CLASS_COLORS[name]
+    red, green, blue = colorsys.hsv_to_rgb((0.11 + place * 0.618034) % 1.0, 0.65, 1.0)
+    return round(red * 255), round(green * 255), round(blue * 255)
+
+
+def colormap(values: ArrayLike, name: str = "viridis") -> NDArray[np.uint8]:
+    """Values 0 to 1, of any shape (...,) -> (..., 3) uint8 RGB of one of OpenCV's colour maps."""
+    table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], getattr(cv2, f"COLORMAP_{name.upper()}"))[
+        :, 0, ::-1
+    ]
+    places = np.clip(np.asarray(values, dtype=np.float64) * 255, 0, 255).astype(np.uint8)
+    return np.ascontiguousarray(table[places]).astype(np.uint8)
