@@ -23,14 +23,24 @@ def rotate_history(history: Tensor, rotation_deg: Tensor, grid: BevGrid, center:
 
 
 def _source_cells(rotation_deg: Tensor, grid: BevGrid, center: RotationCenter) -> tuple[Tensor, Tensor]:
-    """Row and column (B, Y, X) int64 of the old cell that each cell takes its history from."""
-    center_x, center_y = _center_cells(grid, center)
-    angle = torch.deg2rad(rotation_deg.double())[:, None, None]
-    x = torch.arange(grid.columns, device=angle.device) + 0.5 - center_x  # (X,)
-    y = (torch.arange(grid.rows, device=angle.device) + 0.5 - center_y)[:, None]  # (Y, 1)
-    source_x = angle.cos() * x - angle.sin() * y + center_x - 0.5
-    source_y = angle.sin() * x + angle.cos() * y + center_y - 0.5
-    return source_y.round().long(), source_x.round().long()
+    """Row and column (B, Y, X) int64 of the old cell that each cell takes its history from.
+
+    Worked out in float32 and in halves of the map, like the original's affine grid: where a source lies midway
+    between two cells, the same one is taken.
+    """
+    half = torch.tensor([grid.columns / 2, grid.rows / 2], device=rotation_deg.device)
+    angle = torch.deg2rad(rotation_deg.double())
+    rotation = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()], -1).unflatten(-1, (2, 2))
+    pivot = torch.tensor(_center_cells(grid, center), device=half.device).double() - half
+    translation = (pivot - rotation @ pivot).float() / half  # (B, 2)
+    by_x, by_y = (rotation.float() / half[:, None]).unbind(-1)  # (B, 2) each
+    x = torch.arange(grid.columns, device=half.device) + 0.5 - half[0]  # (X,)
+    y = torch.arange(grid.rows, device=half.device) + 0.5 - half[1]  # (Y,)
+    turned = [by_x[:, i, None, None] * x + by_y[:, i, None, None] * y[:, None] for i in (0, 1)]
+    source_x, source_y = (part + translation[:, i, None, None] for i, part in enumerate(turned))
+    row = (((source_y + 1) * grid.rows - 1) / 2).round().long()
+    column = (((source_x + 1) * grid.columns - 1) / 2).round().long()
+    return row, column
 
 
 def _center_cells(grid: BevGrid, center: RotationCenter) -> tuple[float, float]:

@@ -117,6 +117,6 @@ def check_outputs(outputs: BEVFormerOutputs, model: BEVFormer, golden: Golden, f
 
 
 def assert_cells_close(cells: torch.Tensor, expected: np.ndarray, share_off: float) -> None:
-    """BEV cells (K, C) within 1e-3, but for a share of them."""
+    """BEV cells (K, C) within 1e-3, but for a share of them (of a small sample: one)."""
     difference = np.abs(cells.numpy() - expected.reshape(cells.shape)).max(axis=-1)
-    assert (difference > 1e-3).mean() <= share_off, f"largest difference {difference.max():.2g}"
+    assert (difference > 1e-3).sum() <= np.ceil(share_off * len(difference)), f"largest {difference.max():.2g}"
