@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-import re
+import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,41 +16,13 @@ from torch import Tensor
 from bevcli.config import known_models, load_config
 from bevcli.errors import WeightsError
 from bevcli.model.bevformer import BEVFormer, BEVFormerConfig
+from bevcli.model.official_keys import from_official, is_official
 
-OFFICIAL_PREFIXES = ("img_backbone.", "img_neck.", "pts_bbox_head.")
-
-# The official names' patterns and ours. One rule after the other is applied to every key.
-_RENAMES = (
-    (r"^img_backbone\.layer(\d)\.", lambda m: f"backbone.stages.{int(m[1]) - 1}."),
-    (r"^img_backbone\.", "backbone."),
-    (r"\.conv_offset\.", ".offset_and_mask."),
-    (r"^img_neck\.lateral_convs\.(\d)\.conv\.", r"neck.lateral.\1."),
-    (r"^pts_bbox_head\.positional_encoding\.row_embed\.weight$", "bev_queries.row_embedding"),
-    (r"^pts_bbox_head\.positional_encoding\.col_embed\.weight$", "bev_queries.column_embedding"),
-    (r"^pts_bbox_head\.bev_embedding\.weight$", "bev_queries.embedding"),
-    (r"^pts_bbox_head\.transformer\.level_embeds$", "image_tokens.level_embedding"),
-    (r"^pts_bbox_head\.transformer\.cams_embeds$", "image_tokens.camera_embedding"),
-    (r"^pts_bbox_head\.transformer\.can_bus_mlp\.norm\.", "bev_queries.can_bus_embedding.4."),
-    (r"^pts_bbox_head\.transformer\.can_bus_mlp\.", "bev_queries.can_bus_embedding."),
-    (r"^pts_bbox_head\.query_embedding\.weight$", "decoder.query_embedding"),
-    (r"^pts_bbox_head\.transformer\.reference_points\.", "decoder.reference_points."),
-    (r"^pts_bbox_head\.cls_branches\.", "detection_head.class_branches."),
-    (r"^pts_bbox_head\.reg_branches\.", "detection_head.box_branches."),
-    (r"^pts_bbox_head\.transformer\.encoder\.", "encoder."),
-    (r"^pts_bbox_head\.transformer\.decoder\.", "decoder."),
-    (r"^(encoder\..*)\.attentions\.0\.", r"\1.temporal_self_attention.attention."),
-    (r"^(encoder\..*)\.attentions\.1\.deformable_attention\.", r"\1.spatial_cross_attention.attention."),
-    (r"^(encoder\..*)\.attentions\.1\.output_proj\.", r"\1.spatial_cross_attention.attention.output_proj."),
-    (r"^(decoder\..*)\.attentions\.0\.attn\.", r"\1.self_attention."),
-    (r"^(decoder\..*)\.attentions\.1\.", r"\1.cross_attention."),
-    (r"\.value_proj\.", ".value_projection."),
-    (r"\.output_proj\.", ".output_projection."),
-    (r"\.ffns\.0\.layers\.0\.0\.", ".feed_forward.expand."),
-    (r"\.ffns\.0\.layers\.1\.", ".feed_forward.reduce."),
-)
-
-# Held by the official files, used in training only.
-_TRAINING_ONLY = ("pts_bbox_head.code_weights",)
+# What torch's restricted unpickler raises on bytes that are no pickle, depending on where they go wrong.
+_BROKEN_PICKLE = (
+    pickle.UnpicklingError, RuntimeError, OSError, EOFError, ValueError, LookupError, TypeError, AttributeError,
+    struct.error,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -107,14 +79,15 @@ class CheckpointSummary:
 def load_weights(path: Path, model: BEVFormer) -> Checkpoint:
     """Loads a file of weights into a model, in place; every key must be there, none more, all of the right shape.
 
-    Raises WeightsError, naming all keys that differ and the known models that the file would fit.
+    Raises WeightsError that says which known model the file is for, or else lists every key that differs.
     """
     checkpoint = read_checkpoint(path)
     report = compare(checkpoint.state, model.state_dict())
     if not report.fits:
-        models = fitting_models(checkpoint.state)
-        fits = f"the file fits model {' or '.join(models)}" if models else "it fits none of the known models"
-        raise WeightsError(f"{path}: is not for model {model.config.name}, {fits}; {report.describe()}")
+        name, others = model.config.name, fitting_models(checkpoint.state)
+        if others:
+            raise WeightsError(f"{path}: expected weights of model {name}, found those of {' or '.join(others)}")
+        raise WeightsError(f"{path}: does not fit model {name} nor any known one; {report.describe()}")
     model.load_state_dict(dict(checkpoint.state))
     return checkpoint
 
@@ -151,14 +124,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
     if not path.is_file():
         raise WeightsError(f"{path}: no such file of weights")
     state, facts = _read_safetensors(path) if path.suffix == ".safetensors" else _read_pth(path)
-    official = any(key.startswith(OFFICIAL_PREFIXES) for key in state)
+    official = is_official(state)
     return Checkpoint(path, from_official(state) if official else state, official, facts)
-
-
-def from_official(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The original's state dict under our names. Keys that no rule knows stay as they are, and so are unexpected."""
-    first_extra = sum(key.startswith("img_neck.lateral_convs.") and key.endswith(".weight") for key in state)
-    return {_our_name(key, first_extra): tensor for key, tensor in state.items() if key not in _TRAINING_ONLY}
 
 
 def compare(state: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> KeyReport:
@@ -187,17 +154,6 @@ def expected_state(config: BEVFormerConfig) -> dict[str, Tensor]:
         return BEVFormer(config).state_dict()
 
 
-def _our_name(key: str, first_extra: int) -> str:
-    output = re.match(r"^img_neck\.fpn_convs\.(\d+)\.conv\.(weight|bias)$", key)
-    if output:
-        level = int(output[1])
-        part = f"output.{level}" if level < first_extra else f"extra.{level - first_extra}"
-        return f"neck.{part}.{output[2]}"
-    for pattern, replacement in _RENAMES:
-        key = re.sub(pattern, replacement, key)
-    return key
-
-
 def _read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     try:
         with safetensors.safe_open(path, framework="pt") as file:
@@ -210,8 +166,8 @@ def _read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 def _read_pth(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     try:
         contents = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError) as error:
-        reason = str(error).split("\n")[0]
+    except _BROKEN_PICKLE as error:
+        reason = str(error).split("\n")[0] or type(error).__name__
         raise WeightsError(f"{path}: is no file of weights that is safe to read: {reason}") from error
     state = contents.get("state_dict", contents) if isinstance(contents, dict) else None
     if not isinstance(state, dict) or not state or not all(isinstance(v, Tensor) for v in state.values()):

@@ -19,12 +19,12 @@ import numpy as np
 import torch
 from stated_rule import rule_picture, rule_tensor
 
-from bevcli.checkpoints import from_official
 from bevcli.config import load_config
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
 from bevcli.model.bevformer import BEVFormer, BEVFormerConfig, BEVFormerInputs
 from bevcli.model.ego_motion_inputs import EgoMotionInputs, ego_motion_inputs
+from bevcli.model.official_keys import from_official
 
 DATA = Path(__file__).parents[1] / "data"
 STEM_GAIN = {"tiny": 1.0, "small": 1 / 57, "base": 1 / 57}

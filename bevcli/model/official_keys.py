@@ -1,0 +1,65 @@
+"""The key names of the original's files of weights, and ours."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+from torch import Tensor
+
+_PREFIXES = ("img_backbone.", "img_neck.", "pts_bbox_head.")
+
+# The official names' patterns and ours. One rule after the other is applied to every key.
+_RENAMES = (
+    (r"^img_backbone\.layer(\d)\.", lambda m: f"backbone.stages.{int(m[1]) - 1}."),
+    (r"^img_backbone\.", "backbone."),
+    (r"\.conv_offset\.", ".offset_and_mask."),
+    (r"^img_neck\.lateral_convs\.(\d)\.conv\.", r"neck.lateral.\1."),
+    (r"^pts_bbox_head\.positional_encoding\.row_embed\.weight$", "bev_queries.row_embedding"),
+    (r"^pts_bbox_head\.positional_encoding\.col_embed\.weight$", "bev_queries.column_embedding"),
+    (r"^pts_bbox_head\.bev_embedding\.weight$", "bev_queries.embedding"),
+    (r"^pts_bbox_head\.transformer\.level_embeds$", "image_tokens.level_embedding"),
+    (r"^pts_bbox_head\.transformer\.cams_embeds$", "image_tokens.camera_embedding"),
+    (r"^pts_bbox_head\.transformer\.can_bus_mlp\.norm\.", "bev_queries.can_bus_embedding.4."),
+    (r"^pts_bbox_head\.transformer\.can_bus_mlp\.", "bev_queries.can_bus_embedding."),
+    (r"^pts_bbox_head\.query_embedding\.weight$", "decoder.query_embedding"),
+    (r"^pts_bbox_head\.transformer\.reference_points\.", "decoder.reference_points."),
+    (r"^pts_bbox_head\.cls_branches\.", "detection_head.class_branches."),
+    (r"^pts_bbox_head\.reg_branches\.", "detection_head.box_branches."),
+    (r"^pts_bbox_head\.transformer\.encoder\.", "encoder."),
+    (r"^pts_bbox_head\.transformer\.decoder\.", "decoder."),
+    (r"^(encoder\..*)\.attentions\.0\.", r"\1.temporal_self_attention.attention."),
+    (r"^(encoder\..*)\.attentions\.1\.deformable_attention\.", r"\1.spatial_cross_attention.attention."),
+    (r"^(encoder\..*)\.attentions\.1\.output_proj\.", r"\1.spatial_cross_attention.attention.output_proj."),
+    (r"^(decoder\..*)\.attentions\.0\.attn\.", r"\1.self_attention."),
+    (r"^(decoder\..*)\.attentions\.1\.", r"\1.cross_attention."),
+    (r"\.value_proj\.", ".value_projection."),
+    (r"\.output_proj\.", ".output_projection."),
+    (r"\.ffns\.0\.layers\.0\.0\.", ".feed_forward.expand."),
+    (r"\.ffns\.0\.layers\.1\.", ".feed_forward.reduce."),
+)
+
+# Held by the official files, used in training only.
+_TRAINING_ONLY = ("pts_bbox_head.code_weights",)
+
+
+def is_official(state: Mapping[str, Tensor]) -> bool:
+    """Whether a state dict uses the original's key names."""
+    return any(key.startswith(_PREFIXES) for key in state)
+
+
+def from_official(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The original's state dict under our names. Keys that no rule knows stay as they are, and so are unexpected."""
+    first_extra = sum(key.startswith("img_neck.lateral_convs.") and key.endswith(".weight") for key in state)
+    return {_our_name(key, first_extra): tensor for key, tensor in state.items() if key not in _TRAINING_ONLY}
+
+
+def _our_name(key: str, first_extra: int) -> str:
+    output = re.match(r"^img_neck\.fpn_convs\.(\d+)\.conv\.(weight|bias)$", key)
+    if output:
+        level = int(output[1])
+        part = f"output.{level}" if level < first_extra else f"extra.{level - first_extra}"
+        return f"neck.{part}.{output[2]}"
+    for pattern, replacement in _RENAMES:
+        key = re.sub(pattern, replacement, key)
+    return key

@@ -1,0 +1,194 @@
+"""Files of weights: read, checked, converted, and refused with one clear line."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import sys
+from pathlib import Path
+
+import pytest
+import safetensors.torch
+import torch
+
+from bevcli.checkpoints import (
+    compare,
+    convert,
+    expected_state,
+    fitting_models,
+    inspect,
+    load_weights,
+    read_checkpoint,
+)
+from bevcli.config import load_config
+from bevcli.errors import WeightsError
+from bevcli.model.official_keys import from_official
+
+sys.path.insert(0, str(Path(__file__).parent / "model"))
+
+from small_model import small_model
+
+KEYS = json.loads((Path(__file__).parent / "data" / "golden_keys.json").read_text())
+
+
+def official_state(model: str) -> dict[str, torch.Tensor]:
+    """A state dict with the official keys and shapes that takes no room: every tensor is one number, expanded."""
+    return {key: torch.zeros(()).expand(shape) for key, shape in KEYS[model].items()}
+
+
+@pytest.fixture
+def official_tiny(tmp_path: Path) -> Path:
+    path = tmp_path / "tiny_epoch_24.pth"
+    torch.save(
+        {"state_dict": official_state("tiny"), "meta": {"epoch": 24, "CLASSES": ("car",)}, "optimizer": {}}, path
+    )
+    return path
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    """The weights of a small model under our names."""
+    path = tmp_path / "small.safetensors"
+    safetensors.torch.save_file(small_model(seed=1).state_dict(), path)
+    return path
+
+
+@pytest.mark.parametrize("model", ["tiny", "small", "base"])
+def test_every_official_key_has_its_place_in_our_model_and_no_place_stays_empty(model: str) -> None:
+    state = {key: torch.empty(shape, device="meta") for key, shape in KEYS[model].items()}
+    report = compare(from_official(state), expected_state(load_config(model)))
+    assert report.fits, report.describe()
+
+
+def test_a_state_dict_fits_its_own_model_alone() -> None:
+    assert fitting_models(from_official(official_state("small"))) == ("small",)
+
+
+def test_no_two_official_keys_become_one() -> None:
+    assert len(from_official(official_state("base"))) == len(official_state("base")) - 1  # but code_weights
+
+
+def test_an_official_file_says_what_it_is(official_tiny: Path) -> None:
+    summary = inspect(official_tiny)
+    assert summary.models == ("tiny",)
+    assert summary.official
+    assert summary.facts == {"epoch": "24"}
+    assert summary.tensors == len(KEYS["tiny"]) - 1
+    assert summary.file_bytes == official_tiny.stat().st_size
+
+
+@pytest.mark.parametrize("suffix", [".safetensors", ".pth"])
+def test_saved_weights_are_loaded_again(tmp_path: Path, suffix: str) -> None:
+    path, state = tmp_path / f"weights{suffix}", small_model(seed=1).state_dict()
+    if suffix == ".pth":
+        torch.save(state, path)
+    else:
+        safetensors.torch.save_file(state, path)
+    model = small_model(seed=2)
+    load_weights(path, model)
+    for key, tensor in model.state_dict().items():
+        assert torch.equal(tensor, state[key]), key
+
+
+def test_half_precision_weights_are_loaded_as_float32(tmp_path: Path) -> None:
+    path, state = tmp_path / "half.safetensors", small_model(seed=1).state_dict()
+    halves = {key: tensor.half() if tensor.is_floating_point() else tensor for key, tensor in state.items()}
+    safetensors.torch.save_file(halves, path)
+    model = small_model(seed=2)
+    load_weights(path, model)
+    assert model.bev_queries.embedding.dtype == torch.float32
+    torch.testing.assert_close(model.bev_queries.embedding.data, state["bev_queries.embedding"], atol=1e-2, rtol=1e-2)
+
+
+def test_a_converted_file_holds_the_same_numbers(official_tiny: Path, tmp_path: Path) -> None:
+    out = tmp_path / "tiny.safetensors"
+    summary = convert(official_tiny, out)
+    assert (summary.models, summary.official, summary.facts) == (("tiny",), False, {"epoch": "24", "model": "tiny"})
+    before, after = read_checkpoint(official_tiny).state, read_checkpoint(out).state
+    assert before.keys() == after.keys()
+    assert all(torch.equal(before[key], after[key]) for key in before)
+
+
+def test_every_missing_unexpected_and_misshapen_key_is_listed(tmp_path: Path) -> None:
+    state = small_model().state_dict()
+    gone = ["neck.lateral.0.weight", "encoder.layers.1.norms.2.bias"]
+    for key in gone:
+        del state[key]
+    state |= {"one.more": torch.zeros(1), "two.more": torch.zeros(1)}
+    state["bev_queries.embedding"] = torch.zeros(5, 32)
+    path = tmp_path / "edited.safetensors"
+    safetensors.torch.save_file(state, path)
+    with pytest.raises(WeightsError) as caught:
+        load_weights(path, small_model())
+    message = str(caught.value)
+    assert "edited.safetensors: does not fit model small-for-tests" in message
+    assert f"2 missing: {gone[0]}, {gone[1]}" in message
+    assert "2 unexpected: one.more, two.more" in message
+    assert "1 misshapen: bev_queries.embedding: expected (48, 32), found (5, 32)" in message
+    assert "\n" not in message
+
+
+def test_weights_of_another_model_are_named(official_tiny: Path) -> None:
+    with pytest.raises(WeightsError, match="expected weights of model small-for-tests, found those of tiny"):
+        load_weights(official_tiny, small_model())
+
+
+def test_a_refused_file_leaves_the_model_as_it_was(official_tiny: Path) -> None:
+    model, untouched = small_model(), small_model().state_dict()
+    with pytest.raises(WeightsError):
+        load_weights(official_tiny, model)
+    assert all(torch.equal(tensor, untouched[key]) for key, tensor in model.state_dict().items())
+
+
+def test_weights_that_fit_no_model_are_not_converted(saved: Path, tmp_path: Path) -> None:
+    with pytest.raises(WeightsError, match="fits none of the known models"):
+        convert(saved, tmp_path / "out.safetensors")
+    assert not (tmp_path / "out.safetensors").exists()
+
+
+def test_a_conversion_goes_to_a_safetensors_file(official_tiny: Path, tmp_path: Path) -> None:
+    with pytest.raises(WeightsError, match=r"expected a name that ends in \.safetensors"):
+        convert(official_tiny, tmp_path / "out.pth")
+
+
+class Evil:
+    """Unpickling it would run code."""
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return print, ("ran",)
+
+
+@pytest.mark.parametrize("suffix", [".pth", ".safetensors"])
+@pytest.mark.parametrize("contents", [b"", b"hello, I am a text\n", b"\x00" * 100, b"PK\x03\x04broken", b"\x80\x02."])
+def test_a_file_that_is_no_weights_is_refused(tmp_path: Path, suffix: str, contents: bytes) -> None:
+    path = tmp_path / f"file{suffix}"
+    path.write_bytes(contents)
+    with pytest.raises(WeightsError) as caught:
+        inspect(path)
+    assert f"file{suffix}: " in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_with_code_in_it_is_refused_and_not_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for path, save in ((tmp_path / "a.pth", torch.save), (tmp_path / "b.pth", _pickle)):
+        save({"state_dict": {"weight": Evil()}}, path)
+        with pytest.raises(WeightsError, match="safe to read"):
+            inspect(path)
+    assert "ran" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("contents", [3, [1, 2], {}, {"state_dict": {}}, {"state_dict": {"a": 1}}])
+def test_a_file_without_a_state_dict_is_refused(tmp_path: Path, contents: object) -> None:
+    path = tmp_path / "other.pth"
+    torch.save(contents, path)
+    with pytest.raises(WeightsError, match="holds no state dict"):
+        inspect(path)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(WeightsError, match=r"nothing\.pth: no such file"):
+        inspect(tmp_path / "nothing.pth")
+
+
+def _pickle(contents: object, path: Path) -> None:
+    path.write_bytes(pickle.dumps(contents))
