@@ -82,11 +82,13 @@ class Frame:
 class Sequence(Protocol):
     """A drive, from whatever files. Readers in `bevcli.sequences` follow it.
 
-    `notes` are what the user should be told once (an assumption, a default). Without ego-motion
-    (`has_ego_motion` false) every pose is the identity, and boxes can be given in the ego frame only.
+    `rig` is the first frame's; a frame's own stands in `Frame.rig` (nuScenes' scenes differ). `notes` are what the
+    user should be told once (an assumption, a default). Without ego-motion (`has_ego_motion` false) every pose is the
+    identity, and boxes can be given in the ego frame only.
     """
 
     name: str
+    rig: CameraRig
     has_ego_motion: bool
     notes: tuple[str, ...]
 

@@ -53,16 +53,14 @@ def run_job(job: Job, *, force: bool) -> None:
         progress = stack.enter_context(Progress(len(job.drive.stamps), "frames"))
         for note in (*job.drive.notes, *([UNTRAINED] if job.loaded.untrained else [])):
             progress.message(f"note: {note}")
-            recording.event(note, "warning")
+            recording.event(note, "WARN")
         places = range(len(job.drive.stamps))
         began = time.perf_counter()
         for frame, prediction, _ in runner.run(job.drive, places, Preprocessor(runner.config, job.chosen_cameras)):
-            for level, text in events(frame, prediction):
-                recording.event(text, level)
-                if level == "warning":
-                    progress.message(f"warning: {text}")
+            for warning in warnings(frame, prediction):
+                progress.message(f"warning: {warning}")
             recording_began = time.perf_counter()
-            recording.log(frame, prediction)
+            recording.log(frame, prediction, prediction.attention)
             boxes.write(_frame_boxes(frame, prediction, world=job.drive.has_ego_motion))
             if job.save_bev is not None and prediction.bev is not None:
                 save_bev(job.save_bev, prediction, {"model": runner.config.name, "untrained": job.loaded.untrained})
@@ -87,17 +85,14 @@ def prepare_folder(out: Path, *, force: bool) -> None:
         raise OutputError(f"{out}: cannot be written ({error.strerror})") from None
 
 
-def events(frame: Frame, prediction: Prediction) -> list[tuple[str, str]]:
-    """(level, text) of what is worth telling of a frame."""
+def warnings(frame: Frame, prediction: Prediction) -> list[str]:
+    """What the person at the terminal should know of a frame; the recording logs its own events."""
     where = f"frame {frame.stamp.index}"
-    found = [("warning", f"{where}: camera {camera} has no picture: {why}") for camera, why in frame.dropped.items()]
+    found = [f"{where}: camera {camera} has no picture: {why}" for camera, why in frame.dropped.items()]
     if prediction.skipped:
-        found.append(("warning", f"{where}: no picture at all; the state is passed on to the next frame"))
-    reason = prediction.started_anew
-    if reason.startswith("gap"):
-        found.append(("warning", f"{where}: {reason}; the history starts anew"))
-    elif reason == "new scene":
-        found.append(("info", f"{where}: scene {frame.stamp.scene} begins; the history starts anew"))
+        found.append(f"{where}: no picture at all; the state is passed on to the next frame")
+    if prediction.started_anew.startswith("gap"):
+        found.append(f"{where}: {prediction.started_anew}; the history starts anew")
     return found
 
 
@@ -105,11 +100,11 @@ def _recording(job: Job) -> Recording:
     config = job.loaded.model.config
     return Recording(
         job.out / "recording.rrd",
-        title=f"{job.drive.name} · {config.name}" + (" · UNTRAINED" if job.loaded.untrained else ""),
-        classes=config.classes,
-        grid=config.bev_grid,
-        options=job.recording,
+        rig=job.drive.rig,
+        class_names=config.classes,
+        title=f"{job.drive.name} · {config.name}",
         untrained=job.loaded.untrained,
+        options=job.recording,
     )
 
 

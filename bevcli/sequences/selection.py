@@ -14,6 +14,7 @@ class Selection:
         self._sequence = sequence
         self._places = tuple(places)
         self.name = sequence.name
+        self.rig = sequence.rig
         self.has_ego_motion = sequence.has_ego_motion
         self.notes = (*sequence.notes, *notes)
 
