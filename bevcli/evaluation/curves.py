@@ -1,0 +1,59 @@
+"""Precision, score and errors along the recall, and what is read from them (nuScenes devkit 1.2.0, its formulas)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.evaluation.config import DetectionConfig
+from bevcli.geometry.transforms import Array
+
+RECALLS = np.linspace(0, 1, 101)
+
+
+@dataclass(frozen=True)
+class RecallCurve:
+    """One class at one matching distance. precision, score: (101,) at RECALLS; both 0 beyond the recall reached."""
+
+    precision: Array
+    score: Array
+
+    def average_precision(self, config: DetectionConfig) -> float:
+        """The mean of the precision above min_precision, over recalls above min_recall, scaled to 0 to 1."""
+        above = self.precision[round(100 * config.min_recall) + 1 :] - config.min_precision
+        return float(np.mean(np.maximum(above, 0))) / (1 - config.min_precision)
+
+    def mean_error(self, config: DetectionConfig, scores: Array, errors: Array) -> float:
+        """The error's running mean, averaged over the recalls from min_recall to the largest reached; 1 if none.
+
+        scores, errors: (M,) of the M true positives by falling score; NaN errors do not count.
+        """
+        first, last = round(100 * config.min_recall) + 1, int(np.flatnonzero(self.score).max(initial=0))
+        if last < first:
+            return 1.0
+        running = _running_mean(errors)
+        along = np.interp(self.score[::-1], scores[::-1], running[::-1])[::-1]
+        return float(np.mean(along[first : last + 1]))
+
+
+def recall_curve(found: NDArray[np.bool_], scores: Array, ground_truth_count: int) -> RecallCurve:
+    """The curve of P predictions by falling score, `found` those that match one of the ground truths."""
+    if not found.any():
+        return RecallCurve(np.zeros_like(RECALLS), np.zeros_like(RECALLS))
+    true_positives = np.cumsum(found).astype(np.float64)
+    precision = true_positives / np.arange(1, len(found) + 1)
+    recall = true_positives / ground_truth_count
+    return RecallCurve(
+        np.interp(RECALLS, recall, precision, right=0),
+        np.interp(RECALLS, recall, scores, right=0),
+    )
+
+
+def _running_mean(values: Array) -> Array:
+    known = ~np.isnan(values)
+    if not known.any():
+        return np.ones(len(values))  # the devkit's choice where nothing is known
+    counts = np.cumsum(known)
+    return np.divide(np.nancumsum(values), counts, out=np.zeros(len(values)), where=counts > 0)

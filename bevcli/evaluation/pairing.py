@@ -1,0 +1,156 @@
+"""Which frame of the predictions belongs to which frame of the ground truth, and both in one frame of reference."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bevcli.errors import InputError
+from bevcli.frame import FrameStamp
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.transforms import Array, Pose, inverse
+from bevcli.sequences.boxes_file import BoxesFile, FrameBoxes
+
+
+@dataclass(frozen=True)
+class FramePairs:
+    """F frames that both sides have, in the predictions' order.
+
+    predictions, ground_truth: boxes by frame, in one frame of reference ("world", "ego" or "bev"). ego_xy: (F, 2)
+    where the ego vehicle stands in it. prediction_stamps, ground_truth_stamps: when, by each side's own count.
+    ego_pose_known: a pose stands with every frame, on one side at least.
+    matched_by: what the frames agree in. notes: what the user should know of it, one line each.
+    """
+
+    frame_of_reference: str
+    predictions: tuple[Boxes3D, ...]
+    ground_truth: tuple[Boxes3D, ...]
+    ego_xy: Array
+    prediction_stamps: tuple[FrameStamp, ...]
+    ground_truth_stamps: tuple[FrameStamp, ...]
+    ego_pose_known: bool
+    matched_by: str
+    predictions_left_out: int
+    ground_truth_left_out: int
+    notes: tuple[str, ...]
+
+
+# What may identify a frame, the surest first; the first one that both sides have in common is taken.
+_KEYS: tuple[tuple[str, Callable[[FrameBoxes], Hashable]], ...] = (
+    ("sample_token", lambda frame: frame.extras.get("sample_token")),
+    ("scene and timestamp_ns", lambda frame: (frame.stamp.scene, frame.stamp.timestamp_ns)),
+    ("timestamp_ns", lambda frame: frame.stamp.timestamp_ns),
+    ("scene and frame number", lambda frame: (frame.stamp.scene, frame.stamp.index)),
+    ("frame number", lambda frame: frame.stamp.index),
+)
+_SURE = ("sample_token", "scene and timestamp_ns")
+
+
+def pair_frames(predictions: BoxesFile, ground_truth: BoxesFile) -> FramePairs:
+    """Bring two files together.
+
+    Frames on one side only are left out, and counted. Where one file is in the world and the other in the ego or
+    bev frame, all boxes move to the world. Raises InputError where no frame is common, or a pose for it is missing.
+    """
+    matched_by, pairs = _common_frames(predictions.frames, ground_truth.frames)
+    reference = _common_frame_of_reference(predictions, ground_truth)
+    found, truth, ego = [], [], []
+    for prediction, true in pairs:
+        pose = true.world_from_ego or prediction.world_from_ego
+        found.append(_moved(prediction, predictions, reference, prediction.world_from_ego or pose))
+        truth.append(_moved(true, ground_truth, reference, pose))
+        ego.append(_ego_xy(reference, pose, predictions.ego_from_bev or ground_truth.ego_from_bev))
+    return FramePairs(
+        frame_of_reference=reference,
+        predictions=tuple(found),
+        ground_truth=tuple(truth),
+        ego_xy=np.array(ego),
+        prediction_stamps=tuple(prediction.stamp for prediction, _ in pairs),
+        ground_truth_stamps=tuple(true.stamp for _, true in pairs),
+        ego_pose_known=all(one.world_from_ego or other.world_from_ego for one, other in pairs),
+        matched_by=matched_by,
+        predictions_left_out=len(predictions.frames) - len(pairs),
+        ground_truth_left_out=len(ground_truth.frames) - len(pairs),
+        notes=_notes(matched_by, len(pairs), len(predictions.frames), len(ground_truth.frames)),
+    )
+
+
+def _common_frames(
+    predictions: Sequence[FrameBoxes], ground_truth: Sequence[FrameBoxes]
+) -> tuple[str, list[tuple[FrameBoxes, FrameBoxes]]]:
+    for name, side in (("predictions", predictions), ("ground truth", ground_truth)):
+        if not side:
+            raise InputError(f"the {name} hold no frame at all: nothing to score")
+    for matched_by, key in _KEYS:
+        of_truth, of_predictions = ([key(frame) for frame in side] for side in (ground_truth, predictions))
+        if _ambiguous(of_truth) or _ambiguous(of_predictions):
+            continue
+        truth = dict(zip(of_truth, ground_truth, strict=True))
+        pairs = [(one, truth[k]) for one, k in zip(predictions, of_predictions, strict=True) if k in truth]
+        if pairs:
+            return matched_by, pairs
+    raise InputError(
+        f"predictions and ground truth have no frame in common: predictions start with {_described(predictions[0])}, "
+        f"ground truth with {_described(ground_truth[0])}: are both of the same drive?"
+    )
+
+
+def _ambiguous(keys: Sequence[Hashable]) -> bool:
+    return None in keys or max(Counter(keys).values()) > 1
+
+
+def _described(frame: FrameBoxes) -> str:
+    return f'scene "{frame.stamp.scene}" frame {frame.stamp.index} at {frame.stamp.timestamp_ns} ns'
+
+
+def _common_frame_of_reference(one: BoxesFile, other: BoxesFile) -> str:
+    if one.frame_of_reference == other.frame_of_reference != "bev":
+        return one.frame_of_reference
+    references = {one.frame_of_reference, other.frame_of_reference}
+    if "world" in references:
+        return "world"
+    return "bev" if references == {"bev"} and not (one.ego_from_bev and other.ego_from_bev) else "ego"
+
+
+def _moved(frame: FrameBoxes, file: BoxesFile, reference: str, world_from_ego: Pose | None) -> Boxes3D:
+    if file.frame_of_reference == reference:
+        return frame.boxes
+    ego_from_boxes = np.eye(4)
+    if file.frame_of_reference == "bev":
+        if file.ego_from_bev is None:
+            raise InputError(
+                f"frame {frame.stamp.index}: boxes in the bev frame cannot be moved to the {reference} frame: state "
+                '"ego_from_bev" in the boxes file'
+            )
+        ego_from_boxes = file.ego_from_bev.matrix
+    if reference == "ego":
+        return frame.boxes.transformed(ego_from_boxes)
+    if world_from_ego is None:
+        raise InputError(
+            f"frame {frame.stamp.index}: boxes in the {file.frame_of_reference} frame cannot be moved to the world: "
+            '"world_from_ego" is missing on both sides'
+        )
+    return frame.boxes.transformed(world_from_ego.matrix @ ego_from_boxes)
+
+
+def _ego_xy(reference: str, world_from_ego: Pose | None, ego_from_bev: Pose | None) -> Array:
+    if reference == "world":
+        assert world_from_ego is not None
+        return world_from_ego.translation[:2]
+    if reference == "bev" and ego_from_bev is not None:
+        return inverse(ego_from_bev.matrix)[:2, 3]
+    return np.zeros(2)
+
+
+def _notes(matched_by: str, pairs: int, predictions: int, ground_truth: int) -> tuple[str, ...]:
+    notes = []
+    if matched_by not in _SURE:
+        notes.append(f"times or scenes differ between the files: frames are matched by {matched_by}")
+    if pairs < ground_truth:
+        notes.append(f"{ground_truth - pairs} of {ground_truth} ground-truth frames have no prediction: left out")
+    if pairs < predictions:
+        notes.append(f"{predictions - pairs} of {predictions} predicted frames have no ground truth: left out")
+    return tuple(notes)

@@ -1,0 +1,62 @@
+"""The boxes of many frames after one another, as the scoring wants them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.transforms import Array
+
+# What stands where a frame does not state an optional column.
+_UNKNOWN = {
+    "scores": np.float64(np.nan),
+    "attributes": np.str_(""),
+    "instances": np.str_(""),
+    "visibilities": np.float64(np.nan),
+    "num_points": np.int64(-1),
+}
+
+
+@dataclass(frozen=True)
+class ScoredBoxes:
+    """N boxes of many frames.
+
+    boxes: with every optional column filled. frames: (N,) the place of each box's frame.
+    ranges_m: (N,) horizontal distance from the ego vehicle.
+    """
+
+    boxes: Boxes3D
+    frames: NDArray[np.int64]
+    ranges_m: Array
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, selection: NDArray[Any]) -> ScoredBoxes:
+        """The boxes of a mask (N,) bool or of indices."""
+        return ScoredBoxes(self.boxes[selection], self.frames[selection], self.ranges_m[selection])
+
+
+def gather(frames: Sequence[Boxes3D], ego_xy: Array) -> ScoredBoxes:
+    """All boxes of F frames.
+
+    ego_xy: (F, 2) where the ego vehicle stands in each frame's frame of reference, metres.
+    """
+    places = np.repeat(np.arange(len(frames)), [len(boxes) for boxes in frames])
+    filled = [boxes for boxes in frames if len(boxes)] or [Boxes3D.empty()]
+    columns: dict[str, Any] = {
+        column.name: np.concatenate([_column(boxes, column.name) for boxes in filled]) for column in fields(Boxes3D)
+    }
+    boxes = Boxes3D(**columns)
+    ranges = np.linalg.norm(boxes.centers[:, :2] - ego_xy[places], axis=1)
+    return ScoredBoxes(boxes, places, ranges)
+
+
+def _column(boxes: Boxes3D, name: str) -> NDArray[Any]:
+    values = getattr(boxes, name)
+    return np.full(len(boxes), _UNKNOWN[name]) if values is None else values
