@@ -54,8 +54,9 @@ class BEVFormerConfig:
         grid, levels = self.bev_grid, self.neck.levels
         if min(grid.rows, grid.columns, grid.pillar_points) < 1:
             raise ValueError("bev_grid needs at least one row, column and pillar point")
-        if self.channels % 2 or self.channels % self.encoder.heads or self.channels % self.decoder.heads:
-            raise ValueError(f"channels is {self.channels}; it must be even and a multiple of the attention heads")
+        divisors = (2, self.encoder.attention_heads, self.decoder.attention_heads)
+        if any(self.channels % divisor for divisor in divisors):
+            raise ValueError(f"channels is {self.channels}; it must be even and a multiple of the attention_heads")
         if self.encoder.spatial_points % grid.pillar_points:
             raise ValueError("encoder.spatial_points must be a multiple of bev_grid.pillar_points")
         if not len(self.backbone.output_stages) <= levels <= self.image_tokens.level_embeddings:

@@ -20,7 +20,7 @@ class DecoderConfig:
     """
 
     layers: int = 6
-    heads: int = 8
+    attention_heads: int = 8
     points: int = 4
     queries: int = 900
     feed_forward_width: int = 512
@@ -61,8 +61,8 @@ class DecoderLayer(nn.Module):
         super().__init__()
         self.level_shapes = (bev_shape,)
         dropout = config.dropout
-        self.self_attention = nn.MultiheadAttention(channels, config.heads, dropout, batch_first=True)
-        self.cross_attention = DeformableAttention(channels, channels, config.heads, config.points)
+        self.self_attention = nn.MultiheadAttention(channels, config.attention_heads, dropout, batch_first=True)
+        self.cross_attention = DeformableAttention(channels, channels, config.attention_heads, config.points)
         self.feed_forward = FeedForward(channels, config.feed_forward_width, dropout)
         self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(3))
         self.dropout = nn.Dropout(dropout)

@@ -25,7 +25,7 @@ class EncoderConfig:
     """
 
     layers: int = 6
-    heads: int = 8
+    attention_heads: int = 8
     temporal_points: int = 4
     spatial_points: int = 8
     feed_forward_width: int = 512
@@ -98,7 +98,7 @@ class EncoderLayer(nn.Module):
 
     def __init__(self, config: EncoderConfig, channels: int, levels: int, bev_shape: tuple[int, int]) -> None:
         super().__init__()
-        heads, dropout = config.heads, config.dropout
+        heads, dropout = config.attention_heads, config.dropout
         self.temporal_self_attention = TemporalSelfAttention(
             channels, heads, config.temporal_points, bev_shape, dropout
         )

@@ -30,8 +30,8 @@ def small_config(**changes: object) -> BEVFormerConfig:
         "backbone": ResNetConfig((1, 1, 1, 1), "pytorch", output_stages=(3, 4), deformable_stages=(4,), width=8),
         "neck": FPNConfig(levels=3),
         "image_tokens": ImageTokensConfig(level_embeddings=3),
-        "encoder": EncoderConfig(2, heads=4, temporal_points=2, spatial_points=4, feed_forward_width=48),
-        "decoder": DecoderConfig(2, heads=4, points=2, queries=12, feed_forward_width=48, max_boxes=10),
+        "encoder": EncoderConfig(2, attention_heads=4, temporal_points=2, spatial_points=4, feed_forward_width=48),
+        "decoder": DecoderConfig(2, attention_heads=4, points=2, queries=12, feed_forward_width=48, max_boxes=10),
     }
     return BEVFormerConfig(**{**settings, **changes})  # type: ignore[arg-type]
 
