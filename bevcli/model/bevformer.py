@@ -54,6 +54,10 @@ class BEVFormerConfig:
         grid, levels = self.bev_grid, self.neck.levels
         if min(grid.rows, grid.columns, grid.pillar_points) < 1:
             raise ValueError("bev_grid needs at least one row, column and pillar point")
+        if any(start >= end for start, end in (grid.x_range_m, grid.y_range_m, grid.z_range_m)):
+            raise ValueError("bev_grid: each range goes from a smaller to a larger number")
+        if not (self.classes and self.cameras) or min(self.channels, self.rate_hz, self.max_gap_s) <= 0:
+            raise ValueError("classes and cameras must not be empty, channels, rate_hz and max_gap_s must be positive")
         divisors = (2, self.encoder.attention_heads, self.decoder.attention_heads)
         if any(self.channels % divisor for divisor in divisors):
             raise ValueError(f"channels is {self.channels}; it must be even and a multiple of the attention_heads")

@@ -27,6 +27,13 @@ class DecoderConfig:
     dropout: float = 0.1
     max_boxes: int = 300
 
+    def __post_init__(self) -> None:
+        counts = (self.layers, self.attention_heads, self.points, self.queries, self.max_boxes)
+        if min(*counts, self.feed_forward_width) < 1 or not 0 <= self.dropout < 1:
+            raise ValueError(
+                "layers, heads, points, queries, boxes and width must be positive, dropout from 0 to below 1"
+            )
+
 
 class Decoder(nn.Module):
     """Object queries that look at the BEV map and move their reference points to the objects."""

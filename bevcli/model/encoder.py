@@ -31,6 +31,11 @@ class EncoderConfig:
     feed_forward_width: int = 512
     dropout: float = 0.1
 
+    def __post_init__(self) -> None:
+        counts = (self.layers, self.attention_heads, self.temporal_points, self.spatial_points)
+        if min(*counts, self.feed_forward_width) < 1 or not 0 <= self.dropout < 1:
+            raise ValueError("layers, heads, points and width must be positive, dropout from 0 to below 1")
+
 
 class Encoder(nn.Module):
     """BEV queries, image features and history to the BEV map."""

@@ -30,7 +30,9 @@ class ResNetConfig:
     def __post_init__(self) -> None:
         stages = self.output_stages + self.deformable_stages
         if not self.output_stages or not set(stages) <= {1, 2, 3, 4}:
-            raise ValueError("output_stages and deformable_stages name stages 1 to 4")
+            raise ValueError("output_stages and deformable_stages name stages 1 to 4, output_stages at least one")
+        if min(*self.blocks, self.width) < 1:
+            raise ValueError("blocks and width must be positive")
 
     def output_channels(self) -> tuple[int, ...]:
         """Channels of the map of each output stage."""
