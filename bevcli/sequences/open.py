@@ -8,6 +8,8 @@ from pathlib import Path
 from bevcli.errors import InputError
 from bevcli.frame import Sequence
 from bevcli.sequences.folder import EgoMotionUse, FolderSequence
+from bevcli.sequences.intrinsics import read_rig
+from bevcli.sequences.nuscenes import NuScenesChoice, NuScenesSequence, is_nuscenes_root
 from bevcli.sequences.selection import select
 
 PARTS_OF_A_FOLDER = ("calibration.json", "frames.csv", "ego_motion.csv", "images", "videos")
@@ -19,15 +21,22 @@ class InputOptions:
 
     ego_motion: "required"; "static": the vehicle stands; "none": a missing file is allowed.
     strict: a missing or unreadable picture is an error. scene: only frames of this one.
+    version, split, sweeps: of nuScenes, see `NuScenesChoice`.
+    intrinsics, extrinsics: files that replace calibration.json, see `read_rig`.
     """
 
     ego_motion: EgoMotionUse = "required"
     strict: bool = False
     scene: str | None = None
+    version: str | None = None
+    split: str | None = None
+    sweeps: bool = False
+    intrinsics: Path | None = None
+    extrinsics: Path | None = None
 
 
 def open_sequence(path: Path, options: InputOptions = InputOptions()) -> Sequence:
-    """The sequence in a native folder.
+    """The sequence in a native folder (with pictures or videos) or a nuScenes dataset root.
 
     Raises InputError where the path holds nothing of the kind, or something in it is wrong.
     """
@@ -35,10 +44,29 @@ def open_sequence(path: Path, options: InputOptions = InputOptions()) -> Sequenc
         raise InputError(f"{path}: there is no such folder")
     if not path.is_dir():
         raise InputError(f"{path}: is a file (expected a sequence folder with calibration.json and pictures)")
+    if is_nuscenes_root(path):
+        return _open_nuscenes(path, options)
     if not any((path / part).exists() for part in PARTS_OF_A_FOLDER):
-        raise InputError(f"{path}: is no sequence folder (none of {', '.join(PARTS_OF_A_FOLDER)} is in it)")
-    sequence = FolderSequence(path, ego_motion=options.ego_motion, strict=options.strict)
+        expected = f"{', '.join(PARTS_OF_A_FOLDER)}, or a nuScenes root's v1.0-*/scene.json"
+        raise InputError(f"{path}: is no sequence folder (it has none of {expected})")
+    return _open_folder(path, options)
+
+
+def _open_folder(path: Path, options: InputOptions) -> Sequence:
+    if options.version or options.split or options.sweeps:
+        raise InputError(f"{path}: --version, --split and --sweeps are for nuScenes roots (no v1.0-* folder is in it)")
+    rig = read_rig(options.intrinsics, options.extrinsics)
+    sequence = FolderSequence(path, ego_motion=options.ego_motion, strict=options.strict, rig=rig)
     return sequence if options.scene is None else _scene(sequence, path, options.scene)
+
+
+def _open_nuscenes(path: Path, options: InputOptions) -> Sequence:
+    if options.intrinsics or options.extrinsics:
+        raise InputError(f"{path}: a nuScenes root has its own calibration: leave out --intrinsics and --extrinsics")
+    if options.ego_motion == "static":
+        raise InputError(f"{path}: a nuScenes root states where the vehicle was: leave out --static")
+    choice = NuScenesChoice(options.version, options.scene, options.split, options.sweeps)
+    return NuScenesSequence(path, choice, strict=options.strict)
 
 
 def _scene(sequence: Sequence, path: Path, scene: str) -> Sequence:

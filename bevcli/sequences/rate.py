@@ -70,10 +70,10 @@ def _nearest_to_beat(times_ns: np.ndarray, rate_hz: float) -> list[int]:
 def _note(total: int, kept: int, slowest_ratio: float, rate_hz: float) -> str:
     notes = []
     if kept < total:
-        notes.append(f"{kept} of {total} frames are used: the model was trained at {rate_hz:g} frames a second")
-    if slowest_ratio < SLOWEST_RATIO:
         notes.append(
-            f"the input has {slowest_ratio * rate_hz:.2g} frames a second, the model was trained at {rate_hz:g}: "
-            "expect worse velocities and history"
+            f"{kept} of {total} frames are used, those nearest to {rate_hz:g} a second (--rate all: every one)"
         )
+    if slowest_ratio < SLOWEST_RATIO:
+        found = f"{slowest_ratio * rate_hz:.2g} frames a second"
+        notes.append(f"the input has {found}, fewer than the model's {rate_hz:g}: speeds and history will suffer")
     return "; ".join(notes)

@@ -1,0 +1,101 @@
+"""nuScenes' tables: JSON lists of objects, the large ones over a gigabyte, read in batches."""
+
+from __future__ import annotations
+
+import gc
+import json
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.errors import InputError
+
+Row: TypeAlias = dict[str, Any]
+BATCH_BYTES = 16 << 20
+# Between two rows. The large tables hold neither objects in rows nor free text, so nothing else looks like this.
+BETWEEN_ROWS = re.compile(rb"}\s*,\s*{")
+TAIL_BYTES = 1 << 14  # where a batch is cut: no row is longer
+
+
+def read_rows(path: Path) -> list[Row]:
+    """All rows of a table. Raises InputError where it is missing or no list of objects."""
+    return [row for batch in read_batches(path) for row in batch]
+
+
+def read_batches(path: Path) -> Iterator[list[Row]]:
+    """The rows of a table, some ten thousands at a time; raises InputError as `read_rows`."""
+    if not path.is_file():
+        raise InputError(f"{path}: the table is missing (expected a nuScenes table)")
+    if path.stat().st_size <= BATCH_BYTES:
+        yield _parse(path, path.read_bytes())
+        return
+    with path.open("rb") as file:
+        rest = file.read(BATCH_BYTES).lstrip()[1:]  # without the list's opening bracket
+        while block := file.read(BATCH_BYTES):
+            text = rest + block
+            cut = _last_row_end(text)
+            yield _parse(path, b"[" + text[:cut] + b"]")
+            rest = text[cut:].lstrip()[1:]  # without the comma
+        yield _parse(path, b"[" + rest)
+
+
+@contextmanager
+def without_garbage_collection() -> Iterator[None]:
+    """Millions of rows make the collector walk them over and over: a third of the time for nothing."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+def column(rows: list[Row], name: str, path: Path) -> list[Any]:
+    """A column of rows. Raises InputError where one lacks it."""
+    try:
+        return [row[name] for row in rows]
+    except (KeyError, TypeError):
+        raise InputError(f'{path}: a row has no "{name}" (expected a nuScenes table)') from None
+
+
+def tokens(rows: list[Row], name: str, path: Path) -> NDArray[np.bytes_]:
+    """A column of tokens as (N,) bytes."""
+    return np.array(column(rows, name, path), dtype="S") if rows else np.zeros(0, dtype="S32")
+
+
+def places_of(wanted: NDArray[np.bytes_], table: NDArray[np.bytes_], path: Path) -> NDArray[np.int64]:
+    """(N,) the rows of a table by token. table: (M,) its tokens. Raises InputError where one is not in it."""
+    if not len(wanted):
+        return np.zeros(0, dtype=np.int64)
+    order = np.argsort(table)
+    if len(table):
+        places = order[np.searchsorted(table, wanted, sorter=order).clip(max=len(table) - 1)]
+        unknown = table[places] != wanted
+    else:
+        places, unknown = np.zeros(len(wanted), dtype=np.int64), np.ones(len(wanted), dtype=bool)
+    if unknown.any():
+        token = wanted[unknown][0].decode()
+        raise InputError(f'{path}: token "{token}" is not in the table, but another table refers to it')
+    return places
+
+
+def _last_row_end(text: bytes) -> int:
+    start = max(0, len(text) - TAIL_BYTES)
+    ends = [match.start() + 1 for match in BETWEEN_ROWS.finditer(text, start)]
+    return ends[-1] if ends else 0
+
+
+def _parse(path: Path, text: bytes) -> list[Row]:
+    try:
+        rows = json.loads(text)
+    except ValueError as error:
+        raise InputError(f"{path}: cannot be read as JSON ({error})") from None
+    if not isinstance(rows, list):
+        raise InputError(f"{path}: expected a list of rows (a nuScenes table)")
+    return rows
