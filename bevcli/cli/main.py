@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 
 from bevcli import __version__
+from bevcli.cli.convert import convert
 from bevcli.cli.run import run
 from bevcli.cli.weights import weights_app
 from bevcli.errors import BevcliError
@@ -39,6 +40,7 @@ def root(
     """Run BEVFormer on sequences from any camera rig, and see what it sees."""
 
 
+app.command()(convert)
 app.command()(run)
 app.add_typer(weights_app, name="weights")
 

@@ -1,0 +1,67 @@
+"""`bevcli convert`: any input, written as a native sequence folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def convert(
+    source: Annotated[
+        Path, typer.Argument(metavar="INPUT", help="A sequence folder, a folder with videos, or a nuScenes root.")
+    ],
+    out: Annotated[Path, typer.Argument(metavar="OUT_SEQUENCE", help="The native sequence folder to write.")],
+    scene: Annotated[str | None, typer.Option(help="Only this scene, as scene-0103.")] = None,
+    version: Annotated[
+        str | None, typer.Option(help="nuScenes: the version, as v1.0-mini. Default: the only one there.")
+    ] = None,
+    split: Annotated[
+        str | None, typer.Option(help="nuScenes: only scenes of this split (train, val, test, mini_train, mini_val).")
+    ] = None,
+    sweeps: Annotated[
+        bool, typer.Option("--sweeps", help="nuScenes: the pictures between the keyframes too (12 a second).")
+    ] = False,
+    intrinsics: Annotated[
+        Path | None,
+        typer.Option(help="Kalibr camchain or ROS camera_info YAML (or a folder of these), for calibration.json."),
+    ] = None,
+    extrinsics: Annotated[
+        Path | None, typer.Option(help='JSON with each camera\'s "ego_from_camera", to go with --intrinsics.')
+    ] = None,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="A missing or unreadable picture is an error, not a gap.")
+    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace a sequence in OUT_SEQUENCE.")] = False,
+) -> None:
+    """Write any input as a native sequence folder.
+
+    Pictures are copied byte for byte; those of a video become PNG. Ego-motion, ground truth and maps come along.
+    """
+    from bevcli.cli.progress import Progress
+    from bevcli.errors import OutputError
+    from bevcli.sequences.native_writer import NativeWriter
+    from bevcli.sequences.open import InputOptions, open_sequence
+
+    if out.resolve() == source.resolve() or out.resolve() in source.resolve().parents:
+        raise OutputError(f"{out}: holds the input itself: name another folder")
+    options = InputOptions("none", strict, scene, version, split, sweeps, intrinsics, extrinsics)
+    sequence = open_sequence(source, options)
+    for note in sequence.notes:
+        typer.echo(f"note: {note}", err=True)
+    count = len(sequence.stamps)
+    gaps = 0
+    with (
+        NativeWriter(out, with_ego_motion=sequence.has_ego_motion, force=force) as writer,
+        Progress(count, "frames") as progress,
+    ):
+        for place in range(count):
+            frame = sequence.load(place)
+            for camera, reason in frame.dropped.items():
+                progress.message(f"warning: frame {frame.stamp.index}: camera {camera}: {reason}")
+            gaps += len(frame.dropped)
+            writer.write(frame)
+            progress.advance()
+    missing = f", {gaps} pictures missing" if gaps else ""
+    typer.echo(f"{out}: {count} frames, {len(frame.rig.cameras)} cameras{missing}")
