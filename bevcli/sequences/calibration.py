@@ -42,10 +42,10 @@ def draft_calibration(path: Path) -> RigDraft:
     """The rig in calibration.json with all mistakes in it. Raises InputError only where it is no JSON object."""
     document = _load_object(path)
     report = Report()
-    if document.get("format") != FORMAT:
-        report.error(
-            "wrong-format", "format", "is not the one that is read", expected=FORMAT, found=document.get("format")
-        )
+    if "format" not in document:
+        report.missing("format", FORMAT)
+    elif document["format"] != FORMAT:
+        report.error("wrong-format", "format", "is not the one that is read", expected=FORMAT, found=document["format"])
     cameras = _parse_cameras(document, report)
     given = "ego_from_bev" in document
     ego_from_bev = parse_transform(document, "ego_from_bev", report) if given else None

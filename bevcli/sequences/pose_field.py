@@ -52,7 +52,8 @@ def _rotation_of(quaternion: Array, report: Report) -> Array | None:
     if abs(norm - 1) > TOLERANCE:
         report.error(
             "quaternion-norm", "rotation_wxyz", "is no rotation, its norm is not 1",
-            expected="1 ± 0.001", found=f"{norm:.6g}", advice="check for lost or rounded digits; the order is w, x, y, z",
+            expected="1 ± 0.001", found=f"{norm:.6g}",
+            advice="check for lost or rounded digits; the order is w, x, y, z",
         )  # fmt: skip
     return rotation_from_quaternion(quaternion) if norm > TOLERANCE else None
 

@@ -1,0 +1,77 @@
+"""How a camera stands on the vehicle, in the words of whoever mounts it: height, yaw, pitch, roll, field of view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bevcli.geometry.cameras import Camera
+from bevcli.geometry.transforms import Array
+
+FRONT_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # ego axes of a camera looking ahead
+_STEP_DEG = 0.1
+_ANGLES = np.radians(np.arange(-90 + _STEP_DEG / 2, 90, _STEP_DEG))
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """position: (3,) metres in ego. Angles in degrees.
+
+    yaw_deg: counter-clockwise from straight ahead. pitch_deg: up is positive. roll_deg: positive when the camera leans
+    to its right; 180 is upside down.
+    """
+
+    position: Array
+    yaw_deg: float
+    pitch_deg: float
+    roll_deg: float
+
+    @property
+    def height(self) -> float:
+        """Metres above the ego frame's ground."""
+        return float(self.position[2])
+
+    @property
+    def reach(self) -> float:
+        """Metres from the ego frame's origin, seen from above."""
+        return float(np.hypot(self.position[0], self.position[1]))
+
+
+def mounting_of(ego_from_camera: Array) -> Mounting:
+    """The mounting of a camera with this pose (4, 4)."""
+    right, down, forward = ego_from_camera[:3, 0], ego_from_camera[:3, 1], ego_from_camera[:3, 2]
+    return Mounting(
+        position=ego_from_camera[:3, 3],
+        yaw_deg=float(np.degrees(np.arctan2(forward[1], forward[0]))),
+        pitch_deg=float(np.degrees(np.arcsin(np.clip(forward[2], -1, 1)))),
+        roll_deg=float(np.degrees(np.arctan2(-right[2], -down[2]))),
+    )
+
+
+def seen_fov_deg(camera: Camera) -> tuple[float, float]:
+    """Degrees across the picture, horizontally and vertically through the optical axis, the lens included.
+
+    At most 180: nothing behind the camera's plane has a picture.
+    """
+    return _seen(camera, 0), _seen(camera, 1)
+
+
+def horizon(camera: Camera) -> Array:
+    """(P, 2) pixels of the horizon, NaN where it is not in the picture. Points far away at the camera's own height."""
+    yaws = np.radians(np.arange(0, 360, 0.25))
+    far = np.stack([np.cos(yaws), np.sin(yaws), np.zeros_like(yaws)], axis=-1) * 1e5
+    pixels, depth = camera.project_ego(far + camera.ego_from_camera[:3, 3])
+    seen = np.where(camera.contains(pixels, depth)[:, None], pixels, np.nan)
+    start = int(np.argmax(depth < 0))  # a gap, so that the line does not begin in the middle of the picture
+    return np.roll(seen, -start, axis=0)
+
+
+def _seen(camera: Camera, axis: int) -> float:
+    rays = np.zeros((len(_ANGLES), 3))
+    rays[:, axis], rays[:, 2] = np.sin(_ANGLES), np.cos(_ANGLES)
+    pixels, _ = camera.project(rays)
+    size = (camera.width, camera.height)[axis]
+    with np.errstate(invalid="ignore"):
+        inside = (pixels[:, axis] > 0) & (pixels[:, axis] < size)
+    return float(inside.sum() * _STEP_DEG)
