@@ -7,32 +7,29 @@ from typing import Annotated
 
 import typer
 
+from bevcli.cli.input_options import (
+    ExtrinsicsOption,
+    IntrinsicsOption,
+    SceneOption,
+    SplitOption,
+    StrictOption,
+    SweepsOption,
+    VersionOption,
+)
+
 
 def convert(
     source: Annotated[
         Path, typer.Argument(metavar="INPUT", help="A sequence folder, a folder with videos, or a nuScenes root.")
     ],
     out: Annotated[Path, typer.Argument(metavar="OUT_SEQUENCE", help="The native sequence folder to write.")],
-    scene: Annotated[str | None, typer.Option(help="Only this scene, as scene-0103.")] = None,
-    version: Annotated[
-        str | None, typer.Option(help="nuScenes: the version, as v1.0-mini. Default: the only one there.")
-    ] = None,
-    split: Annotated[
-        str | None, typer.Option(help="nuScenes: only scenes of this split (train, val, test, mini_train, mini_val).")
-    ] = None,
-    sweeps: Annotated[
-        bool, typer.Option("--sweeps", help="nuScenes: the pictures between the keyframes too (12 a second).")
-    ] = False,
-    intrinsics: Annotated[
-        Path | None,
-        typer.Option(help="Kalibr camchain or ROS camera_info YAML (or a folder of these), for calibration.json."),
-    ] = None,
-    extrinsics: Annotated[
-        Path | None, typer.Option(help='JSON with each camera\'s "ego_from_camera", to go with --intrinsics.')
-    ] = None,
-    strict: Annotated[
-        bool, typer.Option("--strict", help="A missing or unreadable picture is an error, not a gap.")
-    ] = False,
+    strict: StrictOption = False,
+    scene: SceneOption = None,
+    version: VersionOption = None,
+    split: SplitOption = None,
+    sweeps: SweepsOption = False,
+    intrinsics: IntrinsicsOption = None,
+    extrinsics: ExtrinsicsOption = None,
     force: Annotated[bool, typer.Option("--force", help="Replace a sequence in OUT_SEQUENCE.")] = False,
 ) -> None:
     """Write any input as a native sequence folder.

@@ -7,7 +7,18 @@ from typing import Annotated, Literal
 
 import typer
 
-INPUT, MODEL, OUTPUT, RECORDING = "Input", "Model", "Output", "Recording"
+from bevcli.cli.input_options import (
+    PANEL,
+    ExtrinsicsOption,
+    IntrinsicsOption,
+    SceneOption,
+    SplitOption,
+    StrictOption,
+    SweepsOption,
+    VersionOption,
+)
+
+MODEL, OUTPUT, RECORDING = "Model", "Output", "Recording"
 
 
 def run(
@@ -41,31 +52,25 @@ def run(
     ] = None,
     frames: Annotated[
         str | None,
-        typer.Option(metavar="A:B", help="Only these places in the sequence, B exclusive.", rich_help_panel=INPUT),
+        typer.Option(metavar="A:B", help="Only these places in the sequence, B exclusive.", rich_help_panel=PANEL),
     ] = None,
     rate: Annotated[
         str | None,
-        typer.Option(metavar="HZ|all", help="Thin to this rate. Default: the model's own.", rich_help_panel=INPUT),
+        typer.Option(metavar="HZ|all", help="Thin to this rate. Default: the model's own.", rich_help_panel=PANEL),
     ] = None,
     every: Annotated[
-        int | None, typer.Option(min=1, help="Take every N-th frame, whatever the rate.", rich_help_panel=INPUT)
+        int | None, typer.Option(min=1, help="Take every N-th frame, whatever the rate.", rich_help_panel=PANEL)
     ] = None,
     static: Annotated[
-        bool, typer.Option("--static", help="The vehicle stands: no ego-motion is needed.", rich_help_panel=INPUT)
+        bool, typer.Option("--static", help="The vehicle stands: no ego-motion is needed.", rich_help_panel=PANEL)
     ] = False,
-    strict: Annotated[
-        bool, typer.Option("--strict", help="A missing picture is an error, not a warning.", rich_help_panel=INPUT)
-    ] = False,
-    scene: Annotated[str | None, typer.Option(help="Only this scene.", rich_help_panel=INPUT)] = None,
-    version: Annotated[
-        str | None, typer.Option(help="nuScenes: which tables, as v1.0-mini.", rich_help_panel=INPUT)
-    ] = None,
-    split: Annotated[
-        str | None, typer.Option(help="nuScenes: the scenes of a split, as val.", rich_help_panel=INPUT)
-    ] = None,
-    sweeps: Annotated[
-        bool, typer.Option("--sweeps", help="nuScenes: pictures between the keyframes, too.", rich_help_panel=INPUT)
-    ] = False,
+    strict: StrictOption = False,
+    scene: SceneOption = None,
+    version: VersionOption = None,
+    split: SplitOption = None,
+    sweeps: SweepsOption = False,
+    intrinsics: IntrinsicsOption = None,
+    extrinsics: ExtrinsicsOption = None,
     out: Annotated[
         Path | None, typer.Option(help="Default: runs/SEQUENCE-MODEL.", rich_help_panel=OUTPUT, show_default=False)
     ] = None,
@@ -112,7 +117,8 @@ def run(
 
     recording = RecordingOptions(record, bev, score, tuple(map(parse_probe, probe or ())), live)
     loaded = load_model(model, weights, untrained=untrained)
-    options = InputOptions(ego_motion=ego_motion_use(static=static, temporal=temporal), strict=strict, scene=scene)
+    motion = ego_motion_use(static=static, temporal=temporal)
+    options = InputOptions(motion, strict, scene, version, split, sweeps, intrinsics, extrinsics)
     drive = choose_frames(sequence, options, FrameChoice(frames, rate, every), loaded.model.config)
     target = choose_device(device)
     step = StepOptions(
