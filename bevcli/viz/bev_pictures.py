@@ -72,7 +72,7 @@ class BevPictures(Generic[Stamp]):
         self._waiting: list[tuple[Stamp, Features]] = []
 
     def push(self, stamp: Stamp, features: Features) -> list[tuple[Stamp, NDArray[np.uint8]]]:
-        """features: (rows, columns, C), rows from the smallest y. Pictures: (rows, columns, 3), the largest y on top."""
+        """features: (rows, columns, C), rows from the smallest y. Pictures: (rows, columns, 3), largest y on top."""
         self._waiting.append((stamp, features))
         if self._colors is None and len(self._waiting) < FITTED_ON:
             return []

@@ -10,9 +10,9 @@ from bevcli.viz import entities
 from bevcli.viz.camera_layout import camera_rows
 
 HIDDEN = rrb.EntityBehavior(visible=False)
-EYE_M, LOOK_AT_M = (-17.0, 0.0, 11.5), (9.0, 0.0, 0.0)  # in ego: behind and above, looking ahead
+EYE_M, LOOK_AT_M = (-15.0, 0.0, 10.0), (8.0, 0.0, 0.0)  # in ego: behind and above, looking ahead
 BACKGROUND = [18, 20, 25]
-VIEW_MARGIN_M = 42.0  # what the BEV view shows around the vehicle at first
+VIEW_MARGIN_M = 36.0  # what the BEV view shows around the vehicle at first
 
 
 def recording_blueprint(rig: CameraRig, note: str = "", probes: bool = False) -> rrb.Blueprint:
@@ -77,11 +77,13 @@ def _bev_tabs(titled: str) -> rrb.Tabs:
 
 
 def _curves() -> rrb.Vertical:
-    times = rrb.TimeSeriesView(origin=entities.STAGE_CURVES, name="Seconds per stage")
-    counts = rrb.TimeSeriesView(origin=entities.BOX_CURVES, name="Boxes per class")
-    events = rrb.TextLogView(origin=entities.EVENTS, name="Events")
+    legend = rrb.PlotLegend(rrb.Corner2D.LeftTop)
+    times = rrb.TimeSeriesView(origin=entities.STAGE_CURVES, name="Seconds per stage", plot_legend=legend)
+    counts = rrb.TimeSeriesView(origin=entities.BOX_CURVES, name="Boxes per class", plot_legend=legend)
+    columns = rrb.TextLogColumns(timeline_columns=[], text_log_columns=["loglevel", "body"])
+    events = rrb.TextLogView(origin=entities.EVENTS, name="Events", columns=columns)
     about = rrb.TextDocumentView(origin=entities.RUN, name="About")
-    return rrb.Vertical(times, counts, rrb.Tabs(events, about, active_tab=0), row_shares=[2, 2, 2])
+    return rrb.Vertical(rrb.Tabs(times, counts, active_tab=0), rrb.Tabs(events, about, active_tab=0), row_shares=[3, 2])
 
 
 def _camera(rig: CameraRig, name: str, *, probes: bool) -> rrb.Spatial2DView:

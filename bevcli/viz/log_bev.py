@@ -13,7 +13,7 @@ from bevcli.viz import entities
 from bevcli.viz.attention import Probe
 from bevcli.viz.palette import MAP_COLORS, colormap
 
-GROUND_OPACITY = 150  # of 255: boxes, rings and the trajectory stay readable on the map
+GROUND_OPACITY = 110  # of 255: boxes, rings and the trajectory stay readable on the map
 BELOW_GROUND_M = 0.06  # so that the map does not flicker with what lies on the ground
 
 
@@ -60,7 +60,7 @@ def log_probes(stream: rr.RecordingStream, probes: tuple[Probe, ...], ego_from_b
     stream.log(entities.BEV_PROBES, dots)
     low, high = grid.pillar_heights()[[0, -1]]
     ends = np.stack([np.column_stack([centers, np.full(len(centers), z)]) for z in (low, high)], axis=1)
-    stream.log(entities.PROBES, rr.LineStrips3D(apply(ego_from_bev, ends), colors=[255, 80, 220], radii=0.08))
+    stream.log(entities.PROBES, rr.LineStrips3D(apply(ego_from_bev, ends), colors=[255, 80, 220], radii=0.05))
 
 
 def _placed(picture: NDArray[np.uint8], x_range: tuple[float, float], y_range: tuple[float, float]) -> rr.Transform3D:

@@ -11,10 +11,10 @@ import rerun as rr
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
 from bevcli.viz import entities
+from bevcli.viz.labels import labels_in_scene
 from bevcli.viz.palette import FALSE_COLOR, GROUND_TRUTH_COLOR, MISSED_COLOR, class_color
 
 MOVING_M_S = 0.5  # slower things get no velocity arrow
-LABELLED_WITHIN_M = 35.0  # farther boxes show their colour only: labels would cover the scene
 THIN, THICK = rr.Radius.ui_points(0.8), rr.Radius.ui_points(1.6)
 
 
@@ -25,21 +25,12 @@ def box_colors(boxes: Boxes3D, class_names: Sequence[str]) -> np.ndarray:
     return np.array([colors[name] for name in boxes.classes], dtype=np.uint8).reshape(-1, 3)
 
 
-def box_labels(boxes: Boxes3D) -> list[str]:
-    """ "car 0.83" for each, without the score where there is none."""
-    names = [str(name).replace("_", " ") for name in boxes.classes]
-    if boxes.scores is None:
-        return names
-    return [f"{name} {score:.2f}" for name, score in zip(names, boxes.scores, strict=True)]
-
-
 def log_boxes_3d(
     stream: rr.RecordingStream, boxes: Boxes3D, false: np.ndarray, class_names: Sequence[str], ego_xy: Array
 ) -> None:
     """Writes predicted boxes of the recording's world; `false` (N,) crosses out those that no ground truth has."""
     ids = [1 + list(class_names).index(name) if name in class_names else 0 for name in boxes.classes]
-    near = np.linalg.norm(boxes.centers[:, :2] - ego_xy, axis=-1) < LABELLED_WITHIN_M
-    labels = [text if close else "" for text, close in zip(box_labels(boxes), near, strict=True)]
+    labels = labels_in_scene(boxes, ego_xy)
     archetype = rr.Boxes3D(**_shape(boxes), class_ids=ids, labels=labels, show_labels=True, radii=THICK)
     facts = rr.AnyValues(
         score=np.ones(len(boxes)) if boxes.scores is None else boxes.scores,

@@ -16,11 +16,11 @@ from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.viz import entities
 from bevcli.viz.attention import CameraSamples
 from bevcli.viz.box_lines import lines_in_picture
-from bevcli.viz.log_boxes import box_colors, box_labels
+from bevcli.viz.labels import box_labels, labels_in_picture
+from bevcli.viz.log_boxes import box_colors
 from bevcli.viz.palette import GROUND_TRUTH_COLOR, MISSED_COLOR, colormap
 
 JPEG_QUALITY = 85  # of pictures that come without bytes of their own, as a video's do
-LABELLED_FROM_PX = 34  # of the box's height in a picture 900 pixels high: smaller boxes show their colour only
 POINT = rr.Radius.ui_points(2.0)
 
 
@@ -60,8 +60,8 @@ def log_boxes_in_picture(
         entities.overlay(name, "boxes"),
         rr.LineStrips2D(lines.segments, colors=colors[lines.owners], radii=rr.Radius.ui_points(1.0), draw_order=30),
     )
-    places, owners = _label_places(lines.segments, lines.owners, shot.camera.height)
     texts = box_labels(boxes)
+    places, owners = labels_in_picture(lines, texts, shot.camera.width, shot.camera.height)
     labels = rr.Points2D(
         places,
         labels=[texts[owner] for owner in owners],
@@ -113,15 +113,3 @@ def _encoded(picture: Picture) -> tuple[bytes, str]:
         return picture.encoded, picture.media_type
     _, data = cv2.imencode(".jpg", picture.pixels_bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return data.tobytes(), "image/jpeg"
-
-
-def _label_places(segments: Array, owners: np.ndarray, picture_height: int) -> tuple[Array, np.ndarray]:
-    """The middle of the upper edge of each box that is high enough for a label, (L, 2), and the boxes (L,)."""
-    places, labelled = [], []
-    for owner in np.unique(owners):
-        points = segments[owners == owner].reshape(-1, 2)
-        low, high = points.min(0), points.max(0)
-        if high[1] - low[1] >= LABELLED_FROM_PX * picture_height / 900:
-            places.append(((low[0] + high[0]) / 2, low[1]))
-            labelled.append(owner)
-    return np.array(places).reshape(-1, 2), np.array(labelled, dtype=np.int64)

@@ -10,13 +10,12 @@ import numpy as np
 import rerun as rr
 
 from bevcli.errors import OutputError
-from bevcli.frame import Frame, FrameStamp, Prediction
+from bevcli.frame import AttentionView, Frame, FrameStamp, Prediction
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array, inverse, rigid
 from bevcli.viz import entities, log_bev, log_boxes, log_cameras, static_scene
 from bevcli.viz.about import about_text
-from bevcli.viz.attention import AttentionView
 from bevcli.viz.bev_pictures import BevPictures
 from bevcli.viz.blueprint import recording_blueprint
 from bevcli.viz.matching import match
