@@ -13,6 +13,7 @@ import typer
 
 from bevcli import __version__
 from bevcli.cli.convert import convert
+from bevcli.cli.project_debug import project_debug
 from bevcli.cli.run import run
 from bevcli.cli.weights import weights_app
 from bevcli.errors import BevcliError
@@ -41,6 +42,7 @@ def root(
 
 
 app.command()(convert)
+app.command()(project_debug)
 app.command()(run)
 app.add_typer(weights_app, name="weights")
 

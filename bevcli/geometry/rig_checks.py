@@ -48,6 +48,11 @@ def check_rig(rig: CameraRig, found_before: Sequence[Finding] = (), grid: BevGri
     return RigReport(sorted_by_severity(findings), coverage, measures)
 
 
+def with_findings(report: RigReport, findings: Sequence[Finding]) -> RigReport:
+    """The report with more findings, as a sequence's."""
+    return replace(report, findings=sorted_by_severity([*report.findings, *findings]))
+
+
 def sorted_by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Errors, then warnings, then infos; otherwise in their order."""
     return tuple(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))

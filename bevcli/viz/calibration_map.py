@@ -49,8 +49,8 @@ def draw_coverage(axes: Axes, rig: CameraRig, coverage: Coverage) -> None:
         _draw_camera(axes, camera, rig)
     axes.set_xlim(*grid.x_range_m)
     axes.set_ylim(*grid.y_range_m)
-    axes.set_xlabel("x of the bev frame, m", color=FAINT)
-    axes.set_ylabel("y of the bev frame, m", color=FAINT)
+    axes.set_xlabel("x of the bev frame, m", color=FAINT, fontsize=9, labelpad=2)
+    axes.set_ylabel("y of the bev frame, m", color=FAINT, fontsize=9, labelpad=1)
     axes.tick_params(colors=FAINT, labelsize=8)
     for spine in axes.spines.values():
         spine.set_color(FAINT)

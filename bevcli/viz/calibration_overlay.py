@@ -52,7 +52,7 @@ def height_colors(grid: BevGrid) -> NDArray[np.uint8]:
 
 
 def ground_lines(camera: Camera) -> list[Array]:
-    """Lines (P, 2) in pixels of a grid on the ground, every 5 m around the ego origin, where they are near the picture."""
+    """Lines (P, 2) in pixels of a 5 m grid on the ground around the ego origin, where they are near the picture."""
     along = np.arange(-GRID_REACH_M, GRID_REACH_M + 0.05, 0.1)
     lines: list[Array] = []
     for offset in np.arange(-GRID_REACH_M, GRID_REACH_M + 0.1, GRID_STEP_M):
@@ -94,7 +94,7 @@ def draw_overlay(camera: Camera, ego_from_bev: Array, picture_bgr: Picture | Non
         canvas = np.full((shown.height, shown.width, 3), BACKDROP, dtype=np.uint8)
     else:
         resized = cv2.resize(picture_bgr, (shown.width, shown.height), interpolation=cv2.INTER_AREA)
-        canvas = (resized[..., ::-1] * 0.8).astype(np.uint8)  # a little darker, so that the overlay stands out
+        canvas = (resized[..., ::-1] * 0.85).astype(np.uint8)  # a little darker, so that the overlay stands out
     _draw_lines(canvas, ground_lines(shown), GROUND, 0.55)
     _draw_lines(canvas, visible_runs(horizon(shown)), HORIZON, 0.9, thickness=2)
     _draw_lines(canvas, pillar_lines(shown, ego_from_bev), PILLAR, 0.35)

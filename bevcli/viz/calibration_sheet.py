@@ -1,4 +1,4 @@
-"""The sheet: all cameras' pictures with their overlay, laid out around the vehicle, and the coverage map between them."""
+"""The sheet: all cameras' pictures with their overlay, laid out around the vehicle, and the coverage map amid them."""
 
 from __future__ import annotations
 
@@ -16,42 +16,64 @@ from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.rig_checks import RigReport
 from bevcli.geometry.rig_findings import Finding
 from bevcli.geometry.rig_pose import mounting_of, seen_fov_deg
-from bevcli.geometry.transforms import Array
 from bevcli.viz.calibration_map import FAINT, INK, LEGEND_STYLE, PAPER, draw_coverage, save
 from bevcli.viz.calibration_overlay import GROUND, HORIZON, PILLAR_GRID, Picture, draw_overlay, height_colors
 
 SEVERITY_COLORS = {"error": "#ff5c72", "warning": "#ffc857", "info": "#7fb7e6"}
 SIDE_DEG = (75.0, 105.0)  # cameras that look sideways stand beside the map
-SLOT = (4.8, 3.1)  # inches a camera
-PICTURE_WIDTH = 960
+DPI = 100
+SLOT, GAP, TITLE, DETAILS, MIDDLE = 5.2, 0.3, 0.32, 0.38, 5.2  # inches: a picture's width, between, above, below, map
+PICTURE_WIDTH = 1040
 
 
 def write_sheet(path: Path, rig: CameraRig, report: RigReport, pictures: Mapping[str, Picture]) -> None:
     """Write the PNG. pictures: by camera (H, W, 3) BGR; a camera without one gets a dark field. Raises OutputError."""
     front, left, right, back = around(rig)
     columns = max(len(front), len(back), 3)
-    middle = max(len(left), len(right), 2)
-    rows = [bool(front) * 1.0, middle * 1.0, bool(back) * 1.0]
-    figure = Figure(figsize=(columns * SLOT[0], sum(rows) * SLOT[1] + 0.5), dpi=90, facecolor=PAPER)
-    grid = figure.add_gridspec(int(sum(rows)), 6 * columns, wspace=0.35, hspace=0.16,
-                               left=0.02, right=0.985, top=0.965, bottom=0.035)  # fmt: skip
-    first = int(rows[0])
-    for row, cameras in ((0, front), (int(sum(rows)) - 1, back)):
-        start = 3 * (columns - len(cameras))  # centred: a slot is six columns of the grid wide
-        for place, camera in enumerate(cameras):
-            slot = figure.add_subplot(grid[row, start + 6 * place : start + 6 * place + 6])
-            _draw_camera(slot, camera, rig.ego_from_bev, pictures.get(camera.name), report)
-    for cameras, columns_of in ((left, slice(0, 6)), (right, slice(6 * columns - 6, 6 * columns))):
-        for place, camera in enumerate(cameras):
-            slot = figure.add_subplot(grid[first + place, columns_of])
-            _draw_camera(slot, camera, rig.ego_from_bev, pictures.get(camera.name), report)
-    center = figure.add_subplot(grid[first : first + middle, 3 * columns - 4 : 3 * columns + 4])
-    draw_coverage(center, rig, report.coverage)
+    heights = [_row_height(front), max(_column_height(left), _column_height(right), MIDDLE), _row_height(back)]
+    sheet = _Sheet(columns * (SLOT + GAP) + GAP, sum(heights) + 2 * GAP)
+    tops = GAP + np.cumsum([0.0, *heights[:2]])
+    for row, top in ((front, tops[0]), (back, tops[2])):
+        start = (sheet.width - len(row) * (SLOT + GAP) + GAP) / 2
+        for place, camera in enumerate(row):
+            _draw_camera(sheet, (start + place * (SLOT + GAP), top), camera, rig, report, pictures)
+    for column, start in ((left, GAP), (right, sheet.width - SLOT - GAP)):
+        top = tops[1]
+        for camera in column:
+            _draw_camera(sheet, (start, top), camera, rig, report, pictures)
+            top += _camera_height(camera)
+    size, top = MIDDLE - 1.1, tops[1] + (heights[1] - MIDDLE) / 2 + 0.35
+    draw_coverage(sheet.axes((sheet.width - size) / 2 + 0.1, top, size, size), rig, report.coverage)
     if not left:
-        _write_findings(figure.add_subplot(grid[first : first + middle, 0:6]), report.findings)
+        _write_findings(sheet.axes(GAP, top, SLOT, size), report.findings)
     if not right:
-        _write_legend(figure.add_subplot(grid[first : first + middle, 6 * columns - 6 : 6 * columns]))
-    save(figure, path)
+        _write_legend(sheet.axes(sheet.width - SLOT - GAP, top, SLOT, size))
+    save(sheet.figure, path)
+
+
+class _Sheet:
+    """A figure on which axes are placed in inches from the top left corner."""
+
+    def __init__(self, width: float, height: float) -> None:
+        self.width, self.height = width, height
+        self.figure = Figure(figsize=(width, height), dpi=DPI, facecolor=PAPER)
+
+    def axes(self, left: float, top: float, width: float, height: float) -> Axes:
+        bottom = self.height - top - height
+        box = (left / self.width, bottom / self.height, width / self.width, height / self.height)
+        return self.figure.add_axes(box)
+
+
+def _camera_height(camera: Camera) -> float:
+    return TITLE + SLOT * min(camera.height / camera.width, 1.0) + DETAILS
+
+
+def _row_height(cameras: Sequence[Camera]) -> float:
+    return max(map(_camera_height, cameras), default=0.0)
+
+
+def _column_height(cameras: Sequence[Camera]) -> float:
+    return sum(map(_camera_height, cameras))
 
 
 def around(rig: CameraRig) -> tuple[list[Camera], list[Camera], list[Camera], list[Camera]]:
@@ -69,10 +91,20 @@ def around(rig: CameraRig) -> tuple[list[Camera], list[Camera], list[Camera], li
     )
 
 
-def _draw_camera(axes: Axes, camera: Camera, ego_from_bev: Array, picture: Picture | None, report: RigReport) -> None:
+def _draw_camera(
+    sheet: _Sheet,
+    corner: tuple[float, float],
+    camera: Camera,
+    rig: CameraRig,
+    report: RigReport,
+    pictures: Mapping[str, Picture],
+) -> None:
+    left, top = corner
+    axes = sheet.axes(left, top + TITLE, SLOT, _camera_height(camera) - TITLE - DETAILS)
+    picture = pictures.get(camera.name)
     if picture is not None and picture.shape[:2] != (camera.height, camera.width):
-        picture = cv2.resize(picture, (camera.width, camera.height))
-    axes.imshow(draw_overlay(camera, ego_from_bev, picture, PICTURE_WIDTH))
+        picture = cv2.resize(picture, (camera.width, camera.height)).astype(np.uint8)
+    axes.imshow(draw_overlay(camera, rig.ego_from_bev, picture, PICTURE_WIDTH))
     axes.set_xticks([])
     axes.set_yticks([])
     mounting = mounting_of(camera.ego_from_camera)
@@ -84,7 +116,7 @@ def _draw_camera(axes: Axes, camera: Camera, ego_from_bev: Array, picture: Pictu
     axes.set_title(camera.name, loc="left", color=INK, fontsize=11)
     details = f"yaw {mounting.yaw_deg:.0f}°  pitch {mounting.pitch_deg:.1f}°  roll {mounting.roll_deg:.1f}°"
     details += f"  height {mounting.height:.2f} m  view {seen_fov_deg(camera)[0]:.0f}°"
-    axes.set_title(details, loc="right", color=FAINT, fontsize=8.5)
+    axes.set_xlabel(details, color=FAINT, fontsize=9, loc="left", labelpad=5)
     if mine:
         box = {"facecolor": PAPER, "edgecolor": color, "alpha": 0.9, "boxstyle": "round,pad=0.4"}
         text = textwrap.fill(mine[0].message, 50)
@@ -100,13 +132,13 @@ def _write_findings(axes: Axes, findings: Sequence[Finding]) -> None:
     for finding in findings:
         where = f"{finding.camera}: " if finding.camera else ""
         numbers = f" ({finding.found})" if finding.found else ""
-        lines = textwrap.wrap(f"{where}{finding.message}{numbers}", 58)[:4]
-        if height - 0.04 * len(lines) < 0.03:
+        lines = textwrap.wrap(f"{where}{finding.message}{numbers}", 56)[:4]
+        if height - 0.05 * len(lines) < 0.03:
             axes.text(0, height, "and more: see the table", color=FAINT, fontsize=9, va="top")
             break
         axes.text(0, height, finding.severity, color=SEVERITY_COLORS[finding.severity], fontsize=9, va="top")
         axes.text(0.15, height, "\n".join(lines), color=INK, fontsize=9, va="top", linespacing=1.25)
-        height -= 0.04 * len(lines) + 0.025
+        height -= 0.05 * len(lines) + 0.02
 
 
 def _write_legend(axes: Axes) -> None:
