@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.synth.ground_texture import GroundTexture
+from bevcli.synth.lens import LensMaps, distortion_maps
 from bevcli.synth.rasteriser import VisibilityBuffer, rasterise
 from bevcli.synth.shading import ShadowMap, shade
 from bevcli.synth.triangles import Soup
@@ -45,10 +46,12 @@ def expose(moment: Moment, camera: Camera, world_from_ego: Array, supersampling:
     """The picture that a camera takes. world_from_ego: (4, 4) at the camera's time.
 
     supersampling: samples a pixel along each side, averaged for the picture; pixels are counted in whole pixels.
-    A lens with distortion is served by resampling a pinhole picture, objects by its nearest pixel.
+    A lens with distortion is served by resampling a wider pinhole picture, objects by its nearest pixel.
     """
-    pinhole = camera.undistorted()
-    fine = supersampled(pinhole, supersampling)
+    if camera.distortion is not None:
+        lens = distortion_maps(camera)
+        return _through(lens, expose(moment, lens.pinhole, world_from_ego, supersampling), moment.object_count)
+    fine = supersampled(camera, supersampling)
     world_from_camera = world_from_ego @ camera.ego_from_camera
     buffer = rasterise(
         moment.soup.surfaces.corners, moment.soup.runs, moment.soup.objects, moment.soup.spheres, fine,
@@ -63,7 +66,18 @@ def expose(moment: Moment, camera: Camera, world_from_ego: Array, supersampling:
     if supersampling > 1:
         picture = cv2.resize(picture, (camera.width, camera.height), interpolation=cv2.INTER_AREA).astype(np.uint8)
         objects = np.ascontiguousarray(objects[::supersampling, ::supersampling])
-    return Exposure(picture, objects, visible // area, np.maximum(buffer.unoccluded, visible) // area)
+    return Exposure(picture, objects, visible // area, -(-buffer.unoccluded // area))
+
+
+def _through(lens: LensMaps, pinhole: Exposure, object_count: int) -> Exposure:
+    """What the lens makes of its pinhole picture; unoccluded pixels are scaled as the visible ones."""
+    picture = cv2.remap(pinhole.pixels_bgr, lens.x, lens.y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    rows, columns = np.round(lens.y).astype(int), np.round(lens.x).astype(int)
+    objects = pinhole.objects[rows, columns]
+    visible = np.bincount(objects[objects >= 0], minlength=object_count)
+    share = np.minimum(pinhole.visible / np.maximum(pinhole.unoccluded, 1), 1.0)
+    unoccluded = np.where(visible > 0, np.ceil(visible / np.maximum(share, 1e-6)), pinhole.unoccluded)
+    return Exposure(picture.astype(np.uint8), objects, visible, unoccluded.astype(np.int64))
 
 
 def supersampled(camera: Camera, factor: int) -> Camera:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
+from bevcli.errors import InputError
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.transforms import Array, rigid, rotation_about_z
+from bevcli.sequences.calibration import read_calibration
+from bevcli.synth.lens import distortion_maps
 
 # name: x, y, z in ego (m), yaw (degrees), focal length (px at 1600 x 900)
 _MOUNTS = {
@@ -28,3 +33,21 @@ def nuscenes_like_rig(width: int = 1600, height: int = 900) -> CameraRig:
         camera = Camera(name, 1600, 900, intrinsics, rigid((x, y, z), rotation))
         cameras.append(camera.scaled(width / 1600, height / 900))
     return CameraRig(tuple(cameras), default_ego_from_bev())
+
+
+def rig_for_rendering(path: Path | None, size: tuple[int, int] | None) -> CameraRig:
+    """The rig of a calibration.json, or the default one, with pictures of `size` (width, height) where it is given.
+
+    Raises InputError where the file is wrong, or a camera's picture is too wide to be rendered through a pinhole.
+    """
+    rig = nuscenes_like_rig() if path is None else read_calibration(path)
+    if size is not None:
+        cameras = tuple(c.scaled(size[0] / c.width, size[1] / c.height) for c in rig.cameras)
+        rig = CameraRig(cameras, rig.ego_from_bev, rig.ego_from_bev_assumed)
+    for camera in rig.cameras:
+        if camera.distortion is not None:
+            try:
+                distortion_maps(camera)
+            except InputError as error:
+                raise InputError(f"{path}: camera {camera.name}: {error}") from None
+    return rig

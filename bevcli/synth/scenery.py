@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from bevcli.geometry.transforms import Array
 from bevcli.synth.buildings import House, houses, kerb_slab
 from bevcli.synth.city import CORNER_M, KERB_M, Block, CityPlan, rounded_rectangle
-from bevcli.synth.furniture import bench, bin_, bus_shelter, bush, hydrant, lamp_post, sign_post, tree
+from bevcli.synth.furniture import bench, bin_, bus_shelter, bush, hydrant, lamp_post, sign_post, signal_head, tree
 from bevcli.synth.landuse import landuse
 from bevcli.synth.mesh import Mesh, joined
 from bevcli.synth.triangles import Run, Soup, gather, make_run, place
@@ -27,6 +27,7 @@ class Furnishings:
         self.signs = [sign_post(k) for k in range(6)]
         self.small = [bench(), bin_(), hydrant()]
         self.shelter = bus_shelter()
+        self.signals = {light: signal_head(light) for light in ("red", "yellow", "green")}
 
 
 class Scenery:
