@@ -42,8 +42,8 @@ def mini_config() -> BEVFormerConfig:
         bev_grid=BevGrid(rows=12, columns=10, x_range_m=(-25, 25), y_range_m=(-30, 30)),
         channels=32,
         backbone=ResNetConfig(blocks=(1, 1, 1, 1), width=8),
-        encoder=EncoderConfig(layers=2, heads=4, feed_forward_width=64),
-        decoder=DecoderConfig(layers=2, heads=4, queries=30, feed_forward_width=64, max_boxes=20),
+        encoder=EncoderConfig(layers=2, attention_heads=4, feed_forward_width=64),
+        decoder=DecoderConfig(layers=2, attention_heads=4, queries=30, feed_forward_width=64, max_boxes=20),
     )
 
 

@@ -20,11 +20,13 @@ from bevcli.pipeline.model_loading import LoadedModel
 from bevcli.pipeline.preprocess import Preprocessor
 from bevcli.pipeline.runner import Runner, StepOptions
 from bevcli.sequences.boxes_file import BoxesWriter, FrameBoxes
+from bevcli.sequences.map_file import write_map
 from bevcli.viz.options import RecordingOptions
 from bevcli.viz.recording import Recording
 
 UNTRAINED = "UNTRAINED: the weights are random, and so are the boxes"
-OUTPUTS = ("recording.rrd", "predictions.json", "summary.json", "results_nusc.json")
+MAPS = "segmentation"
+OUTPUTS = ("recording.rrd", "predictions.json", "summary.json", "results_nusc.json", f"{MAPS}/map.json")
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,8 @@ def run_job(job: Job, *, force: bool) -> None:
             recording_began = time.perf_counter()
             recording.log(frame, prediction, prediction.attention)
             boxes.write(_frame_boxes(frame, prediction, world=job.drive.has_ego_motion))
+            if prediction.segmentation is not None:
+                write_map(job.out / MAPS, frame.stamp.index, prediction.segmentation)
             if job.save_bev is not None and prediction.bev is not None:
                 save_bev(job.save_bev, prediction, {"model": runner.config.name, "untrained": job.loaded.untrained})
             now = time.perf_counter()
@@ -79,8 +83,8 @@ def prepare_folder(out: Path, *, force: bool) -> None:
         raise OutputError(f"{out}: exists already; say --force to overwrite it, or --out DIR for another folder")
     try:
         out.mkdir(parents=True, exist_ok=True)
-        for name in OUTPUTS:
-            (out / name).unlink(missing_ok=True)
+        for path in (*(out / name for name in OUTPUTS), *(out / MAPS).glob("[0-9]*.png")):
+            path.unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"{out}: cannot be written ({error.strerror})") from None
 

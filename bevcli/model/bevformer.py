@@ -21,6 +21,7 @@ from bevcli.model.image_config import ImageConfig
 from bevcli.model.image_tokens import ImageTokens, ImageTokensConfig
 from bevcli.model.pillar_projection import PillarProjection, find_hits, project_pillars
 from bevcli.model.resnet import ResNet, ResNetConfig
+from bevcli.model.segmentation_head import SegmentationConfig, SegmentationHead, SegmentationOutputs
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,7 @@ class BEVFormerConfig:
     rate_hz: frames a second that the model was trained on.
     max_gap_s: a longer time between two frames starts the history anew.
     channels: of every token and query, C.
+    heads: what the BEV map is read by; "segmentation" adds the head that `segmentation` configures.
     """
 
     name: str
@@ -42,13 +44,14 @@ class BEVFormerConfig:
     rate_hz: float = 2.0
     max_gap_s: float = 2.0
     channels: int = 256
-    heads: tuple[Literal["detection"], ...] = ("detection",)
+    heads: tuple[Literal["detection", "segmentation"], ...] = ("detection",)
     backbone: ResNetConfig = field(default_factory=ResNetConfig)
     neck: FPNConfig = field(default_factory=FPNConfig)
     image_tokens: ImageTokensConfig = field(default_factory=ImageTokensConfig)
     ego_motion: EgoMotionConfig = field(default_factory=EgoMotionConfig)
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     decoder: DecoderConfig = field(default_factory=DecoderConfig)
+    segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
 
     def __post_init__(self) -> None:
         grid, levels = self.bev_grid, self.neck.levels
@@ -58,7 +61,11 @@ class BEVFormerConfig:
             raise ValueError("bev_grid: each range goes from a smaller to a larger number")
         if not (self.classes and self.cameras) or min(self.channels, self.rate_hz, self.max_gap_s) <= 0:
             raise ValueError("classes and cameras must not be empty, channels, rate_hz and max_gap_s must be positive")
-        divisors = (2, self.encoder.attention_heads, self.decoder.attention_heads)
+        if "detection" not in self.heads or len(set(self.heads)) < len(self.heads):
+            raise ValueError('heads must name "detection", and no head twice')
+        divisors = [2, self.encoder.attention_heads, self.decoder.attention_heads]
+        if "segmentation" in self.heads:
+            divisors.append(self.segmentation.attention_heads)
         if any(self.channels % divisor for divisor in divisors):
             raise ValueError(f"channels is {self.channels}; it must be even and a multiple of the attention_heads")
         if self.encoder.spatial_points % grid.pillar_points:
@@ -98,11 +105,13 @@ class BEVFormerOutputs:
 
     class_logits: (L, B, Q, classes), one a decoder layer.
     box_codes: (L, B, Q, 10) cx, cy, log w, log l, cz, log h, sin, cos, vx, vy; centres in metres, bev frame.
+    segmentation: of the segmentation head, None without one.
     """
 
     bev: Tensor
     class_logits: Tensor
     box_codes: Tensor
+    segmentation: SegmentationOutputs | None = None
 
 
 class BEVFormer(nn.Module):
@@ -122,6 +131,8 @@ class BEVFormer(nn.Module):
         self.encoder = Encoder(config.encoder, channels, levels, grid, config.ego_motion.history_shift)
         self.decoder = Decoder(config.decoder, channels, bev_shape)
         self.detection_head = DetectionHead(config.decoder.layers, channels, len(config.classes), grid)
+        wanted = "segmentation" in config.heads
+        self.segmentation_head = SegmentationHead(config.segmentation, channels, bev_shape) if wanted else None
         pillars = torch.as_tensor(grid.pillars(), dtype=torch.float32).flatten(0, 1)  # (Y·X, Z, 3)
         self.register_buffer("pillars", pillars, persistent=False)
 
@@ -146,7 +157,10 @@ class BEVFormer(nn.Module):
         # Boxes are refined in steps finer than half precision can tell.
         with torch.autocast(bev.device.type, enabled=False):
             class_logits, box_codes = self.decoder(bev.float(), self.detection_head)
-        return BEVFormerOutputs(bev, class_logits, box_codes)
+            segmentation = None
+            if self.segmentation_head is not None:
+                segmentation = self.segmentation_head(bev.float(), self.bev_queries.position())
+        return BEVFormerOutputs(bev, class_logits, box_codes, segmentation)
 
     def project_pillars(self, inputs: BEVFormerInputs) -> PillarProjection:
         """Where the pillars appear in the cameras of these inputs, and where they are visible."""

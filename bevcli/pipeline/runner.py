@@ -11,13 +11,14 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from bevcli.frame import AttentionView, Frame, FrameStamp, Prediction, Sequence
+from bevcli.frame import AttentionView, BevMap, Frame, FrameStamp, Prediction, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
 from bevcli.model.attention_probe import AttentionProbe
-from bevcli.model.bevformer import BEVFormer, BEVFormerInputs
+from bevcli.model.bevformer import BEVFormer, BEVFormerInputs, BEVFormerOutputs
 from bevcli.model.box_coding import decode
 from bevcli.model.ego_motion_inputs import ego_motion_inputs
+from bevcli.model.panoptic_merging import decode_maps
 from bevcli.pipeline.attention import attention_view, probe_cells
 from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
 from bevcli.pipeline.read_ahead import read_ahead
@@ -75,8 +76,9 @@ class Runner:
             outputs = self.model(inputs, None if state is None else state.bev, probe)
         boxes = decode(outputs, self.config)[0]
         self.clock.mark("box_decoding")
+        segmentation = self._segmentation(outputs)
         view = None if probe is None else attention_view(probe, prepared, self.config)
-        prediction = self._prediction(frame, started_anew, boxes, outputs.bev[0], view)
+        prediction = self._prediction(frame, started_anew, boxes, outputs.bev[0], view, segmentation)
         return BevState(outputs.bev, frame.world_from_ego, frame.stamp), prediction
 
     def run(
@@ -129,6 +131,14 @@ class Runner:
         cells = probe_cells(self.options.probes, self.config.bev_grid)
         return AttentionProbe(layer=self.config.encoder.layers - 1, cells=cells.to(self.device))
 
+    def _segmentation(self, outputs: BEVFormerOutputs) -> BevMap | None:
+        if outputs.segmentation is None:
+            return None
+        grid = self.config.bev_grid
+        bev_map = decode_maps(outputs.segmentation, self.config.segmentation, grid)[0].bev_map(grid)
+        self.clock.mark("map_merging")
+        return bev_map
+
     def _autocast(self) -> contextlib.AbstractContextManager[object]:
         if self.options.precision == "fp32":
             return contextlib.nullcontext()
@@ -141,6 +151,7 @@ class Runner:
         boxes: Boxes3D,
         bev: Tensor | None,
         attention: AttentionView | None = None,
+        segmentation: BevMap | None = None,
     ) -> Prediction:
         return Prediction(
             stamp=frame.stamp,
@@ -151,6 +162,7 @@ class Runner:
             bev=bev,
             started_anew=started_anew,
             skipped=bev is None,
+            segmentation=segmentation,
             attention=attention,
             stage_seconds={} if bev is None else self.clock.read(),
         )

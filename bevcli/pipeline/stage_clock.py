@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import torch
 from torch import nn
 
-STAGES = ("backbone", "neck", "encoder", "decoder")
+STAGES = ("backbone", "neck", "encoder", "decoder", "segmentation_head")
 
 
 class StageClock:
@@ -18,8 +18,9 @@ class StageClock:
         self._device = device
         self._last = 0.0
         self._seconds: dict[str, float] = {}
-        for name in STAGES:
-            model.get_submodule(name).register_forward_hook(lambda *_, name=name: self.mark(name))
+        for name, module in model.named_children():
+            if name in STAGES:
+                module.register_forward_hook(lambda *_, name=name: self.mark(name))
 
     def start(self) -> None:
         """A new step begins now."""

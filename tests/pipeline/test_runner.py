@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -5,6 +7,7 @@ from conftest import MemorySequence, WithoutPictures, make_rig
 
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import apply
+from bevcli.model.bevformer import BEVFormer
 from bevcli.pipeline.camera_assignment import NUSCENES_YAWS_DEG
 from bevcli.pipeline.preprocess import Preprocessor
 from bevcli.pipeline.runner import Runner, StepOptions
@@ -104,3 +107,11 @@ def test_every_stage_is_timed(mini_model):
     prediction = run(mini_model, MemorySequence(1))[0][0]
     assert list(prediction.stage_seconds) == ["backbone", "neck", "encoder", "decoder", "box_decoding"]
     assert all(seconds > 0 for seconds in prediction.stage_seconds.values())
+
+
+def test_a_segmentation_head_fills_the_prediction(mini_config):
+    torch.manual_seed(0)
+    model = BEVFormer(replace(mini_config, heads=("detection", "segmentation")))
+    predictions, _ = run(model, MemorySequence(2))
+    assert [prediction.segmentation.cells.shape for prediction in predictions] == [(12, 10)] * 2
+    assert list(predictions[0].stage_seconds)[-3:] == ["segmentation_head", "box_decoding", "map_merging"]

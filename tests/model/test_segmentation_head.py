@@ -1,0 +1,106 @@
+"""The segmentation head: shapes, what its parts respond to, and the rules by which masks become a map."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from small_model import small_config, small_inputs, small_model
+
+from bevcli.geometry.bev_grid import BevGrid
+from bevcli.model.mask_decoder import MaskDecoderLayer
+from bevcli.model.panoptic_merging import PanopticMap, decode_maps, merge
+from bevcli.model.segmentation_head import SegmentationConfig, SegmentationHead, SegmentationOutputs
+
+BOTH = ("detection", "segmentation")
+SEGMENTATION = SegmentationConfig(5, location_layers=2, mask_layers=3, attention_heads=4, feed_forward_width=48)
+
+
+def test_one_forward_pass_serves_both_heads() -> None:
+    outputs = small_model(heads=BOTH, segmentation=SEGMENTATION)(small_inputs(batch=2))
+    assert outputs.class_logits.shape == (2, 2, 12, 3)
+    assert outputs.segmentation is not None
+    assert outputs.segmentation.mask_logits.shape == (3, 2, 3 + 5, 48)
+    assert outputs.segmentation.class_logits.shape == (3, 2, 3 + 5)
+    assert outputs.segmentation.locations.shape == (2, 2, 5, 4)
+
+
+def test_without_the_head_there_is_no_segmentation_and_no_weight_of_it() -> None:
+    model = small_model()
+    assert model(small_inputs()).segmentation is None
+    assert not [key for key in model.state_dict() if "segmentation" in key]
+
+
+def test_locations_lie_on_the_map() -> None:
+    locations = SegmentationHead(SEGMENTATION, 32, (6, 8))(torch.randn(2, 48, 32), torch.randn(48, 32)).locations
+    assert ((locations >= 0) & (locations <= 1)).all()
+
+
+def test_a_mask_is_where_its_query_attends() -> None:
+    layer = MaskDecoderLayer(channels=8, heads=2, feed_forward_width=8, dropout=0.0)
+    with torch.no_grad():
+        for projection in (layer.query_projection, layer.key_projection):
+            projection.weight.copy_(torch.eye(8))
+            projection.bias.zero_()
+        layer.mask_projection.weight.copy_(torch.tensor([[1.0, 2.0]]))
+        layer.mask_projection.bias.zero_()
+    query, bev = torch.zeros(1, 1, 8), torch.zeros(1, 3, 8)
+    query[0, 0] = torch.tensor([1.0, 0, 0, 0, 1, 0, 0, 0])
+    bev[0, 1, 0] = 6.0  # found by the first head, which counts once
+    bev[0, 2, 4] = 6.0  # found by the second, which counts twice
+    _, masks, _ = layer(query, torch.zeros(3, 8), bev)
+    assert masks[0, 0].tolist() == pytest.approx([0, 6 / math.sqrt(4), 2 * 6 / math.sqrt(4)])
+
+
+def masks_of(*rows: list[float]) -> np.ndarray:
+    """Masks over a map of one row."""
+    return np.array(rows)[:, None, :]
+
+
+def test_the_surer_mask_is_laid_down_first_and_later_ones_keep_what_is_free() -> None:
+    masks = masks_of([0.9, 0.9, 0.9, 0.0], [0.0, 0.0, 0.8, 0.8])
+    config = SegmentationConfig(min_free_share=0.5)
+    assert merge(masks, np.array([0.9, 0.9]), config).tolist() == [[0, 0, 0, 1]]
+    assert merge(masks, np.array([0.6, 0.99]), config).tolist() == [[0, 0, 1, 1]]
+
+
+def test_a_mask_of_which_too_little_is_left_is_dropped() -> None:
+    masks = masks_of([0.9, 0.9, 0.9, 0.0], [0.0, 0.8, 0.8, 0.8])
+    assert merge(masks, np.array([0.9, 0.9]), SegmentationConfig(min_free_share=0.6)).tolist() == [[0, 0, 0, -1]]
+
+
+def test_confidence_is_the_class_times_the_square_of_the_mean_mask() -> None:
+    masks = masks_of([0.8, 0.8, 0.2])  # mean over 0.5 is 0.8: 0.5 · 0.64 = 0.32
+    assert merge(masks, np.array([0.5]), SegmentationConfig(min_confidence=0.31)).tolist() == [[0, 0, -1]]
+    assert merge(masks, np.array([0.5]), SegmentationConfig(min_confidence=0.33)).tolist() == [[-1, -1, -1]]
+
+
+def test_an_empty_mask_takes_nothing() -> None:
+    assert merge(masks_of([0.1, 0.2]), np.array([1.0]), SegmentationConfig(min_confidence=0.0)).max() == -1
+
+
+def test_a_map_is_written_with_its_bits_and_ahead_on_top() -> None:
+    grid = BevGrid(2, 3, x_range_m=(-3, 3), y_range_m=(-2, 2))
+    logits = torch.full((1, 1, 5, 6), -9.0)
+    logits[0, 0, 0, :3] = 9.0  # the road: the row behind the vehicle
+    logits[0, 0, 2, 1] = 9.0  # a crossing on it
+    logits[0, 0, 4, [1, 4]] = 9.0  # a vehicle on both rows
+    outputs = SegmentationOutputs(logits, torch.full((1, 1, 5), 9.0), torch.zeros(1, 1, 2, 4))
+    panoptic = decode_maps(outputs, SegmentationConfig(), grid)[0]
+    assert panoptic.things.tolist() == [[-1, 1, -1], [-1, 1, -1]]
+    bev_map = panoptic.bev_map(grid)
+    assert bev_map.cells.tolist() == [[0, 8, 0], [1, 1 + 4 + 8, 1]]
+    assert (bev_map.x_range_m, bev_map.y_range_m) == ((-3, 3), (-2, 2))
+
+
+def test_vehicles_keep_their_identity_and_stuff_lies_upon_stuff() -> None:
+    stuff = np.array([[[True, True]], [[True, False]], [[False, False]]])
+    panoptic = PanopticMap(stuff, np.array([[4, 7]]))
+    assert panoptic.bev_map(BevGrid(1, 2)).cells.tolist() == [[1 + 2 + 8, 1 + 8]]
+
+
+def test_heads_without_detection_are_refused() -> None:
+    with pytest.raises(ValueError, match="heads must name"):
+        small_config(heads=("segmentation",))
