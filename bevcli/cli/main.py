@@ -13,6 +13,7 @@ import typer
 
 from bevcli import __version__
 from bevcli.cli.convert import convert
+from bevcli.cli.eval import evaluate
 from bevcli.cli.project_debug import project_debug
 from bevcli.cli.run import run
 from bevcli.cli.weights import weights_app
@@ -42,6 +43,7 @@ def root(
 
 
 app.command()(convert)
+app.command("eval")(evaluate)
 app.command()(project_debug)
 app.command()(run)
 app.add_typer(weights_app, name="weights")

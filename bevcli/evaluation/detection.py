@@ -115,7 +115,7 @@ def _visibility_recall(matches: Sequence[ClassMatches], row: int, low: float, hi
     counts = {}
     for part in matches:
         visibility = _visibilities(part)
-        inside = (visibility >= low) & ((visibility < high) | (visibility == high == 1))
+        inside = (visibility >= low) & (visibility < (high if high < 1 else np.inf))
         counts[part.name] = (int(part.found(row)[inside].sum()), int(inside.sum()))
     return VisibilityRecall(
         low,

@@ -4,38 +4,43 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.transforms import Array, Pose, inverse
 from bevcli.sequences.boxes_file import BoxesFile, FrameBoxes
 
 
 @dataclass(frozen=True)
 class FramePairs:
-    """F frames that both sides have, in the predictions' order.
+    """F frames that are scored, in the predictions' order.
 
-    predictions, ground_truth: boxes by frame, in one frame of reference ("world", "ego" or "bev"). ego_xy: (F, 2)
-    where the ego vehicle stands in it. prediction_stamps, ground_truth_stamps: when, by each side's own count.
-    ego_pose_known: a pose stands with every frame, on one side at least.
+    frame_of_reference: "world", "ego" or "bev", of all boxes here. predictions, ground_truth: boxes by frame.
+    reference_from_ego: (F, 4, 4) where the ego vehicle stands in it. ego_pose_known: one side at least states poses.
+    prediction_stamps, ground_truth_stamps: when, by each side's own count. sample_tokens: of the ground truth.
     matched_by: what the frames agree in. notes: what the user should know of it, one line each.
     """
 
     frame_of_reference: str
     predictions: tuple[Boxes3D, ...]
     ground_truth: tuple[Boxes3D, ...]
-    ego_xy: Array
+    reference_from_ego: Array
+    ego_pose_known: bool
     prediction_stamps: tuple[FrameStamp, ...]
     ground_truth_stamps: tuple[FrameStamp, ...]
-    ego_pose_known: bool
+    sample_tokens: tuple[str | None, ...]
     matched_by: str
-    predictions_left_out: int
-    ground_truth_left_out: int
     notes: tuple[str, ...]
+
+    @property
+    def ego_xy(self) -> Array:
+        """(F, 2) the ego vehicle's place in the frame of reference, metres."""
+        return self.reference_from_ego[:, :2, 3]
 
 
 # What may identify a frame, the surest first; the first one that both sides have in common is taken.
@@ -49,32 +54,38 @@ _KEYS: tuple[tuple[str, Callable[[FrameBoxes], Hashable]], ...] = (
 _SURE = ("sample_token", "scene and timestamp_ns")
 
 
-def pair_frames(predictions: BoxesFile, ground_truth: BoxesFile) -> FramePairs:
+def pair_frames(predictions: BoxesFile, ground_truth: BoxesFile, *, count_missing: bool = False) -> FramePairs:
     """Bring two files together.
 
-    Frames on one side only are left out, and counted. Where one file is in the world and the other in the ego or
-    bev frame, all boxes move to the world. Raises InputError where no frame is common, or a pose for it is missing.
+    Frames on one side only are left out, and counted in the notes; with count_missing, those of the ground truth
+    stay as frames without any prediction. Where one file is in the world and the other in the ego or bev frame,
+    all boxes move to the world. Raises InputError where no frame is common, or a pose for the move is missing.
     """
     matched_by, pairs = _common_frames(predictions.frames, ground_truth.frames)
+    notes = _notes(matched_by, len(pairs), len(predictions.frames), len(ground_truth.frames), count_missing)
+    if count_missing:
+        paired = {id(true) for _, true in pairs}
+        missing = [true for true in ground_truth.frames if id(true) not in paired]
+        pairs += [(replace(true, world_from_ego=None, boxes=Boxes3D.empty()), true) for true in missing]
     reference = _common_frame_of_reference(predictions, ground_truth)
-    found, truth, ego = [], [], []
-    for prediction, true in pairs:
-        pose = true.world_from_ego or prediction.world_from_ego
-        found.append(_moved(prediction, predictions, reference, prediction.world_from_ego or pose))
-        truth.append(_moved(true, ground_truth, reference, pose))
-        ego.append(_ego_xy(reference, pose, predictions.ego_from_bev or ground_truth.ego_from_bev))
+    ego_from_bev = predictions.ego_from_bev or ground_truth.ego_from_bev
+    poses = [true.world_from_ego or prediction.world_from_ego for prediction, true in pairs]
     return FramePairs(
         frame_of_reference=reference,
-        predictions=tuple(found),
-        ground_truth=tuple(truth),
-        ego_xy=np.array(ego),
+        predictions=tuple(
+            _moved(prediction, predictions, reference, prediction.world_from_ego or pose)
+            for (prediction, _), pose in zip(pairs, poses, strict=True)
+        ),
+        ground_truth=tuple(
+            _moved(true, ground_truth, reference, pose) for (_, true), pose in zip(pairs, poses, strict=True)
+        ),
+        reference_from_ego=np.stack([_reference_from_ego(reference, pose, ego_from_bev) for pose in poses]),
+        ego_pose_known=all(pose is not None for pose in poses),
         prediction_stamps=tuple(prediction.stamp for prediction, _ in pairs),
         ground_truth_stamps=tuple(true.stamp for _, true in pairs),
-        ego_pose_known=all(one.world_from_ego or other.world_from_ego for one, other in pairs),
+        sample_tokens=tuple(true.extras.get("sample_token") for _, true in pairs),
         matched_by=matched_by,
-        predictions_left_out=len(predictions.frames) - len(pairs),
-        ground_truth_left_out=len(ground_truth.frames) - len(pairs),
-        notes=_notes(matched_by, len(pairs), len(predictions.frames), len(ground_truth.frames)),
+        notes=notes,
     )
 
 
@@ -136,21 +147,22 @@ def _moved(frame: FrameBoxes, file: BoxesFile, reference: str, world_from_ego: P
     return frame.boxes.transformed(world_from_ego.matrix @ ego_from_boxes)
 
 
-def _ego_xy(reference: str, world_from_ego: Pose | None, ego_from_bev: Pose | None) -> Array:
+def _reference_from_ego(reference: str, world_from_ego: Pose | None, ego_from_bev: Pose | None) -> Array:
     if reference == "world":
-        assert world_from_ego is not None
-        return world_from_ego.translation[:2]
-    if reference == "bev" and ego_from_bev is not None:
-        return inverse(ego_from_bev.matrix)[:2, 3]
-    return np.zeros(2)
+        assert world_from_ego is not None  # boxes could not have been moved without
+        return world_from_ego.matrix
+    if reference == "bev":
+        return inverse(ego_from_bev.matrix if ego_from_bev else default_ego_from_bev())
+    return np.eye(4)
 
 
-def _notes(matched_by: str, pairs: int, predictions: int, ground_truth: int) -> tuple[str, ...]:
+def _notes(matched_by: str, pairs: int, predictions: int, ground_truth: int, count_missing: bool) -> tuple[str, ...]:
     notes = []
     if matched_by not in _SURE:
         notes.append(f"times or scenes differ between the files: frames are matched by {matched_by}")
     if pairs < ground_truth:
-        notes.append(f"{ground_truth - pairs} of {ground_truth} ground-truth frames have no prediction: left out")
+        fate = "all their boxes count as missed" if count_missing else "left out (--count-missing counts them)"
+        notes.append(f"{ground_truth - pairs} of {ground_truth} ground-truth frames have no prediction: {fate}")
     if pairs < predictions:
         notes.append(f"{predictions - pairs} of {predictions} predicted frames have no ground truth: left out")
     return tuple(notes)

@@ -1,0 +1,119 @@
+"""What `bevcli eval` is given: predictions and ground truth, from files, folders or a nuScenes root."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from bevcli.errors import InputError
+from bevcli.evaluation.pairing import FramePairs
+from bevcli.frame import FrameStamp
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.transforms import Pose, apply, rigid, rotation_about_z
+from bevcli.sequences.boxes_file import BoxesFile, FrameBoxes, read_boxes
+from bevcli.sequences.map_file import MapFolder, open_maps
+from bevcli.sequences.nuscenes import NuScenesChoice, chosen_scenes, is_nuscenes_root, tables_of
+from bevcli.sequences.nuscenes_cache import open_index
+from bevcli.sequences.nuscenes_index import NuScenesIndex
+
+
+@dataclass(frozen=True)
+class ScoredInput:
+    """One side. maps: where there is a folder of them. bicycle_racks: in the world, by sample token."""
+
+    boxes: BoxesFile
+    maps: MapFolder | None = None
+    bicycle_racks: Mapping[str, Boxes3D] = field(default_factory=dict)
+
+
+def open_predictions(path: Path) -> ScoredInput:
+    """A boxes file with scores, or the folder of a run that holds predictions.json; maps in segmentation/ beside it.
+
+    Raises InputError where it is missing or wrong, or boxes have no scores.
+    """
+    file = path / "predictions.json" if path.is_dir() else path
+    boxes = read_boxes(file)
+    for frame in boxes.frames:
+        if len(frame.boxes) and frame.boxes.scores is None:
+            raise InputError(
+                f'{file}: frame {frame.stamp.index}: boxes have no "score" (expected in predictions): '
+                "is this a ground truth?"
+            )
+    return ScoredInput(boxes, _maps_beside(file, "segmentation"))
+
+
+def open_ground_truth(path: Path, choice: NuScenesChoice = NuScenesChoice()) -> ScoredInput:
+    """A boxes file, a native sequence folder with ground_truth.json, or a nuScenes root; maps beside the file.
+
+    choice: which part of a nuScenes root. Raises InputError where there is no ground truth, or it is wrong.
+    """
+    if path.is_dir() and is_nuscenes_root(path):
+        return _open_nuscenes(path, choice)
+    file = path / "ground_truth.json" if path.is_dir() else path
+    boxes = read_boxes(file)
+    if choice.scene is not None:
+        kept = tuple(frame for frame in boxes.frames if frame.stamp.scene == choice.scene)
+        if not kept:
+            raise InputError(f'{file}: has no scene "{choice.scene}"')
+        boxes = replace(boxes, frames=kept)
+    return ScoredInput(boxes, _maps_beside(file, "ground_truth_map"))
+
+
+def without_cycles_in_racks(pairs: FramePairs, bicycle_racks: Mapping[str, Boxes3D]) -> FramePairs:
+    """Leave out bicycles and motorcycles, found and true, whose middle is in a bicycle rack, as the devkit does.
+
+    bicycle_racks: in the world, as the pairs.
+    """
+    if not bicycle_racks:
+        return pairs
+    assert pairs.frame_of_reference == "world"
+    racks = [bicycle_racks.get(token or "", Boxes3D.empty()) for token in pairs.sample_tokens]
+    return replace(
+        pairs,
+        predictions=tuple(map(_outside, pairs.predictions, racks)),
+        ground_truth=tuple(map(_outside, pairs.ground_truth, racks)),
+    )
+
+
+def _outside(boxes: Boxes3D, racks: Boxes3D) -> Boxes3D:
+    cycles = np.isin(boxes.classes, ("bicycle", "motorcycle"))
+    if not len(racks) or not cycles.any():
+        return boxes
+    inside = np.zeros(len(boxes), dtype=bool)
+    for center, size, yaw in zip(racks.centers, racks.sizes_lwh, racks.yaws, strict=True):
+        rack_from_world = np.linalg.inv(rigid(center, rotation_about_z(float(yaw))))
+        inside |= (np.abs(apply(rack_from_world, boxes.centers)) <= size / 2).all(axis=1)
+    return boxes[~(cycles & inside)]
+
+
+def _maps_beside(file: Path, name: str) -> MapFolder | None:
+    folder = file.parent / name
+    return open_maps(folder) if folder.is_dir() else None
+
+
+def _open_nuscenes(root: Path, choice: NuScenesChoice) -> ScoredInput:
+    tables = tables_of(root, choice.version)
+    index, _ = open_index(tables)
+    frames: list[FrameBoxes] = []
+    racks = {}
+    for scene in chosen_scenes(index, tables, choice):
+        for sample in range(*index.scenes.first_sample[scene : scene + 2]):
+            frames.append(_nuscenes_frame(index, scene, sample, len(frames), tables))
+            racks[frames[-1].extras["sample_token"]] = index.bicycle_racks(sample)
+    return ScoredInput(BoxesFile("world", tuple(frames)), bicycle_racks=racks)
+
+
+def _nuscenes_frame(index: NuScenesIndex, scene: int, sample: int, number: int, tables: Path) -> FrameBoxes:
+    boxes = index.ground_truth(sample)
+    if boxes is None:
+        raise InputError(f"{tables}: has no annotations (the test split?): nothing to score against")
+    samples = index.samples
+    return FrameBoxes(
+        FrameStamp(number, str(index.scenes.names[scene]), int(samples.times_us[sample]) * 1000),
+        Pose(np.array(samples.translations[sample]), np.array(samples.quaternions[sample])),
+        boxes,
+        {"sample_token": samples.tokens[sample].decode()},
+    )
