@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import shutil
 from collections.abc import Mapping
+from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
@@ -46,8 +47,12 @@ class NativeWriter:
         self._motion: dict[int, tuple[Pose, Kinematics]] = {}
         self._scenes: dict[str, tuple[int, int]] = {}  # the first and last time of each
         self._boxes: BoxesWriter | None = None
-        self._table = (folder / "frames.csv").open("w", newline="", encoding="utf-8")
-        self._rows = csv.writer(self._table, lineterminator="\n")
+        self._open = ExitStack()
+        try:
+            table = self._open.enter_context((folder / "frames.csv").open("w", newline="", encoding="utf-8"))
+        except OSError as error:
+            raise OutputError(f"{folder / 'frames.csv'}: cannot be written ({error.strerror})") from None
+        self._rows = csv.writer(table, lineterminator="\n")
 
     def write(self, frame: Frame) -> None:
         """Append a frame."""
@@ -67,9 +72,7 @@ class NativeWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._table.close()
-        if self._boxes is not None:
-            self._boxes.__exit__(kind, error, trace)
+        self._open.close()
         if kind is None:
             self._finish()
 
@@ -137,7 +140,8 @@ class NativeWriter:
     def _write_boxes(self, frame: Frame) -> None:
         assert frame.ground_truth is not None
         if self._boxes is None:
-            self._boxes = BoxesWriter(self.folder / BOXES_FILE, "world" if self._with_ego_motion else "ego")
+            frame_of_reference = "world" if self._with_ego_motion else "ego"
+            self._boxes = self._open.enter_context(BoxesWriter(self.folder / BOXES_FILE, frame_of_reference))
         pose = frame.world_from_ego if self._with_ego_motion else None
         extras = {"sample_token": frame.sample_token} if frame.sample_token else {}
         self._boxes.write(FrameBoxes(frame.stamp, pose, frame.ground_truth, extras))

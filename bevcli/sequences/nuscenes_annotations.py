@@ -9,7 +9,16 @@ from numpy.typing import NDArray
 
 from bevcli.geometry.transforms import Array
 from bevcli.sequences.nuscenes_index import Annotations, Ints
-from bevcli.sequences.nuscenes_json import Row, column, places_of, read_batches, read_rows, tokens
+from bevcli.sequences.nuscenes_json import (
+    Row,
+    column,
+    integers,
+    places_of,
+    read_batches,
+    read_rows,
+    tokens,
+    vectors,
+)
 
 MAX_GAP_S = 1.5  # between two annotations of an object, for its velocity to be known
 
@@ -67,7 +76,6 @@ def _columns(rows: list[Row], path: Path, names: _Names) -> dict[str, NDArray]:
     instances = column(rows, "instance_token", path)
     attributes = column(rows, "attribute_tokens", path)
     visibilities = column(rows, "visibility_token", path)
-    points = zip(column(rows, "num_lidar_pts", path), column(rows, "num_radar_pts", path), strict=True)
     return {
         "tokens": tokens(rows, "token", path),
         "samples": tokens(rows, "sample_token", path),
@@ -76,11 +84,11 @@ def _columns(rows: list[Row], path: Path, names: _Names) -> dict[str, NDArray]:
         "categories": np.array([names.category.get(token, b"") for token in instances]),
         "attributes": np.array([names.attribute.get(own[0], b"") if own else b"" for own in attributes]),
         "instances": np.array(instances, dtype="S"),
-        "centers": np.array(column(rows, "translation", path), dtype=np.float64),
-        "sizes_wlh": np.array(column(rows, "size", path), dtype=np.float64),
-        "quaternions": np.array(column(rows, "rotation", path), dtype=np.float64),
+        "centers": vectors(rows, "translation", path, 3),
+        "sizes_wlh": vectors(rows, "size", path, 3),
+        "quaternions": vectors(rows, "rotation", path, 4),
         "visibilities": np.array([names.visibility.get(token, np.nan) for token in visibilities]),
-        "num_points": np.array([lidar + radar for lidar, radar in points], dtype=np.int64),
+        "num_points": integers(rows, "num_lidar_pts", path) + integers(rows, "num_radar_pts", path),
     }
 
 

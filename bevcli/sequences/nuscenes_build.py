@@ -15,10 +15,12 @@ from bevcli.sequences.nuscenes_index import Ints, NuScenesIndex, Pictures, Sampl
 from bevcli.sequences.nuscenes_json import (
     Row,
     column,
+    integers,
     places_of,
     read_batches,
     read_rows,
     tokens,
+    vectors,
     without_garbage_collection,
 )
 
@@ -89,8 +91,8 @@ def _read_sensors(tables: Path) -> tuple[NDArray[np.bytes_], Sensors]:
     none = np.full((3, 3), np.nan)
     sensors = Sensors(
         np.array([channels.get(token, "") for token in column(rows, "sensor_token", path)], dtype=np.str_),
-        np.array(column(rows, "translation", path), dtype=np.float64),
-        np.array(column(rows, "rotation", path), dtype=np.float64),
+        vectors(rows, "translation", path, 3),
+        vectors(rows, "rotation", path, 4),
         np.array([row.get("camera_intrinsic") or none for row in rows], dtype=np.float64),
     )
     return tokens(rows, "token", path), sensors
@@ -103,7 +105,7 @@ def _read_samples(tables: Path) -> tuple[NDArray[np.str_], NDArray[np.bytes_], I
     if not scenes or not rows:
         raise InputError(f"{path if scenes else scene_path}: the table has no rows")
     in_scene = places_of(tokens(rows, "scene_token", path), tokens(scenes, "token", scene_path), scene_path)
-    times = np.array(column(rows, "timestamp", path), dtype=np.int64)
+    times = integers(rows, "timestamp", path)
     order = np.lexsort((times, in_scene))
     names = np.array(column(scenes, "name", scene_path), dtype=np.str_)
     return names, tokens(rows, "token", path)[order], times[order], in_scene[order]
@@ -133,17 +135,16 @@ def _read_sensor_data(
 def _sensor_data_of(
     rows: list[Row], path: Path, sample_tokens: NDArray[np.bytes_], sensor_tokens: NDArray[np.bytes_]
 ) -> _SensorData:
-    sizes = list(zip(column(rows, "width", path), column(rows, "height", path), strict=True))
     return _SensorData(
         samples=places_of(tokens(rows, "sample_token", path), sample_tokens, path.with_name("sample.json")),
         sensors=places_of(
             tokens(rows, "calibrated_sensor_token", path), sensor_tokens, path.with_name("calibrated_sensor.json")
         ),
         poses=tokens(rows, "ego_pose_token", path),
-        times_us=np.array(column(rows, "timestamp", path), dtype=np.int64),
-        keys=np.array(column(rows, "is_key_frame", path), dtype=bool),
-        sizes=np.array([(width or 0, height or 0) for width, height in sizes], dtype=np.int64),
-        files=np.array([name.encode() for name in column(rows, "filename", path)]),
+        times_us=integers(rows, "timestamp", path),
+        keys=integers(rows, "is_key_frame", path).astype(bool),
+        sizes=np.stack([integers(rows, "width", path), integers(rows, "height", path)], axis=1),
+        files=np.array([str(name).encode() for name in column(rows, "filename", path)]),
     )
 
 
@@ -156,8 +157,8 @@ def _read_poses(tables: Path, wanted: NDArray[np.bytes_]) -> tuple[Array, Array]
         rows = [row for row, token in zip(batch, column(batch, "token", path), strict=True) if token in needed]
         if rows:
             found.append(tokens(rows, "token", path))
-            translations.append(np.array(column(rows, "translation", path), dtype=np.float64))
-            quaternions.append(np.array(column(rows, "rotation", path), dtype=np.float64))
+            translations.append(vectors(rows, "translation", path, 3))
+            quaternions.append(vectors(rows, "rotation", path, 4))
     places = places_of(wanted, np.concatenate(found) if found else np.zeros(0, "S32"), path)
     chosen = np.concatenate(quaternions)[places]
     return np.concatenate(translations)[places], chosen / np.linalg.norm(chosen, axis=1, keepdims=True)

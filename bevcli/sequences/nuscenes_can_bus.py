@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.errors import InputError
 from bevcli.geometry.ego_motion import Kinematics
 from bevcli.geometry.transforms import Array
-from bevcli.sequences.nuscenes_json import column, read_rows
+from bevcli.sequences.nuscenes_json import integers, read_rows, vectors
 
 
 @dataclass(frozen=True)
@@ -37,9 +36,7 @@ def read_can_bus(root: Path, scene: str) -> CanBus | None:
     rows = read_rows(path)
     if not rows:
         return None
-    times = np.array(column(rows, "utime", path), dtype=np.int64)
-    vectors = [np.array(column(rows, name, path), dtype=np.float64) for name in ("accel", "rotation_rate", "vel")]
-    if any(values.shape != (len(rows), 3) or not np.isfinite(values).all() for values in vectors):
-        raise InputError(f"{path}: expected three finite numbers in each accel, rotation_rate and vel")
+    times = integers(rows, "utime", path)
+    quantities = [vectors(rows, name, path, 3) for name in ("accel", "rotation_rate", "vel")]
     order = np.argsort(times, kind="stable")
-    return CanBus(times[order], *(values[order] for values in vectors))
+    return CanBus(times[order], *(values[order] for values in quantities))

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
+from bevcli.geometry.transforms import Array
 
 Row: TypeAlias = dict[str, Any]
 BATCH_BYTES = 16 << 20
@@ -62,6 +63,25 @@ def column(rows: list[Row], name: str, path: Path) -> list[Any]:
         return [row[name] for row in rows]
     except (KeyError, TypeError):
         raise InputError(f'{path}: a row has no "{name}" (expected a nuScenes table)') from None
+
+
+def integers(rows: list[Row], name: str, path: Path) -> NDArray[np.int64]:
+    """A column of integers as (N,). Raises InputError where one is none."""
+    values = np.array(column(rows, name, path))
+    if len(values) and (values.ndim != 1 or values.dtype.kind not in "iub"):
+        raise InputError(f'{path}: "{name}": expected an integer in every row')
+    return values.astype(np.int64)
+
+
+def vectors(rows: list[Row], name: str, path: Path, size: int) -> Array:
+    """A column of `size` numbers as (N, size). Raises InputError where one has others, or a number is not finite."""
+    try:
+        values = np.array(column(rows, name, path), dtype=np.float64)
+    except (ValueError, TypeError):
+        values = np.full((1, 0), np.nan)
+    if values.shape != (len(rows), size) or not np.isfinite(values).all():
+        raise InputError(f'{path}: "{name}": expected {size} finite numbers in every row')
+    return values
 
 
 def tokens(rows: list[Row], name: str, path: Path) -> NDArray[np.bytes_]:

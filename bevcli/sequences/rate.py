@@ -11,6 +11,7 @@ from bevcli.frame import FrameStamp
 
 # Between these ratios to the wanted rate a scene counts as being at that rate: keyframe times jitter.
 SLOWEST_RATIO, FASTEST_RATIO = 0.75, 1.5
+HOLE_BEATS = 1.5  # a gap longer than so many beats is a hole
 
 
 @dataclass(frozen=True)
@@ -57,14 +58,23 @@ def median_rate_hz(times_ns: np.ndarray) -> float:
 
 
 def _nearest_to_beat(times_ns: np.ndarray, rate_hz: float) -> list[int]:
+    """The beat starts anew after a hole in the recording: there is no frame for the beats in it."""
     seconds = (times_ns - times_ns[0]) / 1e9
-    beats = np.arange(0, seconds[-1] + 0.5 / rate_hz, 1 / rate_hz)
+    holes = np.flatnonzero(np.diff(seconds) > HOLE_BEATS / rate_hz) + 1
+    kept: list[int] = []
+    for piece in np.split(np.arange(len(seconds)), holes):
+        kept += (piece[0] + _nearest_in_piece(seconds[piece] - seconds[piece[0]], rate_hz)).tolist()
+    return kept
+
+
+def _nearest_in_piece(seconds: np.ndarray, rate_hz: float) -> np.ndarray:
+    if len(seconds) == 1:
+        return np.zeros(1, dtype=np.int64)
+    end = seconds[-1] + 0.5 * np.median(np.diff(seconds))  # a later beat has no frame, and the last is not its own
+    beats = np.arange(0, end, 1 / rate_hz)
     later = np.clip(np.searchsorted(seconds, beats), 1, len(seconds) - 1)
     earlier = later - 1
-    nearest = np.where(beats - seconds[earlier] <= seconds[later] - beats, earlier, later)
-    # A beat in a hole of the recording has no frame of its own: its nearest one belongs to another beat.
-    near = np.abs(seconds[nearest] - beats) <= 0.5 / rate_hz
-    return np.unique(nearest[near]).tolist()
+    return np.unique(np.where(beats - seconds[earlier] <= seconds[later] - beats, earlier, later))
 
 
 def _note(total: int, kept: int, slowest_ratio: float, rate_hz: float) -> str:

@@ -1,0 +1,134 @@
+"""`bevcli convert`: what was an input of any kind is read back the same as a native folder."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from conftest import CAMERAS, picture_of
+from typer.testing import CliRunner
+
+from bevcli.cli.main import app
+from bevcli.errors import InputError, OutputError
+from bevcli.frame import BevMap
+from bevcli.sequences.map_file import write_map
+from bevcli.sequences.native_writer import NativeWriter
+from bevcli.sequences.open import InputOptions, open_sequence
+
+
+def convert(*arguments):
+    return CliRunner().invoke(app, ["convert", *map(str, arguments)], catch_exceptions=True)
+
+
+def test_a_gap_and_the_order_of_cameras_are_kept(edit, tmp_path):
+    drive = edit("frames.csv", "images/CAM_BACK/1.png", "")
+    assert convert(drive, tmp_path / "out").exit_code == 0
+    one, other = open_sequence(drive), open_sequence(tmp_path / "out")
+    assert one.stamps == other.stamps
+    for place in range(4):
+        a, b = one.load(place), other.load(place)
+        assert list(a.pictures) == list(b.pictures)
+        assert a.dropped == b.dropped
+        assert a.rig.names == b.rig.names
+        for camera, picture in a.pictures.items():
+            assert picture.encoded == b.pictures[camera].encoded
+            np.testing.assert_allclose(
+                a.world_from_ego_at[camera].matrix, b.world_from_ego_at[camera].matrix, atol=1e-9
+            )
+        np.testing.assert_allclose(a.kinematics.velocity, b.kinematics.velocity, atol=1e-12)
+
+
+def test_maps_come_along(drive, tmp_path):
+    cells = np.random.default_rng(0).integers(0, 16, (20, 20), dtype=np.uint8)
+    write_map(drive / "ground_truth_map", 11, BevMap(cells, (-10.0, 10.0), (-10.0, 10.0)))
+    convert(drive, tmp_path / "out")
+    sequence = open_sequence(tmp_path / "out")
+    np.testing.assert_array_equal(sequence.load(1).ground_truth_map.cells, cells)
+    assert sequence.load(0).ground_truth_map is None
+
+
+def test_a_drive_without_ego_motion_stays_without(drive, tmp_path):
+    (drive / "ego_motion.csv").unlink()
+    assert convert(drive, tmp_path / "out").exit_code == 0
+    assert not (tmp_path / "out" / "ego_motion.csv").exists()
+    with pytest.raises(InputError, match="--static"):
+        open_sequence(tmp_path / "out")
+
+
+def test_pictures_of_a_video_become_png(drive, edit, tmp_path):
+    writer = cv2.VideoWriter(str(drive / "v.mkv"), cv2.VideoWriter_fourcc(*"FFV1"), 2, (64, 36))
+    writer.write(picture_of("CAM_BACK", 9))
+    writer.release()
+    edit("frames.csv", "images/CAM_BACK/2.png", "v.mkv#0")
+    convert(drive, tmp_path / "out")
+    written = tmp_path / "out" / "images" / "CAM_BACK" / "000012.png"
+    np.testing.assert_array_equal(cv2.imread(str(written)), picture_of("CAM_BACK", 9))
+
+
+def test_an_existing_folder_is_replaced_only_by_force(drive, tmp_path):
+    out = tmp_path / "out"
+    assert convert(drive, out).exit_code == 0
+    (out / "mine.txt").write_text("kept")
+    (out / "images" / "CAM_FRONT" / "old.png").write_text("")
+    again = convert(drive, out)
+    assert isinstance(again.exception, OutputError)
+    assert "--force" in str(again.exception)
+    assert convert(drive, out, "--force").exit_code == 0
+    assert (out / "mine.txt").exists()
+    assert not (out / "images" / "CAM_FRONT" / "old.png").exists()
+
+
+@pytest.mark.parametrize("target", ["drive", "."])
+def test_the_input_is_never_overwritten(drive, target):
+    answer = convert(drive, drive.parent / target, "--force")
+    assert isinstance(answer.exception, OutputError)
+    assert open_sequence(drive).load(3).pictures
+
+
+def write_native(folder, frames):
+    with NativeWriter(folder, with_ego_motion=True) as writer:
+        for frame in frames:
+            writer.write(frame)
+
+
+def test_an_interrupted_conversion_is_no_sequence(drive, tmp_path):
+    def interrupted():
+        yield open_sequence(drive).load(0)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_native(tmp_path / "out", interrupted())
+    with pytest.raises(InputError, match=r"calibration.json"):
+        open_sequence(tmp_path / "out")
+
+
+def test_scenes_with_different_rigs_do_not_mix(drive, tmp_path):
+    other = tmp_path / "other"
+    shutil.copytree(drive, other)
+    calibration = json.loads((other / "calibration.json").read_text())
+    calibration["cameras"]["CAM_BACK"]["ego_from_camera"]["translation"][0] += 0.1
+    (other / "calibration.json").write_text(json.dumps(calibration))
+    frames = [open_sequence(drive).load(0), open_sequence(other).load(1)]
+    with pytest.raises(InputError, match="another calibration"):
+        write_native(tmp_path / "out", frames)
+
+
+def test_one_scene_of_several(drive, tmp_path):
+    lines = (drive / "frames.csv").read_text().splitlines()
+    scenes = ["scene", "first", "first", "second", "second"]
+    (drive / "frames.csv").write_text("\n".join(f"{s},{line}" for s, line in zip(scenes, lines, strict=True)))
+    convert(drive, tmp_path / "out", "--scene", "second")
+    assert [stamp.index for stamp in open_sequence(tmp_path / "out", InputOptions(scene="second")).stamps] == [12, 13]
+
+
+def test_intrinsics_in_yaml_make_a_calibration(drive, tmp_path):
+    (drive / "calibration.json").rename(drive / "extrinsics.json")
+    lines = [
+        f"{name}: {{camera_model: pinhole, intrinsics: [50, 51, 31.5, 17.5], resolution: [64, 36]}}" for name in CAMERAS
+    ]
+    (drive / "camchain.yaml").write_text("\n".join(lines))
+    options = ["--intrinsics", drive / "camchain.yaml", "--extrinsics", drive / "extrinsics.json"]
+    assert convert(drive, tmp_path / "out", *options).exit_code == 0
+    rig = open_sequence(tmp_path / "out").load(0).rig
+    np.testing.assert_allclose(rig["CAM_BACK"].intrinsics, [[50, 0, 31.5], [0, 51, 17.5], [0, 0, 1]])

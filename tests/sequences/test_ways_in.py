@@ -1,0 +1,112 @@
+"""The same real drive as a native folder, as six lossless videos, and as a nuScenes root: the same frames."""
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from bevcli.geometry.cameras import CameraRig
+from bevcli.sequences.folder import FolderSequence
+from bevcli.sequences.native_writer import NativeWriter
+from bevcli.sequences.open import InputOptions, open_sequence
+
+
+def assert_same_rig(one: CameraRig, other: CameraRig) -> None:
+    assert set(one.names) == set(other.names)
+    np.testing.assert_allclose(one.ego_from_bev, other.ego_from_bev, atol=1e-12)
+    for name in one.names:
+        assert (one[name].width, one[name].height) == (other[name].width, other[name].height)
+        np.testing.assert_allclose(one[name].intrinsics, other[name].intrinsics, atol=1e-9)
+        np.testing.assert_allclose(one[name].ego_from_camera, other[name].ego_from_camera, atol=1e-9)
+
+
+def assert_same_frames(one, other, *, same_bytes: bool) -> None:
+    assert [stamp.timestamp_ns for stamp in one.stamps] == [stamp.timestamp_ns for stamp in other.stamps]
+    for place in range(len(one.stamps)):
+        a, b = one.load(place), other.load(place)
+        assert_same_rig(a.rig, b.rig)
+        np.testing.assert_allclose(a.world_from_ego.matrix, b.world_from_ego.matrix, atol=1e-9)
+        np.testing.assert_allclose(a.world_from_ego.quaternion, b.world_from_ego.quaternion, atol=1e-6)
+        for name in a.rig.names:
+            np.testing.assert_allclose(a.world_from_ego_at[name].matrix, b.world_from_ego_at[name].matrix, atol=1e-9)
+            assert a.pictures[name].timestamp_ns == b.pictures[name].timestamp_ns
+            np.testing.assert_array_equal(a.pictures[name].pixels_bgr, b.pictures[name].pixels_bgr)
+            assert not same_bytes or a.pictures[name].encoded == b.pictures[name].encoded
+        for quantity in ("acceleration", "angular_rate", "velocity"):
+            np.testing.assert_allclose(getattr(a.kinematics, quantity), getattr(b.kinematics, quantity), atol=1e-12)
+        np.testing.assert_allclose(a.ground_truth.centers, b.ground_truth.centers, atol=1e-9)
+        np.testing.assert_allclose(a.ground_truth.sizes_lwh, b.ground_truth.sizes_lwh, atol=1e-9)
+        np.testing.assert_allclose(a.ground_truth.yaws, b.ground_truth.yaws, atol=1e-9)
+        assert a.ground_truth.classes.tolist() == b.ground_truth.classes.tolist()
+
+
+def copy_without_pictures(source: Path, target: Path) -> None:
+    target.mkdir()
+    for name in ("calibration.json", "ego_motion.csv", "frames.csv", "ground_truth.json"):
+        (target / name).write_bytes((source / name).read_bytes())
+
+
+def write_videos(source: Path, target: Path, suffix: str) -> None:
+    (target / "videos").mkdir()
+    for folder in (source / "images").iterdir():
+        path = target / "videos" / f"{folder.name}{suffix}"
+        writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"FFV1"), 2, (1600, 900))
+        for picture in sorted(folder.iterdir()):
+            writer.write(cv2.imread(str(picture)))
+        writer.release()
+
+
+def test_nuscenes_root(real_drive, nuscenes_root):
+    sequence = open_sequence(nuscenes_root)
+    assert sequence.has_ego_motion
+    assert [stamp.scene for stamp in sequence.stamps] == ["scene-0103"] * 4
+    assert_same_frames(open_sequence(real_drive), sequence, same_bytes=True)
+
+
+def test_samples_of_a_root_have_their_tokens(nuscenes_root):
+    assert open_sequence(nuscenes_root).load(0).sample_token == "3e8750f331d7499e9b5123e9eb70f2e2"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("suffix", [".mkv", ".avi"])
+def test_six_lossless_videos(real_drive, tmp_path, suffix):
+    copy_without_pictures(real_drive, tmp_path / "videos_in")
+    write_videos(real_drive, tmp_path / "videos_in", suffix)
+    table = (real_drive / "frames.csv").read_text()
+    for number in range(4):
+        for camera in FolderSequence(real_drive).rig.names:
+            table = table.replace(f"images/{camera}/{number:06d}.jpg", f"videos/{camera}{suffix}#{number}")
+    (tmp_path / "videos_in" / "frames.csv").write_text(table)
+    assert_same_frames(open_sequence(real_drive), open_sequence(tmp_path / "videos_in"), same_bytes=False)
+
+
+@pytest.mark.parametrize("which", ["native", "nuscenes"])
+def test_converted(real_drive, nuscenes_root, tmp_path, which):
+    source = open_sequence(real_drive if which == "native" else nuscenes_root)
+    with NativeWriter(tmp_path / "out", with_ego_motion=True) as writer:
+        for place in range(len(source.stamps)):
+            writer.write(source.load(place))
+    assert_same_frames(source, open_sequence(tmp_path / "out"), same_bytes=True)
+
+
+def test_a_scene_and_a_split_are_chosen(nuscenes_root):
+    for options in (
+        InputOptions(scene="scene-0103"),
+        InputOptions(split="mini_val"),
+        InputOptions(version="v1.0-mini"),
+    ):
+        assert len(open_sequence(nuscenes_root, options).stamps) == 4
+
+
+def test_without_can_bus_kinematics_come_from_the_poses(nuscenes_root, tmp_path):
+    """The car drives at 8.4 m/s forward, as its own sensors say."""
+    shutil.copytree(nuscenes_root, tmp_path / "root", ignore=shutil.ignore_patterns("can_bus"))
+    told, derived = open_sequence(nuscenes_root), open_sequence(tmp_path / "root")
+    assert any("no CAN bus" in note for note in derived.notes)
+    for place in range(4):
+        a, b = told.load(place).kinematics, derived.load(place).kinematics
+        np.testing.assert_allclose(a.velocity, b.velocity, atol=0.3)
+        np.testing.assert_allclose(a.angular_rate[2], b.angular_rate[2], atol=0.03)
+        np.testing.assert_allclose(a.acceleration, b.acceleration, atol=0.8)
