@@ -25,7 +25,7 @@ HEIGHTS_M = (0.15, 5.0)  # bumper to the roof of a lorry
 STEEPEST_DEG = 30.0  # pitched by more, and without the horizon in the picture, a camera looks at ground or sky
 MOST_ROLL_DEG = 30.0
 LEVEL_DEG = (20.0, 10.0)  # pitch and roll of a pose that an explanation must arrive at
-NAME_TURN_DEG = 60.0  # and at most so far from where the camera's name says that it looks
+NAME_TURN_DEG = 80.0  # and at most so far from where the camera's name says that it looks
 ONE_AXIS_TURN_DEG = 30.0  # a camera that is merely tilted still looks where its name says, by less than this
 
 
@@ -69,7 +69,7 @@ def check_poses(cameras: Sequence[Camera]) -> tuple[Finding, ...]:
     affected = [camera for camera in metric if defects_of(camera)]
     explained = {camera.name: [m for m in MISTAKES if _explains(m, camera)] for camera in affected}
     for camera in affected:
-        defect, mistake = defects_of(camera)[0], _most_common(explained[camera.name], explained)
+        defect, mistake = defects_of(camera)[0], _best(camera, explained)
         if mistake is None or (len(affected) == 1 and _is_turned_about_one_axis(camera)):
             findings.append(defect)
         else:
@@ -131,19 +131,30 @@ def _explains(mistake: Mistake, camera: Camera) -> bool:
 
 def _is_turned_about_one_axis(camera: Camera) -> bool:
     """Whether the pose is that of a camera merely tilted or rolled in its place: a single camera's plain mistake."""
-    mounting, said = mounting_of(camera.ego_from_camera), direction_of_name(camera.name)
     codes = [defect.code for defect in defects_of(camera)]
-    if codes == ["camera-rolled"]:
-        return True
-    as_named = said is None or turn_deg(said, mounting.yaw_deg) <= ONE_AXIS_TURN_DEG
-    return codes in (["looks-at-ground"], ["looks-at-sky"]) and abs(mounting.roll_deg) <= LEVEL_DEG[1] and as_named
+    if codes not in (["looks-at-ground"], ["looks-at-sky"]):
+        return codes == ["camera-rolled"]
+    right, said = camera.ego_from_camera[:3, 0], direction_of_name(camera.name)
+    yaw_deg = float(np.degrees(np.arctan2(right[0], -right[1])))  # tilting leaves it, even straight up and down
+    level = abs(right[2]) <= np.sin(np.radians(LEVEL_DEG[1]))
+    return bool(level and (said is None or turn_deg(said, yaw_deg) <= ONE_AXIS_TURN_DEG))
 
 
-def _most_common(candidates: Sequence[Mistake], explained: Mapping[str, Sequence[Mistake]]) -> Mistake | None:
-    """Of the mistakes that explain this camera the one that explains most cameras; None where they are the fewer."""
-    counts = {mistake: sum(mistake in of for of in explained.values()) for mistake in candidates}
-    best = max(candidates, key=lambda mistake: counts[mistake], default=None)
+def _best(camera: Camera, explained: Mapping[str, Sequence[Mistake]]) -> Mistake | None:
+    """Of the mistakes that explain this camera the one that explains most cameras, and of equals the best fit.
+
+    None where it explains fewer than half of the affected cameras: then it is chance.
+    """
+    counts = {mistake: sum(mistake in of for of in explained.values()) for mistake in explained[camera.name]}
+    best = max(counts, key=lambda mistake: (counts[mistake], -_misfit(mistake, camera)), default=None)
     return best if best is not None and 2 * counts[best] >= len(explained) else None
+
+
+def _misfit(mistake: Mistake, camera: Camera) -> float:
+    """Degrees by which the undone pose is off level and off its name."""
+    mounting, said = mounting_of(mistake.undo(camera.ego_from_camera)), direction_of_name(camera.name)
+    off_name = 0.0 if said is None else turn_deg(said, mounting.yaw_deg)
+    return abs(mounting.pitch_deg) + abs(mounting.roll_deg) + off_name
 
 
 def _mistake_finding(camera: Camera, mistake: Mistake, defect: Finding) -> Finding:
