@@ -1,0 +1,1 @@
+"""Losses, clips and the loop that train a BEVFormer, without any framework."""

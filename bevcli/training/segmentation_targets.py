@@ -1,0 +1,95 @@
+"""What the segmentation head should say of a frame: stuff from its map, things from its vehicles' footprints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from bevcli.errors import InputError
+from bevcli.frame import MAP_CLASSES, BevMap
+from bevcli.geometry.bev_grid import BevGrid
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.model.segmentation_head import STUFF_CLASSES
+from bevcli.synth.bev_truth import VEHICLE_CLASSES
+from bevcli.training.detection_targets import seen
+
+# How much of a BEV cell a class covers for the cell to count as it: least for lines, which are thinner than a cell.
+MIN_SHARES = {"drivable_road": 0.4, "lane_boundary": 0.2, "pedestrian_crossing": 0.4}
+SAMPLES = 8  # looked up along each side of a BEV cell
+
+
+@dataclass(frozen=True)
+class SegmentationTargets:
+    """stuff: (S, Y·X) float32 of 0 and 1 in the order of STUFF_CLASSES, None where no map is known.
+
+    things: (G, Y·X) float32. locations: (G, 4) float32: centre x, y, extent x, y, 0 to 1 over the map.
+    """
+
+    stuff: Tensor | None
+    things: Tensor
+    locations: Tensor
+
+    def to(self, device: torch.device) -> SegmentationTargets:
+        """The same on a device."""
+        stuff = None if self.stuff is None else self.stuff.to(device)
+        return SegmentationTargets(stuff, self.things.to(device), self.locations.to(device))
+
+
+def segmentation_targets(boxes: Boxes3D, bev_map: BevMap | None, grid: BevGrid) -> SegmentationTargets:
+    """boxes: of the frame, bev frame. Raises InputError where the map does not reach as far as the grid."""
+    vehicles = boxes[np.isin(boxes.classes, VEHICLE_CLASSES) & seen(boxes)]
+    vehicles = vehicles[(grid.cell_of(vehicles.centers[:, :2]) >= 0).all(-1)]
+    stuff = None if bev_map is None else torch.from_numpy(_stuff(bev_map, grid)).float()
+    return SegmentationTargets(
+        stuff,
+        torch.from_numpy(_footprints(vehicles, grid)).float(),
+        torch.from_numpy(_locations(vehicles, grid)).float(),
+    )
+
+
+def _stuff(bev_map: BevMap, grid: BevGrid) -> NDArray[np.bool_]:
+    """(S, Y·X): whether enough of a cell is of a class."""
+    _check_reach(bev_map, grid)
+    fine = BevGrid(grid.rows * SAMPLES, grid.columns * SAMPLES, grid.x_range_m, grid.y_range_m)
+    rows, columns = bev_map.cells.shape
+    map_grid = BevGrid(rows, columns, bev_map.x_range_m, bev_map.y_range_m)
+    places = map_grid.cell_of(fine.cell_centers())  # (Y · 8, X · 8, 2)
+    bits = bev_map.cells[::-1][places[..., 0], places[..., 1]]  # the map's rows run from the largest y
+    layers = np.stack([(bits & MAP_CLASSES[name]) > 0 for name in STUFF_CLASSES])
+    shares = layers.reshape(len(layers), grid.rows, SAMPLES, grid.columns, SAMPLES).mean((2, 4))
+    enough = np.array([MIN_SHARES[name] for name in STUFF_CLASSES])
+    return (shares >= enough[:, None, None]).reshape(len(layers), -1)
+
+
+def _check_reach(bev_map: BevMap, grid: BevGrid) -> None:
+    for axis, reach, wanted in (("x", bev_map.x_range_m, grid.x_range_m), ("y", bev_map.y_range_m, grid.y_range_m)):
+        if reach[0] > wanted[0] or reach[1] < wanted[1]:
+            raise InputError(
+                f"a ground truth map covers {axis} {reach[0]:g} to {reach[1]:g} m, but the model's BEV grid "
+                f"{wanted[0]:g} to {wanted[1]:g} m: write larger maps, or train without the segmentation head"
+            )
+
+
+def _footprints(vehicles: Boxes3D, grid: BevGrid) -> NDArray[np.bool_]:
+    """(G, Y·X): the cells whose centre a vehicle covers, and always the cell of its own centre."""
+    cells = grid.cell_centers().reshape(-1, 2)
+    from_center = cells - vehicles.centers[:, None, :2]  # (G, Y·X, 2)
+    cos, sin = np.cos(vehicles.yaws)[:, None], np.sin(vehicles.yaws)[:, None]
+    along = np.abs(cos * from_center[..., 0] + sin * from_center[..., 1])
+    across = np.abs(cos * from_center[..., 1] - sin * from_center[..., 0])
+    covered = (along <= vehicles.sizes_lwh[:, :1] / 2) & (across <= vehicles.sizes_lwh[:, 1:2] / 2)
+    row, column = grid.cell_of(vehicles.centers[:, :2]).T
+    covered[np.arange(len(vehicles)), row * grid.columns + column] = True
+    return covered
+
+
+def _locations(vehicles: Boxes3D, grid: BevGrid) -> NDArray[np.float64]:
+    """(G, 4) centre and extent of the footprints' bounding rectangles over the map."""
+    start, end = np.array([grid.x_range_m, grid.y_range_m]).T
+    corners = vehicles.corners()[:, :4, :2]
+    extent = corners.max(1) - corners.min(1) if len(vehicles) else np.zeros((0, 2))
+    return np.concatenate([(vehicles.centers[:, :2] - start) / (end - start), extent / (end - start)], axis=-1)

@@ -1,0 +1,110 @@
+"""Losses against numbers worked out by hand, and the matcher against every permutation."""
+
+from __future__ import annotations
+
+from itertools import permutations
+from math import exp, log
+
+import numpy as np
+import pytest
+import torch
+
+from bevcli.training.detection_loss import DetectionLossConfig, detection_loss
+from bevcli.training.detection_targets import DetectionTargets
+from bevcli.training.dice_loss import dice_costs, dice_loss
+from bevcli.training.focal_loss import focal_cost, focal_loss
+from bevcli.training.matcher import match
+
+
+@pytest.mark.parametrize("shape", [(5, 3), (3, 5), (4, 4), (6, 1)])
+def test_no_permutation_is_cheaper_than_the_matching(shape: tuple[int, int]) -> None:
+    costs = np.random.default_rng(sum(shape)).normal(size=shape)
+    pairs = match(torch.from_numpy(costs))
+    small, large = sorted(shape)
+    wide = costs if shape[0] == small else costs.T
+    cheapest = min(sum(wide[i, p] for i, p in enumerate(order)) for order in permutations(range(large), small))
+    assert costs[pairs.queries, pairs.truths].sum() == pytest.approx(cheapest)
+    assert len(set(pairs.queries)) == len(set(pairs.truths)) == small
+
+
+def test_nothing_to_match_gives_no_pair() -> None:
+    assert len(match(torch.zeros(4, 0)).queries) == 0
+
+
+def test_a_pair_of_no_finite_cost_is_the_last_choice() -> None:
+    pairs = match(torch.tensor([[float("nan"), 0.0], [1.0, 5.0]]))
+    assert list(zip(pairs.queries, pairs.truths, strict=True)) == [(0, 1), (1, 0)]
+
+
+def test_focal_loss_by_hand() -> None:
+    # logit log 3: p = 3/4. As a positive 0.25 · (1/4)² · -log(3/4), as a negative 0.75 · (3/4)² · -log(1/4).
+    losses = focal_loss(torch.tensor([log(3), log(3)]), torch.tensor([1.0, 0.0]))
+    assert losses.tolist() == pytest.approx([0.25 / 16 * log(4 / 3), 0.75 * 9 / 16 * log(4)])
+    assert focal_cost(torch.tensor([log(3)])).tolist() == pytest.approx([0.25 / 16 * log(4 / 3) - 27 / 64 * log(4)])
+
+
+def test_dice_loss_by_hand() -> None:
+    logits = torch.tensor([[0.0, 0.0], [60.0, -60.0]])  # masks (1/2, 1/2) and (1, 0)
+    truth = torch.tensor([1.0, 0.0])
+    assert dice_loss(logits, truth.expand(2, 2)).tolist() == pytest.approx([1 - 1 / 1.5, 0], abs=1e-3)
+    others = torch.tensor([[1.0, 0.0], [0.0, 1.0]])
+    assert dice_costs(logits, others).flatten().tolist() == pytest.approx([1 / 3, 1 / 3, 0, 1], abs=1e-3)
+
+
+def code(x: float, vx: float = 0.0) -> list[float]:
+    return [x, 0, 0, 0, 0, 0, 0, 1, vx, 0]
+
+
+def targets(*codes: list[float], label: int = 0) -> DetectionTargets:
+    return DetectionTargets(torch.full((len(codes),), label), torch.tensor(codes).reshape(len(codes), 10))
+
+
+CONFIG = DetectionLossConfig()
+
+
+def test_detection_loss_by_hand() -> None:
+    """Two queries, one class, one box: the nearer query answers for it, the other is background."""
+    codes = torch.tensor([[code(x=5.0), code(x=1.5, vx=3.0)]])[None]  # (1, 1, 2, 10)
+    logits = torch.zeros(1, 1, 2, 1)  # p = 1/2 each
+    loss = detection_loss(logits, codes, [targets(code(x=1.0))], CONFIG)
+    assert loss.boxes.item() == pytest.approx(0.25 * (0.5 + 0.2 * 3.0))
+    assert loss.classes.item() == pytest.approx(2 * (0.25 + 0.75) / 4 * log(2))
+    assert loss.total.item() == pytest.approx(loss.boxes.item() + loss.classes.item())
+
+
+def test_the_class_decides_between_queries_at_the_same_place() -> None:
+    codes = torch.tensor([[code(0.0), code(0.0)]])[None]
+    logits = torch.tensor([[[[-2.0], [2.0]]]])
+    sure = detection_loss(logits, codes, [targets(code(0.0))], CONFIG).classes.item()
+    p = 1 / (1 + exp(-2))
+    positive, negative = 0.25 * (1 - p) ** 2 * -log(p), 0.75 * (1 - p) ** 2 * -log(p)
+    assert sure == pytest.approx(2 * (positive + negative), rel=1e-4)
+
+
+def test_losses_are_divided_by_the_boxes_of_the_batch() -> None:
+    codes = torch.tensor([code(2.0)]).expand(1, 2, 1, 10)
+    logits = torch.zeros(1, 2, 1, 1)
+    one = detection_loss(logits[:, :1], codes[:, :1], [targets(code(0.0))], CONFIG)
+    two = detection_loss(logits, codes, [targets(code(0.0))] * 2, CONFIG)
+    assert two.boxes.item() == pytest.approx(one.boxes.item())
+    assert two.classes.item() == pytest.approx(one.classes.item())
+
+
+def test_every_layer_adds_its_loss() -> None:
+    codes, logits = torch.tensor([[code(2.0)]])[None], torch.zeros(1, 1, 1, 1)
+    once = detection_loss(logits, codes, [targets(code(0.0))], CONFIG).total
+    thrice = detection_loss(logits.expand(3, -1, -1, -1), codes.expand(3, -1, -1, -1), [targets(code(0.0))], CONFIG)
+    assert thrice.total.item() == pytest.approx(3 * once.item())
+
+
+def test_a_box_of_unknown_velocity_counts_as_a_class_only() -> None:
+    codes, logits = torch.tensor([[code(2.0)]])[None], torch.zeros(1, 1, 1, 1)
+    loss = detection_loss(logits, codes, [targets(code(0.0, vx=float("nan")))], CONFIG)
+    assert loss.boxes.item() == 0
+    assert loss.classes.item() == pytest.approx(2 * 0.25 / 4 * log(2))
+
+
+def test_a_frame_without_boxes_teaches_background() -> None:
+    loss = detection_loss(torch.zeros(1, 1, 3, 2), torch.zeros(1, 1, 3, 10), [targets()], CONFIG)
+    assert loss.boxes.item() == 0
+    assert loss.classes.item() == pytest.approx(2 * 6 * 0.75 / 4 * log(2))
