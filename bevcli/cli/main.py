@@ -16,6 +16,7 @@ from bevcli.cli.convert import convert
 from bevcli.cli.eval import evaluate
 from bevcli.cli.project_debug import project_debug
 from bevcli.cli.run import run
+from bevcli.cli.viz import viz
 from bevcli.cli.weights import weights_app
 from bevcli.errors import BevcliError
 
@@ -46,6 +47,7 @@ app.command()(convert)
 app.command("eval")(evaluate)
 app.command()(project_debug)
 app.command()(run)
+app.command()(viz)
 app.add_typer(weights_app, name="weights")
 
 

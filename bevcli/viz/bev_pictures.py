@@ -30,8 +30,8 @@ class BevColors:
     low, high: (K,) the values that become 0 and 1.
     """
 
-    mean: Array
-    basis: Array | None
+    mean: Features
+    basis: Features | None
     low: Array
     high: Array
 
@@ -50,7 +50,8 @@ def fit_colors(kind: str, features: Features) -> BevColors:
     Raises InputError when there is no channel K.
     """
     channels = features.shape[-1]
-    mean, basis = np.zeros(channels, np.float32), None
+    mean: Features = np.zeros(channels, np.float32)
+    basis: Features | None = None
     if kind == "pca":
         mean = features.mean(0)
         basis = _principal_components(features - mean)
@@ -90,7 +91,7 @@ class BevPictures(Generic[Stamp]):
         return ready
 
 
-def _values(features: Features, mean: Array, basis: Array | None) -> Array:
+def _values(features: Features, mean: Features, basis: Features | None) -> Features:
     if basis is None:
         return np.linalg.norm(features, axis=-1, keepdims=True)
     return (features - mean) @ basis
@@ -101,8 +102,10 @@ def _thinned(features: Features) -> Features:
     return cells[:: max(1, len(cells) // CELLS_FOR_FIT)]
 
 
-def _principal_components(centered: Features) -> Array:
+def _principal_components(centered: Features) -> Features:
     _, vectors = np.linalg.eigh(centered.T @ centered)
     basis = vectors[:, :-4:-1]  # the three largest, largest first
     signs = np.sign(basis[np.abs(basis).argmax(0), np.arange(basis.shape[1])])
-    return basis * np.where(signs == 0, 1, signs)  # eigenvectors have no sign of their own: the largest entry is up
+    return basis * np.where(signs == 0, 1, signs).astype(
+        np.float32
+    )  # eigenvectors have no sign of their own: the largest entry is up

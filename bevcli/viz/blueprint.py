@@ -87,14 +87,12 @@ def _curves() -> rrb.Vertical:
 
 
 def _camera(rig: CameraRig, name: str, *, probes: bool) -> rrb.Spatial2DView:
-    overrides = {entities.overlay(name, "pillars"): [HIDDEN]}
-    if not probes:
-        overrides[entities.overlay(name, "probes")] = [HIDDEN]
+    hidden = ("pillars",) if probes else ("pillars", "probes")
     camera = rig[name]
     return rrb.Spatial2DView(
         origin=entities.camera(name),
         name=name,
         background=BACKGROUND,
         visual_bounds=rrb.VisualBounds2D(x_range=[0, camera.width], y_range=[0, camera.height]),
-        overrides=overrides,
+        overrides={entities.overlay(name, kind): HIDDEN for kind in hidden},
     )

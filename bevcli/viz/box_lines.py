@@ -49,7 +49,7 @@ def clip_near(ends: Array) -> tuple[Array, NDArray[np.bool_]]:
     span = depth[:, 1] - depth[:, 0]
     share = np.clip((NEAR_CLIP_M - depth[:, 0]) / np.where(span == 0, 1.0, span), 0, 1)
     cut = ends[:, 0] + share[:, None] * (ends[:, 1] - ends[:, 0])
-    return np.where(before[..., None], ends, cut[:, None]), before.any(-1)
+    return np.where(before[..., None], ends, cut[:, None]), np.asarray(before.any(-1))
 
 
 def clip_to_picture(segments: Array, width: int, height: int) -> tuple[Array, NDArray[np.bool_]]:

@@ -6,11 +6,10 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from bevcli.frame import MAP_CLASSES, BevMap
+from bevcli.frame import MAP_CLASSES, BevMap, Probe
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.transforms import Array, apply
 from bevcli.viz import entities
-from bevcli.viz.attention import Probe
 from bevcli.viz.palette import MAP_COLORS, colormap
 
 GROUND_OPACITY = 110  # of 255: boxes, rings and the trajectory stay readable on the map
@@ -60,7 +59,10 @@ def log_probes(stream: rr.RecordingStream, probes: tuple[Probe, ...], ego_from_b
     stream.log(entities.BEV_PROBES, dots)
     low, high = grid.pillar_heights()[[0, -1]]
     ends = np.stack([np.column_stack([centers, np.full(len(centers), z)]) for z in (low, high)], axis=1)
-    stream.log(entities.PROBES, rr.LineStrips3D(apply(ego_from_bev, ends), colors=[255, 80, 220], radii=0.05))
+    stream.log(
+        entities.PROBES,
+        rr.LineStrips3D(apply(ego_from_bev, ends).astype(np.float32), colors=[255, 80, 220], radii=0.05),
+    )
 
 
 def _placed(picture: NDArray[np.uint8], x_range: tuple[float, float], y_range: tuple[float, float]) -> rr.Transform3D:

@@ -47,7 +47,10 @@ def log_boxes_3d(
         radii=rr.Radius.ui_points(1.2),
     )
     stream.log(entities.VELOCITY, arrows)
-    stream.log(entities.FALSE_BOXES, rr.LineStrips3D(_crosses(boxes[false]), colors=FALSE_COLOR, radii=THICK))
+    stream.log(
+        entities.FALSE_BOXES,
+        rr.LineStrips3D(_crosses(boxes[false]).astype(np.float32), colors=FALSE_COLOR, radii=THICK),
+    )
 
 
 def log_ground_truth_3d(stream: rr.RecordingStream, truth: Boxes3D, found: np.ndarray) -> None:
@@ -75,7 +78,7 @@ def log_boxes_bev(stream: rr.RecordingStream, boxes: Boxes3D, false: np.ndarray,
         draw_order=31,
     )
     stream.log(entities.BEV_VELOCITY, arrows)
-    crosses = _crosses(boxes[false])[..., :2] * (1, -1)
+    crosses = (_crosses(boxes[false])[..., :2] * (1, -1)).astype(np.float32)
     stream.log(entities.BEV_FALSE, rr.LineStrips2D(crosses, colors=FALSE_COLOR, radii=THIN, draw_order=32))
 
 

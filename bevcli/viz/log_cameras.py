@@ -9,12 +9,11 @@ import cv2
 import numpy as np
 import rerun as rr
 
-from bevcli.frame import Picture
+from bevcli.frame import CameraSamples, Picture
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.viz import entities
-from bevcli.viz.attention import CameraSamples
 from bevcli.viz.box_lines import lines_in_picture
 from bevcli.viz.labels import box_labels, labels_in_picture
 from bevcli.viz.log_boxes import box_colors
@@ -58,7 +57,12 @@ def log_boxes_in_picture(
     colors = box_colors(boxes, class_names)
     stream.log(
         entities.overlay(name, "boxes"),
-        rr.LineStrips2D(lines.segments, colors=colors[lines.owners], radii=rr.Radius.ui_points(1.0), draw_order=30),
+        rr.LineStrips2D(
+            lines.segments.astype(np.float32),
+            colors=colors[lines.owners],
+            radii=rr.Radius.ui_points(1.0),
+            draw_order=30,
+        ),
     )
     texts = box_labels(boxes)
     places, owners = labels_in_picture(lines, texts, shot.camera.width, shot.camera.height)
@@ -81,7 +85,12 @@ def log_ground_truth_in_picture(
     colors = np.where(found[:, None], GROUND_TRUTH_COLOR, MISSED_COLOR).astype(np.uint8).reshape(-1, 3)
     stream.log(
         entities.overlay(shot.camera.name, "ground_truth"),
-        rr.LineStrips2D(lines.segments, colors=colors[lines.owners], radii=rr.Radius.ui_points(0.6), draw_order=20),
+        rr.LineStrips2D(
+            lines.segments.astype(np.float32),
+            colors=colors[lines.owners],
+            radii=rr.Radius.ui_points(0.6),
+            draw_order=20,
+        ),
     )
 
 

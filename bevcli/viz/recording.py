@@ -50,6 +50,7 @@ class Recording:
         self._stream = rr.RecordingStream(APPLICATION)
         self._origin: Array | None = None
         self._last: Frame | None = None
+        self._early_events: list[tuple[str, str]] = []  # said before there was a frame to say it at
         self._pillars: Array | None = None
         wanted = self.options.bev != "none" and self.options.shows_insides
         self._bev_pictures: BevPictures[tuple[FrameStamp, Prediction]] | None = None
@@ -89,8 +90,11 @@ class Recording:
         self._flush()
 
     def event(self, text: str, level: str = "INFO") -> None:
-        """Writes a line into the log of events, at the last frame's time. level: "INFO", "WARN" or "ERROR"."""
-        self._stream.log(entities.EVENTS, rr.TextLog(text, level=level))
+        """Writes a line into the log of events, at the newest frame, or the first. level: "INFO", "WARN" or "ERROR"."""
+        if self._origin is None:
+            self._early_events.append((text, level))
+        else:
+            self._stream.log(entities.EVENTS, rr.TextLog(text, level=level))
 
     def _log_about(self) -> None:
         text = about_text(self.title, self.rig, self.options, untrained=self.untrained)
@@ -182,8 +186,8 @@ class Recording:
 
     def _log_frame_events(self, frame: Frame, prediction: Prediction) -> None:
         scene = f' of scene "{frame.stamp.scene}"' if frame.stamp.scene else ""
-        if self._last is None and self.untrained:
-            self.event("The weights are UNTRAINED: boxes and maps mean nothing.", "WARN")
+        while self._early_events:
+            self.event(*self._early_events.pop(0))
         if prediction.started_anew:
             self.event(f"frame {frame.stamp.index}{scene}: the model starts without history")
         for camera, reason in frame.dropped.items():

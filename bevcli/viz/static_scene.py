@@ -59,8 +59,8 @@ def _log_vehicle(stream: rr.RecordingStream, rig: CameraRig) -> None:
     archetype = rr.Mesh3D(
         vertex_positions=mesh.vertices,
         triangle_indices=mesh.faces,
-        vertex_normals=mesh.vertex_normals,
-        vertex_colors=mesh.visual.vertex_colors,
+        vertex_normals=mesh.normals,
+        vertex_colors=mesh.colors,
     )
     stream.log(entities.VEHICLE, archetype, static=True)
     strips = [_seen_from_above(rig, strip) for strip in outline_and_heading()]
