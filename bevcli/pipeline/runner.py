@@ -20,6 +20,7 @@ from bevcli.model.box_coding import decode
 from bevcli.model.ego_motion_inputs import ego_motion_inputs
 from bevcli.model.panoptic_merging import decode_maps
 from bevcli.pipeline.attention import attention_view, probe_cells
+from bevcli.pipeline.cpu_memory import keep_freed_memory
 from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
 from bevcli.pipeline.read_ahead import read_ahead
 from bevcli.pipeline.stage_clock import StageClock
@@ -59,6 +60,8 @@ class Runner:
         self.device = device
         self.options = StepOptions() if options is None else options
         self.clock = StageClock(model, device)
+        if device.type == "cpu":
+            keep_freed_memory()
 
     @torch.inference_mode()
     def step(self, state: BevState | None, prepared: PreparedFrame) -> tuple[BevState | None, Prediction]:
