@@ -13,6 +13,7 @@ import typer
 
 from bevcli import __version__
 from bevcli.cli.convert import convert
+from bevcli.cli.demo import demo
 from bevcli.cli.eval import evaluate
 from bevcli.cli.project_debug import project_debug
 from bevcli.cli.run import run
@@ -44,6 +45,7 @@ def root(
 
 
 app.command()(convert)
+app.command()(demo)
 app.command("eval")(evaluate)
 app.command()(project_debug)
 app.command()(run)
