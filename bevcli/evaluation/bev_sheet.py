@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Mapping
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,7 +11,6 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
-from numpy.typing import NDArray
 
 from bevcli.evaluation.operating_point import Outcome, best_outcome
 from bevcli.evaluation.plot_style import CLASS_COLORS, titled_figure
@@ -20,6 +19,7 @@ from bevcli.evaluation.scoring import Scores
 from bevcli.geometry.transforms import Array, apply, inverse
 
 WORST_FRAMES = 4
+MOST_DOTS = 1500
 _MISS, _ALARM, _HIT = "#d62728", "#ff9d1e", "#3a9a4b"
 
 
@@ -31,30 +31,41 @@ def draw_bev_sheet(scores: Scores) -> Figure:
     """
     row = scores.config.distances_m.index(scores.config.error_distance_m)
     outcomes = [best_outcome(matches, row) for matches in scores.detection.matches]
-    missed, alarms = (sum(int(flags.sum()) for flags in side) for side in _sides(outcomes))
+    limit = f"{scores.config.error_distance_m:g} m"
     figure = titled_figure(
-        (14, 11.5),
+        (12, 10),
         "Misses and false alarms, seen from above",
-        f"{missed} missed, {alarms} false alarms; each class cut at its best score (largest F1 at "
-        f"{scores.config.error_distance_m:g} m); ahead is up",
+        f"each class is cut at its best score (largest F1 at {limit}); ahead is up, rings every 10 m",
     )
-    grid = figure.add_gridspec(3, WORST_FRAMES)
+    grid = figure.add_gridspec(2, 2 * WORST_FRAMES, height_ratios=(2, 1.15))
     radius = _radius(scores)
-    half = WORST_FRAMES // 2
-    everything = (
-        ("All misses", [(o.matches.name, o.matches.ground_truth[o.missed]) for o in outcomes]),
-        ("All false alarms", [(o.matches.name, o.matches.predictions[o.false_alarms]) for o in outcomes]),
-    )
-    for place, (title, parts) in enumerate(everything):
-        axes = figure.add_subplot(grid[:2, place * half : (place + 1) * half])
+    missed = {outcome.matches.name: outcome.matches.ground_truth[outcome.missed] for outcome in outcomes}
+    alarms = {outcome.matches.name: outcome.matches.predictions[outcome.false_alarms] for outcome in outcomes}
+    for place, (title, parts) in enumerate((("missed", missed), ("false alarms", alarms))):
+        axes = figure.add_subplot(grid[0, place * WORST_FRAMES : (place + 1) * WORST_FRAMES])
         _draw_dots(axes, title, parts, scores.pairs.reference_from_ego, radius)
     for place, frame in enumerate(_worst_frames(outcomes)):
-        _draw_frame(figure.add_subplot(grid[2, place]), frame, outcomes, scores, radius)
+        _draw_frame(figure.add_subplot(grid[1, 2 * place : 2 * place + 2]), frame, outcomes, scores, radius)
+    heading = {"title": "class: missed / false alarms", "title_fontsize": 9}
+    handles = _legend(missed, alarms)
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=9, frameon=False, **heading)
     return figure
 
 
-def _sides(outcomes: list[Outcome]) -> tuple[list[NDArray[np.bool_]], list[NDArray[np.bool_]]]:
-    return [outcome.missed for outcome in outcomes], [outcome.false_alarms for outcome in outcomes]
+def _legend(missed: Mapping[str, ScoredBoxes], alarms: Mapping[str, ScoredBoxes]) -> list[Line2D]:
+    dots = [
+        Line2D(
+            [],
+            [],
+            color=CLASS_COLORS[name],
+            marker="o",
+            linestyle="",
+            label=f"{name} {len(part)} / {len(alarms[name])}",
+        )
+        for name, part in missed.items()
+    ]
+    outlines = ((_HIT, "found"), (_MISS, "missed"), (_ALARM, "false alarm"))
+    return dots + [Line2D([], [], color=color, label=label) for color, label in outlines]
 
 
 def _radius(scores: Scores) -> float:
@@ -73,21 +84,22 @@ def _worst_frames(outcomes: list[Outcome]) -> list[int]:
 
 
 def _draw_dots(
-    axes: Axes, title: str, parts: Iterable[tuple[str, ScoredBoxes]], reference_from_ego: Array, radius: float
+    axes: Axes, title: str, parts: Mapping[str, ScoredBoxes], reference_from_ego: Array, radius: float
 ) -> None:
-    total = 0
-    for name, part in parts:
+    places, colors = [np.zeros((0, 3))], []
+    for name, part in parts.items():
         ego_from_reference = inverse(reference_from_ego)[part.frames]
-        points = np.einsum("nij,nj->ni", ego_from_reference[:, :3, :3], part.boxes.centers)
-        points += ego_from_reference[:, :3, 3]
-        size = 22 if len(part) < 200 else 6
-        x, y = _on_paper(points).T
-        label = f"{name} ({len(part)})"
-        axes.scatter(x, y, s=size, color=CLASS_COLORS[name], label=label, alpha=0.75, linewidths=0, zorder=3)
-        total += len(part)
+        turned = np.einsum("nij,nj->ni", ego_from_reference[:, :3, :3], part.boxes.centers)
+        places.append(turned + ego_from_reference[:, :3, 3])
+        colors += [CLASS_COLORS[name]] * len(part)
+    points = _on_paper(np.concatenate(places))
+    # A few of very many, mixed, so that no class hides another.
+    shown = np.random.default_rng(0).permutation(len(points))[:MOST_DOTS]
+    x, y = points[shown].T
+    axes.scatter(x, y, s=16, c=[colors[place] for place in shown], alpha=0.8, linewidths=0, zorder=3)
     _draw_ground(axes, radius)
-    axes.set_title(f"{title}: {total}", fontsize=12)
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
+    thinned = f", {MOST_DOTS} of them shown" if len(points) > MOST_DOTS else ""
+    axes.set_title(f"{len(points)} {title}{thinned}", fontsize=12)
 
 
 def _draw_frame(axes: Axes, frame: int, outcomes: list[Outcome], scores: Scores, radius: float) -> None:
@@ -104,10 +116,7 @@ def _draw_frame(axes: Axes, frame: int, outcomes: list[Outcome], scores: Scores,
     _draw_ground(axes, radius)
     stamp = scores.pairs.prediction_stamps[frame]
     scene = f"{stamp.scene} " if stamp.scene else ""
-    axes.set_title(f"{scene}frame {stamp.index}: {counts[0]} missed, {counts[1]} false", fontsize=10)
-    styles = ((_HIT, "found"), (_MISS, "missed"), (_ALARM, "false alarm"))
-    handles = [Line2D([], [], color=color, label=label) for color, label in styles]
-    axes.legend(handles=handles, loc="lower left", fontsize=7, framealpha=0.8)
+    axes.set_title(f"{scene}frame {stamp.index}\n{counts[0]} missed, {counts[1]} false alarms", fontsize=10)
 
 
 def _draw_boxes(axes: Axes, part: ScoredBoxes, ego_from_reference: Array, color: str, style: str) -> None:
@@ -120,7 +129,6 @@ def _draw_ground(axes: Axes, radius: float) -> None:
     """Range rings every 10 m, and the ego vehicle."""
     for ring in np.arange(10, radius + 1, 10):
         axes.add_patch(Circle((0, 0), ring, fill=False, color="#dddddd", linewidth=0.8, zorder=1))
-        axes.text(0, -ring, f"{ring:.0f} m", fontsize=7, color="#999999", ha="center", va="bottom", zorder=2)
     ego = np.array([[3.8, 0.0, 0], [2.6, 0.95, 0], [-1.0, 0.95, 0], [-1.0, -0.95, 0], [2.6, -0.95, 0]])
     axes.add_patch(Polygon(_on_paper(ego), color="#333333", zorder=4))
     axes.set_xlim(-radius, radius)

@@ -51,6 +51,8 @@ def draw_precision_recall(detection: DetectionScores) -> Figure:
     panels = figure.subplots(2, (len(table.classes) + 1) // 2, sharex=True, sharey=True)
     for axes, (name, scores) in zip(panels.flat, table.classes.items(), strict=False):
         _precision_recall_panel(axes, name, scores)
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="upper right", ncols=len(labels), frameon=False, title="centres closer than")
     for axes in panels[-1]:
         axes.set_xlabel("recall")
     for axes in panels[:, 0]:
@@ -75,6 +77,7 @@ def draw_errors_by_range(detection: DetectionScores) -> Figure:
         axes.plot(middles, means, color="black", linewidth=2.5, marker="o", label="mean")
         axes.set_title("AP" if error is None else _ERROR_TITLES[error], fontsize=11)
         axes.set_ylim(bottom=0)
+        axes.set_xticks(sorted({end for part in bins for end in (part.low_m, part.high_m)}))
         axes.grid(color=GRID)
     for axes in panels[-1]:
         axes.set_xlabel("distance from the ego vehicle (m)")
@@ -84,18 +87,16 @@ def draw_errors_by_range(detection: DetectionScores) -> Figure:
 
 
 def _precision_recall_panel(axes: Axes, name: str, scores: ClassScores) -> None:
-    axes.set_title(f"{name}: AP {scores.mean_ap:.2f} ({scores.ground_truth_count} boxes)", fontsize=11)
+    axes.set_title(f"{name}  AP {scores.mean_ap:.2f}", fontsize=11, loc="left")
     for (distance, curve), color in zip(scores.curves.items(), _DISTANCE_COLORS, strict=False):
         reached = curve.score > 0
-        label = f"{distance:g} m: {scores.aps[distance]:.2f}"
-        axes.plot(RECALLS[reached], curve.precision[reached], color=color, linewidth=2, label=label)
+        axes.plot(RECALLS[reached], curve.precision[reached], color=color, linewidth=2, label=f"{distance:g} m")
     axes.set_xlim(0, 1)
     axes.set_ylim(0, 1.02)
     axes.grid(color=GRID)
-    if scores.ground_truth_count:
-        axes.legend(loc="upper right", fontsize=8, title="AP at", title_fontsize=8, framealpha=0.8)
-    else:
-        axes.text(0.5, 0.5, "no ground truth", ha="center", va="center", color="gray")
+    aps = " · ".join(f"{ap:.2f}" for ap in scores.aps.values())
+    text = f"{scores.ground_truth_count} boxes, APs {aps}" if scores.ground_truth_count else "no ground truth"
+    axes.text(0.98, 0.03, text, ha="right", va="bottom", fontsize=8, color="#555555", transform=axes.transAxes)
 
 
 def _value(scores: ClassScores | None, error: str | None) -> float:

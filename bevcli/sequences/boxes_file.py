@@ -11,18 +11,18 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from bevcli.errors import InputError, OutputError
+from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
 from bevcli.sequences.box_json import boxes_from_json, boxes_to_json
+from bevcli.sequences.growing_json import GrowingJson
 from bevcli.sequences.pose_json import pose_from_json, pose_to_json
 
 FORMAT = "bevcli-boxes/1"
 FRAMES_OF_REFERENCE = ("world", "ego", "bev")
 _FILE_KEYS = ("format", "frame_of_reference", "ego_from_bev", "frames")
 _FRAME_KEYS = ("frame", "scene", "timestamp_ns", "world_from_ego", "boxes")
-_TAIL = b"\n]}\n"
 
 
 @dataclass(frozen=True)
@@ -95,17 +95,10 @@ class BoxesWriter:
         ego_from_bev: Pose | None = None,
     ) -> None:
         assert frame_of_reference in FRAMES_OF_REFERENCE
-        self.path = path
         head: dict[str, Any] = {"format": FORMAT, "frame_of_reference": frame_of_reference, **(extras or {})}
         if ego_from_bev is not None:
             head["ego_from_bev"] = pose_to_json(ego_from_bev)
-        try:
-            self._file = path.open("wb", buffering=0)  # a frame is one write, and on the disk after it
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
-        self._separator = b"\n"
-        self._end = 0
-        self._append(json.dumps(head).encode()[:-1] + b', "frames": [')
+        self._file = GrowingJson(path, json.dumps(head)[:-1] + ', "frames": [', "]}")
 
     def write(self, frame: FrameBoxes) -> None:
         """Append a frame, its boxes in the file's frame of reference."""
@@ -118,15 +111,7 @@ class BoxesWriter:
         if frame.world_from_ego is not None:
             row["world_from_ego"] = pose_to_json(frame.world_from_ego)
         row["boxes"] = boxes_to_json(frame.boxes)
-        try:
-            text = json.dumps(row, allow_nan=False)
-        except ValueError:
-            raise OutputError(
-                f"{self.path}: frame {frame.stamp.index}: a box or pose has a number that is not finite; "
-                "the model's output is broken (try --precision fp32)"
-            ) from None
-        self._append(self._separator + text.encode())
-        self._separator = b",\n"
+        self._file.append(row, f"frame {frame.stamp.index}")
 
     def __enter__(self) -> BoxesWriter:
         return self
@@ -135,14 +120,6 @@ class BoxesWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._file.close()
-
-    def _append(self, addition: bytes) -> None:
-        self._file.seek(self._end)
-        try:
-            self._file.write(addition + _TAIL)
-        except OSError as error:
-            raise OutputError(f"{self.path}: cannot be written ({error.strerror})") from None
-        self._end += len(addition)
 
 
 @contextmanager
