@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from bevcli.geometry.transforms import Array
 
@@ -66,7 +66,8 @@ class CityPlan:
     def __init__(self, seed: int) -> None:
         self.seed = seed
         rng = self.stream("bend")
-        self._angle = rng.uniform(0, 2 * np.pi)
+        angle = rng.uniform(0, 2 * np.pi)
+        self._cosine, self._sine = float(np.cos(angle)), float(np.sin(angle))
         self._amplitude = rng.uniform(1.0, 7.0, 2)
         self._period = rng.uniform(170, 280, 2)
         self._phase = rng.uniform(0, 2 * np.pi, 2)
@@ -84,13 +85,15 @@ class CityPlan:
         p = np.asarray(points, dtype=np.float64)
         x = p[..., 0] + self._amplitude[0] * np.sin(2 * np.pi * p[..., 1] / self._period[0] + self._phase[0])
         y = p[..., 1] + self._amplitude[1] * np.sin(2 * np.pi * p[..., 0] / self._period[1] + self._phase[1])
-        c, s = np.cos(self._angle), np.sin(self._angle)
-        return np.stack([c * x - s * y, s * x + c * y], axis=-1)
+        world = np.empty_like(p)
+        world[..., 0] = self._cosine * x - self._sine * y
+        world[..., 1] = self._sine * x + self._cosine * y
+        return world
 
     def unbend(self, points: ArrayLike) -> Array:
         """World (..., 2) -> plan points, by fixed-point iteration (the bend is gentle)."""
         w = np.asarray(points, dtype=np.float64)
-        c, s = np.cos(self._angle), np.sin(self._angle)
+        c, s = self._cosine, self._sine
         target = np.stack([c * w[..., 0] + s * w[..., 1], -s * w[..., 0] + c * w[..., 1]], axis=-1)
         p = target.copy()
         for _ in range(12):
@@ -153,17 +156,6 @@ class CityPlan:
             index += 1
         before, after = self._position(axis, index), self._position(axis, index + 1)
         return index if position - before <= after - position else index + 1
-
-    def ground_height(self, points: ArrayLike) -> NDArray[np.float64]:
-        """Height (...,) of the ground at plan points (..., 2): 0 on roads, KERB_M inside blocks, a ramp at kerbs."""
-        p = np.asarray(points, dtype=np.float64)
-        distance = np.full(p.shape[:-1], np.inf)
-        for axis in (0, 1):
-            across = p[..., 1 - axis]
-            low, high = float(across.min()) - 60, float(across.max()) + 60
-            for street in self.streets_between(axis, low, high):
-                distance = np.minimum(distance, np.abs(across - street.position) - street.half_width)
-        return KERB_M * np.clip(distance / 0.3 + 0.5, 0, 1)
 
 
 def rounded_rectangle(

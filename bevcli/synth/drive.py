@@ -13,21 +13,20 @@ from bevcli.frame import BevMap, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion
-from bevcli.geometry.transforms import Array, Pose, inverse, rigid, rotation_about_z
-from bevcli.synth.actors import Actor, State
+from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid, rotation_about_z
+from bevcli.synth.actors import Actor, Body, State
 from bevcli.synth.bev_truth import MapWindow, draw_map
 from bevcli.synth.catalog import Catalog
 from bevcli.synth.city import CityPlan
 from bevcli.synth.ground_plan import GroundPlan
 from bevcli.synth.ground_texture import GroundTexture, paint_ground
-from bevcli.synth.mesh import Mesh
 from bevcli.synth.renderer import Exposure, Moment, expose
 from bevcli.synth.rig import nuscenes_like_rig
 from bevcli.synth.scenery import Furnishings, Scenery
 from bevcli.synth.shadows import shadow_map
 from bevcli.synth.simulation import Simulation
 from bevcli.synth.street_signals import signal_runs
-from bevcli.synth.triangles import Run, Soup, gather, joined_soup, place
+from bevcli.synth.triangles import Run, Shape, Soup, gather, joined_soup, place
 from bevcli.synth.weather import WEATHER_NAMES, Weather, make_weather
 
 ANNOTATED_M = 60.0  # boxes are kept within this distance of the bev frame's origin
@@ -116,7 +115,8 @@ class Drive:
         self._detail = Detail.for_width(max(camera.width for camera in self.rig.cameras) * supersampling)
         self._scenery = Scenery(self.city, self._stock.furnishings)
         self._around: tuple[tuple[float, float], Soup, GroundTexture] | None = None
-        self._fitted: dict[tuple[str, int], Mesh] = {}
+        self._shapes: dict[tuple[str, int], Shape] = {}
+        self._placed: dict[tuple[str, int], tuple[Run, tuple[float, ...]]] = {}
 
     def time_s(self, index: int) -> float:
         """Seconds since the drive's start."""
@@ -167,10 +167,11 @@ class Drive:
     def expose(self, states: list[State], world_from_ego: Pose, time_s: float) -> dict[str, Exposure]:
         """The pictures of all cameras when the annotated world is in these states."""
         static, ground = self._surroundings(world_from_ego.translation[:2])
-        runs = [self._place(state) for state in states]
         here = world_from_ego.translation[:2]
+        near_first = np.argsort([np.hypot(*(state.position[:2] - here)) for state in states], kind="stable")
+        runs = [self._place(states[k]) for k in near_first]
         signals = signal_runs(self.city, self.simulation.signals, self._stock.furnishings, here, time_s)
-        moving = gather([*runs, *signals], [*range(len(runs)), *[-1] * len(signals)])
+        moving = gather([*runs, *signals], [*near_first.tolist(), *[-1] * len(signals)])
         soup = joined_soup(static, moving)
         parts = [soup.surfaces.corners, self._ego_shape(world_from_ego)]
         shadows = shadow_map(parts, self.weather.to_sun, here, self._detail.extent_m, self._detail.shadow_m)
@@ -198,18 +199,26 @@ class Drive:
         return self._around[1], self._around[2]
 
     def _place(self, state: State) -> Run:
+        """The actor's triangles; those of one that stands still are kept."""
         key = (state.body.instance, state.pose)
-        if key not in self._fitted:
-            poses = state.body.variant.poses
-            self._fitted[key] = poses[state.pose % len(poses)].fitted(state.body.size_lwh)
-        x, y, z = state.position
-        return place(self._fitted[key], (x, y, z), state.yaw, state.body.paint, state.body.dye)
+        x, y, z = (float(c) for c in state.position)
+        here = (x, y, z, state.yaw)
+        if key not in self._placed or self._placed[key][1] != here:
+            self._placed[key] = (place(self._shape(state.body, state.pose), (x, y, z), state.yaw), here)
+        return self._placed[key][0]
+
+    def _shape(self, body: Body, pose: int) -> Shape:
+        """The body's mesh in its size and colours."""
+        key = (body.instance, pose)
+        if key not in self._shapes:
+            mesh = body.variant.poses[pose % len(body.variant.poses)].fitted(body.size_lwh)
+            self._shapes[key] = Shape.of(mesh).painted(body.paint, body.dye)
+        return self._shapes[key]
 
     def _ego_shape(self, world_from_ego: Pose) -> NDArray[np.float32]:
-        """The ego vehicle's own triangles, for its shadow."""
-        body = self.simulation.ego_body
-        mesh = body.variant.poses[0].fitted(body.size_lwh).moved(x=1.4)
-        return place(mesh, tuple(world_from_ego.translation), world_from_ego.yaw).corners
+        """The ego vehicle's own triangles, for its shadow; its frame's origin is behind its middle."""
+        x, y, _ = apply(world_from_ego.matrix, (1.4, 0.0, 0.0))
+        return place(self._shape(self.simulation.ego_body, 0), (x, y, 0.0), world_from_ego.yaw).corners
 
     def _boxes(self, states: list[State], exposures: Mapping[str, Exposure], pose: Pose) -> Boxes3D:
         """Ground truth boxes in the world frame, within ANNOTATED_M of the bev frame's origin."""

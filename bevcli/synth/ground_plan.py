@@ -102,12 +102,11 @@ class GroundPlan:
         paints = [GroundPaint(outline, KERB), GroundPaint(city.bend(inner), PAVEMENT)]
         south, east, north, west = block.sidewalks
         (x0, y0), (x1, y1) = block.low, block.high
-        for x in np.arange(x0 + 1, x1 - 1, 1.5):
-            paints += [self._bar((x, y0 + 0.3), (x, y0 + south), 0.04, JOINT),
-                       self._bar((x, y1 - north), (x, y1 - 0.3), 0.04, JOINT)]  # fmt: skip
-        for y in np.arange(y0 + 1, y1 - 1, 1.5):
-            paints += [self._bar((x0 + 0.3, y), (x0 + west, y), 0.04, JOINT),
-                       self._bar((x1 - east, y), (x1 - 0.3, y), 0.04, JOINT)]  # fmt: skip
+        x, y = np.arange(x0 + 1, x1 - 1, 1.5), np.arange(y0 + 1, y1 - 1, 1.5)
+        for low, high in ((y0 + 0.3, y0 + south), (y1 - north, y1 - 0.3)):
+            paints += self._bars(_pairs(x, low), _pairs(x, high), 0.04, JOINT)
+        for low, high in ((x0 + 0.3, x0 + west), (x1 - east, x1 - 0.3)):
+            paints += self._bars(_pairs(y, low)[:, ::-1], _pairs(y, high)[:, ::-1], 0.04, JOINT)
         yard_low = (x0 + west, y0 + south)
         yard_high = (x1 - east, y1 - north)
         yard = city.bend(rounded_rectangle(yard_low, yard_high, 0.5))
@@ -125,10 +124,10 @@ class GroundPlan:
         for street, across, sign in ((a, b, 1), (a, b, -1), (b, a, 1), (b, a, -1)):
             edge = (y if street is a else x) + sign * across.half_width
             crossings.append(self._band(street, edge + sign * CROSSING_FROM_M, edge + sign * CROSSING_TO_M))
-            for offset in np.arange(-street.half_width + 0.5, street.half_width - 0.3, 1.1):
-                start = self._at(street, edge + sign * CROSSING_FROM_M, offset + 0.25)
-                end = self._at(street, edge + sign * CROSSING_TO_M, offset + 0.25)
-                paints.append(self._bar(start, end, 0.55, WHITE))
+            offsets = np.arange(-street.half_width + 0.75, street.half_width - 0.05, 1.1)
+            start = [self._at(street, edge + sign * CROSSING_FROM_M, offset) for offset in offsets]
+            end = [self._at(street, edge + sign * CROSSING_TO_M, offset) for offset in offsets]
+            paints += self._bars(start, end, 0.55, WHITE)
             side = self._approach_side(street, sign)
             stop = edge + sign * STOP_LINE_M
             paints.append(
@@ -159,7 +158,8 @@ class GroundPlan:
                 paints.append(GroundPaint(self._band(street, low, high, side * inner, side * street.half_width), PARKING))
             for offset, color, dash in self._lines(street):
                 boundaries.append(self.city.bend(self._run(street, low, high, side * offset)))
-                paints += [self._bar(a, b, LINE_M, color) for a, b in self._dashes(street, low, high, side * offset, dash)]
+                dashes = list(self._dashes(street, low, high, side * offset, dash))
+                paints += self._bars([a for a, _ in dashes], [b for _, b in dashes], LINE_M, color)
         paints += self._marks(street, low, high)
         return GroundPiece(tuple(paints), (self._band(street, start, end),), tuple(boundaries))
 
@@ -233,12 +233,22 @@ class GroundPlan:
             end = min(start + (dash or step), high)
             yield self._at(street, start, offset), self._at(street, end, offset)
 
-    def _bar(self, start: ArrayLike, end: ArrayLike, width: float, color: Color) -> GroundPaint:
+    def _bar(self, start: tuple[float, float], end: tuple[float, float], width: float, color: Color) -> GroundPaint:
         """A painted line between two plan points."""
-        a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
+        return self._bars([start], [end], width, color)[0]
+
+    def _bars(self, starts: ArrayLike, ends: ArrayLike, width: float, color: Color) -> list[GroundPaint]:
+        """Painted lines between plan points (L, 2) and (L, 2)."""
+        a, b = np.asarray(starts, dtype=np.float64), np.asarray(ends, dtype=np.float64)
         way = b - a
-        normal = np.array([-way[1], way[0]]) / max(float(np.hypot(*way)), 1e-9) * width / 2
-        return GroundPaint(self.city.bend(np.array([a + normal, b + normal, b - normal, a - normal])), color)
+        normal = np.stack([-way[:, 1], way[:, 0]], -1) / np.linalg.norm(way, axis=1, keepdims=True) * width / 2
+        corners = self.city.bend(np.stack([a + normal, b + normal, b - normal, a - normal], axis=1))
+        return [GroundPaint(outline, color) for outline in corners]
+
+
+def _pairs(varying: Array, fixed: float) -> Array:
+    """(L, 2) points of varying first and fixed second coordinate."""
+    return np.stack([varying, np.full(len(varying), fixed)], -1)
 
 
 def _junction_outline(x: float, y: float, half_x: float, half_y: float, reach_x: float, reach_y: float) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -15,17 +16,20 @@ from bevcli.synth.palette import linear
 
 SUBPIXEL_BITS = 4
 LEVELS = 6
+ROUGH_SIZE, ROUGH_TEXEL_M = 512, 0.125
 
 
 @dataclass(frozen=True)
 class GroundTexture:
     """texels: (K, 3) uint8 of all levels, square root of linear light, coarser levels after finer ones.
+    rough: of `roughness`.
 
     offsets: (LEVELS,) first texel of each level. origin: (x, y) of the first texel's corner, metres, rows along y.
     size: texels a side of the finest level, a multiple of 2^(LEVELS - 1).
     """
 
     texels: NDArray[np.uint8]
+    rough: NDArray[np.float32]
     offsets: NDArray[np.int64]
     origin: tuple[float, float]
     texel_m: float
@@ -48,7 +52,7 @@ def paint_ground(pieces: list[GroundPiece], center: ArrayLike, extent_m: float, 
     counts = [level.shape[0] ** 2 for level in levels]
     offsets = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
     texels = np.concatenate([level.reshape(-1, 3) for level in levels])
-    return GroundTexture(texels, offsets, (float(origin[0]), float(origin[1])), texel_m, size)
+    return GroundTexture(texels, roughness(), offsets, (float(origin[0]), float(origin[1])), texel_m, size)
 
 
 def fill(canvas: NDArray[np.uint8], outline: NDArray[np.float64], color: tuple[int, ...] | int) -> None:
@@ -61,18 +65,19 @@ def fill(canvas: NDArray[np.uint8], outline: NDArray[np.float64], color: tuple[i
     cv2.fillPoly(canvas, [fixed], color, smooth, SUBPIXEL_BITS)
 
 
+@lru_cache(maxsize=256)
 def _stored(color: tuple[int, int, int]) -> tuple[int, ...]:
     return tuple(int(round(float(np.sqrt(c)) * 255)) for c in linear(color))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def sample_ground(texels, offsets, origin_x, origin_y, texel_m, size, x, y, across, along, rx, ry, out):
+def sample_ground(texels, offsets, rough, origin_x, origin_y, texel_m, size, x, y, across, along, rx, ry, out):
     """Linear albedo at (x, y) into out (3,); returns the grain, a relative brightness of the rough surface.
 
-    across, along: metres that the pixel spans, `along` in the direction (rx, ry); up to four samples are spread over it.
+    across, along: metres that the pixel spans, `along` in the direction (rx, ry); up to three samples are spread over it.
     """
     flat = np.sqrt(rx * rx + ry * ry) + 1e-9
-    samples = min(max(int(along / across), 1), 4)
+    samples = min(max(int(0.6 * along / across), 1), 3)
     width = max(across, along / samples * 0.5)
     level = 0
     span = texel_m * 1.4
@@ -97,21 +102,27 @@ def sample_ground(texels, offsets, origin_x, origin_y, texel_m, size, x, y, acro
             out[c] += value * value
     for c in range(3):
         out[c] /= 65025.0 * samples
-    grain = 0.0
+    size_n = rough.shape[0]
+    u, v = x / ROUGH_TEXEL_M, y / ROUGH_TEXEL_M
+    iu, iv = int(np.floor(u)), int(np.floor(v))
+    wu, wv = u - iu, v - iv
+    i0, i1, j0, j1 = iu & (size_n - 1), (iu + 1) & (size_n - 1), iv & (size_n - 1), (iv + 1) & (size_n - 1)
+    grain = (rough[j0, i0] * (1 - wu) + rough[j0, i1] * wu) * (1 - wv) + (
+        rough[j1, i0] * (1 - wu) + rough[j1, i1] * wu
+    ) * wv
     if width < 0.05:
         fine = scramble(int(np.floor(x * 45)), int(np.floor(y * 45))) % 256 / 255.0 - 0.5
         grain += 0.22 * fine * min(1.0, (0.05 - width) / 0.035)
-    if width < 1.0:
-        grain += 0.2 * (_smooth_noise(x * 0.9, y * 0.9) - 0.5) * min(1.0, (1.0 - width) / 0.5)
-    grain += 0.22 * (_smooth_noise(x * 0.13, y * 0.13) - 0.5)
     return grain
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _smooth_noise(x, y):
-    iu, iv = int(np.floor(x)), int(np.floor(y))
-    wu, wv = x - iu, y - iv
-    wu, wv = wu * wu * (3 - 2 * wu), wv * wv * (3 - 2 * wv)
-    a, b = scramble(iu, iv) & 1023, scramble(iu + 1, iv) & 1023
-    c, d = scramble(iu, iv + 1) & 1023, scramble(iu + 1, iv + 1) & 1023
-    return ((a * (1 - wu) + b * wu) * (1 - wv) + (c * (1 - wu) + d * wu) * wv) / 1023.0
+def roughness() -> NDArray[np.float32]:
+    """(512, 512) relative brightness of worn ground, repeating, in texels of ROUGH_TEXEL_M; the same everywhere."""
+    rng = np.random.Generator(np.random.PCG64(7))
+    total = np.zeros((ROUGH_SIZE, ROUGH_SIZE))
+    for cells, strength in ((8, 0.22), (64, 0.20)):
+        coarse = np.pad(rng.random((cells, cells)), 2, mode="wrap") - 0.5
+        scale = ROUGH_SIZE // cells
+        fine = cv2.resize(coarse, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+        total += strength * fine[2 * scale : 2 * scale + ROUGH_SIZE, 2 * scale : 2 * scale + ROUGH_SIZE]
+    return total.astype(np.float32)

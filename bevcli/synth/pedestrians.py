@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bevcli.geometry.transforms import Array
 from bevcli.synth.actors import MOVING_M_S, Body, State, draw_body
 from bevcli.synth.catalog import Catalog
-from bevcli.synth.city import CityPlan, along, rounded_rectangle
+from bevcli.synth.city import KERB_M, CityPlan, along, rounded_rectangle
 from bevcli.synth.people import PERSON_NAMES
 from bevcli.synth.route import DIRECTIONS, node_center, street_of
 from bevcli.synth.signals import Signals
@@ -45,23 +45,27 @@ class Walker:
 
     def on_road(self, time_s: float) -> bool:
         """Whether vehicles must mind the person."""
-        return self.road[0] < float(np.interp(time_s, self.times, self.places)) < self.road[1]
+        return self.road[0] - 0.3 < float(np.interp(time_s, self.times, self.places)) < self.road[1] + 0.3
 
     def state(self, time_s: float) -> State | None:
         """None before the walk begins and after it ends."""
         if not self.times[0] <= time_s <= self.times[-1]:
             return None
-        plan = self.plan_at(time_s)
-        x, y = self.city.bend(plan)
-        before, after = (self.city.bend(self.plan_at(t)) for t in (time_s - 0.02, time_s + 0.02))
+        moments = np.array([time_s - 0.02, time_s, time_s + 0.02])
+        places = np.interp(moments, self.times, self.places)
+        plan = np.stack([np.interp(places, self.positions, self.path[:, k]) for k in (0, 1)], -1)
+        before, here, after = self.city.bend(plan)
         velocity = (after - before) / 0.04
-        place = float(np.interp(time_s, self.times, self.places))
-        segment = int(np.clip(np.searchsorted(self.positions, place, side="right") - 1, 0, len(self.path) - 2))
-        yaw = self.city.heading(plan, _unit(self.path[segment + 1] - self.path[segment]))
         moving = float(np.hypot(*velocity)) > MOVING_M_S
-        position = np.array([x, y, float(self.city.ground_height(plan))])
+        if moving:
+            yaw = float(np.arctan2(velocity[1], velocity[0]))
+        else:  # waiting: towards the other side
+            segment = int(np.searchsorted(self.positions, places[1], side="right"))
+            yaw = self.city.heading(plan[1], _unit(self.path[segment] - self.path[segment - 1]))
+        inside = min(places[1] - self.road[0], self.road[1] - places[1])  # metres into the road, negative on pavements
+        position = np.array([here[0], here[1], KERB_M * float(np.clip(0.5 - inside / 0.3, 0, 1))])
         attribute = "pedestrian.moving" if moving else "pedestrian.standing"
-        return State(self.body, position, yaw, velocity, attribute, int(place / STRIDE_M) % 2)
+        return State(self.body, position, yaw, velocity, attribute, int(places[1] / STRIDE_M) % 2)
 
 
 def _unit(way: Array) -> Array:
@@ -131,7 +135,7 @@ def _crosser(
     end = start + (2 * reach - kerb) / speed
     body = _person(catalog, rng, name)
     return _make(city, body, path, [begin, arrival, start, end], [0.0, kerb, kerb, 2 * reach],
-                 (ALONG_PAVEMENT_M - 0.3, far + 0.3))  # fmt: skip
+                 (ALONG_PAVEMENT_M, far))  # fmt: skip
 
 
 def _person(catalog: Catalog, rng: np.random.Generator, name: str) -> Body:

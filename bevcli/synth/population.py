@@ -8,7 +8,17 @@ from bevcli.geometry.transforms import Array
 from bevcli.synth.actors import draw_body
 from bevcli.synth.catalog import Catalog
 from bevcli.synth.city import STOP_LINE_M, CityPlan
-from bevcli.synth.route import DIRECTIONS, LaneStart, build_route, draw_turns, node_center, street_of
+from bevcli.synth.route import (
+    DIRECTIONS,
+    LaneStart,
+    bicycle_turns,
+    build_route,
+    draw_turns,
+    lane_offset,
+    node_center,
+    right_of,
+    street_of,
+)
 from bevcli.synth.traffic import Unit, Vehicle
 
 TRAFFIC_MIX = {
@@ -43,13 +53,18 @@ class Population:
         route = build_route(self.city, start, draw_turns(self.city, start, rng, 0.4), self.route_m, speed)
         return Vehicle(route, units, 8.0, speed * 0.6, 1.0)
 
-    def appear(self, around: Array, near_m: float, far_m: float, others: list[Vehicle], bicycle: bool) -> Vehicle | None:
-        """A vehicle somewhere on a lane between near_m and far_m of a world point, or None where there is no room."""
+    def appear(self, around: Array, near_m: float, far_m: float, taken: Array, bicycle: bool) -> Vehicle | None:
+        """A vehicle somewhere on a lane between near_m and far_m of a world point, or None where there is no room.
+
+        taken: (M, 2) world points where vehicles are.
+        """
         rng = self._rng
         x, y = self.city.unbend(around)
         axis = int(rng.integers(2))
         across, lengthwise = (y, x) if axis == 0 else (x, y)
         streets = self.city.streets_between(axis, across - far_m, across + far_m)
+        if not streets:
+            return None
         street = streets[int(rng.integers(len(streets)))]
         at = lengthwise + rng.uniform(-far_m, far_m)
         direction = axis + 2 * int(rng.integers(2))
@@ -61,21 +76,19 @@ class Population:
         cross = street_of(self.city, node, direction + 1)
         if before < cross.half_width + STOP_LINE_M + 1:
             return None
+        offset = right_of(direction) * lane_offset(street, lane, bicycle)
+        front = self.city.bend(_on_axis(axis, at, street.position) + offset)
+        if not near_m <= np.hypot(*(front - around)) <= far_m:
+            return None
+        reach = np.linspace(-length - 6, 8, 10)[:, None] * DIRECTIONS[direction]  # nobody close before or behind
+        lane_ahead = self.city.bend(_on_axis(axis, at, street.position) + offset + reach)
+        if _nearest(lane_ahead, taken) < (1.6 if bicycle else 2.2):
+            return None
         start = LaneStart(node, direction, lane, before + length + 2)
-        turns = draw_turns(self.city, start, rng) if not bicycle else iter(lambda: 0 if rng.random() < 0.7 else -1, None)
+        turns = bicycle_turns(rng) if bicycle else draw_turns(self.city, start, rng)
         speed = float(rng.uniform(3.5, 6.0) if bicycle else rng.uniform(7.5, 12.5))
         route = build_route(self.city, start, turns, self.route_m * speed / 12 + length, speed, bicycle)
-        vehicle = Vehicle(route, units, length + 2, speed * 0.7, float(rng.uniform(0.7, 1.25)), bicycle)
-        place = route.at(vehicle.front)
-        if not near_m <= np.hypot(*(place - around)) <= far_m:
-            return None
-        mine = vehicle.body_points()
-        for other in others:
-            if np.min(np.linalg.norm(mine[:, None] - other.body_points()[None], axis=-1)) < (2.0 if bicycle else 9.0):
-                same_lane = np.cos(other.route.yaw_at(other.front) - route.yaw_at(vehicle.front)) > 0.5
-                if same_lane or bicycle or np.min(np.linalg.norm(mine[:, None] - other.body_points()[None], axis=-1)) < 2.5:
-                    return None
-        return vehicle
+        return Vehicle(route, units, length + 2, speed * 0.7, float(rng.uniform(0.7, 1.25)), bicycle)
 
     def _next_node(self, axis: int, index: int, at: float, direction: int) -> tuple[int, int]:
         nearest = self.city.nearest(1 - axis, at)
@@ -111,3 +124,10 @@ def _unit(body, lag: float) -> Unit:  # noqa: ANN001
 
 def _on_axis(axis: int, at: float, across: float) -> Array:
     return np.array([at, across]) if axis == 0 else np.array([across, at])
+
+
+def _nearest(points: Array, others: Array) -> float:
+    """Smallest distance between points (P, 2) and (M, 2), infinite where there are none."""
+    if not len(others):
+        return float("inf")
+    return float(np.sqrt(((points[:, None] - others[None]) ** 2).sum(-1).min()))

@@ -13,7 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from bevcli.geometry.cameras import Camera
-from bevcli.geometry.transforms import Array
+from bevcli.geometry.transforms import Array, inverse
 
 NEAR_M = 0.1  # triangles are cut where they come nearer to the camera's plane
 
@@ -23,7 +23,8 @@ class VisibilityBuffer:
     """What each pixel of one picture sees.
 
     triangles: (H, W) int32 index of the nearest triangle, -1 for none. inverse_depth: (H, W) float32, 1/m.
-    unoccluded: (O,) int64 pixels that each object would cover alone in the picture.
+    unoccluded: (O,) int64 pixels that each object would cover alone in the picture; for one that is wholly hidden by
+    what was drawn before it, it may be 0.
     """
 
     triangles: NDArray[np.int32]
@@ -33,6 +34,7 @@ class VisibilityBuffer:
 
 def rasterise(
     corners: NDArray[np.float32],
+    normals: NDArray[np.float32],
     runs: NDArray[np.int64],
     run_objects: NDArray[np.int32],
     run_spheres: NDArray[np.float32],
@@ -42,7 +44,7 @@ def rasterise(
 ) -> VisibilityBuffer:
     """Rasterise triangles into one picture. The camera's distortion is not applied.
 
-    corners: (T, 3, 3) world metres, counter-clockwise seen from outside; back faces are not drawn.
+    corners: (T, 3, 3) world metres, counter-clockwise seen from outside; back faces are not drawn. normals: (T, 3).
     runs: (R, 2) first and last-plus-one triangle of each run. run_objects: (R,) object that the run belongs to,
     -1 for none; the runs of one object follow each other. run_spheres: (R, 4) bounding sphere x, y, z, radius.
     camera_from_world: (4, 4).
@@ -55,14 +57,14 @@ def rasterise(
     k = camera.intrinsics
     pinhole = np.array([k[0, 0], k[0, 1], k[0, 2], k[1, 1], k[1, 2]])
     _rasterise_runs(
-        corners, runs, run_objects, run_spheres, np.ascontiguousarray(camera_from_world[:3]), pinhole,
-        triangles, inverse_depth, stamps, unoccluded,
+        corners, normals, runs, run_objects, run_spheres, np.ascontiguousarray(camera_from_world[:3]), pinhole,
+        inverse(camera_from_world)[:3, 3].copy(), triangles, inverse_depth, stamps, unoccluded,
     )  # fmt: skip
     return VisibilityBuffer(triangles, inverse_depth, unoccluded)
 
 
 @njit(cache=True, nogil=True)
-def _rasterise_runs(corners, runs, run_objects, run_spheres, camera_from_world, pinhole,
+def _rasterise_runs(corners, normals, runs, run_objects, run_spheres, camera_from_world, pinhole, eye,
                     triangles, inverse_depth, stamps, unoccluded):  # fmt: skip
     height, width = triangles.shape
     slope_x = max(pinhole[2], width - pinhole[2]) / pinhole[0] + abs(pinhole[1] / pinhole[0])
@@ -84,8 +86,17 @@ def _rasterise_runs(corners, runs, run_objects, run_spheres, camera_from_world, 
             continue
         if abs(center[1]) > slope_y * center[2] + radius * reach_y:
             continue
+        if center[2] - radius > NEAR_M and _is_hidden(center, radius, pinhole, inverse_depth):
+            continue  # it shows nothing, so that its unoccluded pixels need not be counted either
         owner = run_objects[run]
         for t in range(runs[run, 0], runs[run, 1]):
+            facing = (
+                normals[t, 0] * (corners[t, 0, 0] - eye[0])
+                + normals[t, 1] * (corners[t, 0, 1] - eye[1])
+                + normals[t, 2] * (corners[t, 0, 2] - eye[2])
+            )
+            if facing > 1e-3:  # seen from behind
+                continue
             for i in range(3):
                 for axis in range(3):
                     row = camera_from_world[axis]
@@ -97,52 +108,75 @@ def _rasterise_runs(corners, runs, run_objects, run_spheres, camera_from_world, 
             _draw_triangle(p, cut, t, owner, pinhole, triangles, inverse_depth, stamps, unoccluded)
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def _is_hidden(center, radius, pinhole, inverse_depth):
+    """Whether everything that the sphere's picture may cover is nearer than the sphere already."""
+    near, far = center[2] - radius, center[2] + radius
+    left, right = center[0] - radius, center[0] + radius
+    above, below = center[1] - radius, center[1] + radius
+    low_y, high_y = min(above / near, above / far), max(below / near, below / far)
+    low_x, high_x = min(left / near, left / far), max(right / near, right / far)
+    skew_low, skew_high = min(pinhole[1] * low_y, pinhole[1] * high_y), max(pinhole[1] * low_y, pinhole[1] * high_y)
+    u0 = max(int(np.floor(pinhole[0] * low_x + skew_low + pinhole[2])), 0)
+    u1 = min(int(np.ceil(pinhole[0] * high_x + skew_high + pinhole[2])), inverse_depth.shape[1] - 1)
+    v0 = max(int(np.floor(pinhole[3] * low_y + pinhole[4])), 0)
+    v1 = min(int(np.ceil(pinhole[3] * high_y + pinhole[4])), inverse_depth.shape[0] - 1)
+    nearest = 1.0 / near
+    for v in range(v0, v1 + 1):
+        for u in range(u0, u1 + 1):
+            if inverse_depth[v, u] < nearest:
+                return False
+    return True
+
+
 @njit(cache=True, nogil=True)
 def _draw_triangle(p, cut, t, owner, pinhole, triangles, inverse_depth, stamps, unoccluded):
-    """One triangle p (3, 3) in the camera frame: 1/z is affine over the picture, so its plane gives it exactly."""
-    ax, ay, az = p[1, 0] - p[0, 0], p[1, 1] - p[0, 1], p[1, 2] - p[0, 2]
-    bx, by, bz = p[2, 0] - p[0, 0], p[2, 1] - p[0, 1], p[2, 2] - p[0, 2]
-    nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-    distance = nx * p[0, 0] + ny * p[0, 1] + nz * p[0, 2]
-    if distance >= -1e-12:  # seen from behind or edge-on
-        return
-    fx, skew, cx, fy, cy = pinhole
-    gu = nx / fx / distance
-    gv = (ny - nx * skew / fx) / fy / distance
-    g0 = nz / distance - gu * cx - gv * cy
+    """One triangle p (3, 3) in the camera frame, cut at the near plane where it must be."""
     if p[0, 2] >= NEAR_M and p[1, 2] >= NEAR_M and p[2, 2] >= NEAR_M:
-        _fill(p[0], p[1], p[2], pinhole, gu, gv, g0, t, owner, triangles, inverse_depth, stamps, unoccluded)
+        _fill(p, p, 0, 1, 2, pinhole, t, owner, triangles, inverse_depth, stamps, unoccluded)
         return
     count = 0
     for i in range(3):  # Sutherland-Hodgman against the near plane
         j = (i + 1) % 3
         if p[i, 2] >= NEAR_M:
-            cut[count] = p[i]
+            for axis in range(3):
+                cut[count, axis] = p[i, axis]
             count += 1
         if (p[i, 2] >= NEAR_M) != (p[j, 2] >= NEAR_M):
             w = (NEAR_M - p[i, 2]) / (p[j, 2] - p[i, 2])
-            cut[count] = p[i] + w * (p[j] - p[i])
+            for axis in range(3):
+                cut[count, axis] = p[i, axis] + w * (p[j, axis] - p[i, axis])
             count += 1
     for i in range(1, count - 1):
-        _fill(cut[0], cut[i], cut[i + 1], pinhole, gu, gv, g0, t, owner, triangles, inverse_depth, stamps, unoccluded)
+        _fill(p, cut, 0, i, i + 1, pinhole, t, owner, triangles, inverse_depth, stamps, unoccluded)
 
 
-@njit(cache=True, nogil=True)
-def _fill(a, b, c, pinhole, gu, gv, g0, t, owner, triangles, inverse_depth, stamps, unoccluded):
-    """Scan the rows that the triangle's picture spans; each of its edges bounds the columns of a row."""
-    fx, skew, cx, fy, cy = pinhole
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fill(p, q, a, b, c, pinhole, t, owner, triangles, inverse_depth, stamps, unoccluded):
+    """Scan the rows of the picture that points a, b, c of q span; each edge bounds the columns of a row.
+
+    p: (3, 3) the whole triangle in the camera frame. 1 / z is affine over the picture, so its plane gives it exactly.
+    """
+    fx, skew, cx, fy, cy = pinhole[0], pinhole[1], pinhole[2], pinhole[3], pinhole[4]
     height, width = triangles.shape
-    u0, v0 = (fx * a[0] + skew * a[1]) / a[2] + cx, fy * a[1] / a[2] + cy
-    u1, v1 = (fx * b[0] + skew * b[1]) / b[2] + cx, fy * b[1] / b[2] + cy
-    u2, v2 = (fx * c[0] + skew * c[1]) / c[2] + cx, fy * c[1] / c[2] + cy
-    area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)
-    if area == 0.0:
-        return
+    u0, v0 = (fx * q[a, 0] + skew * q[a, 1]) / q[a, 2] + cx, fy * q[a, 1] / q[a, 2] + cy
+    u1, v1 = (fx * q[b, 0] + skew * q[b, 1]) / q[b, 2] + cx, fy * q[b, 1] / q[b, 2] + cy
+    u2, v2 = (fx * q[c, 0] + skew * q[c, 1]) / q[c, 2] + cx, fy * q[c, 1] / q[c, 2] + cy
     top = int(np.ceil(max(min(v0, v1, v2), 0.0)))
     bottom = int(np.floor(min(max(v0, v1, v2), height - 1.0)))
     left_most, right_most = max(min(u0, u1, u2), 0.0), min(max(u0, u1, u2), width - 1.0)
-    if left_most > right_most:
+    if top > bottom or np.ceil(left_most) > np.floor(right_most):
         return
+    ax, ay, az = p[1, 0] - p[0, 0], p[1, 1] - p[0, 1], p[1, 2] - p[0, 2]
+    bx, by, bz = p[2, 0] - p[0, 0], p[2, 1] - p[0, 1], p[2, 2] - p[0, 2]
+    nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    distance = nx * p[0, 0] + ny * p[0, 1] + nz * p[0, 2]
+    area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)
+    if distance >= -1e-12 or area == 0.0:  # seen from behind or edge-on
+        return
+    gu = nx / fx / distance
+    gv = (ny - nx * skew / fx) / fy / distance
+    g0 = nz / distance - gu * cx - gv * cy
     sign = 1.0 if area > 0 else -1.0
     e0u, e0v = -(v1 - v0) * sign, (u1 - u0) * sign
     e1u, e1v = -(v2 - v1) * sign, (u2 - u1) * sign
@@ -154,9 +188,8 @@ def _fill(a, b, c, pinhole, gu, gv, g0, t, owner, triangles, inverse_depth, stam
         low, high = _narrow(low, high, e2u, -e2v * (v - v2), u2)
         if low > high:
             continue
-        start, stop = int(np.ceil(low)), int(np.floor(high)) + 1
         base = gv * v + g0
-        for u in range(start, stop):
+        for u in range(int(np.ceil(low)), int(np.floor(high)) + 1):
             nearness = np.float32(gu * u + base)
             if owner >= 0 and stamps[v, u] != owner:
                 stamps[v, u] = owner

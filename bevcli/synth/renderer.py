@@ -54,7 +54,7 @@ def expose(moment: Moment, camera: Camera, world_from_ego: Array, supersampling:
     fine = supersampled(camera, supersampling)
     world_from_camera = world_from_ego @ camera.ego_from_camera
     buffer = rasterise(
-        moment.soup.surfaces.corners, moment.soup.runs, moment.soup.objects, moment.soup.spheres, fine,
+        moment.soup.surfaces.corners, moment.soup.surfaces.normals, moment.soup.runs, moment.soup.objects, moment.soup.spheres, fine,
         inverse(world_from_camera), moment.object_count,
     )  # fmt: skip
     picture = shade(

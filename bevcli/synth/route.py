@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -87,7 +87,7 @@ def right_of(direction: int) -> Array:
     return DIRECTIONS[(direction - 1) % 4]
 
 
-def draw_turns(city: CityPlan, start: LaneStart, rng: np.random.Generator, straight_on: float = 0.5) -> Iterable[int]:
+def draw_turns(city: CityPlan, start: LaneStart, rng: np.random.Generator, straight_on: float = 0.5) -> Iterator[int]:
     """Endless turns that a driver may take from the lane that they are in."""
     node, direction, lane = start.node, start.direction, start.lane
     while True:
@@ -98,6 +98,12 @@ def draw_turns(city: CityPlan, start: LaneStart, rng: np.random.Generator, strai
         direction = (direction + turn) % 4
         node = (node[0] + int(DIRECTIONS[direction][0]), node[1] + int(DIRECTIONS[direction][1]))
         lane = _lane_after(city, node, direction, turn, lane)
+
+
+def bicycle_turns(rng: np.random.Generator) -> Iterator[int]:
+    """Endless turns of a bicycle: straight on or right, as it keeps right."""
+    while True:
+        yield 0 if rng.random() < 0.7 else -1
 
 
 def _lane_after(city: CityPlan, node: tuple[int, int], direction: int, turn: int, lane: int) -> int:
@@ -111,7 +117,7 @@ def build_route(
     """A route of at least `length` metres at a preferred speed in m/s; a bicycle keeps right of the lanes."""
     node, direction, lane = start.node, start.direction, start.lane
     street = street_of(city, node, direction)
-    offset = _offset(street, lane, bicycle)
+    offset = lane_offset(street, lane, bicycle)
     at = node_center(city, node) - DIRECTIONS[direction] * start.before + right_of(direction) * offset
     corners, marks, travelled = [at[None]], [], 0.0
     choose = iter(turns)
@@ -122,7 +128,7 @@ def build_route(
         following = (node[0] + int(DIRECTIONS[after][0]), node[1] + int(DIRECTIONS[after][1]))
         lane = _lane_after(city, following, after, turn, lane)
         new_street = street_of(city, following, after)
-        new_offset = _offset(new_street, lane, bicycle)
+        new_offset = lane_offset(new_street, lane, bicycle)
         corner = center + right_of(direction) * offset
         if turn != 0:
             corner = corner + DIRECTIONS[direction] * (right_of(after) @ DIRECTIONS[direction]) * new_offset
@@ -146,7 +152,8 @@ def corner_at(center: Array, direction: int, offset: float, ahead: float) -> Arr
     return center + right_of(direction) * offset + DIRECTIONS[direction] * ahead
 
 
-def _offset(street: Street, lane: int, bicycle: bool) -> float:
+def lane_offset(street: Street, lane: int, bicycle: bool) -> float:
+    """Metres right of the street's centre line on which a vehicle keeps; bicycles keep right of all lanes."""
     return street.lanes * street.lane_m + BICYCLE_OFFSET_M if bicycle else street.lane_offset(lane)
 
 

@@ -10,24 +10,24 @@ from bevcli.synth.buildings import House, houses, kerb_slab
 from bevcli.synth.city import CORNER_M, KERB_M, Block, CityPlan, rounded_rectangle
 from bevcli.synth.furniture import bench, bin_, bus_shelter, bush, hydrant, lamp_post, sign_post, signal_head, tree
 from bevcli.synth.landuse import landuse
-from bevcli.synth.mesh import Mesh, joined
-from bevcli.synth.triangles import Run, Soup, gather, make_run, place
+from bevcli.synth.mesh import joined
+from bevcli.synth.triangles import Run, Shape, Soup, gather, make_run, place
 
 TREE_KINDS = 12
 
 
 class Furnishings:
-    """The meshes that scenery repeats, made once."""
+    """The shapes that scenery repeats, made once."""
 
     def __init__(self) -> None:
         rng = np.random.Generator(np.random.PCG64(20))
-        self.trees = [tree(k, rng) for k in range(TREE_KINDS)]
-        self.bushes = [bush(rng) for _ in range(4)]
-        self.lamp = lamp_post()
-        self.signs = [sign_post(k) for k in range(6)]
-        self.small = [bench(), bin_(), hydrant()]
-        self.shelter = bus_shelter()
-        self.signals = {light: signal_head(light) for light in ("red", "yellow", "green")}
+        self.trees = [Shape.of(tree(k, rng)) for k in range(TREE_KINDS)]
+        self.bushes = [Shape.of(bush(rng)) for _ in range(4)]
+        self.lamp = Shape.of(lamp_post())
+        self.signs = [Shape.of(sign_post(k)) for k in range(6)]
+        self.small = [Shape.of(mesh) for mesh in (bench(), bin_(), hydrant())]
+        self.shelter = Shape.of(bus_shelter())
+        self.signals = {light: Shape.of(signal_head(light)) for light in ("red", "yellow", "green")}
 
 
 class Scenery:
@@ -48,7 +48,8 @@ class Scenery:
                 found += self._block(i, j)
         at = np.asarray(center, dtype=np.float64)
         near = [run for run in found if np.hypot(*(run.sphere[:2] - at)) < reach_m + run.sphere[3]]
-        return gather(near, [-1] * len(near))
+        near.sort(key=lambda run: (len(run.facades) == 0, float(np.hypot(*(run.sphere[:2] - at)))))
+        return gather(near, [-1] * len(near))  # houses first, near ones before far ones: they hide the most
 
     def _block(self, column: int, row: int) -> list[Run]:
         key = (column, row)
@@ -111,9 +112,9 @@ class Scenery:
             runs.append(self._put(self.furnishings.shelter, spot, outward))
         return runs
 
-    def _put(self, mesh: Mesh, point: Array, yaw: float) -> Run:
+    def _put(self, shape: Shape, point: Array, yaw: float) -> Run:
         x, y = self.city.bend(point)
-        return place(mesh, (float(x), float(y), KERB_M), yaw)
+        return place(shape, (float(x), float(y), KERB_M), yaw)
 
 
 def side_of(land: Block, side: int) -> tuple[Array, Array, Array]:

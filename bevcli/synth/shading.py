@@ -69,7 +69,7 @@ def shade(
     _shade(
         buffer.triangles, buffer.inverse_depth, surfaces.normals, surfaces.albedo, surfaces.material,
         surfaces.facade, surfaces.facades,
-        ground.texels, ground.offsets, ground.origin[0], ground.origin[1], ground.texel_m, ground.size,
+        ground.texels, ground.offsets, ground.rough, ground.origin[0], ground.origin[1], ground.texel_m, ground.size,
         shadows.heights, shadows.origin[0], shadows.origin[1], shadows.texel_m, shadows.shear[0], shadows.shear[1],
         light, w.to_sun, w.clouds, w.haze_m, w.lamps, w.shadow_softness_m,
         ray_from_image, np.ascontiguousarray(world_from_camera[:3, 3]), 1.0 / camera.intrinsics[0, 0],
@@ -80,7 +80,7 @@ def shade(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _shade(triangles, inverse_depth, normals, albedo, material, facade, facades,
-           texels, offsets, ground_x, ground_y, texel_m, ground_size,
+           texels, offsets, rough, ground_x, ground_y, texel_m, ground_size,
            heights, shadow_x, shadow_y, shadow_texel, shear_x, shear_y,
            light, to_sun, clouds, haze_m, lamps, softness,
            ray_from_image, eye, pixel_angle, table, picture):  # fmt: skip
@@ -114,7 +114,7 @@ def _shade(triangles, inverse_depth, normals, albedo, material, facade, facades,
             grain = 0.0
             if kind == GROUND:
                 grazing = max(-rz / length, 0.02)
-                grain = sample_ground(texels, offsets, ground_x, ground_y, texel_m, ground_size,
+                grain = sample_ground(texels, offsets, rough, ground_x, ground_y, texel_m, ground_size,
                                       px, py, footprint, footprint / grazing, rx, ry, a)  # fmt: skip
             elif kind == FACADE:
                 if facade_albedo(facades[facade[t]], px, py, pz, footprint, lamps, a):
@@ -143,7 +143,8 @@ def _shade(triangles, inverse_depth, normals, albedo, material, facade, facades,
                 if kind == GLASS or kind == PAINT:
                     _reflect(rx / length, ry / length, rz / length, nx, ny, nz, kind, light, to_sun, clouds,
                              lit > 0.02, mirror, a)  # fmt: skip
-            veil = 1.0 - np.exp(-distance / haze_m)
+            far = distance / haze_m
+            veil = 1.0 - 1.0 / (1.0 + far + 0.48 * far * far + 0.235 * far * far * far)  # near 1 - exp(-far)
             veil *= veil
             for c in range(3):
                 a[c] += (haze[c] - a[c]) * veil
@@ -190,7 +191,11 @@ def _reflect(x, y, z, nx, ny, nz, kind, light, to_sun, clouds, sunlit, mirror, c
     grazing = 1.0 - min(max(facing, 0.0), 1.0)
     fresnel = grazing * grazing * grazing * grazing * grazing
     if mz > 0:
-        _sky(mx, my, mz, light, to_sun, clouds, mirror)
+        if kind == GLASS:
+            _sky(mx, my, mz, light, to_sun, clouds, mirror)
+        else:
+            for c in range(3):
+                mirror[c] = light[4, c] + (light[3, c] - light[4, c]) * mz
         fade = min(1.0, mz * 4.0)
         for c in range(3):
             mirror[c] = mirror[c] * fade + 0.22 * light[4, c] * (1 - fade)

@@ -114,6 +114,7 @@ class Simulation:
     def _populate(self, vehicles: list[Vehicle], near_m: float) -> None:
         """Fill the streets around the ego vehicle."""
         ego = self._ego
+        taken = [vehicle.body_points() for vehicle in vehicles]
         for attempt in range(6 * (VEHICLES + BICYCLES)):
             bicycles = sum(v.bicycle for v in vehicles)
             if len(vehicles) >= VEHICLES + BICYCLES:
@@ -122,9 +123,10 @@ class Simulation:
             if not wants_bicycle and len(vehicles) - bicycles >= VEHICLES:
                 continue
             around = ego.route.at(ego.front + 25.0)
-            new = self.population.appear(around, near_m, REACH_M, vehicles, wants_bicycle)
+            new = self.population.appear(around, near_m, REACH_M, np.concatenate(taken), wants_bicycle)
             if new is not None:
                 vehicles.append(new)
+                taken.append(new.body_points())
 
     def _renew(self, vehicles: list[Vehicle], time_s: float) -> list[Vehicle]:
         """Let vehicles go that are far away or at their route's end, and new ones come at the edge; returns the former."""

@@ -26,10 +26,10 @@ def signal_runs(
                 street, cross = street_of(city, node, direction), street_of(city, node, direction + 1)
                 ahead = DIRECTIONS[direction] * (cross.half_width + 0.9)
                 spot = node_center(city, node) + ahead + right_of(direction) * (street.half_width + 0.9)
-                mesh = furnishings.signals[signals.light(node, direction % 2, time_s)]
+                shape = furnishings.signals[signals.light(node, direction % 2, time_s)]
                 yaw = city.heading(spot, -DIRECTIONS[direction])
                 point = city.bend(spot)
-                runs.append(place(mesh, (float(point[0]), float(point[1]), KERB_M), yaw))
+                runs.append(place(shape, (float(point[0]), float(point[1]), KERB_M), yaw))
     return runs
 
 

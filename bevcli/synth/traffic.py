@@ -14,7 +14,7 @@ from bevcli.synth.route import JunctionPass, Route
 from bevcli.synth.signals import Signals
 
 STEP_S = 0.1
-LOOK_AHEAD_M = 42.0
+LOOK_AHEAD_M, LOOK_STEPS = 42.0, 54
 CORRIDOR_M = 1.55  # something this near to the middle of a vehicle's way is in its way
 COMFORT = 2.0  # m/s², usual braking
 HARDEST = -3.4  # m/s², what the traffic ever brakes with
@@ -59,7 +59,7 @@ class Vehicle:
     def body_points(self) -> Array:
         """(B, 2) points along the vehicle, at most 2.5 m apart, its ends included."""
         count = max(int(np.ceil(self.length / 2.5)) + 1, 2)
-        return self.route.at(np.linspace(self.front - self.length, self.front, count))
+        return _points_between(self.route.points, self.route.positions, self.front - self.length, self.front, count)
 
 
 def step(
@@ -91,8 +91,8 @@ def _acceleration(
     limit = float(np.interp(vehicle.front, route.positions, route.speed_limits))
     speed, strongest = vehicle.speed, 1.6 * vehicle.liveliness
     free = strongest * (1 - (speed / max(limit, 0.3)) ** 4) if speed <= limit else max(-2.2, (limit - speed) * 2.0)
-    ahead = np.arange(vehicle.front + 0.3, vehicle.front + LOOK_AHEAD_M, 0.8)
-    gap, other = _nearest_in_way(route.at(ahead), 0.8, obstacles, owners, index, 0.9 if vehicle.bicycle else CORRIDOR_M)
+    corridor = 0.9 if vehicle.bicycle else CORRIDOR_M
+    gap, other = _nearest_in_way(route.points, route.positions, vehicle.front, obstacles, owners, index, corridor)
     wanted = free
     if gap < np.inf:
         lead = float(speeds[other]) if other >= 0 else 0.0
@@ -141,14 +141,29 @@ def _may_enter(
 
 
 @njit(cache=True, nogil=True)
-def _nearest_in_way(way, spacing, obstacles, owners, own, corridor):
-    """Distance along the way (P, 2) to the first obstacle within the corridor, and its owner; inf, -1 for none."""
+def _points_between(points, positions, start, end, count):
+    """(count, 2) points at even positions from start to end along a route."""
+    found = np.empty((count, 2))
+    for i in range(count):
+        place = start + (end - start) * i / (count - 1)
+        k = min(max(np.searchsorted(positions, place) - 1, 0), len(positions) - 2)
+        w = min(max((place - positions[k]) / (positions[k + 1] - positions[k]), 0.0), 1.0)
+        found[i, 0] = points[k, 0] + w * (points[k + 1, 0] - points[k, 0])
+        found[i, 1] = points[k, 1] + w * (points[k + 1, 1] - points[k, 1])
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _nearest_in_way(points, positions, front, obstacles, owners, own, corridor):
+    """Distance along a route from `front` to the first obstacle in its corridor, and its owner; inf, -1 for none."""
     squared = corridor * corridor
-    for i in range(way.shape[0]):
-        for k in range(obstacles.shape[0]):
-            if owners[k] == own:
-                continue
+    way = _points_between(points, positions, front + 0.3, front + LOOK_AHEAD_M, LOOK_STEPS)
+    reach = (LOOK_AHEAD_M + 5.0) ** 2
+    near = [k for k in range(obstacles.shape[0]) if owners[k] != own
+            and (obstacles[k, 0] - way[0, 0]) ** 2 + (obstacles[k, 1] - way[0, 1]) ** 2 < reach]  # fmt: skip
+    for i in range(LOOK_STEPS):
+        for k in near:
             dx, dy = obstacles[k, 0] - way[i, 0], obstacles[k, 1] - way[i, 1]
             if dx * dx + dy * dy < squared:
-                return max(i * spacing - 0.4, 0.05), owners[k]
+                return max(i * (LOOK_AHEAD_M - 0.3) / (LOOK_STEPS - 1) - 0.4, 0.05), owners[k]
     return np.inf, -1

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from bevcli.synth.mesh import Material, Mesh
 from bevcli.synth.shading import Surfaces
 
+NO_FACADES = np.zeros((0, 16), np.float32)
+
 
 @dataclass(frozen=True)
 class Run:
-    """Triangles of one thing. sphere: (4,) x, y, z, radius. facade: (T,) row of facades, -1 for none."""
+    """Triangles of one thing. sphere: (4,) x, y, z, radius. facade: (T,) row of facades, -1 for all where there are none."""
 
     corners: NDArray[np.float32]
     normals: NDArray[np.float32]
@@ -35,28 +38,52 @@ class Soup:
     spheres: NDArray[np.float32]
 
 
-def place(
-    mesh: Mesh,
-    position: tuple[float, float, float],
-    yaw: float,
-    paint: NDArray[np.float32] | None = None,
-    dye: NDArray[np.float32] | None = None,
-) -> Run:
-    """A mesh at a world position, turned by yaw, its PAINT and DYE faces in the given linear colours (3,)."""
-    c, s = np.float32(np.cos(yaw)), np.float32(np.sin(yaw))
-    x, y = mesh.faces[..., 0], mesh.faces[..., 1]
-    corners = np.empty_like(mesh.faces)
-    corners[..., 0] = c * x - s * y + np.float32(position[0])
-    corners[..., 1] = s * x + c * y + np.float32(position[1])
-    corners[..., 2] = mesh.faces[..., 2] + np.float32(position[2])
-    albedo = mesh.albedo
-    if paint is not None or dye is not None:
-        albedo = albedo.copy()
-        if paint is not None:
-            albedo[mesh.material == Material.PAINT] = paint
-        if dye is not None:
-            albedo[mesh.material == Material.DYE] = dye
-    return make_run(corners, albedo, mesh.material)
+@dataclass(frozen=True)
+class Shape:
+    """A mesh ready to be placed many times: its normals and bounding sphere are known."""
+
+    mesh: Mesh
+    normals: NDArray[np.float32]
+    sphere: NDArray[np.float32]
+
+    @staticmethod
+    def of(mesh: Mesh) -> Shape:
+        """Work out what placing needs."""
+        run = make_run(mesh.faces, mesh.albedo, mesh.material)
+        return Shape(mesh, run.normals, run.sphere)
+
+    def painted(self, paint: NDArray[np.float32], dye: NDArray[np.float32]) -> Shape:
+        """The shape with its PAINT and DYE faces in these linear colours (3,)."""
+        albedo = self.mesh.albedo.copy()
+        albedo[self.mesh.material == Material.PAINT] = paint
+        albedo[self.mesh.material == Material.DYE] = dye
+        return replace(self, mesh=replace(self.mesh, albedo=albedo))
+
+
+def place(shape: Shape, position: tuple[float, float, float], yaw: float) -> Run:
+    """A shape at a world position, turned by yaw."""
+    x, y, z = position
+    corners, normals = np.empty_like(shape.mesh.faces), np.empty_like(shape.normals)
+    cosine, sine = float(np.cos(yaw)), float(np.sin(yaw))
+    _turn_and_shift(shape.mesh.faces, shape.normals, cosine, sine, float(x), float(y), float(z), corners, normals)
+    cx, cy, cz, radius = shape.sphere
+    sphere = np.array([cosine * cx - sine * cy + x, sine * cx + cosine * cy + y, cz + z, radius], np.float32)
+    none = np.full(len(corners), -1, np.int32)
+    return Run(corners, normals, shape.mesh.albedo, shape.mesh.material, none, NO_FACADES, sphere)
+
+
+@njit(cache=True, nogil=True)
+def _turn_and_shift(faces, normals, cosine, sine, x, y, z, out_corners, out_normals):
+    for t in range(faces.shape[0]):
+        for i in range(3):
+            a, b = faces[t, i, 0], faces[t, i, 1]
+            out_corners[t, i, 0] = cosine * a - sine * b + x
+            out_corners[t, i, 1] = sine * a + cosine * b + y
+            out_corners[t, i, 2] = faces[t, i, 2] + z
+        a, b = normals[t, 0], normals[t, 1]
+        out_normals[t, 0] = cosine * a - sine * b
+        out_normals[t, 1] = sine * a + cosine * b
+        out_normals[t, 2] = normals[t, 2]
 
 
 def make_run(
@@ -73,7 +100,7 @@ def make_run(
     low, high = points.min(0), points.max(0)
     sphere = np.array([*((low + high) / 2), np.linalg.norm(high - low) / 2 + 1e-3], np.float32)
     if facade is None or facades is None:
-        facade, facades = np.full(len(corners), -1, np.int32), np.zeros((0, 16), np.float32)
+        facade, facades = np.full(len(corners), -1, np.int32), NO_FACADES
     return Run(corners, normals, albedo, material, facade, facades, sphere)
 
 
@@ -83,7 +110,7 @@ def gather(runs: Sequence[Run], objects: Sequence[int]) -> Soup:
     ends = np.cumsum(counts)
     shifted, facade_count = [], 0
     for run in runs:
-        shifted.append(np.where(run.facade >= 0, run.facade + facade_count, -1).astype(np.int32))
+        shifted.append(run.facade + np.int32(facade_count) if len(run.facades) else run.facade)
         facade_count += len(run.facades)
     facades = np.concatenate([run.facades for run in runs])
     surfaces = Surfaces(
