@@ -120,9 +120,11 @@ def _check_coverage(file: Path, motion: EgoMotion, entries: tuple[FrameEntry, ..
         times |= {f"camera {name}": source.timestamp_ns for name, source in entry.sources.items()}
         for what, time in times.items():
             if not first - TOLERANCE_NS <= time <= last + TOLERANCE_NS:
+                listed = entry.place.startswith(str(file.with_name("frames.csv")))
+                advice = "extend the ego-motion, or cut the frames" if listed else "state the start in timing.toml"
                 raise InputError(
                     f"{file}: covers {first} to {last} ns, but {what} is at {time} ns ({entry.place}; at most 50 ms "
-                    "outside is allowed): extend the ego-motion, or cut the frames"
+                    f"outside is allowed): {advice}"
                 )
 
 

@@ -99,6 +99,12 @@ def test_poses_are_taken_at_the_pictures_own_times(videos):
     np.testing.assert_allclose(frame.world_from_ego_at["CAM_FRONT"].translation[0], 14.3, atol=1e-9)
 
 
+def test_videos_that_miss_the_ego_motion_ask_for_their_start(videos):
+    """Without timing.toml they start at 0, long before the first pose."""
+    with pytest.raises(InputError, match=r"ego_motion.csv: covers .* CAM_BACK.avi#0.*timing.toml"):
+        open_sequence(videos)
+
+
 def test_a_camera_without_a_video(videos):
     (videos / "videos/CAM_BACK.avi").unlink()
     with pytest.raises(InputError, match="camera CAM_BACK: expected one video"):
