@@ -101,7 +101,7 @@ def test_poses_are_taken_at_the_pictures_own_times(videos):
 
 def test_videos_that_miss_the_ego_motion_ask_for_their_start(videos):
     """Without timing.toml they start at 0, long before the first pose."""
-    with pytest.raises(InputError, match=r"ego_motion.csv: covers .* CAM_BACK.avi#0.*timing.toml"):
+    with pytest.raises(InputError, match=r"ego_motion.csv: covers .*CAM_BACK.avi#0.*timing.toml"):
         open_sequence(videos)
 
 
