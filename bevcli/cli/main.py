@@ -15,6 +15,7 @@ from bevcli import __version__
 from bevcli.cli.convert import convert
 from bevcli.cli.demo import demo
 from bevcli.cli.eval import evaluate
+from bevcli.cli.export import export
 from bevcli.cli.project_debug import project_debug
 from bevcli.cli.run import run
 from bevcli.cli.viz import viz
@@ -47,6 +48,7 @@ def root(
 app.command()(convert)
 app.command()(demo)
 app.command("eval")(evaluate)
+app.command()(export)
 app.command()(project_debug)
 app.command()(run)
 app.command()(viz)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import evaluate
@@ -10,6 +11,8 @@ from bevcli.evaluation.detection_scores import DetectionScores
 from bevcli.evaluation.inputs import ScoredInput, without_cycles_in_racks
 from bevcli.evaluation.pairing import FramePairs, pair_frames
 from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmentation
+from bevcli.geometry.attributes import attributes_by_speed
+from bevcli.geometry.boxes import Boxes3D
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,8 @@ def score(
     """Score predictions. max_range_m: cuts every class's range. count_missing: see `pair_frames`.
 
     Class ranges hold where frames state an ego pose. Where none does, the devkit's reading is kept: nothing is
-    too far away, unless max_range_m is given. Raises InputError where the two do not fit together.
+    too far away, unless max_range_m is given. Predictions that state no attribute get them by class and speed. Raises
+    InputError where the two do not fit together.
     """
     pairs = pair_frames(predictions.boxes, ground_truth.boxes, count_missing=count_missing)
     pairs = without_cycles_in_racks(pairs, ground_truth.bicycle_racks)
@@ -42,12 +46,18 @@ def score(
         config = config.cut_at(max_range_m)
     elif not pairs.ego_pose_known:
         config = config.unlimited()
-    detection = evaluate(pairs.predictions, pairs.ground_truth, config, pairs.ego_xy)
+    detection = evaluate(_with_attributes(pairs.predictions), pairs.ground_truth, config, pairs.ego_xy)
     segmentation, map_notes = _score_maps(predictions, ground_truth, pairs)
     notes = [*pairs.notes, *map_notes]
     if max_range_m is None and not pairs.ego_pose_known:
         notes.append('no frame states "world_from_ego": class ranges are not applied (--max-range M applies them)')
     return Scores(pairs, config, detection, segmentation, (*notes, *_detection_notes(detection)))
+
+
+def _with_attributes(frames: Sequence[Boxes3D]) -> Sequence[Boxes3D]:
+    if any(boxes.attributes is not None for boxes in frames):
+        return frames
+    return [replace(boxes, attributes=attributes_by_speed(boxes)) for boxes in frames]
 
 
 def _score_maps(

@@ -6,7 +6,7 @@ import gc
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -78,6 +78,16 @@ def read_boxes(path: Path) -> BoxesFile:
         None if ego_from_bev is None else pose_from_json(ego_from_bev, f"{path}: ego_from_bev"),
         _others(content, _FILE_KEYS),
     )
+
+
+def above_score(boxes: BoxesFile, score: float) -> BoxesFile:
+    """The boxes with at least this score; those without any score stay."""
+
+    def kept(frame: FrameBoxes) -> FrameBoxes:
+        scores = frame.boxes.scores
+        return frame if scores is None else replace(frame, boxes=frame.boxes[scores >= score])
+
+    return replace(boxes, frames=tuple(map(kept, boxes.frames)))
 
 
 class BoxesWriter:

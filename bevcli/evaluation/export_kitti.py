@@ -1,0 +1,116 @@
+"""Boxes as KITTI object labels: one text file a frame, of what one camera sees, in that camera's frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from bevcli.errors import InputError, OutputError
+from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
+from bevcli.geometry.cameras import Camera
+from bevcli.geometry.transforms import Array, apply, inverse, wrap_angle
+from bevcli.sequences.boxes_file import BoxesFile, FrameBoxes
+
+# KITTI's own types where it has them; names in its style for the others.
+KITTI_TYPES = {
+    "car": "Car", "truck": "Truck", "construction_vehicle": "ConstructionVehicle", "bus": "Bus",
+    "trailer": "Trailer", "barrier": "Barrier", "motorcycle": "Motorcycle", "bicycle": "Cyclist",
+    "pedestrian": "Pedestrian", "traffic_cone": "TrafficCone",
+}  # fmt: skip
+OCCLUSION_UNKNOWN = 3
+NEAR_M = 0.1  # edges are cut this far before the camera
+
+
+def write_kitti(boxes: BoxesFile, camera: Camera, ego_from_bev: Array, folder: Path) -> int:
+    """Write label_2/NNNNNN.txt and calib/NNNNNN.txt for every frame; NNNNNN is the frame's number.
+
+    A box is written where the camera sees a part of it, lens distortion undone. ego_from_bev: (4, 4), of boxes in
+    the bev frame, and for the calibration's lidar. Returns the number of labels. Raises InputError where boxes in
+    the world have no ego pose, or frame numbers repeat, and OutputError.
+    """
+    numbers = [frame.stamp.index for frame in boxes.frames]
+    if len(set(numbers)) < len(numbers):
+        raise InputError("frame numbers repeat, and KITTI's files are named by them: export each scene on its own")
+    count = 0
+    try:
+        for name in ("label_2", "calib"):
+            (folder / name).mkdir(parents=True, exist_ok=True)
+        for frame in boxes.frames:
+            lines = kitti_labels(_in_ego(frame, boxes.frame_of_reference, ego_from_bev), camera)
+            name = f"{frame.stamp.index:06d}.txt"
+            (folder / "label_2" / name).write_text("".join(f"{line}\n" for line in lines))
+            (folder / "calib" / name).write_text(_calibration(camera, ego_from_bev))
+            count += len(lines)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written ({error.strerror})") from None
+    return count
+
+
+def kitti_labels(boxes_ego: Boxes3D, camera: Camera) -> list[str]:
+    """One line a box that the camera sees, in the boxes' order.
+
+    type, truncated 0 to 1, occluded (3: unknown), alpha, the 2D box left, top, right, bottom in pixels, height,
+    width, length in metres, the middle of the bottom face in the camera's frame, rotation_y, and the score if any.
+    """
+    camera_from_ego = camera.camera_from_ego
+    bottoms = boxes_ego.centers - np.stack([np.zeros(len(boxes_ego))] * 2 + [boxes_ego.sizes_lwh[:, 2] / 2], axis=-1)
+    locations = apply(camera_from_ego, bottoms)
+    headings = np.stack([np.cos(boxes_ego.yaws), np.sin(boxes_ego.yaws), np.zeros(len(boxes_ego))], axis=-1)
+    headings = headings @ camera_from_ego[:3, :3].T
+    rotations_y = np.arctan2(-headings[:, 2], headings[:, 0])
+    alphas = wrap_angle(rotations_y - np.arctan2(locations[:, 0], locations[:, 2]))
+    lines = []
+    for place, corners in enumerate(boxes_ego.corners()):
+        seen = _picture_box(apply(camera_from_ego, corners), camera)
+        if seen is None:
+            continue
+        rectangle, truncated = seen
+        length, width, height = boxes_ego.sizes_lwh[place]
+        numbers = [alphas[place], *rectangle, height, width, length, *locations[place], rotations_y[place]]
+        label = f"{KITTI_TYPES[str(boxes_ego.classes[place])]} {truncated:.2f} {OCCLUSION_UNKNOWN} "
+        score = "" if boxes_ego.scores is None else f" {boxes_ego.scores[place]:.4f}"
+        lines.append(label + " ".join(f"{number:.3f}" for number in numbers) + score)
+    return lines
+
+
+def _picture_box(corners: Array, camera: Camera) -> tuple[Array, float] | None:
+    """The rectangle around a box's visible part, cut at the picture's border, and the share that is cut off."""
+    points = _before_the_camera(corners)
+    if not len(points):
+        return None
+    pixels = (points @ camera.intrinsics.T)[:, :2] / points[:, 2:]
+    whole = np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
+    limits = np.array([camera.width - 1, camera.height - 1] * 2)
+    cut = np.clip(whole, 0, limits)
+    area, whole_area = np.prod(cut[2:] - cut[:2]), np.prod(whole[2:] - whole[:2])
+    return (cut, float(1 - area / whole_area)) if area > 0 else None
+
+
+def _before_the_camera(corners: Array) -> Array:
+    """The corners (8, 3) before the camera, and where edges pass the plane just before it."""
+    points = [corner for corner in corners if corner[2] >= NEAR_M]
+    for start, end in BOX_EDGES:
+        a, b = corners[start], corners[end]
+        if (a[2] < NEAR_M) != (b[2] < NEAR_M):
+            points.append(a + (NEAR_M - a[2]) / (b[2] - a[2]) * (b - a))
+    return np.array(points)
+
+
+def _in_ego(frame: FrameBoxes, frame_of_reference: str, ego_from_bev: Array) -> Boxes3D:
+    if frame_of_reference == "bev":
+        return frame.boxes.transformed(ego_from_bev)
+    if frame_of_reference == "ego":
+        return frame.boxes
+    assert frame.world_from_ego is not None  # read_boxes asks for it
+    return frame.boxes.transformed(inverse(frame.world_from_ego.matrix))
+
+
+def _calibration(camera: Camera, ego_from_bev: Array) -> str:
+    """P0 to P3 all this camera's, R0_rect the identity, and the bev frame in the lidar's place."""
+    projection = np.concatenate([camera.intrinsics, np.zeros((3, 1))], axis=1)
+    rows = {f"P{number}": projection for number in range(4)}
+    rows["R0_rect"] = np.eye(3)
+    rows["Tr_velo_to_cam"] = (camera.camera_from_ego @ ego_from_bev)[:3]
+    rows["Tr_imu_to_velo"] = inverse(ego_from_bev)[:3]
+    return "".join(f"{name}: {' '.join(f'{number:.12e}' for number in row.ravel())}\n" for name, row in rows.items())
