@@ -17,6 +17,8 @@ from bevcli.model.bevformer import BEVFormerConfig
 
 T = TypeVar("T")
 
+TRAINING = "training"  # the table of a model's file that says how it is trained, of which the model knows nothing
+
 
 def known_models() -> tuple[str, ...]:
     """The names of the models whose TOML files come with the package."""
@@ -29,27 +31,41 @@ def load_config(name_or_path: str | Path) -> BEVFormerConfig:
 
     Raises ConfigError when there is none, or when its contents are wrong.
     """
-    name = str(name_or_path)
-    if name.endswith(".toml"):
-        path = Path(name)
-        if not path.is_file():
-            raise ConfigError(f"{path}: no such model file; known models are {', '.join(known_models())}")
-        return parse_config(_read(path), name, BEVFormerConfig)
-    if name not in known_models():
-        known = ", ".join(known_models())
-        raise ConfigError(f'model "{name}" is unknown; expected one of {known}, or a file FILE.toml')
-    file = f"{name}.toml"
-    text = resources.files("bevcli").joinpath("configs", file).read_text(encoding="utf-8")
-    return parse_config(text, file, BEVFormerConfig)
+    text, file = _read_model(str(name_or_path))
+    table = _parse(text, file)
+    return _dataclass({key: table[key] for key in table if key != TRAINING}, BEVFormerConfig, file, "")
+
+
+def load_training(name_or_path: str | Path, kind: type[T]) -> T:
+    """The [training] table of a model's file as a dataclass; its defaults where the file has none."""
+    text, file = _read_model(str(name_or_path))
+    return _dataclass(_parse(text, file).get(TRAINING, {}), kind, file, f"{TRAINING}.")
 
 
 def parse_config(text: str, file: str, kind: type[T]) -> T:
     """TOML text to a dataclass of that kind, nested dataclasses as tables; `file` is named in errors."""
+    return _dataclass(_parse(text, file), kind, file, "")
+
+
+def _parse(text: str, file: str) -> dict[str, Any]:
     try:
-        table = tomllib.loads(text)
+        return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{file}: is no valid TOML: {error}") from error
-    return _dataclass(table, kind, file, "")
+
+
+def _read_model(name: str) -> tuple[str, str]:
+    """Text and file name of a known model, or of a file whose name ends in .toml."""
+    if name.endswith(".toml"):
+        path = Path(name)
+        if not path.is_file():
+            raise ConfigError(f"{path}: no such model file; known models are {', '.join(known_models())}")
+        return _read(path), name
+    if name not in known_models():
+        known = ", ".join(known_models())
+        raise ConfigError(f'model "{name}" is unknown; expected one of {known}, or a file FILE.toml')
+    file = f"{name}.toml"
+    return resources.files("bevcli").joinpath("configs", file).read_text(encoding="utf-8"), file
 
 
 def _read(path: Path) -> str:

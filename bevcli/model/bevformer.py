@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import contextlib
+from dataclasses import dataclass, field, fields
 from typing import Literal
 
 import torch
@@ -98,6 +99,11 @@ class BEVFormerInputs:
     shift: Tensor
     rotation_deg: Tensor
 
+    def to(self, device: torch.device) -> BEVFormerInputs:
+        """The same on a device."""
+        tensors = (getattr(self, part.name) for part in fields(self))
+        return BEVFormerInputs(*(tensor.to(device, non_blocking=True) for tensor in tensors))
+
 
 @dataclass(frozen=True)
 class BEVFormerOutputs:
@@ -115,9 +121,13 @@ class BEVFormerOutputs:
 
 
 class BEVFormer(nn.Module):
-    """The whole model; its parts in the order of the paper's figure 2."""
+    """The whole model; its parts in the order of the paper's figure 2.
+
+    autocast_dtype: what backbone, neck and encoder compute in; None leaves that to the caller.
+    """
 
     pillars: Tensor
+    autocast_dtype: torch.dtype | None = None
 
     def __init__(self, config: BEVFormerConfig) -> None:
         super().__init__()
@@ -143,17 +153,7 @@ class BEVFormer(nn.Module):
 
         probe: filled with what one encoder layer looked at.
         """
-        maps = self.neck(self.backbone(inputs.images.flatten(0, 1)))
-        image_features = self.image_tokens(maps, inputs.camera_index)
-        bev = self.encoder(
-            self.bev_queries(inputs.can_bus),
-            self.bev_queries.position(),
-            image_features,
-            find_hits(self.project_pillars(inputs)),
-            None if history is None else self.align_history(history, inputs.rotation_deg),
-            inputs.shift,
-            probe,
-        )
+        bev = self.bev_map(inputs, history, probe)
         # Boxes are refined in steps finer than half precision can tell.
         with torch.autocast(bev.device.type, enabled=False):
             class_logits, box_codes = self.decoder(bev.float(), self.detection_head)
@@ -161,6 +161,20 @@ class BEVFormer(nn.Module):
             if self.segmentation_head is not None:
                 segmentation = self.segmentation_head(bev.float(), self.bev_queries.position())
         return BEVFormerOutputs(bev, class_logits, box_codes, segmentation)
+
+    def bev_map(self, inputs: BEVFormerInputs, history: Tensor | None, probe: AttentionProbe | None = None) -> Tensor:
+        """The first half of `forward`: the BEV map (B, Y·X, C), before any head reads it."""
+        with self._autocast(inputs.images.device):
+            maps = self.neck(self.backbone(inputs.images.flatten(0, 1)))
+            return self.encoder(
+                self.bev_queries(inputs.can_bus),
+                self.bev_queries.position(),
+                self.image_tokens(maps, inputs.camera_index),
+                find_hits(self.project_pillars(inputs)),
+                None if history is None else self.align_history(history, inputs.rotation_deg),
+                inputs.shift,
+                probe,
+            )
 
     def project_pillars(self, inputs: BEVFormerInputs) -> PillarProjection:
         """Where the pillars appear in the cameras of these inputs, and where they are visible."""
@@ -171,3 +185,8 @@ class BEVFormer(nn.Module):
         """The history map (B, Y·X, C), turned by rotation_deg (B,)."""
         center = self.config.ego_motion.history_rotation_center
         return rotate_history(history, rotation_deg, self.config.bev_grid, center)
+
+    def _autocast(self, device: torch.device) -> contextlib.AbstractContextManager[object]:
+        if self.autocast_dtype is None:
+            return contextlib.nullcontext()
+        return torch.autocast(device.type, self.autocast_dtype)

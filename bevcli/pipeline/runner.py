@@ -17,10 +17,10 @@ from bevcli.geometry.transforms import Pose
 from bevcli.model.attention_probe import AttentionProbe
 from bevcli.model.bevformer import BEVFormer, BEVFormerInputs, BEVFormerOutputs
 from bevcli.model.box_coding import decode
-from bevcli.model.ego_motion_inputs import ego_motion_inputs
 from bevcli.model.panoptic_merging import decode_maps
 from bevcli.pipeline.attention import attention_view, probe_cells
 from bevcli.pipeline.cpu_memory import keep_freed_memory
+from bevcli.pipeline.model_inputs import model_inputs
 from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
 from bevcli.pipeline.read_ahead import read_ahead
 from bevcli.pipeline.stage_clock import StageClock
@@ -107,26 +107,8 @@ class Runner:
         return f"gap of {seconds:.1f} s" if not 0 < seconds <= self.config.max_gap_s else ""
 
     def _inputs(self, prepared: PreparedFrame, state: BevState | None) -> BEVFormerInputs:
-        frame = prepared.frame
-        motion = ego_motion_inputs(
-            frame.world_from_ego,
-            None if state is None else state.pose,
-            frame.kinematics.acceleration,
-            frame.kinematics.angular_rate,
-            frame.kinematics.velocity,
-            self.config.bev_grid,
-            self.config.ego_motion,
-        )
-        tensors = (
-            prepared.images,
-            prepared.image_from_bev,
-            prepared.camera_index,
-            prepared.has_picture,
-            torch.from_numpy(motion.can_bus)[None],
-            torch.from_numpy(motion.shift)[None],
-            torch.tensor([motion.rotation_deg], dtype=torch.float32),
-        )
-        return BEVFormerInputs(*(tensor.to(self.device, non_blocking=True) for tensor in tensors))
+        inputs = model_inputs([prepared], [None if state is None else state.pose], self.config)
+        return inputs.to(self.device)
 
     def _probe(self, frame: Frame) -> AttentionProbe | None:
         if not self.options.ask_attention:

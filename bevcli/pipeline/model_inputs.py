@@ -1,0 +1,54 @@
+"""Prepared frames of several drives as one step of the model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from bevcli.errors import InputError
+from bevcli.geometry.transforms import Pose
+from bevcli.model.bevformer import BEVFormerConfig, BEVFormerInputs
+from bevcli.model.ego_motion_inputs import EgoMotionInputs, ego_motion_inputs
+from bevcli.pipeline.preprocess import PreparedFrame
+
+
+def model_inputs(
+    frames: Sequence[PreparedFrame], previous_poses: Sequence[Pose | None], config: BEVFormerConfig
+) -> BEVFormerInputs:
+    """B frames, each of another drive, as a batch.
+
+    previous_poses: world_from_ego of the frame before, of each drive; None at its start. Raises InputError where the
+    drives' cameras do not take the same camera embeddings.
+    """
+    index = frames[0].camera_index
+    for prepared in frames:
+        if not torch.equal(prepared.camera_index, index):
+            raise InputError(
+                f"cameras {', '.join(prepared.assignment.cameras)} and {', '.join(frames[0].assignment.cameras)} "
+                "cannot go into one batch: use drives of one rig, or batches of 1"
+            )
+    motions = [_motion(prepared, pose, config) for prepared, pose in zip(frames, previous_poses, strict=True)]
+    return BEVFormerInputs(
+        images=torch.cat([prepared.images for prepared in frames]),
+        image_from_bev=torch.cat([prepared.image_from_bev for prepared in frames]),
+        camera_index=index,
+        has_picture=torch.cat([prepared.has_picture for prepared in frames]),
+        can_bus=torch.from_numpy(np.stack([motion.can_bus for motion in motions])),
+        shift=torch.from_numpy(np.stack([motion.shift for motion in motions])),
+        rotation_deg=torch.tensor([motion.rotation_deg for motion in motions], dtype=torch.float32),
+    )
+
+
+def _motion(prepared: PreparedFrame, previous_pose: Pose | None, config: BEVFormerConfig) -> EgoMotionInputs:
+    frame = prepared.frame
+    return ego_motion_inputs(
+        frame.world_from_ego,
+        previous_pose,
+        frame.kinematics.acceleration,
+        frame.kinematics.angular_rate,
+        frame.kinematics.velocity,
+        config.bev_grid,
+        config.ego_motion,
+    )
