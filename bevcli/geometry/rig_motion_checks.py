@@ -38,16 +38,21 @@ class _Drive:
         """The median angle of the ego frame's z against the world's, degrees."""
         return float(np.degrees(np.median(np.arccos(np.clip(self.rotations[:, 2, 2], -1, 1)))))
 
+    def way(self) -> float:
+        """Metres driven, without what is noise at rest."""
+        return float(np.linalg.norm(self.steps, axis=1)[self.speeds > SLOWEST_MOVING].sum())
+
     def headings_deg(self) -> Array:
-        """(M,) degrees counter-clockwise from ego x of the steps on which the vehicle moves."""
-        moving = self.speeds > SLOWEST_MOVING
+        """(M,) degrees counter-clockwise from ego x of the steps on which the vehicle moves; none on a short way."""
+        moving = (self.speeds > SLOWEST_MOVING) & (self.way() >= SHORTEST_WAY_M)
         steps = np.einsum("tji,tj->ti", self.rotations[:-1], self.steps)[moving]
         return np.degrees(np.arctan2(steps[:, 1], steps[:, 0]))
 
     def is_sane(self) -> bool:
-        """Level, and forward for most of the time."""
+        """Level, not faster than a car, and forward for most of the time."""
         headings = self.headings_deg()
-        return bool(self.tilt_deg() <= MOST_TILT_DEG and (np.abs(headings) <= FORWARD_DEG).mean() >= MOSTLY)
+        ahead = len(headings) == 0 or (np.abs(headings) <= FORWARD_DEG).mean() >= MOSTLY
+        return bool(self.tilt_deg() <= MOST_TILT_DEG and np.median(self.speeds) <= FASTEST and ahead)
 
 
 def check_ego_motion(ego_motion: EgoMotion) -> tuple[Finding, ...]:
@@ -55,11 +60,10 @@ def check_ego_motion(ego_motion: EgoMotion) -> tuple[Finding, ...]:
     drive = _drive(ego_motion, ego_motion.translations, ego_motion.quaternions)
     if len(drive.steps) == 0:
         return ()
-    unit = _speed_unit(drive)
-    if unit is not None:
-        return (unit,)
-    jump = _jump(drive, ego_motion)
-    findings = [finding for finding in (jump, _direction(drive, ego_motion)) if finding is not None]
+    cause = None if drive.is_sane() else _mistake(drive, ego_motion) or _units(drive)
+    if cause is not None:
+        return (cause,)
+    findings = [finding for finding in (_jump(drive, ego_motion), _direction(drive)) if finding is not None]
     speed = None if findings else _stated_speed(drive, ego_motion)
     return (*findings, speed) if speed is not None else tuple(findings)
 
@@ -70,7 +74,7 @@ def _drive(ego_motion: EgoMotion, translations: Array, quaternions: Array) -> _D
     return _Drive(rotations, translations, np.diff(translations, axis=0), seconds)
 
 
-def _speed_unit(drive: _Drive) -> Finding | None:
+def _units(drive: _Drive) -> Finding | None:
     """Translations in millimetres, or times not in nanoseconds, make every speed absurd."""
     median = float(np.median(drive.speeds))
     if median <= FASTEST:
@@ -93,32 +97,39 @@ def _jump(drive: _Drive, ego_motion: EgoMotion) -> Finding | None:
     return Finding("ego-jump", "error", None, message, found, f"at most {FASTEST:g} m/s", advice)
 
 
-def _direction(drive: _Drive, ego_motion: EgoMotion) -> Finding | None:
-    """Tilted, sideways or backwards all the time; explained by the mistake after whose undoing all is well."""
-    headings, tilt = drive.headings_deg(), drive.tilt_deg()
-    way = float(np.linalg.norm(drive.steps, axis=1)[drive.speeds > SLOWEST_MOVING].sum())
-    tilted = tilt > MOST_TILT_DEG
-    if len(headings) == 0 or way < SHORTEST_WAY_M:
-        message, found = "the ego frame is tilted in the world", f"{tilt:.0f}°"
-        return _error("ego-tilted", message, found, "level, z up", "check the quaternions") if tilted else None
+def _mistake(drive: _Drive, ego_motion: EgoMotion) -> Finding | None:
+    """The mistake after whose undoing the vehicle drives as vehicles do."""
+    for code, message, advice, undone in _undone(ego_motion):
+        if undone.is_sane():
+            return _error(code, message, _words(drive), "level, and ahead", advice)
+    return None
+
+
+def _direction(drive: _Drive) -> Finding | None:
+    """Tilted, sideways or backwards all the time."""
+    if drive.tilt_deg() > MOST_TILT_DEG:
+        message, advice = "the ego frame is tilted in the world", "ego z and world z point up: check the axes"
+        return _error("ego-tilted", message, _words(drive), "level", advice)
+    headings = drive.headings_deg()
+    if len(headings) == 0:
+        return None
     ahead = float((np.abs(headings) <= FORWARD_DEG).mean())
     back = float((np.abs(headings) >= 180 - FORWARD_DEG).mean())
-    if not tilted and ahead >= 0.5:
-        return None
-    middle = float(np.degrees(np.angle(np.exp(1j * np.radians(headings)).mean())))
-    found = f"moves {middle:.0f}° from ahead on {way:.0f} m, tilt {tilt:.0f}°"
-    for code, message, advice, undone in _undone(ego_motion):
-        if undone.is_sane() and not drive.is_sane():
-            return _error(code, message, found, "level, and ahead", advice)
-    if tilted:
-        return _error("ego-tilted", "the ego frame is tilted in the world", found, "level, z up", "check the axes")
     if back >= MOSTLY:
         advice = "ego x points forward: turn the ego frame, unless the drive is in reverse"
-        return _error("ego-backwards", "the vehicle drives backwards all the time", found, "ahead", advice)
+        return _error("ego-backwards", "the vehicle drives backwards all the time", _words(drive), "ahead", advice)
     if 1 - ahead - back >= MOSTLY:
         advice = "ego is x forward, y left: turn the ego frame"
-        return _error("ego-sideways", "the vehicle drives sideways all the time", found, "ahead", advice)
+        return _error("ego-sideways", "the vehicle drives sideways all the time", _words(drive), "ahead", advice)
     return None
+
+
+def _words(drive: _Drive) -> str:
+    headings, tilt = drive.headings_deg(), f"tilt {drive.tilt_deg():.0f}°"
+    if len(headings) == 0:
+        return tilt
+    middle = float(np.degrees(np.angle(np.exp(1j * np.radians(headings)).mean())))
+    return f"moves {middle:.0f}° from ahead on {drive.way():.0f} m, {tilt}"
 
 
 def _undone(ego_motion: EgoMotion) -> list[tuple[str, str, str, _Drive]]:

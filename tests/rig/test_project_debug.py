@@ -1,0 +1,161 @@
+"""The command: exit codes, the JSON, the pictures, and what it says of a sequence."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from healthy_rigs import HEALTHY, copy_of
+from typer.testing import CliRunner
+
+from bevcli.cli.main import app
+from bevcli.errors import InputError
+
+FILES = {"cameras.png", "coverage.png", "recording.rrd", "findings.json"}
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, ["project-debug", *map(str, arguments)])
+
+
+def calibration(document, folder):
+    path = folder / "calibration.json"
+    path.write_text(json.dumps(document))
+    return path
+
+
+@pytest.fixture
+def small_drive(tmp_path):
+    """Five frames of two cameras, driving straight ahead at 10 m/s."""
+    folder = tmp_path / "drive"
+    document = copy_of("six")
+    document["cameras"] = {name: document["cameras"][name] for name in ("CAM_FRONT", "CAM_BACK")}
+    for name, camera in document["cameras"].items():
+        camera["width"], camera["height"] = 160, 90
+        camera["intrinsics"] = [[value / 10 for value in row] for row in camera["intrinsics"][:2]] + [[0, 0, 1]]
+        (folder / "images" / name).mkdir(parents=True)
+        for number in range(5):
+            cv2.imwrite(str(folder / "images" / name / f"{number}.png"), np.full((90, 160, 3), 40 * number, np.uint8))
+    calibration(document, folder)
+    rows = ["frame,timestamp_ns,CAM_FRONT,CAM_BACK,CAM_BACK.timestamp_ns"]
+    for number in range(5):
+        time = 10**9 + number * 500_000_000
+        rows.append(f"{number},{time},images/CAM_FRONT/{number}.png,images/CAM_BACK/{number}.png,{time + 20_000_000}")
+    (folder / "frames.csv").write_text("\n".join(rows))
+    write_motion(folder, heading=(1, 0, 0, 0))
+    return folder
+
+
+def write_motion(folder, heading):
+    rows = ["timestamp_ns,x,y,z,qw,qx,qy,qz"]
+    rows += [f"{t},{t / 1e8},0,0,{','.join(map(str, heading))}" for t in range(10**9 - 10**8, 4 * 10**9, 10**8)]
+    (folder / "ego_motion.csv").write_text("\n".join(rows))
+
+
+@pytest.mark.parametrize("name", HEALTHY)
+def test_every_healthy_rig_gets_all_files_and_exit_code_0(name, tmp_path):
+    result = run(calibration(copy_of(name), tmp_path), "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
+    for picture in ("cameras.png", "coverage.png"):
+        assert cv2.imread(str(tmp_path / "out" / picture)).std() > 10
+    assert max(map(len, result.stdout.splitlines()[:-1])) <= 110
+
+
+def test_an_error_is_exit_code_3_and_one_json_object(tmp_path):
+    document = copy_of("six")
+    for camera in document["cameras"].values():
+        camera["ego_from_camera"]["translation"] = [1000 * v for v in camera["ego_from_camera"]["translation"]]
+    result = run(calibration(document, tmp_path), "--out", tmp_path / "out", "--json")
+    assert result.exit_code == 3
+    report = json.loads(result.stdout)
+    assert set(report) == {"findings", "coverage"}
+    (finding,) = report["findings"]
+    assert set(finding) == {"code", "severity", "camera", "message", "found", "expected", "advice"}
+    assert (finding["code"], finding["severity"], finding["camera"]) == ("translation-unit", "error", None)
+    assert report == json.loads((tmp_path / "out" / "findings.json").read_text())
+    assert sum(report["coverage"]["cells_by_cameras"].values()) == 10_000
+
+
+def test_what_run_refuses_is_explained(tmp_path):
+    document = copy_of("six")
+    del document["cameras"]["CAM_BACK"]["intrinsics"]
+    document["cameras"]["CAM_FRONT"]["ego_from_camera"]["rotation_wxyz"] = [0.5, -0.5, 0.5, -0.4]
+    result = run(calibration(document, tmp_path), "--out", tmp_path / "out", "--json")
+    assert result.exit_code == 3
+    found = {(f["code"], f["camera"]) for f in json.loads(result.stdout)["findings"] if f["severity"] == "error"}
+    assert found == {("missing-key", "CAM_BACK"), ("quaternion-norm", "CAM_FRONT")}
+    assert (tmp_path / "out" / "cameras.png").exists()
+
+
+def test_a_calibration_without_any_usable_camera_gets_its_findings(tmp_path):
+    path = calibration({"format": "bevcli-calibration/1", "cameras": {"front": {}}}, tmp_path)
+    result = run(path, "--out", tmp_path / "out")
+    assert result.exit_code == 3
+    assert "missing-key" in result.stdout
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"findings.json"}
+
+
+def test_no_json_at_all_is_a_mistake_in_the_input(tmp_path):
+    (tmp_path / "calibration.json").write_text("{")
+    result = run(tmp_path / "calibration.json", "--out", tmp_path / "out")
+    assert result.exit_code == 1
+    assert isinstance(result.exception, InputError)
+
+
+def test_a_healthy_sequence(small_drive, tmp_path):
+    result = run(small_drive, "--out", tmp_path / "out", "--json")
+    assert result.exit_code == 0
+    codes = {finding["code"] for finding in json.loads(result.stdout)["findings"]}
+    assert codes <= {"cells-unseen", "overlap-far"}
+
+
+def test_a_drive_sideways_is_found(small_drive, tmp_path):
+    write_motion(small_drive, heading=(0.5**0.5, 0, 0, 0.5**0.5))
+    result = run(small_drive, "--out", tmp_path / "out", "--json")
+    assert result.exit_code == 3
+    errors = [f["code"] for f in json.loads(result.stdout)["findings"] if f["severity"] == "error"]
+    assert errors == ["ego-sideways"]
+
+
+def test_a_calibration_with_another_folder_s_pictures(small_drive, tmp_path):
+    path = tmp_path / "mine.json"
+    shutil.move(small_drive / "calibration.json", path)
+    result = run(path, "--sequence", small_drive, "--frame", 2, "--out", tmp_path / "out")
+    assert result.exit_code == 0
+    assert "drive: 2 cameras" in result.stdout
+
+
+def test_pictures_of_another_size_are_explained(small_drive, tmp_path):
+    document = json.loads((small_drive / "calibration.json").read_text())
+    for camera in document["cameras"].values():
+        camera["width"], camera["height"] = 320, 180
+        camera["intrinsics"] = [[2 * value for value in row] for row in camera["intrinsics"][:2]] + [[0, 0, 1]]
+    calibration(document, small_drive)
+    result = run(small_drive, "--out", tmp_path / "out", "--json")
+    (error,) = [f for f in json.loads(result.stdout)["findings"] if f["severity"] == "error"]
+    assert error["code"] == "sequence-refused"
+    assert "160" in error["message"]
+
+
+def test_ego_motion_that_does_not_cover_the_frames_is_explained_and_the_pictures_shown(small_drive, tmp_path):
+    rows = (small_drive / "ego_motion.csv").read_text().splitlines()
+    (small_drive / "ego_motion.csv").write_text("\n".join(rows[:6]))
+    result = run(small_drive, "--out", tmp_path / "out", "--json")
+    errors = [f for f in json.loads(result.stdout)["findings"] if f["severity"] == "error"]
+    assert [error["code"] for error in errors] == ["sequence-refused"]
+    assert "ego_motion.csv" in errors[0]["message"]
+
+
+def test_a_frame_that_is_not_there_is_a_mistake_in_the_input(small_drive, tmp_path):
+    result = run(small_drive, "--frame", 5, "--out", tmp_path / "out")
+    assert result.exit_code == 1
+    assert "5 frames" in str(result.exception)
+
+
+def test_the_real_sequences_give_no_error(shared, tmp_path):
+    for name in ("nuscenes-scene-0103", "nuscenes-mini-4"):
+        result = run(shared / "data" / name, "--out", tmp_path / name, "--json")
+        assert result.exit_code == 0
+        assert [f["code"] for f in json.loads(result.stdout)["findings"] if f["severity"] != "info"] == []
