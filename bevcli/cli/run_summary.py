@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from collections import Counter, defaultdict
-from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING
 
 from bevcli import __version__
 from bevcli.cli.progress import duration
+from bevcli.cli.run_files import PREDICTIONS, RECORDING, SEGMENTATION, SUBMISSION, SUMMARY
 from bevcli.frame import Frame, Prediction
 from bevcli.pipeline.camera_assignment import assign_cameras
 
@@ -75,9 +75,9 @@ class RunSummary:
             "files": self._files(),
         }
 
-    def write(self, path: Path) -> None:
+    def write(self) -> None:
         """Writes summary.json, whatever the run came to."""
-        path.write_text(json.dumps(self.as_data(), indent=1) + "\n")
+        (self._job.out / SUMMARY).write_text(json.dumps(self.as_data(), indent=1) + "\n")
 
     def table(self) -> str:
         """The last words of a run."""
@@ -101,5 +101,6 @@ class RunSummary:
         return len(self._whole) / sum(self._whole) if self._whole else 0.0
 
     def _files(self) -> list[str]:
-        written = [self._job.out / name for name in ("recording.rrd", "predictions.json", "summary.json")]
-        return [str(path) for path in (*written, *([self._job.save_bev] if self._job.save_bev else []))]
+        written = [self._job.out / name for name in (RECORDING, PREDICTIONS, SUBMISSION, SEGMENTATION)]
+        found = [path for path in written if path.exists()] + [self._job.out / SUMMARY]
+        return [str(path) for path in (*found, *([self._job.save_bev] if self._job.save_bev else []))]

@@ -10,7 +10,7 @@ import numpy as np
 import rerun as rr
 
 from bevcli.errors import OutputError
-from bevcli.frame import AttentionView, Frame, FrameStamp, Prediction
+from bevcli.frame import Frame, FrameStamp, Prediction
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array, inverse, rigid
@@ -76,7 +76,7 @@ class Recording:
             self._log_bev_pictures(self._bev_pictures.finish())
         self._stream.__exit__(kind, error, trace)
 
-    def log(self, frame: Frame, prediction: Prediction, attention: AttentionView | None = None) -> None:
+    def log(self, frame: Frame, prediction: Prediction) -> None:
         """Writes one frame: what was seen, the boxes at or above the score, and what the attention did."""
         self._start_or_follow(frame)
         self._at(frame.stamp)
@@ -85,7 +85,7 @@ class Recording:
         self._log_curves(prediction)
         self._log_frame_events(frame, prediction)
         if self.options.shows_insides:
-            self._log_insides(frame, prediction, attention, shots)
+            self._log_insides(frame, prediction, shots)
         self._last = frame
         self._flush()
 
@@ -199,7 +199,6 @@ class Recording:
         self,
         frame: Frame,
         prediction: Prediction,
-        attention: AttentionView | None,
         shots: tuple[log_cameras.CameraShot, ...],
     ) -> None:
         self._log_pillars(frame, prediction, shots)
@@ -211,7 +210,7 @@ class Recording:
             placed = (frame.stamp, prediction)
             self._log_bev_pictures(self._bev_pictures.push(placed, features))
             self._at(frame.stamp)
-        self._log_attention(prediction, attention, shots)
+        self._log_attention(prediction, shots)
 
     def _log_bev_pictures(self, ready: list[tuple[tuple[FrameStamp, Prediction], np.ndarray]]) -> None:
         for (stamp, prediction), picture in ready:
@@ -229,9 +228,8 @@ class Recording:
             if shot.camera.name in frame.pictures:
                 log_cameras.log_pillar_hits(self._stream, shot, points, colors)
 
-    def _log_attention(
-        self, prediction: Prediction, attention: AttentionView | None, shots: tuple[log_cameras.CameraShot, ...]
-    ) -> None:
+    def _log_attention(self, prediction: Prediction, shots: tuple[log_cameras.CameraShot, ...]) -> None:
+        attention = prediction.attention
         if attention is None:
             return
         log_bev.log_history(self._stream, attention.history_weight, prediction.grid)
