@@ -4,25 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.frame import Frame, FrameStamp
-from bevcli.geometry.cameras import Camera, CameraRig
-from bevcli.geometry.ego_motion import EgoMotion, Kinematics, derive_kinematics
 from bevcli.geometry.transforms import Pose
 from bevcli.sequences.nuscenes_cache import open_index
-from bevcli.sequences.nuscenes_can_bus import CanBus, read_can_bus
 from bevcli.sequences.nuscenes_index import Ints, NuScenesIndex
+from bevcli.sequences.nuscenes_scene import SceneFacts, read_scene_facts, scene_rig
 from bevcli.sequences.nuscenes_splits import SPLITS, split_of
 from bevcli.sequences.nuscenes_sweeps import sweep_frames
 from bevcli.sequences.pictures import PictureReader, PictureSource
-
-# The order in which nuScenes' cameras are told; others follow by name.
-CAMERAS = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT")
 
 
 @dataclass(frozen=True)
@@ -45,16 +40,6 @@ class _Moment:
     rows: Ints
 
 
-@dataclass(frozen=True)
-class _SceneFacts:
-    """What holds for a whole scene. motion: all its poses. sensor_names: the camera of each calibrated sensor."""
-
-    rig: CameraRig
-    can_bus: CanBus | None
-    motion: EgoMotion
-    sensor_names: dict[int, str]
-
-
 class NuScenesSequence:
     """Keyframes of nuScenes (and the pictures between, if asked for), scene after scene, numbered from 0.
 
@@ -72,7 +57,7 @@ class NuScenesSequence:
         self.rig = scene_rig(self.index, scenes[0])[0]
         self._moments = tuple(self._find_moments(scenes, choice.sweeps))
         self._pictures = PictureReader(strict=strict)
-        self._facts = lru_cache(maxsize=2)(self._read_facts)
+        self._facts = lru_cache(maxsize=2)(partial(read_scene_facts, self.index, root))
         self.notes = tuple(text for text in (note, self._can_bus_note(scenes)) if text)
 
     @property
@@ -95,7 +80,7 @@ class NuScenesSequence:
             pictures=pictures,
             world_from_ego=pose,
             world_from_ego_at={n: self._picture_pose(rows[n]) if n in rows else pose for n in facts.rig.names},
-            kinematics=_kinematics(moment.stamp, facts),
+            kinematics=facts.kinematics_at(moment.stamp.timestamp_ns),
             dropped=dropped,
             ground_truth=None if moment.sample is None else self.index.ground_truth(moment.sample),
             sample_token=None if moment.sample is None else self.index.samples.tokens[moment.sample].decode(),
@@ -118,16 +103,11 @@ class NuScenesSequence:
         pictures = self.index.pictures
         return Pose(np.array(pictures.translations[row]), np.array(pictures.quaternions[row]))
 
-    def _pose(self, moment: _Moment, facts: _SceneFacts) -> Pose:
+    def _pose(self, moment: _Moment, facts: SceneFacts) -> Pose:
         if moment.sample is None:
             return facts.motion.pose_at(moment.stamp.timestamp_ns)
         samples = self.index.samples
         return Pose(np.array(samples.translations[moment.sample]), np.array(samples.quaternions[moment.sample]))
-
-    def _read_facts(self, scene: int) -> _SceneFacts:
-        name = str(self.index.scenes.names[scene])
-        rig, sensor_names = scene_rig(self.index, scene)
-        return _SceneFacts(rig, read_can_bus(self.root, name), scene_motion(self.index, scene), sensor_names)
 
     def _can_bus_note(self, scenes: Iterable[int]) -> str:
         names = [str(self.index.scenes.names[scene]) for scene in scenes]
@@ -175,46 +155,6 @@ def chosen_scenes(index: NuScenesIndex, tables: Path, choice: NuScenesChoice) ->
     return scenes
 
 
-def scene_rig(index: NuScenesIndex, scene: int) -> tuple[CameraRig, dict[int, str]]:
-    """The rig of a scene, and the camera's name of each of its calibrated sensors."""
-    first, last = index.scenes.first_picture[scene : scene + 2]
-    sensors, rows = np.unique(index.pictures.sensors[first:last], return_index=True)
-    cameras = [_camera(index, int(sensor), first + row) for sensor, row in zip(sensors, rows, strict=True)]
-    cameras.sort(key=lambda camera: (CAMERAS.index(camera.name) if camera.name in CAMERAS else 99, camera.name))
-    names = {int(sensor): str(index.sensors.channels[sensor]) for sensor in sensors}
-    if len({camera.name for camera in cameras}) < len(cameras):
-        raise InputError(f"scene {index.scenes.names[scene]}: a camera changes its calibration within the scene")
-    lidar = int(index.samples.lidars[index.scenes.first_sample[scene]])
-    return CameraRig(tuple(cameras), _sensor_pose(index, lidar).matrix), names
-
-
-def scene_motion(index: NuScenesIndex, scene: int) -> EgoMotion:
-    """A scene's poses at its keyframes' and pictures' times; kinematics are derived from the keyframes' alone.
-
-    Poses a few milliseconds apart would make differences of differences of their noise.
-    """
-    samples, pictures = index.samples, index.pictures
-    keys = slice(*index.scenes.first_sample[scene : scene + 2])
-    rows = slice(*index.scenes.first_picture[scene : scene + 2])
-    key_times = samples.times_us[keys] * 1000
-    keyframes = (samples.translations[keys], samples.quaternions[keys])
-    rough = EgoMotion(key_times, *keyframes, *derive_kinematics(key_times, *keyframes))
-    # The first of equal times is kept: keyframes come first.
-    times, first = np.unique(np.concatenate([key_times, pictures.times_us[rows] * 1000]), return_index=True)
-    translations = np.concatenate([keyframes[0], pictures.translations[rows]])[first]
-    quaternions = np.concatenate([keyframes[1], pictures.quaternions[rows]])[first]
-    inside = np.clip(times, key_times[0], key_times[-1])
-    derived = [rough.kinematics_at(int(time)) for time in inside]
-    return EgoMotion(
-        times,
-        translations,
-        quaternions,
-        np.stack([k.acceleration for k in derived]),
-        np.stack([k.angular_rate for k in derived]),
-        np.stack([k.velocity for k in derived]),
-    )
-
-
 def _versions(root: Path) -> list[str]:
     return sorted(path.parent.name for path in root.glob("v1.*/scene.json"))
 
@@ -229,19 +169,3 @@ def _keyframes(index: NuScenesIndex, scene: int) -> Iterable[tuple[int, int, Int
     bounds = np.searchsorted(np.sort(samples), np.arange(start, end + 1))
     for place, sample in enumerate(range(start, end)):
         yield int(index.samples.times_us[sample]), sample, keys[bounds[place] : bounds[place + 1]]
-
-
-def _kinematics(stamp: FrameStamp, facts: _SceneFacts) -> Kinematics:
-    if facts.can_bus is None:
-        return facts.motion.kinematics_at(stamp.timestamp_ns)
-    return facts.can_bus.kinematics_at(stamp.timestamp_ns // 1000)
-
-
-def _camera(index: NuScenesIndex, sensor: int, picture: int) -> Camera:
-    width, height = (int(value) for value in index.pictures.sizes[picture])
-    name = str(index.sensors.channels[sensor])
-    return Camera(name, width, height, np.array(index.sensors.intrinsics[sensor]), _sensor_pose(index, sensor).matrix)
-
-
-def _sensor_pose(index: NuScenesIndex, sensor: int) -> Pose:
-    return Pose(index.sensors.translations[sensor], index.sensors.quaternions[sensor])
