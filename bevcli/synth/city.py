@@ -119,8 +119,8 @@ class CityPlan:
         rng = self.stream("street", axis, index)
         lanes = int(rng.choice([1, 2], p=[0.6, 0.4]))
         return Street(
-            axis, index, self._position(axis, index), lanes, float(rng.uniform(3.3, 3.6)), 1.5,
-            2.4 if rng.random() < 0.75 else 0.0, float(rng.uniform(3.2, 5.2)), bool(rng.random() < 0.75),
+            axis, index, self._position(axis, index), lanes, float(rng.uniform(3.3, 3.6)), 1.7,
+            2.6 if rng.random() < 0.75 else 0.0, float(rng.uniform(4.0, 6.0)), bool(rng.random() < 0.75),
             bool(rng.random() < 0.6),
         )  # fmt: skip
 

@@ -56,6 +56,9 @@ def facade_albedo(row, x, y, z, footprint, lamps, out):
         for c in range(3):
             out[c] *= shade
         return False
+    if z < shop_m and shop_m < 1.0:  # a plinth of stone
+        out[0], out[1], out[2] = 0.5 * out[0] + 0.08, 0.5 * out[1] + 0.08, 0.5 * out[2] + 0.08
+        return False
     if z < shop_m:
         return _shop(u, z, length, shop_m, seed, out)
     floors = np.floor((height - 0.9 - shop_m) / floor_m)
@@ -136,9 +139,9 @@ def _shop(u, z, length, shop_m, seed, out):
     if z > shop_m - 0.75:
         if z > shop_m - 0.68 and 0.25 < wu < width - 0.25:
             pick = scramble(index + 5, seed) % 6
-            out[0] = 0.42 if pick in (0, 3) else 0.05
-            out[1] = 0.30 if pick in (1, 3, 4) else 0.05
-            out[2] = 0.30 if pick in (2, 4) else 0.06
+            out[0] = 0.30 if pick in (0, 3) else 0.07
+            out[1] = 0.20 if pick in (1, 3, 4) else 0.06
+            out[2] = 0.22 if pick in (2, 4) else 0.07
         return False
     if wu < 0.25 or wu > width - 0.25 or z < 0.45 and kind != 0:
         for c in range(3):

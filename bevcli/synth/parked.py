@@ -12,8 +12,8 @@ from bevcli.synth.people import PERSON_NAMES
 from bevcli.synth.scenery import side_of
 
 PARKED_MIX = {"car": 0.78, "truck": 0.09, "trailer": 0.05, "motorcycle": 0.05, "bus": 0.03}
-FILLED = 0.68  # share of parking places that are taken
-WORKS_SHARE = 0.42  # share of the sides of stretches with parking that have road works
+FILLED = 0.55  # share of parking places that are taken
+WORKS_SHARE = 0.27  # share of the sides of stretches with parking that have road works
 WITHOUT_RIDER = {
     "motorcycle": ("sport", "cruiser", "scooter"), "bicycle": ("city", "racer", "cargo", "mountain"),
 }  # fmt: skip
@@ -81,18 +81,18 @@ class Roadside:
     ) -> list[Standing]:
         """Road works over a span of the parking lane: barriers along the traffic, cones, machines, workers."""
         draw, made = self.catalog.draw, []
-        edge, middle = street.half_width - 2.9, street.half_width - 1.35
+        edge, middle = street.half_width - 3.05, street.half_width - 1.4
         barrier = draw("barrier", rng)
-        for k, at in enumerate(np.arange(closed[0] + 3.2, closed[1] - 2.5, rng.choice([2.65, 2.65, 4.0]))):
+        for k, at in enumerate(np.arange(closed[0] + 4.0, closed[1] - 3.9, rng.choice([2.65, 2.65, 4.0]))):
             body = draw_body(barrier, rng, f"barrier-{name}-{k}", 0.02)
             made.append(self._stand(street, body, float(at), side * edge, side, "", np.pi / 2))
         cone = draw("traffic_cone", rng)
-        taper = [(closed[0] + 2.6 * f, street.half_width - 0.3 - (2.6 * f)) for f in np.linspace(0, 1, 4)]
-        taper += [(closed[1] - 2.6 * f, street.half_width - 0.3 - (2.6 * f)) for f in np.linspace(0, 1, 4)]
-        taper += [(rng.uniform(closed[0] + 4, closed[1] - 3), edge + 0.7) for _ in range(2)]
+        across = np.linspace(street.half_width - 0.3, edge + 0.1, 4)
+        taper = [(closed[0] + 0.75 * k, offset) for k, offset in enumerate(across)]
+        taper += [(closed[1] - 0.75 * k, offset) for k, offset in enumerate(across)]
         for k, (at, offset) in enumerate(taper):
             made.append(self._stand(street, draw_body(cone, rng, f"cone-{name}-{k}", 0.03), at, side * offset, side, ""))
-        small = [v.name for v in self.catalog.by_class["construction_vehicle"] if v.size_lwh[0] < closed[1] - closed[0] - 8]
+        small = [v.name for v in self.catalog.by_class["construction_vehicle"] if v.size_lwh[0] < closed[1] - closed[0] - 8 and v.size_lwh[1] < 2.72]
         machine = draw_body(draw("construction_vehicle", rng, small), rng, f"machine-{name}")
         space = (closed[0] + 4 + machine.size_lwh[0] / 2, closed[1] - 4 - machine.size_lwh[0] / 2)
         at = float(rng.uniform(*space)) if space[1] > space[0] else (closed[0] + closed[1]) / 2
@@ -100,9 +100,9 @@ class Roadside:
         made.append(self._stand(street, machine, at, side * middle, side, "vehicle.parked", turned))
         for k in range(int(rng.integers(1, 4))):
             body = draw_body(draw("pedestrian", rng, ["worker_standing"]), rng, f"worker-{name}-{k}", 0.03)
-            where = closed[0] + 2.9 if k == 0 else closed[1] - 3.0 - 0.9 * k
+            where = closed[0] + 2.9 if k == 0 else closed[1] - 2.1 - 0.8 * k
             turn = float(rng.uniform(0, 6.3))
-            made.append(self._stand(street, body, where, side * (street.half_width - rng.uniform(0.6, 1.6)), side,
+            made.append(self._stand(street, body, where, side * (street.half_width - (0.6, 0.7, 1.5)[k]), side,
                                     "pedestrian.standing", turn))  # fmt: skip
         return made
 
@@ -127,16 +127,19 @@ class Roadside:
             length = float(np.hypot(*(end - start)))
             way = (end - start) / length
             depth = land.sidewalks[side]
-            for group in range(int(rng.poisson(1.3))):
-                at = rng.uniform(9, length - 9)
-                for k in range(int(rng.integers(1, 4))):
+            for group in range(int(rng.poisson(0.7))):
+                at = 9 + (length - 22) * (group + rng.random()) / 4  # racks do not overlap: each has its part of the side
+                for k in range(int(rng.integers(1, 4)) if group < 4 else 0):
                     class_name = "bicycle" if rng.random() < 0.75 else "motorcycle"
                     variant = self.catalog.draw(class_name, rng, WITHOUT_RIDER[class_name])
                     body = draw_body(variant, rng, f"rack-{column}.{row}.{side}.{group}.{k}", 0.03)
                     point = start + way * (at + 0.85 * k) + inward * (depth - 1.0)
                     made.append(self._stand_on_land(body, point, self.city.heading(point, inward), "cycle.without_rider"))
-            for group in range(int(rng.poisson(0.9))):
-                middle = start + way * rng.uniform(8, length - 8) + inward * rng.uniform(1.8, depth - 1.2)
+            for group in range(int(rng.poisson(0.5))):
+                middle = start + way * rng.uniform(8, length - 8) + inward * (depth - 1.0)
+                x, y = self.city.bend(middle)
+                if any(np.hypot(m.position[0] - x, m.position[1] - y) < 2.6 for m in made):
+                    continue
                 for k in range(int(rng.integers(1, 4))):
                     names = [f"{n}_standing" for n in PERSON_NAMES if n != "worker"]
                     variant = self.catalog.draw("pedestrian", rng, names)
@@ -163,7 +166,7 @@ class Roadside:
         for side in range(4):
             start, end = corners[side], corners[(side + 1) % 4]
             way = (end - start) / np.hypot(*(end - start))
-            for k, at in enumerate(np.arange(1.8, float(np.hypot(*(end - start))) - 1.5, 2.75)):
+            for k, at in enumerate(np.arange(1.8, float(np.hypot(*(end - start))) - 1.5, 4.2)):
                 if rng.random() < 0.12:
                     continue
                 point = start + way * at

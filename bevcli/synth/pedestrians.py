@@ -16,10 +16,10 @@ from bevcli.synth.route import DIRECTIONS, node_center, street_of
 from bevcli.synth.signals import Signals
 
 STRIDE_M = 0.72
-CROSSING_LINE_M = 2.7  # where people cross, measured from the junction's box
+CROSSING_LINE_M = 3.2  # where people cross, measured from the junction's box
 ALONG_PAVEMENT_M = 26.0  # how far people come from, and go on to
-STROLLERS_PER_BLOCK = 7
-SECONDS_BETWEEN_CROSSERS = 7.0
+STROLLERS_PER_BLOCK = 4.5
+SECONDS_BETWEEN_CROSSERS = 8.0
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def strollers(city: CityPlan, catalog: Catalog, column: int, row: int, span_s: t
     land = city.block(column, row)
     walkers = []
     for k in range(int(rng.poisson(STROLLERS_PER_BLOCK))):
-        inset = rng.uniform(1.5, min(land.sidewalks) - 0.6)
+        inset = rng.uniform(1.3, min(land.sidewalks) - 2.1)
         low, high = (land.low[0] + inset, land.low[1] + inset), (land.high[0] - inset, land.high[1] - inset)
         ring = np.roll(rounded_rectangle(low, high, 3.5), int(rng.integers(100)), axis=0)
         if rng.random() < 0.5:
@@ -109,27 +109,28 @@ def crossers(
     begin = span_s[0] - 30
     while begin < span_s[1]:
         name = f"crosser-{node[0]}-{node[1]}-{len(walkers)}"
-        walkers.append(_crosser(city, catalog, signals, node, begin, rng, name))
+        walkers.append(_crosser(city, catalog, signals, node, begin, rng, name, len(walkers)))
         begin += rng.exponential(SECONDS_BETWEEN_CROSSERS)
     return walkers
 
 
 def _crosser(
     city: CityPlan, catalog: Catalog, signals: Signals, node: tuple[int, int], begin: float,
-    rng: np.random.Generator, name: str,
+    rng: np.random.Generator, name: str, index: int,
 ) -> Walker:  # fmt: skip
     """One person: along the pavement to a kerb, over the road when the signal says walk, and on."""
     arm = int(rng.integers(4))
     street, cross = street_of(city, node, arm), street_of(city, node, arm + 1)
-    sideways = DIRECTIONS[(arm + 1) % 4] * (1 if rng.random() < 0.5 else -1)
-    spot = node_center(city, node) + DIRECTIONS[arm] * (cross.half_width + CROSSING_LINE_M + rng.uniform(-0.8, 0.8))
+    side = 1 if rng.random() < 0.5 else -1  # who goes one way keeps to one side of the crossing
+    sideways = DIRECTIONS[(arm + 1) % 4] * side
+    spot = node_center(city, node) + DIRECTIONS[arm] * (cross.half_width + CROSSING_LINE_M + side * (0.25 + 0.72 * (index % 3)))
     reach = street.half_width + ALONG_PAVEMENT_M
     path = along(spot - sideways * reach, spot + sideways * reach)
-    speed = rng.uniform(1.0, 1.7)
-    kerb, far = ALONG_PAVEMENT_M - rng.uniform(0.5, 1.4), ALONG_PAVEMENT_M + 2 * street.half_width
+    speed = max(rng.uniform(1.0, 1.7), street.half_width / 6.5)  # over within 13 s
+    kerb, far = ALONG_PAVEMENT_M - 0.5 - 0.85 * (index // 3 % 3), ALONG_PAVEMENT_M + 2 * street.half_width
     arrival = begin + kerb / speed
     start = arrival
-    while not signals.walk(node, start):
+    while not signals.walk(node, arm % 2, start):
         start += 0.25
     start += rng.uniform(0, 1.0) if start > arrival else 0.0
     end = start + (2 * reach - kerb) / speed

@@ -17,7 +17,7 @@ SMOOTHING_M = 1.2  # corners are rounded over this, so that yaw rates rise and f
 LATERAL_ACCELERATION = 2.2  # m/s², how fast curves are taken
 BRAKING = 1.7  # m/s², how early drivers slow for curves
 DIRECTIONS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)], dtype=np.float64)  # east, north, west, south
-BICYCLE_OFFSET_M = 0.55  # from the outermost lane's edge to the line that bicycles keep
+BICYCLE_OFFSET_M = 0.5  # from the outermost lane's edge to the line that bicycles keep
 
 
 @dataclass(frozen=True)
@@ -87,12 +87,12 @@ def right_of(direction: int) -> Array:
     return DIRECTIONS[(direction - 1) % 4]
 
 
-def draw_turns(city: CityPlan, start: LaneStart, rng: np.random.Generator, straight_on: float = 0.5) -> Iterator[int]:
+def draw_turns(city: CityPlan, start: LaneStart, rng: np.random.Generator, straight_on: float = 0.6) -> Iterator[int]:
     """Endless turns that a driver may take from the lane that they are in."""
     node, direction, lane = start.node, start.direction, start.lane
     while True:
         lanes = street_of(city, node, direction).lanes
-        options = [1, -1] if lanes == 1 else ([1] if lane == 0 else [-1])
+        options = [1, -1, -1] if lanes == 1 else ([1] if lane == 0 else [-1])  # left turns hold up those behind
         turn = 0 if rng.random() < straight_on else int(options[int(rng.integers(len(options)))])
         yield turn
         direction = (direction + turn) % 4

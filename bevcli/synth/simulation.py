@@ -20,9 +20,9 @@ from bevcli.synth.route import Route
 from bevcli.synth.signals import Signals
 from bevcli.synth.traffic import STEP_S, Unit, Vehicle, step
 
-WARM_UP_S = 8.0  # the traffic runs this long before the first frame, so that queues have formed
+WARM_UP_S = 6.0  # the traffic runs this long before the first frame, so that queues have formed
 AFTER_S = 0.6
-VEHICLES, BICYCLES = 34, 7
+VEHICLES, BICYCLES = 22, 6
 REACH_M = 75.0
 EGO_REAR_AXLE_M = 3.75  # from the ego vehicle's front to its rear axle, where its frame's origin is
 EGO_SMOOTHING_S = 0.35
@@ -61,13 +61,14 @@ class Simulation:
 
     def __init__(self, city: CityPlan, catalog: Catalog, duration_s: float) -> None:
         self.city, self.catalog = city, catalog
-        self.signals = Signals(city)
         self.roadside = Roadside(city, catalog)
         self.span_s = (-WARM_UP_S, duration_s + AFTER_S)
         self.population = Population(city, catalog, 14.0 * (self.span_s[1] - self.span_s[0]) + 60)
         body = draw_body(catalog.by_class["car"][2], city.stream("ego-body"), "ego", 0.0)
         self.ego_body = body
         self._ego = self.population.ego((Unit(body.variant, body.size_lwh, body.paint, body.dye, "ego", 0.0),))
+        first = self._ego.route.passes[0]
+        self.signals = Signals(city, (first.node, first.direction % 2))
         self._crossers: dict[tuple[int, int], list[Walker]] = {}
         self._strollers: dict[tuple[int, int], list[Walker]] = {}
         self._driving: list[Driving] = []

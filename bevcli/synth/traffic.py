@@ -125,17 +125,17 @@ def _same_way(vehicle: Vehicle, vehicles: list[Vehicle], other: int) -> bool:
 def _may_enter(
     vehicle: Vehicle, crossing: JunctionPass, vehicles: list[Vehicle], signals: Signals, time_s: float
 ) -> bool:
-    """Green, and for left turns nobody oncoming who is near or inside the junction."""
-    if signals.light(crossing.node, crossing.direction % 2, time_s) != "green":
-        return False
-    if crossing.turn <= 0:
-        return True
+    """Green, and for left turns nobody oncoming who is near or inside the junction; they may use the yellow, too."""
+    light = signals.light(crossing.node, crossing.direction % 2, time_s)
+    if crossing.turn <= 0 or light == "red":
+        return light == "green"
     for other in vehicles:
         theirs = other.next_pass()
         if theirs is None or theirs.node != crossing.node or theirs.direction != (crossing.direction + 2) % 4:
             continue
-        near = theirs.stop - 24 < other.front < theirs.leave
-        if theirs.turn != 1 and near and (other.speed > 0.5 or other.front > theirs.stop - 6):
+        near = theirs.stop - 15 < other.front < theirs.leave - 5
+        waits = other.speed < 0.5 and (light == "yellow" or other.front < theirs.stop - 6)
+        if theirs.turn != 1 and near and (not waits or other.front > theirs.stop + 1):
             return False
     return True
 
