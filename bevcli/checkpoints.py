@@ -167,8 +167,10 @@ def _read_pth(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     try:
         contents = torch.load(path, map_location="cpu", weights_only=True)
     except _BROKEN_PICKLE as error:
-        reason = str(error).split("\n")[0] or type(error).__name__
-        raise WeightsError(f"{path}: is no file of weights that is safe to read: {reason}") from error
+        raise WeightsError(
+            f"{path}: is no file of weights that is safe to read (expected a PyTorch file of tensors and plain values, "
+            "or .safetensors): it is damaged, something else, or holds objects that could run code"
+        ) from error
     state = contents.get("state_dict", contents) if isinstance(contents, dict) else None
     if not isinstance(state, dict) or not state or not all(isinstance(v, Tensor) for v in state.values()):
         raise WeightsError(f"{path}: holds no state dict; expected tensors by name, at the top or as state_dict")
