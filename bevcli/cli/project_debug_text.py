@@ -9,7 +9,7 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.rig_checks import RigReport
 from bevcli.geometry.rig_coverage import Coverage
 from bevcli.geometry.rig_findings import SEVERITIES, Finding
-from bevcli.geometry.rig_pose import mounting_of, seen_fov_deg
+from bevcli.geometry.rig_pose import degrees_text, mounting_of, seen_fov_deg
 
 WIDTH = 100
 INDENT = " " * 10
@@ -41,9 +41,9 @@ def _rig_lines(rig: CameraRig, coverage: Coverage) -> list[str]:
                 camera.name,
                 f"{camera.width}x{camera.height}",
                 f"{seen_fov_deg(camera)[0]:.0f}°",
-                f"{mounting.yaw_deg:.0f}°",
-                f"{mounting.pitch_deg:.1f}°",
-                f"{mounting.roll_deg:.1f}°",
+                degrees_text(mounting.yaw_deg, 0),
+                degrees_text(mounting.pitch_deg),
+                degrees_text(mounting.roll_deg),
                 f"{x:.2f}",
                 f"{y:.2f}",
                 f"{z:.2f} m",
@@ -71,7 +71,10 @@ def _finding_lines(findings: Sequence[Finding]) -> list[str]:
     for finding in findings:
         where = f"{finding.camera}: " if finding.camera else ""
         head = f"{finding.severity:<9} {where}{finding.message}  [{finding.code}]"
-        lines += ["", *textwrap.wrap(head, WIDTH, subsequent_indent=INDENT, break_long_words=False)]
+        lines += [
+            "",
+            *textwrap.wrap(head, WIDTH, subsequent_indent=INDENT, break_long_words=False, break_on_hyphens=False),
+        ]
         for word, value in (("found", finding.found), ("expected", finding.expected), ("do", finding.advice)):
             if value:
                 text = f"{word + ':':<9} {value}"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.rig_findings import Finding
-from bevcli.geometry.rig_names import words_of
+from bevcli.geometry.rig_names import side_of
 from bevcli.geometry.transforms import Array, apply
 
 COVERAGE_GRID = BevGrid(rows=100, columns=100)
@@ -66,11 +66,11 @@ def check_coverage(coverage: Coverage, ego_from_bev: Array) -> tuple[Finding, ..
     middle = np.append(empty.mean(0), 0) @ ego_from_bev[:3, :3].T
     yaw = float(np.degrees(np.arctan2(middle[1], middle[0])))
     around = np.hypot(middle[0], middle[1]) < 0.1 * (coverage.grid.x_range_m[1] - coverage.grid.x_range_m[0])
-    side = "all around" if around else f"mostly {words_of(yaw)}"
-    severity = "warning" if coverage.unseen > UNSEEN_WARNING else "info"
+    side = "all around" if around else f"mostly {side_of(yaw)}"
     return (
         Finding(
-            "cells-unseen", "warning" if severity == "warning" else "info", None, "BEV cells are seen by no camera",
+            "cells-unseen", "warning" if coverage.unseen > UNSEEN_WARNING else "info", None,
+            "BEV cells are seen by no camera",
             f"{coverage.unseen:.1%} of the cells, {side}", "0%", "nothing is detected there: see the coverage map",
         ),
     )  # fmt: skip

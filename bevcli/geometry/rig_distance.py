@@ -65,7 +65,7 @@ def check_distance(measures: Sequence[Measure]) -> tuple[Finding, ...]:
     """A warning for every property that is far from nuScenes'; unseen cells have a finding of their own."""
     far = [measure for measure in measures if not measure.is_near and measure.code != "cells-seen"]
     return tuple(
-        Finding(m.code, "warning", None, f"{m.name} is far from nuScenes'", m.value, m.reference, ADVICE) for m in far
+        Finding(m.code, "warning", None, f"{m.name}: far from nuScenes'", m.value, m.reference, ADVICE) for m in far
     )
 
 
@@ -77,6 +77,6 @@ def _measure(
 
 def _span(low: float, high: float, unit: str) -> str:
     digits = 2 if unit == "m" else 1
-    first, last = f"{low:.{digits}f}", f"{high:.{digits}f}"
+    first, last = (f"{round(value, digits) + 0.0:.{digits}f}" for value in (low, high))  # never "-0.0"
     gap = " " if unit == "m" else ""
     return f"{first}{gap}{unit}" if first == last else f"{first} to {last}{gap}{unit}"

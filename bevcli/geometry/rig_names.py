@@ -122,7 +122,11 @@ def _swap_finding(moved: Sequence[str], named: Mapping[str, float], looks: Mappi
 
 def words_of(yaw_deg: float) -> str:
     """A direction as a person says it: "back left (109°)"."""
+    return f"{side_of(yaw_deg)} ({yaw_deg:.0f}°)"
+
+
+def side_of(yaw_deg: float) -> str:
+    """Where a direction points: "back left"."""
     middles = {"ahead": 0, "front left": 50, "left": 90, "back left": 130, "back": 180}
     middles |= {"back right": -130, "right": -90, "front right": -50}
-    nearest = min(middles, key=lambda word: turn_deg(middles[word], yaw_deg))
-    return f"{nearest} ({yaw_deg:.0f}°)"
+    return min(middles, key=lambda word: turn_deg(middles[word], yaw_deg))

@@ -49,12 +49,32 @@ def mounting_of(ego_from_camera: Array) -> Mounting:
     )
 
 
+def degrees_text(angle_deg: float, digits: int = 1) -> str:
+    """As "0.4°", never "-0.0°"."""
+    return f"{round(angle_deg, digits) + 0.0:.{digits}f}°"
+
+
 def seen_fov_deg(camera: Camera) -> tuple[float, float]:
     """Degrees across the picture, horizontally and vertically through the optical axis, the lens included.
 
     At most 180: nothing behind the camera's plane has a picture.
     """
-    return _seen(camera, 0), _seen(camera, 1)
+    (left, right), (up, down) = seen_range_deg(camera, 0), seen_range_deg(camera, 1)
+    return right - left, down - up
+
+
+def seen_range_deg(camera: Camera, axis: int) -> tuple[float, float]:
+    """From which to which angle to the optical axis the picture reaches, degrees; axis 0 to the right, 1 downwards."""
+    rays = np.zeros((len(_ANGLES), 3))
+    rays[:, axis], rays[:, 2] = np.sin(_ANGLES), np.cos(_ANGLES)
+    pixels, _ = camera.project(rays)
+    size = (camera.width, camera.height)[axis]
+    with np.errstate(invalid="ignore"):
+        inside = (pixels[:, axis] > 0) & (pixels[:, axis] < size)
+    seen = np.degrees(_ANGLES[inside])
+    if len(seen) == 0:
+        return 0.0, 0.0
+    return float(seen[0]) - _STEP_DEG / 2, float(seen[-1]) + _STEP_DEG / 2
 
 
 def horizon(camera: Camera) -> Array:
@@ -65,13 +85,3 @@ def horizon(camera: Camera) -> Array:
     seen = np.where(camera.contains(pixels, depth)[:, None], pixels, np.nan)
     start = int(np.argmax(depth < 0))  # a gap, so that the line does not begin in the middle of the picture
     return np.roll(seen, -start, axis=0)
-
-
-def _seen(camera: Camera, axis: int) -> float:
-    rays = np.zeros((len(_ANGLES), 3))
-    rays[:, axis], rays[:, 2] = np.sin(_ANGLES), np.cos(_ANGLES)
-    pixels, _ = camera.project(rays)
-    size = (camera.width, camera.height)[axis]
-    with np.errstate(invalid="ignore"):
-        inside = (pixels[:, axis] > 0) & (pixels[:, axis] < size)
-    return float(inside.sum() * _STEP_DEG)

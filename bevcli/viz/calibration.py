@@ -105,7 +105,7 @@ def _log_camera(stream: rr.RecordingStream, camera: Camera, ego_from_bev: Array,
         image = rr.EncodedImage(contents=encoded, media_type="image/jpeg")
         stream.log(entities.picture(camera.name), image, static=True)
     points = pillars_in(camera, ego_from_bev)
-    radii = np.clip(60 / np.maximum(points.depths, 1e-3), 1.2, 6) * camera.width / 800
+    radii = np.clip(60 / np.maximum(points.distances, 1e-3), 1.2, 6) * camera.width / 800
     dots = rr.Points2D(points.pixels, colors=points.colors, radii=radii, draw_order=30)
     stream.log(entities.overlay(camera.name, "pillars"), dots, static=True)
     lines = {

@@ -15,7 +15,7 @@ from matplotlib.patches import Patch
 from bevcli.errors import OutputError
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.rig_coverage import Coverage
-from bevcli.geometry.rig_pose import seen_fov_deg
+from bevcli.geometry.rig_pose import seen_range_deg
 from bevcli.geometry.transforms import apply, inverse
 
 PAPER, INK, FAINT = "#14171c", "#e8ecf1", "#8a93a0"
@@ -97,8 +97,7 @@ def _draw_camera(axes: Axes, camera: Camera, rig: CameraRig) -> None:
     bev_from_camera = inverse(rig.ego_from_bev) @ camera.ego_from_camera
     place, forward = bev_from_camera[:2, 3], bev_from_camera[:2, 2]
     yaw = float(np.degrees(np.arctan2(forward[1], forward[0])))
-    half = seen_fov_deg(camera)[0] / 2
-    for angle in np.radians([yaw - half, yaw + half]):
+    for angle in np.radians(yaw - np.array(seen_range_deg(camera, 0))):
         end = place + 80 * np.array([np.cos(angle), np.sin(angle)])
         axes.plot([place[0], end[0]], [place[1], end[1]], color=INK, linewidth=0.7, alpha=0.6, zorder=3)
     label = place + 27 * np.array([np.cos(np.radians(yaw)), np.sin(np.radians(yaw))])

@@ -28,10 +28,10 @@ Picture = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class PillarPoints:
-    """What of the pillars a camera sees: pixels (M, 2), depths (M,) in metres, colours (M, 3) RGB by height."""
+    """What of the pillars a camera sees: pixels (M, 2), distances (M,) in metres, colours (M, 3) RGB by height."""
 
     pixels: Array
-    depths: Array
+    distances: Array
     colors: NDArray[np.uint8]
 
 
@@ -39,11 +39,11 @@ def pillars_in(camera: Camera, ego_from_bev: Array, grid: BevGrid = PILLAR_GRID)
     """The pillars' points that lie in the camera's picture, the farthest first."""
     points = apply(ego_from_bev, grid.pillars()).reshape(-1, 3)
     pixels = pillar_pixels(camera, points)
-    depths = apply(camera.camera_from_ego, points)[:, 2]
+    distances = np.linalg.norm(points - camera.ego_from_camera[:3, 3], axis=1)
     colors = np.tile(height_colors(grid), (grid.rows * grid.columns, 1))
-    order = np.argsort(-depths)
+    order = np.argsort(-distances)
     order = order[np.isfinite(pixels[order]).all(-1)]
-    return PillarPoints(pixels[order], depths[order], colors[order])
+    return PillarPoints(pixels[order], distances[order], colors[order])
 
 
 def height_colors(grid: BevGrid) -> NDArray[np.uint8]:
@@ -113,8 +113,8 @@ def _draw_lines(canvas: Picture, lines: list[Array], color: Color, opacity: floa
 
 def _draw_pillars(canvas: Picture, points: PillarPoints) -> None:
     scale = canvas.shape[1] / 800
-    for pixel, depth, color in zip(points.pixels, points.depths, points.colors, strict=True):
-        radius = float(np.clip(60 / depth, 1.2, 6)) * scale
+    for pixel, distance, color in zip(points.pixels, points.distances, points.colors, strict=True):
+        radius = float(np.clip(60 / distance, 1.2, 6)) * scale
         center = tuple(np.round(pixel * 16).astype(int).tolist())
         cv2.circle(canvas, center, round(radius * 16), color.tolist(), -1, cv2.LINE_AA, 4)
 

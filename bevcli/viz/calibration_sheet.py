@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.rig_checks import RigReport
 from bevcli.geometry.rig_findings import Finding
-from bevcli.geometry.rig_pose import mounting_of, seen_fov_deg
+from bevcli.geometry.rig_pose import degrees_text, mounting_of, seen_fov_deg
 from bevcli.viz.calibration_map import FAINT, INK, LEGEND_STYLE, PAPER, draw_coverage, save
 from bevcli.viz.calibration_overlay import GROUND, HORIZON, PILLAR_GRID, Picture, draw_overlay, height_colors
 
@@ -23,6 +23,8 @@ SEVERITY_COLORS = {"error": "#ff5c72", "warning": "#ffc857", "info": "#7fb7e6"}
 SIDE_DEG = (75.0, 105.0)  # cameras that look sideways stand beside the map
 DPI = 100
 SLOT, GAP, TITLE, DETAILS, MIDDLE = 5.2, 0.3, 0.32, 0.38, 5.2  # inches: a picture's width, between, above, below, map
+FOOTER = 3.0  # for findings and legend where cameras stand beside the map
+LINE = 0.19
 PICTURE_WIDTH = 1040
 
 
@@ -31,7 +33,8 @@ def write_sheet(path: Path, rig: CameraRig, report: RigReport, pictures: Mapping
     front, left, right, back = around(rig)
     columns = max(len(front), len(back), 3)
     heights = [_row_height(front), max(_column_height(left), _column_height(right), MIDDLE), _row_height(back)]
-    sheet = _Sheet(columns * (SLOT + GAP) + GAP, sum(heights) + 2 * GAP)
+    footer = FOOTER if left or right else 0.0
+    sheet = _Sheet(columns * (SLOT + GAP) + GAP, sum(heights) + footer + 2 * GAP)
     tops = GAP + np.cumsum([0.0, *heights[:2]])
     for row, top in ((front, tops[0]), (back, tops[2])):
         start = (sheet.width - len(row) * (SLOT + GAP) + GAP) / 2
@@ -44,10 +47,10 @@ def write_sheet(path: Path, rig: CameraRig, report: RigReport, pictures: Mapping
             top += _camera_height(camera)
     size, top = MIDDLE - 1.1, tops[1] + (heights[1] - MIDDLE) / 2 + 0.35
     draw_coverage(sheet.axes((sheet.width - size) / 2 + 0.1, top, size, size), rig, report.coverage)
-    if not left:
-        _write_findings(sheet.axes(GAP, top, SLOT, size), report.findings)
-    if not right:
-        _write_legend(sheet.axes(sheet.width - SLOT - GAP, top, SLOT, size))
+    if footer:
+        top, size = sheet.height - GAP - footer, footer
+    _write_findings(sheet.axes(GAP, top, SLOT, size), size, report.findings)
+    _write_legend(sheet.axes(sheet.width - SLOT - GAP, top, SLOT, size))
     save(sheet.figure, path)
 
 
@@ -114,7 +117,8 @@ def _draw_camera(
         spine.set_color(color)
         spine.set_linewidth(2.5 if mine else 0.8)
     axes.set_title(camera.name, loc="left", color=INK, fontsize=11)
-    details = f"yaw {mounting.yaw_deg:.0f}°  pitch {mounting.pitch_deg:.1f}°  roll {mounting.roll_deg:.1f}°"
+    angles = (degrees_text(mounting.yaw_deg, 0), degrees_text(mounting.pitch_deg), degrees_text(mounting.roll_deg))
+    details = "yaw {}  pitch {}  roll {}".format(*angles)
     details += f"  height {mounting.height:.2f} m  view {seen_fov_deg(camera)[0]:.0f}°"
     axes.set_xlabel(details, color=FAINT, fontsize=9, loc="left", labelpad=5)
     if mine:
@@ -123,27 +127,29 @@ def _draw_camera(
         axes.text(0.02, 0.96, text, transform=axes.transAxes, va="top", color=color, fontsize=10, bbox=box)
 
 
-def _write_findings(axes: Axes, findings: Sequence[Finding]) -> None:
+def _write_findings(axes: Axes, height: float, findings: Sequence[Finding]) -> None:
+    """As many findings as have room in axes of this height, inches."""
     axes.axis("off")
-    axes.text(0, 0.97, "Findings", color=INK, fontsize=13, va="top")
+    axes.set_ylim(height, 0)
+    axes.text(0, 0, "Findings", color=INK, fontsize=13, va="top")
     if not findings:
-        axes.text(0, 0.89, "none: the rig looks healthy", color="#7fd6a0", fontsize=10, va="top")
-    height = 0.89
+        axes.text(0, 0.45, "none: the rig looks healthy", color="#7fd6a0", fontsize=10, va="top")
+    top = 0.45
     for finding in findings:
         where = f"{finding.camera}: " if finding.camera else ""
         numbers = f" ({finding.found})" if finding.found else ""
         lines = textwrap.wrap(f"{where}{finding.message}{numbers}", 56)[:4]
-        if height - 0.05 * len(lines) < 0.03:
-            axes.text(0, height, "and more: see the table", color=FAINT, fontsize=9, va="top")
+        if top + LINE * len(lines) > height - LINE:
+            axes.text(0, top, "and more: see the table", color=FAINT, fontsize=9, va="top")
             break
-        axes.text(0, height, finding.severity, color=SEVERITY_COLORS[finding.severity], fontsize=9, va="top")
-        axes.text(0.15, height, "\n".join(lines), color=INK, fontsize=9, va="top", linespacing=1.25)
-        height -= 0.05 * len(lines) + 0.02
+        axes.text(0, top, finding.severity, color=SEVERITY_COLORS[finding.severity], fontsize=9, va="top")
+        axes.text(0.15, top, "\n".join(lines), color=INK, fontsize=9, va="top", linespacing=1.25)
+        top += LINE * len(lines) + 0.08
 
 
 def _write_legend(axes: Axes) -> None:
     axes.axis("off")
-    axes.text(0.1, 0.97, "How to read it", color=INK, fontsize=13, va="top")
+    axes.text(0.1, 1.0, "How to read it", color=INK, fontsize=13, va="top", transform=axes.transAxes)
     heights = PILLAR_GRID.pillar_heights()
     colors = [tuple(color / 255) for color in height_colors(PILLAR_GRID)]
     dots = [
@@ -156,4 +162,4 @@ def _write_legend(axes: Axes) -> None:
         Line2D([], [], color=tuple(np.array(HORIZON) / 255), label="the horizon: far away, at the camera's height"),
         Line2D([], [], color=tuple(np.array(GROUND) / 255), label="the ground, every 5 m: it should lie on the road"),
     ]
-    axes.legend(handles=dots + lines, loc="upper left", bbox_to_anchor=(0.08, 0.93), labelspacing=0.9, **LEGEND_STYLE)
+    axes.legend(handles=dots + lines, loc="upper left", bbox_to_anchor=(0.08, 0.94), labelspacing=0.9, **LEGEND_STYLE)
