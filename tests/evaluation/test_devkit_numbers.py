@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +12,6 @@ import pytest
 from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import evaluate
 from bevcli.geometry.boxes import Boxes3D
-
-SHARED = os.environ.get("BEVCLI_SHARED")
-pytestmark = pytest.mark.skipif(not SHARED, reason="BEVCLI_SHARED does not point to the reference numbers")
 
 
 def boxes(rows: list[dict[str, Any]]) -> Boxes3D:
@@ -33,8 +29,8 @@ def boxes(rows: list[dict[str, Any]]) -> Boxes3D:
     )
 
 
-def test_every_number_equals_the_devkits() -> None:
-    golden = json.loads((Path(SHARED or "") / "golden" / "detection_metrics.json").read_text())
+def test_every_number_equals_the_devkits(shared: Path) -> None:
+    golden = json.loads((shared / "golden" / "detection_metrics.json").read_text())
     samples = list(dict.fromkeys(row["sample"] for row in golden["predictions"]))
     predictions, ground_truth = (
         [boxes([row for row in golden[key] if row["sample"] == sample]) for sample in samples]

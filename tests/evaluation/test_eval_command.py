@@ -1,0 +1,222 @@
+"""`bevcli eval` and `bevcli export` from the command line: files in, numbers, plots and one-line errors out."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from random_boxes import as_predictions, random_truth
+from typer.testing import CliRunner
+
+from bevcli.cli.main import app
+from bevcli.errors import InputError
+from bevcli.evaluation.inputs import open_ground_truth, open_predictions, without_cycles_in_racks
+from bevcli.evaluation.pairing import pair_frames
+from bevcli.frame import BevMap, FrameStamp
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.transforms import Pose
+from bevcli.sequences.boxes_file import BoxesFile, BoxesWriter, FrameBoxes, read_boxes
+from bevcli.sequences.map_file import write_map
+from bevcli.sequences.nuscenes import NuScenesChoice
+
+
+def write_frames(path: Path, frames: list[Boxes3D], reference: str = "ego", pose: Pose | None = None) -> Path:
+    with BoxesWriter(path, reference) as writer:
+        for place, boxes in enumerate(frames):
+            writer.write(FrameBoxes(FrameStamp(place, "s", place * 500_000_000), pose, boxes))
+    return path
+
+
+def evaluated(*arguments: Path | str) -> dict[str, Any]:
+    result = CliRunner().invoke(app, ["eval", *map(str, arguments), "--json"], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout)
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> tuple[Path, Path]:
+    """Predictions of middling quality in the ego frame, and their ground truth."""
+    truth = random_truth(21, frames=3)
+    found = as_predictions(truth, 22, noise_m=0.6, false_per_frame=15)
+    return (
+        write_frames(tmp_path / "predictions.json", found, pose=Pose.identity()),
+        write_frames(tmp_path / "ground_truth.json", truth, pose=Pose.identity()),
+    )
+
+
+def test_the_json_has_the_devkits_keys(files: tuple[Path, Path]) -> None:
+    scores = evaluated(*files)
+    keys = {"label_aps", "mean_dist_aps", "mean_ap", "label_tp_errors", "tp_errors", "tp_scores", "nd_score", "cfg"}
+    assert keys <= set(scores)
+    assert set(scores["label_aps"]["car"]) == {"0.5", "1.0", "2.0", "4.0"}
+    assert scores["label_tp_errors"]["traffic_cone"]["vel_err"] is None
+    assert 0 < scores["mean_ap"] < 1
+    assert 0 < scores["nd_score"] < 1
+    assert scores["frames"] == 3
+    assert scores["iou"] is None
+    assert scores["notes"] == []
+    assert len(scores["recall_by_visibility"]) == 4
+
+
+def test_the_table_says_the_same(files: tuple[Path, Path]) -> None:
+    result = CliRunner().invoke(app, ["eval", *map(str, files)], catch_exceptions=False)
+    scores = evaluated(*files)
+    assert f"mAP {scores['mean_ap']:.3f}   NDS {scores['nd_score']:.3f}" in result.stdout
+    assert max(map(len, result.stdout.splitlines())) <= 115
+
+
+def test_predictions_without_a_box_score_zero_and_say_so(tmp_path: Path, files: tuple[Path, Path]) -> None:
+    empty = write_frames(tmp_path / "empty.json", [Boxes3D.empty()] * 3, pose=Pose.identity())
+    scores = evaluated(empty, files[1])
+    assert (scores["mean_ap"], scores["nd_score"]) == (0, 0)
+    assert any("the predictions hold no box" in note for note in scores["notes"])
+
+
+def test_max_range_leaves_out_what_is_farther(files: tuple[Path, Path]) -> None:
+    scores = evaluated(*files, "--max-range", "12")
+    assert scores["ground_truth_boxes"] < evaluated(*files)["ground_truth_boxes"]
+    assert max(scores["cfg"]["class_range"].values()) == 12
+    assert [(part["from_m"], part["to_m"]) for part in scores["by_range"]] == [(0, 10), (10, 12)]
+
+
+def test_ranges_hold_only_where_the_ego_pose_is_stated(tmp_path: Path) -> None:
+    far = random_truth(23, frames=1)[0]
+    far = replace(far, centers=far.centers + [100.0, 0, 0])
+    truth = write_frames(tmp_path / "ground_truth.json", [far])
+    found = write_frames(tmp_path / "predictions.json", as_predictions([far], 24))
+    scores = evaluated(found, truth)
+    assert scores["mean_ap"] == pytest.approx(1)
+    assert any("class ranges are not applied" in note for note in scores["notes"])
+    posed = write_frames(tmp_path / "posed.json", [far], pose=Pose.identity())
+    assert evaluated(found, posed)["ground_truth_boxes"] == 0
+
+
+def test_absent_classes_and_attributes_are_told(tmp_path: Path) -> None:
+    truth = [boxes[boxes.classes == "car"] for boxes in random_truth(25)]
+    truth = [replace(boxes, attributes=None) for boxes in truth]
+    found = as_predictions(truth, 26)
+    notes = evaluated(
+        write_frames(tmp_path / "p.json", found, pose=Pose.identity()),
+        write_frames(tmp_path / "g.json", truth, pose=Pose.identity()),
+    )["notes"]
+    assert any("no ground truth of truck" in note and "without them mAP 1.000, NDS 1.000" in note for note in notes)
+    assert any("states no attributes" in note for note in notes)
+
+
+def test_predictions_without_attributes_get_them_by_speed(tmp_path: Path) -> None:
+    truth = [boxes[boxes.classes == "car"] for boxes in random_truth(27)]
+    fast = [replace(boxes, velocities=np.full((len(boxes), 2), 3.0)) for boxes in truth]
+    found = [replace(boxes, attributes=None) for boxes in as_predictions(fast, 28)]
+    scores = evaluated(
+        write_frames(tmp_path / "p.json", found, pose=Pose.identity()),
+        write_frames(tmp_path / "g.json", fast, pose=Pose.identity()),
+    )
+    assert scores["label_tp_errors"]["car"]["attr_err"] == 0
+
+
+def test_maps_beside_the_files_are_scored(tmp_path: Path) -> None:
+    run, drive = tmp_path / "run", tmp_path / "drive"
+    for folder, name, maps, value in (
+        (run, "predictions", "segmentation", 1),
+        (drive, "ground_truth", "ground_truth_map", 9),
+    ):
+        folder.mkdir()
+        boxes = as_predictions(random_truth(29, frames=2), 30)
+        write_frames(folder / f"{name}.json", boxes, pose=Pose.identity())
+        write_map(folder / maps, 0, BevMap(np.full((4, 4), value, np.uint8), (-2, 2), (-2, 2)))
+    scores = evaluated(run, drive)
+    assert scores["iou"] == {
+        "drivable_road": 1, "lane_boundary": None, "pedestrian_crossing": None, "vehicle": 0,
+    }  # fmt: skip
+    assert scores["map_frames"] == 1
+    assert any("1 of 2 frames lack a map" in note for note in scores["notes"])
+
+
+def test_plots_are_pictures_with_something_in_them(tmp_path: Path, files: tuple[Path, Path]) -> None:
+    CliRunner().invoke(app, ["eval", *map(str, files), "--plot", str(tmp_path / "plots")], catch_exceptions=False)
+    names = {"precision_recall.png", "errors_by_range.png", "misses_and_false_alarms.png"}
+    assert {path.name for path in (tmp_path / "plots").iterdir()} == names
+    for name in names:
+        picture = cv2.imread(str(tmp_path / "plots" / name))
+        assert picture is not None
+        assert min(picture.shape[:2]) > 600
+        assert (picture < 200).any(axis=2).mean() > 0.005
+
+
+def test_plots_of_nothing_are_drawn_too(tmp_path: Path) -> None:
+    empty = write_frames(tmp_path / "empty.json", [Boxes3D.empty()], pose=Pose.identity())
+    evaluated(empty, empty, "--plot", tmp_path / "plots")
+    assert len(list((tmp_path / "plots").iterdir())) == 3
+
+
+def test_mistakes_are_named(tmp_path: Path, files: tuple[Path, Path]) -> None:
+    with pytest.raises(InputError, match=r'ground_truth\.json: frame 0: boxes have no "score"'):
+        open_predictions(files[1])
+    (tmp_path / "other").mkdir()
+    with pytest.raises(InputError, match=r"other.predictions\.json: the file is missing"):
+        open_predictions(tmp_path / "other")
+    with pytest.raises(InputError, match='has no scene "x"'):
+        open_ground_truth(files[1], NuScenesChoice(scene="x"))
+
+
+def test_cycles_in_a_bicycle_rack_do_not_count() -> None:
+    def at(places: list[tuple[float, float, float]], names: list[str]) -> Boxes3D:
+        count = len(names)
+        return Boxes3D(
+            np.array(places),
+            np.ones((count, 3)),
+            np.zeros(count),
+            np.zeros((count, 2)),
+            np.array(names),
+            np.ones(count),
+        )
+
+    rack = replace(at([(10.0, 0, 1)], ["static_object.bicycle_rack"]), sizes_lwh=np.array([[6.0, 2, 2]]))
+    rack = replace(rack, yaws=np.array([np.pi / 2]))  # along y
+    places = [(10.0, 2.5, 1.0), (12.5, 0.0, 1.0), (10.0, -2.0, 1.0), (10.0, 0.0, 3.0), (10.0, 0.0, 1.0)]
+    boxes = at(places, ["bicycle", "bicycle", "motorcycle", "bicycle", "pedestrian"])
+    frame = FrameBoxes(FrameStamp(0, "s", 0), Pose.identity(), boxes, {"sample_token": "t"})
+    file = BoxesFile("world", (frame,))
+    pairs = without_cycles_in_racks(pair_frames(file, file), {"t": rack})
+    for kept in (pairs.predictions[0], pairs.ground_truth[0]):
+        np.testing.assert_array_equal(kept.centers, [places[1], places[3], places[4]])
+
+
+def test_a_nuscenes_root_and_the_native_form_of_it_give_the_same(shared: Path, tmp_path: Path) -> None:
+    native, root = shared / "data" / "nuscenes-scene-0103", shared / "data" / "nuscenes-mini-4"
+    truth = read_boxes(native / "ground_truth.json")
+    found = as_predictions([frame.boxes for frame in truth.frames], 31, noise_m=0.5)
+    with BoxesWriter(tmp_path / "predictions.json", "world") as writer:
+        for frame, boxes in zip(truth.frames, found, strict=True):
+            writer.write(replace(frame, boxes=boxes))
+    from_root = evaluated(tmp_path / "predictions.json", root)
+    from_native = evaluated(tmp_path / "predictions.json", native)
+    assert from_root["frames"] == from_native["frames"] == 4
+    # The root also knows points in boxes and attributes; what both know is equal.
+    assert from_root["ground_truth_boxes"] <= from_native["ground_truth_boxes"]
+    assert from_root["label_aps"]["car"] == pytest.approx(from_native["label_aps"]["car"])
+
+
+def test_the_devkits_numbers_from_the_command_line(shared: Path, tmp_path: Path) -> None:
+    golden = json.loads((shared / "golden" / "detection_metrics.json").read_text())
+    for side in ("predictions", "ground_truth"):
+        frames: list[dict[str, Any]] = [
+            {"frame": place, "timestamp_ns": place * 500_000_000, "boxes": []} for place in range(12)
+        ]
+        for row in golden[side]:
+            kept = {key: value for key, value in row.items() if key != "sample" and value != -1.0}
+            frames[int(row["sample"].removeprefix("sample-"))]["boxes"].append(kept)
+        content = {"format": "bevcli-boxes/1", "frame_of_reference": "ego", "frames": frames}
+        (tmp_path / f"{side}.json").write_text(json.dumps(content))
+    scores = evaluated(tmp_path / "predictions.json", tmp_path / "ground_truth.json")
+    for key, expected in golden["expected"].items():
+        if isinstance(expected, float):
+            assert scores[key] == pytest.approx(expected, abs=1e-9)
+        else:
+            for name, value in expected.items():
+                assert scores[key][name] == pytest.approx(value, abs=1e-9, nan_ok=True), (key, name)

@@ -1,0 +1,126 @@
+"""A submission keeps the rules that the nuScenes devkit checks when it reads one, restated here."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bevcli.errors import InputError
+from bevcli.evaluation.submission import SubmissionWriter, write_submission
+from bevcli.frame import FrameStamp
+from bevcli.geometry.attributes import attributes_by_speed
+from bevcli.geometry.boxes import CLASSES, Boxes3D
+from bevcli.geometry.transforms import Pose, yaw_of_quaternion
+from bevcli.sequences.boxes_file import BoxesFile, FrameBoxes
+
+ALLOWED_ATTRIBUTES = {
+    "pedestrian": {"pedestrian.moving", "pedestrian.sitting_lying_down", "pedestrian.standing"},
+    "bicycle": {"cycle.with_rider", "cycle.without_rider"},
+    "motorcycle": {"cycle.with_rider", "cycle.without_rider"},
+    "barrier": {""},
+    "traffic_cone": {""},
+}
+VEHICLE_ATTRIBUTES = {"vehicle.moving", "vehicle.parked", "vehicle.stopped"}
+
+
+def many_boxes(count: int, seed: int = 0) -> Boxes3D:
+    rng = np.random.default_rng(seed)
+    velocities = rng.normal(0, 0.3, (count, 2))
+    velocities[::7] = np.nan
+    return Boxes3D(
+        centers=rng.uniform(-50, 50, (count, 3)),
+        sizes_lwh=rng.uniform(0.3, 8, (count, 3)),
+        yaws=rng.uniform(-math.pi, math.pi, count),
+        velocities=velocities,
+        classes=rng.choice(CLASSES, count),
+        scores=rng.uniform(0, 1, count),
+    )
+
+
+def assert_valid(submission: dict[str, Any], tokens: set[str]) -> None:
+    assert set(submission) == {"meta", "results"}
+    flags = {"use_camera", "use_lidar", "use_radar", "use_map", "use_external"}
+    assert set(submission["meta"]) == flags
+    assert all(type(submission["meta"][flag]) is bool for flag in flags)
+    assert set(submission["results"]) == tokens
+    for token, boxes in submission["results"].items():
+        assert len(boxes) <= 500
+        for box in boxes:
+            assert box["sample_token"] == token
+            for key, length in (("translation", 3), ("size", 3), ("rotation", 4), ("velocity", 2)):
+                assert len(box[key]) == length
+                assert all(type(number) is float and math.isfinite(number) for number in box[key])
+            assert box["detection_name"] in CLASSES
+            assert type(box["detection_score"]) is float
+            allowed = ALLOWED_ATTRIBUTES.get(box["detection_name"], VEHICLE_ATTRIBUTES)
+            assert box["attribute_name"] in allowed
+
+
+def frame(index: int, boxes: Boxes3D, **extras: Any) -> FrameBoxes:
+    return FrameBoxes(FrameStamp(index, "s", index), Pose.identity(), boxes, extras)
+
+
+def test_the_devkits_rules_are_kept(tmp_path: Path) -> None:
+    boxes = many_boxes(620)
+    rows = (
+        frame(0, boxes, sample_token="t0"),
+        frame(1, many_boxes(1)),  # between keyframes: no token
+        frame(2, Boxes3D.empty(), sample_token="t2"),
+    )
+    write_submission(BoxesFile("world", rows), tmp_path / "results_nusc.json")
+    submission = json.loads((tmp_path / "results_nusc.json").read_text())
+    assert_valid(submission, {"t0", "t2"})
+    assert submission["meta"]["use_camera"] is True
+    written = submission["results"]["t0"]
+    assert boxes.scores is not None
+    best = np.sort(boxes.scores)[::-1][:500]
+    np.testing.assert_array_equal([box["detection_score"] for box in written], best)
+    first = int(np.argmax(boxes.scores))
+    assert written[0]["translation"] == boxes.centers[first].tolist()
+    assert written[0]["size"] == boxes.sizes_lwh[first][[1, 0, 2]].tolist()  # width, length, height
+    assert yaw_of_quaternion(written[0]["rotation"]) == pytest.approx(boxes.yaws[first])
+
+
+def test_a_submission_is_whole_after_every_frame(tmp_path: Path) -> None:
+    path = tmp_path / "results_nusc.json"
+    with SubmissionWriter(path) as writer:
+        for count in range(3):
+            assert_valid(json.loads(path.read_text()), {f"t{place}" for place in range(count)})
+            writer.write(frame(count, many_boxes(5), sample_token=f"t{count}"))
+
+
+@pytest.mark.parametrize(
+    ("class_name", "slow", "fast"),
+    [
+        ("car", "vehicle.parked", "vehicle.moving"),
+        ("truck", "vehicle.parked", "vehicle.moving"),
+        ("bus", "vehicle.stopped", "vehicle.moving"),
+        ("bicycle", "cycle.without_rider", "cycle.with_rider"),
+        ("motorcycle", "cycle.without_rider", "cycle.with_rider"),
+        ("pedestrian", "pedestrian.standing", "pedestrian.moving"),
+        ("traffic_cone", "", ""),
+        ("barrier", "", ""),
+    ],
+)
+def test_attributes_follow_from_class_and_speed(class_name: str, slow: str, fast: str) -> None:
+    boxes = Boxes3D(
+        np.zeros((3, 3)),
+        np.ones((3, 3)),
+        np.zeros(3),
+        np.array([[0.1, 0.17], [0.15, 0.15], [np.nan, np.nan]]),  # 0.197, 0.212 m/s, unknown
+        np.repeat([class_name], 3),
+    )
+    assert attributes_by_speed(boxes).tolist() == [slow, fast, slow]
+
+
+def test_what_is_not_of_nuscenes_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match='needs a "sample_token"'):
+        write_submission(BoxesFile("world", (frame(0, many_boxes(1)),)), tmp_path / "a.json")
+    with pytest.raises(InputError, match="these are in the ego frame"):
+        write_submission(BoxesFile("ego", (frame(0, many_boxes(1), sample_token="t"),)), tmp_path / "a.json")
+    assert not (tmp_path / "a.json").exists()
