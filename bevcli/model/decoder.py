@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from bevcli.model.deformable_attention import DeformableAttention, deformable_attention, sampling_locations
+from bevcli.model.deformable_attention import DeformableAttention, sampling_locations
 from bevcli.model.detection_head import DetectionHead
 from bevcli.model.feed_forward import FeedForward
 
@@ -88,8 +88,7 @@ class DecoderLayer(nn.Module):
         batch, queries, _ = query.shape
         offsets, weights = self.cross_attention.look(query)  # (B, Q, heads, 1, 1, P, 2)
         locations = sampling_locations(reference_points[:, :, None, None, None], offsets[:, :, :, 0], self.level_shapes)
-        values = self.cross_attention.project_values(bev)
-        sampled = deformable_attention(
-            values, self.level_shapes, locations.flatten(0, 1), weights[:, :, :, 0].flatten(0, 1), [queries] * batch
+        sampled = self.cross_attention.sample(
+            bev, self.level_shapes, locations.flatten(0, 1), weights[:, :, :, 0].flatten(0, 1), [queries] * batch
         )
         return self.cross_attention.output_projection(sampled.unflatten(0, (batch, queries)))

@@ -5,10 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+from bevcli.model.deformable_attention_compiled import sample_compiled
 
 LevelShapes = tuple[tuple[int, int], ...]
 """(height, width) of each feature level, fine to coarse."""
@@ -22,31 +26,84 @@ class FeatureMaps:
     level_shapes: LevelShapes
 
 
+Backend = Literal["grid_sample", "padded", "compiled", "triton"]
+"""grid_sample: map by map, with gradients. padded: the textbook's, all maps at once, their queries padded to the
+longest list. compiled: loops on the CPU. triton: a kernel on a GPU. The last two have no gradients."""
+
+
 def deformable_attention(
-    values: Tensor, level_shapes: LevelShapes, locations: Tensor, weights: Tensor, queries_per_map: Sequence[int]
+    values: Tensor,
+    level_shapes: LevelShapes,
+    locations: Tensor,
+    weights: Tensor,
+    queries_per_map: Sequence[int],
+    backend: Backend = "grid_sample",
 ) -> Tensor:
     """Weighted sums of values sampled at given places: the one front of the operation.
 
     values: (G, S, heads, D), G maps, each the cells of its L levels one after another, S in all.
     locations: (M, heads, L, P, 2) float32, x and y, 0 to 1 over a level's map; outside of it values are zero.
     weights: (M, heads, L, P). queries_per_map: G counts, of sum M: the first queries_per_map[0] queries sample
-    map 0, and so on. Returns (M, heads · D) in the dtype of values.
+    map 0, and so on. Returns (M, heads · D) in the dtype of values. All backends answer the same up to rounding.
     """
-    parts = zip(values, locations.split(list(queries_per_map)), weights.split(list(queries_per_map)), strict=True)
-    return torch.cat([_sample_one_map(value, level_shapes, where, weight) for value, where, weight in parts])
+    return _IMPLEMENTATIONS[backend](values, level_shapes, locations, weights, queries_per_map)
 
 
-def _sample_one_map(values: Tensor, level_shapes: LevelShapes, locations: Tensor, weights: Tensor) -> Tensor:
-    """The plain version: values (S, heads, D), locations (m, heads, L, P, 2), weights -> (m, heads · D)."""
+def fastest_backend(device: torch.device) -> Backend:
+    """What to run on a device where no gradients are asked for."""
+    if device.type == "cpu":
+        return "compiled"
+    return "triton" if device.type == "cuda" and find_spec("triton") else "grid_sample"
+
+
+def _sample_map_by_map(
+    values: Tensor, level_shapes: LevelShapes, locations: Tensor, weights: Tensor, queries_per_map: Sequence[int]
+) -> Tensor:
+    counts = list(queries_per_map)
+    parts = zip(values, locations.split(counts), weights.split(counts), strict=True)
+    return torch.cat([_grid_sample(v[None], level_shapes, where[None], w[None])[0] for v, where, w in parts])
+
+
+def _sample_padded(
+    values: Tensor, level_shapes: LevelShapes, locations: Tensor, weights: Tensor, queries_per_map: Sequence[int]
+) -> Tensor:
+    counts = torch.tensor(queries_per_map, device=values.device)
+    longest = max(queries_per_map)
+    kept = torch.arange(longest, device=values.device) < counts[:, None]  # (G, longest)
+    padded_locations = locations.new_zeros(len(counts), longest, *locations.shape[1:])
+    padded_weights = weights.new_zeros(len(counts), longest, *weights.shape[1:])
+    padded_locations[kept], padded_weights[kept] = locations, weights
+    return _grid_sample(values, level_shapes, padded_locations, padded_weights)[kept]
+
+
+def _grid_sample(values: Tensor, level_shapes: LevelShapes, locations: Tensor, weights: Tensor) -> Tensor:
+    """values (G, S, heads, D), locations (G, m, heads, L, P, 2), weights (G, m, heads, L, P) -> (G, m, heads · D)."""
+    maps, _, heads, _ = values.shape
     result = values.new_zeros((), dtype=torch.float32)
-    grid = (2 * locations.float() - 1).permute(2, 1, 0, 3, 4)  # (L, heads, m, P, 2)
-    level_weights = weights.float().permute(2, 1, 0, 3)  # (L, heads, m, P)
+    grid = (2 * locations.float() - 1).permute(3, 0, 2, 1, 4, 5).flatten(1, 2)  # (L, G·heads, m, P, 2)
+    level_weights = weights.float().permute(3, 0, 2, 1, 4).flatten(1, 2)  # (L, G·heads, m, P)
     sizes = [height * width for height, width in level_shapes]
-    for level, cells in enumerate(values.float().split(sizes)):
-        level_map = cells.permute(1, 2, 0).unflatten(-1, level_shapes[level])  # (heads, D, H, W)
-        sampled = F.grid_sample(level_map, grid[level], align_corners=False)  # (heads, D, m, P)
+    for level, cells in enumerate(values.float().split(sizes, dim=1)):
+        level_map = cells.permute(0, 2, 3, 1).flatten(0, 1).unflatten(-1, level_shapes[level])  # (G·heads, D, H, W)
+        sampled = F.grid_sample(level_map, grid[level], align_corners=False)  # (G·heads, D, m, P)
         result = result + (sampled * level_weights[level, :, None]).sum(-1)
-    return result.permute(2, 0, 1).flatten(1).to(values.dtype)  # (m, heads · D)
+    return result.unflatten(0, (maps, heads)).permute(0, 3, 1, 2).flatten(2).to(values.dtype)  # (G, m, heads · D)
+
+
+def _sample_on_gpu(
+    values: Tensor, level_shapes: LevelShapes, locations: Tensor, weights: Tensor, queries_per_map: Sequence[int]
+) -> Tensor:
+    from bevcli.model.deformable_attention_triton import sample_triton  # only where Triton is installed
+
+    return sample_triton(values, level_shapes, locations, weights, queries_per_map)
+
+
+_IMPLEMENTATIONS = {
+    "grid_sample": _sample_map_by_map,
+    "padded": _sample_padded,
+    "compiled": sample_compiled,
+    "triton": _sample_on_gpu,
+}
 
 
 class DeformableAttention(nn.Module):
@@ -54,7 +111,10 @@ class DeformableAttention(nn.Module):
 
     A query says where each head looks (offsets from reference points, in cells) and how much each place counts.
     maps: value maps that a query looks at, each with its own points and its own softmax.
+    `backend` says how values are sampled; a model starts with the one that has gradients.
     """
+
+    backend: Backend = "grid_sample"
 
     def __init__(
         self, channels: int, query_channels: int, heads: int, points: int, levels: int = 1, maps: int = 1
@@ -82,6 +142,18 @@ class DeformableAttention(nn.Module):
         heads, maps, levels, points = self.shape
         weights = self.attention_weights(query).unflatten(-1, (heads, maps, levels * points)).softmax(-1)
         return offsets, weights.unflatten(-1, (levels, points))
+
+    def sample(
+        self,
+        tokens: Tensor,
+        level_shapes: LevelShapes,
+        locations: Tensor,
+        weights: Tensor,
+        queries_per_map: Sequence[int],
+    ) -> Tensor:
+        """`deformable_attention` with the values of tokens (G, S, C) and this module's backend -> (M, C)."""
+        values = self.project_values(tokens)
+        return deformable_attention(values, level_shapes, locations, weights, queries_per_map, self.backend)
 
     def _initialize(self) -> None:
         """As published: heads look in a ring of directions, further with each point, and weigh places equally."""

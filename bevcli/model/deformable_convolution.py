@@ -2,18 +2,32 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from bevcli.model.deformable_convolution_compiled import convolve_compiled
+
+Backend = Literal["grid_sample", "compiled"]
+"""grid_sample: tap after tap, with gradients. compiled: on the CPU, tile after tile, without."""
+
 
 class ModulatedDeformableConvolution(nn.Module):
-    """A 3x3 convolution without bias whose nine taps move by learned offsets and are weighted by a learned mask."""
+    """A 3x3 convolution whose nine taps move by learned offsets and are weighted by a learned mask.
+
+    It has no bias but the one that a batch norm folded into it leaves. `backend` says how it is computed; a model
+    starts with the one that has gradients.
+    """
+
+    backend: Backend = "grid_sample"
 
     def __init__(self, in_channels: int, out_channels: int, stride: int = 1) -> None:
         super().__init__()
         self.stride = stride
         self.weight = nn.Parameter(torch.empty(out_channels, in_channels, 3, 3))
+        self.bias: nn.Parameter | None = None
         self.offset_and_mask = nn.Conv2d(in_channels, 27, 3, stride, padding=1)
         nn.init.kaiming_normal_(self.weight, mode="fan_out", nonlinearity="relu")
         nn.init.zeros_(self.offset_and_mask.weight)
@@ -25,7 +39,10 @@ class ModulatedDeformableConvolution(nn.Module):
         # Channels 0 to 17 are nine (dy, dx) pairs, one a tap; 18 to 26 the mask.
         offsets = moves[:, :18].unflatten(1, (9, 2))  # (B, 9, 2, H', W')
         mask = moves[:, 18:].sigmoid()  # (B, 9, H', W')
-        return modulated_deformable_convolution(x, offsets, mask, self.weight, self.stride)
+        if self.backend == "compiled":
+            return convolve_compiled(x, offsets, mask, self.weight, self.bias, self.stride)
+        y = modulated_deformable_convolution(x, offsets, mask, self.weight, self.stride)
+        return y if self.bias is None else y + self.bias[:, None, None]
 
 
 def modulated_deformable_convolution(

@@ -10,7 +10,6 @@ from bevcli.model.deformable_attention import (
     DeformableAttention,
     FeatureMaps,
     LevelShapes,
-    deformable_attention,
     sampling_locations,
 )
 from bevcli.model.pillar_projection import PillarHits
@@ -37,9 +36,8 @@ class SpatialCrossAttention(nn.Module):
         A cell that no camera sees gets the output projection's bias.
         """
         locations, weights = self._look(query, image_features.level_shapes, hits)
-        values = self.attention.project_values(image_features.tokens)
-        sampled = deformable_attention(
-            values, image_features.level_shapes, locations, weights, hits.hits_per_camera
+        sampled = self.attention.sample(
+            image_features.tokens, image_features.level_shapes, locations, weights, hits.hits_per_camera
         )  # (M, C)
         if probe is not None:
             probe.spatial = _chosen_samples(probe.cells, hits, locations, weights)

@@ -9,7 +9,6 @@ from bevcli.model.attention_probe import AttentionProbe
 from bevcli.model.deformable_attention import (
     DeformableAttention,
     LevelShapes,
-    deformable_attention,
     sampling_locations,
 )
 
@@ -40,8 +39,8 @@ class TemporalSelfAttention(nn.Module):
         offsets, weights = self.attention.look(torch.cat([bev_maps[:, 0], query + position], dim=-1))
         reference = reference_points.transpose(1, 2)[:, :, None, :, None, None]  # (B, Y·X, 1, 2, 1, 1, 2)
         locations = sampling_locations(reference, offsets, self.level_shapes)  # (B, Y·X, heads, 2, 1, P, 2)
-        sampled = deformable_attention(
-            self.attention.project_values(bev_maps.flatten(0, 1)),
+        sampled = self.attention.sample(
+            bev_maps.flatten(0, 1),
             self.level_shapes,
             locations.movedim(3, 1).flatten(0, 2),
             weights.movedim(3, 1).flatten(0, 2),

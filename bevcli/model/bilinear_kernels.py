@@ -1,0 +1,148 @@
+"""Compiled loops that sample feature maps bilinearly and sum what they find; they hold no sampled values.
+
+Plain functions of arrays without Python objects: many threads may run one on disjoint ranges of queries or rows.
+The compiled code is kept on disk (NUMBA_CACHE_DIR, beside this file or in the user's cache folder).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, types
+from numba.extending import overload
+
+
+def as_float32(number: object) -> np.float32:
+    """A float32, or a bfloat16 that comes as its 16 bits (uint16), as float32. Only for compiled code."""
+    raise NotImplementedError
+
+
+@overload(as_float32, inline="always")
+def _as_float32(number):  # type: ignore[no-untyped-def]
+    if number == types.uint16:
+        return lambda number: np.uint32(np.uint32(number) << np.uint32(16)).view(np.float32)
+    return lambda number: np.float32(number)
+
+
+def put_float32(array: object, index: int, number: object) -> None:
+    """Stores a float32 in an array of float32, or of bfloat16 bits, rounded to even. Only for compiled code."""
+    raise NotImplementedError
+
+
+@overload(put_float32, inline="always")
+def _put_float32(array, index, number):  # type: ignore[no-untyped-def]
+    if array.dtype == types.float32:
+
+        def put(array, index, number):  # type: ignore[no-untyped-def]
+            array[index] = number
+    else:
+
+        def put(array, index, number):  # type: ignore[no-untyped-def]
+            bits = np.float32(number).view(np.uint32)
+            rounding = np.uint32(0x7FFF) + ((bits >> np.uint32(16)) & np.uint32(1))
+            array[index] = np.uint16((bits + rounding) >> np.uint32(16))
+
+    return put
+
+
+@njit(nogil=True, cache=True, error_model="numpy", inline="never")
+def bilinear_corners(x, y, height, width):  # type: ignore[no-untyped-def]
+    """The four cells around a place (x, y) in cells and their shares: (top, bottom, left, right, four shares).
+
+    A neighbour outside of the map counts nothing: its share is zero and a cell inside stands for it.
+    """
+    one, zero = np.float32(1), np.float32(0)
+    left, top = np.int64(np.floor(x)), np.int64(np.floor(y))
+    right, bottom = left + 1, top + 1
+    right_share, bottom_share = x - np.float32(left), y - np.float32(top)
+    left_share, top_share = one - right_share, one - bottom_share
+    if left < 0:
+        left, left_share = 0, zero
+    if right >= width:
+        right, right_share = width - 1, zero
+    if top < 0:
+        top, top_share = 0, zero
+    if bottom >= height:
+        bottom, bottom_share = height - 1, zero
+    shares = (top_share * left_share, top_share * right_share, bottom_share * left_share, bottom_share * right_share)
+    return top, bottom, left, right, shares
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def sample_maps(values, level_shapes, locations, weights, map_of_query, out, begin, end) -> None:  # type: ignore[no-untyped-def]
+    """Writes the weighted sums of queries begin to end - 1 to out (M, heads, D) float32.
+
+    values: (G, S, heads, D) float32 or bfloat16 bits. level_shapes: (L, 2) int64 height, width.
+    locations: (M, heads, L, P, 2) float32, x and y, 0 to 1. weights: (M, heads, L, P) float32.
+    map_of_query: (M,) int64, which of the G maps a query samples. Outside of a map values are zero.
+    """
+    heads, levels, points = weights.shape[1:]
+    depth = values.shape[3]
+    for query in range(begin, end):
+        tokens = values[map_of_query[query]]
+        for head in range(heads):
+            total = out[query, head]
+            for channel in range(depth):
+                total[channel] = 0
+            start = 0
+            for level in range(levels):
+                height, width = level_shapes[level]
+                for point in range(points):
+                    x = locations[query, head, level, point, 0] * np.float32(width) - np.float32(0.5)
+                    y = locations[query, head, level, point, 1] * np.float32(height) - np.float32(0.5)
+                    # Written so that NaN fails it too.
+                    if not (x > -1 and x < width and y > -1 and y < height):
+                        continue
+                    top, bottom, left, right, shares = bilinear_corners(x, y, height, width)
+                    weight = weights[query, head, level, point]
+                    w00, w01 = weight * shares[0], weight * shares[1]
+                    w10, w11 = weight * shares[2], weight * shares[3]
+                    a = tokens[start + top * width + left, head]
+                    b = tokens[start + top * width + right, head]
+                    c = tokens[start + bottom * width + left, head]
+                    d = tokens[start + bottom * width + right, head]
+                    for channel in range(depth):
+                        total[channel] += (
+                            w00 * as_float32(a[channel])
+                            + w01 * as_float32(b[channel])
+                            + w10 * as_float32(c[channel])
+                            + w11 * as_float32(d[channel])
+                        )
+                start += height * width
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def sample_taps(x, offsets, mask, stride, first, out, begin, end) -> None:  # type: ignore[no-untyped-def]
+    """Writes the nine sampled and masked taps of output positions first + begin to first + end - 1.
+
+    x: (B, H, W, C) float32 or bfloat16 bits. offsets: (B, H', W', 9, 2) float32, dy and dx in cells, taps row by row.
+    mask: (B, H', W', 9) float32. Positions count through B, H', W'. out: (rows, 9, C) in the dtype of x; row `begin`
+    takes position first + begin.
+    """
+    _, height, width, channels = x.shape
+    _, out_height, out_width, taps = mask.shape
+    for row in range(begin, end):
+        position = first + row
+        picture = position // (out_height * out_width)
+        line = position // out_width % out_height
+        column = position % out_width
+        for tap in range(taps):
+            place_y = np.float32(line * stride - 1 + tap // 3) + offsets[picture, line, column, tap, 0]
+            place_x = np.float32(column * stride - 1 + tap % 3) + offsets[picture, line, column, tap, 1]
+            target = out[row, tap]
+            if not (place_x > -1 and place_x < width and place_y > -1 and place_y < height):
+                target[:] = 0
+                continue
+            top, bottom, left, right, shares = bilinear_corners(place_x, place_y, height, width)
+            weight = mask[picture, line, column, tap]
+            w00, w01 = weight * shares[0], weight * shares[1]
+            w10, w11 = weight * shares[2], weight * shares[3]
+            a, b = x[picture, top, left], x[picture, top, right]
+            c, d = x[picture, bottom, left], x[picture, bottom, right]
+            for channel in range(channels):
+                total = (
+                    w00 * as_float32(a[channel])
+                    + w01 * as_float32(b[channel])
+                    + w10 * as_float32(c[channel])
+                    + w11 * as_float32(d[channel])
+                )
+                put_float32(target, channel, total)

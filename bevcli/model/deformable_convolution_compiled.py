@@ -1,0 +1,40 @@
+"""Modulated deformable convolution on the CPU: compiled sampling and a matrix product, tile after tile."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import torch.nn.functional as F
+from torch import Tensor
+
+from bevcli.model.deformable_attention_compiled import as_array
+from bevcli.model.row_threads import in_threads
+
+# Unfolded rows of one tile: large enough for a matrix product at full speed, small enough to stay in the cache.
+TILE_BYTES = 8 << 20
+
+
+def convolve_compiled(
+    x: Tensor, offsets: Tensor, mask: Tensor, weight: Tensor, bias: Tensor | None, stride: int
+) -> Tensor:
+    """As `modulated_deformable_convolution`; float32 or bfloat16 on the CPU, no gradients. Returns channels-last."""
+    from bevcli.model.bilinear_kernels import sample_taps  # loads the compiler, which not every run needs
+
+    batch, channels = x.shape[:2]
+    height, width = mask.shape[-2:]
+    rows = batch * height * width
+    tile = min(rows, max(64, TILE_BYTES // (9 * channels * x.element_size())))
+    arrays = (
+        as_array(x.permute(0, 2, 3, 1)),
+        as_array(offsets.float().permute(0, 3, 4, 1, 2)),
+        as_array(mask.float().permute(0, 2, 3, 1)),
+    )
+    taps = x.new_empty(tile, 9, channels)
+    matrix = weight.permute(0, 2, 3, 1).flatten(1).contiguous()  # (O, 9 · C)
+    out = x.new_empty(rows, len(weight))
+
+    for first in range(0, rows, tile):
+        count = min(tile, rows - first)
+        in_threads(partial(sample_taps, *arrays, stride, first, as_array(taps)), count)
+        out[first : first + count] = F.linear(taps[:count].flatten(1), matrix, bias)
+    return out.view(batch, height, width, -1).permute(0, 3, 1, 2)

@@ -1,0 +1,85 @@
+"""A trained model made ready to be run: the same answers, sooner."""
+
+from __future__ import annotations
+
+import copy
+from typing import Literal
+
+import torch
+from torch import nn
+from torch.nn.utils.fusion import fuse_conv_bn_weights
+
+from bevcli.model.bevformer import BEVFormer
+from bevcli.model.deformable_attention import DeformableAttention, fastest_backend
+from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
+from bevcli.model.resnet import Bottleneck, ResNet
+
+Precision = Literal["fp32", "bf16", "fp16"]
+DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
+
+
+def prepare_for_inference(model: BEVFormer, device: torch.device, precision: Precision = "fp32") -> BEVFormer:
+    """A copy of the model on the device, for inference only; the model itself stays as it is.
+
+    Batch norms are folded into their convolutions, pictures are convolved channels-last, and deformable operations
+    take the device's fastest backends. At half precision backbone, neck and encoder compute in it; the sums that
+    run through the encoder's layers, reference points, sampling locations, decoder and heads stay in float32.
+    """
+    prepared = copy.deepcopy(model).to(device).eval().requires_grad_(False)
+    _fold_batch_norms(prepared.backbone)
+    for module in prepared.modules():
+        if isinstance(module, DeformableAttention):
+            module.backend = fastest_backend(device)
+        elif isinstance(module, ModulatedDeformableConvolution) and device.type == "cpu":
+            module.backend = "compiled"
+    _lower_precision(prepared, DTYPES[precision])
+    nn.Module.to(prepared.backbone, memory_format=torch.channels_last)
+    nn.Module.to(prepared.neck, memory_format=torch.channels_last)
+    return prepared
+
+
+def textbook_version(model: BEVFormer, device: torch.device) -> BEVFormer:
+    """A copy of the model that computes as the textbooks say: the yardstick and the oracle of the prepared one.
+
+    Batch norms apart, channels-first float32, `grid_sample` with all queries padded to the longest camera.
+    """
+    textbook = copy.deepcopy(model).to(device).eval().requires_grad_(False)
+    for module in textbook.modules():
+        if isinstance(module, DeformableAttention):
+            module.backend = "padded"
+    return textbook
+
+
+def _fold_batch_norms(backbone: ResNet) -> None:
+    _fold(backbone, "conv1", "bn1")
+    for block in backbone.modules():
+        if isinstance(block, Bottleneck):
+            for number in (1, 2, 3):
+                _fold(block, f"conv{number}", f"bn{number}")
+            if isinstance(block.downsample, nn.Sequential):
+                _fold(block.downsample, "0", "1")
+
+
+def _fold(parent: nn.Module, convolution_name: str, norm_name: str) -> None:
+    """Folds a batch norm into the convolution before it; an identity takes its place."""
+    convolution, norm = parent.get_submodule(convolution_name), parent.get_submodule(norm_name)
+    assert isinstance(convolution, nn.Conv2d | ModulatedDeformableConvolution)
+    assert isinstance(norm, nn.BatchNorm2d)
+    assert norm.running_mean is not None
+    assert norm.running_var is not None
+    convolution.weight, convolution.bias = fuse_conv_bn_weights(
+        convolution.weight, convolution.bias, norm.running_mean, norm.running_var, norm.eps, norm.weight, norm.bias
+    )
+    parent.set_submodule(norm_name, nn.Identity())
+
+
+def _lower_precision(model: BEVFormer, dtype: torch.dtype) -> None:
+    if dtype == torch.float32:
+        return
+    model.autocast_dtype = dtype
+    # Weights are converted once; autocast then converts only what flows between them.
+    for part in (model.backbone, model.neck, model.image_tokens):
+        part.to(dtype)
+    for module in model.encoder.modules():
+        if isinstance(module, nn.Linear):
+            module.to(dtype)

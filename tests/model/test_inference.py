@@ -1,0 +1,52 @@
+"""A model made ready for inference answers as the model itself does."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from small_model import small_inputs, small_model
+
+from bevcli.model.bevformer import BEVFormer, BEVFormerOutputs
+from bevcli.model.inference import prepare_for_inference, textbook_version
+
+CPU = torch.device("cpu")
+
+
+def two_steps(model: BEVFormer) -> BEVFormerOutputs:
+    """The second of two steps, so that history takes part."""
+    with torch.inference_mode():
+        return model(small_inputs(1), model(small_inputs(0)).bev)
+
+
+@pytest.fixture(scope="module")
+def model() -> BEVFormer:
+    model = small_model()
+    random = torch.Generator().manual_seed(1)
+    for name, buffer in model.named_buffers():  # batch norms that have seen pictures
+        if name.endswith(("running_mean", "running_var")):
+            buffer.copy_(0.5 + torch.rand(buffer.shape, generator=random))
+    return model
+
+
+@pytest.mark.parametrize("version", [prepare_for_inference, textbook_version])
+def test_answers_are_the_models(model, version):
+    expected, found = two_steps(model), two_steps(version(model, CPU))
+    torch.testing.assert_close(found.bev, expected.bev, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(found.class_logits, expected.class_logits, atol=1e-3, rtol=1e-3)
+    torch.testing.assert_close(found.box_codes, expected.box_codes, atol=1e-3, rtol=1e-3)
+
+
+def test_half_precision_stays_near(model):
+    expected, found = two_steps(model), two_steps(prepare_for_inference(model, CPU, "bf16"))
+    error = (found.bev - expected.bev).norm() / expected.bev.norm()
+    assert 1e-5 < error < 0.05
+    assert found.box_codes.dtype == found.class_logits.dtype == torch.float32
+
+
+def test_the_model_itself_stays_as_it_is(model):
+    before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
+    prepare_for_inference(model, CPU, "bf16")
+    after = model.state_dict()
+    assert before.keys() == after.keys()
+    assert all(torch.equal(before[name], after[name]) for name in before)
+    assert all(parameter.requires_grad for parameter in model.parameters())
