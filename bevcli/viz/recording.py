@@ -18,6 +18,7 @@ from bevcli.viz import entities, log_bev, log_boxes, log_cameras, static_scene
 from bevcli.viz.about import about_text
 from bevcli.viz.bev_pictures import BevPictures
 from bevcli.viz.blueprint import recording_blueprint
+from bevcli.viz.live import LiveView
 from bevcli.viz.matching import match
 from bevcli.viz.options import RecordingOptions
 from bevcli.viz.palette import EGO_COLOR, class_color
@@ -48,6 +49,7 @@ class Recording:
         self.class_names = tuple(class_names)
         self.options = RecordingOptions() if options is None else options
         self._stream = rr.RecordingStream(APPLICATION)
+        self._live = LiveView() if self.options.live else None
         self._origin: Array | None = None
         self._last: Frame | None = None
         self._early_events: list[tuple[str, str]] = []  # said before there was a frame to say it at
@@ -61,10 +63,13 @@ class Recording:
         note = UNTRAINED if self.untrained else ""
         blueprint = recording_blueprint(self.rig, note, probes=bool(self.options.probes))
         self._stream.__enter__()
+        sinks = [] if self._live is None else [self._live.sink]
         try:
-            self._stream.save(self.path, default_blueprint=blueprint)
+            self._stream.set_sinks(rr.FileSink(self.path), *sinks, default_blueprint=blueprint)
         except RuntimeError as error:
             raise OutputError(f"{self.path}: the recording cannot be written ({error})") from error
+        if self._live is not None:
+            self._live.open()
         static_scene.log_static(self._stream, self.rig, self.class_names)
         self._log_about()
         return self
@@ -75,6 +80,8 @@ class Recording:
         if self._bev_pictures is not None:
             self._log_bev_pictures(self._bev_pictures.finish())
         self._stream.__exit__(kind, error, trace)
+        if self._live is not None:
+            self._live.close()
 
     def log(self, frame: Frame, prediction: Prediction) -> None:
         """Writes one frame: what was seen, the boxes at or above the score, and what the attention did."""
