@@ -11,7 +11,7 @@ from bevcli.cli.input_options import SceneOption, SplitOption, VersionOption
 
 
 def evaluate(
-    predictions: Annotated[Path, typer.Argument(help="predictions.json, or the folder of a run.")],
+    predictions: Annotated[Path, typer.Argument(help="predictions.json, the folder of a run, or a results_nusc.json.")],
     ground_truth: Annotated[
         Path, typer.Argument(help="ground_truth.json, a sequence folder that has one, or a nuScenes root.")
     ],

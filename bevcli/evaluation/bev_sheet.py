@@ -114,7 +114,7 @@ def _draw_frame(axes: Axes, frame: int, outcomes: list[Outcome], scores: Scores,
         counts[0] += int((here & outcome.missed).sum())
         counts[1] += int((said_here & outcome.false_alarms).sum())
     _draw_ground(axes, radius)
-    stamp = scores.pairs.prediction_stamps[frame]
+    stamp = scores.pairs.ground_truth_stamps[frame]
     scene = f"{stamp.scene} " if stamp.scene else ""
     axes.set_title(f"{scene}frame {stamp.index}\n{counts[0]} missed, {counts[1]} false alarms", fontsize=10)
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.evaluation.pairing import FramePairs
+from bevcli.evaluation.read_submission import is_submission, read_submission
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose, apply, rigid, rotation_about_z
@@ -30,12 +31,12 @@ class ScoredInput:
 
 
 def open_predictions(path: Path) -> ScoredInput:
-    """A boxes file with scores, or the folder of a run that holds predictions.json; maps in segmentation/ beside it.
+    """A boxes file with scores, the folder of a run that holds predictions.json, or a nuScenes submission.
 
-    Raises InputError where it is missing or wrong, or boxes have no scores.
+    Maps are in segmentation/ beside it. Raises InputError where it is missing or wrong, or boxes have no scores.
     """
     file = path / "predictions.json" if path.is_dir() else path
-    boxes = read_boxes(file)
+    boxes = read_submission(file) if is_submission(file) else read_boxes(file)
     for frame in boxes.frames:
         if len(frame.boxes) and frame.boxes.scores is None:
             raise InputError(

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from bevcli.errors import InputError
+from bevcli.evaluation.read_submission import is_submission, read_submission
 from bevcli.evaluation.submission import SubmissionWriter, write_submission
 from bevcli.frame import FrameStamp
 from bevcli.geometry.attributes import attributes_by_speed
@@ -116,6 +117,41 @@ def test_attributes_follow_from_class_and_speed(class_name: str, slow: str, fast
         np.repeat([class_name], 3),
     )
     assert attributes_by_speed(boxes).tolist() == [slow, fast, slow]
+
+
+def test_a_submission_is_read_back(tmp_path: Path) -> None:
+    path = tmp_path / "results_nusc.json"
+    boxes = many_boxes(20)
+    write_submission(BoxesFile("world", (frame(0, boxes, sample_token="t0"),)), path)
+    assert is_submission(path)
+    found = read_submission(path)
+    assert found.frame_of_reference == "world"
+    assert found.frames[0].extras["sample_token"] == "t0"
+    assert boxes.scores is not None
+    best_first = boxes[np.argsort(-boxes.scores)]
+    np.testing.assert_allclose(found.frames[0].boxes.centers, best_first.centers)
+    np.testing.assert_allclose(found.frames[0].boxes.sizes_lwh, best_first.sizes_lwh)
+    np.testing.assert_allclose(found.frames[0].boxes.yaws, best_first.yaws)
+    assert found.frames[0].boxes.classes.tolist() == best_first.classes.tolist()
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("translation", [1, 2], "sample t0: box 0: center: expected 3 numbers"),
+        ("rotation", [0, 0, 0, 0], "sample t0: box 0: rotation: expected 4 numbers of norm 1"),
+        ("detection_name", "tank", "sample t0: box 0: unknown class 'tank'"),
+        ("detection_score", None, "sample t0: box 0: score"),
+    ],
+)
+def test_a_wrong_submission_is_named(tmp_path: Path, key: str, value: Any, message: str) -> None:
+    path = tmp_path / "results_nusc.json"
+    write_submission(BoxesFile("world", (frame(0, many_boxes(1), sample_token="t0"),)), path)
+    content = json.loads(path.read_text())
+    content["results"]["t0"][0][key] = value
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=message):
+        read_submission(path)
 
 
 def test_what_is_not_of_nuscenes_is_refused(tmp_path: Path) -> None:
