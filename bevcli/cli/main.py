@@ -18,6 +18,7 @@ from bevcli.cli.eval import evaluate
 from bevcli.cli.export import export
 from bevcli.cli.project_debug import project_debug
 from bevcli.cli.run import run
+from bevcli.cli.train import train
 from bevcli.cli.viz import viz
 from bevcli.cli.weights import weights_app
 from bevcli.errors import BevcliError
@@ -51,6 +52,7 @@ app.command("eval")(evaluate)
 app.command()(export)
 app.command()(project_debug)
 app.command()(run)
+app.command()(train)
 app.command()(viz)
 app.add_typer(weights_app, name="weights")
 

@@ -1,0 +1,61 @@
+"""Clips: short parts of drives, as in the paper a frame to learn from and some before it, for the history."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bevcli.errors import InputError
+from bevcli.frame import Sequence
+from bevcli.sequences.rate import scenes_of
+from bevcli.training.drives import Drives
+
+
+@dataclass(frozen=True)
+class ClipConfig:
+    """frames: of a clip; the paper's base model trains on 4, tiny and small on 3; 1 is without history.
+
+    batch: clips a step. short_share: of the batches, whose clips are shorter, as at the start of a scene.
+    """
+
+    frames: int = 3
+    batch: int = 4
+    short_share: float = 0.1
+
+    def __post_init__(self) -> None:
+        if min(self.frames, self.batch) < 1 or not 0 <= self.short_share <= 1:
+            raise ValueError("frames and batch must be positive, short_share from 0 to 1")
+
+
+@dataclass(frozen=True)
+class Clip:
+    """drive: its place among the drives. places: of the frames in it, in order; the last one is learned from."""
+
+    drive: int
+    places: tuple[int, ...]
+
+
+def draw_clips(drives: Drives, config: ClipConfig, random: np.random.Generator) -> list[Clip]:
+    """The clips of a batch, all of one length. Raises InputError where a drive is too short for it."""
+    frames = config.frames
+    if frames > 1 and random.random() < config.short_share:
+        frames = int(random.integers(1, frames))
+    clips = []
+    for _ in range(config.batch):
+        drive = int(random.integers(len(drives)))
+        clips.append(Clip(drive, draw_places(drives.open(drive), frames, random)))
+    return clips
+
+
+def draw_places(sequence: Sequence, frames: int, random: np.random.Generator) -> tuple[int, ...]:
+    """A frame drawn at random and frames - 1 of the `frames` before it in its scene, one left out at random."""
+    scenes = list(scenes_of(sequence.stamps))
+    ends = [(scene, end) for scene in scenes for end in range(frames - 1, len(scene))]
+    if not ends:
+        raise InputError(f"{sequence.name}: no scene of it has the {frames} frames of a clip")
+    scene, end = ends[int(random.integers(len(ends)))]
+    before = scene[max(0, end - frames) : end]
+    if len(before) == frames:
+        del before[int(random.integers(len(before)))]
+    return (*before, scene[end])

@@ -1,0 +1,89 @@
+"""Samples: the frames of a batch of clips as the model's inputs, with what it should say of the last ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from bevcli.errors import InputError
+from bevcli.frame import Frame
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.transforms import inverse
+from bevcli.model.bevformer import BEVFormerConfig, BEVFormerInputs
+from bevcli.pipeline.model_inputs import model_inputs
+from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
+from bevcli.training.augmentation import AugmentationConfig, distort_pictures, mask_pictures
+from bevcli.training.clips import Clip
+from bevcli.training.detection_targets import DetectionTargets, detection_targets
+from bevcli.training.drives import Drives
+from bevcli.training.segmentation_targets import SegmentationTargets, segmentation_targets
+
+
+@dataclass(frozen=True)
+class Batch:
+    """B clips of one length. steps: the model's inputs, one a frame. detection, segmentation: B, of the last frames.
+
+    segmentation is empty where the model has no such head.
+    """
+
+    steps: tuple[BEVFormerInputs, ...]
+    detection: tuple[DetectionTargets, ...]
+    segmentation: tuple[SegmentationTargets, ...]
+
+    def to(self, device: torch.device) -> Batch:
+        """The same on a device."""
+        return Batch(
+            tuple(step.to(device) for step in self.steps),
+            tuple(targets.to(device) for targets in self.detection),
+            tuple(targets.to(device) for targets in self.segmentation),
+        )
+
+
+def load_batch(
+    drives: Drives,
+    clips: list[Clip],
+    config: BEVFormerConfig,
+    augmentation: AugmentationConfig,
+    random: np.random.Generator,
+) -> Batch:
+    """Reads, changes and prepares the frames of clips of one length. Raises InputError without ground truth."""
+    loaded = [_load_clip(drives, clip, config, augmentation, random) for clip in clips]
+    steps = []
+    for number, frames in enumerate(zip(*loaded, strict=True)):
+        before = [clip[number - 1].frame.world_from_ego if number else None for clip in loaded]
+        inputs = model_inputs(frames, before, config)
+        mask_pictures(inputs.images, augmentation.grid_mask, random)
+        steps.append(inputs)
+    truths = [(clip[-1].frame, ground_truth(clip[-1].frame)) for clip in loaded]
+    segments = "segmentation" in config.heads
+    return Batch(
+        tuple(steps),
+        tuple(detection_targets(boxes, config) for _, boxes in truths),
+        tuple(
+            segmentation_targets(boxes, frame.ground_truth_map, config.bev_grid) for frame, boxes in truths if segments
+        ),
+    )
+
+
+def ground_truth(frame: Frame) -> Boxes3D:
+    """The true boxes in the bev frame. Raises InputError where the frame has none."""
+    if frame.ground_truth is None:
+        raise InputError(
+            f"frame {frame.stamp.index} of {frame.stamp.scene or 'the drive'} has no ground truth boxes: "
+            "training needs ground_truth.json (bevcli convert writes it)"
+        )
+    return frame.ground_truth.transformed(inverse(frame.world_from_ego.matrix @ frame.rig.ego_from_bev))
+
+
+def _load_clip(
+    drives: Drives,
+    clip: Clip,
+    config: BEVFormerConfig,
+    augmentation: AugmentationConfig,
+    random: np.random.Generator,
+) -> list[PreparedFrame]:
+    sequence, prepare = drives.open(clip.drive), Preprocessor(config)
+    frames = (sequence.load(place) for place in clip.places)
+    return [prepare(distort_pictures(frame, augmentation.photometric, random)) for frame in frames]

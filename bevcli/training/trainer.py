@@ -1,0 +1,151 @@
+"""The training loop: clips in, a step of the optimizer, checkpoints and curves out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+
+from bevcli.errors import BevcliError
+from bevcli.model.bevformer import BEVFormer
+from bevcli.pipeline.model_loading import choose_precision
+from bevcli.pipeline.read_ahead import read_ahead
+from bevcli.pipeline.runner import Runner, StepOptions
+from bevcli.training.augmentation import AugmentationConfig
+from bevcli.training.checkpoint import load_checkpoint, save_checkpoint, save_weights
+from bevcli.training.clips import ClipConfig, draw_clips
+from bevcli.training.curves import Curve, draw
+from bevcli.training.detection_loss import DetectionLossConfig, detection_loss
+from bevcli.training.drives import Drives
+from bevcli.training.optimizer import OptimizerConfig, clip_gradients, make_optimizer, set_rate
+from bevcli.training.recurrent_clip import forward_clip
+from bevcli.training.samples import Batch, load_batch
+from bevcli.training.segmentation_loss import SegmentationLossConfig, segmentation_loss
+from bevcli.training.validation import Validation, validate
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """The [training] table of a model's file.
+
+    steps: of the optimizer. held_out: how many of the drives, the last ones, are for evaluation only.
+    evaluate_every, checkpoint_every: steps. freeze_batch_norm: for fine-tuning, keep the running statistics.
+    weights_dtype: of weights.safetensors.
+    """
+
+    steps: int = 10_000
+    held_out: int = 2
+    evaluate_every: int = 1000
+    checkpoint_every: int = 250
+    freeze_batch_norm: bool = False
+    weights_dtype: Literal["float32", "float16"] = "float32"
+    clips: ClipConfig = field(default_factory=ClipConfig)
+    augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
+    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+    detection_loss: DetectionLossConfig = field(default_factory=DetectionLossConfig)
+    segmentation_loss: SegmentationLossConfig = field(default_factory=SegmentationLossConfig)
+
+    def __post_init__(self) -> None:
+        if min(self.steps, self.evaluate_every, self.checkpoint_every) < 1 or self.held_out < 0:
+            raise ValueError("steps, evaluate_every and checkpoint_every must be positive, held_out not negative")
+
+
+@dataclass(frozen=True)
+class TrainingJob:
+    """drives: to learn from. held_out: to evaluate on; empty to evaluate on `drives`. out: a folder that exists.
+
+    seed: decides everything that is drawn, together with the number of the step.
+    """
+
+    model: BEVFormer
+    config: TrainingConfig
+    drives: Drives
+    held_out: Drives
+    out: Path
+    device: torch.device
+    seed: int = 0
+
+
+class Trainer:
+    """A training that can be stopped at any time and resumed at its last checkpoint.
+
+    Writes checkpoint.pt, weights.safetensors, loss.csv, validation.csv and curves.png.
+    """
+
+    def __init__(self, job: TrainingJob, *, resume: bool = False) -> None:
+        self.job = job
+        self.runner = Runner(job.model, job.device, StepOptions(choose_precision(None, job.device)))
+        self.optimizer = make_optimizer(job.model, job.config.optimizer)
+        checkpoint = job.out / "checkpoint.pt"
+        self.done = load_checkpoint(checkpoint, job.model, self.optimizer) if resume else 0
+        self.loss_curve = Curve(job.out / "loss.csv", self.done)
+        self.validation_curve = Curve(job.out / "validation.csv", self.done)
+
+    def run(
+        self,
+        after_step: Callable[[], None] = lambda: None,
+        after_validation: Callable[[int, Validation], None] = lambda step, scores: None,
+    ) -> None:
+        """All steps that are left. Raises BevcliError where the loss is no number any more."""
+        config = self.job.config
+        for batch in read_ahead(self._load, range(self.done, config.steps)):
+            self.loss_curve.add(self.done + 1, self._step(batch))
+            self.done += 1
+            last = self.done == config.steps
+            if self.done % config.evaluate_every == 0 or last:
+                after_validation(self.done, self._validate())
+            if self.done % config.checkpoint_every == 0 or last:
+                save_checkpoint(self.job.out / "checkpoint.pt", self.done, self.job.model, self.optimizer)
+            after_step()
+
+    def _load(self, step: int) -> Batch:
+        job = self.job
+        random = np.random.default_rng([job.seed, step])
+        clips = draw_clips(job.drives, job.config.clips, random)
+        return load_batch(job.drives, clips, job.model.config, job.config.augmentation, random)
+
+    def _step(self, batch: Batch) -> dict[str, float]:
+        """One step of the optimizer; returns the row of the loss curve."""
+        job, config = self.job, self.job.config
+        torch.manual_seed(int(np.random.SeedSequence([job.seed, self.done]).generate_state(1)[0]))  # for dropout
+        rate = config.optimizer.learning_rate * config.optimizer.share(self.done, config.steps)
+        set_rate(self.optimizer, rate)
+        losses = self._losses(batch.to(job.device))
+        total = torch.stack(list(losses.values())).sum()
+        if not math.isfinite(total.item()):
+            raise BevcliError(
+                f"step {self.done + 1}: the loss is {total.item()}; lower the learning rate, and --resume "
+                f"from the last checkpoint in {job.out}"
+            )
+        self.optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        norm = clip_gradients(job.model, config.optimizer.max_gradient_norm)
+        self.optimizer.step()
+        row = {"loss": total.item(), **{name: loss.item() for name, loss in losses.items()}}
+        return row | {"learning rate": rate, "gradient norm": norm}
+
+    def _losses(self, batch: Batch) -> dict[str, torch.Tensor]:
+        job, config = self.job, self.job.config
+        with torch.autocast(job.device.type, torch.bfloat16, enabled=job.device.type == "cuda"):
+            outputs = forward_clip(job.model, batch.steps, freeze_batch_norm=config.freeze_batch_norm)
+        detection = detection_loss(outputs.class_logits, outputs.box_codes, batch.detection, config.detection_loss)
+        losses = {"classes": detection.classes, "boxes": detection.boxes}
+        if outputs.segmentation is not None:
+            maps = segmentation_loss(outputs.segmentation, batch.segmentation, config.segmentation_loss)
+            losses |= {"map classes": maps.classes, "masks": maps.masks, "locations": maps.locations}
+        return losses
+
+    def _validate(self) -> Validation:
+        job = self.job
+        job.model.eval()
+        scores = validate(self.runner, job.held_out if len(job.held_out) else job.drives)
+        self.validation_curve.add(self.done, scores.row())
+        dtype = torch.float16 if job.config.weights_dtype == "float16" else torch.float32
+        save_weights(job.out / "weights.safetensors", job.model, dtype)
+        draw(self.loss_curve, self.validation_curve, job.out / "curves.png")
+        return scores

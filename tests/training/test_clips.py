@@ -1,0 +1,85 @@
+"""Which frames make a clip, and what may change in its pictures."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+import torch
+from conftest import MemorySequence
+
+from bevcli.errors import InputError
+from bevcli.training.augmentation import distort, distort_pictures, mask_pictures
+from bevcli.training.clips import ClipConfig, draw_clips, draw_places
+
+
+class Drives:
+    """Copies of one drive."""
+
+    def __init__(self, sequence: MemorySequence, count: int = 2) -> None:
+        self._sequence, self._count = sequence, count
+
+    def __len__(self) -> int:
+        return self._count
+
+    def open(self, place: int) -> MemorySequence:
+        return self._sequence
+
+
+def drawn(sequence: MemorySequence, frames: int, times: int = 200) -> Counter[tuple[int, ...]]:
+    random = np.random.default_rng(0)
+    return Counter(draw_places(sequence, frames, random) for _ in range(times))
+
+
+def test_one_of_the_frames_before_is_left_out_and_the_order_kept() -> None:
+    expected = {(0, 1), (0, 2), (1, 2), (1, 3), (2, 3)}  # the start has one frame before it, the others two
+    assert set(drawn(MemorySequence(4), frames=2)) == expected
+    assert all(places[-1] - places[0] <= 3 for places in drawn(MemorySequence(10), frames=3))
+
+
+def test_a_clip_stays_in_its_scene() -> None:
+    assert set(drawn(MemorySequence(6, scenes="aaabbb"), frames=3)) == {(0, 1, 2), (3, 4, 5)}
+
+
+def test_a_clip_of_one_frame_has_no_history() -> None:
+    assert set(drawn(MemorySequence(3), frames=1)) == {(0,), (1,), (2,)}
+
+
+def test_a_drive_too_short_for_a_clip_is_refused() -> None:
+    with pytest.raises(InputError, match="memory: no scene of it has the 4 frames of a clip"):
+        drawn(MemorySequence(6, scenes="aaabbb"), frames=4)
+
+
+def test_the_clips_of_a_batch_are_of_one_length_and_some_batches_are_short() -> None:
+    random, lengths = np.random.default_rng(0), Counter()
+    for _ in range(300):
+        clips = draw_clips(Drives(MemorySequence(8)), ClipConfig(frames=3, batch=4, short_share=0.3), random)
+        assert len({len(clip.places) for clip in clips}) == 1
+        lengths[len(clips[0].places)] += 1
+    assert set(lengths) == {1, 2, 3}
+    assert lengths[3] / 300 == pytest.approx(0.7, abs=0.1)
+
+
+def test_pictures_are_left_alone_where_nothing_is_asked_for() -> None:
+    frame, random = MemorySequence(1).load(0), np.random.default_rng(0)
+    assert distort_pictures(frame, 0.0, random) is frame
+    images = torch.ones(1, 2, 3, 8, 8)
+    mask_pictures(images, 0.0, random)
+    assert (images == 1).all()
+
+
+def test_distortion_changes_light_and_colour_and_repeats_with_its_seed() -> None:
+    pixels = np.full((4, 4, 3), (40, 90, 160), dtype=np.uint8)
+    changed = distort(pixels, 1.0, np.random.default_rng(1))
+    assert changed.dtype == np.uint8
+    assert not np.array_equal(changed, pixels)
+    assert np.array_equal(changed, distort(pixels, 1.0, np.random.default_rng(1)))
+
+
+def test_half_of_the_rows_and_columns_of_the_grid_mask_cross() -> None:
+    images = torch.ones(2, 6, 3, 64, 64)
+    mask_pictures(images, 1.0, np.random.default_rng(0))
+    covered = (images == 0).float().mean((-1, -2, -3))
+    assert ((covered > 0.05) & (covered < 0.6)).all()
+    assert covered.mean().item() == pytest.approx(0.25, abs=0.1)
