@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bevcli.errors import InputError
@@ -35,6 +35,8 @@ def choose_frames(path: Path, options: InputOptions, choice: FrameChoice, config
 
     Raises InputError.
     """
+    if options.sweeps and choice.rate is None and choice.every is None:
+        choice = replace(choice, rate="all")  # who asks for the pictures in between wants them
     sequence = _thinned(open_sequence(path, options), choice, config)
     return select(sequence, frame_range(choice.frames, len(sequence.stamps)))
 

@@ -1,0 +1,177 @@
+"""`bevcli run` as its user types it, with the mini model."""
+
+import csv
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import MemorySequence, WithoutPictures
+
+from bevcli.cli.run_job import Job, run_job
+from bevcli.errors import OutputError
+from bevcli.pipeline.model_loading import LoadedModel
+from bevcli.pipeline.runner import StepOptions
+from bevcli.sequences.boxes_file import read_boxes
+from bevcli.viz.options import RecordingOptions
+
+SAMPLE = Path(__file__).parents[2] / "samples/street"
+MINI_TOML = """
+name = "mini"
+classes = ["car", "truck", "construction_vehicle", "bus", "trailer",
+  "barrier", "motorcycle", "bicycle", "pedestrian", "traffic_cone"]
+cameras = ["CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT"]
+channels = 32
+[image]
+size = [160, 90]
+color_order = "rgb"
+mean = [123.0, 116.0, 103.0]
+std = [58.0, 57.0, 57.0]
+[bev_grid]
+rows = 10
+columns = 10
+[backbone]
+blocks = [1, 1, 1, 1]
+width = 8
+[encoder]
+layers = 2
+attention_heads = 4
+[decoder]
+layers = 2
+attention_heads = 4
+queries = 30
+max_boxes = 20
+"""
+
+
+@pytest.fixture
+def job(mini_model, tmp_path):
+    """Runs a sequence in process; gives back the output folder."""
+
+    def make(sequence, *, score=0.0, force=False, out="out", **options) -> Path:
+        step = StepOptions(ask_attention=True, **options)
+        recording = RecordingOptions(score=score)
+        loaded = LoadedModel(mini_model, None)
+        folder = tmp_path / out
+        bev = tmp_path / "bev"
+        run_job(Job(sequence, loaded, torch.device("cpu"), step, recording, {}, folder, bev), force=force)
+        return folder
+
+    return make
+
+
+def command(cwd, *arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "bevcli", *arguments], cwd=cwd, capture_output=True, text=True, check=False
+    )
+
+
+def test_the_command_runs_the_sample_and_says_that_it_is_untrained(tmp_path):
+    (tmp_path / "mini.toml").write_text(MINI_TOML)
+    done = command(tmp_path, "run", str(SAMPLE), "--model", "mini.toml", "--untrained", "--frames", "0:2")
+    assert done.returncode == 0, done.stderr
+    out = tmp_path / "runs/street-mini"
+    assert {path.name for path in out.iterdir()} == {"recording.rrd", "predictions.json", "summary.json"}
+    boxes = read_boxes(out / "predictions.json")
+    assert [len(frame.boxes) for frame in boxes.frames] == [20, 20]
+    assert boxes.extras["untrained"] is True
+    assert json.loads((out / "summary.json").read_text())["untrained"] is True
+    assert "UNTRAINED" in done.stdout
+    assert "UNTRAINED" in done.stderr
+    assert "2/2 frames" in done.stderr
+
+    again = command(tmp_path, "run", str(SAMPLE), "--model", "mini.toml", "--untrained", "--frames", "0:1")
+    assert again.returncode == 1
+    assert "--force" in again.stderr
+    assert len(read_boxes(out / "predictions.json").frames) == 2
+
+
+def test_some_frames_give_the_same_boxes_as_the_whole(job):
+    whole = read_boxes(job(MemorySequence(4), out="whole") / "predictions.json")
+    part = read_boxes(job(MemorySequence(2), out="part") / "predictions.json")
+    for one, other in zip(part.frames, whole.frames, strict=False):
+        assert one.boxes.centers == pytest.approx(other.boxes.centers, abs=1e-4)
+        assert one.boxes.scores == pytest.approx(other.boxes.scores, abs=1e-5)
+
+
+def test_one_thread_and_two_agree(job):
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        one = read_boxes(job(MemorySequence(2), out="one") / "predictions.json")
+        torch.set_num_threads(2)
+        two = read_boxes(job(MemorySequence(2), out="two") / "predictions.json")
+    finally:
+        torch.set_num_threads(threads)
+    for a, b in zip(one.frames, two.frames, strict=True):
+        assert a.boxes.centers == pytest.approx(b.boxes.centers, abs=1e-4)
+        assert a.boxes.scores == pytest.approx(b.boxes.scores, abs=1e-4)
+
+
+def test_bev_features_are_written_with_what_explains_them(job, tmp_path):
+    job(MemorySequence(2))
+    features = np.load(tmp_path / "bev/000001.npy")
+    facts = json.loads((tmp_path / "bev/000001.json").read_text())
+    assert features.shape == (12, 10, 32)
+    assert features.dtype == np.float16
+    assert facts["untrained"] is True
+    assert facts["frame"] == 1
+    assert facts["x_range_m"] == [-25, 25]
+
+
+def test_gaps_are_in_the_summary(job):
+    out = job(WithoutPictures({0: ["CAM_BACK"], 1: "all"}, count=3))
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["skipped_frames"] == [1]
+    assert {"frame": 0, "camera": "CAM_BACK", "reason": "missing"} in summary["dropped_pictures"]
+    frames = read_boxes(out / "predictions.json").frames
+    assert frames[1].extras["skipped"] is True
+    assert len(frames[1].boxes) == 0
+
+
+def test_without_ego_motion_boxes_are_given_in_the_ego_frame(job):
+    standing = MemorySequence(1)
+    standing.has_ego_motion = False
+    assert read_boxes(job(standing) / "predictions.json").frame_of_reference == "ego"
+
+
+def test_keyframes_of_nuscenes_also_go_into_a_submission(job):
+    class WithTokens(MemorySequence):
+        def load(self, place):
+            return replace(super().load(place), sample_token=f"token-{place}")
+
+    submission = json.loads((job(WithTokens(2)) / "results_nusc.json").read_text())
+    assert list(submission["results"]) == ["token-0", "token-1"]
+
+
+def test_what_was_done_survives_a_failure_in_a_later_frame(job, tmp_path):
+    class Failing(MemorySequence):
+        def load(self, place):
+            if place == 2:
+                raise OutputError("a failure")
+            return super().load(place)
+
+    with pytest.raises(OutputError, match="a failure"):
+        job(Failing(4))
+    assert len(read_boxes(tmp_path / "out/predictions.json").frames) == 2
+    assert json.loads((tmp_path / "out/summary.json").read_text())["frames"] == 2
+
+
+def test_a_missing_picture_is_a_warning_and_with_strict_an_error(tmp_path):
+    (tmp_path / "mini.toml").write_text(MINI_TOML)
+    drive = tmp_path / "drive"
+    shutil.copytree(SAMPLE, drive)
+    with (drive / "frames.csv").open() as file:
+        (drive / next(csv.DictReader(file))["CAM_BACK"]).unlink()
+    arguments = ("run", "drive", "--model", "mini.toml", "--untrained", "--frames", "0:1", "--out", "out")
+    lenient = command(tmp_path, *arguments)
+    assert lenient.returncode == 0
+    assert "warning: frame 0: camera CAM_BACK" in lenient.stderr
+    strict = command(tmp_path, *arguments, "--force", "--strict")
+    assert strict.returncode == 1
+    assert "CAM_BACK" in strict.stderr.splitlines()[-1]
