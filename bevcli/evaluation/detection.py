@@ -17,7 +17,7 @@ from bevcli.evaluation.detection_scores import (
     ScoreTable,
     VisibilityRecall,
 )
-from bevcli.evaluation.scored_boxes import gather
+from bevcli.evaluation.scored_boxes import ScoredBoxes, gather
 from bevcli.evaluation.true_positives import true_positive_errors
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
@@ -42,8 +42,7 @@ def evaluate(
     config = config or DetectionConfig()
     ego = np.zeros((len(predictions), 2)) if ego_xy is None else np.asarray(ego_xy, dtype=np.float64)
     truth, found = gather(ground_truth, ego), gather(predictions, ego)
-    assert truth.boxes.num_points is not None
-    truth = truth[truth.boxes.num_points != 0]
+    truth, found = _with_points(truth), _with_points(found)
     matches = tuple(match_class(name, truth, found, config) for name in config.class_ranges_m)
     unmeasured = _unmeasured(truth.boxes)
 
@@ -63,6 +62,12 @@ def evaluate(
         unmeasured=unmeasured,
         matches=matches,
     )
+
+
+def _with_points(boxes: ScoredBoxes) -> ScoredBoxes:
+    # On both sides, as the devkit: ground truth that is given as predictions is then perfect.
+    assert boxes.boxes.num_points is not None
+    return boxes[boxes.boxes.num_points != 0]
 
 
 def _score_class(part: ClassMatches, config: DetectionConfig, unmeasured: tuple[str, ...]) -> ClassScores:

@@ -161,6 +161,12 @@ def test_ground_truth_without_points_is_left_out() -> None:
     assert scores.ground_truth_count == 2
 
 
+def test_ground_truth_given_as_predictions_is_perfect() -> None:
+    truth = [replace(boxes, num_points=boxes.num_points % 3) for boxes in random_truth(10)]
+    scores = evaluate([replace(boxes, scores=np.ones(len(boxes))) for boxes in truth], truth)
+    assert scores.overall.nd_score == pytest.approx(1)
+
+
 def test_an_error_that_nobody_knows_is_left_out_of_nds() -> None:
     truth = random_truth(1)
     untold = [replace(boxes, attributes=None, velocities=np.full((len(boxes), 2), np.nan)) for boxes in truth]
