@@ -111,7 +111,7 @@ def _log_camera(stream: rr.RecordingStream, camera: Camera, ego_from_bev: Array,
     lines = {
         "ground_grid": (ground_lines(camera), (*GROUND, 120), 0.6),
         "pillar_lines": (pillar_lines(camera, ego_from_bev), (235, 238, 245, 90), 0.6),
-        "horizon": (visible_runs(horizon(camera)), HORIZON, 1.5),
+        "horizon": (visible_runs(horizon(camera)), HORIZON, 1.0),
     }
     for kind, (strips, color, width) in lines.items():
         inside = [strip for line in strips for strip in _clipped(line, camera)]
