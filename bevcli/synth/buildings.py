@@ -150,5 +150,3 @@ def kerb_slab(city: CityPlan, outline: Array) -> Mesh:
     faces = np.concatenate([sides, np.stack([top_a, top_b, center], 1)]).astype(np.float32)
     material = np.r_[np.full(len(sides), Material.MATTE), np.full(len(ring), Material.GROUND)].astype(np.uint8)
     return Mesh(faces, np.tile(linear((176, 174, 168)), (len(faces), 1)), material)
-
-

@@ -64,7 +64,7 @@ def car(name: str) -> Mesh:
     return joined(parts)
 
 
-def _along(s: CarShape):  # noqa: ANN202
+def _along(s: CarShape):
     return lambda fraction: (fraction - 0.5) * s.length
 
 

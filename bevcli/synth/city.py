@@ -158,9 +158,7 @@ class CityPlan:
         return index if position - before <= after - position else index + 1
 
 
-def rounded_rectangle(
-    low: tuple[float, float], high: tuple[float, float], radius: float, step: float = 6.0
-) -> Array:
+def rounded_rectangle(low: tuple[float, float], high: tuple[float, float], radius: float, step: float = 6.0) -> Array:
     """(P, 2) counter-clockwise outline with round corners, its sides cut into pieces of at most `step` metres."""
     (x0, y0), (x1, y1) = low, high
     radius = min(radius, (x1 - x0) / 2, (y1 - y0) / 2)

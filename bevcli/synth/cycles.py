@@ -36,11 +36,21 @@ def bicycle(name: str) -> Mesh:
         block((-0.24, 0, seat_z + 0.03), (0.26, 0.15, 0.06), RUBBER), rod((-0.05, -0.16, 0.3), (-0.05, 0.16, 0.3), 0.03, CHROME, sections=5),
     ]  # fmt: skip
     if kind == "city":
-        parts += [block((back - 0.02, 0, 0.74), (0.42, 0.16, 0.03), TRIM), block((front - 0.05, 0, 0.98), (0.3, 0.34, 0.22), (120, 92, 62))]
+        parts += [
+            block((back - 0.02, 0, 0.74), (0.42, 0.16, 0.03), TRIM),
+            block((front - 0.05, 0, 0.98), (0.3, 0.34, 0.22), (120, 92, 62)),
+        ]
     if kind == "cargo":
         parts.append(block((0.32, 0, 0.62), (0.55, 0.5, 0.45), (168, 122, 70)))
     if name.endswith("_rider"):
-        parts.append(rider((-0.24, seat_z + 0.04), (front - 0.24, bar_z), (-0.05, 0.3), (230, 230, 226) if kind == "racer" else (52, 58, 70)))
+        parts.append(
+            rider(
+                (-0.24, seat_z + 0.04),
+                (front - 0.24, bar_z),
+                (-0.05, 0.3),
+                (230, 230, 226) if kind == "racer" else (52, 58, 70),
+            )
+        )
     return joined(parts)
 
 
@@ -66,7 +76,20 @@ def motorcycle(name: str) -> Mesh:
                   block((-0.42, 0, 0.76), (0.62, 0.26, 0.1), RUBBER), side_profile([(back - 0.15, 0.66), (back + 0.4, 0.6), (back + 0.4, 0.72), (back - 0.12, 0.82)], 0.13, PAINT, Material.PAINT),
                   *[rod((-0.1, y, 0.3), (back - 0.1, y, 0.36), 0.05, CHROME) for y in (-0.17, 0.17)]]  # fmt: skip
         if kind == "sport":
-            parts.append(side_profile([(front - 0.42, 0.6), (front - 0.1, 0.62), (front - 0.12, 0.9), (front - 0.3, 1.08), (front - 0.42, 0.9)], 0.18, PAINT, Material.PAINT))
+            parts.append(
+                side_profile(
+                    [
+                        (front - 0.42, 0.6),
+                        (front - 0.1, 0.62),
+                        (front - 0.12, 0.9),
+                        (front - 0.3, 1.08),
+                        (front - 0.42, 0.9),
+                    ],
+                    0.18,
+                    PAINT,
+                    Material.PAINT,
+                )
+            )
     if name.endswith("_rider"):
         seat = (back + 0.35, 0.82) if kind == "scooter" else (-0.4, 0.8)
         parts.append(rider(seat, (front - 0.3, bar_z), (0.0, 0.36), (200, 30, 34) if kind == "sport" else (34, 36, 40)))

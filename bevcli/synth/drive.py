@@ -98,7 +98,7 @@ class Drive:
         stock: Stock | None = None,
         supersampling: int = 1,
         threads: int = 1,
-        map_window: MapWindow = MapWindow(),  # noqa: B008
+        map_window: MapWindow = MapWindow(),
     ) -> None:
         self.seed, self.frames, self.rate_hz = seed, frames, rate_hz
         self.rig = rig or nuscenes_like_rig(400, 225)
@@ -227,7 +227,9 @@ class Drive:
         visible = sum(exposure.visible for exposure in exposures.values())
         unoccluded = sum(exposure.unoccluded for exposure in exposures.values())
         sizes = np.stack([s.body.size_lwh for s in states])
-        centers = np.stack([s.position for s in states]) + np.column_stack([np.zeros((len(states), 2)), sizes[:, 2] / 2])
+        centers = np.stack([s.position for s in states]) + np.column_stack(
+            [np.zeros((len(states), 2)), sizes[:, 2] / 2]
+        )
         boxes = Boxes3D(
             centers, sizes, np.array([s.yaw for s in states]), np.stack([s.velocity for s in states]),
             np.array([s.body.variant.class_name for s in states]),

@@ -50,7 +50,9 @@ def export_drive(
                 )
             )  # fmt: skip
             progress(rendered)
-    write_ego_motion(folder / "ego_motion.csv", motion)  # denser than the frames, so that cameras may be shifted in time
+    write_ego_motion(
+        folder / "ego_motion.csv", motion
+    )  # denser than the frames, so that cameras may be shifted in time
 
 
 def encode_jpeg(pixels_bgr: NDArray[np.uint8], quality: int = JPEG_QUALITY) -> bytes:

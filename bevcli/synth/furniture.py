@@ -22,7 +22,9 @@ def tree(variant: int, rng: np.random.Generator) -> Mesh:
     if variant % 4 == 3:
         for k in range(3):
             low = trunk * 0.5 + k * height * 0.22
-            parts.append(_leaves(cone(0, 0, low, low + height * 0.36, 1.7 - 0.42 * k, 0.05, tone, Material.LEAVES, 9), rng))
+            parts.append(
+                _leaves(cone(0, 0, low, low + height * 0.36, 1.7 - 0.42 * k, 0.05, tone, Material.LEAVES, 9), rng)
+            )
         return joined(parts)
     count, spread = (5, 1.2) if variant % 4 != 2 else (3, 0.5)
     for k in range(count):
@@ -30,7 +32,9 @@ def tree(variant: int, rng: np.random.Generator) -> Mesh:
         radius = rng.uniform(1.2, 1.8)
         z = trunk + rng.uniform(0.7, 1.0) * (height - trunk) * (0.35 + 0.5 * (k % 2))
         center = (spread * np.cos(angle), spread * np.sin(angle), z)
-        parts.append(_leaves(ball(center, (radius, radius, radius * rng.uniform(0.75, 1.1)), tone, Material.LEAVES), rng))
+        parts.append(
+            _leaves(ball(center, (radius, radius, radius * rng.uniform(0.75, 1.1)), tone, Material.LEAVES), rng)
+        )
     crown = ball((0, 0, height - 1.6), (1.5, 1.5, 1.6), tone, Material.LEAVES)
     return joined([*parts, _leaves(crown, rng)])
 

@@ -27,8 +27,8 @@ from bevcli.synth.palette import Color
 
 WHITE: Color = (222, 222, 216)
 YELLOW: Color = (214, 170, 54)
-ASPHALT: Color = (84, 84, 87)
-PARKING: Color = (92, 91, 92)
+ASPHALT: Color = (92, 92, 95)
+PARKING: Color = (99, 98, 99)
 BIKE_LANE: Color = (96, 78, 74)
 PAVEMENT: Color = (158, 154, 146)
 JOINT: Color = (132, 128, 121)
@@ -155,7 +155,9 @@ class GroundPlan:
                 )  # fmt: skip
             if street.parking_m:
                 inner = lanes_edge + street.bike_m
-                paints.append(GroundPaint(self._band(street, low, high, side * inner, side * street.half_width), PARKING))
+                paints.append(
+                    GroundPaint(self._band(street, low, high, side * inner, side * street.half_width), PARKING)
+                )
             for offset, color, dash in self._lines(street):
                 boundaries.append(self.city.bend(self._run(street, low, high, side * offset)))
                 dashes = list(self._dashes(street, low, high, side * offset, dash))
@@ -184,14 +186,14 @@ class GroundPlan:
             at, offset = rng.uniform(low, high), rng.uniform(-1, 1) * (street.half_width - 1.5)
             size = rng.uniform(0.5, 3.5), rng.uniform(0.3, 1.2)
             tone = int(rng.choice([70, 74, 98]))
-            yield GroundPaint(
-                self._band(street, at, at + size[0], offset, offset + size[1]), (tone, tone, tone + 2)
-            )
+            yield GroundPaint(self._band(street, at, at + size[0], offset, offset + size[1]), (tone, tone, tone + 2))
         for _ in range(3):
             at, offset = rng.uniform(low, high), rng.uniform(-1, 1) * (street.half_width - 2)
             angle = np.linspace(0, 2 * np.pi, 14)[:-1]
             yield GroundPaint(
-                self.city.bend(np.array(self._at(street, at, offset)) + 0.36 * np.stack([np.cos(angle), np.sin(angle)], -1)),
+                self.city.bend(
+                    np.array(self._at(street, at, offset)) + 0.36 * np.stack([np.cos(angle), np.sin(angle)], -1)
+                ),
                 (58, 56, 55),
             )
 
@@ -257,8 +259,6 @@ def _junction_outline(x: float, y: float, half_x: float, half_y: float, reach_x:
     for sx, sy in ((1, 1), (-1, 1), (-1, -1), (1, -1)):
         sweep = np.linspace(0, np.pi / 2, 6)[:: sx * sy]
         points.append(
-            np.stack(
-                [x + sx * (reach_x - CORNER_M * np.sin(sweep)), y + sy * (reach_y - CORNER_M * np.cos(sweep))], -1
-            )
+            np.stack([x + sx * (reach_x - CORNER_M * np.sin(sweep)), y + sy * (reach_y - CORNER_M * np.cos(sweep))], -1)
         )
     return np.concatenate(points)

@@ -7,16 +7,14 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from bevcli.synth.facades import scramble
 from bevcli.synth.ground_plan import ASPHALT, GroundPiece
 from bevcli.synth.palette import linear
 
 SUBPIXEL_BITS = 4
 LEVELS = 6
-ROUGH_SIZE, ROUGH_TEXEL_M = 512, 0.125
+ROUGH_SIZE = 512
 
 
 @dataclass(frozen=True)
@@ -70,54 +68,8 @@ def _stored(color: tuple[int, int, int]) -> tuple[int, ...]:
     return tuple(int(round(float(np.sqrt(c)) * 255)) for c in linear(color))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def sample_ground(texels, offsets, rough, origin_x, origin_y, texel_m, size, x, y, across, along, rx, ry, out):
-    """Linear albedo at (x, y) into out (3,); returns the grain, a relative brightness of the rough surface.
-
-    across, along: metres that the pixel spans, `along` in the direction (rx, ry); up to three samples are spread over it.
-    """
-    flat = np.sqrt(rx * rx + ry * ry) + 1e-9
-    samples = min(max(int(0.6 * along / across), 1), 3)
-    width = max(across, along / samples * 0.5)
-    level = 0
-    span = texel_m * 1.4
-    while width > span and level < offsets.shape[0] - 1:
-        level += 1
-        span *= 2
-    n = size >> level
-    scale = 1.0 / (texel_m * (1 << level))
-    out[0] = out[1] = out[2] = 0.0
-    for i in range(samples):
-        shift = ((i + 0.5) / samples - 0.5) * along
-        u = (x + shift * rx / flat - origin_x) * scale - 0.5
-        v = (y + shift * ry / flat - origin_y) * scale - 0.5
-        u, v = min(max(u, 0.0), n - 1.001), min(max(v, 0.0), n - 1.001)
-        iu, iv = int(u), int(v)
-        wu, wv = u - iu, v - iv
-        at = offsets[level] + iv * n + iu
-        for c in range(3):
-            value = (texels[at, c] * (1 - wu) + texels[at + 1, c] * wu) * (1 - wv) + (
-                texels[at + n, c] * (1 - wu) + texels[at + n + 1, c] * wu
-            ) * wv
-            out[c] += value * value
-    for c in range(3):
-        out[c] /= 65025.0 * samples
-    size_n = rough.shape[0]
-    u, v = x / ROUGH_TEXEL_M, y / ROUGH_TEXEL_M
-    iu, iv = int(np.floor(u)), int(np.floor(v))
-    wu, wv = u - iu, v - iv
-    i0, i1, j0, j1 = iu & (size_n - 1), (iu + 1) & (size_n - 1), iv & (size_n - 1), (iv + 1) & (size_n - 1)
-    grain = (rough[j0, i0] * (1 - wu) + rough[j0, i1] * wu) * (1 - wv) + (
-        rough[j1, i0] * (1 - wu) + rough[j1, i1] * wu
-    ) * wv
-    if width < 0.05:
-        fine = scramble(int(np.floor(x * 45)), int(np.floor(y * 45))) % 256 / 255.0 - 0.5
-        grain += 0.22 * fine * min(1.0, (0.05 - width) / 0.035)
-    return grain
-
-
 def roughness() -> NDArray[np.float32]:
-    """(512, 512) relative brightness of worn ground, repeating, in texels of ROUGH_TEXEL_M; the same everywhere."""
+    """(512, 512) relative brightness of worn ground, repeating, in texels of shading_kernels.ROUGH_TEXEL_M."""
     rng = np.random.Generator(np.random.PCG64(7))
     total = np.zeros((ROUGH_SIZE, ROUGH_SIZE))
     for cells, strength in ((8, 0.22), (64, 0.20)):

@@ -94,9 +94,7 @@ def rod(
     sections: int = 6,
 ) -> Mesh:
     """A cylinder between two points."""
-    shape = trimesh.creation.cylinder(
-        radius, segment=np.array([start, end], dtype=np.float64), sections=sections
-    )
+    shape = trimesh.creation.cylinder(radius, segment=np.array([start, end], dtype=np.float64), sections=sections)
     return from_trimesh(shape, color, material)
 
 
@@ -108,8 +106,7 @@ def cone(
     angle = np.linspace(0, 2 * np.pi, sections, endpoint=False)
     ring = np.stack([np.cos(angle), np.sin(angle)], -1)
     rings = [
-        np.column_stack([ring * r + (x, y), np.full(sections, z)])
-        for r, z in ((radius, bottom), (top_radius, top))
+        np.column_stack([ring * r + (x, y), np.full(sections, z)]) for r, z in ((radius, bottom), (top_radius, top))
     ]
     return loft(rings, color, material)
 
@@ -147,9 +144,7 @@ def loft(rings: Sequence[ArrayLike], color: Color, material: Material = Material
     if shape.volume < 0:
         shape.invert()
     sound = shape.area_faces > 1e-9
-    return from_trimesh(
-        trimesh.Trimesh(shape.vertices, shape.faces[sound], process=False), color, material
-    )
+    return from_trimesh(trimesh.Trimesh(shape.vertices, shape.faces[sound], process=False), color, material)
 
 
 def side_profile(
@@ -168,7 +163,5 @@ def side_profile(
 def wheel(x: float, y: float, radius: float, width: float, hub: Color = (122, 124, 128)) -> Mesh:
     """A tyre with a hub, its axle along y."""
     tyre = rod((x, y - width / 2, radius), (x, y + width / 2, radius), radius, (22, 22, 24), sections=12)
-    rim = rod(
-        (x, y - width / 2 - 0.012, radius), (x, y + width / 2 + 0.012, radius), radius * 0.52, hub, sections=8
-    )
+    rim = rod((x, y - width / 2 - 0.012, radius), (x, y + width / 2 + 0.012, radius), radius * 0.52, hub, sections=8)
     return joined([tyre, rim])

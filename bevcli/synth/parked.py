@@ -91,8 +91,14 @@ class Roadside:
         taper = [(closed[0] + 0.75 * k, offset) for k, offset in enumerate(across)]
         taper += [(closed[1] - 0.75 * k, offset) for k, offset in enumerate(across)]
         for k, (at, offset) in enumerate(taper):
-            made.append(self._stand(street, draw_body(cone, rng, f"cone-{name}-{k}", 0.03), at, side * offset, side, ""))
-        small = [v.name for v in self.catalog.by_class["construction_vehicle"] if v.size_lwh[0] < closed[1] - closed[0] - 8 and v.size_lwh[1] < 2.72]
+            made.append(
+                self._stand(street, draw_body(cone, rng, f"cone-{name}-{k}", 0.03), at, side * offset, side, "")
+            )
+        small = [
+            v.name
+            for v in self.catalog.by_class["construction_vehicle"]
+            if v.size_lwh[0] < closed[1] - closed[0] - 8 and v.size_lwh[1] < 2.72
+        ]
         machine = draw_body(draw("construction_vehicle", rng, small), rng, f"machine-{name}")
         space = (closed[0] + 4 + machine.size_lwh[0] / 2, closed[1] - 4 - machine.size_lwh[0] / 2)
         at = float(rng.uniform(*space)) if space[1] > space[0] else (closed[0] + closed[1]) / 2
@@ -107,7 +113,14 @@ class Roadside:
         return made
 
     def _stand(
-        self, street: Street, body, at: float, offset: float, side: int, attribute: str, turn: float = 0.0  # noqa: ANN001
+        self,
+        street: Street,
+        body,
+        at: float,
+        offset: float,
+        side: int,
+        attribute: str,
+        turn: float = 0.0,
     ) -> Standing:
         """Stand a body at a place of a street, facing as traffic on its side drives, turned by `turn`."""
         plan = (at, street.position + offset) if street.axis == 0 else (street.position + offset, at)
@@ -128,13 +141,17 @@ class Roadside:
             way = (end - start) / length
             depth = land.sidewalks[side]
             for group in range(int(rng.poisson(0.7))):
-                at = 9 + (length - 22) * (group + rng.random()) / 4  # racks do not overlap: each has its part of the side
+                at = (
+                    9 + (length - 22) * (group + rng.random()) / 4
+                )  # racks do not overlap: each has its part of the side
                 for k in range(int(rng.integers(1, 4)) if group < 4 else 0):
                     class_name = "bicycle" if rng.random() < 0.75 else "motorcycle"
                     variant = self.catalog.draw(class_name, rng, WITHOUT_RIDER[class_name])
                     body = draw_body(variant, rng, f"rack-{column}.{row}.{side}.{group}.{k}", 0.03)
                     point = start + way * (at + 0.85 * k) + inward * (depth - 1.0)
-                    made.append(self._stand_on_land(body, point, self.city.heading(point, inward), "cycle.without_rider"))
+                    made.append(
+                        self._stand_on_land(body, point, self.city.heading(point, inward), "cycle.without_rider")
+                    )
             for group in range(int(rng.poisson(0.5))):
                 middle = start + way * rng.uniform(8, length - 8) + inward * (depth - 1.0)
                 x, y = self.city.bend(middle)
@@ -150,7 +167,7 @@ class Roadside:
                     made.append(self._stand_on_land(body, point, facing, "pedestrian.standing"))
         return made
 
-    def _stand_on_land(self, body, point, yaw: float, attribute: str) -> Standing:  # noqa: ANN001
+    def _stand_on_land(self, body, point, yaw: float, attribute: str) -> Standing:
         x, y = self.city.bend(point)
         return Standing(body, np.array([x, y, KERB_M]), yaw, attribute)
 
@@ -180,14 +197,22 @@ class Roadside:
             for _ in range(12):
                 point = low + 8 + rng.random(2) * (high - low - 16)
                 x, y = self.city.bend(point)
-                clear = all(np.hypot(m.position[0] - x, m.position[1] - y) > (m.body.size_lwh[0] + body.size_lwh[0]) / 2 for m in made)
+                clear = all(
+                    np.hypot(m.position[0] - x, m.position[1] - y) > (m.body.size_lwh[0] + body.size_lwh[0]) / 2
+                    for m in made
+                )
                 if clear:
                     made.append(self._stand_on_land(body, point, float(rng.uniform(0, 6.3)), attribute))
                     break
         for k in range(8):
             point = low + 1.4 + rng.random(2) * (high - low - 2.8)
             if rng.random() < 0.5:
-                body = draw_body(self.catalog.draw("pedestrian", rng, ["worker_standing"]), rng, f"siteworker-{column}.{row}.{k}", 0.03)
+                body = draw_body(
+                    self.catalog.draw("pedestrian", rng, ["worker_standing"]),
+                    rng,
+                    f"siteworker-{column}.{row}.{k}",
+                    0.03,
+                )
                 made.append(self._stand_on_land(body, point, float(rng.uniform(0, 6.3)), "pedestrian.standing"))
             else:
                 body = draw_body(self.catalog.draw("traffic_cone", rng), rng, f"sitecone-{column}.{row}.{k}", 0.03)

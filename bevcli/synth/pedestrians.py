@@ -123,7 +123,9 @@ def _crosser(
     street, cross = street_of(city, node, arm), street_of(city, node, arm + 1)
     side = 1 if rng.random() < 0.5 else -1  # who goes one way keeps to one side of the crossing
     sideways = DIRECTIONS[(arm + 1) % 4] * side
-    spot = node_center(city, node) + DIRECTIONS[arm] * (cross.half_width + CROSSING_LINE_M + side * (0.25 + 0.72 * (index % 3)))
+    spot = node_center(city, node) + DIRECTIONS[arm] * (
+        cross.half_width + CROSSING_LINE_M + side * (0.25 + 0.72 * (index % 3))
+    )
     reach = street.half_width + ALONG_PAVEMENT_M
     path = along(spot - sideways * reach, spot + sideways * reach)
     speed = max(rng.uniform(1.0, 1.7), street.half_width / 6.5)  # over within 13 s

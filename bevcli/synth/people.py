@@ -26,9 +26,15 @@ def person(name: str, stride: int) -> Mesh:
         *_head(0.02, 1.62, skin, hair),
     ]  # fmt: skip
     if name == "woman":
-        parts += [cone(0, 0, 0.55, 1.0, 0.27, 0.17, SHIRT, Material.DYE), ball((-0.07, 0, 1.58), (0.1, 0.13, 0.18), hair)]
+        parts += [
+            cone(0, 0, 0.55, 1.0, 0.27, 0.17, SHIRT, Material.DYE),
+            ball((-0.07, 0, 1.58), (0.1, 0.13, 0.18), hair),
+        ]
     elif name == "worker":
-        parts += [ball((0.02, 0, 1.73), (0.15, 0.14, 0.09), (250, 210, 40)), block((0, 0, 1.2), (0.31, 0.43, 0.06), (236, 240, 200))]
+        parts += [
+            ball((0.02, 0, 1.73), (0.15, 0.14, 0.09), (250, 210, 40)),
+            block((0, 0, 1.2), (0.31, 0.43, 0.06), (236, 240, 200)),
+        ]
     elif name == "backpack":
         parts.append(block((-0.2, 0, 1.22), (0.18, 0.32, 0.46), (150, 52, 44)))
     elif name == "coat":
@@ -67,7 +73,9 @@ def rider(seat: tuple[float, float], bars: tuple[float, float], pedal: tuple[flo
     parts = [rod(hip, shoulder, 0.16, SHIRT, Material.DYE, 8), ball(tuple(shoulder + (0.06, 0, 0.24)), (0.12, 0.1, 0.13), SKIN[1]),
              ball(tuple(shoulder + (0.05, 0, 0.29)), (0.145, 0.115, 0.11), helmet)]  # fmt: skip
     for side in (-1, 1):
-        knee = np.array([(seat[0] + pedal[0]) / 2 + 0.24, side * 0.14, (seat[1] + pedal[1]) / 2 + 0.12 * (1 + side * 0.5)])
+        knee = np.array(
+            [(seat[0] + pedal[0]) / 2 + 0.24, side * 0.14, (seat[1] + pedal[1]) / 2 + 0.12 * (1 + side * 0.5)]
+        )
         foot = np.array([pedal[0] + 0.08 * side, side * 0.13, pedal[1] + 0.07 * side])
         hand = np.array([bars[0], side * 0.24, bars[1]])
         parts += [rod(hip + (0, side * 0.09, 0), knee, 0.08, TROUSERS[0]), rod(knee, foot, 0.06, TROUSERS[0]),

@@ -118,7 +118,7 @@ class Population:
         return (_unit(draw_body(draw(class_name, rng, names), rng, name), 0.0),)
 
 
-def _unit(body, lag: float) -> Unit:  # noqa: ANN001
+def _unit(body, lag: float) -> Unit:
     return Unit(body.variant, body.size_lwh, body.paint, body.dye, body.instance, lag)
 
 

@@ -93,5 +93,3 @@ def seen_objects(buffer: VisibilityBuffer, soup: Soup) -> NDArray[np.int32]:
     """(H, W) int32 object that each pixel sees, -1 for none."""
     owners = np.repeat(soup.objects, soup.runs[:, 1] - soup.runs[:, 0])
     return np.where(buffer.triangles >= 0, owners[buffer.triangles], -1).astype(np.int32)
-
-

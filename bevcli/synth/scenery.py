@@ -130,4 +130,7 @@ def _house_runs(house: House) -> list[Run]:
     rows = np.stack([w.row for w in house.walls])
     index = np.repeat(np.arange(len(rows)), [len(w.mesh.faces) for w in house.walls]).astype(np.int32)
     rest = joined(house.rest)
-    return [make_run(wall.faces, wall.albedo, wall.material, index, rows), make_run(rest.faces, rest.albedo, rest.material)]
+    return [
+        make_run(wall.faces, wall.albedo, wall.material, index, rows),
+        make_run(rest.faces, rest.albedo, rest.material),
+    ]

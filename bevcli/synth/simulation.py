@@ -48,7 +48,9 @@ class EgoTrack:
         s = [interpolated_track(self.times, self.positions, self.speeds, time_s + d) for d in (-h, 0.0, h)]
         speed = (s[2] - s[0]) / (2 * h)
         rate = float(self.route.yaw_at(s[2]) - self.route.yaw_at(s[0])) / (2 * h)
-        forward = float(np.interp(time_s + h, self.times, self.speeds) - np.interp(time_s - h, self.times, self.speeds)) / (2 * h)
+        forward = float(
+            np.interp(time_s + h, self.times, self.speeds) - np.interp(time_s - h, self.times, self.speeds)
+        ) / (2 * h)
         return (
             np.array([forward, speed * rate, GRAVITY]),
             np.array([0.0, 0.0, rate]),
@@ -81,8 +83,12 @@ class Simulation:
         columns = self.city.streets_between(1, x - reach_m, x + reach_m)
         rows = self.city.streets_between(0, y - reach_m, y + reach_m)
         spans = (
-            range(columns[0].index - 1, columns[-1].index + 1) if columns else range(_below(self.city, 1, x), _below(self.city, 1, x) + 1),
-            range(rows[0].index - 1, rows[-1].index + 1) if rows else range(_below(self.city, 0, y), _below(self.city, 0, y) + 1),
+            range(columns[0].index - 1, columns[-1].index + 1)
+            if columns
+            else range(_below(self.city, 1, x), _below(self.city, 1, x) + 1),
+            range(rows[0].index - 1, rows[-1].index + 1)
+            if rows
+            else range(_below(self.city, 0, y), _below(self.city, 0, y) + 1),
         )
         found: list[Actor] = [*self._driving]
         for i in spans[0]:

@@ -31,5 +31,3 @@ def signal_runs(
                 point = city.bend(spot)
                 runs.append(place(shape, (float(point[0]), float(point[1]), KERB_M), yaw))
     return runs
-
-

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bevcli.geometry.transforms import Array
 from bevcli.synth.catalog import Variant
 from bevcli.synth.route import JunctionPass, Route
-from bevcli.synth.signals import Signals
+from bevcli.synth.signals import Light, Signals
 
 STEP_S = 0.1
 LOOK_AHEAD_M, LOOK_STEPS = 42.0, 54
@@ -62,9 +62,7 @@ class Vehicle:
         return _points_between(self.route.points, self.route.positions, self.front - self.length, self.front, count)
 
 
-def step(
-    vehicles: list[Vehicle], people: Array, signals: Signals, time_s: float
-) -> None:
+def step(vehicles: list[Vehicle], people: Array, signals: Signals, time_s: float) -> None:
     """Move all vehicles on by STEP_S. people: (H, 2) world points of persons who may stand in the way."""
     bodies = [vehicle.body_points() for vehicle in vehicles]
     owners = np.repeat(np.arange(len(bodies)), [len(b) for b in bodies])
@@ -125,19 +123,30 @@ def _same_way(vehicle: Vehicle, vehicles: list[Vehicle], other: int) -> bool:
 def _may_enter(
     vehicle: Vehicle, crossing: JunctionPass, vehicles: list[Vehicle], signals: Signals, time_s: float
 ) -> bool:
-    """Green, and for left turns nobody oncoming who is near or inside the junction; they may use the yellow, too."""
+    """Green, and nobody there to whom the vehicle must give way. Left turns may use the yellow, too."""
     light = signals.light(crossing.node, crossing.direction % 2, time_s)
-    if crossing.turn <= 0 or light == "red":
-        return light == "green"
-    for other in vehicles:
-        theirs = other.next_pass()
-        if theirs is None or theirs.node != crossing.node or theirs.direction != (crossing.direction + 2) % 4:
-            continue
+    if light != "green" and (light == "red" or crossing.turn <= 0):
+        return False
+    return not any(
+        _has_priority(other, theirs, vehicle, crossing, light)
+        for other in vehicles
+        if other is not vehicle and (theirs := other.next_pass()) is not None and theirs.node == crossing.node
+    )
+
+
+def _has_priority(
+    other: Vehicle, theirs: JunctionPass, vehicle: Vehicle, crossing: JunctionPass, light: Light
+) -> bool:
+    """Oncoming traffic before left turns; bicycles before right turns beside them, until these have begun."""
+    if theirs.direction == (crossing.direction + 2) % 4 and crossing.turn == 1 and theirs.turn != 1:
         near = theirs.stop - 15 < other.front < theirs.leave - 5
         waits = other.speed < 0.5 and (light == "yellow" or other.front < theirs.stop - 6)
-        if theirs.turn != 1 and near and (not waits or other.front > theirs.stop + 1):
-            return False
-    return True
+        return near and (not waits or other.front > theirs.stop + 1)
+    if theirs.direction == crossing.direction and other.bicycle != vehicle.bicycle:
+        if vehicle.bicycle:
+            return theirs.turn == -1 and theirs.stop + 0.5 < other.front < theirs.leave + 2
+        return crossing.turn == -1 and theirs.stop - 8 < other.front < theirs.leave
+    return False
 
 
 @njit(cache=True, nogil=True)

@@ -26,7 +26,11 @@ def truck(name: str) -> Mesh:
     cab = _cab(length / 2, half, min(height, 3.0))
     bed = length - 2.3
     middle = rear + bed / 2
-    parts = [cab, block((middle, 0, 0.85), (bed, 1.0, 0.3), TRIM), *_axles((rear + 1.1, rear + 2.4, length / 2 - 1.2), half, 0.5)]
+    parts = [
+        cab,
+        block((middle, 0, 0.85), (bed, 1.0, 0.3), TRIM),
+        *_axles((rear + 1.1, rear + 2.4, length / 2 - 1.2), half, 0.5),
+    ]
     if name == "box":
         parts += [block((middle, 0, height / 2 + 0.5), (bed, 2 * half, height - 1.0), CARGO, Material.DYE),
                   block((middle, 0, 1.3), (bed + 0.02, 2 * half + 0.02, 0.5), PAINT, Material.PAINT)]  # fmt: skip
@@ -72,13 +76,23 @@ def _delivery() -> Mesh:
              block((1.45, 0, 1.85), (0.8, 1.985, 0.7), GLASS, Material.GLASS), block((-0.9, 0, 1.7), (3.2, 2.0, 0.35), CARGO, Material.DYE),
              block((3.06, 0, 0.6), (0.1, 1.9, 0.25), TRIM), block((-3.08, 0, 0.5), (0.1, 1.9, 0.2), TRIM), block((-3.1, 0, 1.7), (0.04, 0.04, 1.9), TRIM)]  # fmt: skip
     for side in (-1, 1):
-        parts += [block((3.02, side * 0.75, 0.92), (0.14, 0.34, 0.2), LAMP, Material.GLOW), block((-3.1, side * 0.9, 1.3), (0.06, 0.14, 0.5), TAIL, Material.GLOW)]
+        parts += [
+            block((3.02, side * 0.75, 0.92), (0.14, 0.34, 0.2), LAMP, Material.GLOW),
+            block((-3.1, side * 0.9, 1.3), (0.06, 0.14, 0.5), TAIL, Material.GLOW),
+        ]
     return joined([*parts, *_axles((-1.9, 2.05), 1.0, 0.37)])
 
 
 def _cab(nose: float, half: float, height: float) -> Mesh:
     """A cab-over driver's cab whose front is at x = nose."""
-    body = [(nose - 2.1, 0.6), (nose, 0.45), (nose, 1.5), (nose - 0.12, height - 0.25), (nose - 0.5, height), (nose - 2.1, height)]
+    body = [
+        (nose - 2.1, 0.6),
+        (nose, 0.45),
+        (nose, 1.5),
+        (nose - 0.12, height - 0.25),
+        (nose - 0.5, height),
+        (nose - 2.1, height),
+    ]
     parts = [side_profile(body, half * 0.98, PAINT, Material.PAINT, top_half_width=half * 0.94),
              side_profile([(nose - 0.4, 1.55), (nose + 0.015, 1.55), (nose - 0.1, 2.4), (nose - 0.4, 2.4)], half * 0.9, GLASS, Material.GLASS),
              block((nose - 0.95, 0, 1.95), (0.9, half * 1.955, 0.75), GLASS, Material.GLASS),
@@ -100,17 +114,34 @@ def bus(name: str) -> Mesh:
     half, front = 1.28, length / 2
     slope = 0.5 if name == "coach" else 0.12
     nose = front - 1.5 if name == "school" else front
-    body = [(-front, floor), (nose, floor), (nose, 1.3), (nose - slope, height - 0.1), (nose - slope - 0.15, height), (-front + 0.1, height)]
+    body = [
+        (-front, floor),
+        (nose, floor),
+        (nose, 1.3),
+        (nose - slope, height - 0.1),
+        (nose - slope - 0.15, height),
+        (-front + 0.1, height),
+    ]
     parts = [side_profile(body, half, PAINT, Material.PAINT, top_half_width=half * 0.96)]
     decks = [(1.35, 2.35)] if name != "double" else [(1.2, 1.95), (2.65, 3.5)]
     if name == "coach":
         decks = [(1.9, 3.0)]
     for low, high in decks:
         parts += _bus_windows(-front + 0.7, nose - 1.0, low, high, half)
-        parts.append(block((nose - slope / 2, 0, (low + high) / 2 + 0.05), (0.06 + slope * 0.5, half * 1.8, high - low + 0.25), GLASS, Material.GLASS))
+        parts.append(
+            block(
+                (nose - slope / 2, 0, (low + high) / 2 + 0.05),
+                (0.06 + slope * 0.5, half * 1.8, high - low + 0.25),
+                GLASS,
+                Material.GLASS,
+            )
+        )
         parts.append(block((-front + 0.02, 0, (low + high) / 2), (0.08, half * 1.5, high - low), GLASS, Material.GLASS))
     if name == "school":
-        parts += [block((front - 0.75, 0, 1.05), (1.5, half * 1.7, 1.1), PAINT, Material.PAINT), block((front, 0, 0.95), (0.05, 1.3, 0.6), TRIM)]
+        parts += [
+            block((front - 0.75, 0, 1.05), (1.5, half * 1.7, 1.1), PAINT, Material.PAINT),
+            block((front, 0, 0.95), (0.05, 1.3, 0.6), TRIM),
+        ]
     if name == "articulated":
         parts.append(block((-1.5, 0, height / 2 + 0.15), (0.8, half * 1.99, height - 0.5), (40, 40, 42)))
     if name in ("city", "articulated", "double", "mini", "shuttle"):
@@ -128,7 +159,12 @@ def _bus_windows(start: float, end: float, low: float, high: float, half: float)
     count = max(int((end - start) / 1.4), 2)
     width = (end - start) / count
     return [
-        block((start + (k + 0.5) * width, 0, (low + high) / 2), (width - 0.14, half * 1.985, high - low), GLASS, Material.GLASS)
+        block(
+            (start + (k + 0.5) * width, 0, (low + high) / 2),
+            (width - 0.14, half * 1.985, high - low),
+            GLASS,
+            Material.GLASS,
+        )
         for k in range(count)
     ]
 
@@ -137,14 +173,26 @@ def trailer(name: str) -> Mesh:
     """One of TRAILER_NAMES; its drawbar or kingpin is at the front."""
     if name == "utility":
         return _utility_trailer()
-    length, half, height = 12.4, 1.27, {"box": 3.9, "curtain": 3.9, "container": 3.8, "tanker": 3.5, "flatbed": 2.6}[name]
+    length, half, height = (
+        12.4,
+        1.27,
+        {"box": 3.9, "curtain": 3.9, "container": 3.8, "tanker": 3.5, "flatbed": 2.6}[name],
+    )
     rear = -length / 2
     parts = [block((0, 0, 1.1), (length, 1.0, 0.28), TRIM), block((length / 2 - 2.6, 0, 0.6), (0.2, 1.4, 0.9), TRIM),
              block((rear + 0.08, 0, 0.6), (0.12, 2.3, 0.2), TRIM), *_axles((rear + 1.2, rear + 2.5, rear + 3.8), half, 0.5)]  # fmt: skip
     if name in ("box", "container", "curtain"):
         parts.append(block((0, 0, height / 2 + 0.62), (length, 2 * half, height - 1.24), CARGO, Material.DYE))
         ribs = int(length / 0.8) if name == "container" else 4
-        parts += [block((rear + (k + 0.5) * length / ribs, 0, height / 2 + 0.62), (0.1, 2 * half + 0.05, height - 1.3), PAINT, Material.PAINT) for k in range(ribs)]
+        parts += [
+            block(
+                (rear + (k + 0.5) * length / ribs, 0, height / 2 + 0.62),
+                (0.1, 2 * half + 0.05, height - 1.3),
+                PAINT,
+                Material.PAINT,
+            )
+            for k in range(ribs)
+        ]
         parts.append(block((rear, 0, height / 2 + 0.6), (0.05, 0.06, height - 1.4), TRIM))
         if name == "curtain":
             parts.append(block((0, 0, height - 1.1), (length * 0.5, 2 * half + 0.03, 0.8), PAINT, Material.PAINT))

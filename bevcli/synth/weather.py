@@ -44,7 +44,7 @@ def make_weather(name: str, rng: np.random.Generator) -> Weather:
     azimuth = rng.uniform(0, 2 * np.pi)
     if name == "noon":
         elevation = rng.uniform(0.65, 1.05)
-        return _weather(name, azimuth, elevation, (1.0, 0.95, 0.86), 1.0, (0.30, 0.38, 0.50), (84, 136, 206),
+        return _weather(name, azimuth, elevation, (1.0, 0.95, 0.86), 1.25, (0.32, 0.39, 0.50), (84, 136, 206),
                         (190, 212, 232), (255, 255, 255), _clouds(rng, rng.uniform(0.45, 0.62)), 420.0, 0.5, 0.05)  # fmt: skip
     if name == "evening":
         elevation = rng.uniform(0.22, 0.38)
@@ -59,9 +59,7 @@ def _weather(
     sky: tuple[float, float, float], zenith: tuple[int, int, int], horizon: tuple[int, int, int],
     cloud: tuple[int, int, int], clouds: NDArray[np.float32], haze_m: float, lamps: float, softness: float,
 ) -> Weather:  # fmt: skip
-    to_sun = np.array(
-        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
-    )
+    to_sun = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
     sun_light = (np.array(sun) * strength).astype(np.float32)
     sky_light = np.array(sky, np.float32)
     bounce = (0.22 * (sun_light * np.sin(elevation) + sky_light) + 0.25 * sky_light).astype(np.float32)

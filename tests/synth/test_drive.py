@@ -1,0 +1,255 @@
+"""A drive's ground truth: what is said of an object is what the pictures show and what happens over time."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from bevcli.geometry.boxes import CLASSES
+from bevcli.geometry.transforms import inverse, wrap_angle
+from bevcli.synth.actors import State
+from bevcli.synth.drive import ANNOTATED_M, Drive, RenderedFrame, Stock
+from bevcli.synth.rig import nuscenes_like_rig
+
+
+def test_same_seed_gives_the_same_bytes(drive: Drive, frame: RenderedFrame, stock: Stock):
+    """Whatever was rendered before, and with two threads."""
+    again = Drive(113, frames=20, rig=drive.rig, stock=stock, weather="noon", threads=2)
+    again.frame(2)
+    other = again.frame(9)
+    for name, picture in frame.pictures.items():
+        assert picture.tobytes() == other.pictures[name].tobytes()
+    assert frame.boxes.centers.tobytes() == other.boxes.centers.tobytes()
+    assert frame.bev_map.cells.tobytes() == other.bev_map.cells.tobytes()
+
+
+def test_another_seed_is_another_drive(frame: RenderedFrame, stock: Stock):
+    other = Drive(114, rig=nuscenes_like_rig(320, 180), stock=stock, weather="noon").frame(9)
+    difference = np.abs(other.pictures["CAM_FRONT"].astype(int) - frame.pictures["CAM_FRONT"])
+    assert difference.mean() > 10
+
+
+def _projected(corners_world, camera, world_from_ego):
+    """Pixels (8, 2) by cv2.projectPoints and depths (8,)."""
+    camera_from_world = inverse(world_from_ego.matrix @ camera.ego_from_camera)
+    rotation, _ = cv2.Rodrigues(camera_from_world[:3, :3])
+    pixels, _ = cv2.projectPoints(corners_world, rotation, camera_from_world[:3, 3], camera.intrinsics, None)
+    return pixels[:, 0], corners_world @ camera_from_world[2, :3] + camera_from_world[2, 3]
+
+
+def test_projected_box_contains_the_objects_pixels(drive: Drive, frame: RenderedFrame):
+    states = drive.states(9)
+    rows = {instance: k for k, instance in enumerate(frame.boxes.instances)}
+    checked = 0
+    for name, exposure in frame.exposures.items():
+        for index in np.unique(exposure.objects[exposure.objects >= 0]):
+            row = rows.get(states[index].body.instance)
+            if row is None:
+                continue
+            pixels, depths = _projected(
+                frame.boxes.corners()[row], drive.rig[name], frame.world_from_ego
+            )
+            if depths.min() < 0.3:
+                continue
+            v, u = np.nonzero(exposure.objects == index)
+            hull = cv2.convexHull(pixels.astype(np.float32))
+            outside = [cv2.pointPolygonTest(hull, (float(x), float(y)), True) for x, y in zip(u, v, strict=True)]
+            assert min(outside) > -0.6, frame.boxes.instances[row]
+            checked += 1
+    assert checked > 40
+
+
+def test_visibility_agrees_with_rendering_each_object_alone(drive: Drive, frame: RenderedFrame):
+    """Another way to count: a scene with nothing but the object, and the difference of two pictures."""
+    states = drive.states(9)
+    rows = {instance: k for k, instance in enumerate(frame.boxes.instances)}
+    visible_rows = [k for k, s in enumerate(states) if frame.boxes.num_points[rows.get(s.body.instance, 0)] > 150][:8]
+    for k in visible_rows:
+        body = states[k].body
+        if body.instance not in rows:
+            continue
+        row = rows[body.instance]
+        alone = 0
+        for camera in drive.rig.cameras:
+            alone += _silhouette(drive, states[k], camera, frame).sum()
+        shown = sum(int((e.objects == k).sum()) for e in frame.exposures.values())
+        assert frame.boxes.num_points[row] == shown
+        assert frame.boxes.visibilities[row] == pytest.approx(shown / alone, abs=0.04)
+
+
+def _silhouette(drive: Drive, state: State, camera, frame: RenderedFrame):
+    """(H, W) bool mask of an object alone, filled triangle by triangle with OpenCV."""
+    faces = drive._shape(state.body, state.pose).mesh.faces.astype(np.float64)
+    c, s = np.cos(state.yaw), np.sin(state.yaw)
+    world = faces @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + state.position
+    fine = 8
+    mask = np.zeros((camera.height * fine, camera.width * fine), np.uint8)
+    pixels, depths = _projected(world.reshape(-1, 3), camera, frame.world_from_ego)
+    pixels, depths = pixels.reshape(-1, 3, 2), depths.reshape(-1, 3)
+    for triangle, depth in zip(pixels, depths, strict=True):
+        if depth.min() > 0.2 and np.abs(triangle).max() < 5000:
+            cv2.fillConvexPoly(mask, np.round(((triangle + 0.5) * fine - 0.5) * 16).astype(np.int32), 1, cv2.LINE_8, 4)
+    return mask[fine // 2 :: fine, fine // 2 :: fine] > 0
+
+
+def test_velocities_are_differences_of_positions(drive: Drive):
+    """Over a tenth of a second, but for those who start or stop just then."""
+    rate = drive.rate_hz
+    h, checked = 0.05, 0
+    for index in (3, 9, 15):
+        time_s = index / rate
+        origin = drive.world_from_ego(time_s).translation[:2]
+        for actor in drive.simulation.actors_near(origin, 60):
+            states = [actor.state(time_s + d) for d in (-h, 0.0, h)]
+            if any(s is None for s in states):
+                continue
+            if max(np.hypot(*(s.velocity - states[1].velocity)) for s in states) > 0.25:
+                continue  # a person who starts or stops does so within a step
+            difference = (states[2].position - states[0].position)[:2] / (2 * h)
+            assert np.hypot(*(difference - states[1].velocity)) < 0.2
+            checked += bool(np.hypot(*difference) > 1)
+    assert checked > 20
+
+
+def test_a_turn_moves_standing_boxes_in_the_ego_frame_and_not_in_the_world(drive: Drive, stock: Stock):
+    turning = max(range(19), key=lambda k: _turned(drive, k))
+    assert _turned(drive, turning) > np.radians(5)
+    first, second = drive.frame(turning), drive.frame(turning + 1)
+    one = {i: k for k, i in enumerate(first.boxes.instances)}
+    shared = [
+        (one[i], k) for k, i in enumerate(second.boxes.instances)
+        if i in one and i.startswith(("parked", "cone", "barrier", "machine", "rack", "fence", "site"))
+    ]  # fmt: skip
+    assert len(shared) > 5
+    a, b = np.array(shared).T
+    np.testing.assert_array_equal(first.boxes.centers[a], second.boxes.centers[b])
+    np.testing.assert_array_equal(first.boxes.yaws[a], second.boxes.yaws[b])
+    ego_a = first.boxes[a].transformed(inverse(first.world_from_ego.matrix))
+    ego_b = second.boxes[b].transformed(inverse(second.world_from_ego.matrix))
+    turn = wrap_angle(second.world_from_ego.yaw - first.world_from_ego.yaw)
+    np.testing.assert_allclose(wrap_angle(ego_b.yaws - ego_a.yaws + turn), 0, atol=1e-9)
+
+
+def _turned(drive: Drive, index: int) -> float:
+    poses = [drive.world_from_ego(drive.time_s(k)) for k in (index, index + 1)]
+    return float(abs(wrap_angle(poses[1].yaw - poses[0].yaw)))
+
+
+def test_ego_motion_is_that_of_a_car(stock: Stock):
+    """No matter the seed: acceleration below 4 m/s², and rates and velocities that fit the poses."""
+    for seed in (113, 3, 8):
+        motion = Drive(seed, frames=20, stock=stock).ego_motion(20.0)
+        assert np.hypot(*motion.accelerations[:, :2].T).max() < 4.0
+        seconds = np.diff(motion.timestamps_ns) / 1e9
+        moved = np.diff(motion.translations, axis=0)
+        speeds = np.linalg.norm(moved, axis=1) / seconds
+        between = (motion.velocities[1:, 0] + motion.velocities[:-1, 0]) / 2
+        np.testing.assert_allclose(speeds, between, atol=0.15)
+        assert motion.velocities[:, 0].max() > 1.0
+
+
+def test_map_agrees_with_what_stands_on_it(drive: Drive, frame: RenderedFrame):
+    """Driving vehicles stand on road cells, and the middle of every vehicle's box is a vehicle cell."""
+    window = drive.map_window
+    bev = frame.boxes.transformed(inverse(frame.world_from_ego.matrix @ drive.rig.ego_from_bev))
+    near = (np.abs(bev.centers[:, :2]) < window.half_extent_m - 1).all(axis=1)
+    vehicles = near & np.isin(bev.classes, ("car", "truck", "bus", "trailer", "motorcycle", "bicycle"))
+    assert vehicles.sum() > 5
+    for row in np.nonzero(vehicles)[0]:
+        column, line = np.round(window.pixels(bev.centers[row : row + 1]))[0].astype(int)
+        cell = frame.bev_map.cells[line, column]
+        assert cell & 8
+        if bev.instances[row].startswith(("moving", "parked")):
+            assert cell & 1
+
+
+def test_boxes_are_kept_near_and_complete(drive: Drive, frame: RenderedFrame):
+    boxes = frame.boxes
+    origin = (frame.world_from_ego.matrix @ drive.rig.ego_from_bev)[:2, 3]
+    assert np.hypot(*(boxes.centers[:, :2] - origin).T).max() < ANNOTATED_M
+    assert set(boxes.classes) <= set(CLASSES)
+    assert len(set(boxes.instances)) == len(boxes)
+    assert ((boxes.visibilities >= 0) & (boxes.visibilities <= 1)).all()
+    np.testing.assert_array_equal(boxes.num_points > 0, boxes.visibilities > 0)
+
+
+def test_supersampling_changes_counts_little(drive: Drive, frame: RenderedFrame, stock: Stock):
+    fine = Drive(113, frames=20, rig=drive.rig, stock=stock, weather="noon", supersampling=2).frame(9)
+    large = frame.boxes.num_points > 200
+    np.testing.assert_allclose(fine.boxes.num_points[large], frame.boxes.num_points[large], rtol=0.12)
+
+
+def test_a_lens_bends_the_picture_as_its_camera_says(drive: Drive, frame: RenderedFrame, stock: Stock):
+    """Through a lens with distortion, an object's box still contains its pixels."""
+    from bevcli.geometry.cameras import CameraRig, Distortion
+
+    lens = Distortion("brown_conrady", (-0.25, 0.08, 0.001, -0.0005))
+    rig = CameraRig(tuple(replace(c, distortion=lens) for c in drive.rig.cameras), drive.rig.ego_from_bev)
+    bent = Drive(113, frames=20, rig=rig, stock=stock, weather="noon")
+    exposure, states = bent.frame(9).exposures["CAM_BACK"], bent.states(9)
+    camera, checked = rig["CAM_BACK"], 0
+    for index in np.unique(exposure.objects[exposure.objects >= 0]):
+        row = np.nonzero(frame.boxes.instances == states[index].body.instance)[0]
+        if not len(row):
+            continue
+        corners = frame.boxes[row].transformed(inverse(frame.world_from_ego.matrix)).corners()[0]
+        pixels, depth = camera.project_ego(corners)
+        if depth.min() < 1 or not np.isfinite(pixels).all():
+            continue
+        v, u = np.nonzero(exposure.objects == index)
+        assert u.min() > pixels[:, 0].min() - 1.5
+        assert u.max() < pixels[:, 0].max() + 1.5
+        assert v.min() > pixels[:, 1].min() - 1.5
+        checked += 1
+    assert checked > 5
+
+
+@pytest.mark.slow
+def test_drives_are_dense(stock: Stock):
+    """Eight drives, every fourth frame: the density that forty whole drives must have, by share."""
+    counts, near, hidden, frames = dict.fromkeys(CLASSES, 0), 0, 0, 0
+    for seed in range(200, 208):
+        drive = Drive(seed, frames=20, rig=nuscenes_like_rig(200, 112), stock=stock)
+        for index in range(0, 20, 4):
+            frame = drive.frame(index)
+            for name in frame.boxes.classes:
+                counts[str(name)] += 1
+            origin = (frame.world_from_ego.matrix @ drive.rig.ego_from_bev)[:2, 3]
+            inside = np.hypot(*(frame.boxes.centers[:, :2] - origin).T) < 32
+            near += int(inside.sum())
+            hidden += int((frame.boxes.visibilities[inside] < 0.4).sum())
+            frames += 1
+    assert near / frames >= 15
+    assert hidden / near >= 0.15
+    assert all(count >= 200 * frames / 800 for count in counts.values()), counts
+
+
+@pytest.mark.slow
+def test_vehicles_do_not_drive_through_each_other(stock: Stock):
+    for seed in range(300, 306):
+        drive = Drive(seed, frames=20, stock=stock)
+        for index in range(0, 20, 3):
+            states = [s for s in drive.states(index) if s.body.instance.startswith("moving")]
+            for i, one in enumerate(states):
+                for other in states[i + 1 :]:
+                    if one.body.instance.split("-")[1] == other.body.instance.split("-")[1]:
+                        continue  # a tractor and its trailer touch
+                    assert not _overlap(one, other), (seed, index, one.body.instance, other.body.instance)
+
+
+def _overlap(one: State, other: State, tolerance_m: float = 0.15) -> bool:
+    """Whether two boxes overlap on the ground, by the separating axis theorem."""
+    corners = []
+    for state in (one, other):
+        length, width = state.body.size_lwh[:2] / 2
+        local = np.array([(length, width), (-length, width), (-length, -width), (length, -width)])
+        c, s = np.cos(state.yaw), np.sin(state.yaw)
+        corners.append(local @ np.array([[c, s], [-s, c]]) + state.position[:2])
+    for state in (one, other):
+        for angle in (state.yaw, state.yaw + np.pi / 2):
+            axis = np.array([np.cos(angle), np.sin(angle)])
+            a, b = (c @ axis for c in corners)
+            if min(a.max(), b.max()) - max(a.min(), b.min()) < tolerance_m:
+                return False
+    return True
