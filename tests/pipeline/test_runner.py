@@ -8,6 +8,7 @@ from conftest import MemorySequence, WithoutPictures, make_rig
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import apply
 from bevcli.model.bevformer import BEVFormer
+from bevcli.model.pillar_projection import project_pillars
 from bevcli.pipeline.camera_assignment import NUSCENES_YAWS_DEG
 from bevcli.pipeline.preprocess import Preprocessor
 from bevcli.pipeline.runner import Runner, StepOptions
@@ -115,3 +116,26 @@ def test_a_segmentation_head_fills_the_prediction(mini_config):
     predictions, _ = run(model, MemorySequence(2))
     assert [prediction.segmentation.cells.shape for prediction in predictions] == [(12, 10)] * 2
     assert list(predictions[0].stage_seconds)[-3:] == ["segmentation_head", "box_decoding", "map_merging"]
+
+
+def test_removing_a_camera_changes_only_the_cells_that_it_saw(mini_model):
+    """After the first spatial cross-attention; later layers spread the change."""
+    seen = {}
+
+    def keep(module, inputs, output):
+        seen["queries"] = output
+
+    runner = Runner(mini_model, CPU, StepOptions())
+    handle = runner.model.encoder.layers[0].spatial_cross_attention.register_forward_hook(keep)
+    preprocess = Preprocessor(mini_model.config)
+    whole = preprocess(MemorySequence(1).load(0))
+    runner.step(None, whole)
+    with_camera = seen["queries"]
+    runner.step(None, preprocess(WithoutPictures({0: ["CAM_FRONT_LEFT"]}, count=1).load(0)))
+    handle.remove()
+    changed = (seen["queries"] - with_camera).abs().amax(-1)[0] > 1e-6
+    projection = project_pillars(whole.image_from_bev, mini_model.pillars, (96, 160), whole.has_picture)
+    hits = projection.hit[0, mini_model.config.cameras.index("CAM_FRONT_LEFT")]
+    assert changed.any()
+    assert not (changed & ~hits).any()
+    assert (changed == hits).float().mean() > 0.99
