@@ -14,6 +14,7 @@ from bevcli.cli.progress import Progress
 from bevcli.cli.run_files import RunFiles, prepare_folder
 from bevcli.cli.run_summary import RunSummary
 from bevcli.frame import Frame, Prediction, Sequence
+from bevcli.model.inference import prepare_for_inference
 from bevcli.pipeline.model_loading import LoadedModel
 from bevcli.pipeline.preprocess import Preprocessor
 from bevcli.pipeline.runner import Runner, StepOptions
@@ -37,7 +38,7 @@ class Job:
 def run_job(job: Job, *, force: bool) -> None:
     """Runs every frame; what is written is whole after each of them, whatever comes next."""
     prepare_folder(job.out, force=force)
-    runner = Runner(job.loaded.model, job.device, job.step)
+    runner = Runner(prepare_for_inference(job.loaded.model, job.device, job.step.precision), job.device, job.step)
     summary = RunSummary(job)
     places = range(len(job.drive.stamps))
     with contextlib.ExitStack() as stack:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import dataclass, field, fields
 from typing import Literal
 
@@ -123,11 +122,11 @@ class BEVFormerOutputs:
 class BEVFormer(nn.Module):
     """The whole model; its parts in the order of the paper's figure 2.
 
-    autocast_dtype: what backbone, neck and encoder compute in; None leaves that to the caller.
+    prepared: whether this is `prepare_for_inference`'s, which says itself what is computed in which precision.
     """
 
     pillars: Tensor
-    autocast_dtype: torch.dtype | None = None
+    prepared: bool = False
 
     def __init__(self, config: BEVFormerConfig) -> None:
         super().__init__()
@@ -164,17 +163,16 @@ class BEVFormer(nn.Module):
 
     def bev_map(self, inputs: BEVFormerInputs, history: Tensor | None, probe: AttentionProbe | None = None) -> Tensor:
         """The first half of `forward`: the BEV map (B, Y·X, C), before any head reads it."""
-        with self._autocast(inputs.images.device):
-            maps = self.neck(self.backbone(inputs.images.flatten(0, 1)))
-            return self.encoder(
-                self.bev_queries(inputs.can_bus),
-                self.bev_queries.position(),
-                self.image_tokens(maps, inputs.camera_index),
-                find_hits(self.project_pillars(inputs)),
-                None if history is None else self.align_history(history, inputs.rotation_deg),
-                inputs.shift,
-                probe,
-            )
+        maps = self.neck(self.backbone(inputs.images.flatten(0, 1)))
+        return self.encoder(
+            self.bev_queries(inputs.can_bus),
+            self.bev_queries.position(),
+            self.image_tokens(maps, inputs.camera_index),
+            find_hits(self.project_pillars(inputs)),
+            None if history is None else self.align_history(history, inputs.rotation_deg),
+            inputs.shift,
+            probe,
+        )
 
     def project_pillars(self, inputs: BEVFormerInputs) -> PillarProjection:
         """Where the pillars appear in the cameras of these inputs, and where they are visible."""
@@ -185,8 +183,3 @@ class BEVFormer(nn.Module):
         """The history map (B, Y·X, C), turned by rotation_deg (B,)."""
         center = self.config.ego_motion.history_rotation_center
         return rotate_history(history, rotation_deg, self.config.bev_grid, center)
-
-    def _autocast(self, device: torch.device) -> contextlib.AbstractContextManager[object]:
-        if self.autocast_dtype is None:
-            return contextlib.nullcontext()
-        return torch.autocast(device.type, self.autocast_dtype)

@@ -44,7 +44,7 @@ def deformable_attention(
     values: (G, S, heads, D), G maps, each the cells of its L levels one after another, S in all.
     locations: (M, heads, L, P, 2) float32, x and y, 0 to 1 over a level's map; outside of it values are zero.
     weights: (M, heads, L, P). queries_per_map: G counts, of sum M: the first queries_per_map[0] queries sample
-    map 0, and so on. Returns (M, heads · D) in the dtype of values. All backends answer the same up to rounding.
+    map 0, and so on. Returns (M, heads · D) float32, whatever values is. All backends answer the same up to rounding.
     """
     return _IMPLEMENTATIONS[backend](values, level_shapes, locations, weights, queries_per_map)
 
@@ -87,7 +87,7 @@ def _grid_sample(values: Tensor, level_shapes: LevelShapes, locations: Tensor, w
         level_map = cells.permute(0, 2, 3, 1).flatten(0, 1).unflatten(-1, level_shapes[level])  # (G·heads, D, H, W)
         sampled = F.grid_sample(level_map, grid[level], align_corners=False)  # (G·heads, D, m, P)
         result = result + (sampled * level_weights[level, :, None]).sum(-1)
-    return result.unflatten(0, (maps, heads)).permute(0, 3, 1, 2).flatten(2).to(values.dtype)  # (G, m, heads · D)
+    return result.unflatten(0, (maps, heads)).permute(0, 3, 1, 2).flatten(2)  # (G, m, heads · D)
 
 
 def _sample_on_gpu(
@@ -130,6 +130,7 @@ class DeformableAttention(nn.Module):
 
     def project_values(self, tokens: Tensor) -> Tensor:
         """tokens: (G, S, C) -> values (G, S, heads, C / heads)."""
+        tokens = tokens.to(self.value_projection.weight.dtype)
         return self.value_projection(tokens).unflatten(-1, (self.shape[0], -1))
 
     def look(self, query: Tensor) -> tuple[Tensor, Tensor]:

@@ -27,7 +27,7 @@ def sample_compiled(
     out = torch.empty(len(locations), *values.shape[2:])
     arrays = (as_array(values), shapes, as_array(locations.float()), as_array(weights.float()), map_of_query)
     in_threads(partial(sample_maps, *arrays, out.numpy()), len(locations))
-    return out.flatten(1).to(values.dtype)
+    return out.flatten(1)
 
 
 def as_array(tensor: Tensor) -> np.ndarray:

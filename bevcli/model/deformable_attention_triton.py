@@ -25,7 +25,7 @@ def sample_triton(
     counts = torch.tensor(list(queries_per_map), device=values.device)
     map_of_query = torch.arange(len(counts), device=values.device).repeat_interleave(counts, output_size=queries)
     shapes = torch.tensor(level_shapes, dtype=torch.int32, device=values.device)
-    out = values.new_empty(queries, heads, depth)
+    out = values.new_empty(queries, heads, depth, dtype=torch.float32)
     grid = (triton.cdiv(queries, QUERIES_PER_PROGRAM), heads)
     if queries:
         _sample[grid](
@@ -96,4 +96,4 @@ def _sample(  # type: ignore[no-untyped-def]
                 total += share[:, None] * value.to(tl.float32)
         first_cell += height * width
     target = out + (query[:, None] * HEADS + head) * DEPTH + channel[None, :]
-    tl.store(target, total.to(out.dtype.element_ty), exists[:, None] & has_channel[None, :])
+    tl.store(target, total, exists[:, None] & has_channel[None, :])

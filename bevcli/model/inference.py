@@ -13,6 +13,7 @@ from bevcli.model.bevformer import BEVFormer
 from bevcli.model.deformable_attention import DeformableAttention, fastest_backend
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.resnet import Bottleneck, ResNet
+from bevcli.model.spatial_cross_attention import SpatialCrossAttention
 
 Precision = Literal["fp32", "bf16", "fp16"]
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
@@ -22,10 +23,12 @@ def prepare_for_inference(model: BEVFormer, device: torch.device, precision: Pre
     """A copy of the model on the device, for inference only; the model itself stays as it is.
 
     Batch norms are folded into their convolutions, pictures are convolved channels-last, and deformable operations
-    take the device's fastest backends. At half precision backbone, neck and encoder compute in it; the sums that
-    run through the encoder's layers, reference points, sampling locations, decoder and heads stay in float32.
+    take the device's fastest backends. At half precision the whole way of the pictures computes in it: backbone,
+    neck, image tokens and their values. What follows moves boxes by decimetres when it is rounded, and is a small
+    part of the work: BEV queries, sampling locations, decoder and heads stay in float32.
     """
     prepared = copy.deepcopy(model).to(device).eval().requires_grad_(False)
+    prepared.prepared = True
     _fold_batch_norms(prepared.backbone)
     for module in prepared.modules():
         if isinstance(module, DeformableAttention):
@@ -33,8 +36,8 @@ def prepare_for_inference(model: BEVFormer, device: torch.device, precision: Pre
         elif isinstance(module, ModulatedDeformableConvolution) and device.type == "cpu":
             module.backend = "compiled"
     _lower_precision(prepared, DTYPES[precision])
-    nn.Module.to(prepared.backbone, memory_format=torch.channels_last)
-    nn.Module.to(prepared.neck, memory_format=torch.channels_last)
+    for part in (prepared.backbone, prepared.neck):
+        part.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return prepared
 
 
@@ -74,12 +77,8 @@ def _fold(parent: nn.Module, convolution_name: str, norm_name: str) -> None:
 
 
 def _lower_precision(model: BEVFormer, dtype: torch.dtype) -> None:
-    if dtype == torch.float32:
-        return
-    model.autocast_dtype = dtype
-    # Weights are converted once; autocast then converts only what flows between them.
     for part in (model.backbone, model.neck, model.image_tokens):
         part.to(dtype)
     for module in model.encoder.modules():
-        if isinstance(module, nn.Linear):
-            module.to(dtype)
+        if isinstance(module, SpatialCrossAttention):
+            module.attention.value_projection.to(dtype)

@@ -11,7 +11,7 @@ from bevcli.checkpoints import load_weights
 from bevcli.config import load_config
 from bevcli.errors import BevcliError, WeightsError
 from bevcli.model.bevformer import BEVFormer
-from bevcli.pipeline.runner import Precision
+from bevcli.model.inference import Precision
 
 UNTRAINED_SEED = 0  # so that two untrained runs of one drive agree
 

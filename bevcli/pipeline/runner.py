@@ -6,7 +6,6 @@ import contextlib
 from collections.abc import Iterator
 from collections.abc import Sequence as Items
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -17,6 +16,7 @@ from bevcli.geometry.transforms import Pose
 from bevcli.model.attention_probe import AttentionProbe
 from bevcli.model.bevformer import BEVFormer, BEVFormerInputs, BEVFormerOutputs
 from bevcli.model.box_coding import decode
+from bevcli.model.inference import Precision
 from bevcli.model.panoptic_merging import decode_maps
 from bevcli.pipeline.attention import attention_view, probe_cells
 from bevcli.pipeline.cpu_memory import keep_freed_memory
@@ -25,7 +25,6 @@ from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
 from bevcli.pipeline.read_ahead import read_ahead
 from bevcli.pipeline.stage_clock import StageClock
 
-Precision = Literal["fp32", "bf16", "fp16"]
 _AUTOCAST = {"bf16": torch.bfloat16, "fp16": torch.float16}
 
 
@@ -125,7 +124,7 @@ class Runner:
         return bev_map
 
     def _autocast(self) -> contextlib.AbstractContextManager[object]:
-        if self.options.precision == "fp32":
+        if self.options.precision == "fp32" or self.model.prepared:
             return contextlib.nullcontext()
         return torch.autocast(self.device.type, _AUTOCAST[self.options.precision])
 

@@ -35,8 +35,8 @@ def test_backends_equal_map_by_map_sampling(backend, depth):
 def test_half_precision_values_are_summed_in_float32(dtype):
     inputs = case(16, dtype=dtype)
     found = deformable_attention(*inputs, "compiled")
-    assert found.dtype == dtype
-    torch.testing.assert_close(found, deformable_attention(*inputs), rtol=1e-2, atol=1e-3)
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found, deformable_attention(*inputs))
 
 
 @pytest.mark.parametrize("backend", ["padded", "compiled"])
