@@ -49,8 +49,8 @@ def write_calibration_recording(path: Path, rig: CameraRig, report: RigReport, p
         _log_scene(stream, rig, report.coverage)
         for camera in rig.cameras:
             _log_camera(stream, camera, rig.ego_from_bev, pictures.get(camera.name))
-        markdown = rr.TextDocument(findings_markdown(report), media_type="text/markdown")
-        stream.log(FINDINGS, markdown, static=True)
+        stream.set_time(entities.FRAME_TIMELINE, sequence=0)  # as a run's recording has: `bevcli viz` looks for it
+        stream.log(FINDINGS, rr.TextDocument(findings_markdown(report), media_type="text/markdown"))
 
 
 def findings_markdown(report: RigReport) -> str:

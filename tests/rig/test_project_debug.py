@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError
+from bevcli.viz.screenshot import take_screenshot
 
 FILES = {"cameras.png", "coverage.png", "recording.rrd", "findings.json"}
 
@@ -159,3 +160,11 @@ def test_the_real_sequences_give_no_error(shared, tmp_path):
         result = run(shared / "data" / name, "--out", tmp_path / name, "--json")
         assert result.exit_code == 0
         assert [f["code"] for f in json.loads(result.stdout)["findings"] if f["severity"] != "info"] == []
+
+
+@pytest.mark.slow
+def test_the_viewer_shows_all_views_of_the_recording(small_drive, tmp_path):
+    run(small_drive, "--out", tmp_path / "out")
+    views = take_screenshot(tmp_path / "out" / "recording.rrd", tmp_path / "shot.png")
+    assert set(views) == {"The rig", "Cameras per BEV cell", "Findings", "CAM_FRONT", "CAM_BACK"}
+    assert cv2.imread(str(tmp_path / "shot.png")).std() > 10
