@@ -19,7 +19,7 @@ FARTHEST_M = 6.0
 
 def check_bev_frame(ego_from_bev: Array) -> tuple[Finding, ...]:
     """Findings about ego_from_bev (4, 4): one error at most, or warnings."""
-    unit = unit_of(ego_from_bev[:3, 3])
+    unit = unit_of(float(np.linalg.norm(ego_from_bev[:3, 3])))
     if unit != 1:
         found, expected = f"{np.linalg.norm(ego_from_bev[:3, 3]):.0f} m from the ego origin", "about (0.94, 0, 1.84) m"
         message = f'"ego_from_bev" has its translation in {"millimetres" if unit == 1000 else "centimetres"}'

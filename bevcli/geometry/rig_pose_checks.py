@@ -63,7 +63,9 @@ MISTAKES = (
 
 def check_poses(cameras: Sequence[Camera]) -> tuple[Finding, ...]:
     """Findings about single cameras' poses, all of severity error; none where every pose is plausible."""
-    units = {camera.name: unit_of(camera.ego_from_camera[:3, 3]) for camera in cameras}
+    lengths = {camera.name: float(np.linalg.norm(camera.ego_from_camera[:3, 3])) for camera in cameras}
+    unit = unit_of(max(lengths.values(), default=0.0))  # one rig is measured in one unit, if not all of it is wrong
+    units = {name: unit if length > OTHER_UNIT_M else 1.0 for name, length in lengths.items()}
     findings = [_unit_finding(camera, units[camera.name]) for camera in cameras if units[camera.name] != 1]
     metric = [in_metres(camera, units[camera.name]) for camera in cameras]
     affected = [camera for camera in metric if defects_of(camera)]
@@ -77,9 +79,8 @@ def check_poses(cameras: Sequence[Camera]) -> tuple[Finding, ...]:
     return tuple(findings)
 
 
-def unit_of(translation: Array) -> float:
-    """How many of the translation's (3,) units make a metre: 1, 100 or 1000, by its length."""
-    length = float(np.linalg.norm(translation))
+def unit_of(length: float) -> float:
+    """How many of the units of a translation of this length make a metre: 1, 100 or 1000."""
     if length <= OTHER_UNIT_M:
         return 1.0
     return 100.0 if length < LONGEST_CM else 1000.0
@@ -132,11 +133,12 @@ def _explains(mistake: Mistake, camera: Camera) -> bool:
 def _is_turned_about_one_axis(camera: Camera) -> bool:
     """Whether the pose is that of a camera merely tilted or rolled in its place: a single camera's plain mistake."""
     codes = [defect.code for defect in defects_of(camera)]
-    if codes not in (["looks-at-ground"], ["looks-at-sky"]):
-        return codes == ["camera-rolled"]
     right, said = camera.ego_from_camera[:3, 0], direction_of_name(camera.name)
-    yaw_deg = float(np.degrees(np.arctan2(right[0], -right[1])))  # tilting leaves it, even straight up and down
-    level = abs(right[2]) <= np.sin(np.radians(LEVEL_DEG[1]))
+    if codes == ["camera-rolled"]:
+        yaw_deg, level = mounting_of(camera.ego_from_camera).yaw_deg, True
+    else:
+        yaw_deg = float(np.degrees(np.arctan2(right[0], -right[1])))  # tilting leaves it, even straight up and down
+        level = abs(right[2]) <= np.sin(np.radians(LEVEL_DEG[1])) and codes in (["looks-at-ground"], ["looks-at-sky"])
     return bool(level and (said is None or turn_deg(said, yaw_deg) <= ONE_AXIS_TURN_DEG))
 
 
