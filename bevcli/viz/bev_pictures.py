@@ -93,8 +93,8 @@ class BevPictures(Generic[Stamp]):
 
 def _values(features: Features, mean: Features, basis: Features | None) -> Features:
     if basis is None:
-        return np.linalg.norm(features, axis=-1, keepdims=True)
-    return (features - mean) @ basis
+        return np.asarray(np.linalg.norm(features, axis=-1, keepdims=True), dtype=np.float32)
+    return np.asarray((features - mean) @ basis, dtype=np.float32)
 
 
 def _thinned(features: Features) -> Features:

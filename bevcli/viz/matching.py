@@ -5,9 +5,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 
 MATCH_DISTANCE_M = 2.0  # of the centres on the ground, as in nuScenes' detection score
+
+
+def counted(truth: Boxes3D, grid: BevGrid) -> Boxes3D:
+    """The ground-truth boxes, in the bev frame, that a model could find: in its grid, and seen by some sensor."""
+    inside = (grid.cell_of(truth.centers[:, :2]) >= 0).all(-1)
+    seen = np.ones(len(truth), dtype=bool) if truth.num_points is None else truth.num_points != 0
+    return truth[inside & seen]
 
 
 def match(predicted: Boxes3D, truth: Boxes3D) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

@@ -19,7 +19,7 @@ from bevcli.viz.about import about_text
 from bevcli.viz.bev_pictures import BevPictures
 from bevcli.viz.blueprint import recording_blueprint
 from bevcli.viz.live import LiveView
-from bevcli.viz.matching import match
+from bevcli.viz.matching import counted, match
 from bevcli.viz.options import RecordingOptions
 from bevcli.viz.palette import EGO_COLOR, class_color
 from bevcli.viz.pillars import drawn_pillars
@@ -159,9 +159,10 @@ class Recording:
         in_world = shown.transformed(world_from_bev)
         true = np.ones(len(shown), dtype=bool)
         if frame.ground_truth is not None:
-            truth = frame.ground_truth.transformed(self._in_recording(np.eye(4)))
-            true, found = match(in_world, truth)
-            self._log_ground_truth(truth, found, inverse(world_from_bev), shots)
+            in_recording = frame.ground_truth.transformed(self._in_recording(np.eye(4)))
+            truth = counted(in_recording.transformed(inverse(world_from_bev)), prediction.grid)
+            true, found = match(shown, truth)
+            self._log_ground_truth(truth, found, world_from_bev, shots)
         stream, names = self._stream, self.class_names
         ego_xy = self._in_recording(prediction.world_from_ego.matrix)[:2, 3]
         log_boxes.log_boxes_3d(stream, in_world, ~true, names, ego_xy)
@@ -172,12 +173,13 @@ class Recording:
         stream.log(entities.BOX_CURVES, rr.Scalars(counts))
 
     def _log_ground_truth(
-        self, truth: Boxes3D, found: np.ndarray, bev_from_world: Array, shots: tuple[log_cameras.CameraShot, ...]
+        self, truth: Boxes3D, found: np.ndarray, world_from_bev: Array, shots: tuple[log_cameras.CameraShot, ...]
     ) -> None:
-        log_boxes.log_ground_truth_3d(self._stream, truth, found)
-        log_boxes.log_ground_truth_bev(self._stream, truth.transformed(bev_from_world), found)
+        in_world = truth.transformed(world_from_bev)
+        log_boxes.log_ground_truth_3d(self._stream, in_world, found)
+        log_boxes.log_ground_truth_bev(self._stream, truth, found)
         for shot in shots:
-            log_cameras.log_ground_truth_in_picture(self._stream, shot, truth, found)
+            log_cameras.log_ground_truth_in_picture(self._stream, shot, in_world, found)
 
     def _log_curves(self, prediction: Prediction) -> None:
         stages = prediction.stage_seconds

@@ -54,6 +54,8 @@ def _is_whole(path: Path) -> bool:
         raise InputError(f"{path}: the recording is missing (`bevcli run` writes one)") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    if not start:
+        raise InputError(f"{path}: this is no recording: the file is empty")
     if start != MAGIC:
         raise InputError(f"{path}: this is no recording (expected a file that starts with RRF2, found {start!r})")
     return end.startswith(FOOTER)

@@ -61,15 +61,17 @@ class RecordingReader:
     _reader: RrdReader = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        try:
-            object.__setattr__(self, "_reader", RrdReader(self.path))
-        except RuntimeError as error:
-            raise InputError(f"{self.path}: this is no readable recording ({error})") from error
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a file without its end is read part by part, and that is what we do
+            try:
+                object.__setattr__(self, "_reader", RrdReader(self.path))
+            except RuntimeError as error:
+                raise InputError(f"{self.path}: this is no readable recording ({error})") from error
 
     def chunks(self) -> Iterator[Chunk]:
         """All parts of the recording, in the file's order."""
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a file without its end is read part by part, and that is what we do
+            warnings.simplefilter("ignore")
             try:
                 yield from self._reader.stream()
             except (RuntimeError, ValueError) as error:
