@@ -75,7 +75,7 @@ def read_boxes(path: Path) -> BoxesFile:
     return BoxesFile(
         frame_of_reference,
         frames,
-        None if ego_from_bev is None else pose_from_json(ego_from_bev, f"{path}: ego_from_bev"),
+        None if ego_from_bev is None else pose_from_json(ego_from_bev, "ego_from_bev", str(path)),
         _others(content, _FILE_KEYS),
     )
 
@@ -175,7 +175,7 @@ def _frame(path: Path, place: int, row: Any, frame_of_reference: str) -> FrameBo
         raise InputError(f'{where}: "world_from_ego" is missing (expected, because frame_of_reference is world)')
     return FrameBoxes(
         FrameStamp(index, scene, timestamp_ns),
-        None if stated is None else pose_from_json(stated, f"{where}: world_from_ego"),
+        None if stated is None else pose_from_json(stated, "world_from_ego", where),
         boxes_from_json(row["boxes"], where),
         _others(row, _FRAME_KEYS),
     )

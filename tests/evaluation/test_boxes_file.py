@@ -138,7 +138,7 @@ MISTAKES = {
     "no pose": (in_frame("world_from_ego", None), 'frame 5: "world_from_ego" is missing'),
     "norm": (
         in_frame("world_from_ego", {"translation": [0, 0, 0], "rotation_wxyz": [1, 1, 0, 0]}),
-        "frame 5: world_from_ego: rotation_wxyz has norm 1.41421",
+        r'frame 5: "world_from_ego.rotation_wxyz" is no rotation, its norm is not 1 \(expected .*, found 1.41421\)',
     ),
     "boxes no list": (in_frame("boxes", {}), 'frame 5: "boxes" must be a list'),
     "twice": (repeat_the_frame, 'frame 5: scene "" has 1 ns twice'),
