@@ -102,4 +102,15 @@ def _draw_camera(axes: Axes, camera: Camera, rig: CameraRig) -> None:
         axes.plot([place[0], end[0]], [place[1], end[1]], color=INK, linewidth=0.7, alpha=0.6, zorder=3)
     label = place + 27 * np.array([np.cos(np.radians(yaw)), np.sin(np.radians(yaw))])
     box = {"facecolor": PAPER, "edgecolor": "none", "alpha": 0.75, "boxstyle": "round,pad=0.25"}
-    axes.text(*label, camera.name, color=INK, fontsize=8, ha="center", va="center", bbox=box, zorder=5, clip_on=True)
+    axes.text(
+        float(label[0]),
+        float(label[1]),
+        camera.name,
+        color=INK,
+        fontsize=8,
+        ha="center",
+        va="center",
+        bbox=box,
+        zorder=5,
+        clip_on=True,
+    )
