@@ -121,4 +121,4 @@ def prepare_folder(out: Path, *, resume: bool) -> None:
 
 def describe(scores: Validation) -> str:
     """The scores on one line."""
-    return ", ".join(f"{name} {value:.3f}" for name, value in scores.row().items())
+    return ", ".join(f"{name} {value:.3f}" for name, value in scores.summary().items())

@@ -27,7 +27,7 @@ class Curve:
 
     def add(self, step: int, numbers: Row) -> None:
         """One more row, in the file at once."""
-        row = {"step": float(step), **numbers}
+        row = {"step": step, **numbers}
         _write(self.path, [row], "a", header=not self.rows)
         self.rows.append(row)
 
@@ -41,7 +41,7 @@ def draw(loss: Curve, validation: Curve, path: Path) -> None:
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
     _draw_rows(left, _smoothed(loss.rows), skipped=("step", "learning rate", "gradient norm"))
-    _draw_rows(right, validation.rows, skipped=("step", "mATE", "mAVE"), marker="o")
+    _draw_rows(right, [_scores(row) for row in validation.rows], skipped=("step",), marker="o")
     left.set(title="Training loss", xlabel="step", yscale="log")
     right.set(title="Validation", xlabel="step", ylim=(0, 1))
     figure.savefig(path, dpi=110)
@@ -54,6 +54,11 @@ def _draw_rows(axes, rows: list[Row], skipped: tuple[str, ...], marker: str = ""
     if rows:
         axes.legend(fontsize=8)
     axes.grid(alpha=0.3)
+
+
+def _scores(row: Row) -> Row:
+    """What lies between 0 and 1: no error, and not every class."""
+    return {name: row[name] for name in row if name in ("step", "mAP", "NDS") or name.startswith("IoU")}
 
 
 def _smoothed(rows: list[Row], points: int = 200) -> list[Row]:
@@ -76,4 +81,4 @@ def _write(path: Path, rows: list[Row], mode: str, *, header: bool = True) -> No
             writer = csv.DictWriter(file, list(rows[0]))
             if header:
                 writer.writeheader()
-            writer.writerows(rows)
+            writer.writerows({name: f"{value:.6g}" for name, value in row.items()} for row in rows)

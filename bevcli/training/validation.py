@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from bevcli.evaluation.config import DetectionConfig
@@ -18,23 +19,27 @@ from bevcli.training.drives import Drives
 
 @dataclass(frozen=True)
 class Validation:
-    """Scores of the classes that have ground truth; errors and IoU are NaN where nothing measures them."""
+    """Scores of the classes that have ground truth; NaN where nothing measures them.
+
+    aps: by class, averaged over the matching distances. iou: by class of the map.
+    """
 
     mean_ap: float
     nd_score: float
     translation_error_m: float
     velocity_error: float
+    aps: dict[str, float]
     iou: dict[str, float]
+
+    def summary(self) -> dict[str, float]:
+        """The numbers that are looked at first, by their names."""
+        first = {"mAP": self.mean_ap, "NDS": self.nd_score, "mAVE": self.velocity_error}
+        return first | {f"IoU {name}": value for name, value in self.iou.items()}
 
     def row(self) -> dict[str, float]:
         """The numbers by the names of the curve's columns."""
-        numbers = {
-            "mAP": self.mean_ap,
-            "NDS": self.nd_score,
-            "mATE": self.translation_error_m,
-            "mAVE": self.velocity_error,
-        }
-        return numbers | {f"IoU {name}": value for name, value in self.iou.items()}
+        aps = {f"AP {name}": value for name, value in self.aps.items()}
+        return {**self.summary(), "mATE": self.translation_error_m, **aps}
 
 
 def validate(runner: Runner, drives: Drives) -> Validation:
@@ -55,7 +60,10 @@ def validate(runner: Runner, drives: Drives) -> Validation:
         nd_score=table.nd_score,
         translation_error_m=table.errors["trans_err"],
         velocity_error=table.errors["vel_err"],
-        iou=dict(evaluate_segmentation(maps).iou) if maps else dict.fromkeys(MAP_CLASSES, float("nan")),
+        aps={
+            name: table.classes[name].mean_ap if name in table.classes else math.nan for name in runner.config.classes
+        },
+        iou=dict(evaluate_segmentation(maps).iou) if maps else dict.fromkeys(MAP_CLASSES, math.nan),
     )
 
 
