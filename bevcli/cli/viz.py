@@ -85,16 +85,23 @@ def _export(recording: Path, path: Path) -> None:
 
 
 def _open(recording: Path, *, web: bool, host: str, port: int) -> None:
-    from bevcli.viz.viewer import display_is_there, start_viewer, stop
+    from bevcli.viz.viewer import display_is_there
     from bevcli.viz.web_viewer import WebViewer, web_viewer_assets
 
     if display_is_there() and not web:
-        process = start_viewer("--bind", "127.0.0.1", "--port", "auto", str(recording))
-        try:
-            process.wait()
-        finally:
-            stop(process)
-        return
+        if _window_closed_well(recording):
+            return
+        typer.echo("note: the viewer's window did not open; here it is for the browser")
     viewer = WebViewer(web_viewer_assets(), recording, host, port)
     typer.echo(f"{viewer.address}  open this in a browser; Ctrl-C ends it")
     viewer.serve()
+
+
+def _window_closed_well(recording: Path) -> bool:
+    from bevcli.viz.viewer import LOOPBACK, start_viewer, stop
+
+    process = start_viewer("--bind", LOOPBACK, "--port", "auto", str(recording))
+    try:
+        return process.wait() == 0
+    finally:
+        stop(process)

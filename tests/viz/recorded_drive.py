@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from conftest import MemorySequence
+from memory_drive import MemorySequence
 
 from bevcli.frame import AttentionView, CameraSamples, Frame, Prediction, Probe
 from bevcli.geometry.bev_grid import BevGrid

@@ -1,7 +1,7 @@
 """Views stand as the cameras stand; labels do not cover each other."""
 
 import numpy as np
-from conftest import make_rig
+from memory_drive import make_rig
 
 from bevcli.viz.box_lines import PictureLines
 from bevcli.viz.camera_layout import camera_rows, rows_by_yaw

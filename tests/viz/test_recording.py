@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import MemorySequence, WithoutPictures
+from memory_drive import MemorySequence, WithoutPictures
 from recorded_drive import bev_from_world, boxes_ahead, predict, record, with_truth
 
 from bevcli.errors import OutputError
@@ -193,7 +193,7 @@ def test_every_frame_survives_a_crash(tmp_path):
     script = f"""
 import os, sys
 sys.path[:0] = {[str(Path(__file__).parent), str(Path(__file__).parents[1])]!r}
-from conftest import MemorySequence
+from memory_drive import MemorySequence
 from recorded_drive import predict
 from bevcli.viz.recording import Recording
 drive = MemorySequence(4)

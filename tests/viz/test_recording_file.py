@@ -1,7 +1,7 @@
 """Recordings that were cut off are mended; files that are none get one line."""
 
 import pytest
-from conftest import MemorySequence
+from memory_drive import MemorySequence
 from recorded_drive import record
 
 from bevcli.errors import InputError

@@ -6,7 +6,7 @@ import json
 import cv2
 import numpy as np
 import pytest
-from conftest import MemorySequence
+from memory_drive import MemorySequence
 from recorded_drive import bev_from_world, boxes_ahead, record
 from typer.testing import CliRunner
 
