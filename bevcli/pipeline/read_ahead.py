@@ -12,13 +12,13 @@ S = TypeVar("S")
 T = TypeVar("T")
 
 
-def read_ahead(work: Callable[[S], T], items: Iterable[S], depth: int = 2) -> Iterator[T]:
-    """Yields work(item) for every item, in order, worked out in one background thread up to `depth` items ahead.
+def read_ahead(work: Callable[[S], T], items: Iterable[S], depth: int = 2, threads: int = 1) -> Iterator[T]:
+    """Yields work(item) for every item, in order, worked out in background threads up to `depth` items ahead.
 
     An exception in `work` is raised at its item. Stopping early leaves nothing running but the item at work.
     """
     source = iter(items)
-    pool = ThreadPoolExecutor(1, thread_name_prefix="read-ahead")
+    pool = ThreadPoolExecutor(threads, thread_name_prefix="read-ahead")
     pending: deque[Future[T]] = deque(pool.submit(work, item) for item in islice(source, depth))
     try:
         while pending:

@@ -6,8 +6,12 @@ import csv
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bevcli.errors import OutputError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 Row = Mapping[str, float]
 
@@ -47,7 +51,7 @@ def draw(loss: Curve, validation: Curve, path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def _draw_rows(axes, rows: list[Row], skipped: tuple[str, ...], marker: str = "") -> None:  # type: ignore[no-untyped-def]
+def _draw_rows(axes: Axes, rows: list[Row], skipped: tuple[str, ...], marker: str = "") -> None:
     for name in rows[0] if rows else ():
         if name not in skipped:
             axes.plot([row["step"] for row in rows], [row[name] for row in rows], label=name, marker=marker)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import threading
 from collections.abc import Sequence as Items
 from pathlib import Path
 from typing import Protocol
@@ -24,7 +25,7 @@ FRAMES_A_DRIVE = 20
 
 
 class Drives(Protocol):
-    """Some drives, of which one is opened at a time."""
+    """Some drives; threads may open them side by side."""
 
     def __len__(self) -> int: ...
 
@@ -34,22 +35,23 @@ class Drives(Protocol):
 
 
 class FolderDrives:
-    """Sequence folders (or nuScenes roots), opened when they are first asked for and kept open."""
+    """Sequence folders (or nuScenes roots), opened when they are first asked for and kept open by each thread."""
 
     def __init__(self, folders: Items[Path], rate_hz: float) -> None:
         self._folders = tuple(folders)
         self._rate_hz = rate_hz
-        self._opened: dict[int, Sequence] = {}
+        self._of_thread = threading.local()  # a sequence is read by one thread
 
     def __len__(self) -> int:
         return len(self._folders)
 
     def open(self, place: int) -> Sequence:
         """The drive at a place, thinned to the model's rate."""
-        if place not in self._opened:
+        opened: dict[int, Sequence] = vars(self._of_thread).setdefault("opened", {})
+        if place not in opened:
             sequence = open_sequence(self._folders[place])
-            self._opened[place] = select(sequence, thin(sequence.stamps, self._rate_hz).places)
-        return self._opened[place]
+            opened[place] = select(sequence, thin(sequence.stamps, self._rate_hz).places)
+        return opened[place]
 
 
 class RenderedDrives:
@@ -64,6 +66,7 @@ class RenderedDrives:
         self._folders = [cache / f"{seed:06d}" for seed in seeds]
         self._seeds = tuple(seeds)
         self._config = config
+        self._rendering = threading.Lock()
         self._stock: Stock | None = None
         self._drives = FolderDrives(self._folders, config.rate_hz)
 
@@ -73,8 +76,9 @@ class RenderedDrives:
     def open(self, place: int) -> Sequence:
         """The drive at a place; rendered (some seconds) when it is not in the cache."""
         folder = self._folders[place]
-        if not folder.exists():
-            self._render(self._seeds[place], folder)
+        with self._rendering:
+            if not folder.exists():
+                self._render(self._seeds[place], folder)
         return self._drives.open(place)
 
     def _render(self, seed: int, folder: Path) -> None:

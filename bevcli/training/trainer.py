@@ -35,6 +35,7 @@ class TrainingConfig:
 
     steps: of the optimizer. held_out: how many of the drives, the last ones, are for evaluation only.
     evaluate_every, checkpoint_every: steps. freeze_batch_norm: for fine-tuning, keep the running statistics.
+    loaders: threads that read batches ahead; more than one where a GPU waits for them.
     weights_dtype: of weights.safetensors.
     """
 
@@ -43,6 +44,7 @@ class TrainingConfig:
     evaluate_every: int = 1000
     checkpoint_every: int = 250
     freeze_batch_norm: bool = False
+    loaders: int = 1
     weights_dtype: Literal["float32", "float16"] = "float32"
     clips: ClipConfig = field(default_factory=ClipConfig)
     augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
@@ -51,8 +53,10 @@ class TrainingConfig:
     segmentation_loss: SegmentationLossConfig = field(default_factory=SegmentationLossConfig)
 
     def __post_init__(self) -> None:
-        if min(self.steps, self.evaluate_every, self.checkpoint_every) < 1 or self.held_out < 0:
-            raise ValueError("steps, evaluate_every and checkpoint_every must be positive, held_out not negative")
+        if min(self.steps, self.evaluate_every, self.checkpoint_every, self.loaders) < 1 or self.held_out < 0:
+            raise ValueError(
+                "steps, evaluate_every, checkpoint_every and loaders must be positive, held_out not negative"
+            )
 
 
 @dataclass(frozen=True)
@@ -93,7 +97,8 @@ class Trainer:
     ) -> None:
         """All steps that are left. Raises BevcliError where the loss is no number any more."""
         config = self.job.config
-        for batch in read_ahead(self._load, range(self.done, config.steps)):
+        left = range(self.done, config.steps)
+        for batch in read_ahead(self._load, left, depth=2 * config.loaders, threads=config.loaders):
             self.loss_curve.add(self.done + 1, self._step(batch))
             self.done += 1
             last = self.done == config.steps

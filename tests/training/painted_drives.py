@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from conftest import make_rig
+from memory_drive import make_rig
 
 from bevcli.frame import BevMap, Frame, FrameStamp, Picture
 from bevcli.geometry.bev_grid import BevGrid

@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 import pytest
 import torch
-from conftest import MemorySequence
+from memory_drive import MemorySequence
 
 from bevcli.errors import InputError
 from bevcli.training.augmentation import distort, distort_pictures, mask_pictures

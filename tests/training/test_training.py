@@ -74,9 +74,18 @@ def test_a_seed_reproduces_and_another_one_differs(tmp_path: Path) -> None:
     assert_same_weights(runs[0], runs[2], same=False)
 
 
+def test_the_number_of_loaders_changes_nothing(tmp_path: Path) -> None:
+    one, three = (
+        trainer(tmp_path / str(loaders), settings=replace(SHORT, steps=2, loaders=loaders)) for loaders in (1, 3)
+    )
+    one.run()
+    three.run()
+    assert_same_weights(one, three)
+
+
 def test_every_parameter_receives_a_gradient(tmp_path: Path) -> None:
-    one = trainer(tmp_path)
-    torch.stack(list(one._losses(one._load(0)).values())).sum().backward()
+    one = trainer(tmp_path, settings=replace(SHORT, steps=1))
+    one.run()
     without = [name for name, parameter in one.job.model.named_parameters() if parameter.grad is None]
     assert without == []
 
