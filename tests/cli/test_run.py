@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import MemorySequence, WithoutPictures
+from memory_drive import MemorySequence, WithoutPictures
 
 from bevcli.cli.run_job import Job, run_job
 from bevcli.errors import OutputError

@@ -1,5 +1,5 @@
 import pytest
-from conftest import MemorySequence
+from memory_drive import MemorySequence
 
 from bevcli.cli import run_input
 from bevcli.cli.run_input import FrameChoice, choose_frames, ego_motion_use, frame_range

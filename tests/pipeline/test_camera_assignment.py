@@ -1,5 +1,5 @@
 import pytest
-from conftest import make_rig
+from memory_drive import make_rig
 
 from bevcli.errors import InputError
 from bevcli.pipeline.camera_assignment import NUSCENES_YAWS_DEG, assign_cameras

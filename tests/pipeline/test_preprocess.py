@@ -3,7 +3,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from conftest import MemorySequence, WithoutPictures, make_camera, make_rig
+from memory_drive import MemorySequence, WithoutPictures, make_camera, make_rig
 
 from bevcli.geometry.cameras import CameraRig, Distortion
 from bevcli.geometry.transforms import Pose, apply, inverse

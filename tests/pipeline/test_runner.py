@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from conftest import MemorySequence, WithoutPictures, make_rig
+from memory_drive import MemorySequence, WithoutPictures, make_rig
 
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import apply

@@ -6,19 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import cv2
-import numpy as np
 import pytest
+from small_drive import CAMERAS, SIZE, picture_of
 
-CAMERAS = ("CAM_FRONT", "CAM_BACK")
-SIZE = (64, 36)
 FRONT_WXYZ, BACK_WXYZ = [0.5, -0.5, 0.5, -0.5], [0.5, -0.5, -0.5, 0.5]
-
-
-def picture_of(camera: str, number: int) -> np.ndarray:
-    """A picture that tells camera and number apart from all others, with smooth and sharp parts."""
-    u, v = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
-    seed = CAMERAS.index(camera) * 40 + number * 7
-    return np.stack([u * 3 + seed, v * 5 + seed, (u // 4 + v // 4 + number) % 2 * 200], axis=-1).astype(np.uint8)
 
 
 def _calibration() -> dict:

@@ -6,7 +6,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from conftest import CAMERAS, picture_of
+from small_drive import CAMERAS, picture_of
 from typer.testing import CliRunner
 
 from bevcli.cli.main import app

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from conftest import CAMERAS, SIZE, picture_of
+from small_drive import CAMERAS, SIZE, picture_of
 
 from bevcli.errors import InputError
 from bevcli.sequences.open import InputOptions, open_sequence

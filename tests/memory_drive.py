@@ -1,0 +1,75 @@
+"""A drive in memory: noise pictures, a gentle curve, any rig. For tests of everything that comes after the readers."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from bevcli.frame import Frame, FrameStamp, Picture
+from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
+from bevcli.geometry.ego_motion import GRAVITY, Kinematics
+from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
+from bevcli.pipeline.camera_assignment import NUSCENES_YAWS_DEG
+
+
+def make_camera(name: str, yaw_deg: float, width: int = 320, height: int = 180) -> Camera:
+    """A level camera at the vehicle's roof that looks to `yaw_deg`."""
+    intrinsics = np.array([[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]])
+    looking_forward = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    rotation = rotation_about_z(np.radians(yaw_deg)) @ looking_forward
+    return Camera(name, width, height, intrinsics, rigid((0.9, 0, 1.6), rotation))
+
+
+def make_rig(yaws_deg: dict[str, float] | None = None) -> CameraRig:
+    """Cameras by name and direction; nuScenes' six by default."""
+    yaws_deg = NUSCENES_YAWS_DEG if yaws_deg is None else yaws_deg
+    return CameraRig(tuple(make_camera(name, yaw) for name, yaw in yaws_deg.items()), default_ego_from_bev())
+
+
+class MemorySequence:
+    """A drive of noise pictures on a gentle curve, in memory, as a `Sequence`."""
+
+    name = "memory"
+    notes = ()
+    has_ego_motion = True
+
+    def __init__(self, count: int = 4, rig: CameraRig | None = None, scenes: str = "aaaaaaaaaa", step_s: float = 0.5):
+        self.rig = make_rig() if rig is None else rig
+        self.stamps = tuple(FrameStamp(i, scenes[i], 10**18 + int(i * step_s * 1e9)) for i in range(count))
+
+    def load(self, place: int) -> Frame:
+        stamp = self.stamps[place]
+        pose = self.pose(place)
+        random = np.random.default_rng(place)
+        pictures = {
+            camera.name: Picture(
+                stamp.timestamp_ns, random.integers(0, 256, (camera.height, camera.width, 3), dtype=np.uint8)
+            )
+            for camera in self.rig.cameras
+        }
+        return Frame(
+            stamp=stamp,
+            rig=self.rig,
+            pictures=pictures,
+            world_from_ego=pose,
+            world_from_ego_at=dict.fromkeys(self.rig.names, pose),
+            kinematics=Kinematics(np.array([0.1, 0.0, GRAVITY]), np.array([0, 0, 0.1]), np.array([6.0, 0, 0])),
+        )
+
+    def pose(self, place: int) -> Pose:
+        yaw = 0.05 * place
+        return Pose(np.array([3.0 * place, 0.1 * place, 0.0]), np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]))
+
+
+class WithoutPictures(MemorySequence):
+    """The same drive, with some pictures missing: place -> cameras, or "all"."""
+
+    def __init__(self, missing, **options):
+        super().__init__(**options)
+        self.missing = missing
+
+    def load(self, place: int) -> Frame:
+        frame = super().load(place)
+        gone = self.missing.get(place, ())
+        names = frame.rig.names if gone == "all" else gone
+        kept = {name: picture for name, picture in frame.pictures.items() if name not in names}
+        return replace(frame, pictures=kept, dropped=dict.fromkeys(names, "missing"))
