@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import rerun as rr
 
 from bevcli.geometry.boxes import Boxes3D
@@ -36,7 +37,7 @@ def log_boxes_3d(
         score=np.ones(len(boxes)) if boxes.scores is None else boxes.scores,
         velocity_x=boxes.velocities[:, 0],
         velocity_y=boxes.velocities[:, 1],
-        name=[str(name) for name in boxes.classes],
+        name=_names(boxes),
     )
     stream.log(entities.BOXES, archetype, facts)
     moving = np.linalg.norm(boxes.velocities, axis=-1) > MOVING_M_S
@@ -56,10 +57,10 @@ def log_boxes_3d(
 def log_ground_truth_3d(stream: rr.RecordingStream, truth: Boxes3D, found: np.ndarray) -> None:
     """Writes ground-truth boxes of the recording's world: pale where found (M,), red where missed."""
     pale = rr.Boxes3D(**_shape(truth[found]), colors=[*GROUND_TRUTH_COLOR, 150], radii=THIN)
-    stream.log(entities.GROUND_TRUTH, pale, rr.AnyValues(name=[str(name) for name in truth[found].classes]))
+    stream.log(entities.GROUND_TRUTH, pale, rr.AnyValues(name=_names(truth[found])))
     missed = truth[~found]
     red = rr.Boxes3D(**_shape(missed), colors=MISSED_COLOR, radii=THIN)
-    stream.log(entities.MISSED, red, rr.AnyValues(name=[str(name) for name in missed.classes]))
+    stream.log(entities.MISSED, red, rr.AnyValues(name=_names(missed)))
 
 
 def log_boxes_bev(stream: rr.RecordingStream, boxes: Boxes3D, false: np.ndarray, class_names: Sequence[str]) -> None:
@@ -111,6 +112,10 @@ def _shape(boxes: Boxes3D) -> dict[str, Any]:
         "quaternions": quaternions,
         "fill_mode": "majorwireframe",
     }
+
+
+def _names(boxes: Boxes3D) -> pa.Array:
+    return pa.array([str(name) for name in boxes.classes], pa.utf8())  # typed, so that no boxes are a value, too
 
 
 def _crosses(boxes: Boxes3D) -> Array:

@@ -161,7 +161,10 @@ class Recording:
         if frame.ground_truth is not None:
             in_recording = frame.ground_truth.transformed(self._in_recording(np.eye(4)))
             truth = counted(in_recording.transformed(inverse(world_from_bev)), prediction.grid)
-            true, found = match(shown, truth)
+            if self.untrained:  # nothing can be found or missed: a scene all in red would say nothing
+                found = np.ones(len(truth), dtype=bool)
+            else:
+                true, found = match(shown, truth)
             self._log_ground_truth(truth, found, world_from_bev, shots)
         stream, names = self._stream, self.class_names
         ego_xy = self._in_recording(prediction.world_from_ego.matrix)[:2, 3]
@@ -194,15 +197,24 @@ class Recording:
         self._stream.log(entities.BOX_CURVES, lines, static=True)
 
     def _log_frame_events(self, frame: Frame, prediction: Prediction) -> None:
-        scene = f' of scene "{frame.stamp.scene}"' if frame.stamp.scene else ""
+        if self._last is None and self.untrained:
+            self.event("The weights are UNTRAINED: boxes and maps mean nothing.", "WARN")
         while self._early_events:
             self.event(*self._early_events.pop(0))
         if prediction.started_anew:
-            self.event(f"frame {frame.stamp.index}{scene}: the model starts without history")
+            self.event(f"frame {frame.stamp.index}: {self._why_anew(frame.stamp)}; the model starts without history")
         for camera, reason in frame.dropped.items():
             self.event(f"frame {frame.stamp.index}: camera {camera} is missing: {reason}", "WARN")
         if prediction.skipped:
             self.event(f"frame {frame.stamp.index}: no picture at all, the model was not asked", "WARN")
+
+    def _why_anew(self, stamp: FrameStamp) -> str:
+        before = None if self._last is None else self._last.stamp
+        if before is None:
+            return f'scene "{stamp.scene}" begins' if stamp.scene else "the drive begins"
+        if before.scene != stamp.scene:
+            return f'scene change from "{before.scene}" to "{stamp.scene}"'
+        return f"{(stamp.timestamp_ns - before.timestamp_ns) / 1e9:.1f} s since the last frame"
 
     def _log_insides(
         self,

@@ -13,7 +13,7 @@ from recorded_drive import bev_from_world, boxes_ahead, predict, record, with_tr
 
 from bevcli.errors import OutputError
 from bevcli.frame import Picture
-from bevcli.geometry.boxes import CLASSES
+from bevcli.geometry.boxes import CLASSES, Boxes3D
 from bevcli.geometry.transforms import Pose
 from bevcli.viz import entities
 from bevcli.viz.options import RecordingOptions
@@ -150,6 +150,26 @@ def test_an_untrained_run_says_so(tmp_path):
     (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
     assert frame.values(entities.RUN, "untrained") == [True]
     assert "untrained" in frame.values(entities.RUN, "TextDocument:text")[0]
+    assert frame.values(entities.MISSED, "name") == []  # it promised nothing: nothing is missed
+    assert any("UNTRAINED" in text for text in events(tmp_path / "r.rrd"))
+
+
+def events(path: Path) -> list[str]:
+    batches = [c.to_record_batch() for c in RecordingReader(path).chunks() if c.entity_path == "/events"]
+    return [text for batch in batches for (text,) in batch.column("TextLog:text").to_pylist()]
+
+
+def test_why_the_model_starts_anew_is_an_event(tmp_path):
+    drive = MemorySequence(4, scenes="aabb")
+    with Recording(tmp_path / "r.rrd", rig=drive.rig, class_names=CLASSES, title="", untrained=False) as recording:
+        for place in range(4):
+            frame = drive.load(place)
+            recording.log(frame, replace(predict(frame), started_anew=place != 1))
+    assert events(tmp_path / "r.rrd") == [
+        'frame 0: scene "a" begins; the model starts without history',
+        'frame 2: scene change from "a" to "b"; the model starts without history',
+        "frame 3: 0.5 s since the last frame; the model starts without history",
+    ]
 
 
 def test_minimal_has_no_insides(tmp_path):
@@ -170,16 +190,30 @@ def test_a_frame_costs_less_than_its_allowance(standard):
     assert path.stat().st_size < 1.05 * pictures + 3 * 400_000
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_frame_without_boxes_shows_none(tmp_path, monkeypatch):
+    monkeypatch.setenv("RERUN_STRICT", "1")
+    drive = MemorySequence(2)
+    first, second = (with_truth(drive.load(place)) for place in range(2))
+    with Recording(tmp_path / "r.rrd", rig=drive.rig, class_names=CLASSES, title="", untrained=False) as recording:
+        recording.log(first, predict(first))
+        recording.log(replace(second, ground_truth=Boxes3D.empty()), replace(predict(second), boxes=Boxes3D.empty()))
+    *_, last = RecordingReader(tmp_path / "r.rrd").frames()
+    assert len(recorded_boxes(last).boxes) == 0
+    assert last.values(entities.GROUND_TRUTH, "name") == []
+    for entity in (entities.BEV_BOXES, entities.overlay("CAM_FRONT", "boxes")):
+        assert last.values(entity, "LineStrips2D:strips") == []
+
+
 def test_events_before_the_first_frame_are_kept(tmp_path):
     drive = MemorySequence(1)
     frame = with_truth(drive.load(0))
     with Recording(tmp_path / "r.rrd", rig=drive.rig, class_names=CLASSES, title="", untrained=False) as recording:
         recording.event("a note", "WARN")
         recording.log(frame, predict(frame))
-    batches = [c.to_record_batch() for c in RecordingReader(tmp_path / "r.rrd").chunks() if c.entity_path == "/events"]
-    texts = [text for batch in batches for (text,) in batch.column("TextLog:text").to_pylist()]
-    assert "a note" in texts
-    assert all(entities.TIME_TIMELINE in batch.schema.names for batch in batches)
+    assert events(tmp_path / "r.rrd")[0] == "a note"
+    (read,) = RecordingReader(tmp_path / "r.rrd").frames()
+    assert read.has(entities.EVENTS, "TextLog:text")  # it has a place in time
 
 
 def test_a_file_that_cannot_be_written_is_one_line(tmp_path):
