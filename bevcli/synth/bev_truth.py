@@ -28,7 +28,7 @@ class MapWindow:
     @property
     def cells(self) -> int:
         """Cells along a side."""
-        return int(round(2 * self.half_extent_m / self.cell_m))
+        return round(2 * self.half_extent_m / self.cell_m)
 
     def pixels(self, points_bev: Array) -> Array:
         """Points (P, 2+) in the bev frame -> (P, 2) column and row; the first cell's middle is (0, 0)."""

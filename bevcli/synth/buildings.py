@@ -10,12 +10,18 @@ from bevcli.geometry.transforms import Array
 from bevcli.synth.city import KERB_M, Block, CityPlan
 from bevcli.synth.facades import FacadeStyle, facade_row
 from bevcli.synth.mesh import Material, Mesh, block, loft
-from bevcli.synth.palette import Color, linear
+from bevcli.synth.palette import Color, darker, linear
 
 BRICK: tuple[Color, ...] = ((150, 82, 62), (128, 66, 54), (168, 108, 80), (110, 74, 64), (178, 130, 98))
 PLASTER: tuple[Color, ...] = (
-    (214, 202, 178), (198, 178, 142), (186, 192, 190), (222, 214, 204), (176, 150, 128), (164, 178, 162), (206, 172, 144),
-)  # fmt: skip
+    (214, 202, 178),
+    (198, 178, 142),
+    (186, 192, 190),
+    (222, 214, 204),
+    (176, 150, 128),
+    (164, 178, 162),
+    (206, 172, 144),
+)
 OFFICE: tuple[Color, ...] = ((120, 126, 132), (150, 152, 150), (90, 98, 106), (176, 172, 164))
 ROOF: Color = (104, 98, 94)
 
@@ -117,7 +123,7 @@ def _roof(ground: Array, height: float, style: FacadeStyle) -> Mesh:
     middle = ground.mean(0)
     wide = middle + (ground - middle) * (1 + 0.25 / np.linalg.norm(ground - middle, axis=1, keepdims=True))
     rings = [np.column_stack([wide, np.full(4, z)]) for z in (height - 0.22, height + 0.12)]
-    return loft(rings, tuple(int(c * 0.8) for c in style.wall) if style.band else ROOF)
+    return loft(rings, darker(style.wall, 0.8) if style.band else ROOF)
 
 
 def _awnings(rng: np.random.Generator, ground: Array) -> list[Mesh]:

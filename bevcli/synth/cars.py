@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from bevcli.synth.mesh import Material, Mesh, block, joined, rod, side_profile, wheel
@@ -64,7 +65,8 @@ def car(name: str) -> Mesh:
     return joined(parts)
 
 
-def _along(s: CarShape):
+def _along(s: CarShape) -> Callable[[float], float]:
+    """Fraction of the length -> x in metres."""
     return lambda fraction: (fraction - 0.5) * s.length
 
 

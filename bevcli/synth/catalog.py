@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.synth import palette
+from bevcli.synth.buses import BUS_NAMES, bus
 from bevcli.synth.cars import CAR_SHAPES, car
 from bevcli.synth.cycles import BICYCLE_NAMES, MOTORCYCLE_NAMES, bicycle, motorcycle
 from bevcli.synth.machines import MACHINE_NAMES, machine
@@ -16,7 +17,8 @@ from bevcli.synth.mesh import Mesh
 from bevcli.synth.palette import Color
 from bevcli.synth.people import PERSON_NAMES, person
 from bevcli.synth.roadworks import BARRIER_NAMES, CONE_NAMES, barrier, traffic_cone
-from bevcli.synth.trucks import BUS_NAMES, TRAILER_NAMES, TRUCK_NAMES, bus, trailer, truck
+from bevcli.synth.trailers import TRAILER_NAMES, trailer
+from bevcli.synth.trucks import TRUCK_NAMES, truck
 
 
 @dataclass(frozen=True)

@@ -138,7 +138,7 @@ class CityPlan:
     def streets_between(self, axis: int, low: float, high: float) -> list[Street]:
         """Streets of an axis whose kerbs reach into low to high across it."""
         index = self.nearest(axis, low) - 1
-        found = []
+        found: list[Street] = []
         while True:
             street = self.street(axis, index)
             if street.position - street.half_width > high:

@@ -15,9 +15,19 @@ MOTORCYCLE_NAMES = ("sport", "cruiser", "scooter", "sport_rider", "cruiser_rider
 
 def _thin_wheel(x: float, radius: float, width: float) -> Mesh:
     """A wheel of two discs: a dark tyre and a lighter middle."""
-    return joined([rod((x, -width / 2, radius), (x, width / 2, radius), radius, RUBBER, sections=14),
-                   rod((x, -width / 2 - 0.005, radius), (x, width / 2 + 0.005, radius), radius * 0.86, (150, 152, 156), sections=14),
-                   rod((x, -width / 2 - 0.02, radius), (x, width / 2 + 0.02, radius), radius * 0.15, TRIM, sections=6)])  # fmt: skip
+    return joined(
+        [
+            rod((x, -width / 2, radius), (x, width / 2, radius), radius, RUBBER, sections=14),
+            rod(
+                (x, -width / 2 - 0.005, radius),
+                (x, width / 2 + 0.005, radius),
+                radius * 0.86,
+                (150, 152, 156),
+                sections=14,
+            ),
+            rod((x, -width / 2 - 0.02, radius), (x, width / 2 + 0.02, radius), radius * 0.15, TRIM, sections=6),
+        ]
+    )
 
 
 def bicycle(name: str) -> Mesh:
@@ -29,12 +39,18 @@ def bicycle(name: str) -> Mesh:
     crank, seat, head = (-0.05, 0, 0.3), (-0.22, 0, seat_z), (front - 0.2, 0, bar_z - 0.12)
     tube = 0.03
     parts = [
-        _thin_wheel(back, radius, 0.045), _thin_wheel(front, radius, 0.045),
-        rod(crank, seat, tube, PAINT, Material.PAINT, 5), rod(seat, head, tube, PAINT, Material.PAINT, 5), rod(crank, head, tube, PAINT, Material.PAINT, 5),
-        rod(crank, (back, 0, radius), 0.025, PAINT, Material.PAINT, 4), rod(seat, (back, 0, radius), 0.02, PAINT, Material.PAINT, 4),
-        rod((front - 0.22, 0, bar_z), (front, 0, radius), 0.028, TRIM, sections=5), rod((front - 0.24, -0.27, bar_z), (front - 0.24, 0.27, bar_z), 0.022, TRIM, sections=5),
-        block((-0.24, 0, seat_z + 0.03), (0.26, 0.15, 0.06), RUBBER), rod((-0.05, -0.16, 0.3), (-0.05, 0.16, 0.3), 0.03, CHROME, sections=5),
-    ]  # fmt: skip
+        _thin_wheel(back, radius, 0.045),
+        _thin_wheel(front, radius, 0.045),
+        rod(crank, seat, tube, PAINT, Material.PAINT, 5),
+        rod(seat, head, tube, PAINT, Material.PAINT, 5),
+        rod(crank, head, tube, PAINT, Material.PAINT, 5),
+        rod(crank, (back, 0, radius), 0.025, PAINT, Material.PAINT, 4),
+        rod(seat, (back, 0, radius), 0.02, PAINT, Material.PAINT, 4),
+        rod((front - 0.22, 0, bar_z), (front, 0, radius), 0.028, TRIM, sections=5),
+        rod((front - 0.24, -0.27, bar_z), (front - 0.24, 0.27, bar_z), 0.022, TRIM, sections=5),
+        block((-0.24, 0, seat_z + 0.03), (0.26, 0.15, 0.06), RUBBER),
+        rod((-0.05, -0.16, 0.3), (-0.05, 0.16, 0.3), 0.03, CHROME, sections=5),
+    ]
     if kind == "city":
         parts += [
             block((back - 0.02, 0, 0.74), (0.42, 0.16, 0.03), TRIM),
@@ -63,18 +79,47 @@ def motorcycle(name: str) -> Mesh:
     parts += [rod((x, -0.085, radius), (x, 0.085, radius), radius * 0.55, CHROME, sections=8) for x in (back, front)]
     bar_z = 1.08 if kind == "cruiser" else 0.98
     parts += [rod((front - 0.28, y, bar_z), (front, y, radius), 0.035, CHROME, sections=5) for y in (-0.1, 0.1)]
-    parts += [rod((front - 0.3, -0.36, bar_z), (front - 0.3, 0.36, bar_z), 0.025, TRIM, sections=5),
-              ball((front - 0.14, 0, bar_z - 0.16), (0.1, 0.11, 0.11), (255, 248, 226), Material.GLOW),
-              block((back - 0.12, 0, 0.72), (0.08, 0.2, 0.1), (190, 16, 18), Material.GLOW)]  # fmt: skip
+    parts += [
+        rod((front - 0.3, -0.36, bar_z), (front - 0.3, 0.36, bar_z), 0.025, TRIM, sections=5),
+        ball((front - 0.14, 0, bar_z - 0.16), (0.1, 0.11, 0.11), (255, 248, 226), Material.GLOW),
+        block((back - 0.12, 0, 0.72), (0.08, 0.2, 0.1), (190, 16, 18), Material.GLOW),
+    ]
     if kind == "scooter":
-        parts += [side_profile([(back - 0.1, 0.35), (back + 0.6, 0.3), (back + 0.55, 0.75), (back - 0.1, 0.78)], 0.2, PAINT, Material.PAINT),
-                  side_profile([(front - 0.42, 0.3), (front - 0.3, 0.28), (front - 0.22, 0.95), (front - 0.34, 0.98)], 0.22, PAINT, Material.PAINT),
-                  block((0.0, 0, 0.3), (0.6, 0.36, 0.08), TRIM), block((back + 0.2, 0, 0.8), (0.7, 0.28, 0.08), RUBBER)]  # fmt: skip
+        parts += [
+            side_profile(
+                [(back - 0.1, 0.35), (back + 0.6, 0.3), (back + 0.55, 0.75), (back - 0.1, 0.78)],
+                0.2,
+                PAINT,
+                Material.PAINT,
+            ),
+            side_profile(
+                [(front - 0.42, 0.3), (front - 0.3, 0.28), (front - 0.22, 0.95), (front - 0.34, 0.98)],
+                0.22,
+                PAINT,
+                Material.PAINT,
+            ),
+            block((0.0, 0, 0.3), (0.6, 0.36, 0.08), TRIM),
+            block((back + 0.2, 0, 0.8), (0.7, 0.28, 0.08), RUBBER),
+        ]
     else:
         tank_z = 0.82 if kind == "sport" else 0.74
-        parts += [block((-0.02, 0, 0.45), (0.55, 0.3, 0.36), (70, 70, 74)), side_profile([(-0.15, 0.62), (0.35, 0.66), (0.38, tank_z), (0.0, tank_z + 0.14), (-0.2, tank_z)], 0.17, PAINT, Material.PAINT),
-                  block((-0.42, 0, 0.76), (0.62, 0.26, 0.1), RUBBER), side_profile([(back - 0.15, 0.66), (back + 0.4, 0.6), (back + 0.4, 0.72), (back - 0.12, 0.82)], 0.13, PAINT, Material.PAINT),
-                  *[rod((-0.1, y, 0.3), (back - 0.1, y, 0.36), 0.05, CHROME) for y in (-0.17, 0.17)]]  # fmt: skip
+        parts += [
+            block((-0.02, 0, 0.45), (0.55, 0.3, 0.36), (70, 70, 74)),
+            side_profile(
+                [(-0.15, 0.62), (0.35, 0.66), (0.38, tank_z), (0.0, tank_z + 0.14), (-0.2, tank_z)],
+                0.17,
+                PAINT,
+                Material.PAINT,
+            ),
+            block((-0.42, 0, 0.76), (0.62, 0.26, 0.1), RUBBER),
+            side_profile(
+                [(back - 0.15, 0.66), (back + 0.4, 0.6), (back + 0.4, 0.72), (back - 0.12, 0.82)],
+                0.13,
+                PAINT,
+                Material.PAINT,
+            ),
+            *[rod((-0.1, y, 0.3), (back - 0.1, y, 0.36), 0.05, CHROME) for y in (-0.17, 0.17)],
+        ]
         if kind == "sport":
             parts.append(
                 side_profile(

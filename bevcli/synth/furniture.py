@@ -59,20 +59,28 @@ def bush(rng: np.random.Generator) -> Mesh:
 
 def lamp_post() -> Mesh:
     """A street lamp whose arm reaches along x."""
-    return joined([
-        cone(0, 0, 0, 7.6, 0.1, 0.06, STEEL, sections=6), rod((0, 0, 7.5), (1.8, 0, 7.9), 0.045, STEEL, sections=5),
-        block((2.1, 0, 7.9), (0.8, 0.26, 0.12), DARK), block((2.1, 0, 7.82), (0.6, 0.2, 0.05), (255, 236, 190), Material.GLOW),
-        block((0, 0, 0.3), (0.3, 0.3, 0.6), STEEL),
-    ])  # fmt: skip
+    return joined(
+        [
+            cone(0, 0, 0, 7.6, 0.1, 0.06, STEEL, sections=6),
+            rod((0, 0, 7.5), (1.8, 0, 7.9), 0.045, STEEL, sections=5),
+            block((2.1, 0, 7.9), (0.8, 0.26, 0.12), DARK),
+            block((2.1, 0, 7.82), (0.6, 0.2, 0.05), (255, 236, 190), Material.GLOW),
+            block((0, 0, 0.3), (0.3, 0.3, 0.6), STEEL),
+        ]
+    )
 
 
 def sign_post(kind: int) -> Mesh:
     """A traffic sign that faces along x: stop, speed limit, yield, direction, warning or parking."""
     pole = rod((0, 0, 0), (0, 0, 2.6), 0.035, STEEL, sections=5)
     colors: tuple[tuple[Color, Color], ...] = (
-        ((190, 26, 30), (235, 235, 232)), ((235, 235, 232), (190, 26, 30)), ((190, 26, 30), (240, 240, 238)),
-        ((24, 84, 168), (240, 240, 238)), ((238, 190, 30), (30, 30, 30)), ((24, 84, 168), (240, 240, 238)),
-    )  # fmt: skip
+        ((190, 26, 30), (235, 235, 232)),
+        ((235, 235, 232), (190, 26, 30)),
+        ((190, 26, 30), (240, 240, 238)),
+        ((24, 84, 168), (240, 240, 238)),
+        ((238, 190, 30), (30, 30, 30)),
+        ((24, 84, 168), (240, 240, 238)),
+    )
     outer, inner = colors[kind % 6]
     sides = (8, 16, 3, 4, 4, 4)[kind % 6]
     disc = rod((0.04, 0, 2.4), (0.07, 0, 2.4), 0.38, outer, sections=sides)
@@ -87,8 +95,10 @@ def sign_post(kind: int) -> Mesh:
 def signal_head(lit: str) -> Mesh:
     """A traffic signal on a pole with an arm; it faces along x and hangs at +y. lit: red, yellow or green."""
     lamps: dict[str, tuple[Color, Color]] = {
-        "red": ((255, 40, 30), (60, 14, 14)), "yellow": ((255, 190, 40), (58, 44, 12)), "green": ((50, 255, 140), (10, 48, 30)),
-    }  # fmt: skip
+        "red": ((255, 40, 30), (60, 14, 14)),
+        "yellow": ((255, 190, 40), (58, 44, 12)),
+        "green": ((50, 255, 140), (10, 48, 30)),
+    }
     parts = [cone(0, 0, 0, 6.0, 0.1, 0.07, DARK, sections=6), rod((0, 0, 5.8), (0, 3.6, 5.9), 0.05, DARK, sections=5)]
     for y, z in ((3.4, 5.35), (0.22, 2.7)):
         parts.append(block((0.1, y, z), (0.24, 0.36, 1.05), (24, 26, 26)))
@@ -101,10 +111,14 @@ def signal_head(lit: str) -> Mesh:
 def bench() -> Mesh:
     """A bench that faces along x."""
     wood = (134, 96, 62)
-    return joined([
-        block((0, 0, 0.45), (0.45, 1.7, 0.06), wood), block((-0.24, 0, 0.75), (0.06, 1.7, 0.36), wood),
-        block((0, 0.7, 0.22), (0.4, 0.06, 0.44), DARK), block((0, -0.7, 0.22), (0.4, 0.06, 0.44), DARK),
-    ])  # fmt: skip
+    return joined(
+        [
+            block((0, 0, 0.45), (0.45, 1.7, 0.06), wood),
+            block((-0.24, 0, 0.75), (0.06, 1.7, 0.36), wood),
+            block((0, 0.7, 0.22), (0.4, 0.06, 0.44), DARK),
+            block((0, -0.7, 0.22), (0.4, 0.06, 0.44), DARK),
+        ]
+    )
 
 
 def bin_() -> Mesh:
@@ -115,15 +129,23 @@ def bin_() -> Mesh:
 def hydrant() -> Mesh:
     """A fire hydrant."""
     red = (186, 44, 36)
-    return joined([cone(0, 0, 0, 0.6, 0.13, 0.12, red), ball((0, 0, 0.62), (0.14, 0.14, 0.14), red),
-                   rod((0, -0.22, 0.45), (0, 0.22, 0.45), 0.06, red)])  # fmt: skip
+    return joined(
+        [
+            cone(0, 0, 0, 0.6, 0.13, 0.12, red),
+            ball((0, 0, 0.62), (0.14, 0.14, 0.14), red),
+            rod((0, -0.22, 0.45), (0, 0.22, 0.45), 0.06, red),
+        ]
+    )
 
 
 def bus_shelter() -> Mesh:
     """A bus stop with a glass back wall; it opens along x."""
-    return joined([
-        block((0, 0, 2.45), (1.5, 4.0, 0.1), DARK), block((-0.65, 0, 1.3), (0.04, 3.8, 1.9), (60, 74, 80), Material.GLASS),
-        *[rod((x, y, 0), (x, y, 2.4), 0.05, DARK, sections=5) for x in (-0.65, 0.6) for y in (-1.9, 1.9)],
-        block((-0.35, 0, 0.45), (0.35, 2.6, 0.06), (134, 96, 62)),
-        block((0, 1.95, 1.3), (1.2, 0.08, 1.7), (210, 120, 70)),
-    ])  # fmt: skip
+    return joined(
+        [
+            block((0, 0, 2.45), (1.5, 4.0, 0.1), DARK),
+            block((-0.65, 0, 1.3), (0.04, 3.8, 1.9), (60, 74, 80), Material.GLASS),
+            *[rod((x, y, 0), (x, y, 2.4), 0.05, DARK, sections=5) for x in (-0.65, 0.6) for y in (-1.9, 1.9)],
+            block((-0.35, 0, 0.45), (0.35, 2.6, 0.06), (134, 96, 62)),
+            block((0, 1.95, 1.3), (1.2, 0.08, 1.7), (210, 120, 70)),
+        ]
+    )

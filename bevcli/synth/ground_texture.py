@@ -37,7 +37,7 @@ class GroundTexture:
 def paint_ground(pieces: list[GroundPiece], center: ArrayLike, extent_m: float, texel_m: float) -> GroundTexture:
     """Paint a square of `extent_m` around a world point (2,)."""
     block = 2 ** (LEVELS - 1)
-    size = int(round(extent_m / texel_m / block)) * block
+    size = round(extent_m / texel_m / block) * block
     origin = np.asarray(center, dtype=np.float64) - size * texel_m / 2
     canvas = np.empty((size, size, 3), np.uint8)
     canvas[:] = _stored(ASPHALT)
@@ -65,7 +65,7 @@ def fill(canvas: NDArray[np.uint8], outline: NDArray[np.float64], color: tuple[i
 
 @lru_cache(maxsize=256)
 def _stored(color: tuple[int, int, int]) -> tuple[int, ...]:
-    return tuple(int(round(float(np.sqrt(c)) * 255)) for c in linear(color))
+    return tuple(round(float(np.sqrt(c)) * 255) for c in linear(color))
 
 
 def roughness() -> NDArray[np.float32]:

@@ -32,6 +32,12 @@ def linear(color: ArrayLike) -> NDArray[np.float32]:
     return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
+def darker(color: Color, factor: float) -> Color:
+    """The colour with all its components times a factor."""
+    red, green, blue = (int(component * factor) for component in color)
+    return red, green, blue
+
+
 def display_table(size: int = 4096, limit: float = 1.6) -> NDArray[np.uint8]:
     """(size,) sRGB bytes of linear light from 0 to `limit`, with a soft shoulder for what is brighter than white."""
     light = np.linspace(0, limit, size)

@@ -1,10 +1,11 @@
-"""What stands along the streets and is annotated: parked vehicles, road works, building sites, cycles, waiting people."""
+"""What stands along the streets and is annotated: parked vehicles, road works, building sites, people."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from bevcli.synth.actors import Standing, draw_body
+from bevcli.geometry.transforms import Array
+from bevcli.synth.actors import Body, Standing, draw_body
 from bevcli.synth.catalog import Catalog
 from bevcli.synth.city import KERB_M, STOP_LINE_M, CityPlan, Street
 from bevcli.synth.landuse import landuse
@@ -15,8 +16,9 @@ PARKED_MIX = {"car": 0.78, "truck": 0.09, "trailer": 0.05, "motorcycle": 0.05, "
 FILLED = 0.55  # share of parking places that are taken
 WORKS_SHARE = 0.27  # share of the sides of stretches with parking that have road works
 WITHOUT_RIDER = {
-    "motorcycle": ("sport", "cruiser", "scooter"), "bicycle": ("city", "racer", "cargo", "mountain"),
-}  # fmt: skip
+    "motorcycle": ("sport", "cruiser", "scooter"),
+    "bicycle": ("city", "racer", "cargo", "mountain"),
+}
 
 
 class Roadside:
@@ -108,14 +110,23 @@ class Roadside:
             body = draw_body(draw("pedestrian", rng, ["worker_standing"]), rng, f"worker-{name}-{k}", 0.03)
             where = closed[0] + 2.9 if k == 0 else closed[1] - 2.1 - 0.8 * k
             turn = float(rng.uniform(0, 6.3))
-            made.append(self._stand(street, body, where, side * (street.half_width - (0.6, 0.7, 1.5)[k]), side,
-                                    "pedestrian.standing", turn))  # fmt: skip
+            made.append(
+                self._stand(
+                    street,
+                    body,
+                    where,
+                    side * (street.half_width - (0.6, 0.7, 1.5)[k]),
+                    side,
+                    "pedestrian.standing",
+                    turn,
+                )
+            )
         return made
 
     def _stand(
         self,
         street: Street,
-        body,
+        body: Body,
         at: float,
         offset: float,
         side: int,
@@ -167,7 +178,7 @@ class Roadside:
                     made.append(self._stand_on_land(body, point, facing, "pedestrian.standing"))
         return made
 
-    def _stand_on_land(self, body, point, yaw: float, attribute: str) -> Standing:
+    def _stand_on_land(self, body: Body, point: Array, yaw: float, attribute: str) -> Standing:
         x, y = self.city.bend(point)
         return Standing(body, np.array([x, y, KERB_M]), yaw, attribute)
 
@@ -189,10 +200,13 @@ class Roadside:
                 point = start + way * at
                 body = draw_body(barrier, rng, f"fence-{column}.{row}.{side}.{k}", 0.02)
                 made.append(self._stand_on_land(body, point, self.city.heading(point, way) + np.pi / 2, ""))
-        for k, (class_name, names, attribute) in enumerate([
-            *[("construction_vehicle", None, "vehicle.parked")] * int(rng.integers(4, 7)),
-            *[("truck", ("dumper", "flatbed"), "vehicle.parked")] * 2, ("trailer", ("flatbed", "container", "utility"), "vehicle.parked"),
-        ]):  # fmt: skip
+        for k, (class_name, names, attribute) in enumerate(
+            [
+                *[("construction_vehicle", None, "vehicle.parked")] * int(rng.integers(4, 7)),
+                *[("truck", ("dumper", "flatbed"), "vehicle.parked")] * 2,
+                ("trailer", ("flatbed", "container", "utility"), "vehicle.parked"),
+            ]
+        ):
             body = draw_body(self.catalog.draw(class_name, rng, names), rng, f"site-{column}.{row}.{k}")
             for _ in range(12):
                 point = low + 8 + rng.random(2) * (high - low - 16)

@@ -20,11 +20,18 @@ def person(name: str, stride: int) -> Mesh:
     skin, hair, legs = SKIN[k % 4], HAIR[(k + 1) % 4], TROUSERS[k % 4]
     swing = 0.26 * stride
     parts = [
-        *_leg(0.1, swing, legs), *_leg(-0.1, -swing, legs),
-        _torso(0.86, 1.46, Material.DYE if name != "worker" else Material.MATTE, (240, 120, 30) if name == "worker" else SHIRT),
-        *_arm(0.25, -swing * 0.9, skin), *_arm(-0.25, swing * 0.9, skin),
+        *_leg(0.1, swing, legs),
+        *_leg(-0.1, -swing, legs),
+        _torso(
+            0.86,
+            1.46,
+            Material.DYE if name != "worker" else Material.MATTE,
+            (240, 120, 30) if name == "worker" else SHIRT,
+        ),
+        *_arm(0.25, -swing * 0.9, skin),
+        *_arm(-0.25, swing * 0.9, skin),
         *_head(0.02, 1.62, skin, hair),
-    ]  # fmt: skip
+    ]
     if name == "woman":
         parts += [
             cone(0, 0, 0.55, 1.0, 0.27, 0.17, SHIRT, Material.DYE),
@@ -45,14 +52,20 @@ def person(name: str, stride: int) -> Mesh:
 def _leg(y: float, swing: float, color: Color) -> list[Mesh]:
     knee = (swing * 0.6 + 0.03, y, 0.46)
     foot = (swing - 0.03, y, 0.08)
-    return [rod((0, y, 0.9), knee, 0.085, color), rod(knee, foot, 0.065, color),
-            block((foot[0] + 0.06, y, 0.05), (0.26, 0.1, 0.1), (36, 32, 30))]  # fmt: skip
+    return [
+        rod((0, y, 0.9), knee, 0.085, color),
+        rod(knee, foot, 0.065, color),
+        block((foot[0] + 0.06, y, 0.05), (0.26, 0.1, 0.1), (36, 32, 30)),
+    ]
 
 
 def _arm(y: float, swing: float, skin: Color) -> list[Mesh]:
     elbow, hand = (swing * 0.5 - 0.02, y * 1.04, 1.14), (swing + 0.04, y, 0.9)
-    return [rod((0, y * 0.92, 1.4), elbow, 0.06, SHIRT, Material.DYE), rod(elbow, hand, 0.048, SHIRT, Material.DYE),
-            ball(hand, (0.05, 0.05, 0.06), skin, subdivisions=0)]  # fmt: skip
+    return [
+        rod((0, y * 0.92, 1.4), elbow, 0.06, SHIRT, Material.DYE),
+        rod(elbow, hand, 0.048, SHIRT, Material.DYE),
+        ball(hand, (0.05, 0.05, 0.06), skin, subdivisions=0),
+    ]
 
 
 def _torso(low: float, high: float, material: Material, color: Color) -> Mesh:
@@ -63,22 +76,31 @@ def _torso(low: float, high: float, material: Material, color: Color) -> Mesh:
 
 
 def _head(x: float, z: float, skin: Color, hair: Color) -> list[Mesh]:
-    return [rod((x - 0.02, 0, z - 0.2), (x, 0, z - 0.05), 0.055, skin), ball((x, 0, z), (0.105, 0.085, 0.125), skin),
-            ball((x - 0.025, 0, z + 0.035), (0.105, 0.095, 0.105), hair)]  # fmt: skip
+    return [
+        rod((x - 0.02, 0, z - 0.2), (x, 0, z - 0.05), 0.055, skin),
+        ball((x, 0, z), (0.105, 0.085, 0.125), skin),
+        ball((x - 0.025, 0, z + 0.035), (0.105, 0.095, 0.105), hair),
+    ]
 
 
 def rider(seat: tuple[float, float], bars: tuple[float, float], pedal: tuple[float, float], helmet: Color) -> Mesh:
     """A person sitting at `seat` with hands on `bars` and feet at `pedal`, each (x, z)."""
     hip, shoulder = np.array([seat[0], 0.0, seat[1] + 0.06]), np.array([seat[0] + 0.26, 0.0, seat[1] + 0.56])
-    parts = [rod(hip, shoulder, 0.16, SHIRT, Material.DYE, 8), ball(tuple(shoulder + (0.06, 0, 0.24)), (0.12, 0.1, 0.13), SKIN[1]),
-             ball(tuple(shoulder + (0.05, 0, 0.29)), (0.145, 0.115, 0.11), helmet)]  # fmt: skip
+    parts = [
+        rod(hip, shoulder, 0.16, SHIRT, Material.DYE, 8),
+        ball(tuple(shoulder + (0.06, 0, 0.24)), (0.12, 0.1, 0.13), SKIN[1]),
+        ball(tuple(shoulder + (0.05, 0, 0.29)), (0.145, 0.115, 0.11), helmet),
+    ]
     for side in (-1, 1):
         knee = np.array(
             [(seat[0] + pedal[0]) / 2 + 0.24, side * 0.14, (seat[1] + pedal[1]) / 2 + 0.12 * (1 + side * 0.5)]
         )
         foot = np.array([pedal[0] + 0.08 * side, side * 0.13, pedal[1] + 0.07 * side])
         hand = np.array([bars[0], side * 0.24, bars[1]])
-        parts += [rod(hip + (0, side * 0.09, 0), knee, 0.08, TROUSERS[0]), rod(knee, foot, 0.06, TROUSERS[0]),
-                  block((foot[0] + 0.05, foot[1], foot[2]), (0.24, 0.09, 0.09), (30, 30, 30)),
-                  rod(shoulder + (0, side * 0.17, -0.05), hand, 0.055, SHIRT, Material.DYE)]  # fmt: skip
+        parts += [
+            rod(hip + (0, side * 0.09, 0), knee, 0.08, TROUSERS[0]),
+            rod(knee, foot, 0.06, TROUSERS[0]),
+            block((foot[0] + 0.05, foot[1], foot[2]), (0.24, 0.09, 0.09), (30, 30, 30)),
+            rod(shoulder + (0, side * 0.17, -0.05), hand, 0.055, SHIRT, Material.DYE),
+        ]
     return joined(parts)

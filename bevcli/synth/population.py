@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bevcli.geometry.transforms import Array
-from bevcli.synth.actors import draw_body
+from bevcli.synth.actors import Body, draw_body
 from bevcli.synth.catalog import Catalog
 from bevcli.synth.city import STOP_LINE_M, CityPlan
 from bevcli.synth.route import (
@@ -118,7 +118,7 @@ class Population:
         return (_unit(draw_body(draw(class_name, rng, names), rng, name), 0.0),)
 
 
-def _unit(body, lag: float) -> Unit:
+def _unit(body: Body, lag: float) -> Unit:
     return Unit(body.variant, body.size_lwh, body.paint, body.dye, body.instance, lag)
 
 

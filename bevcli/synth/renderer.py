@@ -54,9 +54,15 @@ def expose(moment: Moment, camera: Camera, world_from_ego: Array, supersampling:
     fine = supersampled(camera, supersampling)
     world_from_camera = world_from_ego @ camera.ego_from_camera
     buffer = rasterise(
-        moment.soup.surfaces.corners, moment.soup.surfaces.normals, moment.soup.runs, moment.soup.objects, moment.soup.spheres, fine,
-        inverse(world_from_camera), moment.object_count,
-    )  # fmt: skip
+        moment.soup.surfaces.corners,
+        moment.soup.surfaces.normals,
+        moment.soup.runs,
+        moment.soup.objects,
+        moment.soup.spheres,
+        fine,
+        inverse(world_from_camera),
+        moment.object_count,
+    )
     picture = shade(
         buffer, moment.soup.surfaces, moment.ground, moment.shadows, moment.weather, fine, world_from_camera
     )

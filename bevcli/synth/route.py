@@ -59,7 +59,7 @@ class Route:
 
     def yaw_at(self, position: ArrayLike) -> Array:
         """Heading (...,) in radians."""
-        return np.interp(position, self.positions, self.yaws)
+        return np.interp(np.asarray(position, dtype=np.float64), self.positions, self.yaws)
 
 
 @dataclass(frozen=True)

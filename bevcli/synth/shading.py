@@ -60,12 +60,13 @@ def shade(
     ray_from_image = world_from_camera[:3, :3] @ np.linalg.inv(camera.intrinsics)
     picture = np.empty((*buffer.triangles.shape, 3), np.uint8)
     shade_pixels(
-        buffer.triangles, buffer.inverse_depth, surfaces.normals, surfaces.albedo, surfaces.material,
-        surfaces.facade, surfaces.facades,
-        ground.texels, ground.offsets, ground.rough, ground.origin[0], ground.origin[1], ground.texel_m, ground.size,
-        shadows.heights, shadows.origin[0], shadows.origin[1], shadows.texel_m, shadows.shear[0], shadows.shear[1],
-        light, w.to_sun, w.clouds, w.haze_m, w.lamps, w.shadow_softness_m,
-        ray_from_image, np.ascontiguousarray(world_from_camera[:3, 3]), 1.0 / camera.intrinsics[0, 0],
-        display_table(limit=LIGHT_LIMIT), picture,
-    )  # fmt: skip
+        (buffer.triangles, buffer.inverse_depth),
+        (surfaces.normals, surfaces.albedo, surfaces.material, surfaces.facade, surfaces.facades),
+        (ground.texels, ground.offsets, ground.rough, *ground.origin, ground.texel_m, ground.size),
+        (shadows.heights, *shadows.origin, shadows.texel_m, *shadows.shear, w.shadow_softness_m),
+        (light, w.to_sun, w.clouds, w.haze_m, w.lamps),
+        (ray_from_image, np.ascontiguousarray(world_from_camera[:3, 3]), 1.0 / camera.intrinsics[0, 0]),
+        display_table(limit=LIGHT_LIMIT),
+        picture,
+    )
     return picture

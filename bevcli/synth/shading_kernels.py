@@ -3,6 +3,9 @@
 They share one file because numba's cache on the disk asks only whether a function's own file has changed.
 """
 
+# mypy: disable-error-code="no-untyped-def"
+# numba takes the arguments' types from the first call.
+
 from __future__ import annotations
 
 import numpy as np
@@ -18,16 +21,20 @@ GROUND, FACADE, GLASS, PAINT, GLOW = (
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def shade_pixels(triangles, inverse_depth, normals, albedo, material, facade, facades,
-           texels, offsets, rough, ground_x, ground_y, texel_m, ground_size,
-           heights, shadow_x, shadow_y, shadow_texel, shear_x, shear_y,
-           light, to_sun, clouds, haze_m, lamps, softness,
-           ray_from_image, eye, pixel_angle, table, picture):  # fmt: skip
-    height, width = triangles.shape
+def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, picture):
+    """Colour every pixel of `picture` (H, W, 3); the groups of arrays and numbers are those of `shading.shade`.
+
+    One long function: in parts it would pass a dozen numbers to and fro for every pixel.
+    """
+    triangles, inverse_depth = buffer
+    normals, albedo, material, facade, facades = surfaces
+    light, to_sun, clouds, haze_m, lamps = weather
+    ray_from_image, eye, pixel_angle = view
     sun, sky, bounce, haze = light[0], light[1], light[2], light[5]
     a = np.empty(3)  # albedo, then colour
     mirror = np.empty(3)
     table_scale = (table.shape[0] - 1) / LIGHT_LIMIT
+    height, width = triangles.shape
     for v in range(height):
         for u in range(width):
             rx = ray_from_image[0, 0] * u + ray_from_image[0, 1] * v + ray_from_image[0, 2]
@@ -52,9 +59,8 @@ def shade_pixels(triangles, inverse_depth, normals, albedo, material, facade, fa
             footprint = z * pixel_angle
             grain = 0.0
             if kind == GROUND:
-                grazing = max(-rz / length, 0.02)
-                grain = _ground(texels, offsets, rough, ground_x, ground_y, texel_m, ground_size,
-                                      px, py, footprint, footprint / grazing, rx, ry, a)  # fmt: skip
+                along = footprint * length / max(-rz, 0.02 * length)
+                grain = _ground(ground, px, py, footprint, along, rx, ry, a)
             elif kind == FACADE:
                 if _facade(facades[facade[t]], px, py, pz, footprint, lamps, a):
                     kind = GLASS
@@ -66,12 +72,9 @@ def shade_pixels(triangles, inverse_depth, normals, albedo, material, facade, fa
             else:
                 lit = nx * to_sun[0] + ny * to_sun[1] + nz * to_sun[2]
                 if lit > 0:
-                    off = 0.02 + 1.6 * shadow_texel * (
-                        1.0 - lit
-                    )  # look from a little outside, or surfaces shade themselves
-                    sz = pz + off * nz
-                    lit *= 1.0 - _shadow(heights, px + off * nx + shear_x * sz, py + off * ny + shear_y * sz, sz,
-                                         shadow_x, shadow_y, shadow_texel, softness)  # fmt: skip
+                    # Look from a little outside, or surfaces shade themselves.
+                    off = 0.02 + 1.6 * shadows[3] * (1.0 - lit)
+                    lit *= 1.0 - _shadow(shadows, px + off * nx, py + off * ny, pz + off * nz)
                 else:
                     lit = 0.0
                 up = 0.5 + 0.5 * nz
@@ -81,9 +84,9 @@ def shade_pixels(triangles, inverse_depth, normals, albedo, material, facade, fa
                 for c in range(3):
                     a[c] *= sun[c] * lit + near_ground * (sky[c] * up + bounce[c] * (1.0 - up))
                     a[c] *= 1.0 + grain
-                if kind == GLASS or kind == PAINT:
-                    _reflect(rx / length, ry / length, rz / length, nx, ny, nz, kind, light, to_sun, clouds,
-                             lit > 0.02, mirror, a)  # fmt: skip
+                if kind == GLASS or kind == PAINT:  # noqa: SIM109  (numba is faster so)
+                    x, y, z = rx / length, ry / length, rz / length
+                    _reflect(x, y, z, nx, ny, nz, kind, light, to_sun, clouds, lit > 0.02, mirror, a)
             far = distance / haze_m
             veil = 1.0 - 1.0 / (1.0 + far + 0.48 * far * far + 0.235 * far * far * far)  # near 1 - exp(-far)
             veil *= veil
@@ -154,8 +157,10 @@ def _reflect(x, y, z, nx, ny, nz, kind, light, to_sun, clouds, sunlit, mirror, c
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _shadow(heights, x, y, z, origin_x, origin_y, texel, softness):
-    """Share of the light, 0 to 1, that the shadow map holds back from a point at height z."""
+def _shadow(shadows, x, y, z):
+    """Share of the light, 0 to 1, that the shadow map holds back from a point."""
+    heights, origin_x, origin_y, texel, shear_x, shear_y, softness = shadows
+    x, y = x + shear_x * z, y + shear_y * z
     size = heights.shape[0]
     bias = z + 0.03 + texel * 0.5
     fu, fv = (x - origin_x) / texel - 0.5, (y - origin_y) / texel - 0.5
@@ -180,11 +185,12 @@ def _shadow(heights, x, y, z, origin_x, origin_y, texel, softness):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _ground(texels, offsets, rough, origin_x, origin_y, texel_m, size, x, y, across, along, rx, ry, out):
+def _ground(ground, x, y, across, along, rx, ry, out):
     """Linear albedo at (x, y) into out (3,); returns the grain, a relative brightness of the rough surface.
 
-    across, along: metres that the pixel spans, `along` in the direction (rx, ry); up to three samples are spread over it.
+    across, along: metres that the pixel spans, `along` in the direction (rx, ry): up to three samples there.
     """
+    texels, offsets, rough, origin_x, origin_y, texel_m, size = ground
     flat = np.sqrt(rx * rx + ry * ry) + 1e-9
     samples = min(max(int(0.6 * along / across), 1), 3)
     width = max(across, along / samples * 0.5)

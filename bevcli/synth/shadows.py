@@ -20,7 +20,7 @@ def shadow_map(
     """
     sun = np.asarray(to_sun, dtype=np.float64)
     shear = (float(-sun[0] / sun[2]), float(-sun[1] / sun[2]))
-    size = int(round(extent_m / texel_m))
+    size = round(extent_m / texel_m)
     low = np.asarray(center, dtype=np.float64) - extent_m / 2
     origin = (float(np.floor(low[0] / texel_m) * texel_m), float(np.floor(low[1] / texel_m) * texel_m))
     heights = np.full((size, size), -1.0, np.float32)

@@ -136,7 +136,7 @@ class Simulation:
                 taken.append(new.body_points())
 
     def _renew(self, vehicles: list[Vehicle], time_s: float) -> list[Vehicle]:
-        """Let vehicles go that are far away or at their route's end, and new ones come at the edge; returns the former."""
+        """Let vehicles go that are far away or at their route's end, and new ones come; returns the former."""
         here = self._ego.route.at(self._ego.front)
         gone = []
         for vehicle in vehicles[1:]:
@@ -155,9 +155,11 @@ class Simulation:
         """(H, 2) world points of people on the road near junctions that vehicles approach."""
         nodes = sorted({p.node for v in vehicles if (p := v.next_pass()) is not None})
         points = [
-            w.plan_at(time_s) for node in nodes for w in self._crossers_of(node)
+            w.plan_at(time_s)
+            for node in nodes
+            for w in self._crossers_of(node)
             if w.times[0] < time_s < w.times[-1] and w.on_road(time_s)
-        ]  # fmt: skip
+        ]
         return self.city.bend(np.array(points).reshape(-1, 2))
 
     def _crossers_of(self, node: tuple[int, int]) -> list[Walker]:

@@ -134,9 +134,7 @@ def _may_enter(
     )
 
 
-def _has_priority(
-    other: Vehicle, theirs: JunctionPass, vehicle: Vehicle, crossing: JunctionPass, light: Light
-) -> bool:
+def _has_priority(other: Vehicle, theirs: JunctionPass, vehicle: Vehicle, crossing: JunctionPass, light: Light) -> bool:
     """Oncoming traffic before left turns; bicycles before right turns beside them, until these have begun."""
     if theirs.direction == (crossing.direction + 2) % 4 and crossing.turn == 1 and theirs.turn != 1:
         near = theirs.stop - 15 < other.front < theirs.leave - 5
@@ -150,12 +148,12 @@ def _has_priority(
 
 
 @njit(cache=True, nogil=True)
-def _points_between(points, positions, start, end, count):
+def _points_between(points: Array, positions: Array, start: float, end: float, count: int) -> Array:
     """(count, 2) points at even positions from start to end along a route."""
     found = np.empty((count, 2))
     for i in range(count):
         place = start + (end - start) * i / (count - 1)
-        k = min(max(np.searchsorted(positions, place) - 1, 0), len(positions) - 2)
+        k = min(max(int(np.searchsorted(positions, place)) - 1, 0), len(positions) - 2)
         w = min(max((place - positions[k]) / (positions[k + 1] - positions[k]), 0.0), 1.0)
         found[i, 0] = points[k, 0] + w * (points[k + 1, 0] - points[k, 0])
         found[i, 1] = points[k, 1] + w * (points[k + 1, 1] - points[k, 1])
@@ -163,7 +161,9 @@ def _points_between(points, positions, start, end, count):
 
 
 @njit(cache=True, nogil=True)
-def _nearest_in_way(points, positions, front, obstacles, owners, own, corridor):
+def _nearest_in_way(
+    points: Array, positions: Array, front: float, obstacles: Array, owners: NDArray, own: int, corridor: float
+) -> tuple[float, int]:
     """Distance along a route from `front` to the first obstacle in its corridor, and its owner; inf, -1 for none."""
     squared = corridor * corridor
     way = _points_between(points, positions, front + 0.3, front + LOOK_AHEAD_M, LOOK_STEPS)

@@ -17,7 +17,7 @@ NO_FACADES = np.zeros((0, 16), np.float32)
 
 @dataclass(frozen=True)
 class Run:
-    """Triangles of one thing. sphere: (4,) x, y, z, radius. facade: (T,) row of facades, -1 for all where there are none."""
+    """Triangles of one thing. sphere: (4,) x, y, z, radius. facade: (T,) row of facades, -1 for none."""
 
     corners: NDArray[np.float32]
     normals: NDArray[np.float32]
@@ -73,7 +73,10 @@ def place(shape: Shape, position: tuple[float, float, float], yaw: float) -> Run
 
 
 @njit(cache=True, nogil=True)
-def _turn_and_shift(faces, normals, cosine, sine, x, y, z, out_corners, out_normals):
+def _turn_and_shift(
+    faces: NDArray, normals: NDArray, cosine: float, sine: float, x: float, y: float, z: float,
+    out_corners: NDArray, out_normals: NDArray,
+) -> None:  # fmt: skip
     for t in range(faces.shape[0]):
         for i in range(3):
             a, b = faces[t, i, 0], faces[t, i, 1]

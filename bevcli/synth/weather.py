@@ -44,28 +44,90 @@ def make_weather(name: str, rng: np.random.Generator) -> Weather:
     azimuth = rng.uniform(0, 2 * np.pi)
     if name == "noon":
         elevation = rng.uniform(0.65, 1.05)
-        return _weather(name, azimuth, elevation, (1.0, 0.95, 0.86), 1.25, (0.32, 0.39, 0.50), (84, 136, 206),
-                        (190, 212, 232), (255, 255, 255), _clouds(rng, rng.uniform(0.45, 0.62)), 420.0, 0.5, 0.05)  # fmt: skip
+        return _weather(
+            name,
+            azimuth,
+            elevation,
+            (1.0, 0.95, 0.86),
+            1.25,
+            (0.32, 0.39, 0.50),
+            (84, 136, 206),
+            (190, 212, 232),
+            (255, 255, 255),
+            _clouds(rng, rng.uniform(0.45, 0.62)),
+            420.0,
+            0.5,
+            0.05,
+        )
     if name == "evening":
         elevation = rng.uniform(0.22, 0.38)
-        return _weather(name, azimuth, elevation, (1.0, 0.70, 0.42), 0.95, (0.26, 0.28, 0.38), (92, 118, 178),
-                        (250, 206, 160), (255, 214, 178), _clouds(rng, rng.uniform(0.42, 0.6)), 300.0, 1.2, 0.12)  # fmt: skip
-    return _weather("overcast", azimuth, 1.35, (0.95, 0.98, 1.0), 0.22, (0.50, 0.53, 0.57), (150, 158, 168),
-                    (205, 210, 214), (222, 226, 230), _clouds(rng, 0.2), 230.0, 0.8, 0.8)  # fmt: skip
+        return _weather(
+            name,
+            azimuth,
+            elevation,
+            (1.0, 0.70, 0.42),
+            0.95,
+            (0.26, 0.28, 0.38),
+            (92, 118, 178),
+            (250, 206, 160),
+            (255, 214, 178),
+            _clouds(rng, rng.uniform(0.42, 0.6)),
+            300.0,
+            1.2,
+            0.12,
+        )
+    return _weather(
+        "overcast",
+        azimuth,
+        1.35,
+        (0.95, 0.98, 1.0),
+        0.22,
+        (0.50, 0.53, 0.57),
+        (150, 158, 168),
+        (205, 210, 214),
+        (222, 226, 230),
+        _clouds(rng, 0.2),
+        230.0,
+        0.8,
+        0.8,
+    )
 
 
 def _weather(
-    name: str, azimuth: float, elevation: float, sun: tuple[float, float, float], strength: float,
-    sky: tuple[float, float, float], zenith: tuple[int, int, int], horizon: tuple[int, int, int],
-    cloud: tuple[int, int, int], clouds: NDArray[np.float32], haze_m: float, lamps: float, softness: float,
-) -> Weather:  # fmt: skip
+    name: str,
+    azimuth: float,
+    elevation: float,
+    sun: tuple[float, float, float],
+    strength: float,
+    sky: tuple[float, float, float],
+    zenith: tuple[int, int, int],
+    horizon: tuple[int, int, int],
+    cloud: tuple[int, int, int],
+    clouds: NDArray[np.float32],
+    haze_m: float,
+    lamps: float,
+    softness: float,
+) -> Weather:
     to_sun = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
     sun_light = (np.array(sun) * strength).astype(np.float32)
     sky_light = np.array(sky, np.float32)
     bounce = (0.22 * (sun_light * np.sin(elevation) + sky_light) + 0.25 * sky_light).astype(np.float32)
     haze = linear(horizon) * np.float32(0.95)
-    return Weather(name, to_sun, sun_light, sky_light, bounce, linear(zenith), linear(horizon), haze, linear(cloud),
-                   clouds, haze_m, lamps, softness)  # fmt: skip
+    return Weather(
+        name,
+        to_sun,
+        sun_light,
+        sky_light,
+        bounce,
+        linear(zenith),
+        linear(horizon),
+        haze,
+        linear(cloud),
+        clouds,
+        haze_m,
+        lamps,
+        softness,
+    )
 
 
 def _clouds(rng: np.random.Generator, threshold: float) -> NDArray[np.float32]:

@@ -47,9 +47,7 @@ def test_projected_box_contains_the_objects_pixels(drive: Drive, frame: Rendered
             row = rows.get(states[index].body.instance)
             if row is None:
                 continue
-            pixels, depths = _projected(
-                frame.boxes.corners()[row], drive.rig[name], frame.world_from_ego
-            )
+            pixels, depths = _projected(frame.boxes.corners()[row], drive.rig[name], frame.world_from_ego)
             if depths.min() < 0.3:
                 continue
             v, u = np.nonzero(exposure.objects == index)
@@ -64,18 +62,18 @@ def test_visibility_agrees_with_rendering_each_object_alone(drive: Drive, frame:
     """Another way to count: a scene with nothing but the object, and the difference of two pictures."""
     states = drive.states(9)
     rows = {instance: k for k, instance in enumerate(frame.boxes.instances)}
-    visible_rows = [k for k, s in enumerate(states) if frame.boxes.num_points[rows.get(s.body.instance, 0)] > 150][:8]
-    for k in visible_rows:
-        body = states[k].body
-        if body.instance not in rows:
+    checked = 0
+    for k, state in enumerate(states):
+        row = rows.get(state.body.instance)
+        solid = state.body.variant.class_name in ("car", "truck", "bus", "trailer")  # OpenCV fattens thin bars
+        if row is None or not solid or frame.boxes.num_points[row] < 300:
             continue
-        row = rows[body.instance]
-        alone = 0
-        for camera in drive.rig.cameras:
-            alone += _silhouette(drive, states[k], camera, frame).sum()
+        alone = sum(int(_silhouette(drive, state, camera, frame).sum()) for camera in drive.rig.cameras)
         shown = sum(int((e.objects == k).sum()) for e in frame.exposures.values())
         assert frame.boxes.num_points[row] == shown
         assert frame.boxes.visibilities[row] == pytest.approx(shown / alone, abs=0.04)
+        checked += 1
+    assert checked >= 3
 
 
 def _silhouette(drive: Drive, state: State, camera, frame: RenderedFrame):
