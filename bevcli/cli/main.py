@@ -6,12 +6,14 @@ may have one of its own. No command module imports torch, OpenCV or rerun before
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import Annotated
 
 import typer
 
 from bevcli import __version__
+from bevcli.cli.bench import bench
 from bevcli.cli.convert import convert
 from bevcli.cli.demo import demo
 from bevcli.cli.eval import evaluate
@@ -19,6 +21,7 @@ from bevcli.cli.export import export
 from bevcli.cli.project_debug import project_debug
 from bevcli.cli.run import run
 from bevcli.cli.train import train
+from bevcli.cli.validate import validate
 from bevcli.cli.viz import viz
 from bevcli.cli.weights import weights_app
 from bevcli.errors import BevcliError
@@ -46,6 +49,7 @@ def root(
     """Run BEVFormer on sequences from any camera rig, and see what it sees."""
 
 
+app.command()(bench)
 app.command()(convert)
 app.command()(demo)
 app.command("eval")(evaluate)
@@ -53,12 +57,16 @@ app.command()(export)
 app.command()(project_debug)
 app.command()(run)
 app.command()(train)
+app.command()(validate)
 app.command()(viz)
 app.add_typer(weights_app, name="weights")
 
 
 def run_app() -> None:
     """The console entry point: a user's mistake is one line on stderr and exit code 1, never a traceback."""
+    # Read when PyTorch is loaded: its threads sleep while they wait, so that a frame on a busy machine is not held up
+    # by spinning.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         app()
     except BevcliError as error:

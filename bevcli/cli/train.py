@@ -77,24 +77,29 @@ def choose_drives(
     data: list[Path], rendered: str | None, out: Path, config: BEVFormerConfig, held_out: int
 ) -> tuple[Drives, Drives]:
     """The drives to learn from and those to evaluate on: the last `held_out`, or the same ones where that is 0."""
-    from bevcli.training.drives import FolderDrives, RenderedDrives, part_of
+    from bevcli.training.drives import FIRST_HELD_OUT_SEED, part_of
 
-    if bool(data) == (rendered is not None):
-        raise InputError("training needs drives: give --data DIR (once or more), or --rendered SEEDS, not both")
-
-    def everything() -> Drives:
-        if rendered is None:
-            return FolderDrives(data, config.rate_hz)
-        return RenderedDrives(parse_seeds(rendered), out / "drives", config)
-
-    drives = everything()
+    if rendered is not None and max(parse_seeds(rendered)) >= FIRST_HELD_OUT_SEED:
+        raise InputError(f"--rendered {rendered}: seeds from {FIRST_HELD_OUT_SEED} on are kept for evaluation")
+    drives = open_drives(data, rendered, out / "drives", config)
     count = len(drives)
     if count <= held_out:
         raise InputError(
             f"{count} drives are too few with {held_out} of them held out for evaluation: give more, "
             "or set held_out = 0 in [training] (then it evaluates on what it learned from)"
         )
-    return (part_of(drives, 0, count - held_out), part_of(everything(), count - held_out if held_out else 0, count))
+    return part_of(drives, 0, count - held_out), part_of(drives, count - held_out if held_out else 0, count)
+
+
+def open_drives(data: list[Path], rendered: str | None, cache: Path, config: BEVFormerConfig) -> Drives:
+    """The drives in folders, or rendered from seeds and kept in `cache`. Raises InputError for both or neither."""
+    from bevcli.training.drives import FolderDrives, RenderedDrives
+
+    if bool(data) == (rendered is not None):
+        raise InputError("which drives? give --data DIR (once or more), or --rendered SEEDS, not both")
+    if rendered is None:
+        return FolderDrives(data, config.rate_hz)
+    return RenderedDrives(parse_seeds(rendered), cache, config)
 
 
 def parse_seeds(text: str) -> list[int]:
@@ -104,7 +109,7 @@ def parse_seeds(text: str) -> list[int]:
         seeds = list(range(int(start), int(end))) if colon else [int(part) for part in text.split(",")]
     except ValueError:
         seeds = []
-    if not seeds:
+    if not seeds or min(seeds) < 0:
         raise typer.BadParameter(f'"{text}" (expected A:B, or A,B,C)', param_hint="--rendered")
     return seeds
 

@@ -169,8 +169,8 @@ def test_drives_are_asked_for_held_out_and_kept_apart(tmp_path: Path) -> None:
 
 
 def test_seeds_kept_for_evaluation_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="kept for evaluation"):
-        RenderedDrives([1, 1_000_000], tmp_path, CONFIG)
+    with pytest.raises(InputError, match="seeds from 1000000 on are kept for evaluation"):
+        choose_drives([], "1,1000000", tmp_path, CONFIG, 1)
 
 
 def test_a_training_is_not_overwritten(tmp_path: Path) -> None:
