@@ -58,9 +58,10 @@ class Roadside:
         closed = (high + 1, high + 1)
         if rng.random() < WORKS_SHARE:
             length = rng.uniform(15, 24)
-            begin = rng.uniform(low, high - length)
-            closed = (begin, begin + length)
-            made += self._works(street, side, closed, rng, name)
+            if length < high - low:  # a short block has no room for them
+                begin = rng.uniform(low, high - length)
+                closed = (begin, begin + length)
+                made += self._works(street, side, closed, rng, name)
         at = low
         while at < high - 4:
             class_name = str(rng.choice(list(PARKED_MIX), p=list(PARKED_MIX.values())))

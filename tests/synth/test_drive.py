@@ -251,3 +251,8 @@ def _overlap(one: State, other: State, tolerance_m: float = 0.15) -> bool:
             if min(a.max(), b.max()) - max(a.min(), b.min()) < tolerance_m:
                 return False
     return True
+
+
+def test_a_block_too_short_for_road_works_has_none(stock: Stock):
+    drive = Drive(22, 2, stock=stock)  # starts beside one
+    assert len(drive.states(0)) > 0
