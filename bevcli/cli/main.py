@@ -13,6 +13,7 @@ from typing import Annotated
 import typer
 
 from bevcli import __version__
+from bevcli.cli.bench import bench
 from bevcli.cli.convert import convert
 from bevcli.cli.demo import demo
 from bevcli.cli.eval import evaluate
@@ -48,6 +49,7 @@ def root(
     """Run BEVFormer on sequences from any camera rig, and see what it sees."""
 
 
+app.command()(bench)
 app.command()(convert)
 app.command()(demo)
 app.command("eval")(evaluate)

@@ -24,7 +24,7 @@ def _as_float32(number):  # type: ignore[no-untyped-def]
 
 
 def put_float32(array: object, index: int, number: object) -> None:
-    """Stores a float32 in an array of float32, or of bfloat16 bits, rounded to even. Only for compiled code."""
+    """Stores a float32 in an array of float32, or of bfloat16 bits, rounded to nearest. Only for compiled code."""
     raise NotImplementedError
 
 
@@ -37,14 +37,14 @@ def _put_float32(array, index, number):  # type: ignore[no-untyped-def]
     else:
 
         def put(array, index, number):  # type: ignore[no-untyped-def]
-            bits = np.float32(number).view(np.uint32)
-            rounding = np.uint32(0x7FFF) + ((bits >> np.uint32(16)) & np.uint32(1))
-            array[index] = np.uint16((bits + rounding) >> np.uint32(16))
+            # Casts after every step: sums of two uint32 would be worked out in 64 bits, half as many at a time.
+            bits = np.uint32(np.float32(number).view(np.uint32) + np.uint32(0x8000))
+            array[index] = np.uint16(np.uint32(bits >> np.uint32(16)))
 
     return put
 
 
-@njit(nogil=True, cache=True, error_model="numpy", inline="never")
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"}, inline="never")
 def bilinear_corners(x, y, height, width):  # type: ignore[no-untyped-def]
     """The four cells around a place (x, y) in cells and their shares: (top, bottom, left, right, four shares).
 
@@ -67,7 +67,7 @@ def bilinear_corners(x, y, height, width):  # type: ignore[no-untyped-def]
     return top, bottom, left, right, shares
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
 def sample_maps(values, level_shapes, locations, weights, map_of_query, out, begin, end) -> None:  # type: ignore[no-untyped-def]
     """Writes the weighted sums of queries begin to end - 1 to out (M, heads, D) float32.
 
@@ -110,7 +110,7 @@ def sample_maps(values, level_shapes, locations, weights, map_of_query, out, beg
                 start += height * width
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
 def sample_taps(x, offsets, mask, stride, first, out, begin, end) -> None:  # type: ignore[no-untyped-def]
     """Writes the nine sampled and masked taps of output positions first + begin to first + end - 1.
 
@@ -120,6 +120,7 @@ def sample_taps(x, offsets, mask, stride, first, out, begin, end) -> None:  # ty
     """
     _, height, width, channels = x.shape
     _, out_height, out_width, taps = mask.shape
+    total = np.empty(channels, dtype=np.float32)
     for row in range(begin, end):
         position = first + row
         picture = position // (out_height * out_width)
@@ -139,10 +140,12 @@ def sample_taps(x, offsets, mask, stride, first, out, begin, end) -> None:  # ty
             a, b = x[picture, top, left], x[picture, top, right]
             c, d = x[picture, bottom, left], x[picture, bottom, right]
             for channel in range(channels):
-                total = (
+                total[channel] = (
                     w00 * as_float32(a[channel])
                     + w01 * as_float32(b[channel])
                     + w10 * as_float32(c[channel])
                     + w11 * as_float32(d[channel])
                 )
-                put_float32(target, channel, total)
+            # A loop of its own: in one with the rounding, the sums of bfloat16 are not worked out side by side.
+            for channel in range(channels):
+                put_float32(target, channel, total[channel])

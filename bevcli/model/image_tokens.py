@@ -36,13 +36,13 @@ class ImageTokens(nn.Module):
     def forward(self, maps: Sequence[Tensor], camera_index: Tensor) -> FeatureMaps:
         """maps: (B·N, C, H_l, W_l), one a level. camera_index: (N,) int64.
 
-        Returns the tokens (B·N, S, C) of B·N maps with L levels.
+        Returns the tokens (B·N, S, C) of B·N maps with L levels, in the maps' dtype: rounded once where that is half.
         """
         level_shapes = tuple((x.shape[-2], x.shape[-1]) for x in maps)
         levels = [x.flatten(2).transpose(1, 2) + self.level_embedding[i] for i, x in enumerate(maps)]
         tokens = torch.cat(levels, dim=1)  # (B·N, S, C)
         if self.camera_embedding is None:
-            return FeatureMaps(tokens, level_shapes)
+            return FeatureMaps(tokens.to(maps[0].dtype), level_shapes)
         embedding = self.camera_embedding[camera_index]  # (N, C)
         by_camera = tokens.unflatten(0, (-1, len(camera_index))) + embedding[:, None]
-        return FeatureMaps(by_camera.flatten(0, 1), level_shapes)
+        return FeatureMaps(by_camera.flatten(0, 1).to(maps[0].dtype), level_shapes)

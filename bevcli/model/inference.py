@@ -77,7 +77,7 @@ def _fold(parent: nn.Module, convolution_name: str, norm_name: str) -> None:
 
 
 def _lower_precision(model: BEVFormer, dtype: torch.dtype) -> None:
-    for part in (model.backbone, model.neck, model.image_tokens):
+    for part in (model.backbone, model.neck):
         part.to(dtype)
     for module in model.encoder.modules():
         if isinstance(module, SpatialCrossAttention):

@@ -7,6 +7,8 @@ import ctypes
 # Parameters of mallopt(3).
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 _LARGEST_BLOCK = 1 << 30
+# Where glibc's own thresholds end up in a process that frees large blocks.
+_USUAL_MMAP_THRESHOLD = 32 << 20
 
 
 def keep_freed_memory() -> None:
@@ -15,7 +17,19 @@ def keep_freed_memory() -> None:
     By default every tensor over 32 MiB is mapped, zeroed page by page and unmapped again: in ResNet-50 on six pictures
     that was 2.4 million page faults and half of the time. Does nothing where the C library is not glibc.
     """
+    _set_thresholds(mmap=_LARGEST_BLOCK, trim=(1 << 31) - 1)
+
+
+def return_freed_memory() -> None:
+    """As glibc does by itself; what is free now goes back to the kernel at once."""
+    _set_thresholds(mmap=_USUAL_MMAP_THRESHOLD, trim=2 * _USUAL_MMAP_THRESHOLD)
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
+
+
+def _set_thresholds(mmap: int, trim: int) -> None:
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
-        mallopt(_M_MMAP_THRESHOLD, _LARGEST_BLOCK)
-        mallopt(_M_TRIM_THRESHOLD, (1 << 31) - 1)
+        mallopt(_M_MMAP_THRESHOLD, mmap)
+        mallopt(_M_TRIM_THRESHOLD, trim)

@@ -1,0 +1,157 @@
+"""The benchmark itself: warm up, time every stage, compare with the plain version and with the machine's limits."""
+
+from __future__ import annotations
+
+import contextlib
+import platform
+import resource
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from bevcli.benchmark.comparison import compare_with_plain
+from bevcli.benchmark.limits import measure_limits
+from bevcli.benchmark.made_up_drive import MadeUpDrive
+from bevcli.benchmark.made_up_model import made_up_model
+from bevcli.benchmark.operations import count_operations
+from bevcli.benchmark.result import BenchmarkResult
+from bevcli.benchmark.version import Version
+from bevcli.model.bevformer import BEVFormer, BEVFormerConfig
+from bevcli.model.inference import Precision, prepare_for_inference
+from bevcli.model.pillar_projection import find_hits, project_pillars
+from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
+from bevcli.viz.recording import Recording
+
+WARM_UP_FRAMES = 2  # the second is the first with history
+RUN_FRAMES = 4  # at most, of the run with reading and recording; its first frame does not count
+
+
+@dataclass(frozen=True)
+class BenchmarkSettings:
+    """frames: that are timed, after the warm-up. against_plain: whether the plain version runs beside the fast one.
+
+    profile: where PyTorch's profile of one frame is written (Chrome's trace format).
+    """
+
+    config: BEVFormerConfig
+    device: torch.device
+    precision: Precision
+    frames: int = 5
+    against_plain: bool = False
+    profile: Path | None = None
+
+
+def run_benchmark(settings: BenchmarkSettings) -> BenchmarkResult:
+    """Everything, one after the other; nothing else should run on the machine."""
+    config, device = settings.config, settings.device
+    limits = measure_limits(device, settings.precision)
+    model = made_up_model(config)
+    fast = Version(prepare_for_inference(model, device, settings.precision), device)
+    drive = MadeUpDrive(max(WARM_UP_FRAMES + settings.frames, RUN_FRAMES))
+    stages = _time_stages(fast, drive, settings.frames)
+    frame_s, peak = tuple(fast.seconds), _peak_memory(device)
+    run_frame_s = _time_run(fast, drive)
+    if settings.profile is not None:
+        _write_profile(fast, _prepared(drive, config, 0), settings.profile)
+    comparison = None
+    if settings.against_plain:
+        frames = (_prepared(drive, config, place) for place in range(settings.frames))
+        comparison, frame_s = compare_with_plain(model, fast, frames)
+    return BenchmarkResult(
+        model=config.name,
+        device=device.type,
+        precision=settings.precision,
+        machine=describe_machine(device),
+        stages_s=stages,
+        frame_s=frame_s,
+        run_frame_s=run_frame_s,
+        peak_memory_bytes=peak,
+        operations=count_operations(config, _hits(model, _prepared(drive, config, 0))),
+        limits=limits.fastest(measure_limits(device, settings.precision)),
+        comparison=comparison,
+    )
+
+
+def describe_machine(device: torch.device) -> str:
+    """Processor or GPU, threads and PyTorch's version, in words."""
+    if device.type == "cuda":
+        return f"{torch.cuda.get_device_name(device)}, PyTorch {torch.__version__}"
+    cpu = Path("/proc/cpuinfo")
+    lines = cpu.read_text().splitlines() if cpu.is_file() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    name = names[0] if names else platform.processor() or platform.machine()
+    capability = torch.backends.cpu.get_cpu_capability()
+    return f"{name} ({capability}), {torch.get_num_threads()} threads, PyTorch {torch.__version__}"
+
+
+def _time_stages(fast: Version, drive: MadeUpDrive, frames: int) -> dict[str, tuple[float, ...]]:
+    """Seconds of each stage of each frame, the warm-up left out; one stage at a time."""
+    preprocessor = Preprocessor(fast.runner.config)
+    times: dict[str, list[float]] = defaultdict(list)
+    with _recording(drive, fast) as recording:
+        for place in range(WARM_UP_FRAMES + frames):
+            if place == WARM_UP_FRAMES:
+                times.clear()
+                fast.forget_times()
+            marks = [time.perf_counter()]
+            frame = drive.load(place)
+            marks.append(time.perf_counter())
+            prepared = preprocessor(frame)
+            marks.append(time.perf_counter())
+            prediction = fast.step(prepared)
+            recording_began = time.perf_counter()
+            recording.log(frame, prediction)
+            recording_s = time.perf_counter() - recording_began
+            outside = {"decode": marks[1] - marks[0], "preprocess": marks[2] - marks[1]}
+            for stage, seconds in {**outside, **prediction.stage_seconds, "recording": recording_s}.items():
+                times[stage].append(seconds)
+    return {stage: tuple(seconds) for stage, seconds in times.items()}
+
+
+def _time_run(fast: Version, drive: MadeUpDrive) -> float:
+    """Seconds a frame where reading and recording go on beside the model, as in `bevcli run`."""
+    done = []
+    with _recording(drive, fast) as recording:
+        for frame, prediction, _ in fast.runner.run(drive, range(RUN_FRAMES), Preprocessor(fast.runner.config)):
+            recording.log(frame, prediction)
+            done.append(time.perf_counter())
+    return (done[-1] - done[0]) / (len(done) - 1)
+
+
+@contextlib.contextmanager
+def _recording(drive: MadeUpDrive, fast: Version) -> Iterator[Recording]:
+    """A recording of the standard kind in a folder that vanishes."""
+    with tempfile.TemporaryDirectory(prefix="bevcli-bench-") as folder:
+        path, classes = Path(folder) / "recording.rrd", fast.runner.config.classes
+        with Recording(path, rig=drive.rig, class_names=classes, title="benchmark", untrained=True) as recording:
+            yield recording
+
+
+def _write_profile(fast: Version, prepared: PreparedFrame, path: Path) -> None:
+    with torch.profiler.profile() as profile:
+        fast.step(prepared)
+    profile.export_chrome_trace(str(path))
+
+
+def _prepared(drive: MadeUpDrive, config: BEVFormerConfig, place: int) -> PreparedFrame:
+    return Preprocessor(config)(drive.load(place))
+
+
+def _hits(model: BEVFormer, prepared: PreparedFrame) -> tuple[int, ...]:
+    size = (prepared.images.shape[-2], prepared.images.shape[-1])
+    projection = project_pillars(prepared.image_from_bev, model.pillars.cpu(), size, prepared.has_picture)
+    return find_hits(projection).hits_per_camera
+
+
+def _peak_memory(device: torch.device) -> int:
+    """Bytes: of the whole process on the CPU, of tensors on a GPU."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak

@@ -1,0 +1,61 @@
+"""The table of docs/speed.md: every model at every precision, each in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from bevcli.config import known_models
+from bevcli.errors import BevcliError
+
+BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"
+COLUMNS: Mapping[str, Callable[[dict[str, Any]], str]] = {
+    "model": lambda r: r["model"],
+    "precision": lambda r: r["precision"],
+    "frame, ms": lambda r: f"{r['frame_ms']:.0f}",
+    "frames a second": lambda r: f"{r['fps']:.3g}",
+    "plain, ms": lambda r: f"{r['plain_frame_ms']:.0f}",
+    "times faster": lambda r: f"{r['speedup']:.2f}",
+    "times the limit": lambda r: f"{r['limits']['times_limit']:.2f}",
+    "G operations": lambda r: f"{r['operations_g']:.0f}",
+    "matrix products, G/s": lambda r: f"{r['limits']['gemm_gflops']:.0f}",
+    "run / model": lambda r: f"{r['run_frame_ms'] / r['frame_ms']:.2f}",
+    "memory, MB": lambda r: f"{r['peak_memory_mb']:.0f}",
+    "boxes within 0.1 m": lambda r: f"{r['share_within_0.1_m']:.1%}",
+    "largest score difference": lambda r: f"{r['max_score_difference']:.1g}",
+}
+
+
+def write_table(path: Path, device: torch.device, frames: int) -> None:
+    """Measures and writes the table between its two marks in a Markdown file. Raises BevcliError without marks."""
+    text = path.read_text() if path.is_file() else f"{BEGIN}\n{END}\n"
+    before, begin, rest = text.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not (begin and end):
+        raise BevcliError(f"{path}: has no place for the table (expected the lines {BEGIN} and {END})")
+    precisions = ("bf16", "fp16") if device.type == "cuda" else ("fp32", "bf16")
+    results = [_measure(model, precision, device, frames) for model in known_models() for precision in precisions]
+    path.write_text(f"{before}{begin}\n{_table(results)}\n{end}{after}")
+
+
+def _measure(model: str, precision: str, device: torch.device, frames: int) -> dict[str, Any]:
+    print(f"measuring {model}, {precision} …", file=sys.stderr)
+    options = ["--model", model, "--precision", precision, "--device", device.type, "--frames", str(frames)]
+    command = [sys.executable, "-m", "bevcli", "bench", *options, "--against", "plain", "--json"]
+    # A process of its own: its peak of memory is the model's.
+    answer = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+    return json.loads(answer.stdout)
+
+
+def _table(results: list[dict[str, Any]]) -> str:
+    machine = f"Measured on {date.today().isoformat()}: {results[0]['machine']}."
+    rows = [" | ".join(column(result) for column in COLUMNS.values()) for result in results]
+    lines = [" | ".join(COLUMNS), " | ".join("---" for _ in COLUMNS), *rows]
+    return "\n".join([machine, "", *(f"| {line} |" for line in lines)])

@@ -1,0 +1,91 @@
+"""`bevcli bench`: what it prints, and that its numbers follow from each other."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from importlib import resources
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from bevcli.benchmark.limits import MachineLimits
+from bevcli.benchmark.result import BenchmarkResult, Comparison
+from bevcli.cli.main import app
+
+RESULT = BenchmarkResult(
+    model="tiny",
+    device="cpu",
+    precision="fp32",
+    machine="two cores",
+    stages_s={"backbone": (1.0, 3.0, 2.0)},
+    frame_s=(2.0, 4.0, 3.0),
+    run_frame_s=3.3,
+    peak_memory_bytes=2_000_000,
+    operations=400e9,
+    limits=MachineLimits(gemm_gflops=200.0, copy_gbs=10.0),
+    comparison=Comparison((9.0, 6.0, 5.0), 0.02, 1.0, 1e-5),
+)
+SMALL = {
+    "size = [800, 450]": "size = [160, 90]",
+    "rows = 50": "rows = 12",
+    "columns = 50": "columns = 10",
+    "channels = 256": "channels = 32",
+    "blocks = [3, 4, 6, 3]": "blocks = [1, 1, 1, 1]\nwidth = 8",
+    "queries = 900": "queries = 30",
+}
+
+
+@pytest.fixture
+def small_model_file(tmp_path: Path) -> Path:
+    text = resources.files("bevcli").joinpath("configs/tiny.toml").read_text()
+    for old, new in SMALL.items():
+        assert old in text
+        text = text.replace(old, new)
+    path = tmp_path / "small.toml"
+    path.write_text(text)
+    return path
+
+
+def test_times_limit_is_the_frame_over_its_operations_at_full_speed():
+    assert RESULT.times_limit == pytest.approx(3.0 / 2.0)  # 400 G operations at 200 G a second are 2 s
+
+
+def test_speedup_is_the_ratio_of_medians():
+    assert RESULT.speedup == pytest.approx(6.0 / 3.0)
+    assert replace(RESULT, comparison=None).speedup is None
+
+
+def test_the_text_says_the_same_numbers():
+    text = RESULT.text()
+    for words in ("1.50 times as long", "0.333 frames a second", "2.00 times as long", "100.0%"):
+        assert words in text
+
+
+def test_json_of_a_whole_benchmark(small_model_file):
+    arguments = ["bench", "--model", str(small_model_file), "--frames", "1", "--against", "plain", "--json"]
+    answer = CliRunner().invoke(app, arguments, catch_exceptions=False)
+    data = json.loads(answer.stdout)
+    assert set(data) >= {
+        "model", "device", "precision", "stages_ms", "frame_ms", "fps", "peak_memory_mb", "operations_g", "limits",
+        "plain_frame_ms", "speedup", "max_box_difference_m", "share_within_0.1_m", "max_score_difference",
+    }  # fmt: skip
+    assert set(data["limits"]) == {"gemm_gflops", "copy_gbs", "times_limit"}
+    assert list(data["stages_ms"]) == [
+        "decode", "preprocess", "input", "backbone", "neck", "projection", "temporal attention", "spatial attention",
+        "FFN", "decoder and head", "box_decoding", "recording",
+    ]  # fmt: skip
+    assert all(milliseconds > 0 for milliseconds in data["stages_ms"].values())
+    assert 0 < data["max_box_difference_m"] < 1e-2
+    assert 0 < data["max_score_difference"] < 1e-4
+    assert data["share_within_0.1_m"] == 1
+
+
+@pytest.mark.slow
+def test_profile_of_a_frame_in_half_precision(small_model_file, tmp_path):
+    profile = tmp_path / "profile.json"
+    options = ["--precision", "bf16", "--frames", "1", "--profile", str(profile)]
+    answer = CliRunner().invoke(app, ["bench", "--model", str(small_model_file), *options], catch_exceptions=False)
+    assert "bf16" in answer.stdout
+    assert json.loads(profile.read_text())["traceEvents"]
