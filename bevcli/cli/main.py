@@ -19,6 +19,7 @@ from bevcli.cli.demo import demo
 from bevcli.cli.eval import evaluate
 from bevcli.cli.export import export
 from bevcli.cli.project_debug import project_debug
+from bevcli.cli.render import render
 from bevcli.cli.run import run
 from bevcli.cli.train import train
 from bevcli.cli.validate import validate
@@ -55,6 +56,7 @@ app.command()(demo)
 app.command("eval")(evaluate)
 app.command()(export)
 app.command()(project_debug)
+app.command()(render)
 app.command()(run)
 app.command()(train)
 app.command()(validate)
