@@ -1,4 +1,5 @@
-# make demo: run the main job on a sample.  make test / test-all: the tests.  make check: lint and types.
+# make demo: run the main job on a sample.  make test / test-all: the tests, without and with the slow ones.
+# make check: lint and types.  make bench: measure this machine and write docs/speed.md (nothing else may run).
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
@@ -8,7 +9,7 @@ ifneq ($(wildcard ../shared),)
 export BEVCLI_SHARED ?= $(abspath ../shared)
 endif
 
-.PHONY: install demo test test-all check format clean
+.PHONY: install demo test test-all check format bench clean
 
 install: $(INSTALLED)
 
@@ -23,8 +24,16 @@ demo: $(INSTALLED)
 test: $(INSTALLED)
 	$(BIN)/pytest -m "not slow and not gpu"
 
-test-all: $(INSTALLED)
+test-all: $(VENV)/.viewers
 	$(BIN)/pytest
+
+$(VENV)/.viewers: $(INSTALLED)
+	$(BIN)/pip install --quiet --constraint constraints.txt playwright
+	.ci/install-viewers
+	touch $@
+
+bench: $(INSTALLED)
+	$(BIN)/bevcli bench --table docs/speed.md
 
 check: $(INSTALLED)
 	$(BIN)/ruff check .
