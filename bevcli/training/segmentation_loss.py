@@ -89,14 +89,12 @@ def _choose(
     outputs: SegmentationOutputs, element: int, truth: SegmentationTargets, config: SegmentationLossConfig
 ) -> _Chosen:
     pairs = match(matching_costs(outputs, element, truth, config))
-    device = truth.things.device
-    things, found = torch.as_tensor(pairs.queries, device=device), torch.as_tensor(pairs.truths, device=device)
-    queries, masks = things + len(STUFF_CLASSES), truth.things[found]
+    queries, masks = pairs.queries + len(STUFF_CLASSES), truth.things[pairs.truths]
     if truth.stuff is not None:
         present = truth.stuff.any(-1)
         queries = torch.cat([present.nonzero()[:, 0], queries])
         masks = torch.cat([truth.stuff[present], masks])
-    return _Chosen(queries, masks, things, truth.locations[found])
+    return _Chosen(queries, masks, pairs.queries, truth.locations[pairs.truths])
 
 
 def _class_loss(class_logits: Tensor, chosen: Sequence[_Chosen], targets: Sequence[SegmentationTargets]) -> Tensor:
