@@ -39,10 +39,11 @@ LINE_M = 0.14
 
 @dataclass(frozen=True)
 class GroundPaint:
-    """One colour on the ground. outline: (P, 2) world, convex or nearly so."""
+    """One colour on the ground. outline: (P, 2) world. width_m: of a line; finer textures than that show it."""
 
     outline: Array
     color: Color
+    width_m: float = float("inf")
 
 
 @dataclass(frozen=True)
@@ -245,7 +246,7 @@ class GroundPlan:
         way = b - a
         normal = np.stack([-way[:, 1], way[:, 0]], -1) / np.linalg.norm(way, axis=1, keepdims=True) * width / 2
         corners = self.city.bend(np.stack([a + normal, b + normal, b - normal, a - normal], axis=1))
-        return [GroundPaint(outline, color) for outline in corners]
+        return [GroundPaint(outline, color, width) for outline in corners]
 
 
 def _pairs(varying: Array, fixed: float) -> Array:

@@ -43,7 +43,8 @@ def paint_ground(pieces: list[GroundPiece], center: ArrayLike, extent_m: float, 
     canvas[:] = _stored(ASPHALT)
     for piece in pieces:
         for paint in piece.paints:
-            fill(canvas, (paint.outline - origin) / texel_m - 0.5, _stored(paint.color))
+            if paint.width_m > texel_m / 2:
+                fill(canvas, (paint.outline - origin) / texel_m - 0.5, _stored(paint.color))
     levels = [canvas]
     for _ in range(LEVELS - 1):
         levels.append(cv2.resize(levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))

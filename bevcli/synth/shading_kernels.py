@@ -201,22 +201,24 @@ def _ground(ground, x, y, across, along, rx, ry, out):
         span *= 2
     n = size >> level
     scale = 1.0 / (texel_m * (1 << level))
-    out[0] = out[1] = out[2] = 0.0
+    red = green = blue = 0.0
+    step_x, step_y = along / samples * rx / flat * scale, along / samples * ry / flat * scale
+    start_x = (x - origin_x) * scale - 0.5 - 0.5 * (samples - 1) * step_x
+    start_y = (y - origin_y) * scale - 0.5 - 0.5 * (samples - 1) * step_y
     for i in range(samples):
-        shift = ((i + 0.5) / samples - 0.5) * along
-        u = (x + shift * rx / flat - origin_x) * scale - 0.5
-        v = (y + shift * ry / flat - origin_y) * scale - 0.5
-        u, v = min(max(u, 0.0), n - 1.001), min(max(v, 0.0), n - 1.001)
+        u = min(max(start_x + i * step_x, 0.0), n - 1.001)
+        v = min(max(start_y + i * step_y, 0.0), n - 1.001)
         iu, iv = int(u), int(v)
         wu, wv = u - iu, v - iv
+        w00, w01, w10, w11 = (1 - wu) * (1 - wv), wu * (1 - wv), (1 - wu) * wv, wu * wv
         at = offsets[level] + iv * n + iu
-        for c in range(3):
-            value = (texels[at, c] * (1 - wu) + texels[at + 1, c] * wu) * (1 - wv) + (
-                texels[at + n, c] * (1 - wu) + texels[at + n + 1, c] * wu
-            ) * wv
-            out[c] += value * value
-    for c in range(3):
-        out[c] /= 65025.0 * samples
+        under = at + n
+        r = texels[at, 0] * w00 + texels[at + 1, 0] * w01 + texels[under, 0] * w10 + texels[under + 1, 0] * w11
+        g = texels[at, 1] * w00 + texels[at + 1, 1] * w01 + texels[under, 1] * w10 + texels[under + 1, 1] * w11
+        b = texels[at, 2] * w00 + texels[at + 1, 2] * w01 + texels[under, 2] * w10 + texels[under + 1, 2] * w11
+        red, green, blue = red + r * r, green + g * g, blue + b * b
+    share = 1.0 / (65025.0 * samples)
+    out[0], out[1], out[2] = red * share, green * share, blue * share
     size_n = rough.shape[0]
     u, v = x / ROUGH_TEXEL_M, y / ROUGH_TEXEL_M
     iu, iv = int(np.floor(u)), int(np.floor(v))
