@@ -39,11 +39,10 @@ def recording_blueprint(rig: CameraRig, note: str = "", probes: bool = False) ->
 def _scene(rig: CameraRig, titled: str) -> rrb.Spatial3DView:
     drawn_in_pictures = ("boxes", "ground_truth", "pillars", "probes")
     excluded = [f"- /{entities.overlay(name, kind)}/**" for name in rig.names for kind in drawn_in_pictures]
-    since_start = rr.VisibleTimeRange(
-        entities.TIME_TIMELINE,
-        start=rr.TimeRangeBoundary.infinite(),
-        end=rr.TimeRangeBoundary.cursor_relative(),
-    )
+    since_start = [
+        rr.VisibleTimeRange(timeline, start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative())
+        for timeline in (entities.TIME_TIMELINE, entities.FRAME_TIMELINE)
+    ]
     return rrb.Spatial3DView(
         origin=entities.EGO,  # the scene follows the vehicle because it is drawn in its frame
         contents=[f"/{entities.WORLD}/**", *excluded],
@@ -52,7 +51,7 @@ def _scene(rig: CameraRig, titled: str) -> rrb.Spatial3DView:
         line_grid=False,
         eye_controls=rrb.EyeControls3D(position=EYE_M, look_target=LOOK_AT_M, eye_up=(0, 0, 1)),
         overrides={
-            entities.TRAJECTORY: [rrb.VisibleTimeRanges([since_start])],
+            entities.TRAJECTORY: [rrb.VisibleTimeRanges(since_start)],
             entities.PILLARS: [HIDDEN],
         },
     )

@@ -10,13 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 
 Color = tuple[int, int, int]
 
-# Vehicles warm or cold by size, people and their wheels apart from them, street furniture pale.
+# None is red: red means missed or false.
 CLASS_COLORS: dict[str, Color] = {
     "car": (255, 158, 44),
-    "truck": (255, 99, 71),
-    "construction_vehicle": (233, 150, 122),
+    "truck": (186, 222, 92),
+    "construction_vehicle": (205, 155, 110),
     "bus": (240, 108, 190),
-    "trailer": (255, 140, 140),
+    "trailer": (110, 190, 120),
     "barrier": (150, 160, 175),
     "motorcycle": (178, 130, 255),
     "bicycle": (96, 165, 255),
@@ -27,6 +27,9 @@ GROUND_TRUTH_COLOR: Color = (235, 238, 245)
 MISSED_COLOR: Color = (255, 45, 85)
 FALSE_COLOR: Color = (255, 45, 85)
 EGO_COLOR: Color = (90, 200, 250)
+STAGE_COLORS: tuple[Color, ...] = (
+    (96, 165, 255), (255, 158, 44), (70, 222, 190), (240, 108, 190), (245, 222, 90), (178, 130, 255), (186, 222, 92),
+)  # fmt: skip
 RING_COLOR: Color = (92, 98, 112)
 MAP_COLORS: dict[str, Color] = {
     "drivable_road": (62, 70, 84),

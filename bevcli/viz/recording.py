@@ -21,7 +21,7 @@ from bevcli.viz.blueprint import recording_blueprint
 from bevcli.viz.live import LiveView
 from bevcli.viz.matching import counted, match
 from bevcli.viz.options import RecordingOptions
-from bevcli.viz.palette import EGO_COLOR, class_color
+from bevcli.viz.palette import EGO_COLOR, STAGE_COLORS, class_color
 from bevcli.viz.pillars import drawn_pillars
 
 APPLICATION = "bevcli"
@@ -191,7 +191,8 @@ class Recording:
         self._stream.log(entities.STAGE_CURVES, rr.Scalars(list(stages.values())))
 
     def _name_curves(self, stages: Mapping[str, float]) -> None:
-        self._stream.log(entities.STAGE_CURVES, rr.SeriesLines(names=list(stages)), static=True)
+        stage_colors = [STAGE_COLORS[place % len(STAGE_COLORS)] for place in range(len(stages))]
+        self._stream.log(entities.STAGE_CURVES, rr.SeriesLines(names=list(stages), colors=stage_colors), static=True)
         colors = [class_color(name, place) for place, name in enumerate(self.class_names)]
         lines = rr.SeriesLines(names=list(self.class_names), colors=colors)
         self._stream.log(entities.BOX_CURVES, lines, static=True)

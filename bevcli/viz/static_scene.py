@@ -15,7 +15,7 @@ from bevcli.viz.palette import EGO_COLOR, RING_COLOR, class_color, colormap
 from bevcli.viz.vehicle import outline_and_heading, vehicle_mesh
 
 RING_DISTANCES_M = (10, 20, 30, 40, 50)
-FRUSTUM_LENGTH_M = 0.9
+FRUSTUM_LENGTH_M = 0.55  # longer ones hide the vehicle from the eye behind it
 
 
 def log_static(stream: rr.RecordingStream, rig: CameraRig, class_names: Sequence[str]) -> None:
