@@ -10,7 +10,12 @@ from bevcli.model.ego_motion_inputs import CAN_BUS_SIZE
 
 
 class BevQueries(nn.Module):
-    """The queries that enter the encoder; the same at every step but for the can-bus embedding."""
+    """The queries that enter the encoder; the same at every step but for the can-bus embedding.
+
+    kept_position: the position code, where a prepared model keeps it.
+    """
+
+    kept_position: Tensor | None = None
 
     def __init__(self, grid: BevGrid, channels: int, can_bus: bool) -> None:
         super().__init__()
@@ -27,6 +32,8 @@ class BevQueries(nn.Module):
 
     def position(self) -> Tensor:
         """The position code (Y·X, C) of the cells: the column's (x) half, then the row's (y)."""
+        if self.kept_position is not None:
+            return self.kept_position
         rows, columns = len(self.row_embedding), len(self.column_embedding)
         x = self.column_embedding.expand(rows, -1, -1)
         y = self.row_embedding[:, None].expand(-1, columns, -1)

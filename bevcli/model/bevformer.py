@@ -19,7 +19,8 @@ from bevcli.model.fpn import FPN, FPNConfig
 from bevcli.model.history_alignment import rotate_history
 from bevcli.model.image_config import ImageConfig
 from bevcli.model.image_tokens import ImageTokens, ImageTokensConfig
-from bevcli.model.pillar_projection import PillarProjection, find_hits, project_pillars
+from bevcli.model.kept_result import KeptResult
+from bevcli.model.pillar_projection import PillarHits, PillarProjection, find_hits, project_pillars
 from bevcli.model.resnet import ResNet, ResNetConfig
 from bevcli.model.segmentation_head import SegmentationConfig, SegmentationHead, SegmentationOutputs
 
@@ -144,6 +145,7 @@ class BEVFormer(nn.Module):
         self.segmentation_head = SegmentationHead(config.segmentation, channels, bev_shape) if wanted else None
         pillars = torch.as_tensor(grid.pillars(), dtype=torch.float32).flatten(0, 1)  # (Y·X, Z, 3)
         self.register_buffer("pillars", pillars, persistent=False)
+        self._kept_hits = KeptResult[PillarHits]()
 
     def forward(
         self, inputs: BEVFormerInputs, history: Tensor | None = None, probe: AttentionProbe | None = None
@@ -168,11 +170,19 @@ class BEVFormer(nn.Module):
             self.bev_queries(inputs.can_bus),
             self.bev_queries.position(),
             self.image_tokens(maps, inputs.camera_index),
-            find_hits(self.project_pillars(inputs)),
+            self._hits(inputs),
             None if history is None else self.align_history(history, inputs.rotation_deg),
             inputs.shift,
             probe,
         )
+
+    def _hits(self, inputs: BEVFormerInputs) -> PillarHits:
+        """Which cells attend in which cameras; a prepared model keeps it while calibration and poses stay."""
+        if not self.prepared:
+            return find_hits(self.project_pillars(inputs))
+        size = torch.tensor(inputs.images.shape[-2:])
+        seen_from = (inputs.image_from_bev, inputs.has_picture, size)
+        return self._kept_hits(lambda: find_hits(self.project_pillars(inputs)), *seen_from)
 
     def project_pillars(self, inputs: BEVFormerInputs) -> PillarProjection:
         """Where the pillars appear in the cameras of these inputs, and where they are visible."""

@@ -36,7 +36,12 @@ class DecoderConfig:
 
 
 class Decoder(nn.Module):
-    """Object queries that look at the BEV map and move their reference points to the objects."""
+    """Object queries that look at the BEV map and move their reference points to the objects.
+
+    kept_first_queries: what the queries have made of each other before they look, where a prepared model keeps it.
+    """
+
+    kept_first_queries: Tensor | None = None
 
     def __init__(self, config: DecoderConfig, channels: int, bev_shape: tuple[int, int]) -> None:
         super().__init__()
@@ -53,12 +58,20 @@ class Decoder(nn.Module):
         reference_points = self.reference_points(position).float().sigmoid()  # (B, Q, 3)
         class_logits, box_codes = [], []
         for index, layer in enumerate(self.layers):
-            query = layer(query, position, reference_points[..., :2], bev)
+            attended = self.kept_first_queries if index == 0 else None
+            query = layer(query, position, reference_points[..., :2], bev, attended)
             logits, codes, refined = head(index, query, reference_points)
             class_logits.append(logits)
             box_codes.append(codes)
             reference_points = refined.detach()
         return torch.stack(class_logits), torch.stack(box_codes)
+
+    def first_queries(self) -> Tensor:
+        """(1, Q, C), the queries after the first layer's self-attention: the same in every frame."""
+        position, query = self.query_embedding[None].chunk(2, dim=-1)
+        first = self.layers[0]
+        assert isinstance(first, DecoderLayer)
+        return first.attend(query, position)
 
 
 class DecoderLayer(nn.Module):
@@ -75,14 +88,23 @@ class DecoderLayer(nn.Module):
         self.dropout = nn.Dropout(dropout)
         nn.init.xavier_uniform_(self.self_attention.out_proj.weight)
 
-    def forward(self, query: Tensor, position: Tensor, reference_points: Tensor, bev: Tensor) -> Tensor:
-        """query, position: (B, Q, C). reference_points: (B, Q, 2). bev: (B, Y·X, C). Returns (B, Q, C)."""
-        placed = query + position
-        attended, _ = self.self_attention(placed, placed, query, need_weights=False)
-        query = self.norms[0](query + self.dropout(attended))
+    def forward(
+        self, query: Tensor, position: Tensor, reference_points: Tensor, bev: Tensor, attended: Tensor | None = None
+    ) -> Tensor:
+        """query, position: (B, Q, C). reference_points: (B, Q, 2). bev: (B, Y·X, C). Returns (B, Q, C).
+
+        attended: (B or 1, Q, C), the result of `attend` where it is known already.
+        """
+        query = self.attend(query, position) if attended is None else attended.expand_as(query)
         looked = self._look_at_bev(query + position, reference_points, bev)
         query = self.norms[1](query + self.dropout(looked))
         return self.norms[2](query + self.feed_forward(query))
+
+    def attend(self, query: Tensor, position: Tensor) -> Tensor:
+        """query, position: (B, Q, C). The queries (B, Q, C) after their self-attention and its norm."""
+        placed = query + position
+        attended, _ = self.self_attention(placed, placed, query, need_weights=False)
+        return self.norms[0](query + self.dropout(attended))
 
     def _look_at_bev(self, query: Tensor, reference_points: Tensor, bev: Tensor) -> Tensor:
         batch, queries, _ = query.shape

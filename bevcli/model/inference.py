@@ -22,6 +22,7 @@ DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 def prepare_for_inference(model: BEVFormer, device: torch.device, precision: Precision = "fp32") -> BEVFormer:
     """A copy of the model on the device, for inference only; the model itself stays as it is.
 
+    What is the same in every frame is worked out here, what hangs on calibration and poses when these change.
     Batch norms are folded into their convolutions, pictures are convolved channels-last, and deformable operations
     take the device's fastest backends. At half precision the whole way of the pictures computes in it: backbone,
     neck, image tokens and their values. What follows moves boxes by decimetres when it is rounded, and is a small
@@ -35,6 +36,9 @@ def prepare_for_inference(model: BEVFormer, device: torch.device, precision: Pre
             module.backend = fastest_backend(device)
         elif isinstance(module, ModulatedDeformableConvolution) and device.type == "cpu":
             module.backend = "compiled"
+    with torch.no_grad():
+        prepared.bev_queries.kept_position = prepared.bev_queries.position()
+        prepared.decoder.kept_first_queries = prepared.decoder.first_queries()
     _lower_precision(prepared, DTYPES[precision])
     for part in (prepared.backbone, prepared.neck):
         part.to(memory_format=torch.channels_last)  # type: ignore[call-overload]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from small_model import small_inputs, small_model
@@ -34,6 +36,24 @@ def test_answers_are_the_models(model, version):
     torch.testing.assert_close(found.bev, expected.bev, atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(found.class_logits, expected.class_logits, atol=1e-3, rtol=1e-3)
     torch.testing.assert_close(found.box_codes, expected.box_codes, atol=1e-3, rtol=1e-3)
+
+
+def test_another_calibration_is_noticed(model):
+    prepared = prepare_for_inference(model, CPU)
+    with torch.inference_mode():
+        for seed in (0, 1, 0):
+            inputs = small_inputs(seed)
+            torch.testing.assert_close(prepared(inputs).bev, model(inputs).bev, atol=1e-4, rtol=1e-4)
+        blind = replace(inputs, has_picture=torch.tensor([[True, False]]))
+        torch.testing.assert_close(prepared(blind).bev, model(blind).bev, atol=1e-4, rtol=1e-4)
+
+
+def test_a_batch_of_two_is_two_batches_of_one(model):
+    prepared = prepare_for_inference(model, CPU)
+    with torch.inference_mode():
+        both = prepared(small_inputs(3, batch=2))
+        expected = model(small_inputs(3, batch=2))
+    torch.testing.assert_close(both.box_codes, expected.box_codes, atol=1e-3, rtol=1e-3)
 
 
 def test_half_precision_stays_near(model):

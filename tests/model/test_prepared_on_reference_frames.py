@@ -1,0 +1,56 @@
+"""The prepared tiny model on the four frames of the reference numbers, weights by the rule."""
+
+from __future__ import annotations
+
+import numpy as np
+import original_reference as original
+import pytest
+import torch
+
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.model.bevformer import BEVFormer, BEVFormerOutputs
+from bevcli.model.box_coding import decode
+from bevcli.model.inference import prepare_for_inference
+
+CPU = torch.device("cpu")
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def model() -> BEVFormer:
+    return original.rule_model("tiny", "both")
+
+
+@pytest.fixture(scope="module")
+def prepared_fp32(model: BEVFormer) -> list[BEVFormerOutputs]:
+    return four_frames(prepare_for_inference(model, CPU))
+
+
+def four_frames(model: BEVFormer) -> list[BEVFormerOutputs]:
+    """Frames 0 to 2 are one scene, 3 another."""
+    outputs: list[BEVFormerOutputs] = []
+    with torch.inference_mode():
+        for frame in range(4):
+            history = outputs[-1].bev if frame in (1, 2) else None
+            outputs.append(model(original.inputs(frame, model.config), history))
+    return outputs
+
+
+def nearest(boxes: Boxes3D, others: Boxes3D) -> np.ndarray:
+    """For each box the distance to the nearest of the others with its class, metres."""
+    distance = np.linalg.norm(boxes.centers[:, None] - others.centers[None], axis=-1)
+    return np.where(boxes.classes[:, None] == others.classes[None], distance, np.inf).min(axis=1)
+
+
+def test_float32_equals_the_model(model, prepared_fp32):
+    for expected, found in zip(four_frames(model), prepared_fp32, strict=True):
+        distance = (found.box_codes - expected.box_codes)[-1, 0][:, [0, 1, 4]].norm(dim=-1)
+        assert distance.max() < 1e-2
+        assert (found.class_logits.sigmoid() - expected.class_logits.sigmoid()).abs().max() < 1e-4
+
+
+def test_of_the_boxes_in_bfloat16_95_percent_are_within_a_tenth_of_a_metre(model, prepared_fp32):
+    half = four_frames(prepare_for_inference(model, CPU, "bf16"))
+    pairs = zip(prepared_fp32, half, strict=True)
+    distances = [nearest(decode(one, model.config)[0], decode(other, model.config)[0]) for one, other in pairs]
+    assert (np.concatenate(distances) < 0.1).mean() >= 0.95
