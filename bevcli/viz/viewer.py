@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -40,9 +41,9 @@ def start_viewer(*arguments: str, quiet: bool = True) -> subprocess.Popen[bytes]
 
 
 def stop(process: subprocess.Popen[bytes]) -> None:
-    """Ends a process, at once if it does not listen."""
+    """Ends a viewer as Ctrl-C would, so that it removes its temporary folder; at once if it does not listen."""
     if process.poll() is None:
-        process.terminate()
+        process.send_signal(signal.SIGINT)
         try:
             process.wait(timeout=3)
         except subprocess.TimeoutExpired:
