@@ -9,6 +9,8 @@ from typing import Annotated
 
 import typer
 
+SMOOTHED_WIDTH = 1000  # smaller pictures show jagged edges more, and are quickly drawn
+
 
 class WeatherChoice(StrEnum):
     """What --weather takes."""
@@ -32,8 +34,13 @@ def render(
     weather: Annotated[WeatherChoice | None, typer.Option(help="Default: drawn from the seed.")] = None,
     quality: Annotated[int, typer.Option(min=1, max=100, help="Of the JPEG pictures.")] = 90,
     supersampling: Annotated[
-        int, typer.Option(min=1, max=4, help="Samples a pixel and side; 2 smooths edges and takes four times as long.")
-    ] = 1,
+        int | None,
+        typer.Option(
+            min=1,
+            max=4,
+            help="Samples a pixel and side, against jagged edges; default: 2 up to 1000 pixels wide, else 1.",
+        ),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace a sequence in OUT.")] = False,
 ) -> None:
     """Render a drive through a procedural city as a sequence with ground truth boxes and maps."""
@@ -45,7 +52,10 @@ def render(
     size = parse_resolution(resolution)
     cameras = rig_for_rendering(rig, size)
     chosen = None if weather is None else weather.value
-    drive = Drive(seed, frames, rate, cameras, chosen, supersampling=supersampling, threads=2)
+    width = max(camera.width for camera in cameras.cameras)
+    samples = supersampling or (2 if width <= SMOOTHED_WIDTH else 1)
+    typer.echo("note: the first rendering on a computer compiles the renderer, about 15 s", err=True)
+    drive = Drive(seed, frames, rate, cameras, chosen, supersampling=samples, threads=2)
     with Progress(frames, "frames") as progress:
         export_drive(drive, out, force=force, quality=quality, progress=lambda frame: progress.advance())
     typer.echo(f"{out}: {frames} frames, {len(cameras.cameras)} cameras, {drive.weather.name}, seed {seed}")

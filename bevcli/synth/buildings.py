@@ -9,7 +9,7 @@ import numpy as np
 from bevcli.geometry.transforms import Array
 from bevcli.synth.city import KERB_M, Block, CityPlan
 from bevcli.synth.facades import FacadeStyle, facade_row
-from bevcli.synth.mesh import Material, Mesh, block, loft
+from bevcli.synth.mesh import Material, Mesh, prism
 from bevcli.synth.palette import Color, darker, linear
 
 BRICK: tuple[Color, ...] = ((150, 82, 62), (128, 66, 54), (168, 108, 80), (110, 74, 64), (178, 130, 98))
@@ -105,7 +105,8 @@ def _house(city: CityPlan, rng: np.random.Generator, low: tuple[float, float], h
     middle = ground.mean(0)
     for _ in range(int(rng.integers(0, 3))):
         at = middle + rng.uniform(-3, 3, 2)
-        rest.append(block((at[0], at[1], height + 0.5), (2.2, 1.6, 1.6), (150, 150, 148)))
+        square = at + np.array([(1.1, 0.8), (-1.1, 0.8), (-1.1, -0.8), (1.1, -0.8)])
+        rest.append(prism([np.column_stack([square, np.full(4, height + z)]) for z in (0.0, 1.3)], (150, 150, 148)))
     return House(walls, tuple(rest))
 
 
@@ -123,7 +124,7 @@ def _roof(ground: Array, height: float, style: FacadeStyle) -> Mesh:
     middle = ground.mean(0)
     wide = middle + (ground - middle) * (1 + 0.25 / np.linalg.norm(ground - middle, axis=1, keepdims=True))
     rings = [np.column_stack([wide, np.full(4, z)]) for z in (height - 0.22, height + 0.12)]
-    return loft(rings, darker(style.wall, 0.8) if style.band else ROOF)
+    return prism(rings, darker(style.wall, 0.8) if style.band else ROOF)
 
 
 def _awnings(rng: np.random.Generator, ground: Array) -> list[Mesh]:
@@ -138,8 +139,9 @@ def _awnings(rng: np.random.Generator, ground: Array) -> list[Mesh]:
         out = np.array([way[1], -way[0]])
         at = start + way * rng.uniform(1.0, np.hypot(*(end - start)) - 5.5)
         a, b = at, at + way * 4.0
-        rings = [np.array([[*p, 3.15], [*(p + out * 1.3), 2.65], [*(p + out * 1.3), 2.72], [*p, 3.3]]) for p in (a, b)]
-        parts.append(loft(rings, colors[int(rng.integers(len(colors)))]))
+        footprint = np.array([a, a + out * 1.3, b + out * 1.3, b])
+        rings = [np.column_stack([footprint, (h, e, e, h)]) for h, e in ((3.15, 2.65), (3.3, 2.72))]
+        parts.append(prism(rings, colors[int(rng.integers(len(colors)))]))
     return parts
 
 

@@ -23,7 +23,8 @@ from bevcli.synth.ground_texture import GroundTexture, paint_ground
 from bevcli.synth.renderer import Exposure, Moment, expose
 from bevcli.synth.rig import nuscenes_like_rig
 from bevcli.synth.scenery import Furnishings, Scenery
-from bevcli.synth.shadows import shadow_map
+from bevcli.synth.shading import ShadowMap
+from bevcli.synth.shadows import shadow_map, with_more
 from bevcli.synth.simulation import Simulation
 from bevcli.synth.street_signals import signal_runs
 from bevcli.synth.triangles import Run, Shape, Soup, gather, joined_soup, place
@@ -61,8 +62,18 @@ class Detail:
     def for_width(width: int) -> Detail:
         """Detail that suits pictures of a width in pixels."""
         if width <= 500:
-            return Detail(0.10, 0.12, 128.0)
+            return Detail(0.125, 0.16, 112.0)
         return Detail(0.05, 0.07, 128.0) if width <= 1000 else Detail(0.03, 0.05, 128.0)
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What does not move, around a world point: its triangles, the ground's paint, and its shadows."""
+
+    middle: tuple[float, float]
+    scenery: Soup
+    ground: GroundTexture
+    shadows: ShadowMap
 
 
 @dataclass(frozen=True)
@@ -114,7 +125,7 @@ class Drive:
         self.ground = GroundPlan(self.city)
         self._detail = Detail.for_width(max(camera.width for camera in self.rig.cameras) * supersampling)
         self._scenery = Scenery(self.city, self._stock.furnishings)
-        self._around: tuple[tuple[float, float], Soup, GroundTexture] | None = None
+        self._around: Surroundings | None = None
         self._shapes: dict[tuple[str, int], Shape] = {}
         self._placed: dict[tuple[str, int], tuple[Run, tuple[float, ...]]] = {}
 
@@ -166,16 +177,15 @@ class Drive:
 
     def expose(self, states: list[State], world_from_ego: Pose, time_s: float) -> dict[str, Exposure]:
         """The pictures of all cameras when the annotated world is in these states."""
-        static, ground = self._surroundings(world_from_ego.translation[:2])
+        around = self._surroundings(world_from_ego.translation[:2])
         here = world_from_ego.translation[:2]
         near_first = np.argsort([np.hypot(*(state.position[:2] - here)) for state in states], kind="stable")
         runs = [self._place(states[k]) for k in near_first]
         signals = signal_runs(self.city, self.simulation.signals, self._stock.furnishings, here, time_s)
         moving = gather([*runs, *signals], [*near_first.tolist(), *[-1] * len(signals)])
-        soup = joined_soup(static, moving)
-        parts = [soup.surfaces.corners, self._ego_shape(world_from_ego)]
-        shadows = shadow_map(parts, self.weather.to_sun, here, self._detail.extent_m, self._detail.shadow_m)
-        moment = Moment(soup, len(runs), ground, shadows, self.weather)
+        soup = joined_soup(around.scenery, moving)
+        shadows = with_more(around.shadows, [moving.surfaces.corners, self._ego_shape(world_from_ego)])
+        moment = Moment(soup, len(runs), around.ground, shadows, self.weather)
 
         def one(name: str) -> Exposure:
             return expose(moment, self.rig[name], world_from_ego.matrix, self._supersampling)
@@ -188,15 +198,18 @@ class Drive:
     def _actors(self, origin: Array) -> list[Actor]:
         return self.simulation.actors_near(origin, SEEN_M)
 
-    def _surroundings(self, here: Array) -> tuple[Soup, GroundTexture]:
+    def _surroundings(self, here: Array) -> Surroundings:
         """Scenery and ground around a point, gathered for the middle of the grid cell that it lies in."""
-        snapped = (float(np.round(here[0] / SNAP_M) * SNAP_M), float(np.round(here[1] / SNAP_M) * SNAP_M))
-        if self._around is None or self._around[0] != snapped:
+        middle = (float(np.round(here[0] / SNAP_M) * SNAP_M), float(np.round(here[1] / SNAP_M) * SNAP_M))
+        if self._around is None or self._around.middle != middle:
             extent = self._detail.extent_m + SNAP_M
-            pieces = self.ground.pieces_around(snapped, extent * 0.71)
-            texture = paint_ground(pieces, snapped, extent, self._detail.ground_m)
-            self._around = (snapped, self._scenery.around(snapped, SCENERY_M), texture)
-        return self._around[1], self._around[2]
+            pieces = self.ground.pieces_around(middle, extent * 0.71)
+            texture = paint_ground(pieces, middle, extent, self._detail.ground_m)
+            scenery = self._scenery.around(middle, SCENERY_M)
+            corners = [scenery.surfaces.corners]
+            shadows = shadow_map(corners, self.weather.to_sun, middle, extent, self._detail.shadow_m)
+            self._around = Surroundings(middle, scenery, texture, shadows)
+        return self._around
 
     def _place(self, state: State) -> Run:
         """The actor's triangles; those of one that stands still are kept."""

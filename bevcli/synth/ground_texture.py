@@ -14,7 +14,7 @@ from bevcli.synth.palette import linear
 
 SUBPIXEL_BITS = 4
 LEVELS = 6
-ROUGH_SIZE = 512
+ROUGH_SIZE = 256
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def _stored(color: tuple[int, int, int]) -> tuple[int, ...]:
 
 
 def roughness() -> NDArray[np.float32]:
-    """(512, 512) relative brightness of worn ground, repeating, in texels of shading_kernels.ROUGH_TEXEL_M."""
+    """(256, 256) relative brightness of worn ground, repeating, in texels of shading_kernels.ROUGH_TEXEL_M."""
     rng = np.random.Generator(np.random.PCG64(7))
     total = np.zeros((ROUGH_SIZE, ROUGH_SIZE))
     for cells, strength in ((8, 0.22), (64, 0.20)):

@@ -147,6 +147,20 @@ def loft(rings: Sequence[ArrayLike], color: Color, material: Material = Material
     return from_trimesh(trimesh.Trimesh(shape.vertices, shape.faces[sound], process=False), color, material)
 
 
+def prism(rings: ArrayLike, color: Color, material: Material = Material.MATTE) -> Mesh:
+    """`loft` for many simple bodies: rings (2, P, 3), the lower then the upper, counter-clockwise seen from above."""
+    lower, upper = np.asarray(rings, dtype=np.float32)
+    after_lower, after_upper = np.roll(lower, -1, axis=0), np.roll(upper, -1, axis=0)
+    faces = [np.stack([lower, after_lower, after_upper], 1), np.stack([lower, after_upper, upper], 1)]
+    for i in range(1, len(lower) - 1):
+        faces += [
+            np.stack([lower[0], lower[i + 1], lower[i]])[None],
+            np.stack([upper[0], upper[i], upper[i + 1]])[None],
+        ]
+    joint = np.concatenate(faces)
+    return Mesh(joint, np.tile(linear(color), (len(joint), 1)), np.full(len(joint), material, np.uint8))
+
+
 def side_profile(
     outline_xz: ArrayLike, half_width: float, color: Color, material: Material = Material.MATTE, y: float = 0.0,
     top_half_width: float | None = None,

@@ -14,7 +14,7 @@ from numba import njit
 from bevcli.synth.mesh import Material
 
 LIGHT_LIMIT = 1.6  # brightest light that the display table distinguishes
-ROUGH_TEXEL_M = 0.125  # of the ground's roughness
+ROUGH_TEXEL_M = 0.25  # of the ground's roughness
 GROUND, FACADE, GLASS, PAINT, GLOW = (
     int(m) for m in (Material.GROUND, Material.FACADE, Material.GLASS, Material.PAINT, Material.GLOW)
 )

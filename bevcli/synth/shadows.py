@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,7 +17,7 @@ def shadow_map(
 ) -> ShadowMap:
     """The shadows of triangles (T, 3, 3) in world metres over a square around a world point (2,).
 
-    The map's corners lie on whole texels of the world, so that shadows do not crawl while the vehicle moves.
+    Texels lie at the same places of the world for all centres, so that shadows do not crawl while the vehicle moves.
     """
     sun = np.asarray(to_sun, dtype=np.float64)
     shear = (float(-sun[0] / sun[2]), float(-sun[1] / sun[2]))
@@ -27,3 +28,11 @@ def shadow_map(
     for corners in parts:
         add_heights_from_sun(corners, shear, origin, texel_m, heights)
     return ShadowMap(heights, origin, texel_m, shear)
+
+
+def with_more(shadows: ShadowMap, parts: Iterable[NDArray[np.float32]]) -> ShadowMap:
+    """The map with the shadows of more triangles (T, 3, 3) in it; the given map stays as it is."""
+    heights = shadows.heights.copy()
+    for corners in parts:
+        add_heights_from_sun(corners, shadows.shear, shadows.origin, shadows.texel_m, heights)
+    return replace(shadows, heights=heights)
