@@ -1,0 +1,39 @@
+"""A rendered rig with a known lens: what we undo looks like the picture that never had one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bevcli.geometry.cameras import CameraRig, Distortion, undistort
+from bevcli.synth.drive import Drive, Stock
+from bevcli.synth.rig import nuscenes_like_rig
+
+LENSES = {
+    "brown_conrady": Distortion("brown_conrady", (-0.2, 0.05, 0.001, -0.0005)),
+    "kannala_brandt": Distortion("kannala_brandt", (0.03, -0.01, 0.002, -0.0005)),
+}
+
+
+@pytest.fixture(scope="module")
+def stock():
+    return Stock.make()
+
+
+def rendered(stock, lens):
+    """CAM_FRONT of one frame, with or without a lens."""
+    rig = nuscenes_like_rig(320, 180)
+    camera = replace(rig["CAM_FRONT"], distortion=lens)
+    drive = Drive(113, frames=20, rig=CameraRig((camera,), rig.ego_from_bev), stock=stock, weather="noon")
+    return drive.frame(9).pictures["CAM_FRONT"].astype(np.float64), camera
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_undistorting_a_rendered_picture_gives_the_picture_without_a_lens(stock, name):
+    plain, _ = rendered(stock, None)
+    bent, camera = rendered(stock, LENSES[name])
+    mended = undistort(bent.astype(np.uint8), camera).astype(np.float64)
+    seen = mended.sum(-1) > 0  # black where the lens saw nothing
+    assert seen.mean() > 0.85
+    before, after = np.abs(bent - plain)[seen].mean(), np.abs(mended - plain)[seen].mean()
+    assert after < 0.4 * before
