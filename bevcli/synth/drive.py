@@ -63,7 +63,7 @@ class Detail:
         """Detail that suits pictures of a width in pixels."""
         if width <= 500:
             return Detail(0.125, 0.16, 112.0)
-        return Detail(0.05, 0.07, 128.0) if width <= 1000 else Detail(0.03, 0.05, 128.0)
+        return Detail(0.06, 0.08, 112.0) if width <= 1000 else Detail(0.04, 0.06, 112.0)
 
 
 @dataclass(frozen=True)
