@@ -29,7 +29,7 @@ from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
 from bevcli.viz.recording import Recording
 
 WARM_UP_FRAMES = 2  # the second is the first with history
-RUN_FRAMES = 4  # at most, of the run with reading and recording; its first frame does not count
+RUN_FRAMES = 3  # at most, of the run with reading and recording; its first frame does not count
 
 
 @dataclass(frozen=True)

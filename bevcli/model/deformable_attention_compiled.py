@@ -30,6 +30,12 @@ def sample_compiled(
     return out.flatten(1)
 
 
+def load_compiled(dtype: torch.dtype) -> None:
+    """Loads the compiler and the loops for values of float32 and of a dtype; the first call would wait for it."""
+    for values in (torch.zeros(1, 1, 1, 1), torch.zeros(1, 1, 1, 1, dtype=dtype)):
+        sample_compiled(values, [(1, 1)], torch.zeros(1, 1, 1, 1, 2), torch.zeros(1, 1, 1, 1), [1])
+
+
 def as_array(tensor: Tensor) -> np.ndarray:
     """A view for compiled loops, of a copy where the layout asks for it; bfloat16 as its bits, float16 as float32."""
     tensor = tensor.detach().contiguous()
