@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor
 
@@ -17,7 +18,7 @@ TILE_BYTES = 8 << 20
 def convolve_compiled(
     x: Tensor, offsets: Tensor, mask: Tensor, weight: Tensor, bias: Tensor | None, stride: int
 ) -> Tensor:
-    """As `modulated_deformable_convolution`; float32 or bfloat16 on the CPU, no gradients. Returns channels-last."""
+    """As `modulated_deformable_convolution`; on the CPU, no gradients. Returns channels-last."""
     from bevcli.model.bilinear_kernels import sample_taps  # loads the compiler, which not every run needs
 
     batch, channels = x.shape[:2]
@@ -29,12 +30,13 @@ def convolve_compiled(
         as_array(offsets.float().permute(0, 3, 4, 1, 2)),
         as_array(mask.float().permute(0, 2, 3, 1)),
     )
-    taps = x.new_empty(tile, 9, channels)
+    # The compiled loops write bfloat16 and float32.
+    taps = torch.empty(tile, 9, channels, dtype=torch.bfloat16 if x.dtype == torch.bfloat16 else torch.float32)
     matrix = weight.permute(0, 2, 3, 1).flatten(1).contiguous()  # (O, 9 · C)
     out = x.new_empty(rows, len(weight))
 
     for first in range(0, rows, tile):
         count = min(tile, rows - first)
         in_threads(partial(sample_taps, *arrays, stride, first, as_array(taps)), count)
-        out[first : first + count] = F.linear(taps[:count].flatten(1), matrix, bias)
+        out[first : first + count] = F.linear(taps[:count].flatten(1).to(x.dtype), matrix, bias)
     return out.view(batch, height, width, -1).permute(0, 3, 1, 2)

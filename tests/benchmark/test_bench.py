@@ -8,6 +8,7 @@ from importlib import resources
 from pathlib import Path
 
 import pytest
+import torch
 from typer.testing import CliRunner
 
 from bevcli.benchmark.limits import MachineLimits
@@ -89,3 +90,14 @@ def test_profile_of_a_frame_in_half_precision(small_model_file, tmp_path):
     answer = CliRunner().invoke(app, ["bench", "--model", str(small_model_file), *options], catch_exceptions=False)
     assert "bf16" in answer.stdout
     assert json.loads(profile.read_text())["traceEvents"]
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU")
+def test_a_gpu_is_timed_by_its_own_events(small_model_file):
+    options = ["--device", "cuda", "--against", "plain", "--json"]
+    answer = CliRunner().invoke(app, ["bench", "--model", str(small_model_file), *options], catch_exceptions=False)
+    data = json.loads(answer.stdout)
+    inside = set(data["stages_ms"]) - {"decode", "preprocess", "recording"}
+    assert sum(data["stages_ms"][stage] for stage in inside) <= 1.2 * max(data["frame_ms_spread"])
+    assert data["share_within_0.1_m"] > 0.5

@@ -29,11 +29,12 @@ def test_compiled_equals_plain(monkeypatch, stride, tile_bytes):
     torch.testing.assert_close(layer(x.to(memory_format=torch.channels_last)), expected, atol=1e-4, rtol=1e-4)
 
 
-def test_half_precision_rounds_what_it_sampled_in_float32():
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_half_precision_rounds_what_it_sampled_in_float32(dtype):
     layer, x = layer_and_picture(1)
-    expected = layer(x.bfloat16().float())
+    expected = layer(x.to(dtype).float())
     layer.backend = "compiled"
-    layer.bfloat16()
-    found = layer(x.bfloat16())
-    assert found.dtype == torch.bfloat16
+    layer.to(dtype)
+    found = layer(x.to(dtype))
+    assert found.dtype == dtype
     assert (found.float() - expected).norm() < 0.03 * expected.norm()

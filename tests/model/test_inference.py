@@ -56,10 +56,11 @@ def test_a_batch_of_two_is_two_batches_of_one(model):
     torch.testing.assert_close(both.box_codes, expected.box_codes, atol=1e-3, rtol=1e-3)
 
 
-def test_half_precision_stays_near(model):
-    expected, found = two_steps(model), two_steps(prepare_for_inference(model, CPU, "bf16"))
+@pytest.mark.parametrize("precision", ["bf16", "fp16"])
+def test_half_precision_stays_near(model, precision):
+    expected, found = two_steps(model), two_steps(prepare_for_inference(model, CPU, precision))
     error = (found.bev - expected.bev).norm() / expected.bev.norm()
-    assert 1e-5 < error < 0.05
+    assert 1e-6 < error < 0.05
     assert found.box_codes.dtype == found.class_logits.dtype == torch.float32
 
 
@@ -70,3 +71,15 @@ def test_the_model_itself_stays_as_it_is(model):
     assert before.keys() == after.keys()
     assert all(torch.equal(before[name], after[name]) for name in before)
     assert all(parameter.requires_grad for parameter in model.parameters())
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU")
+@pytest.mark.parametrize(("precision", "tolerance"), [("fp32", 1e-3), ("bf16", 0.05), ("fp16", 0.02)])
+def test_a_gpu_answers_as_the_cpu(model, precision, tolerance):
+    gpu = torch.device("cuda")
+    prepared = prepare_for_inference(model, gpu, precision)
+    with torch.inference_mode():
+        found = prepared(small_inputs(1).to(gpu), prepared(small_inputs(0).to(gpu)).bev).bev.cpu()
+    expected = two_steps(model).bev
+    assert (found - expected).norm() < tolerance * expected.norm()
