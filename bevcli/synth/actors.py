@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from bevcli.geometry.transforms import Array
 from bevcli.synth.catalog import Variant
 from bevcli.synth.palette import linear
-from bevcli.synth.traffic import Unit, Vehicle
+from bevcli.synth.traffic import Unit, Vehicle, points_between
 
 MOVING_M_S = 0.3  # slower counts as standing
 _DIFFERENCE_S = 0.02  # velocities are central differences over twice this
@@ -104,14 +105,14 @@ class Driving:
         front = interpolated_track(self.times, self.fronts, self.speeds, time_s)
         length = float(self.unit.size_lwh[0])
         middle = front - self.unit.lag - length / 2
-        axles = self.vehicle.route.at([middle - 0.3 * length, middle + 0.3 * length])
-        way = axles[1] - axles[0]
-        return axles.mean(0), float(np.arctan2(way[1], way[0]))
+        route = self.vehicle.route
+        rear, fore = points_between(route.points, route.positions, middle - 0.3 * length, middle + 0.3 * length, 2)
+        return (rear + fore) / 2, math.atan2(fore[1] - rear[1], fore[0] - rear[0])
 
 
 def interpolated_track(times: Array, fronts: Array, speeds: Array, time_s: float) -> float:
     """Position on a track at a time: a cubic between steps that keeps positions and speeds."""
-    k = int(np.clip(np.searchsorted(times, time_s, side="right") - 1, 0, len(times) - 2))
+    k = min(max(int(times.searchsorted(time_s, side="right")) - 1, 0), len(times) - 2)
     span = times[k + 1] - times[k]
     u = (time_s - times[k]) / span
     a, b, m, n = fronts[k], fronts[k + 1], speeds[k] * span, speeds[k + 1] * span

@@ -31,7 +31,7 @@ from bevcli.synth.triangles import Run, Shape, Soup, gather, joined_soup, place
 from bevcli.synth.weather import WEATHER_NAMES, Weather, make_weather
 
 ANNOTATED_M = 60.0  # boxes are kept within this distance of the bev frame's origin
-SEEN_M = 75.0  # actors are drawn within this distance
+SEEN_M = 66.0  # actors are drawn within this distance
 SCENERY_M = 135.0
 SNAP_M = 24.0  # scenery and ground are gathered anew when the vehicle has moved this far
 FIRST_TIMESTAMP_NS = 1_700_000_000_000_000_000

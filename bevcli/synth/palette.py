@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -38,6 +40,7 @@ def darker(color: Color, factor: float) -> Color:
     return red, green, blue
 
 
+@lru_cache(maxsize=4)
 def display_table(size: int = 4096, limit: float = 1.6) -> NDArray[np.uint8]:
     """(size,) sRGB bytes of linear light from 0 to `limit`, with a soft shoulder for what is brighter than white."""
     light = np.linspace(0, limit, size)

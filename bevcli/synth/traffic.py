@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numba import njit
@@ -47,7 +48,7 @@ class Vehicle:
     bicycle: bool = False
     track: list[tuple[float, float, float]] = field(default_factory=list)
 
-    @property
+    @cached_property
     def length(self) -> float:
         """Metres from the foremost to the last point."""
         return self.units[-1].lag + float(self.units[-1].size_lwh[0])
@@ -59,7 +60,7 @@ class Vehicle:
     def body_points(self) -> Array:
         """(B, 2) points along the vehicle, at most 2.5 m apart, its ends included."""
         count = max(int(np.ceil(self.length / 2.5)) + 1, 2)
-        return _points_between(self.route.points, self.route.positions, self.front - self.length, self.front, count)
+        return points_between(self.route.points, self.route.positions, self.front - self.length, self.front, count)
 
 
 def step(vehicles: list[Vehicle], people: Array, signals: Signals, time_s: float) -> None:
@@ -148,7 +149,7 @@ def _has_priority(other: Vehicle, theirs: JunctionPass, vehicle: Vehicle, crossi
 
 
 @njit(cache=True, nogil=True)
-def _points_between(points: Array, positions: Array, start: float, end: float, count: int) -> Array:
+def points_between(points: Array, positions: Array, start: float, end: float, count: int) -> Array:
     """(count, 2) points at even positions from start to end along a route."""
     found = np.empty((count, 2))
     for i in range(count):
@@ -166,7 +167,7 @@ def _nearest_in_way(
 ) -> tuple[float, int]:
     """Distance along a route from `front` to the first obstacle in its corridor, and its owner; inf, -1 for none."""
     squared = corridor * corridor
-    way = _points_between(points, positions, front + 0.3, front + LOOK_AHEAD_M, LOOK_STEPS)
+    way = points_between(points, positions, front + 0.3, front + LOOK_AHEAD_M, LOOK_STEPS)
     reach = (LOOK_AHEAD_M + 5.0) ** 2
     near = [k for k in range(obstacles.shape[0]) if owners[k] != own
             and (obstacles[k, 0] - way[0, 0]) ** 2 + (obstacles[k, 1] - way[0, 1]) ** 2 < reach]  # fmt: skip
