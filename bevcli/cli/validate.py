@@ -51,4 +51,4 @@ def validate(
     if as_json:
         print(json.dumps(scores_to_json(scores.detection, scores.config, scores.segmentation), indent=1))
     else:
-        print(f"{len(drives)} drives\n\n{scores_table(scores.detection, scores.segmentation)}")
+        print(f"drives  {len(drives)}\n\n{scores_table(scores.detection, scores.segmentation)}")
