@@ -44,7 +44,7 @@ def test_a_moved_location_costs_its_distance() -> None:
         RIGHT_ANSWER.mask_logits, RIGHT_ANSWER.class_logits, RIGHT_ANSWER.locations + torch.tensor([0.1, 0, 0, 0])
     )
     loss = segmentation_loss(moved, [TRUTH], CONFIG)
-    assert loss.locations.item() == pytest.approx(2.0 * (2 * 0.1) / 4)  # four masks in the frame
+    assert loss.locations.item() == pytest.approx(2.0 * (2 * 0.1) / 2)  # two things in the frame
     assert loss.masks.item() == pytest.approx(0, abs=1e-4)
 
 
@@ -56,7 +56,7 @@ def test_an_undecided_mask_costs_dice_and_focal_loss() -> None:
     )
     dice = 1 - 2 * 1 / (4 * 0.25 + 2)
     pixels = (0.25 + 0.75) / 2 * 0.25 * log(2)
-    assert loss.masks.item() == pytest.approx((3 * dice + 4 * pixels) / 4, rel=1e-3)
+    assert loss.masks.item() == pytest.approx((3 * dice + 4 * pixels) / 2, rel=1e-3)  # two masks of stuff
 
 
 def test_a_wrong_class_costs_focal_loss() -> None:
@@ -65,7 +65,7 @@ def test_a_wrong_class_costs_focal_loss() -> None:
     loss = segmentation_loss(
         SegmentationOutputs(RIGHT_ANSWER.mask_logits, logits, RIGHT_ANSWER.locations), [TRUTH], CONFIG
     )
-    assert loss.classes.item() == pytest.approx(0.75 / 4 * log(2) / 4, rel=1e-3)
+    assert loss.classes.item() == pytest.approx(0.75 / 4 * log(2) / 2, rel=1e-3)
 
 
 def test_without_a_map_stuff_is_not_taught() -> None:
@@ -82,3 +82,12 @@ def test_every_mask_layer_is_taught() -> None:
     logits = torch.cat([torch.zeros_like(RIGHT_ANSWER.mask_logits), RIGHT_ANSWER.mask_logits])
     two = SegmentationOutputs(logits, RIGHT_ANSWER.class_logits.expand(2, -1, -1), RIGHT_ANSWER.locations)
     assert segmentation_loss(two, [TRUTH], CONFIG).masks.item() > 0.5
+
+
+def test_many_vehicles_do_not_drown_the_road() -> None:
+    logits = RIGHT_ANSWER.mask_logits.clone()
+    logits[0, 0, 0] = 0  # the road is undecided
+    one_wrong = SegmentationOutputs(logits, RIGHT_ANSWER.class_logits, RIGHT_ANSWER.locations)
+    without_things = SegmentationTargets(TRUTH.stuff, TRUTH.things[:0], TRUTH.locations[:0])
+    with_things = segmentation_loss(one_wrong, [TRUTH], CONFIG).masks.item()
+    assert with_things == pytest.approx(segmentation_loss(one_wrong, [without_things], CONFIG).masks.item(), abs=1e-4)
