@@ -11,7 +11,9 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
+from statistics import median
 
 import torch
 
@@ -29,7 +31,7 @@ from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
 from bevcli.viz.recording import Recording
 
 WARM_UP_FRAMES = 2  # the second is the first with history
-RUN_FRAMES = 3  # at most, of the run with reading and recording; its first frame does not count
+MIN_RUN_FRAMES = 3  # of the run with reading and recording; its first frame does not count
 
 
 @dataclass(frozen=True)
@@ -53,10 +55,10 @@ def run_benchmark(settings: BenchmarkSettings) -> BenchmarkResult:
     limits = measure_limits(device, settings.precision)
     model = made_up_model(config)
     fast = Version(prepare_for_inference(model, device, settings.precision), device)
-    drive = MadeUpDrive(max(WARM_UP_FRAMES + settings.frames, RUN_FRAMES))
+    drive = MadeUpDrive(max(WARM_UP_FRAMES + settings.frames, MIN_RUN_FRAMES))
     stages = _time_stages(fast, drive, settings.frames)
     frame_s, peak = tuple(fast.seconds), _peak_memory(device)
-    run_frame_s = _time_run(fast, drive)
+    run_frame_s = _time_run(fast, drive, max(settings.frames, MIN_RUN_FRAMES))
     if settings.profile is not None:
         _write_profile(fast, _prepared(drive, config, 0), settings.profile)
     comparison = None
@@ -114,14 +116,14 @@ def _time_stages(fast: Version, drive: MadeUpDrive, frames: int) -> dict[str, tu
     return {stage: tuple(seconds) for stage, seconds in times.items()}
 
 
-def _time_run(fast: Version, drive: MadeUpDrive) -> float:
-    """Seconds a frame where reading and recording go on beside the model, as in `bevcli run`."""
+def _time_run(fast: Version, drive: MadeUpDrive, frames: int) -> float:
+    """The median seconds of a frame where reading and recording go on beside the model, as in `bevcli run`."""
     done = []
     with _recording(drive, fast) as recording:
-        for frame, prediction, _ in fast.runner.run(drive, range(RUN_FRAMES), Preprocessor(fast.runner.config)):
+        for frame, prediction, _ in fast.runner.run(drive, range(frames), Preprocessor(fast.runner.config)):
             recording.log(frame, prediction)
             done.append(time.perf_counter())
-    return (done[-1] - done[0]) / (len(done) - 1)
+    return median(after - before for before, after in pairwise(done))
 
 
 @contextlib.contextmanager
