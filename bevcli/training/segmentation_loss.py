@@ -61,17 +61,22 @@ def segmentation_loss(
 ) -> SegmentationLoss:
     """targets: B. Things are matched once, by what the last layers say; every layer answers to that matching.
 
-    All losses are divided by the number of masks in the batch. A frame without a map trains no stuff query.
+    The losses of things are divided by the number of things in the batch, those of stuff by the masks of stuff, so
+    that many vehicles do not drown the road. A frame without a map trains no stuff query.
     """
     chosen = [_choose(outputs, element, truth, config) for element, truth in enumerate(targets)]
-    count = max(sum(len(one.queries) for one in chosen), 1)
-    classes = config.class_weight * _class_loss(outputs.class_logits, chosen, targets)
+    things = sum(len(one.things) for one in chosen)
+    stuff = sum(len(one.queries) for one in chosen) - things
+    shares = outputs.class_logits.new_full(outputs.class_logits.shape[-1:], 1 / max(things, 1))  # (Q,)
+    shares[: len(STUFF_CLASSES)] = 1 / max(stuff, 1)
+    classes = config.class_weight * (_class_losses(outputs.class_logits, chosen, targets) * shares).sum()
     masks, locations = classes.new_zeros(()), classes.new_zeros(())
     for element, one in enumerate(chosen):
-        masks = masks + _mask_loss(outputs.mask_logits[:, element, one.queries], one.masks, config)
+        losses = _mask_losses(outputs.mask_logits[:, element, one.queries], one.masks, config)
+        masks = masks + (losses * shares[one.queries]).sum()
         errors = outputs.locations[:, element, one.things] - one.locations
-        locations = locations + config.location_weight * errors.abs().sum()
-    return SegmentationLoss(classes / count, masks / count, locations / count)
+        locations = locations + config.location_weight * errors.abs().sum() / max(things, 1)
+    return SegmentationLoss(classes, masks, locations)
 
 
 def matching_costs(
@@ -97,19 +102,17 @@ def _choose(
     return _Chosen(queries, masks, pairs.queries, truth.locations[pairs.truths])
 
 
-def _class_loss(class_logits: Tensor, chosen: Sequence[_Chosen], targets: Sequence[SegmentationTargets]) -> Tensor:
-    """class_logits: (M, B, Q). Focal loss, summed over layers and queries."""
+def _class_losses(class_logits: Tensor, chosen: Sequence[_Chosen], targets: Sequence[SegmentationTargets]) -> Tensor:
+    """Focal losses (M, B, Q) of class_logits (M, B, Q)."""
     wanted, taught = torch.zeros_like(class_logits), torch.ones_like(class_logits)
     for element, (one, truth) in enumerate(zip(chosen, targets, strict=True)):
         wanted[:, element, one.queries] = 1
         if truth.stuff is None:
             taught[:, element, : len(STUFF_CLASSES)] = 0
-    return (focal_loss(class_logits, wanted) * taught).sum()
+    return focal_loss(class_logits, wanted) * taught
 
 
-def _mask_loss(logits: Tensor, masks: Tensor, config: SegmentationLossConfig) -> Tensor:
-    """logits: (M, K, Y·X) against masks (K, Y·X), summed over layers and masks."""
+def _mask_losses(logits: Tensor, masks: Tensor, config: SegmentationLossConfig) -> Tensor:
+    """logits: (M, K, Y·X) against masks (K, Y·X) -> (M, K)."""
     masks = masks.expand_as(logits)
-    dice = dice_loss(logits, masks).sum()
-    pixels = focal_loss(logits, masks).mean(-1).sum()
-    return config.dice_weight * dice + config.pixel_weight * pixels
+    return config.dice_weight * dice_loss(logits, masks) + config.pixel_weight * focal_loss(logits, masks).mean(-1)
