@@ -25,7 +25,9 @@ def run(
     sequence: Annotated[
         Path, typer.Argument(help="A sequence folder, a folder of videos (one a camera), or a nuScenes root.")
     ],
-    model: Annotated[str, typer.Option(help="tiny, small, base, or a FILE.toml.", rich_help_panel=MODEL)] = "tiny",
+    model: Annotated[
+        str, typer.Option(help="tiny, small, base, demo, or a FILE.toml.", rich_help_panel=MODEL)
+    ] = "tiny",
     weights: Annotated[
         Path | None, typer.Option(help="The official .pth as published, or a .safetensors.", rich_help_panel=MODEL)
     ] = None,
