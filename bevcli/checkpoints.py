@@ -6,6 +6,7 @@ import pickle
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib import resources
 from pathlib import Path
 
 import safetensors
@@ -126,6 +127,12 @@ def read_checkpoint(path: Path) -> Checkpoint:
     state, facts = _read_safetensors(path) if path.suffix == ".safetensors" else _read_pth(path)
     official = is_official(state)
     return Checkpoint(path, from_official(state) if official else state, official, facts)
+
+
+def bundled_weights(model: str) -> Path | None:
+    """The file of weights that comes with the package for a known model; None where there is none."""
+    file = Path(str(resources.files("bevcli").joinpath("weights", f"{model}.safetensors")))
+    return file if model in known_models() and file.is_file() else None
 
 
 def compare(state: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> KeyReport:

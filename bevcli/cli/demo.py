@@ -19,7 +19,7 @@ def demo(
 ) -> None:
     """Render a short drive, run BEVFormer on it and open the recording.
 
-    The weights are untrained: it shows the machinery and the drive's ground truth, not detections.
+    The model has seen nothing but rendered streets, and knows no others.
     """
     from bevcli.cli.render import render
     from bevcli.cli.run import run
@@ -27,6 +27,6 @@ def demo(
 
     drive, results = out / "drive", out / "results"
     render(drive, seed=seed, frames=frames, resolution=RESOLUTION, force=force)
-    run(drive, untrained=True, out=results, force=force)
+    run(drive, out=results, force=force)
     if view:
         viz(results / "recording.rrd")

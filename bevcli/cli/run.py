@@ -26,10 +26,20 @@ def run(
         Path, typer.Argument(help="A sequence folder, a folder of videos (one a camera), or a nuScenes root.")
     ],
     model: Annotated[
-        str, typer.Option(help="tiny, small, base, demo, or a FILE.toml.", rich_help_panel=MODEL)
-    ] = "tiny",
+        str | None,
+        typer.Option(
+            help="tiny, small, base, demo, or a FILE.toml. Default: what WEIGHTS are for, else demo.",
+            rich_help_panel=MODEL,
+            show_default=False,
+        ),
+    ] = None,
     weights: Annotated[
-        Path | None, typer.Option(help="The official .pth as published, or a .safetensors.", rich_help_panel=MODEL)
+        Path | None,
+        typer.Option(
+            help="The official .pth as published, or a .safetensors. Default: the package's own, which only demo has.",
+            rich_help_panel=MODEL,
+            show_default=False,
+        ),
     ] = None,
     untrained: Annotated[
         bool, typer.Option("--untrained", help="Run on random weights; everything says so.", rich_help_panel=MODEL)

@@ -49,6 +49,8 @@ def run_job(job: Job, *, force: bool) -> None:
             progress.message(f"note: {note}")
         if job.loaded.untrained:
             progress.message("note: the weights are UNTRAINED: random, and so are the boxes")
+        if job.loaded.bundled:
+            progress.message("note: these weights know rendered streets, not the real world (docs/model-card.md)")
         began = time.perf_counter()
         for frame, prediction, _ in runner.run(job.drive, places, Preprocessor(runner.config, job.chosen_cameras)):
             for warning in warnings(frame, prediction):

@@ -10,7 +10,10 @@ import typer
 
 def validate(
     model: Annotated[str, typer.Argument(help="A known model or a FILE.toml.")],
-    weights: Annotated[Path, typer.Option(help="The official .pth as published, or a .safetensors.")],
+    weights: Annotated[
+        Path | None,
+        typer.Option(help="The official .pth, or a .safetensors. Default: the package's own.", show_default=False),
+    ] = None,
     data: Annotated[
         list[Path] | None, typer.Option(metavar="DIR", help="A sequence with ground truth. Repeatable.")
     ] = None,
@@ -38,6 +41,7 @@ def validate(
     from bevcli.cli.train import open_drives
     from bevcli.evaluation.scores_json import scores_to_json
     from bevcli.evaluation.scores_table import scores_table
+    from bevcli.model.inference import prepare_for_inference
     from bevcli.pipeline.model_loading import choose_device, choose_precision, load_model
     from bevcli.pipeline.runner import Runner, StepOptions
     from bevcli.training.validation import validate as validate_model
@@ -45,7 +49,9 @@ def validate(
     loaded = load_model(model, weights, untrained=False)
     drives = open_drives(data or [], rendered, cache, loaded.model.config)
     target = choose_device(device)
-    runner = Runner(loaded.model, target, StepOptions(choose_precision(None, target), temporal))
+    precision = choose_precision(None, target)
+    prepared = prepare_for_inference(loaded.model, target, precision)
+    runner = Runner(prepared, target, StepOptions(precision, temporal))
     with Progress(sum(len(drives.open(place).stamps) for place in range(len(drives))), "frames") as progress:
         scores = validate_model(runner, drives, max_range, progress.advance)
     if as_json:

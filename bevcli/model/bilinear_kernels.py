@@ -110,6 +110,76 @@ def sample_maps(values, level_shapes, locations, weights, map_of_query, out, beg
                 start += height * width
 
 
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+def sample_maps_backward(  # type: ignore[no-untyped-def]
+    values, level_shapes, locations, weights, starts, out_gradient,
+    values_gradient, locations_gradient, weights_gradient, begin, end,
+) -> None:  # fmt: skip
+    """The gradients of `sample_maps`, for heads begin to end - 1, counted through the maps: map * heads + head.
+
+    Heads of maps, and not queries, are shared out: no two of them write to the same place. All float32, the gradients
+    shaped as what they belong to; values_gradient is added to. starts: (G + 1,) int64, where each map's queries begin.
+    """
+    heads, levels, points = weights.shape[1:]
+    depth = values.shape[3]
+    nothing = np.zeros(depth, dtype=np.float32)
+    unused = np.empty(depth, dtype=np.float32)
+    one, half = np.float32(1), np.float32(0.5)
+    for unit in range(begin, end):
+        group, head = unit // heads, unit % heads
+        tokens, tokens_gradient = values[group], values_gradient[group]
+        for query in range(starts[group], starts[group + 1]):
+            above = out_gradient[query, head]
+            start = 0
+            for level in range(levels):
+                height, width = level_shapes[level]
+                for point in range(points):
+                    locations_gradient[query, head, level, point, :] = 0
+                    weights_gradient[query, head, level, point] = 0
+                    x = locations[query, head, level, point, 0] * np.float32(width) - half
+                    y = locations[query, head, level, point, 1] * np.float32(height) - half
+                    if not (x > -1 and x < width and y > -1 and y < height):
+                        continue
+                    left, top = np.int64(np.floor(x)), np.int64(np.floor(y))
+                    right_share, bottom_share = x - np.float32(left), y - np.float32(top)
+                    left_share, top_share = one - right_share, one - bottom_share
+                    first = start + top * width + left
+                    at_left, at_right, at_top, at_bottom = left >= 0, left + 1 < width, top >= 0, top + 1 < height
+                    # Outside of the map there is nothing to read, and what is written is not used.
+                    a = tokens[first, head] if at_top and at_left else nothing
+                    b = tokens[first + 1, head] if at_top and at_right else nothing
+                    c = tokens[first + width, head] if at_bottom and at_left else nothing
+                    d = tokens[first + width + 1, head] if at_bottom and at_right else nothing
+                    to_a = tokens_gradient[first, head] if at_top and at_left else unused
+                    to_b = tokens_gradient[first + 1, head] if at_top and at_right else unused
+                    to_c = tokens_gradient[first + width, head] if at_bottom and at_left else unused
+                    to_d = tokens_gradient[first + width + 1, head] if at_bottom and at_right else unused
+                    weight = weights[query, head, level, point]
+                    share_a, share_b = top_share * left_share, top_share * right_share
+                    share_c, share_d = bottom_share * left_share, bottom_share * right_share
+                    sum_a = sum_b = sum_c = sum_d = np.float32(0)
+                    for channel in range(depth):
+                        arriving = above[channel]
+                        sum_a += arriving * a[channel]
+                        sum_b += arriving * b[channel]
+                        sum_c += arriving * c[channel]
+                        sum_d += arriving * d[channel]
+                    for channel in range(depth):
+                        arriving = weight * above[channel]
+                        to_a[channel] += arriving * share_a
+                        to_b[channel] += arriving * share_b
+                        to_c[channel] += arriving * share_c
+                        to_d[channel] += arriving * share_d
+                    weights_gradient[query, head, level, point] = (
+                        share_a * sum_a + share_b * sum_b + share_c * sum_c + share_d * sum_d
+                    )
+                    along_x = top_share * (sum_b - sum_a) + bottom_share * (sum_d - sum_c)
+                    along_y = left_share * (sum_c - sum_a) + right_share * (sum_d - sum_b)
+                    locations_gradient[query, head, level, point, 0] = weight * along_x * np.float32(width)
+                    locations_gradient[query, head, level, point, 1] = weight * along_y * np.float32(height)
+                start += height * width
+
+
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
 def sample_taps(x, offsets, mask, stride, first, out, begin, end) -> None:  # type: ignore[no-untyped-def]
     """Writes the nine sampled and masked taps of output positions first + begin to first + end - 1.

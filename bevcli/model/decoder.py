@@ -16,7 +16,8 @@ from bevcli.model.feed_forward import FeedForward
 class DecoderConfig:
     """queries: object queries. points: sampling points a head of the cross-attention into the BEV map.
 
-    max_boxes: how many of the best-scored boxes are decoded.
+    max_boxes: how many of the best-scored boxes are decoded. training_groups: so many sets of queries learn side by
+    side, each to find every object (Group DETR, Chen et al. 2023); only the first is used afterwards.
     """
 
     layers: int = 6
@@ -26,12 +27,13 @@ class DecoderConfig:
     feed_forward_width: int = 512
     dropout: float = 0.1
     max_boxes: int = 300
+    training_groups: int = 1
 
     def __post_init__(self) -> None:
-        counts = (self.layers, self.attention_heads, self.points, self.queries, self.max_boxes)
+        counts = (self.layers, self.attention_heads, self.points, self.queries, self.max_boxes, self.training_groups)
         if min(*counts, self.feed_forward_width) < 1 or not 0 <= self.dropout < 1:
             raise ValueError(
-                "layers, heads, points, queries, boxes and width must be positive, dropout from 0 to below 1"
+                "layers, heads, points, queries, boxes, groups and width must be positive, dropout from 0 to below 1"
             )
 
 
@@ -45,21 +47,26 @@ class Decoder(nn.Module):
 
     def __init__(self, config: DecoderConfig, channels: int, bev_shape: tuple[int, int]) -> None:
         super().__init__()
+        self.training_groups = config.training_groups
         # Of each object query the position half, then the content half.
-        self.query_embedding = nn.Parameter(torch.randn(config.queries, 2 * channels))
+        self.query_embedding = nn.Parameter(torch.randn(config.training_groups * config.queries, 2 * channels))
         self.reference_points = nn.Linear(channels, 3)
         self.layers = nn.ModuleList(DecoderLayer(config, channels, bev_shape) for _ in range(config.layers))
         nn.init.xavier_uniform_(self.reference_points.weight)
         nn.init.zeros_(self.reference_points.bias)
 
     def forward(self, bev: Tensor, head: DetectionHead) -> tuple[Tensor, Tensor]:
-        """bev: (B, Y·X, C). Returns class logits (L, B, Q, classes) and box codes (L, B, Q, 10), one a layer."""
-        position, query = self.query_embedding.expand(len(bev), -1, -1).chunk(2, dim=-1)  # (B, Q, C) each
+        """bev: (B, Y·X, C). Returns class logits (L, B, Q, classes) and box codes (L, B, Q, 10), one a layer.
+
+        In training mode Q are the queries of all groups, one group after another.
+        """
+        groups = self.training_groups if self.training else 1
+        position, query = self._queries(groups).expand(len(bev), -1, -1).chunk(2, dim=-1)  # (B, Q, C) each
         reference_points = self.reference_points(position).float().sigmoid()  # (B, Q, 3)
         class_logits, box_codes = [], []
         for index, layer in enumerate(self.layers):
             attended = self.kept_first_queries if index == 0 else None
-            query = layer(query, position, reference_points[..., :2], bev, attended)
+            query = layer(query, position, reference_points[..., :2], bev, attended, groups)
             logits, codes, refined = head(index, query, reference_points)
             class_logits.append(logits)
             box_codes.append(codes)
@@ -68,10 +75,14 @@ class Decoder(nn.Module):
 
     def first_queries(self) -> Tensor:
         """(1, Q, C), the queries after the first layer's self-attention: the same in every frame."""
-        position, query = self.query_embedding[None].chunk(2, dim=-1)
+        position, query = self._queries(groups=1)[None].chunk(2, dim=-1)
         first = self.layers[0]
         assert isinstance(first, DecoderLayer)
         return first.attend(query, position)
+
+    def _queries(self, groups: int) -> Tensor:
+        """(groups · Q, 2 C), those of the first groups."""
+        return self.query_embedding[: len(self.query_embedding) // self.training_groups * groups]
 
 
 class DecoderLayer(nn.Module):
@@ -89,22 +100,30 @@ class DecoderLayer(nn.Module):
         nn.init.xavier_uniform_(self.self_attention.out_proj.weight)
 
     def forward(
-        self, query: Tensor, position: Tensor, reference_points: Tensor, bev: Tensor, attended: Tensor | None = None
+        self,
+        query: Tensor,
+        position: Tensor,
+        reference_points: Tensor,
+        bev: Tensor,
+        attended: Tensor | None = None,
+        groups: int = 1,
     ) -> Tensor:
         """query, position: (B, Q, C). reference_points: (B, Q, 2). bev: (B, Y·X, C). Returns (B, Q, C).
 
         attended: (B or 1, Q, C), the result of `attend` where it is known already.
+        groups: queries of different groups do not attend to each other.
         """
-        query = self.attend(query, position) if attended is None else attended.expand_as(query)
+        query = self.attend(query, position, groups) if attended is None else attended.expand_as(query)
         looked = self._look_at_bev(query + position, reference_points, bev)
         query = self.norms[1](query + self.dropout(looked))
         return self.norms[2](query + self.feed_forward(query))
 
-    def attend(self, query: Tensor, position: Tensor) -> Tensor:
-        """query, position: (B, Q, C). The queries (B, Q, C) after their self-attention and its norm."""
-        placed = query + position
-        attended, _ = self.self_attention(placed, placed, query, need_weights=False)
-        return self.norms[0](query + self.dropout(attended))
+    def attend(self, query: Tensor, position: Tensor, groups: int = 1) -> Tensor:
+        """query, position: (B, Q, C). The queries (B, Q, C) after the self-attention of each group, and its norm."""
+        apart = query.unflatten(1, (groups, -1)).flatten(0, 1)  # (B · groups, Q / groups, C)
+        placed = apart + position.unflatten(1, (groups, -1)).flatten(0, 1)
+        attended, _ = self.self_attention(placed, placed, apart, need_weights=False)
+        return self.norms[0](query + self.dropout(attended.reshape(query.shape)))
 
     def _look_at_bev(self, query: Tensor, reference_points: Tensor, bev: Tensor) -> Tensor:
         batch, queries, _ = query.shape

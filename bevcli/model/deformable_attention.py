@@ -28,7 +28,7 @@ class FeatureMaps:
 
 Backend = Literal["grid_sample", "padded", "compiled", "triton"]
 """grid_sample: map by map, with gradients. padded: the textbook's, all maps at once, their queries padded to the
-longest list. compiled: loops on the CPU. triton: a kernel on a GPU. The last two have no gradients."""
+longest list. compiled: loops on the CPU, with gradients. triton: a kernel on a GPU, without."""
 
 
 def deformable_attention(
@@ -49,11 +49,11 @@ def deformable_attention(
     return _IMPLEMENTATIONS[backend](values, level_shapes, locations, weights, queries_per_map)
 
 
-def fastest_backend(device: torch.device) -> Backend:
-    """What to run on a device where no gradients are asked for."""
+def fastest_backend(device: torch.device, *, gradients: bool = False) -> Backend:
+    """What to run on a device. gradients: whether they are asked for."""
     if device.type == "cpu":
         return "compiled"
-    return "triton" if device.type == "cuda" and find_spec("triton") else "grid_sample"
+    return "triton" if device.type == "cuda" and find_spec("triton") and not gradients else "grid_sample"
 
 
 def _sample_map_by_map(
@@ -111,7 +111,7 @@ class DeformableAttention(nn.Module):
 
     A query says where each head looks (offsets from reference points, in cells) and how much each place counts.
     maps: value maps that a query looks at, each with its own points and its own softmax.
-    `backend` says how values are sampled; a model starts with the one that has gradients.
+    `backend` says how values are sampled; a model starts with PyTorch's own, which runs everywhere.
     """
 
     backend: Backend = "grid_sample"

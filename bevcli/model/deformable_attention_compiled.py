@@ -1,9 +1,10 @@
-"""Deformable attention on the CPU by compiled loops, which write each sum once and hold no sampled values."""
+"""Deformable attention on the CPU by compiled loops, which hold no sampled values."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +20,21 @@ def sample_compiled(
     weights: Tensor,
     queries_per_map: Sequence[int],
 ) -> Tensor:
-    """As `deformable_attention`; tensors on the CPU, no gradients."""
+    """As `deformable_attention`; tensors on the CPU. Gradients are those of values in float32."""
+    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (values, locations, weights)):
+        return _CompiledSampling.apply(
+            values.float(), locations.float(), weights.float(), level_shapes, queries_per_map
+        )
+    return _sample(values, level_shapes, locations, weights, queries_per_map)
+
+
+def _sample(
+    values: Tensor,
+    level_shapes: Sequence[tuple[int, int]],
+    locations: Tensor,
+    weights: Tensor,
+    queries_per_map: Sequence[int],
+) -> Tensor:
     from bevcli.model.bilinear_kernels import sample_maps  # loads the compiler, which not every run needs
 
     shapes = np.asarray(level_shapes, dtype=np.int64)
@@ -28,6 +43,38 @@ def sample_compiled(
     arrays = (as_array(values), shapes, as_array(locations.float()), as_array(weights.float()), map_of_query)
     in_threads(partial(sample_maps, *arrays, out.numpy()), len(locations))
     return out.flatten(1)
+
+
+class _CompiledSampling(torch.autograd.Function):
+    """`_sample` of float32 with its gradients; for these too, no sampled value is held."""
+
+    @staticmethod
+    def forward(
+        context: Any,
+        values: Tensor,
+        locations: Tensor,
+        weights: Tensor,
+        level_shapes: Sequence[tuple[int, int]],
+        queries_per_map: Sequence[int],
+    ) -> Tensor:
+        context.save_for_backward(values, locations, weights)
+        context.level_shapes, context.queries_per_map = level_shapes, queries_per_map
+        return _sample(values, level_shapes, locations, weights, queries_per_map)
+
+    @staticmethod
+    def backward(context: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        from bevcli.model.bilinear_kernels import sample_maps_backward
+
+        values, locations, weights = context.saved_tensors
+        found = torch.zeros(values.shape), torch.empty(locations.shape), torch.empty(weights.shape)
+        above = gradients[0].unflatten(-1, values.shape[2:])
+        shapes = np.asarray(context.level_shapes, dtype=np.int64)
+        starts = np.cumsum([0, *context.queries_per_map])
+        read = (as_array(values), shapes, as_array(locations), as_array(weights), starts, as_array(above))
+        written = [tensor.numpy() for tensor in found]
+        heads_of_maps = values.shape[0] * values.shape[2]
+        in_threads(partial(sample_maps_backward, *read, *written), heads_of_maps, min_range=1)
+        return (*found, None, None)
 
 
 def load_compiled(dtype: torch.dtype) -> None:

@@ -13,6 +13,8 @@ class ImageConfig:
     size: (width, height) in pixels, before padding. A picture of another aspect is scaled to fit inside it.
     pad_divisor: width and height are padded with zeros to a multiple of it.
     mean, std: of a channel, on 0 to 255, in the order of color_order.
+    resize: "linear", as the published weights know it, jagged where pictures shrink to less than half; "area" averages
+    what falls into a pixel.
     """
 
     size: tuple[int, int]
@@ -20,6 +22,7 @@ class ImageConfig:
     std: tuple[float, float, float]
     color_order: Literal["rgb", "bgr"]
     pad_divisor: int = 32
+    resize: Literal["linear", "area"] = "linear"
 
     def __post_init__(self) -> None:
         if min(self.size) < 1 or min(self.std) <= 0 or self.pad_divisor < 1:

@@ -7,21 +7,23 @@ from pathlib import Path
 
 import torch
 
-from bevcli.checkpoints import load_weights
-from bevcli.config import load_config
+from bevcli.checkpoints import bundled_weights, inspect, load_weights
+from bevcli.config import known_models, load_config
 from bevcli.errors import BevcliError, WeightsError
 from bevcli.model.bevformer import BEVFormer
 from bevcli.model.inference import Precision
 
+DEFAULT_MODEL = "demo"
 UNTRAINED_SEED = 0  # so that two untrained runs of one drive agree
 
 
 @dataclass(frozen=True)
 class LoadedModel:
-    """weights: the file they came from, None when untrained."""
+    """weights: the file they came from, None when untrained. bundled: whether that file is the package's own."""
 
     model: BEVFormer
     weights: Path | None
+    bundled: bool = False
 
     @property
     def untrained(self) -> bool:
@@ -29,15 +31,20 @@ class LoadedModel:
         return self.weights is None
 
 
-def load_model(name_or_path: str, weights: Path | None, *, untrained: bool) -> LoadedModel:
+def load_model(name_or_path: str | None, weights: Path | None, *, untrained: bool) -> LoadedModel:
     """The model of a known name or TOML file, with a file of weights or, if the user says so, with none.
 
-    Raises ConfigError or WeightsError, the latter also when neither weights nor `untrained` is given, or both.
+    name_or_path: None takes the model that the weights fit, or without weights the package's own.
+    Raises ConfigError or WeightsError, the latter also when there are no weights and `untrained` is not given.
     """
-    config = load_config(name_or_path)
     if weights is not None and untrained:
         raise WeightsError(f"--weights {weights} and --untrained exclude each other: give one of them")
-    if weights is None and not untrained:
+    if name_or_path is None:
+        name_or_path = DEFAULT_MODEL if weights is None else _model_of(weights)
+    config = load_config(name_or_path)
+    bundled = bundled_weights(name_or_path) if weights is None and not untrained else None
+    file = weights or bundled
+    if file is None and not untrained:
         raise WeightsError(
             f"model {config.name} has no weights: give --weights FILE (the official .pth or a .safetensors), "
             "or say --untrained to see the machinery run on random weights"
@@ -45,9 +52,19 @@ def load_model(name_or_path: str, weights: Path | None, *, untrained: bool) -> L
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(UNTRAINED_SEED)
         model = BEVFormer(config)
-    if weights is not None:
-        load_weights(weights, model)
-    return LoadedModel(model, weights)
+    if file is not None:
+        load_weights(file, model)
+    return LoadedModel(model, file, bundled=bundled is not None)
+
+
+def _model_of(weights: Path) -> str:
+    """The first known model that a file of weights fits."""
+    models = inspect(weights).models
+    if not models:
+        raise WeightsError(
+            f"{weights}: fits none of the known models ({', '.join(known_models())}): name its own by --model FILE.toml"
+        )
+    return models[0]
 
 
 def choose_device(name: str) -> torch.device:

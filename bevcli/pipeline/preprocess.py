@@ -112,7 +112,9 @@ def network_picture(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: NDAr
     height, width = pixels_bgr.shape[:2]
     scale = min(image.size[0] / width, image.size[1] / height)
     new_width, new_height = round(width * scale), round(height * scale)
-    resized = cv2.resize(pixels_bgr.astype(np.float32), (new_width, new_height), interpolation=cv2.INTER_LINEAR)
+    # Larger pictures are interpolated either way: areas are only for what shrinks.
+    interpolation = cv2.INTER_AREA if image.resize == "area" and scale < 1 else cv2.INTER_LINEAR
+    resized = cv2.resize(pixels_bgr.astype(np.float32), (new_width, new_height), interpolation=interpolation)
     if image.color_order == "rgb":
         resized = resized[..., ::-1]
     planes = resized.transpose(2, 0, 1)

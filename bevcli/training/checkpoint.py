@@ -8,6 +8,7 @@ from pathlib import Path
 
 import safetensors.torch
 import torch
+from torch import nn
 
 from bevcli.errors import OutputError, WeightsError
 from bevcli.model.bevformer import BEVFormer
@@ -15,13 +16,16 @@ from bevcli.model.bevformer import BEVFormer
 FORMAT = "bevcli-training/1"
 
 
-def save_checkpoint(path: Path, step: int, model: BEVFormer, optimizer: torch.optim.AdamW) -> None:
-    """All that goes on from `step` steps done needs: chance is drawn anew from seed and step."""
+def save_checkpoint(path: Path, step: int, model: nn.Module, optimizer: torch.optim.AdamW) -> None:
+    """All that goes on from `step` steps done needs: chance is drawn anew from seed and step.
+
+    model: the whole of what learns.
+    """
     contents = {"format": FORMAT, "step": step, "model": model.state_dict(), "optimizer": optimizer.state_dict()}
     _replace(path, lambda aside: torch.save(contents, aside))
 
 
-def load_checkpoint(path: Path, model: BEVFormer, optimizer: torch.optim.AdamW) -> int:
+def load_checkpoint(path: Path, model: nn.Module, optimizer: torch.optim.AdamW) -> int:
     """Puts model and optimizer where they were; returns the steps done. Raises WeightsError."""
     try:
         contents = torch.load(path, map_location="cpu", weights_only=True)

@@ -1,8 +1,9 @@
-"""Clips: short parts of drives, as in the paper a frame to learn from and some before it, for the history."""
+"""Clips: short parts of drives. As in the paper, one frame to learn from and some before it, for the history."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -17,11 +18,14 @@ class ClipConfig:
     """frames: of a clip; the paper's base model trains on 4, tiny and small on 3; 1 is without history.
 
     batch: clips a step. short_share: of the batches, whose clips are shorter, as at the start of a scene.
+    learn: "last" learns from the last frame of a clip, as published. "all" goes through longer clips and learns from
+    every frame, one update each, the first of them without history: no picture is looked at in vain.
     """
 
     frames: int = 3
     batch: int = 4
     short_share: float = 0.1
+    learn: Literal["last", "all"] = "last"
 
     def __post_init__(self) -> None:
         if min(self.frames, self.batch) < 1 or not 0 <= self.short_share <= 1:
@@ -30,7 +34,7 @@ class ClipConfig:
 
 @dataclass(frozen=True)
 class Clip:
-    """drive: its place among the drives. places: of the frames in it, in order; the last one is learned from."""
+    """drive: its place among the drives. places: of the frames in it, in order."""
 
     drive: int
     places: tuple[int, ...]
@@ -44,18 +48,24 @@ def draw_clips(drives: Drives, config: ClipConfig, random: np.random.Generator) 
     clips = []
     for _ in range(config.batch):
         drive = int(random.integers(len(drives)))
-        clips.append(Clip(drive, draw_places(drives.open(drive), frames, random)))
+        with_gap = config.learn == "last"
+        clips.append(Clip(drive, draw_places(drives.open(drive), frames, random, with_gap=with_gap)))
     return clips
 
 
-def draw_places(sequence: Sequence, frames: int, random: np.random.Generator) -> tuple[int, ...]:
-    """A frame drawn at random and frames - 1 of the `frames` before it in its scene, one left out at random."""
+def draw_places(
+    sequence: Sequence, frames: int, random: np.random.Generator, *, with_gap: bool = True
+) -> tuple[int, ...]:
+    """A frame drawn at random and frames - 1 of those before it in its scene.
+
+    with_gap: they are chosen from `frames` of them, one left out at random, as published.
+    """
     scenes = list(scenes_of(sequence.stamps))
     ends = [(scene, end) for scene in scenes for end in range(frames - 1, len(scene))]
     if not ends:
         raise InputError(f"{sequence.name}: no scene of it has the {frames} frames of a clip")
     scene, end = ends[int(random.integers(len(ends)))]
-    before = scene[max(0, end - frames) : end]
+    before = scene[max(0, end - frames if with_gap else end - frames + 1) : end]
     if len(before) == frames:
         del before[int(random.integers(len(before)))]
     return (*before, scene[end])

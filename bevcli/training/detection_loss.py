@@ -43,14 +43,20 @@ class DetectionLoss:
 
 
 def detection_loss(
-    class_logits: Tensor, box_codes: Tensor, targets: Sequence[DetectionTargets], config: DetectionLossConfig
+    class_logits: Tensor,
+    box_codes: Tensor,
+    targets: Sequence[DetectionTargets],
+    config: DetectionLossConfig,
+    groups: int = 1,
 ) -> DetectionLoss:
     """class_logits: (L, B, Q, classes). box_codes: (L, B, Q, 10). targets: B.
 
     Each layer is matched anew; both losses are divided by the number of matched boxes in the batch.
+    groups: of queries, one after another, each matched for itself; the loss is their mean.
     """
-    layers = [_layer_loss(*layer, targets, config) for layer in zip(class_logits, box_codes, strict=True)]
-    classes, boxes = torch.stack(layers).sum(0)
+    logits, codes = (_groups_as_layers(tensor, groups) for tensor in (class_logits, box_codes))
+    layers = [_layer_loss(*layer, targets, config) for layer in zip(logits, codes, strict=True)]
+    classes, boxes = torch.stack(layers).sum(0) / groups
     return DetectionLoss(classes, boxes)
 
 
@@ -61,6 +67,11 @@ def matching_costs(
     classes = focal_cost(class_logits)[:, truth.labels]
     boxes = torch.cdist(box_codes[:, :MATCHED_NUMBERS], truth.codes[:, :MATCHED_NUMBERS], p=1)
     return config.class_weight * classes + config.box_weight * boxes
+
+
+def _groups_as_layers(tensor: Tensor, groups: int) -> Tensor:
+    """(L, B, groups · Q, ...) -> (L · groups, B, Q, ...)."""
+    return tensor.unflatten(2, (groups, -1)).movedim(2, 1).flatten(0, 1)
 
 
 def _layer_loss(
@@ -74,14 +85,14 @@ def _layer_loss(
         wanted[element, pairs.queries, truth.labels[pairs.truths]] = 1
         found.append(box_codes[element, pairs.queries])
         truths.append(truth.codes[pairs.truths])
-    boxes = _box_loss(torch.cat(found), torch.cat(truths), config.velocity_weight)
+    boxes = box_loss(torch.cat(found), torch.cat(truths), config.velocity_weight)
     count = max(sum(map(len, found)), 1)
     return (
         torch.stack([config.class_weight * focal_loss(class_logits, wanted).sum(), config.box_weight * boxes]) / count
     )
 
 
-def _box_loss(found: Tensor, truth: Tensor, velocity_weight: float) -> Tensor:
+def box_loss(found: Tensor, truth: Tensor, velocity_weight: float) -> Tensor:
     """L1 of matched codes (K, 10), summed; a box of unknown velocity is left out, as published."""
     known = truth.isfinite().all(-1)
     errors = F.l1_loss(found[known], truth[known], reduction="none").sum(0)  # (10,)

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from bevcli.model.bevformer import BEVFormer
-
 
 @dataclass(frozen=True)
 class OptimizerConfig:
@@ -40,12 +38,11 @@ class OptimizerConfig:
         return decayed * (self.warm_up_start + (1 - self.warm_up_start) * step / self.warm_up_steps)
 
 
-def make_optimizer(model: BEVFormer, config: OptimizerConfig) -> torch.optim.AdamW:
-    """AdamW over two groups: everything but the backbone, and the backbone."""
-    backbone = list(model.backbone.parameters())
-    known = {id(parameter) for parameter in backbone}
-    others = [parameter for parameter in model.parameters() if id(parameter) not in known]
-    groups = [{"params": others, "share": 1.0}, {"params": backbone, "share": config.backbone_share}]
+def make_optimizer(learning: nn.Module, backbone: nn.Module, config: OptimizerConfig) -> torch.optim.AdamW:
+    """AdamW over two groups: all that learns but the backbone, and the backbone."""
+    known = {id(parameter) for parameter in backbone.parameters()}
+    others = [parameter for parameter in learning.parameters() if id(parameter) not in known]
+    groups = [{"params": others, "share": 1.0}, {"params": list(backbone.parameters()), "share": config.backbone_share}]
     return torch.optim.AdamW(groups, lr=config.learning_rate, weight_decay=config.weight_decay)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,23 +23,37 @@ from bevcli.training.segmentation_targets import SegmentationTargets, segmentati
 
 
 @dataclass(frozen=True)
-class Batch:
-    """B clips of one length. steps: the model's inputs, one a frame. detection, segmentation: B, of the last frames.
+class Targets:
+    """What a model should say of B frames: B detection and B segmentation targets.
 
     segmentation is empty where the model has no such head.
     """
 
-    steps: tuple[BEVFormerInputs, ...]
     detection: tuple[DetectionTargets, ...]
     segmentation: tuple[SegmentationTargets, ...]
 
-    def to(self, device: torch.device) -> Batch:
+    def to(self, device: torch.device) -> Targets:
         """The same on a device."""
-        return Batch(
-            tuple(step.to(device) for step in self.steps),
+        return Targets(
             tuple(targets.to(device) for targets in self.detection),
             tuple(targets.to(device) for targets in self.segmentation),
         )
+
+
+@dataclass(frozen=True)
+class Batch:
+    """B clips of one length. steps: the model's inputs, one a frame. targets: of the last frames of the clips.
+
+    There are fewer targets than steps where the first frames of clips only make history.
+    """
+
+    steps: tuple[BEVFormerInputs, ...]
+    targets: tuple[Targets, ...]
+
+    def to(self, device: torch.device) -> Batch:
+        """The same on a device."""
+        steps = tuple(step.to(device) for step in self.steps)
+        return Batch(steps, tuple(targets.to(device) for targets in self.targets))
 
 
 def load_batch(
@@ -47,8 +62,13 @@ def load_batch(
     config: BEVFormerConfig,
     augmentation: AugmentationConfig,
     random: np.random.Generator,
+    *,
+    learn_all: bool = False,
 ) -> Batch:
-    """Reads, changes and prepares the frames of clips of one length. Raises InputError without ground truth."""
+    """Reads, changes and prepares the frames of clips of one length. Raises InputError without ground truth.
+
+    learn_all: give the targets of every frame, not of the last one only.
+    """
     loaded = [_load_clip(drives, clip, config, augmentation, random) for clip in clips]
     steps = []
     for number, frames in enumerate(zip(*loaded, strict=True)):
@@ -56,10 +76,14 @@ def load_batch(
         inputs = model_inputs(frames, before, config)
         mask_pictures(inputs.images, augmentation.grid_mask, random)
         steps.append(inputs)
-    truths = [(clip[-1].frame, ground_truth(clip[-1].frame)) for clip in loaded]
+    learned = list(zip(*loaded, strict=True))[0 if learn_all else -1 :]
+    return Batch(tuple(steps), tuple(_targets([prepared.frame for prepared in frames], config) for frames in learned))
+
+
+def _targets(frames: Sequence[Frame], config: BEVFormerConfig) -> Targets:
+    truths = [(frame, ground_truth(frame)) for frame in frames]
     segments = "segmentation" in config.heads
-    return Batch(
-        tuple(steps),
+    return Targets(
         tuple(detection_targets(boxes, config) for _, boxes in truths),
         tuple(
             segmentation_targets(boxes, frame.ground_truth_map, config.bev_grid) for frame, boxes in truths if segments

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import torch
+from torch import Tensor, nn
 
 from bevcli.errors import BevcliError
-from bevcli.model.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer, BEVFormerOutputs
+from bevcli.model.deformable_attention import DeformableAttention, fastest_backend
 from bevcli.pipeline.model_loading import choose_precision
 from bevcli.pipeline.read_ahead import read_ahead
 from bevcli.pipeline.runner import Runner, StepOptions
@@ -20,11 +22,12 @@ from bevcli.training.augmentation import AugmentationConfig
 from bevcli.training.checkpoint import load_checkpoint, save_checkpoint, save_weights
 from bevcli.training.clips import ClipConfig, draw_clips
 from bevcli.training.curves import Curve, draw
+from bevcli.training.dense_loss import DenseLossConfig, DenseReader, dense_loss
 from bevcli.training.detection_loss import DetectionLossConfig, detection_loss
 from bevcli.training.drives import Drives
 from bevcli.training.optimizer import OptimizerConfig, clip_gradients, make_optimizer, set_rate
 from bevcli.training.recurrent_clip import forward_clip
-from bevcli.training.samples import Batch, load_batch
+from bevcli.training.samples import Batch, Targets, load_batch
 from bevcli.training.segmentation_loss import SegmentationLossConfig, segmentation_loss
 from bevcli.training.validation import Validation, validate
 
@@ -33,7 +36,7 @@ from bevcli.training.validation import Validation, validate
 class TrainingConfig:
     """The [training] table of a model's file.
 
-    steps: of the optimizer. held_out: how many of the drives, the last ones, are for evaluation only.
+    steps: batches of clips. held_out: how many of the drives, the last ones, are for evaluation only.
     evaluate_every, checkpoint_every: steps. freeze_batch_norm: for fine-tuning, keep the running statistics.
     loaders: threads that read batches ahead; more than one where a GPU waits for them.
     weights_dtype: of weights.safetensors.
@@ -51,6 +54,7 @@ class TrainingConfig:
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     detection_loss: DetectionLossConfig = field(default_factory=DetectionLossConfig)
     segmentation_loss: SegmentationLossConfig = field(default_factory=SegmentationLossConfig)
+    dense_loss: DenseLossConfig = field(default_factory=DenseLossConfig)
 
     def __post_init__(self) -> None:
         if min(self.steps, self.evaluate_every, self.checkpoint_every, self.loaders) < 1 or self.held_out < 0:
@@ -83,10 +87,13 @@ class Trainer:
 
     def __init__(self, job: TrainingJob, *, resume: bool = False) -> None:
         self.job = job
-        self.runner = Runner(job.model, job.device, StepOptions(choose_precision(None, job.device)))
-        self.optimizer = make_optimizer(job.model, job.config.optimizer)
+        options = StepOptions(choose_precision(None, job.device), temporal=job.config.clips.frames > 1)
+        self.runner = Runner(job.model, job.device, options)
+        self.dense_reader = self._make_dense_reader()
+        self.optimizer = make_optimizer(self._learning(), job.model.backbone, job.config.optimizer)
         checkpoint = job.out / "checkpoint.pt"
-        self.done = load_checkpoint(checkpoint, job.model, self.optimizer) if resume else 0
+        self.done = load_checkpoint(checkpoint, self._learning(), self.optimizer) if resume else 0
+        self._choose_kernels()
         self.loss_curve = Curve(job.out / "loss.csv", self.done)
         self.validation_curve = Curve(job.out / "validation.csv", self.done)
 
@@ -105,45 +112,89 @@ class Trainer:
             if self.done % config.evaluate_every == 0 or last:
                 after_validation(self.done, self._validate())
             if self.done % config.checkpoint_every == 0 or last:
-                save_checkpoint(self.job.out / "checkpoint.pt", self.done, self.job.model, self.optimizer)
+                save_checkpoint(self.job.out / "checkpoint.pt", self.done, self._learning(), self.optimizer)
             after_step()
 
     def _load(self, step: int) -> Batch:
         job = self.job
         random = np.random.default_rng([job.seed, step])
         clips = draw_clips(job.drives, job.config.clips, random)
-        return load_batch(job.drives, clips, job.model.config, job.config.augmentation, random)
+        return load_batch(
+            job.drives, clips, job.model.config, job.config.augmentation, random, learn_all=self._learns_all()
+        )
 
     def _step(self, batch: Batch) -> dict[str, float]:
-        """One step of the optimizer; returns the row of the loss curve."""
+        """One batch, an update of the weights for each frame that is learned from; returns the mean row."""
         job, config = self.job, self.job.config
         torch.manual_seed(int(np.random.SeedSequence([job.seed, self.done]).generate_state(1)[0]))  # for dropout
         rate = config.optimizer.learning_rate * config.optimizer.share(self.done, config.steps)
         set_rate(self.optimizer, rate)
-        losses = self._losses(batch.to(job.device))
+        rows = [self._update(losses) for losses in self._losses(batch.to(job.device))]
+        means = {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
+        norm = means.pop("gradient norm")
+        return means | {"learning rate": rate, "gradient norm": norm}
+
+    def _update(self, losses: dict[str, Tensor]) -> dict[str, float]:
         total = torch.stack(list(losses.values())).sum()
         if not math.isfinite(total.item()):
             raise BevcliError(
                 f"step {self.done + 1}: the loss is {total.item()}; lower the learning rate, and --resume "
-                f"from the last checkpoint in {job.out}"
+                f"from the last checkpoint in {self.job.out}"
             )
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
-        norm = clip_gradients(job.model, config.optimizer.max_gradient_norm)
+        norm = clip_gradients(self._learning(), self.job.config.optimizer.max_gradient_norm)
         self.optimizer.step()
-        row = {"loss": total.item(), **{name: loss.item() for name, loss in losses.items()}}
-        return row | {"learning rate": rate, "gradient norm": norm}
+        return {"loss": total.item(), **{name: loss.item() for name, loss in losses.items()}, "gradient norm": norm}
 
-    def _losses(self, batch: Batch) -> dict[str, torch.Tensor]:
+    def _losses(self, batch: Batch) -> Iterator[dict[str, Tensor]]:
+        """The losses of one frame after another; the model may be updated in between."""
         job, config = self.job, self.job.config
-        with torch.autocast(job.device.type, torch.bfloat16, enabled=job.device.type == "cuda"):
-            outputs = forward_clip(job.model, batch.steps, freeze_batch_norm=config.freeze_batch_norm)
-        detection = detection_loss(outputs.class_logits, outputs.box_codes, batch.detection, config.detection_loss)
+        frames = forward_clip(
+            job.model, batch.steps, learn_all=self._learns_all(), freeze_batch_norm=config.freeze_batch_norm
+        )
+        for targets in batch.targets:
+            with torch.autocast(job.device.type, torch.bfloat16, enabled=computes_in_bfloat16(job.device)):
+                outputs = next(frames)
+            yield self._frame_losses(outputs, targets)
+
+    def _frame_losses(self, outputs: BEVFormerOutputs, targets: Targets) -> dict[str, Tensor]:
+        config, groups = self.job.config, self.job.model.config.decoder.training_groups
+        detection = detection_loss(
+            outputs.class_logits, outputs.box_codes, targets.detection, config.detection_loss, groups
+        )
         losses = {"classes": detection.classes, "boxes": detection.boxes}
+        if self.dense_reader is not None:
+            bev = outputs.bev.float()
+            dense = dense_loss(self.dense_reader, bev, targets.detection, config.dense_loss, config.detection_loss)
+            losses |= {"cell classes": dense.classes, "cell boxes": dense.boxes}
         if outputs.segmentation is not None:
-            maps = segmentation_loss(outputs.segmentation, batch.segmentation, config.segmentation_loss)
+            maps = segmentation_loss(outputs.segmentation, targets.segmentation, config.segmentation_loss)
             losses |= {"map classes": maps.classes, "masks": maps.masks, "locations": maps.locations}
         return losses
+
+    def _choose_kernels(self) -> None:
+        """What computes the same sooner: layouts and backends."""
+        model = self.job.model
+        for part in (model.backbone, model.neck):
+            part.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        for module in model.modules():
+            if isinstance(module, DeformableAttention):
+                module.backend = fastest_backend(self.job.device, gradients=True)
+
+    def _make_dense_reader(self) -> DenseReader | None:
+        if self.job.config.dense_loss.weight == 0:
+            return None
+        of_model = self.job.model.config
+        return DenseReader(of_model.channels, len(of_model.classes), of_model.bev_grid).to(self.job.device)
+
+    def _learning(self) -> nn.ModuleDict:
+        """All that learns: the model, and what reads it in training only."""
+        parts: dict[str, nn.Module] = {"model": self.job.model}
+        return nn.ModuleDict(parts if self.dense_reader is None else parts | {"dense_reader": self.dense_reader})
+
+    def _learns_all(self) -> bool:
+        return self.job.config.clips.learn == "all"
 
     def _validate(self) -> Validation:
         job = self.job
@@ -154,3 +205,8 @@ class Trainer:
         save_weights(job.out / "weights.safetensors", job.model, dtype)
         draw(self.loss_curve, self.validation_curve, job.out / "curves.png")
         return scores
+
+
+def computes_in_bfloat16(device: torch.device) -> bool:
+    """Whether the device has instructions for it, so that mixed precision is the faster one."""
+    return device.type == "cuda" or torch.cpu._is_avx512_bf16_supported()

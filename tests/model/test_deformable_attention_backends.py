@@ -31,6 +31,22 @@ def test_backends_equal_map_by_map_sampling(backend, depth):
     torch.testing.assert_close(deformable_attention(*inputs, backend), deformable_attention(*inputs))
 
 
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("depth", [1, 16, 33])
+def test_the_compiled_loops_have_the_gradients_of_map_by_map_sampling(depth, threads, monkeypatch):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    gradients = {}
+    for backend in ("grid_sample", "compiled"):
+        values, shapes, locations, weights, counts = case(depth)
+        learned = [tensor.requires_grad_() for tensor in (values, locations, weights)]
+        result = deformable_attention(values, shapes, locations, weights, counts, backend)
+        direction = torch.randn(result.shape, generator=torch.Generator().manual_seed(1))
+        gradients[backend] = torch.autograd.grad((result * direction).sum(), learned)
+    for found, expected in zip(gradients["compiled"], gradients["grid_sample"], strict=True):
+        inside = expected.abs() < 1e6  # the places 6.7e6 away have no meaning there
+        torch.testing.assert_close(found[inside], expected[inside], rtol=1e-4, atol=1e-4)
+
+
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 def test_half_precision_values_are_summed_in_float32(dtype):
     inputs = case(16, dtype=dtype)

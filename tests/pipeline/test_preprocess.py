@@ -30,6 +30,21 @@ def test_pictures_are_those_of_the_originals_order(mini_config, order):
     assert images == pytest.approx(np.stack(expected), abs=1e-5)
 
 
+def test_shrunk_pictures_may_be_averaged(mini_config):
+    """Stripes finer than the network's pixels become grey, and not stripes again."""
+    config = replace(mini_config, image=replace(mini_config.image, resize="area"))
+    frame = MemorySequence().load(1)
+    name = config.cameras[0]
+    stripes = np.zeros_like(frame.pictures[name].pixels_bgr)
+    stripes[:, ::2] = 200  # a network's pixel is two by two of them
+    frame = replace(frame, pictures={**frame.pictures, name: replace(frame.pictures[name], pixels_bgr=stripes)})
+    picture = Preprocessor(config)(frame).images[0, 0].numpy()
+    width, height = config.image.size
+    mean, std = (np.array(values)[:, None, None] for values in (config.image.mean, config.image.std))
+    expected = np.broadcast_to((100 - mean) / std, (3, height, width))
+    assert picture[:, :height, :width] == pytest.approx(expected, abs=1e-4)
+
+
 def test_projection_goes_through_the_world_at_each_cameras_own_time(mini_config):
     frame = MemorySequence().load(1)
     late = Pose(frame.world_from_ego.translation + [1.5, 0, 0], frame.world_from_ego.quaternion)

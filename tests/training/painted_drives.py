@@ -41,13 +41,17 @@ CONFIG = BEVFormerConfig(
 
 
 class PaintedDrive:
-    """Two frames half a second apart, with three cars and two pedestrians; truth is told of the second one only."""
+    """Two frames half a second apart, with three cars and two pedestrians.
+
+    told: whether truth is told of both frames, or of the second one only.
+    """
 
     has_ego_motion = True
     notes = ()
     rig = RIG
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, *, told: bool) -> None:
+        self._told = told
         self.name = f"painted-{seed}"
         self.stamps = tuple(FrameStamp(i, self.name, 10**18 + i * 500_000_000) for i in range(2))
         self._boxes = _boxes(np.random.default_rng(seed))  # in the world, where the bev frame is at the second frame
@@ -59,7 +63,7 @@ class PaintedDrive:
         pictures = {c.name: Picture(stamp.timestamp_ns, self._picture(c, pose)) for c in RIG.cameras}
         still = Kinematics(np.array([0, 0, GRAVITY]), np.zeros(3), np.array([2.0, 0, 0]))
         frame = Frame(stamp, RIG, pictures, pose, dict.fromkeys(RIG.names, pose), still)
-        return replace(frame, ground_truth=self._boxes, ground_truth_map=_map()) if place else frame
+        return replace(frame, ground_truth=self._boxes, ground_truth_map=_map()) if place or self._told else frame
 
     def _picture(self, camera: Camera, pose: Pose) -> np.ndarray:
         pixels = np.full((camera.height, camera.width, 3), 120, dtype=np.uint8)
@@ -77,8 +81,8 @@ class PaintedDrive:
 class PaintedDrives:
     """Some painted drives, from seeds."""
 
-    def __init__(self, count: int) -> None:
-        self._drives = [PaintedDrive(seed) for seed in range(count)]
+    def __init__(self, count: int, *, told: bool = False) -> None:
+        self._drives = [PaintedDrive(seed, told=told) for seed in range(count)]
 
     def __len__(self) -> int:
         return len(self._drives)

@@ -38,6 +38,13 @@ def test_one_of_the_frames_before_is_left_out_and_the_order_kept() -> None:
     assert all(places[-1] - places[0] <= 3 for places in drawn(MemorySequence(10), frames=3))
 
 
+def test_clips_that_are_learned_from_as_a_whole_have_no_gap() -> None:
+    random = np.random.default_rng(0)
+    config = ClipConfig(frames=3, batch=50, short_share=0.0, learn="all")
+    found = {clip.places for clip in draw_clips(Drives(MemorySequence(5)), config, random)}
+    assert found == {(0, 1, 2), (1, 2, 3), (2, 3, 4)}
+
+
 def test_a_clip_stays_in_its_scene() -> None:
     assert set(drawn(MemorySequence(6, scenes="aaabbb"), frames=3)) == {(0, 1, 2), (3, 4, 5)}
 

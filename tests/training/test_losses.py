@@ -73,6 +73,16 @@ def test_detection_loss_by_hand() -> None:
     assert loss.total.item() == pytest.approx(loss.boxes.item() + loss.classes.item())
 
 
+def test_groups_of_queries_are_matched_each_for_itself() -> None:
+    random = torch.Generator().manual_seed(0)
+    logits, codes = (torch.randn(2, 1, 6, size, generator=random) for size in (3, 10))
+    truth = [targets(code(x=1.0), code(x=-2.0), label=1)]
+    together = detection_loss(logits, codes, truth, CONFIG, groups=2).total
+    halves = zip(logits.chunk(2, dim=2), codes.chunk(2, dim=2), strict=True)
+    apart = [detection_loss(*half, truth, CONFIG).total for half in halves]
+    assert together.item() == pytest.approx(sum(apart).item() / 2)
+
+
 def test_the_class_decides_between_queries_at_the_same_place() -> None:
     codes = torch.tensor([[code(0.0), code(0.0)]])[None]
     logits = torch.tensor([[[[-2.0], [2.0]]]])

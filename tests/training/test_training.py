@@ -17,6 +17,7 @@ from bevcli.model.bevformer import BEVFormer
 from bevcli.training.augmentation import AugmentationConfig
 from bevcli.training.checkpoint import save_checkpoint
 from bevcli.training.clips import ClipConfig
+from bevcli.training.dense_loss import DenseLossConfig
 from bevcli.training.drives import RenderedDrives
 from bevcli.training.optimizer import OptimizerConfig, make_optimizer, set_rate
 from bevcli.training.trainer import Trainer, TrainingConfig, TrainingJob
@@ -83,6 +84,37 @@ def test_the_number_of_loaders_changes_nothing(tmp_path: Path) -> None:
     assert_same_weights(one, three)
 
 
+def test_all_that_helps_to_learn_survives_a_kill_too(tmp_path: Path) -> None:
+    """Every frame learned from, groups of queries, the dense loss."""
+    settings = replace(
+        SHORT, steps=3, evaluate_every=3, checkpoint_every=1, clips=ClipConfig(2, 2, 0.0, "all"),
+        dense_loss=DenseLossConfig(1.0),
+    )  # fmt: skip
+
+    def helped(out: Path, resume: bool = False) -> Trainer:
+        out.mkdir(exist_ok=True)
+        torch.manual_seed(0)
+        config = replace(NOISY, decoder=replace(NOISY.decoder, training_groups=2))
+        drives = PaintedDrives(2, told=True)
+        job = TrainingJob(BEVFormer(config), settings, drives, drives, out, torch.device("cpu"))
+        return Trainer(job, resume=resume)
+
+    whole = helped(tmp_path / "whole")
+    whole.run()
+    assert [name for name, parameter in whole._learning().named_parameters() if parameter.grad is None] == []
+    killed = helped(tmp_path / "killed")
+
+    def kill() -> None:
+        raise Killed
+
+    with pytest.raises(Killed):
+        killed.run(kill)
+    resumed = helped(tmp_path / "killed", resume=True)
+    assert resumed.done == 1
+    resumed.run()
+    assert_same_weights(whole, resumed)
+
+
 def test_every_parameter_receives_a_gradient(tmp_path: Path) -> None:
     one = trainer(tmp_path, settings=replace(SHORT, steps=1))
     one.run()
@@ -102,7 +134,7 @@ def test_what_a_training_leaves_can_be_run(tmp_path: Path) -> None:
 
 def test_a_kill_while_writing_leaves_the_checkpoint_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = BEVFormer(CONFIG)
-    optimizer = make_optimizer(model, OptimizerConfig())
+    optimizer = make_optimizer(model, model.backbone, OptimizerConfig())
     save_checkpoint(tmp_path / "checkpoint.pt", 7, model, optimizer)
     before = (tmp_path / "checkpoint.pt").read_bytes()
 
@@ -120,7 +152,7 @@ def test_resuming_from_nothing_or_from_another_model_is_refused(tmp_path: Path) 
     with pytest.raises(WeightsError, match="no checkpoint to resume from"):
         trainer(tmp_path, resume=True)
     other = BEVFormer(replace(CONFIG, channels=16))
-    save_checkpoint(tmp_path / "checkpoint.pt", 1, other, make_optimizer(other, OptimizerConfig()))
+    save_checkpoint(tmp_path / "checkpoint.pt", 1, other, make_optimizer(other, other.backbone, OptimizerConfig()))
     with pytest.raises(WeightsError, match="is no checkpoint of this model"):
         trainer(tmp_path, resume=True)
 
@@ -139,7 +171,8 @@ def test_the_rate_warms_up_and_falls_by_a_cosine() -> None:
     assert config.share(50, 100) == pytest.approx(0.5)
     assert config.share(99, 100) < 0.001
     assert config.share(10, 100) == max(config.share(step, 100) for step in range(100))
-    optimizer = make_optimizer(BEVFormer(CONFIG), replace(config, backbone_share=0.1))
+    model = BEVFormer(CONFIG)
+    optimizer = make_optimizer(model, model.backbone, replace(config, backbone_share=0.1))
     set_rate(optimizer, 0.3)
     assert [group["lr"] for group in optimizer.param_groups] == pytest.approx([0.3, 0.03])
 
