@@ -19,7 +19,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	touch $@
 
 demo: $(INSTALLED)
-	$(BIN)/bevcli run samples/street --untrained --out runs/street --force
+	$(BIN)/bevcli run samples/street --out runs/street --force
 
 test: $(INSTALLED)
 	$(BIN)/pytest -m "not slow and not gpu"

@@ -54,10 +54,11 @@ class FolderDrives:
 
 
 class RenderedDrives:
-    """Rendered drives of some seeds, in the model's picture size, kept as sequence folders under `cache`."""
+    """Rendered drives of some seeds, in the model's picture size, kept as sequence folders under `cache`/WxH."""
 
     def __init__(self, seeds: Items[int], cache: Path, config: BEVFormerConfig) -> None:
-        self._folders = [cache / f"{seed:06d}" for seed in seeds]
+        width, height = config.image.size
+        self._folders = [cache / f"{width}x{height}" / f"{seed:06d}" for seed in seeds]
         self._seeds = tuple(seeds)
         self._config = config
         self._rendering = threading.Lock()

@@ -238,7 +238,7 @@ def test_a_rendered_drive_is_rendered_once_and_taught(tmp_path: Path) -> None:
     config = replace(CONFIG, image=replace(CONFIG.image, size=(64, 36)))
     drives = RenderedDrives([4, 5], tmp_path, config)
     assert len(drives.open(1).stamps) == 20
-    assert [path.name for path in tmp_path.iterdir()] == ["000005"]
+    assert [path.name for path in tmp_path.glob("64x36/*")] == ["000005"]
     frame = drives.open(1).load(0)
     assert frame.pictures["CAM_FRONT"].pixels_bgr.shape == (36, 64, 3)
     assert len(frame.ground_truth) > 0
