@@ -32,7 +32,7 @@ def test_a_mistake_in_usage_exits_2():
     [
         (("run", "nowhere", "--untrained"), "nowhere"),
         (("run", "nowhere", "--model", "tinny", "--untrained"), "tinny"),
-        (("run", "nowhere"), "--untrained"),
+        (("run", "nowhere", "--model", "tiny"), "--untrained"),
         (("weights", "inspect", "nowhere.pth"), "nowhere.pth"),
     ],
 )

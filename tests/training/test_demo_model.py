@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import pytest
 import torch
 
+from bevcli.checkpoints import bundled_weights
 from bevcli.config import load_config, load_training
+from bevcli.errors import WeightsError
 from bevcli.model.bevformer import BEVFormer
+from bevcli.model.inference import prepare_for_inference
+from bevcli.pipeline.model_loading import load_model
+from bevcli.pipeline.runner import Runner
+from bevcli.training.drives import FolderDrives
 from bevcli.training.trainer import TrainingConfig
+from bevcli.training.validation import validate
+
+STREET = Path(__file__).parents[2] / "samples" / "street"
 
 
 def test_the_demo_model_is_small_and_whole() -> None:
@@ -25,3 +37,39 @@ def test_the_demo_model_trains_with_history() -> None:
     assert settings.clips.frames >= 2
     assert settings.held_out > 0
     assert settings.weights_dtype == "float16"
+
+
+def test_its_weights_come_with_the_package_and_are_the_default() -> None:
+    loaded = load_model(None, None, untrained=False)
+    assert loaded.model.config.name == "demo"
+    assert loaded.weights == bundled_weights("demo")
+    assert loaded.bundled
+    assert loaded.weights.stat().st_size <= 20e6
+
+
+@pytest.mark.parametrize("name", ["tiny", "small", "base"])
+def test_other_models_refuse_to_run_without_weights(name: str) -> None:
+    with pytest.raises(WeightsError, match=f"model {name} has no weights: give --weights FILE"):
+        load_model(name, None, untrained=False)
+
+
+def test_a_file_of_the_users_own_does_not_get_the_packages_weights(tmp_path: Path) -> None:
+    own = tmp_path / "demo.toml"
+    own.write_text((STREET.parents[1] / "configs" / "demo.toml").read_text())
+    with pytest.raises(WeightsError, match="has no weights"):
+        load_model(str(own), None, untrained=False)
+
+
+def test_weights_alone_say_which_model_they_are_for() -> None:
+    loaded = load_model(None, bundled_weights("demo"), untrained=False)
+    assert loaded.model.config.name == "demo"
+    assert not loaded.bundled
+
+
+def test_it_sees_the_street_in_the_samples() -> None:
+    """Far below what the model card states: enough to tell weights from noise."""
+    model = load_model(None, None, untrained=False).model
+    cpu = torch.device("cpu")
+    scores = validate(Runner(prepare_for_inference(model, cpu), cpu), FolderDrives([STREET], 2.0))
+    assert scores.detection.overall.classes["car"].mean_ap > 0.2
+    assert scores.segmentation.iou["drivable_road"] > 0.6
