@@ -12,7 +12,9 @@ RESOLUTION = "800x450"
 
 def demo(
     out: Annotated[Path, typer.Option(help="The folder for the drive and the results.")] = Path("runs/demo"),
-    seed: Annotated[int, typer.Option(min=0, help="Which street: the same seed renders the same drive.")] = 1,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Which street; the model was taught none from 1000000 on.")
+    ] = 1_000_001,
     frames: Annotated[int, typer.Option(min=1, help="How many frames, two a second.")] = 8,
     view: Annotated[bool, typer.Option("--view/--no-view", help="Open the viewer at the end.")] = True,
     force: Annotated[bool, typer.Option("--force", help="Replace an earlier demo in OUT.")] = False,
