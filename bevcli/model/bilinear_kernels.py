@@ -74,40 +74,50 @@ def sample_maps(values, level_shapes, locations, weights, map_of_query, out, beg
     values: (G, S, heads, D) float32 or bfloat16 bits. level_shapes: (L, 2) int64 height, width.
     locations: (M, heads, L, P, 2) float32, x and y, 0 to 1. weights: (M, heads, L, P) float32.
     map_of_query: (M,) int64, which of the G maps a query samples. Outside of a map values are zero.
+
+    For a head of a query, first all corners are found, then all are read: the processor has many reads under way.
     """
     heads, levels, points = weights.shape[1:]
-    depth = values.shape[3]
+    # Unsigned: a number that may be negative would count from the array's end, and each read would ask whether.
+    depth = np.uint64(values.shape[3])
+    flat = values.reshape(-1)
+    step = heads * values.shape[3]
+    corners = np.empty((levels * points, 4), np.uint64)
+    shares = np.empty((levels * points, 4), np.float32)
+    total = np.empty(depth, np.float32)
     for query in range(begin, end):
-        tokens = values[map_of_query[query]]
         for head in range(heads):
-            total = out[query, head]
-            for channel in range(depth):
-                total[channel] = 0
-            start = 0
+            first = map_of_query[query] * values.shape[1] * step + head * values.shape[3]
             for level in range(levels):
                 height, width = level_shapes[level]
                 for point in range(points):
                     x = locations[query, head, level, point, 0] * np.float32(width) - np.float32(0.5)
                     y = locations[query, head, level, point, 1] * np.float32(height) - np.float32(0.5)
-                    # Written so that NaN fails it too.
-                    if not (x > -1 and x < width and y > -1 and y < height):
-                        continue
-                    top, bottom, left, right, shares = bilinear_corners(x, y, height, width)
-                    weight = weights[query, head, level, point]
-                    w00, w01 = weight * shares[0], weight * shares[1]
-                    w10, w11 = weight * shares[2], weight * shares[3]
-                    a = tokens[start + top * width + left, head]
-                    b = tokens[start + top * width + right, head]
-                    c = tokens[start + bottom * width + left, head]
-                    d = tokens[start + bottom * width + right, head]
-                    for channel in range(depth):
-                        total[channel] += (
-                            w00 * as_float32(a[channel])
-                            + w01 * as_float32(b[channel])
-                            + w10 * as_float32(c[channel])
-                            + w11 * as_float32(d[channel])
-                        )
-                start += height * width
+                    # Written so that NaN is outside too. A place outside counts nothing; the first cell stands for it.
+                    inside = x > -1 and x < width and y > -1 and y < height
+                    x, y = (x, y) if inside else (np.float32(0), np.float32(0))
+                    weight = weights[query, head, level, point] if inside else np.float32(0)
+                    top, bottom, left, right, corner_shares = bilinear_corners(x, y, height, width)
+                    tap = level * points + point
+                    corners[tap, 0] = first + (top * width + left) * step
+                    corners[tap, 1] = first + (top * width + right) * step
+                    corners[tap, 2] = first + (bottom * width + left) * step
+                    corners[tap, 3] = first + (bottom * width + right) * step
+                    for corner in range(4):
+                        shares[tap, corner] = weight * corner_shares[corner]
+                first += height * width * step
+            total[:] = 0
+            for tap in range(levels * points):
+                a, b, c, d = corners[tap, 0], corners[tap, 1], corners[tap, 2], corners[tap, 3]
+                share_a, share_b, share_c, share_d = shares[tap, 0], shares[tap, 1], shares[tap, 2], shares[tap, 3]
+                for channel in range(depth):
+                    total[channel] += (
+                        share_a * as_float32(flat[a + channel])
+                        + share_b * as_float32(flat[b + channel])
+                        + share_c * as_float32(flat[c + channel])
+                        + share_d * as_float32(flat[d + channel])
+                    )
+            out[query, head] = total
 
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
