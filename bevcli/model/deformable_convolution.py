@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Literal
 
 import torch
@@ -28,10 +29,15 @@ class ModulatedDeformableConvolution(nn.Module):
         self.stride = stride
         self.weight = nn.Parameter(torch.empty(out_channels, in_channels, 3, 3))
         self.bias: nn.Parameter | None = None
+        self.product: nn.Module | None = None  # of rows of taps, where one is made ready for inference
         self.offset_and_mask = nn.Conv2d(in_channels, 27, 3, stride, padding=1)
         nn.init.kaiming_normal_(self.weight, mode="fan_out", nonlinearity="relu")
         nn.init.zeros_(self.offset_and_mask.weight)
         nn.init.zeros_(self.offset_and_mask.bias)  # type: ignore[arg-type]
+
+    def taps_matrix(self) -> Tensor:
+        """The weight for rows of nine taps, one after another: (O, 9 · C)."""
+        return self.weight.permute(0, 2, 3, 1).flatten(1).contiguous()
 
     def forward(self, x: Tensor) -> Tensor:
         """x: (B, C, H, W) -> (B, out_channels, H', W')."""
@@ -40,7 +46,8 @@ class ModulatedDeformableConvolution(nn.Module):
         offsets = moves[:, :18].unflatten(1, (9, 2))  # (B, 9, 2, H', W')
         mask = moves[:, 18:].sigmoid()  # (B, 9, H', W')
         if self.backend == "compiled":
-            return convolve_compiled(x, offsets, mask, self.weight, self.bias, self.stride)
+            product = self.product or partial(F.linear, weight=self.taps_matrix(), bias=self.bias)
+            return convolve_compiled(x, offsets, mask, product, len(self.weight), self.stride)
         y = modulated_deformable_convolution(x, offsets, mask, self.weight, self.stride)
         return y if self.bias is None else y + self.bias[:, None, None]
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from bevcli.model.deformable_attention_compiled import as_array
@@ -16,9 +16,12 @@ TILE_BYTES = 8 << 20
 
 
 def convolve_compiled(
-    x: Tensor, offsets: Tensor, mask: Tensor, weight: Tensor, bias: Tensor | None, stride: int
+    x: Tensor, offsets: Tensor, mask: Tensor, product: Callable[[Tensor], Tensor], out_channels: int, stride: int
 ) -> Tensor:
-    """As `modulated_deformable_convolution`; on the CPU, no gradients. Returns channels-last."""
+    """As `modulated_deformable_convolution`; on the CPU, no gradients. Returns channels-last.
+
+    product: (rows, 9 · C), a row's nine taps one after another -> (rows, O).
+    """
     from bevcli.model.bilinear_kernels import sample_taps  # loads the compiler, which not every run needs
 
     batch, channels = x.shape[:2]
@@ -32,11 +35,10 @@ def convolve_compiled(
     )
     # The compiled loops write bfloat16 and float32.
     taps = torch.empty(tile, 9, channels, dtype=torch.bfloat16 if x.dtype == torch.bfloat16 else torch.float32)
-    matrix = weight.permute(0, 2, 3, 1).flatten(1).contiguous()  # (O, 9 · C)
-    out = x.new_empty(rows, len(weight))
+    out = x.new_empty(rows, out_channels)
 
     for first in range(0, rows, tile):
         count = min(tile, rows - first)
         in_threads(partial(sample_taps, *arrays, stride, first, as_array(taps)), count)
-        out[first : first + count] = F.linear(taps[:count].flatten(1).to(x.dtype), matrix, bias)
+        out[first : first + count] = product(taps[:count].flatten(1).to(x.dtype))
     return out.view(batch, height, width, -1).permute(0, 3, 1, 2)

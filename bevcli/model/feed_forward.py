@@ -20,4 +20,4 @@ class FeedForward(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """x: (..., C) -> (..., C), without the residual."""
-        return self.dropout(self.reduce(self.dropout(F.relu(self.expand(x)))))
+        return self.dropout(self.reduce(self.dropout(F.relu(self.expand(x), inplace=True))))

@@ -14,6 +14,7 @@ from bevcli.model.bevformer import BEVFormer
 from bevcli.model.deformable_attention import DeformableAttention, fastest_backend
 from bevcli.model.deformable_attention_compiled import load_compiled
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
+from bevcli.model.onednn_layers import use_onednn
 from bevcli.model.resnet import Bottleneck, ResNet
 from bevcli.model.spatial_cross_attention import SpatialCrossAttention
 
@@ -25,10 +26,11 @@ def prepare_for_inference(model: BEVFormer, device: torch.device, precision: Pre
     """A copy of the model on the device, for inference only; the model itself stays as it is.
 
     What is the same in every frame is worked out here, what hangs on calibration and poses when these change.
-    Batch norms are folded into their convolutions, pictures are convolved channels-last, and deformable operations
-    take the device's fastest backends. At half precision the whole way of the pictures computes in it: backbone,
-    neck, image tokens and their values. What follows moves boxes by decimetres when it is rounded, and is a small
-    part of the work: BEV queries, sampling locations, decoder and heads stay in float32.
+    Batch norms are folded into their convolutions, pictures are convolved channels-last, deformable operations take
+    the device's fastest backends, and on a CPU oneDNN runs convolutions and linear layers. At half precision the
+    whole way of the pictures computes in it: backbone, neck, image tokens and their values. What follows moves boxes
+    by decimetres when it is rounded, and is a small part of the work: BEV queries, sampling locations, decoder and
+    heads stay in float32.
     """
     if device.type == "cpu":
         # Beside the first frame's backbone: the start is half a second sooner.
@@ -47,6 +49,8 @@ def prepare_for_inference(model: BEVFormer, device: torch.device, precision: Pre
     _lower_precision(prepared, DTYPES[precision])
     for part in (prepared.backbone, prepared.neck):
         part.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    if device.type == "cpu":
+        use_onednn(prepared)
     return prepared
 
 

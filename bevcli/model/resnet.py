@@ -61,7 +61,7 @@ class ResNet(nn.Module):
     def forward(self, images: Tensor) -> list[Tensor]:
         """images: (B, 3, H, W), H and W multiples of 32 -> a map (B, C_s, H / 2^(s+1), W / 2^(s+1)) a stage s."""
         x = images.to(self.conv1.weight.dtype)
-        x = self.pool(F.relu(self.bn1(self.conv1(x))))
+        x = F.relu(self.pool(self.bn1(self.conv1(x))))  # the same as the published order, at a quarter of the cost
         maps = []
         for stage, blocks in enumerate(self.stages, start=1):
             x = blocks(x)

@@ -1,0 +1,84 @@
+"""Layers as oneDNN runs them on a CPU, for inference: weights packed once, what follows a convolution in its own pass.
+
+The operators are those that PyTorch's compiler puts in place of convolutions and linear layers. Where a build of
+PyTorch has none of them, a model keeps the layers that it has.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
+from bevcli.model.resnet import Bottleneck
+
+
+def has_onednn(dtype: torch.dtype) -> bool:
+    """Whether these layers run here in a dtype."""
+    operators = ("_convolution_pointwise", "_linear_pointwise", "_reorder_linear_weight", "_is_mkldnn_bf16_supported")
+    if not torch.backends.mkldnn.is_available() or not all(hasattr(torch.ops.mkldnn, name) for name in operators):
+        return False
+    return dtype == torch.float32 or (dtype == torch.bfloat16 and torch.ops.mkldnn._is_mkldnn_bf16_supported())
+
+
+class PackedLinear(nn.Module):
+    """A linear layer whose weight lies as oneDNN reads it."""
+
+    def __init__(self, weight: Tensor, bias: Tensor | None) -> None:
+        super().__init__()
+        self.weight, self.bias = weight, bias
+        self.packed = torch.ops.mkldnn._reorder_linear_weight(weight)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """x: (..., in) -> (..., out)."""
+        return torch.ops.mkldnn._linear_pointwise(x, self.packed, self.bias, "none", [], "")
+
+
+class ActivatedConvolution(nn.Module):
+    """relu(convolution(x)), or relu(convolution(x) + shortcut), in one pass."""
+
+    def __init__(self, convolution: nn.Conv2d) -> None:
+        super().__init__()
+        self.weight, self.bias = convolution.weight, convolution.bias
+        self.geometry = (list(convolution.padding), list(convolution.stride), list(convolution.dilation), 1)
+
+    def forward(self, x: Tensor, shortcut: Tensor | None = None) -> Tensor:
+        """x: (B, in, H, W), shortcut: as the result -> (B, out, H', W')."""
+        convolve: Any = torch.ops.mkldnn._convolution_pointwise
+        if shortcut is None:
+            return convolve(x, self.weight, self.bias, *self.geometry, "relu", [], "")
+        return convolve.binary(x, shortcut, self.weight, self.bias, *self.geometry, "add", 1.0, "relu", [], "")
+
+
+class FusedBottleneck(nn.Module):
+    """A `Bottleneck` whose batch norms are folded."""
+
+    def __init__(self, block: Bottleneck) -> None:
+        super().__init__()
+        assert isinstance(block.conv1, nn.Conv2d)
+        self.conv1, self.conv3 = ActivatedConvolution(block.conv1), ActivatedConvolution(block.conv3)
+        if isinstance(block.conv2, nn.Conv2d):
+            self.conv2: nn.Module = ActivatedConvolution(block.conv2)
+        else:
+            self.conv2 = nn.Sequential(block.conv2, nn.ReLU(inplace=True))
+        self.downsample = block.downsample
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.conv3(self.conv2(self.conv1(x)), self.downsample(x))
+
+
+def use_onednn(part: nn.Module) -> None:
+    """Puts these layers in place of a module's linear layers and of its bottlenecks, whose batch norms are folded."""
+    for name, child in part.named_children():
+        if isinstance(child, Bottleneck) and has_onednn(child.conv1.weight.dtype):
+            child = FusedBottleneck(child)
+            setattr(part, name, child)
+        if isinstance(child, ModulatedDeformableConvolution) and has_onednn(child.weight.dtype):
+            child.product = PackedLinear(child.taps_matrix(), child.bias)
+        # Multi-head attention derives its output layer from nn.Linear and reads the weight itself.
+        elif type(child) is nn.Linear and has_onednn(child.weight.dtype):
+            setattr(part, name, PackedLinear(child.weight, child.bias))
+        else:
+            use_onednn(child)

@@ -1,0 +1,67 @@
+"""oneDNN's layers answer as PyTorch's do."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from small_model import small_inputs, small_model
+from torch import nn
+
+from bevcli.model import onednn_layers
+from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
+from bevcli.model.inference import prepare_for_inference
+from bevcli.model.onednn_layers import FusedBottleneck, PackedLinear, has_onednn, use_onednn
+from bevcli.model.resnet import Bottleneck
+
+pytestmark = pytest.mark.skipif(not has_onednn(torch.float32), reason="this build of PyTorch has no oneDNN")
+TOLERANCE = {torch.float32: 1e-4, torch.bfloat16: 0.1}
+
+
+def dtypes() -> list[torch.dtype]:
+    return [dtype for dtype in TOLERANCE if has_onednn(dtype)]
+
+
+@pytest.mark.parametrize("rows", [(0,), (1,), (2, 900)])
+@pytest.mark.parametrize("bias", [True, False])
+def test_a_packed_linear_layer_answers_the_same(rows, bias):
+    for dtype in dtypes():
+        linear = nn.Linear(48, 20, bias).to(dtype)
+        x = torch.randn(*rows, 48, dtype=dtype)
+        with torch.inference_mode():
+            found = PackedLinear(linear.weight, linear.bias)(x)
+            torch.testing.assert_close(found, linear(x), atol=TOLERANCE[dtype], rtol=TOLERANCE[dtype])
+
+
+@pytest.mark.parametrize("style", ["pytorch", "caffe"])
+@pytest.mark.parametrize(("in_channels", "stride"), [(64, 1), (32, 2)])
+@pytest.mark.parametrize("deformable", [False, True])
+def test_a_fused_bottleneck_answers_the_same(style, in_channels, stride, deformable):
+    for dtype in dtypes():
+        block = Bottleneck(in_channels, 16, stride, style, deformable)
+        for name, module in list(block.named_modules()):
+            if isinstance(module, nn.BatchNorm2d):  # as folding leaves it: biases in the convolutions
+                block.set_submodule(name, nn.Identity())
+            elif isinstance(module, nn.Conv2d | ModulatedDeformableConvolution):
+                module.bias = nn.Parameter(torch.randn(len(module.weight)))
+            if isinstance(module, ModulatedDeformableConvolution):
+                module.backend = "compiled"
+        block = block.to(dtype).to(memory_format=torch.channels_last).requires_grad_(False)
+        x = torch.randn(2, in_channels, 12, 20, dtype=dtype).to(memory_format=torch.channels_last)
+        before = x.clone()
+        with torch.inference_mode():
+            expected = block(x)
+            whole = nn.Sequential(block)
+            use_onednn(whole)
+            assert isinstance(whole[0], FusedBottleneck)
+            torch.testing.assert_close(whole(x), expected, atol=TOLERANCE[dtype], rtol=TOLERANCE[dtype])
+        assert torch.equal(x, before)
+
+
+def test_without_onednn_a_model_keeps_its_layers(monkeypatch):
+    model, cpu = small_model(), torch.device("cpu")
+    with torch.inference_mode():
+        expected = prepare_for_inference(model, cpu)(small_inputs(0)).bev
+        monkeypatch.setattr(onednn_layers, "has_onednn", lambda dtype: False)
+        kept = prepare_for_inference(model, cpu)
+        assert not any(isinstance(module, PackedLinear | FusedBottleneck) for module in kept.modules())
+        torch.testing.assert_close(kept(small_inputs(0)).bev, expected, atol=1e-4, rtol=1e-4)
