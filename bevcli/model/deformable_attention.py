@@ -141,7 +141,7 @@ class DeformableAttention(nn.Module):
         """
         offsets = self.sampling_offsets(query).float().unflatten(-1, (*self.shape, 2))
         heads, maps, levels, points = self.shape
-        weights = self.attention_weights(query).unflatten(-1, (heads, maps, levels * points)).softmax(-1)
+        weights = _softmax(self.attention_weights(query).unflatten(-1, (heads, maps, levels * points)))
         return offsets, weights.unflatten(-1, (levels, points))
 
     def sample(
@@ -174,11 +174,21 @@ class DeformableAttention(nn.Module):
             nn.init.zeros_(projection.bias)
 
 
+def _softmax(logits: Tensor) -> Tensor:
+    """Over the last dimension. A few numbers alone are slow: many rows side by side are not."""
+    if logits.shape[-1] > 8:
+        return logits.softmax(-1)
+    return logits.flatten(0, -2).T.contiguous().softmax(0).T.reshape(logits.shape)
+
+
 def sampling_locations(reference_points: Tensor, offsets: Tensor, level_shapes: LevelShapes) -> Tensor:
     """Where to sample: reference points (..., L or 1, P or 1, 2) plus offsets (..., L, P, 2) in cells of each level.
 
     All x, y, 0 to 1 over a map, in float32: a point behind a camera may lie 1e6 away.
     """
     widths_heights = [(width, height) for height, width in level_shapes]
-    sizes = torch.tensor(widths_heights, dtype=torch.float32, device=offsets.device)
-    return reference_points.float() + offsets.float() / sizes[:, None]
+    sizes = torch.tensor(widths_heights, dtype=torch.float32, device=offsets.device)[:, None]
+    # Laid out in full: two numbers at a time, x and y, take several times as long.
+    sizes = sizes.expand(offsets.shape[-3:]).contiguous()
+    reference_points = reference_points.float().expand(*reference_points.shape[:-2], *offsets.shape[-2:]).contiguous()
+    return reference_points + offsets.float() / sizes

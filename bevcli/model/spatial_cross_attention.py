@@ -53,8 +53,8 @@ class SpatialCrossAttention(nn.Module):
         offsets, weights = self.attention.look(query.flatten(0, 1))  # (B·Y·X, heads, 1, L, P, 2)
         pillar_points = hits.reference_points.shape[1]
         reference = hits.reference_points.repeat(1, self.points // pillar_points, 1)  # point p: height p mod Z
-        locations = sampling_locations(reference[:, None, None], offsets[hits.cell, :, 0], level_shapes)
-        return locations, weights[hits.cell, :, 0]
+        offsets, weights = offsets[:, :, 0].index_select(0, hits.cell), weights[:, :, 0].index_select(0, hits.cell)
+        return sampling_locations(reference[:, None, None], offsets, level_shapes), weights
 
 
 def _chosen_samples(cells: Tensor, hits: PillarHits, locations: Tensor, weights: Tensor) -> SpatialSamples:
