@@ -20,16 +20,21 @@ class ClipConfig:
     batch: clips a step. short_share: of the batches, whose clips are shorter, as at the start of a scene.
     learn: "last" learns from the last frame of a clip, as published. "all" goes through longer clips and learns from
     every frame, one update each, the first of them without history: no picture is looked at in vain.
+    in_turn: with "all", batches a step that are gone through side by side, a frame of each in turn, so that updates
+    that follow each other do not learn from the same few streets.
     """
 
     frames: int = 3
     batch: int = 4
     short_share: float = 0.1
     learn: Literal["last", "all"] = "last"
+    in_turn: int = 1
 
     def __post_init__(self) -> None:
         if min(self.frames, self.batch) < 1 or not 0 <= self.short_share <= 1:
             raise ValueError("frames and batch must be positive, short_share from 0 to 1")
+        if self.in_turn < 1 or (self.in_turn > 1 and self.learn != "all"):
+            raise ValueError('in_turn must be positive, and 1 unless learn is "all"')
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 import torch
@@ -30,6 +30,8 @@ from bevcli.training.recurrent_clip import forward_clip
 from bevcli.training.samples import Batch, Targets, load_batch
 from bevcli.training.segmentation_loss import SegmentationLossConfig, segmentation_loss
 from bevcli.training.validation import Validation, validate
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -105,8 +107,8 @@ class Trainer:
         """All steps that are left. Raises BevcliError where the loss is no number any more."""
         config = self.job.config
         left = range(self.done, config.steps)
-        for batch in read_ahead(self._load, left, depth=2 * config.loaders, threads=config.loaders):
-            self.loss_curve.add(self.done + 1, self._step(batch))
+        for batches in read_ahead(self._load, left, depth=2 * config.loaders, threads=config.loaders):
+            self.loss_curve.add(self.done + 1, self._step(batches))
             self.done += 1
             last = self.done == config.steps
             if self.done % config.evaluate_every == 0 or last:
@@ -115,21 +117,28 @@ class Trainer:
                 save_checkpoint(self.job.out / "checkpoint.pt", self.done, self._learning(), self.optimizer)
             after_step()
 
-    def _load(self, step: int) -> Batch:
-        job = self.job
+    def _load(self, step: int) -> list[Batch]:
+        """The batches that a step goes through side by side."""
+        job, config = self.job, self.job.config
         random = np.random.default_rng([job.seed, step])
-        clips = draw_clips(job.drives, job.config.clips, random)
-        return load_batch(
-            job.drives, clips, job.model.config, job.config.augmentation, random, learn_all=self._learns_all()
-        )
+        batches = []
+        for _ in range(config.clips.in_turn):
+            clips = draw_clips(job.drives, config.clips, random)
+            batches.append(
+                load_batch(
+                    job.drives, clips, job.model.config, config.augmentation, random, learn_all=self._learns_all()
+                )
+            )
+        return batches
 
-    def _step(self, batch: Batch) -> dict[str, float]:
-        """One batch, an update of the weights for each frame that is learned from; returns the mean row."""
+    def _step(self, batches: list[Batch]) -> dict[str, float]:
+        """One step, an update of the weights for each frame that is learned from; returns the mean row."""
         job, config = self.job, self.job.config
         torch.manual_seed(int(np.random.SeedSequence([job.seed, self.done]).generate_state(1)[0]))  # for dropout
         rate = config.optimizer.learning_rate * config.optimizer.share(self.done, config.steps)
         set_rate(self.optimizer, rate)
-        rows = [self._update(losses) for losses in self._losses(batch.to(job.device))]
+        clips = [self._losses(batch.to(job.device)) for batch in batches]
+        rows = [self._update(losses) for losses in _in_turn(clips)]
         means = {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
         norm = means.pop("gradient norm")
         return means | {"learning rate": rate, "gradient norm": norm}
@@ -205,6 +214,17 @@ class Trainer:
         save_weights(job.out / "weights.safetensors", job.model, dtype)
         draw(self.loss_curve, self.validation_curve, job.out / "curves.png")
         return scores
+
+
+def _in_turn(iterators: list[Iterator[T]]) -> Iterator[T]:
+    """The first of each, then the second of each, and so on."""
+    left = list(iterators)
+    while left:
+        for iterator in tuple(left):
+            try:
+                yield next(iterator)
+            except StopIteration:
+                left.remove(iterator)
 
 
 def computes_in_bfloat16(device: torch.device) -> bool:

@@ -20,7 +20,7 @@ from bevcli.training.clips import ClipConfig
 from bevcli.training.dense_loss import DenseLossConfig
 from bevcli.training.drives import RenderedDrives
 from bevcli.training.optimizer import OptimizerConfig, make_optimizer, set_rate
-from bevcli.training.trainer import Trainer, TrainingConfig, TrainingJob
+from bevcli.training.trainer import Trainer, TrainingConfig, TrainingJob, _in_turn
 
 SHORT = TrainingConfig(
     steps=5, held_out=0, evaluate_every=4, checkpoint_every=2, clips=ClipConfig(frames=2, batch=2, short_share=0.0)
@@ -84,10 +84,15 @@ def test_the_number_of_loaders_changes_nothing(tmp_path: Path) -> None:
     assert_same_weights(one, three)
 
 
+def test_batches_in_turn_give_a_frame_each_after_another() -> None:
+    clips = [iter("abc"), iter("de"), iter("fgh")]
+    assert "".join(_in_turn(clips)) == "adfbegch"
+
+
 def test_all_that_helps_to_learn_survives_a_kill_too(tmp_path: Path) -> None:
-    """Every frame learned from, groups of queries, the dense loss."""
+    """Every frame learned from, batches in turn, groups of queries, the dense loss."""
     settings = replace(
-        SHORT, steps=3, evaluate_every=3, checkpoint_every=1, clips=ClipConfig(2, 2, 0.0, "all"),
+        SHORT, steps=3, evaluate_every=3, checkpoint_every=1, clips=ClipConfig(2, 2, 0.0, "all", in_turn=2),
         dense_loss=DenseLossConfig(1.0),
     )  # fmt: skip
 
@@ -100,6 +105,7 @@ def test_all_that_helps_to_learn_survives_a_kill_too(tmp_path: Path) -> None:
         return Trainer(job, resume=resume)
 
     whole = helped(tmp_path / "whole")
+    assert [len(batch.steps) for batch in whole._load(0)] == [2, 2]
     whole.run()
     assert [name for name, parameter in whole._learning().named_parameters() if parameter.grad is None] == []
     killed = helped(tmp_path / "killed")
