@@ -141,7 +141,7 @@ class DeformableAttention(nn.Module):
         """
         offsets = self.sampling_offsets(query).float().unflatten(-1, (*self.shape, 2))
         heads, maps, levels, points = self.shape
-        weights = _softmax(self.attention_weights(query).unflatten(-1, (heads, maps, levels * points)))
+        weights = self.attention_weights(query).unflatten(-1, (heads, maps, levels * points)).softmax(-1)
         return offsets, weights.unflatten(-1, (levels, points))
 
     def sample(
@@ -172,13 +172,6 @@ class DeformableAttention(nn.Module):
         for projection in (self.value_projection, self.output_projection):
             nn.init.xavier_uniform_(projection.weight)
             nn.init.zeros_(projection.bias)
-
-
-def _softmax(logits: Tensor) -> Tensor:
-    """Over the last dimension. A few numbers alone are slow: many rows side by side are not."""
-    if logits.shape[-1] > 8:
-        return logits.softmax(-1)
-    return logits.flatten(0, -2).T.contiguous().softmax(0).T.reshape(logits.shape)
 
 
 def sampling_locations(reference_points: Tensor, offsets: Tensor, level_shapes: LevelShapes) -> Tensor:
