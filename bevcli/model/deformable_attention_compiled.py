@@ -22,31 +22,12 @@ def sample_compiled(
 ) -> Tensor:
     """As `deformable_attention`; tensors on the CPU. Gradients are those of values in float32."""
     if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (values, locations, weights)):
-        return _CompiledSampling.apply(
-            values.float(), locations.float(), weights.float(), level_shapes, queries_per_map
-        )
-    return _sample(values, level_shapes, locations, weights, queries_per_map)
-
-
-def _sample(
-    values: Tensor,
-    level_shapes: Sequence[tuple[int, int]],
-    locations: Tensor,
-    weights: Tensor,
-    queries_per_map: Sequence[int],
-) -> Tensor:
-    from bevcli.model.bilinear_kernels import sample_maps  # loads the compiler, which not every run needs
-
-    shapes = np.asarray(level_shapes, dtype=np.int64)
-    map_of_query = np.repeat(np.arange(len(values)), queries_per_map)
-    out = torch.empty(len(locations), *values.shape[2:])
-    arrays = (as_array(values), shapes, as_array(locations.float()), as_array(weights.float()), map_of_query)
-    in_threads(partial(sample_maps, *arrays, out.numpy()), len(locations))
-    return out.flatten(1)
+        values = values.float()
+    return _CompiledSampling.apply(values, locations.float(), weights.float(), level_shapes, queries_per_map)
 
 
 class _CompiledSampling(torch.autograd.Function):
-    """`_sample` of float32 with its gradients; for these too, no sampled value is held."""
+    """The sums and their gradients, the latter for values in float32; for neither, a sampled value is held."""
 
     @staticmethod
     def forward(
@@ -57,9 +38,16 @@ class _CompiledSampling(torch.autograd.Function):
         level_shapes: Sequence[tuple[int, int]],
         queries_per_map: Sequence[int],
     ) -> Tensor:
+        from bevcli.model.bilinear_kernels import sample_maps  # loads the compiler, which not every run needs
+
         context.save_for_backward(values, locations, weights)
         context.level_shapes, context.queries_per_map = level_shapes, queries_per_map
-        return _sample(values, level_shapes, locations, weights, queries_per_map)
+        shapes = np.asarray(level_shapes, dtype=np.int64)
+        map_of_query = np.repeat(np.arange(len(values)), queries_per_map)
+        out = torch.empty(len(locations), *values.shape[2:])
+        arrays = (as_array(values), shapes, as_array(locations), as_array(weights), map_of_query)
+        in_threads(partial(sample_maps, *arrays, out.numpy()), len(locations))
+        return out.flatten(1)
 
     @staticmethod
     def backward(context: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:

@@ -38,20 +38,28 @@ def prepare_for_inference(model: BEVFormer, device: torch.device, precision: Pre
     prepared = copy.deepcopy(model).to(device).eval().requires_grad_(False)
     prepared.prepared = True
     _fold_batch_norms(prepared.backbone)
-    for module in prepared.modules():
-        if isinstance(module, DeformableAttention):
-            module.backend = fastest_backend(device)
-        elif isinstance(module, ModulatedDeformableConvolution) and device.type == "cpu":
-            module.backend = "compiled"
+    choose_kernels(prepared, device)
     with torch.no_grad():
         prepared.bev_queries.kept_position = prepared.bev_queries.position()
         prepared.decoder.kept_first_queries = prepared.decoder.first_queries()
     _lower_precision(prepared, DTYPES[precision])
-    for part in (prepared.backbone, prepared.neck):
-        part.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     if device.type == "cpu":
         use_onednn(prepared)
     return prepared
+
+
+def choose_kernels(model: BEVFormer, device: torch.device, *, gradients: bool = False) -> None:
+    """Gives a model, in place, the layouts and backends that compute the same soonest on a device.
+
+    gradients: whether they are asked for.
+    """
+    for part in (model.backbone, model.neck):
+        part.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    for module in model.modules():
+        if isinstance(module, DeformableAttention):
+            module.backend = fastest_backend(device, gradients=gradients)
+        elif isinstance(module, ModulatedDeformableConvolution) and device.type == "cpu" and not gradients:
+            module.backend = "compiled"
 
 
 def textbook_version(model: BEVFormer, device: torch.device) -> BEVFormer:

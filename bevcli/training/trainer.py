@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from bevcli.errors import BevcliError
 from bevcli.model.bevformer import BEVFormer, BEVFormerOutputs
-from bevcli.model.deformable_attention import DeformableAttention, fastest_backend
+from bevcli.model.inference import choose_kernels
 from bevcli.pipeline.model_loading import choose_precision
 from bevcli.pipeline.read_ahead import read_ahead
 from bevcli.pipeline.runner import Runner, StepOptions
@@ -92,10 +92,13 @@ class Trainer:
         options = StepOptions(choose_precision(None, job.device), temporal=job.config.clips.frames > 1)
         self.runner = Runner(job.model, job.device, options)
         self.dense_reader = self._make_dense_reader()
-        self.optimizer = make_optimizer(self._learning(), job.model.backbone, job.config.optimizer)
+        # All that learns: the model, and what reads it in training only.
+        parts = {"model": job.model, "dense_reader": self.dense_reader}
+        self.learning = nn.ModuleDict({name: part for name, part in parts.items() if part is not None})
+        self.optimizer = make_optimizer(self.learning, job.model.backbone, job.config.optimizer)
         checkpoint = job.out / "checkpoint.pt"
-        self.done = load_checkpoint(checkpoint, self._learning(), self.optimizer) if resume else 0
-        self._choose_kernels()
+        self.done = load_checkpoint(checkpoint, self.learning, self.optimizer) if resume else 0
+        choose_kernels(job.model, job.device, gradients=True)
         self.loss_curve = Curve(job.out / "loss.csv", self.done)
         self.validation_curve = Curve(job.out / "validation.csv", self.done)
 
@@ -114,7 +117,7 @@ class Trainer:
             if self.done % config.evaluate_every == 0 or last:
                 after_validation(self.done, self._validate())
             if self.done % config.checkpoint_every == 0 or last:
-                save_checkpoint(self.job.out / "checkpoint.pt", self.done, self._learning(), self.optimizer)
+                save_checkpoint(self.job.out / "checkpoint.pt", self.done, self.learning, self.optimizer)
             after_step()
 
     def _load(self, step: int) -> list[Batch]:
@@ -152,7 +155,7 @@ class Trainer:
             )
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
-        norm = clip_gradients(self._learning(), self.job.config.optimizer.max_gradient_norm)
+        norm = clip_gradients(self.learning, self.job.config.optimizer.max_gradient_norm)
         self.optimizer.step()
         return {"loss": total.item(), **{name: loss.item() for name, loss in losses.items()}, "gradient norm": norm}
 
@@ -182,25 +185,11 @@ class Trainer:
             losses |= {"map classes": maps.classes, "masks": maps.masks, "locations": maps.locations}
         return losses
 
-    def _choose_kernels(self) -> None:
-        """What computes the same sooner: layouts and backends."""
-        model = self.job.model
-        for part in (model.backbone, model.neck):
-            part.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        for module in model.modules():
-            if isinstance(module, DeformableAttention):
-                module.backend = fastest_backend(self.job.device, gradients=True)
-
     def _make_dense_reader(self) -> DenseReader | None:
         if self.job.config.dense_loss.weight == 0:
             return None
         of_model = self.job.model.config
         return DenseReader(of_model.channels, len(of_model.classes), of_model.bev_grid).to(self.job.device)
-
-    def _learning(self) -> nn.ModuleDict:
-        """All that learns: the model, and what reads it in training only."""
-        parts: dict[str, nn.Module] = {"model": self.job.model}
-        return nn.ModuleDict(parts if self.dense_reader is None else parts | {"dense_reader": self.dense_reader})
 
     def _learns_all(self) -> bool:
         return self.job.config.clips.learn == "all"

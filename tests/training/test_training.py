@@ -46,17 +46,19 @@ def assert_same_weights(one: Trainer, other: Trainer, *, same: bool = True) -> N
     assert all(torch.equal(a, b) for a, b in pairs) == same
 
 
-def test_a_killed_and_resumed_training_equals_an_uninterrupted_one(tmp_path: Path) -> None:
-    whole = trainer(tmp_path / "whole")
-    whole.run()
-    killed = trainer(tmp_path / "killed")
-
+def run_and_kill(killed: Trainer, *, after: int) -> None:
     def kill() -> None:
-        if killed.done == 3:  # a step after the last checkpoint
+        if killed.done == after:
             raise Killed
 
     with pytest.raises(Killed):
         killed.run(kill)
+
+
+def test_a_killed_and_resumed_training_equals_an_uninterrupted_one(tmp_path: Path) -> None:
+    whole = trainer(tmp_path / "whole")
+    whole.run()
+    run_and_kill(trainer(tmp_path / "killed"), after=3)  # a step after the last checkpoint
     resumed = trainer(tmp_path / "killed", resume=True)
     assert resumed.done == 2
     resumed.run()
@@ -107,14 +109,8 @@ def test_all_that_helps_to_learn_survives_a_kill_too(tmp_path: Path) -> None:
     whole = helped(tmp_path / "whole")
     assert [len(batch.steps) for batch in whole._load(0)] == [2, 2]
     whole.run()
-    assert [name for name, parameter in whole._learning().named_parameters() if parameter.grad is None] == []
-    killed = helped(tmp_path / "killed")
-
-    def kill() -> None:
-        raise Killed
-
-    with pytest.raises(Killed):
-        killed.run(kill)
+    assert [name for name, parameter in whole.learning.named_parameters() if parameter.grad is None] == []
+    run_and_kill(helped(tmp_path / "killed"), after=1)
     resumed = helped(tmp_path / "killed", resume=True)
     assert resumed.done == 1
     resumed.run()
