@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
 
@@ -77,12 +77,16 @@ class CheckpointSummary:
     facts: Mapping[str, str]
 
 
-def load_weights(path: Path, model: BEVFormer) -> Checkpoint:
+def load_weights(path: Path, model: BEVFormer, *, resample: bool = False) -> Checkpoint:
     """Loads a file of weights into a model, in place; every key must be there, none more, all of the right shape.
+
+    resample: weights of a BEV grid with another number of cells are interpolated, to be fine-tuned.
 
     Raises WeightsError that says which known model the file is for, or else lists every key that differs.
     """
     checkpoint = read_checkpoint(path)
+    if resample:
+        checkpoint = replace(checkpoint, state=model.bev_queries.resampled(checkpoint.state, "bev_queries."))
     report = compare(checkpoint.state, model.state_dict())
     if not report.fits:
         name, others = model.config.name, fitting_models(checkpoint.state)

@@ -22,6 +22,7 @@ from bevcli.checkpoints import (
 )
 from bevcli.config import load_config
 from bevcli.errors import WeightsError
+from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.official_keys import from_official
 
 sys.path.insert(0, str(Path(__file__).parent / "model"))
@@ -98,6 +99,26 @@ def test_half_precision_weights_are_loaded_as_float32(tmp_path: Path) -> None:
     load_weights(path, model)
     assert model.bev_queries.embedding.dtype == torch.float32
     torch.testing.assert_close(model.bev_queries.embedding.data, state["bev_queries.embedding"], atol=1e-2, rtol=1e-2)
+
+
+def test_weights_of_another_grid_are_resampled_where_they_are_to_be_fine_tuned(tmp_path: Path) -> None:
+    path, model = tmp_path / "coarse.safetensors", small_model(seed=1)
+    rows, columns = 6, 8
+    y, x = torch.meshgrid(torch.arange(rows) + 0.5, torch.arange(columns) + 0.5, indexing="ij")
+    model.bev_queries.embedding.data[:, 0] = (y / rows).flatten()
+    model.bev_queries.embedding.data[:, 1] = (x / columns).flatten()
+    model.bev_queries.row_embedding.data[:, 0] = y[:, 0] / rows
+    safetensors.torch.save_file(model.state_dict(), path)
+    grid = BevGrid(12, 16, x_range_m=(-16, 16), y_range_m=(-12, 12), z_range_m=(-3, 2), pillar_points=2)
+    finer = small_model(seed=2, bev_grid=grid)
+    with pytest.raises(WeightsError, match="3 misshapen"):
+        load_weights(path, finer)
+    load_weights(path, finer, resample=True)
+    cells = finer.bev_queries.embedding.data.reshape(12, 16, -1)
+    # What grows evenly over the ground does so still, but for the outermost half cells.
+    torch.testing.assert_close(cells[1:-1, 3, 0], ((torch.arange(12) + 0.5) / 12)[1:-1])
+    torch.testing.assert_close(cells[5, 1:-1, 1], ((torch.arange(16) + 0.5) / 16)[1:-1])
+    torch.testing.assert_close(finer.bev_queries.row_embedding.data[1:-1, 0], ((torch.arange(12) + 0.5) / 12)[1:-1])
 
 
 def test_a_converted_file_holds_the_same_numbers(official_tiny: Path, tmp_path: Path) -> None:

@@ -44,7 +44,8 @@ def train(
     """Train the model of CONFIG; write weights.safetensors for `bevcli run --weights`, checkpoint and curves.
 
     The last drives are held out to evaluate on (`held_out` in the training table). A killed training goes on with
-    --resume, to the same result.
+    --resume, to the same result. `torchrun --nproc-per-node N -m bevcli train …` trains with N processes, one a GPU or
+    a CPU core, that learn from clips of their own and update together.
     """
     from dataclasses import replace
 
@@ -55,6 +56,7 @@ def train(
     from bevcli.config import load_config, load_training
     from bevcli.model.bevformer import BEVFormer
     from bevcli.pipeline.model_loading import choose_device
+    from bevcli.training.team import join_team, leave_team
     from bevcli.training.trainer import Trainer, TrainingConfig, TrainingJob
 
     model_config, settings = load_config(config), load_training(config, TrainingConfig)
@@ -65,12 +67,18 @@ def train(
     torch.manual_seed(seed)
     model = BEVFormer(model_config)
     if weights is not None:
-        load_weights(weights, model)
-    job = TrainingJob(model, settings, drives, held_out, out, choose_device(device), seed)
-    trainer = Trainer(job, resume=resume)
+        load_weights(weights, model, resample=True)
+    chosen_device = choose_device(device)
+    team = join_team(chosen_device)
+    trainer = Trainer(TrainingJob(model, settings, drives, held_out, out, chosen_device, seed, team), resume=resume)
+    if not team.leads:
+        trainer.run()
+        return leave_team(team)
     with Progress(settings.steps - trainer.done, "steps") as progress:
         progress.message(f"{len(drives)} drives to learn from, {len(held_out)} to evaluate on; writing to {out}")
         trainer.run(progress.advance, lambda step, scores: progress.message(f"step {step}: {describe(scores)}"))
+    leave_team(team)
+    return None
 
 
 def choose_drives(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor, nn
 
@@ -38,6 +40,31 @@ class BevQueries(nn.Module):
         x = self.column_embedding.expand(rows, -1, -1)
         y = self.row_embedding[:, None].expand(-1, columns, -1)
         return torch.cat([x, y], dim=-1).flatten(0, 1)
+
+    def resampled(self, state: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+        """A model's state dict in which the queries, whose keys begin with prefix, fit the grid of these.
+
+        Bilinear, cell centre to cell centre: both grids cover the same ground.
+        """
+        row_key, column_key, key = (f"{prefix}{name}" for name in ("row_embedding", "column_embedding", "embedding"))
+        if not {row_key, column_key, key} <= set(state):
+            return dict(state)
+        sizes = len(self.row_embedding), len(self.column_embedding)
+        found = len(state[row_key]), len(state[column_key])
+        if found == sizes or len(state[key]) != found[0] * found[1]:
+            return dict(state)
+        cells = state[key].float().unflatten(0, found).permute(2, 0, 1)[None]
+        return {
+            **state,
+            key: nn.functional.interpolate(cells, sizes, mode="bilinear")[0].flatten(1).T,
+            row_key: _stretched(state[row_key], sizes[0]),
+            column_key: _stretched(state[column_key], sizes[1]),
+        }
+
+
+def _stretched(rows: Tensor, count: int) -> Tensor:
+    """(N, C) -> (count, C), linearly."""
+    return nn.functional.interpolate(rows.float().T[None], count, mode="linear")[0].T
 
 
 def can_bus_embedding(channels: int) -> nn.Sequential:

@@ -90,10 +90,12 @@ class RenderedDrives:
             stock=self._stock,
             map_window=MapWindow(half_extent_m=reach),
         )
-        unfinished = folder.with_suffix(".unfinished")
-        shutil.rmtree(unfinished, ignore_errors=True)
+        unfinished = folder.with_suffix(f".unfinished-{os.getpid()}")
         export_drive(drive, unfinished)
-        os.replace(unfinished, folder)
+        try:
+            os.replace(unfinished, folder)
+        except OSError:  # another process was faster
+            shutil.rmtree(unfinished)
 
 
 def part_of(drives: Drives, start: int, end: int) -> Drives:

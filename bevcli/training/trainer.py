@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from bevcli.errors import BevcliError
-from bevcli.model.bevformer import BEVFormer, BEVFormerOutputs
+from bevcli.model.bevformer import BEVFormer, BEVFormerInputs, BEVFormerOutputs
 from bevcli.model.inference import choose_kernels
 from bevcli.pipeline.model_loading import choose_precision
 from bevcli.pipeline.read_ahead import read_ahead
@@ -26,9 +26,11 @@ from bevcli.training.dense_loss import DenseLossConfig, DenseReader, dense_loss
 from bevcli.training.detection_loss import DetectionLossConfig, detection_loss
 from bevcli.training.drives import Drives
 from bevcli.training.optimizer import OptimizerConfig, clip_gradients, make_optimizer, set_rate
+from bevcli.training.picture_loss import PictureLossConfig, PictureReader, picture_loss
 from bevcli.training.recurrent_clip import forward_clip
 from bevcli.training.samples import Batch, Targets, load_batch
 from bevcli.training.segmentation_loss import SegmentationLossConfig, segmentation_loss
+from bevcli.training.team import Team
 from bevcli.training.validation import Validation, validate
 
 T = TypeVar("T")
@@ -57,6 +59,7 @@ class TrainingConfig:
     detection_loss: DetectionLossConfig = field(default_factory=DetectionLossConfig)
     segmentation_loss: SegmentationLossConfig = field(default_factory=SegmentationLossConfig)
     dense_loss: DenseLossConfig = field(default_factory=DenseLossConfig)
+    picture_loss: PictureLossConfig = field(default_factory=PictureLossConfig)
 
     def __post_init__(self) -> None:
         if min(self.steps, self.evaluate_every, self.checkpoint_every, self.loaders) < 1 or self.held_out < 0:
@@ -69,7 +72,7 @@ class TrainingConfig:
 class TrainingJob:
     """drives: to learn from. held_out: to evaluate on; empty to evaluate on `drives`. out: a folder that exists.
 
-    seed: decides everything that is drawn, together with the number of the step.
+    seed: decides everything that is drawn, together with the number of the step and the place in the team.
     """
 
     model: BEVFormer
@@ -79,6 +82,7 @@ class TrainingJob:
     out: Path
     device: torch.device
     seed: int = 0
+    team: Team = field(default_factory=Team)
 
 
 class Trainer:
@@ -92,15 +96,18 @@ class Trainer:
         options = StepOptions(choose_precision(None, job.device), temporal=job.config.clips.frames > 1)
         self.runner = Runner(job.model, job.device, options)
         self.dense_reader = self._make_dense_reader()
+        self.picture_reader = self._make_picture_reader()
+        job.model.neck.register_forward_hook(self._keep_features)
         # All that learns: the model, and what reads it in training only.
-        parts = {"model": job.model, "dense_reader": self.dense_reader}
+        parts = {"model": job.model, "dense_reader": self.dense_reader, "picture_reader": self.picture_reader}
         self.learning = nn.ModuleDict({name: part for name, part in parts.items() if part is not None})
         self.optimizer = make_optimizer(self.learning, job.model.backbone, job.config.optimizer)
         checkpoint = job.out / "checkpoint.pt"
         self.done = load_checkpoint(checkpoint, self.learning, self.optimizer) if resume else 0
         choose_kernels(job.model, job.device, gradients=True)
-        self.loss_curve = Curve(job.out / "loss.csv", self.done)
-        self.validation_curve = Curve(job.out / "validation.csv", self.done)
+        if job.team.leads:
+            self.loss_curve = Curve(job.out / "loss.csv", self.done)
+            self.validation_curve = Curve(job.out / "validation.csv", self.done)
 
     def run(
         self,
@@ -111,8 +118,11 @@ class Trainer:
         config = self.job.config
         left = range(self.done, config.steps)
         for batches in read_ahead(self._load, left, depth=2 * config.loaders, threads=config.loaders):
-            self.loss_curve.add(self.done + 1, self._step(batches))
+            row = self._step(batches)
             self.done += 1
+            if not self.job.team.leads:
+                continue
+            self.loss_curve.add(self.done, row)
             last = self.done == config.steps
             if self.done % config.evaluate_every == 0 or last:
                 after_validation(self.done, self._validate())
@@ -123,7 +133,7 @@ class Trainer:
     def _load(self, step: int) -> list[Batch]:
         """The batches that a step goes through side by side."""
         job, config = self.job, self.job.config
-        random = np.random.default_rng([job.seed, step])
+        random = np.random.default_rng(self._seeds(step))
         batches = []
         for _ in range(config.clips.in_turn):
             clips = draw_clips(job.drives, config.clips, random)
@@ -137,14 +147,20 @@ class Trainer:
     def _step(self, batches: list[Batch]) -> dict[str, float]:
         """One step, an update of the weights for each frame that is learned from; returns the mean row."""
         job, config = self.job, self.job.config
-        torch.manual_seed(int(np.random.SeedSequence([job.seed, self.done]).generate_state(1)[0]))  # for dropout
+        torch.manual_seed(int(np.random.SeedSequence(self._seeds(self.done)).generate_state(1)[0]))  # for dropout
         rate = config.optimizer.learning_rate * config.optimizer.share(self.done, config.steps)
         set_rate(self.optimizer, rate)
         clips = [self._losses(batch.to(job.device)) for batch in batches]
         rows = [self._update(losses) for losses in _in_turn(clips)]
+        job.team.average_statistics(self.learning)
         means = {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
         norm = means.pop("gradient norm")
         return means | {"learning rate": rate, "gradient norm": norm}
+
+    def _seeds(self, step: int) -> list[int]:
+        """What decides chance in a step: another one for each process of a team."""
+        place = self.job.team.place
+        return [self.job.seed, step, place] if place else [self.job.seed, step]
 
     def _update(self, losses: dict[str, Tensor]) -> dict[str, float]:
         total = torch.stack(list(losses.values())).sum()
@@ -155,6 +171,7 @@ class Trainer:
             )
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
+        self.job.team.average_gradients(self.learning)
         norm = clip_gradients(self.learning, self.job.config.optimizer.max_gradient_norm)
         self.optimizer.step()
         return {"loss": total.item(), **{name: loss.item() for name, loss in losses.items()}, "gradient norm": norm}
@@ -165,12 +182,13 @@ class Trainer:
         frames = forward_clip(
             job.model, batch.steps, learn_all=self._learns_all(), freeze_batch_norm=config.freeze_batch_norm
         )
-        for targets in batch.targets:
+        learned = batch.steps[-len(batch.targets) :]
+        for inputs, targets in zip(learned, batch.targets, strict=True):
             with torch.autocast(job.device.type, torch.bfloat16, enabled=computes_in_bfloat16(job.device)):
                 outputs = next(frames)
-            yield self._frame_losses(outputs, targets)
+            yield self._frame_losses(inputs, outputs, targets)
 
-    def _frame_losses(self, outputs: BEVFormerOutputs, targets: Targets) -> dict[str, Tensor]:
+    def _frame_losses(self, inputs: BEVFormerInputs, outputs: BEVFormerOutputs, targets: Targets) -> dict[str, Tensor]:
         config, groups = self.job.config, self.job.model.config.decoder.training_groups
         detection = detection_loss(
             outputs.class_logits, outputs.box_codes, targets.detection, config.detection_loss, groups
@@ -180,6 +198,18 @@ class Trainer:
             bev = outputs.bev.float()
             dense = dense_loss(self.dense_reader, bev, targets.detection, config.dense_loss, config.detection_loss)
             losses |= {"cell classes": dense.classes, "cell boxes": dense.boxes}
+        if self.picture_reader is not None:
+            size = (inputs.images.shape[-2], inputs.images.shape[-1])
+            pictures = picture_loss(
+                self.picture_reader,
+                self._features.float(),
+                inputs.image_from_bev,
+                size,
+                targets.detection,
+                config.picture_loss,
+                config.detection_loss.class_weight,
+            )
+            losses |= {"pixel classes": pictures.classes, "pixel places": pictures.places}
         if outputs.segmentation is not None:
             maps = segmentation_loss(outputs.segmentation, targets.segmentation, config.segmentation_loss)
             losses |= {"map classes": maps.classes, "masks": maps.masks, "locations": maps.locations}
@@ -190,6 +220,16 @@ class Trainer:
             return None
         of_model = self.job.model.config
         return DenseReader(of_model.channels, len(of_model.classes), of_model.bev_grid).to(self.job.device)
+
+    def _make_picture_reader(self) -> PictureReader | None:
+        if self.job.config.picture_loss.weight == 0:
+            return None
+        of_model = self.job.model.config
+        return PictureReader(of_model.channels, len(of_model.classes)).to(self.job.device)
+
+    def _keep_features(self, neck: nn.Module, inputs: tuple[Any, ...], maps: Sequence[Tensor]) -> None:
+        """The finest of the neck's maps, which the picture loss reads."""
+        self._features = maps[0]
 
     def _learns_all(self) -> bool:
         return self.job.config.clips.learn == "all"
