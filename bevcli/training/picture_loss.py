@@ -15,7 +15,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from bevcli.model.bevformer import BEVFormerInputs
 from bevcli.model.pillar_projection import MIN_DEPTH
+from bevcli.training.detection_loss import DetectionLossConfig
 from bevcli.training.detection_targets import DetectionTargets
 from bevcli.training.focal_loss import focal_loss
 
@@ -61,28 +63,28 @@ class PictureReader(nn.Module):
 def picture_loss(
     reader: PictureReader,
     features: Tensor,
-    image_from_bev: Tensor,
-    image_size: tuple[int, int],
+    inputs: BEVFormerInputs,
     targets: Sequence[DetectionTargets],
     config: PictureLossConfig,
-    class_weight: float,
+    of_boxes: DetectionLossConfig,
 ) -> PictureLoss:
-    """features: (B·N, C, h, w), the finest of the neck's. image_from_bev: (B, N, 4, 4). image_size: (H, W), padded.
+    """features: (B·N, C, h, w), the finest of the neck's for these inputs. targets: B.
 
-    targets: B. Both losses are divided by the number of taught pixels.
+    Both losses are divided by the number of taught pixels; the classes weigh as those of boxes.
     """
     logits, places = reader(features)
     wanted = torch.zeros_like(logits)
     found, truths = [], []
-    cameras = image_from_bev.shape[1]
-    for picture, matrix in enumerate(image_from_bev.flatten(0, 1)):
+    image_size = (inputs.images.shape[-2], inputs.images.shape[-1])
+    cameras = inputs.image_from_bev.shape[1]
+    for picture, matrix in enumerate(inputs.image_from_bev.flatten(0, 1)):
         truth = targets[picture // cameras]
         taught = _taught_pixels(matrix, truth.codes, (features.shape[-2], features.shape[-1]), image_size)
         wanted[picture, taught.rows, taught.columns, truth.labels[taught.owners]] = 1
         found.append(places[picture, taught.rows, taught.columns])
         truths.append(taught.places)
     count = max(sum(map(len, found)), 1)
-    classes = class_weight * focal_loss(logits, wanted).sum() / count
+    classes = of_boxes.class_weight * focal_loss(logits, wanted).sum() / count
     errors = F.l1_loss(torch.cat(found), torch.cat(truths), reduction="sum") / count
     return PictureLoss(config.weight * classes, config.weight * config.place_weight * errors)
 

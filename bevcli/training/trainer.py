@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from bevcli.errors import BevcliError
-from bevcli.model.bevformer import BEVFormer, BEVFormerInputs, BEVFormerOutputs
+from bevcli.model.bevformer import BEVFormer
 from bevcli.model.inference import choose_kernels
 from bevcli.pipeline.model_loading import choose_precision
 from bevcli.pipeline.read_ahead import read_ahead
@@ -22,14 +22,11 @@ from bevcli.training.augmentation import AugmentationConfig
 from bevcli.training.checkpoint import load_checkpoint, save_checkpoint, save_weights
 from bevcli.training.clips import ClipConfig, draw_clips
 from bevcli.training.curves import Curve, draw
-from bevcli.training.dense_loss import DenseLossConfig, DenseReader, dense_loss
-from bevcli.training.detection_loss import DetectionLossConfig, detection_loss
 from bevcli.training.drives import Drives
+from bevcli.training.frame_losses import FrameLosses, LossConfigs
 from bevcli.training.optimizer import OptimizerConfig, clip_gradients, make_optimizer, set_rate
-from bevcli.training.picture_loss import PictureLossConfig, PictureReader, picture_loss
 from bevcli.training.recurrent_clip import forward_clip
-from bevcli.training.samples import Batch, Targets, load_batch
-from bevcli.training.segmentation_loss import SegmentationLossConfig, segmentation_loss
+from bevcli.training.samples import Batch, load_batch
 from bevcli.training.team import Team
 from bevcli.training.validation import Validation, validate
 
@@ -37,7 +34,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class TrainingConfig:
+class TrainingConfig(LossConfigs):
     """The [training] table of a model's file.
 
     steps: batches of clips. held_out: how many of the drives, the last ones, are for evaluation only.
@@ -56,10 +53,6 @@ class TrainingConfig:
     clips: ClipConfig = field(default_factory=ClipConfig)
     augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
-    detection_loss: DetectionLossConfig = field(default_factory=DetectionLossConfig)
-    segmentation_loss: SegmentationLossConfig = field(default_factory=SegmentationLossConfig)
-    dense_loss: DenseLossConfig = field(default_factory=DenseLossConfig)
-    picture_loss: PictureLossConfig = field(default_factory=PictureLossConfig)
 
     def __post_init__(self) -> None:
         if min(self.steps, self.evaluate_every, self.checkpoint_every, self.loaders) < 1 or self.held_out < 0:
@@ -95,12 +88,9 @@ class Trainer:
         self.job = job
         options = StepOptions(choose_precision(None, job.device), temporal=job.config.clips.frames > 1)
         self.runner = Runner(job.model, job.device, options)
-        self.dense_reader = self._make_dense_reader()
-        self.picture_reader = self._make_picture_reader()
-        job.model.neck.register_forward_hook(self._keep_features)
+        self.losses = FrameLosses(job.model, job.config)
         # All that learns: the model, and what reads it in training only.
-        parts = {"model": job.model, "dense_reader": self.dense_reader, "picture_reader": self.picture_reader}
-        self.learning = nn.ModuleDict({name: part for name, part in parts.items() if part is not None})
+        self.learning = nn.ModuleDict({"model": job.model, **self.losses.readers}).to(job.device)
         self.optimizer = make_optimizer(self.learning, job.model.backbone, job.config.optimizer)
         checkpoint = job.out / "checkpoint.pt"
         self.done = load_checkpoint(checkpoint, self.learning, self.optimizer) if resume else 0
@@ -186,50 +176,7 @@ class Trainer:
         for inputs, targets in zip(learned, batch.targets, strict=True):
             with torch.autocast(job.device.type, torch.bfloat16, enabled=computes_in_bfloat16(job.device)):
                 outputs = next(frames)
-            yield self._frame_losses(inputs, outputs, targets)
-
-    def _frame_losses(self, inputs: BEVFormerInputs, outputs: BEVFormerOutputs, targets: Targets) -> dict[str, Tensor]:
-        config, groups = self.job.config, self.job.model.config.decoder.training_groups
-        detection = detection_loss(
-            outputs.class_logits, outputs.box_codes, targets.detection, config.detection_loss, groups
-        )
-        losses = {"classes": detection.classes, "boxes": detection.boxes}
-        if self.dense_reader is not None:
-            bev = outputs.bev.float()
-            dense = dense_loss(self.dense_reader, bev, targets.detection, config.dense_loss, config.detection_loss)
-            losses |= {"cell classes": dense.classes, "cell boxes": dense.boxes}
-        if self.picture_reader is not None:
-            size = (inputs.images.shape[-2], inputs.images.shape[-1])
-            pictures = picture_loss(
-                self.picture_reader,
-                self._features.float(),
-                inputs.image_from_bev,
-                size,
-                targets.detection,
-                config.picture_loss,
-                config.detection_loss.class_weight,
-            )
-            losses |= {"pixel classes": pictures.classes, "pixel places": pictures.places}
-        if outputs.segmentation is not None:
-            maps = segmentation_loss(outputs.segmentation, targets.segmentation, config.segmentation_loss)
-            losses |= {"map classes": maps.classes, "masks": maps.masks, "locations": maps.locations}
-        return losses
-
-    def _make_dense_reader(self) -> DenseReader | None:
-        if self.job.config.dense_loss.weight == 0:
-            return None
-        of_model = self.job.model.config
-        return DenseReader(of_model.channels, len(of_model.classes), of_model.bev_grid).to(self.job.device)
-
-    def _make_picture_reader(self) -> PictureReader | None:
-        if self.job.config.picture_loss.weight == 0:
-            return None
-        of_model = self.job.model.config
-        return PictureReader(of_model.channels, len(of_model.classes)).to(self.job.device)
-
-    def _keep_features(self, neck: nn.Module, inputs: tuple[Any, ...], maps: Sequence[Tensor]) -> None:
-        """The finest of the neck's maps, which the picture loss reads."""
-        self._features = maps[0]
+            yield self.losses(inputs, outputs, targets)
 
     def _learns_all(self) -> bool:
         return self.job.config.clips.learn == "all"

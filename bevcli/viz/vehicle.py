@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from bevcli.geometry.transforms import Array
@@ -31,9 +30,8 @@ class ColoredMesh:
 
 def vehicle_mesh() -> ColoredMesh:
     """A car with a cabin and four wheels in the ego frame."""
-    body = trimesh.creation.box(extents=BODY_LWH)
-    body.apply_translation((REAR_AXLE_TO_MIDDLE, 0, 0.62))
-    wheels = [_wheel(x, y) for x in (0.0, WHEELBASE) for y in (-TRACK / 2, TRACK / 2)]
+    body = _box(*BODY_LWH) + (REAR_AXLE_TO_MIDDLE, 0, 0.62)
+    wheels = [_wheel() + (x, y, 0.34) for x in (0.0, WHEELBASE) for y in (-TRACK / 2, TRACK / 2)]
     return _joined([(body, EGO_COLOR), (_cabin(), GLASS), *((wheel, RUBBER) for wheel in wheels)])
 
 
@@ -43,28 +41,49 @@ def outline_and_heading() -> list[Array]:
     return [np.concatenate([OUTLINE, OUTLINE[:1]]), front]
 
 
-def _cabin() -> trimesh.Trimesh:
-    mesh = trimesh.creation.box(extents=(2.5, 1.66, 0.6))
-    top = mesh.vertices[:, 2] > 0
-    mesh.vertices[top, :2] *= (0.68, 0.86)  # windscreens lean
-    mesh.apply_translation((1.0, 0, 1.28))
-    return mesh
+# Parts are triangles, (T, 3, 3): corners in metres, counter-clockwise seen from outside. They are this plain because
+# trimesh takes half a second to load, at the start of every run.
 
 
-def _wheel(x: float, y: float) -> trimesh.Trimesh:
-    mesh = trimesh.creation.cylinder(radius=0.34, height=0.24, sections=20)
-    mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
-    mesh.apply_translation((x, y, 0.34))
-    return mesh
+def _cabin() -> Array:
+    cabin = _box(2.5, 1.66, 0.6)
+    cabin[cabin[..., 2] > 0] *= (0.68, 0.86, 1)  # windscreens lean
+    return cabin + (1.0, 0, 1.28)
 
 
-def _joined(parts: list[tuple[trimesh.Trimesh, Color]]) -> ColoredMesh:
-    for mesh, _ in parts:
-        mesh.unmerge_vertices()  # flat shading: a vertex for each corner of each face
-    starts = np.cumsum([0, *(len(mesh.vertices) for mesh, _ in parts)])
+def _wheel(radius: float = 0.34, width: float = 0.24, sections: int = 20) -> Array:
+    turns = np.arange(sections) / sections * 2 * np.pi
+    standing = _prism(radius * np.stack([np.cos(turns), np.sin(turns)], -1), width)
+    return standing[..., [1, 2, 0]]
+
+
+def _box(length: float, width: float, height: float) -> Array:
+    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / 2
+    return _prism(corners * (length, width), height)
+
+
+def _prism(outline: Array, height: float) -> Array:
+    """A convex outline (N, 2), counter-clockwise, from z = -height / 2 to height / 2."""
+    low, high = (np.insert(outline, 2, z, axis=1) for z in (-height / 2, height / 2))
+    low_next, high_next = np.roll(low, -1, axis=0), np.roll(high, -1, axis=0)
+    sides = [(low, low_next, high_next), (low, high_next, high)]
+    caps = [(low[:1].repeat(len(low), 0), low_next, low), (high[:1].repeat(len(high), 0), high, high_next)]
+    triangles = np.concatenate([np.stack(corners, axis=1) for corners in (*sides, *caps)])
+    return triangles[np.linalg.norm(_normals(triangles), axis=-1) > 0]  # a cap's fan begins and ends in a line
+
+
+def _normals(triangles: Array) -> Array:
+    return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+
+
+def _joined(parts: list[tuple[Array, Color]]) -> ColoredMesh:
+    """Flat shading: a vertex for each corner of each triangle."""
+    triangles = np.concatenate([part for part, _ in parts])
+    normals = _normals(triangles)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return ColoredMesh(
-        vertices=np.concatenate([mesh.vertices for mesh, _ in parts]),
-        normals=np.concatenate([mesh.vertex_normals for mesh, _ in parts]),
-        faces=np.concatenate([mesh.faces + start for (mesh, _), start in zip(parts, starts, strict=False)]),
-        colors=np.concatenate([np.tile(color, (len(mesh.vertices), 1)) for mesh, color in parts]).astype(np.uint8),
+        vertices=triangles.reshape(-1, 3),
+        normals=normals.repeat(3, axis=0),
+        faces=np.arange(3 * len(triangles)).reshape(-1, 3),
+        colors=np.concatenate([np.tile(color, (3 * len(part), 1)) for part, color in parts]).astype(np.uint8),
     )

@@ -7,6 +7,8 @@ import math
 import pytest
 import torch
 
+from bevcli.model.bevformer import BEVFormerInputs
+from bevcli.training.detection_loss import DetectionLossConfig
 from bevcli.training.detection_targets import DetectionTargets
 from bevcli.training.picture_loss import PictureLossConfig, PictureReader, _taught_pixels, picture_loss
 
@@ -22,6 +24,19 @@ def code(x: float, y: float, width: float = 2.0, length: float = 4.0, height: fl
 
 def taught(*codes: list[float]):
     return _taught_pixels(IMAGE_FROM_BEV, torch.tensor(codes).reshape(-1, 10), SHAPE, SIZE)
+
+
+def seen(image_from_bev: torch.Tensor) -> BEVFormerInputs:
+    frames, cameras = image_from_bev.shape[:2]
+    return BEVFormerInputs(
+        images=torch.zeros(frames, cameras, 3, *SIZE),
+        image_from_bev=image_from_bev,
+        camera_index=torch.arange(cameras),
+        has_picture=torch.ones(frames, cameras, dtype=torch.bool),
+        can_bus=torch.zeros(frames, 18),
+        shift=torch.zeros(frames, 2),
+        rotation_deg=torch.zeros(frames),
+    )
 
 
 def test_an_object_teaches_the_inner_half_of_its_outline():
@@ -53,11 +68,11 @@ def test_what_is_said_rightly_costs_little_and_every_weight_learns():
     truth = DetectionTargets(torch.tensor([1]), torch.tensor([code(2, 10)]))
     nothing = DetectionTargets(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 10))
     features = torch.randn(4, 8, *SHAPE)  # two frames of two cameras
-    matrices = IMAGE_FROM_BEV.expand(2, 2, 4, 4)
+    inputs = seen(IMAGE_FROM_BEV.expand(2, 2, 4, 4))
     config = PictureLossConfig(weight=1.0)
 
     def loss():
-        return picture_loss(reader, features, matrices, SIZE, (truth, nothing), config, class_weight=2.0)
+        return picture_loss(reader, features, inputs, (truth, nothing), config, DetectionLossConfig())
 
     first = loss()
     optimizer = torch.optim.Adam(reader.parameters(), lr=0.05)
@@ -74,8 +89,7 @@ def test_what_is_said_rightly_costs_little_and_every_weight_learns():
 def test_frames_without_objects_cost_no_place():
     nothing = DetectionTargets(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 10))
     reader = PictureReader(channels=8, classes=2)
-    result = picture_loss(
-        reader, torch.randn(1, 8, *SHAPE), IMAGE_FROM_BEV[None, None], SIZE, [nothing], PictureLossConfig(1.0), 2.0
-    )
+    features, inputs = torch.randn(1, 8, *SHAPE), seen(IMAGE_FROM_BEV[None, None])
+    result = picture_loss(reader, features, inputs, [nothing], PictureLossConfig(1.0), DetectionLossConfig())
     assert result.places == 0
     assert result.classes.isfinite()
