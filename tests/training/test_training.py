@@ -20,6 +20,7 @@ from bevcli.training.clips import ClipConfig
 from bevcli.training.dense_loss import DenseLossConfig
 from bevcli.training.drives import RenderedDrives
 from bevcli.training.optimizer import OptimizerConfig, make_optimizer, set_rate
+from bevcli.training.picture_loss import PictureLossConfig
 from bevcli.training.trainer import Trainer, TrainingConfig, TrainingJob, _in_turn
 
 SHORT = TrainingConfig(
@@ -92,10 +93,10 @@ def test_batches_in_turn_give_a_frame_each_after_another() -> None:
 
 
 def test_all_that_helps_to_learn_survives_a_kill_too(tmp_path: Path) -> None:
-    """Every frame learned from, batches in turn, groups of queries, the dense loss."""
+    """Every frame learned from, batches in turn, groups of queries, the dense and the picture loss."""
     settings = replace(
         SHORT, steps=3, evaluate_every=3, checkpoint_every=1, clips=ClipConfig(2, 2, 0.0, "all", in_turn=2),
-        dense_loss=DenseLossConfig(1.0),
+        dense_loss=DenseLossConfig(1.0), picture_loss=PictureLossConfig(1.0),
     )  # fmt: skip
 
     def helped(out: Path, resume: bool = False) -> Trainer:
