@@ -71,14 +71,13 @@ def train(
     chosen_device = choose_device(device)
     team = join_team(chosen_device)
     trainer = Trainer(TrainingJob(model, settings, drives, held_out, out, chosen_device, seed, team), resume=resume)
-    if not team.leads:
+    if team.leads:
+        with Progress(settings.steps - trainer.done, "steps") as progress:
+            progress.message(f"{len(drives)} drives to learn from, {len(held_out)} to evaluate on; writing to {out}")
+            trainer.run(progress.advance, lambda step, scores: progress.message(f"step {step}: {describe(scores)}"))
+    else:
         trainer.run()
-        return leave_team(team)
-    with Progress(settings.steps - trainer.done, "steps") as progress:
-        progress.message(f"{len(drives)} drives to learn from, {len(held_out)} to evaluate on; writing to {out}")
-        trainer.run(progress.advance, lambda step, scores: progress.message(f"step {step}: {describe(scores)}"))
     leave_team(team)
-    return None
 
 
 def choose_drives(

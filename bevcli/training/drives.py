@@ -91,11 +91,14 @@ class RenderedDrives:
             map_window=MapWindow(half_extent_m=reach),
         )
         unfinished = folder.with_suffix(f".unfinished-{os.getpid()}")
+        shutil.rmtree(unfinished, ignore_errors=True)
         export_drive(drive, unfinished)
         try:
             os.replace(unfinished, folder)
-        except OSError:  # another process was faster
-            shutil.rmtree(unfinished)
+        except OSError:
+            if not folder.exists():
+                raise
+            shutil.rmtree(unfinished)  # another process was faster
 
 
 def part_of(drives: Drives, start: int, end: int) -> Drives:
