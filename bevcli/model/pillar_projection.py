@@ -41,6 +41,14 @@ class PillarHits:
     cameras_per_cell: Tensor
 
 
+def project_points(image_from_bev: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+    """(..., 4, 4) and (..., 3) metres, bev frame -> pixels (..., 2) and depths in metres (...)."""
+    # Sums of products, not matmul: lower-precision matrix units would move the points by pixels.
+    projected = (image_from_bev[..., :3, :3] * points[..., None, :]).sum(-1) + image_from_bev[..., :3, 3]
+    depth = projected[..., 2:]
+    return projected[..., :2] / depth.clamp(min=MIN_DEPTH), depth[..., 0]
+
+
 def project_pillars(
     image_from_bev: Tensor, pillars: Tensor, image_size: tuple[int, int], has_picture: Tensor
 ) -> PillarProjection:
@@ -49,14 +57,10 @@ def project_pillars(
     image_from_bev: (B, N, 4, 4) float32. pillars: (Y·X, Z, 3) metres, bev frame. has_picture: (B, N) bool.
     image_size: (height, width) of the network's input, padding included, pixels.
     """
-    matrix = image_from_bev.float()[:, :, None, None]  # (B, N, 1, 1, 4, 4)
-    # Sums of products, not matmul: lower-precision matrix units would move the points by pixels.
-    projected = (matrix[..., :3, :3] * pillars.float()[..., None, :]).sum(-1) + matrix[..., :3, 3]
-    depth = projected[..., 2:]
-    pixels = projected[..., :2] / depth.clamp(min=MIN_DEPTH)
+    pixels, depth = project_points(image_from_bev.float()[:, :, None, None], pillars.float())
     height, width = image_size
     points = pixels / pixels.new_tensor([width, height])  # (B, N, Y·X, Z, 2)
-    inside = ((points > 0) & (points < 1)).all(-1) & (depth[..., 0] > MIN_DEPTH)
+    inside = ((points > 0) & (points < 1)).all(-1) & (depth > MIN_DEPTH)
     return PillarProjection(points, inside & has_picture[:, :, None, None])
 
 

@@ -72,7 +72,7 @@ def dense_loss(
         truths.append(truth.codes[owners])
     count = max(sum(map(len, found)), 1)
     classes = of_boxes.class_weight * focal_loss(logits, wanted).sum() / count
-    boxes = of_boxes.box_weight * box_loss(torch.cat(found), torch.cat(truths), of_boxes.velocity_weight) / count
+    boxes = of_boxes.box_weight * box_loss(torch.cat(found), torch.cat(truths), of_boxes) / count
     return DetectionLoss(config.weight * classes, config.weight * boxes)
 
 

@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from bevcli.model.bevformer import BEVFormerInputs
-from bevcli.model.pillar_projection import MIN_DEPTH
+from bevcli.model.pillar_projection import MIN_DEPTH, project_points
 from bevcli.training.detection_loss import DetectionLossConfig
 from bevcli.training.detection_targets import DetectionTargets
 from bevcli.training.focal_loss import focal_loss
@@ -109,10 +109,9 @@ def _taught_pixels(
     rows, columns = shape
     scale = codes.new_tensor([columns / image_size[1], rows / image_size[0]])
     centers = codes[:, [0, 1, 4]]
-    projected = centers @ image_from_bev[:3, :3].T + image_from_bev[:3, 3]
-    depth = projected[:, 2]
+    pixels, depth = project_points(image_from_bev, centers)
     ahead = depth > MIN_DEPTH
-    middle = projected[:, :2] / depth.clamp(min=MIN_DEPTH)[:, None] * scale  # (G, 2), x and y
+    middle = pixels * scale  # (G, 2), x and y
     toward = image_from_bev[2, :3]  # the viewing direction
     focal = (image_from_bev[:2, :3].square().sum(1) - (image_from_bev[:2, :3] @ toward).square()).sqrt() * scale
     width = codes[:, [2, 3]].exp().mean(1)

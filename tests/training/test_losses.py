@@ -115,6 +115,14 @@ def test_a_box_of_unknown_velocity_counts_as_a_class_only() -> None:
     assert loss.classes.item() == pytest.approx(2 * 0.25 / 4 * log(2))
 
 
+@pytest.mark.parametrize(("true_speed", "weight"), [(0.4, 1.0), (4.0, 5.0)])
+def test_speeds_of_what_moves_can_count_more(true_speed: float, weight: float) -> None:
+    codes, logits = torch.tensor([[code(0.0)]])[None], torch.zeros(1, 1, 1, 1)
+    config = DetectionLossConfig(velocity_weight=0.5, moving_weight=5.0)
+    loss = detection_loss(logits, codes, [targets(code(0.0, vx=true_speed))], config)
+    assert loss.boxes.item() == pytest.approx(0.25 * 0.5 * weight * true_speed)
+
+
 def test_a_frame_without_boxes_teaches_background() -> None:
     loss = detection_loss(torch.zeros(1, 1, 3, 2), torch.zeros(1, 1, 3, 10), [targets()], CONFIG)
     assert loss.boxes.item() == 0
