@@ -14,7 +14,7 @@ from bevcli.training.focal_loss import focal_cost, focal_loss
 from bevcli.training.matcher import match
 
 MATCHED_NUMBERS = 8  # of a box code: all but the velocity
-MOVING = 0.5  # m/s and faster
+MIN_MOVING_SPEED = 0.5  # m/s; what is slower stands
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,8 @@ def _layer_loss(
 def box_loss(found: Tensor, truth: Tensor, config: DetectionLossConfig) -> Tensor:
     """L1 of matched codes (K, 10), summed; a box of unknown velocity is left out, as published."""
     known = truth.isfinite().all(-1)
-    errors = F.l1_loss(found[known], truth[known], reduction="none")  # (K, 10)
-    moving = truth[known, MATCHED_NUMBERS:].norm(dim=-1) >= MOVING
+    found, truth = found[known], truth[known]
+    errors = F.l1_loss(found, truth, reduction="none")  # (K, 10)
+    moving = truth[:, MATCHED_NUMBERS:].norm(dim=-1) >= MIN_MOVING_SPEED
     weights = config.velocity_weight * torch.where(moving, config.moving_weight, 1.0)
     return errors[:, :MATCHED_NUMBERS].sum() + (weights * errors[:, MATCHED_NUMBERS:].sum(-1)).sum()
