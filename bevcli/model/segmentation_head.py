@@ -20,8 +20,8 @@ THING_CLASS = "vehicle"
 class SegmentationConfig:
     """thing_queries: as many vehicles at most. location_layers, mask_layers: of the two decoders.
 
-    points: sampling points a head of the location decoder. min_confidence: of a mask in the merged map.
-    min_free_share: of a mask's cells, that no surer mask has taken; with less it is dropped.
+    points: sampling points a head of the location decoder. map_scale: cells of the map along a side of a BEV cell.
+    min_stuff, min_thing: how probable a class, a vehicle must be in a cell of the map.
     """
 
     thing_queries: int = 60
@@ -31,12 +31,15 @@ class SegmentationConfig:
     points: int = 4
     feed_forward_width: int = 512
     dropout: float = 0.1
-    min_confidence: float = 0.3
-    min_free_share: float = 0.6
+    map_scale: int = 4
+    min_stuff: float = 0.45
+    min_thing: float = 0.2
 
     def __post_init__(self) -> None:
-        if self.mask_layers < 1 or not (0 <= self.min_confidence <= 1 and 0 <= self.min_free_share <= 1):
-            raise ValueError("mask_layers must be positive, min_confidence and min_free_share from 0 to 1")
+        if min(self.mask_layers, self.map_scale) < 1:
+            raise ValueError("mask_layers and map_scale must be positive")
+        if not (0 <= self.min_stuff <= 1 and 0 <= self.min_thing <= 1):
+            raise ValueError("min_stuff and min_thing must be from 0 to 1")
         self.location_decoder()  # which checks the other numbers
 
     def location_decoder(self) -> DecoderConfig:

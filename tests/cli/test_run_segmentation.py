@@ -27,7 +27,7 @@ def test_maps_are_written_and_an_earlier_runs_maps_are_gone(mini_config, tmp_pat
     run(config, tmp_path, frames=2, force=True)
     maps = open_maps(tmp_path / "segmentation")
     assert [maps.has(frame) for frame in range(3)] == [True, True, False]
-    assert maps.load(1).cells.shape == (12, 10)
+    assert maps.load(1).cells.shape == (48, 40)
     assert (maps.x_range_m, maps.y_range_m, set(maps.classes)) == ((-25, 25), (-30, 30), set(MAP_CLASSES))
 
 

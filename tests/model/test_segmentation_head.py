@@ -54,31 +54,31 @@ def test_a_mask_is_where_its_query_attends() -> None:
     assert masks[0, 0].tolist() == pytest.approx([0, 6 / math.sqrt(4), 2 * 6 / math.sqrt(4)])
 
 
-def masks_of(*rows: list[float]) -> np.ndarray:
-    """Masks over a map of one row."""
-    return np.array(rows)[:, None, :]
+def in_a_row(*rows: list[float]) -> torch.Tensor:
+    """Probabilities over a map of one row."""
+    return torch.tensor(rows)[:, None, :]
 
 
-def test_the_surer_mask_is_laid_down_first_and_later_ones_keep_what_is_free() -> None:
-    masks = masks_of([0.9, 0.9, 0.9, 0.0], [0.0, 0.0, 0.8, 0.8])
-    config = SegmentationConfig(min_free_share=0.5)
-    assert merge(masks, np.array([0.9, 0.9]), config).tolist() == [[0, 0, 0, 1]]
-    assert merge(masks, np.array([0.6, 0.99]), config).tolist() == [[0, 0, 1, 1]]
+def test_a_cell_is_of_the_query_that_most_probably_has_it() -> None:
+    assert merge(in_a_row([0.9, 0.5, 0.3, 0.1], [0.0, 0.4, 0.6, 0.2]), least=0.2, scale=1).tolist() == [[0, 0, 1, -1]]
 
 
-def test_a_mask_of_which_too_little_is_left_is_dropped() -> None:
-    masks = masks_of([0.9, 0.9, 0.9, 0.0], [0.0, 0.8, 0.8, 0.8])
-    assert merge(masks, np.array([0.9, 0.9]), SegmentationConfig(min_free_share=0.6)).tolist() == [[0, 0, 0, -1]]
+def test_a_query_that_is_nowhere_probable_keeps_its_place_in_the_order() -> None:
+    assert merge(in_a_row([0.1, 0.1], [0.0, 0.7]), least=0.2, scale=1).tolist() == [[-1, 1]]
+    assert merge(in_a_row([0.1, 0.1]), least=0.2, scale=2).tolist() == [[-1] * 4] * 2
 
 
-def test_confidence_is_the_class_times_the_square_of_the_mean_mask() -> None:
-    masks = masks_of([0.8, 0.8, 0.2])  # mean over 0.5 is 0.8: 0.5 · 0.64 = 0.32
-    assert merge(masks, np.array([0.5]), SegmentationConfig(min_confidence=0.31)).tolist() == [[0, 0, -1]]
-    assert merge(masks, np.array([0.5]), SegmentationConfig(min_confidence=0.33)).tolist() == [[-1, -1, -1]]
+def test_a_finer_map_has_its_borders_between_the_cells() -> None:
+    row = in_a_row([1.0, 0.0])  # over four half cells: 1, 0.75, 0.25, 0
+    assert merge(row, least=0.5, scale=2)[0].tolist() == [0, 0, -1, -1]
+    assert merge(row, least=0.2, scale=2)[0].tolist() == [0, 0, 0, -1]
 
 
-def test_an_empty_mask_takes_nothing() -> None:
-    assert merge(masks_of([0.1, 0.2]), np.array([1.0]), SegmentationConfig(min_confidence=0.0)).max() == -1
+def test_a_probability_is_that_of_the_class_times_the_mask() -> None:
+    masks, classes = torch.full((1, 1, 4, 1), 0.5).logit(), torch.tensor([0.9, 0.7, 0.7, 0.3]).logit()[None, None]
+    outputs = SegmentationOutputs(masks, classes, torch.zeros(1, 1, 1, 4))
+    one = decode_maps(outputs, SegmentationConfig(map_scale=1, min_stuff=0.4, min_thing=0.2), BevGrid(1, 1))[0]
+    assert (one.stuff.ravel().tolist(), one.things.tolist()) == ([True, False, False], [[-1]])
 
 
 def test_a_map_is_written_with_its_bits_and_ahead_on_top() -> None:
@@ -88,7 +88,7 @@ def test_a_map_is_written_with_its_bits_and_ahead_on_top() -> None:
     logits[0, 0, 2, 1] = 9.0  # a crossing on it
     logits[0, 0, 4, [1, 4]] = 9.0  # a vehicle on both rows
     outputs = SegmentationOutputs(logits, torch.full((1, 1, 5), 9.0), torch.zeros(1, 1, 2, 4))
-    panoptic = decode_maps(outputs, SegmentationConfig(), grid)[0]
+    panoptic = decode_maps(outputs, SegmentationConfig(map_scale=1), grid)[0]
     assert panoptic.things.tolist() == [[-1, 1, -1], [-1, 1, -1]]
     bev_map = panoptic.bev_map(grid)
     assert bev_map.cells.tolist() == [[0, 8, 0], [1, 1 + 4 + 8, 1]]
