@@ -114,9 +114,8 @@ def test_a_segmentation_head_fills_the_prediction(mini_config):
     torch.manual_seed(0)
     model = BEVFormer(replace(mini_config, heads=("detection", "segmentation")))
     predictions, _ = run(model, MemorySequence(2))
-    assert [prediction.segmentation.cells.shape for prediction in predictions] == [
-        (48, 40)
-    ] * 2  # four cells a BEV cell, each way
+    # Four cells of the map along each side of a BEV cell; there are 12 x 10 of those.
+    assert [prediction.segmentation.cells.shape for prediction in predictions] == [(48, 40)] * 2
     assert list(predictions[0].stage_seconds)[-3:] == ["segmentation_head", "box_decoding", "map_merging"]
 
 
