@@ -39,7 +39,7 @@ class TrainingConfig(LossConfigs):
 
     steps: batches of clips. held_out: how many of the drives, the last ones, are for evaluation only.
     evaluate_every, checkpoint_every: steps. freeze_batch_norm: for fine-tuning, keep the running statistics.
-    loaders: threads that read batches ahead; more than one where a GPU waits for them.
+    loaders: threads that each read one step's batches ahead; more than one where a GPU waits for them.
     weights_dtype: of weights.safetensors.
     """
 
@@ -107,7 +107,7 @@ class Trainer:
         """All steps that are left. Raises BevcliError where the loss is no number any more."""
         config = self.job.config
         left = range(self.done, config.steps)
-        for batches in read_ahead(self._load, left, depth=2 * config.loaders, threads=config.loaders):
+        for batches in read_ahead(self._load, left, depth=config.loaders, threads=config.loaders):
             row = self._step(batches)
             self.done += 1
             if not self.job.team.leads:
