@@ -47,6 +47,7 @@ def test_a_mistake_in_the_input_is_one_line_and_exits_1(arguments, message, tmp_
 def test_an_interrupt_exits_130(tmp_path):
     code = (
         "import os, signal, typer, bevcli.cli.main as main\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job begins with it ignored\n"
         "@main.app.command()\n"
         "def wait(): os.kill(os.getpid(), signal.SIGINT)\n"
         "main.run_app()\n"
