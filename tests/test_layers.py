@@ -8,15 +8,18 @@ import bevcli
 ROOT = Path(bevcli.__file__).parent
 # From the lowest to the highest; names in one set may not import each other.
 LAYERS = (
-    {"errors"},
+    {"errors", "findings"},
     {"geometry"},
     {"frame"},
     {"model"},
     {"config"},
     {"checkpoints"},
     {"sequences"},
-    {"pipeline", "viz", "evaluation"},
-    {"synth"},
+    {"evaluation"},
+    {"recording"},
+    {"viewer"},
+    {"pipeline"},
+    {"rig", "synth"},
     {"training", "benchmark"},
     {"cli"},
     {"__main__"},

@@ -9,7 +9,7 @@ import torch
 from bevcli.benchmark.result import Comparison
 from bevcli.benchmark.version import Version
 from bevcli.model.bevformer import BEVFormer
-from bevcli.model.inference import textbook_version
+from bevcli.model.prepared import textbook_version
 from bevcli.pipeline.cpu_memory import keep_freed_memory, return_freed_memory
 from bevcli.pipeline.preprocess import PreparedFrame
 

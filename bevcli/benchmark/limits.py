@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
-from bevcli.model.inference import DTYPES, Precision
+from bevcli.model.prepared import DTYPES, Precision
 
 # Edge of the square matrices and floats of the copied block: large enough for full speed, small enough to be quick.
 CPU_EDGE, GPU_EDGE = 2048, 8192

@@ -25,10 +25,10 @@ from bevcli.benchmark.operations import count_operations
 from bevcli.benchmark.result import BenchmarkResult
 from bevcli.benchmark.version import Version
 from bevcli.model.bevformer import BEVFormer, BEVFormerConfig
-from bevcli.model.inference import Precision, prepare_for_inference
 from bevcli.model.pillar_projection import find_hits, project_pillars
+from bevcli.model.prepared import Precision, prepare_for_inference
 from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
-from bevcli.viz.recording import Recording
+from bevcli.recording.writer import Recording
 
 WARM_UP_FRAMES = 2  # the second is the first with history
 MIN_RUN_FRAMES = 3  # of the run with reading and recording; its first frame does not count

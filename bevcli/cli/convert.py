@@ -38,7 +38,7 @@ def convert(
     """
     from bevcli.cli.progress import Progress
     from bevcli.errors import OutputError
-    from bevcli.sequences.native_writer import NativeWriter
+    from bevcli.sequences.native.writer import NativeWriter
     from bevcli.sequences.open import InputOptions, open_sequence
 
     if out.resolve() == source.resolve() or out.resolve() in source.resolve().parents:

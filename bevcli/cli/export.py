@@ -36,7 +36,7 @@ def export(
     """
     from bevcli.evaluation.export_csv import write_csv
     from bevcli.evaluation.submission import write_submission
-    from bevcli.sequences.boxes_file import above_score, read_boxes
+    from bevcli.sequences.files.boxes_file import above_score, read_boxes
 
     file = predictions / "predictions.json" if predictions.is_dir() else predictions
     boxes = above_score(read_boxes(file), score)
@@ -58,7 +58,7 @@ def export(
 def _calibrated(calibration: Path | None, name: str | None) -> tuple[Camera, Array]:
     """The camera whose view is exported, and ego_from_bev."""
     from bevcli.errors import InputError
-    from bevcli.sequences.calibration import read_calibration
+    from bevcli.sequences.native.calibration import read_calibration
 
     if calibration is None:
         raise InputError("--format kitti needs --calibration: KITTI labels are in a camera's frame")

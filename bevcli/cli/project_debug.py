@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from bevcli.cli.project_debug_input import DebugInput
-    from bevcli.geometry.rig_checks import RigReport
+    from bevcli.rig.checks import RigReport
+    from bevcli.rig.inspection import DebugInput
 
 ERRORS_FOUND = 3
 
@@ -38,10 +38,10 @@ def project_debug(
     """
     import json as json_format
 
-    from bevcli.cli.project_debug_input import gather
     from bevcli.cli.project_debug_text import report_text
-    from bevcli.geometry.rig_checks import check_rig, with_findings
-    from bevcli.geometry.rig_findings import errors_of
+    from bevcli.findings import errors_of
+    from bevcli.rig.checks import check_rig, with_findings
+    from bevcli.rig.inspection import gather
 
     given = gather(calibration, sequence, frame)
     report = with_findings(check_rig(given.rig, given.rig_findings), given.sequence_findings)
@@ -80,9 +80,9 @@ def report_to_json(report: RigReport) -> dict[str, Any]:
 def _write(folder: Path, given: DebugInput, report: RigReport, document: str) -> list[str]:
     """Write all files into the folder, and name them. Without a camera there are no pictures."""
     from bevcli.errors import OutputError
-    from bevcli.viz.calibration import write_calibration_recording
-    from bevcli.viz.calibration_map import write_coverage_map
-    from bevcli.viz.calibration_sheet import write_sheet
+    from bevcli.rig.coverage_map import write_coverage_map
+    from bevcli.rig.recording import write_calibration_recording
+    from bevcli.rig.sheet import write_sheet
 
     try:
         folder.mkdir(parents=True, exist_ok=True)

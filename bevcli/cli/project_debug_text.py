@@ -5,11 +5,11 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Sequence
 
+from bevcli.findings import SEVERITIES, Finding
 from bevcli.geometry.cameras import CameraRig
-from bevcli.geometry.rig_checks import RigReport
-from bevcli.geometry.rig_coverage import Coverage
-from bevcli.geometry.rig_findings import SEVERITIES, Finding
-from bevcli.geometry.rig_pose import degrees_text, mounting_of, seen_fov_deg
+from bevcli.rig.checks import RigReport
+from bevcli.rig.coverage import Coverage
+from bevcli.rig.pose import degrees_text, mounting_of, seen_fov_deg
 
 WIDTH = 100
 INDENT = " " * 10

@@ -121,11 +121,11 @@ def run(
     score) and summary.json.
     """
     from bevcli.cli.run_input import FrameChoice, choose_frames, ego_motion_use
-    from bevcli.cli.run_job import Job, run_job
     from bevcli.pipeline.model_loading import choose_device, choose_precision, load_model
+    from bevcli.pipeline.run_job import Job, run_job
     from bevcli.pipeline.runner import StepOptions
+    from bevcli.recording.options import RecordingOptions
     from bevcli.sequences.open import InputOptions
-    from bevcli.viz.options import RecordingOptions
 
     recording = RecordingOptions(record, bev, score, tuple(map(parse_probe, probe or ())), live)
     loaded = load_model(model, weights, untrained=untrained)

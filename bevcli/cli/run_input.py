@@ -8,7 +8,7 @@ from pathlib import Path
 from bevcli.errors import InputError
 from bevcli.frame import Sequence
 from bevcli.model.bevformer import BEVFormerConfig
-from bevcli.sequences.folder import EgoMotionUse
+from bevcli.sequences.native.folder import EgoMotionUse
 from bevcli.sequences.open import InputOptions, open_sequence
 from bevcli.sequences.rate import every, thin
 from bevcli.sequences.selection import select

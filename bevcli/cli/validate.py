@@ -41,7 +41,7 @@ def validate(
     from bevcli.cli.train import open_drives
     from bevcli.evaluation.scores_json import scores_to_json
     from bevcli.evaluation.scores_table import scores_table
-    from bevcli.model.inference import prepare_for_inference
+    from bevcli.model.prepared import prepare_for_inference
     from bevcli.pipeline.model_loading import choose_device, choose_precision, load_model
     from bevcli.pipeline.runner import Runner, StepOptions
     from bevcli.training.validation import validate as validate_model

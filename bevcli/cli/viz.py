@@ -35,7 +35,7 @@ def viz(
     Without an option that writes something, the viewer opens: in a window where there is a display, else in the
     browser, at an address of this machine only. Ctrl-C ends it.
     """
-    from bevcli.viz.recording_file import whole_recording
+    from bevcli.viewer.recording_file import whole_recording
 
     if frame is not None and screenshot is None:
         raise typer.BadParameter("--frame goes with --screenshot", param_hint="--frame")
@@ -55,13 +55,13 @@ def viz(
 
 
 def _summarise(recording: Path, read_from: Path) -> None:
-    from bevcli.viz.summary import summarise
+    from bevcli.viewer.summary import summarise
 
     typer.echo(summarise(recording, read_from).text())
 
 
 def _screenshot(recording: Path, picture: Path, frame: int | None) -> None:
-    from bevcli.viz.screenshot import take_screenshot
+    from bevcli.viewer.screenshot import take_screenshot
 
     views = take_screenshot(recording, picture, frame)
     typer.echo(f"{picture}: {len(views)} views")
@@ -69,7 +69,7 @@ def _screenshot(recording: Path, picture: Path, frame: int | None) -> None:
 
 def _video(recording: Path, video: Path) -> None:
     from bevcli.cli.progress import Progress
-    from bevcli.viz.video import frame_rate, write_video
+    from bevcli.viewer.video import frame_rate, write_video
 
     count, rate = frame_rate(recording)
     with Progress(count, "frames") as progress:
@@ -78,15 +78,15 @@ def _video(recording: Path, video: Path) -> None:
 
 
 def _export(recording: Path, path: Path) -> None:
-    from bevcli.cli.viz_export import export_boxes
+    from bevcli.viewer.export import export_boxes
 
     frames, boxes = export_boxes(recording, path)
     typer.echo(f"{path}: {boxes} boxes of {frames} frames")
 
 
 def _open(recording: Path, *, web: bool, host: str, port: int) -> None:
-    from bevcli.viz.viewer import display_is_there
-    from bevcli.viz.web_viewer import WebViewer, web_viewer_assets
+    from bevcli.viewer.native import display_is_there
+    from bevcli.viewer.web import WebViewer, web_viewer_assets
 
     if display_is_there() and not web:
         if _window_closed_well(recording):
@@ -98,7 +98,7 @@ def _open(recording: Path, *, web: bool, host: str, port: int) -> None:
 
 
 def _window_closed_well(recording: Path) -> bool:
-    from bevcli.viz.viewer import LOOPBACK, start_viewer, stop
+    from bevcli.viewer.native import LOOPBACK, start_viewer, stop
 
     process = start_viewer("--bind", LOOPBACK, "--port", "auto", str(recording))
     try:

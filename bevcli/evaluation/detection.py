@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike
 
 from bevcli.evaluation.class_matches import ClassMatches, match_class
 from bevcli.evaluation.config import MEANINGLESS_ERRORS, DetectionConfig
-from bevcli.evaluation.curves import recall_curve
 from bevcli.evaluation.detection_scores import (
     ClassScores,
     DetectionScores,
@@ -17,6 +16,7 @@ from bevcli.evaluation.detection_scores import (
     ScoreTable,
     VisibilityRecall,
 )
+from bevcli.evaluation.precision_recall import recall_curve
 from bevcli.evaluation.scored_boxes import ScoredBoxes, gather
 from bevcli.evaluation.true_positives import true_positive_errors
 from bevcli.geometry.boxes import Boxes3D

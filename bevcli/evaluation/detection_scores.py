@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from bevcli.evaluation.class_matches import ClassMatches
 from bevcli.evaluation.config import ERRORS
-from bevcli.evaluation.curves import RecallCurve
+from bevcli.evaluation.precision_recall import RecallCurve
 
 
 @dataclass(frozen=True)

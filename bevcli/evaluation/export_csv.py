@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from bevcli.errors import OutputError
-from bevcli.sequences.box_json import boxes_to_json
-from bevcli.sequences.boxes_file import BoxesFile, FrameBoxes
+from bevcli.sequences.files.box_json import boxes_to_json
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 
 COLUMNS = (
     "frame", "scene", "timestamp_ns", "frame_of_reference", "class", "score", "x", "y", "z", "length", "width",

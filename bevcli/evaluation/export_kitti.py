@@ -10,7 +10,7 @@ from bevcli.errors import InputError, OutputError
 from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, apply, inverse, wrap_angle
-from bevcli.sequences.boxes_file import BoxesFile, FrameBoxes
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 
 # KITTI's own types where it has them; names in its style for the others.
 KITTI_TYPES = {

@@ -13,7 +13,7 @@ from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.transforms import Array, Pose, inverse
-from bevcli.sequences.boxes_file import BoxesFile, FrameBoxes
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from bevcli.errors import OutputError
 from bevcli.evaluation.bev_sheet import draw_bev_sheet
 from bevcli.evaluation.config import ERRORS
-from bevcli.evaluation.curves import RECALLS
 from bevcli.evaluation.detection_scores import ClassScores, DetectionScores
 from bevcli.evaluation.plot_style import CLASS_COLORS, GRID, titled_figure
+from bevcli.evaluation.precision_recall import RECALLS
 from bevcli.evaluation.scoring import Scores
 
 _ERROR_TITLES = {

@@ -11,8 +11,8 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.transforms import rotation_from_quaternion, yaw_of_rotation
-from bevcli.sequences.box_json import boxes_from_json
-from bevcli.sequences.boxes_file import BoxesFile, FrameBoxes
+from bevcli.sequences.files.box_json import boxes_from_json
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 
 _PEEK_BYTES = 2048  # both kinds of file say what they are at their beginning
 

@@ -12,8 +12,8 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.geometry.attributes import attributes_by_speed
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.sequences.boxes_file import BoxesFile, FrameBoxes
-from bevcli.sequences.growing_json import GrowingJson
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
+from bevcli.sequences.files.growing_json import GrowingJson
 
 MOST_BOXES = 500  # a sample, by the rules of the benchmark; the best by score are kept
 META = {"use_camera": True, "use_lidar": False, "use_radar": False, "use_map": False, "use_external": False}

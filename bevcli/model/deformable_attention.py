@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from bevcli.model.deformable_attention_compiled import sample_compiled
+from bevcli.model.kernels.compiled_attention import sample_compiled
 
 LevelShapes = tuple[tuple[int, int], ...]
 """(height, width) of each feature level, fine to coarse."""
@@ -93,7 +93,7 @@ def _grid_sample(values: Tensor, level_shapes: LevelShapes, locations: Tensor, w
 def _sample_on_gpu(
     values: Tensor, level_shapes: LevelShapes, locations: Tensor, weights: Tensor, queries_per_map: Sequence[int]
 ) -> Tensor:
-    from bevcli.model.deformable_attention_triton import sample_triton  # only where Triton is installed
+    from bevcli.model.kernels.triton_attention import sample_triton  # only where Triton is installed
 
     return sample_triton(values, level_shapes, locations, weights, queries_per_map)
 

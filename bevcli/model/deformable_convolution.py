@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from bevcli.model.deformable_convolution_compiled import convolve_compiled
+from bevcli.model.kernels.compiled_convolution import convolve_compiled
 
 Backend = Literal["grid_sample", "compiled"]
 """grid_sample: tap after tap, with gradients. compiled: on the CPU, tile after tile, without."""

@@ -11,7 +11,7 @@ from bevcli.checkpoints import bundled_weights, inspect, load_weights
 from bevcli.config import known_models, load_config
 from bevcli.errors import BevcliError, WeightsError
 from bevcli.model.bevformer import BEVFormer
-from bevcli.model.inference import Precision
+from bevcli.model.prepared import Precision
 
 DEFAULT_MODEL = "demo"
 UNTRAINED_SEED = 0  # so that two untrained runs of one drive agree

@@ -16,8 +16,8 @@ from bevcli.geometry.transforms import Pose
 from bevcli.model.attention_probe import AttentionProbe
 from bevcli.model.bevformer import BEVFormer, BEVFormerInputs, BEVFormerOutputs
 from bevcli.model.box_coding import decode
-from bevcli.model.inference import Precision
 from bevcli.model.panoptic_merging import decode_maps
+from bevcli.model.prepared import Precision
 from bevcli.pipeline.attention import attention_view, probe_cells
 from bevcli.pipeline.cpu_memory import keep_freed_memory
 from bevcli.pipeline.model_inputs import model_inputs

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from bevcli.errors import InputError
 from bevcli.frame import Sequence
-from bevcli.sequences.folder import EgoMotionUse, FolderSequence
-from bevcli.sequences.intrinsics import read_rig
-from bevcli.sequences.nuscenes import NuScenesChoice, NuScenesSequence, is_nuscenes_root
+from bevcli.sequences.files.intrinsics import read_rig
+from bevcli.sequences.native.folder import EgoMotionUse, FolderSequence
+from bevcli.sequences.nuscenes.scenes import NuScenesChoice, NuScenesSequence, is_nuscenes_root
 from bevcli.sequences.selection import select
 
 PARTS_OF_A_FOLDER = ("calibration.json", "frames.csv", "ego_motion.csv", "images", "videos")

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from bevcli.frame import MAP_CLASSES, BevMap
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, apply
-from bevcli.synth.ground_plan import GroundPiece
-from bevcli.synth.ground_texture import SUBPIXEL_BITS, fill
+from bevcli.synth.render.ground_texture import SUBPIXEL_BITS, fill
+from bevcli.synth.world.ground_plan import GroundPiece
 
 BOUNDARY_M = 0.5  # how wide lane boundaries are drawn, wider than their paint so that cells do not miss them
 VEHICLE_CLASSES = ("car", "truck", "construction_vehicle", "bus", "trailer", "motorcycle", "bicycle")

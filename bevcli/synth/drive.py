@@ -14,21 +14,21 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid, rotation_about_z
-from bevcli.synth.actors import Actor, Body, State
+from bevcli.synth.assets.catalog import Catalog
 from bevcli.synth.bev_truth import MapWindow, draw_map
-from bevcli.synth.catalog import Catalog
-from bevcli.synth.city import CityPlan
-from bevcli.synth.ground_plan import GroundPlan
-from bevcli.synth.ground_texture import GroundTexture, paint_ground
-from bevcli.synth.renderer import Exposure, Moment, expose
+from bevcli.synth.render.ground_texture import GroundTexture, paint_ground
+from bevcli.synth.render.renderer import Exposure, Moment, expose
+from bevcli.synth.render.shading import ShadowMap
+from bevcli.synth.render.shadows import shadow_map, with_more
+from bevcli.synth.render.triangles import Run, Shape, Soup, gather, joined_soup, place
 from bevcli.synth.rig import nuscenes_like_rig
-from bevcli.synth.scenery import Furnishings, Scenery
-from bevcli.synth.shading import ShadowMap
-from bevcli.synth.shadows import shadow_map, with_more
-from bevcli.synth.simulation import Simulation
-from bevcli.synth.street_signals import signal_runs
-from bevcli.synth.triangles import Run, Shape, Soup, gather, joined_soup, place
-from bevcli.synth.weather import WEATHER_NAMES, Weather, make_weather
+from bevcli.synth.world.actors import Actor, Body, State
+from bevcli.synth.world.city import CityPlan
+from bevcli.synth.world.ground_plan import GroundPlan
+from bevcli.synth.world.scenery import Furnishings, Scenery
+from bevcli.synth.world.simulation import Simulation
+from bevcli.synth.world.street_signals import signal_runs
+from bevcli.synth.world.weather import WEATHER_NAMES, Weather, make_weather
 
 ANNOTATED_M = 60.0  # boxes are kept within this distance of the bev frame's origin
 SEEN_M = 66.0  # actors are drawn within this distance

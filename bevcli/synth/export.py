@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from bevcli.frame import Frame, Picture
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.sequences.ego_motion_file import write_ego_motion
-from bevcli.sequences.native_writer import NativeWriter
+from bevcli.sequences.native.ego_motion_file import write_ego_motion
+from bevcli.sequences.native.writer import NativeWriter
 from bevcli.synth.drive import Drive, RenderedFrame
 
 JPEG_QUALITY = 90

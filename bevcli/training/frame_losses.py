@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from bevcli.model.bevformer import BEVFormer, BEVFormerInputs, BEVFormerOutputs
 from bevcli.training.dense_loss import DenseLossConfig, DenseReader, dense_loss
 from bevcli.training.detection_loss import DetectionLossConfig, detection_loss
-from bevcli.training.picture_loss import PictureLossConfig, PictureReader, picture_loss
+from bevcli.training.image_loss import PictureLossConfig, PictureReader, picture_loss
 from bevcli.training.samples import Targets
 from bevcli.training.segmentation_loss import SegmentationLossConfig, segmentation_loss
 

@@ -14,16 +14,16 @@ from torch import Tensor, nn
 
 from bevcli.errors import BevcliError
 from bevcli.model.bevformer import BEVFormer
-from bevcli.model.inference import choose_kernels
+from bevcli.model.prepared import choose_kernels
 from bevcli.pipeline.model_loading import choose_precision
 from bevcli.pipeline.read_ahead import read_ahead
 from bevcli.pipeline.runner import Runner, StepOptions
 from bevcli.training.augmentation import AugmentationConfig
 from bevcli.training.checkpoint import load_checkpoint, save_checkpoint, save_weights
 from bevcli.training.clips import ClipConfig, draw_clips
-from bevcli.training.curves import Curve, draw
 from bevcli.training.drives import Drives
 from bevcli.training.frame_losses import FrameLosses, LossConfigs
+from bevcli.training.learning_curves import Curve, draw
 from bevcli.training.optimizer import OptimizerConfig, clip_gradients, make_optimizer, set_rate
 from bevcli.training.recurrent_clip import forward_clip
 from bevcli.training.samples import Batch, load_batch

@@ -13,12 +13,12 @@ import pytest
 import torch
 from memory_drive import MemorySequence, WithoutPictures
 
-from bevcli.cli.run_job import Job, run_job
 from bevcli.errors import OutputError
 from bevcli.pipeline.model_loading import LoadedModel
+from bevcli.pipeline.run_job import Job, run_job
 from bevcli.pipeline.runner import StepOptions
-from bevcli.sequences.boxes_file import read_boxes
-from bevcli.viz.options import RecordingOptions
+from bevcli.recording.options import RecordingOptions
+from bevcli.sequences.files.boxes_file import read_boxes
 
 SAMPLE = Path(__file__).parents[2] / "samples/street"
 MINI_TOML = """

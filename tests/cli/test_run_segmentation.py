@@ -5,13 +5,13 @@ from dataclasses import replace
 import torch
 from memory_drive import MemorySequence
 
-from bevcli.cli.run_job import Job, run_job
 from bevcli.frame import MAP_CLASSES
 from bevcli.model.bevformer import BEVFormer
 from bevcli.pipeline.model_loading import LoadedModel
+from bevcli.pipeline.run_job import Job, run_job
 from bevcli.pipeline.runner import StepOptions
-from bevcli.sequences.map_file import open_maps
-from bevcli.viz.options import RecordingOptions
+from bevcli.recording.options import RecordingOptions
+from bevcli.sequences.files.map_file import open_maps
 
 
 def run(config, out, frames, *, force=False):

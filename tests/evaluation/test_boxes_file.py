@@ -13,7 +13,7 @@ from bevcli.errors import InputError, OutputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
-from bevcli.sequences.boxes_file import BoxesWriter, FrameBoxes, read_boxes
+from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes, read_boxes
 
 POSE = Pose(np.array([600.25, -3.5, 0.125]), np.array([-0.6, 0.0, 0.0, 0.8]))
 

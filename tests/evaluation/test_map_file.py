@@ -11,7 +11,7 @@ import pytest
 
 from bevcli.errors import InputError
 from bevcli.frame import BevMap
-from bevcli.sequences.map_file import open_maps, write_map
+from bevcli.sequences.files.map_file import open_maps, write_map
 
 MAP = BevMap(np.arange(12, dtype=np.uint8).reshape(3, 4), (-32.0, 32.0), (-24.0, 24.0))
 

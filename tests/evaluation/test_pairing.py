@@ -16,7 +16,7 @@ from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.transforms import Pose, inverse, rigid, rotation_about_z
-from bevcli.sequences.boxes_file import BoxesFile, FrameBoxes
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 
 TRUTH = random_truth(11, frames=4)
 PREDICTIONS = as_predictions(TRUTH, 12, noise_m=0.5, false_per_frame=10)

@@ -17,7 +17,7 @@ from bevcli.frame import FrameStamp
 from bevcli.geometry.attributes import attributes_by_speed
 from bevcli.geometry.boxes import CLASSES, Boxes3D
 from bevcli.geometry.transforms import Pose, yaw_of_quaternion
-from bevcli.sequences.boxes_file import BoxesFile, FrameBoxes
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 
 ALLOWED_ATTRIBUTES = {
     "pedestrian": {"pedestrian.moving", "pedestrian.sitting_lying_down", "pedestrian.standing"},

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-import bevcli.model.deformable_convolution_compiled as compiled
+import bevcli.model.kernels.compiled_convolution as compiled
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 
 

@@ -9,7 +9,7 @@ import torch
 from small_model import small_inputs, small_model
 
 from bevcli.model.bevformer import BEVFormer, BEVFormerOutputs
-from bevcli.model.inference import prepare_for_inference, textbook_version
+from bevcli.model.prepared import prepare_for_inference, textbook_version
 
 CPU = torch.device("cpu")
 

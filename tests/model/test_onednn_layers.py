@@ -7,10 +7,10 @@ import torch
 from small_model import small_inputs, small_model
 from torch import nn
 
-from bevcli.model import onednn_layers
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
-from bevcli.model.inference import prepare_for_inference
-from bevcli.model.onednn_layers import FusedBottleneck, PackedLinear, has_onednn, use_onednn
+from bevcli.model.kernels import onednn as onednn_layers
+from bevcli.model.kernels.onednn import FusedBottleneck, PackedLinear, has_onednn, use_onednn
+from bevcli.model.prepared import prepare_for_inference
 from bevcli.model.resnet import Bottleneck
 
 pytestmark = pytest.mark.skipif(not has_onednn(torch.float32), reason="this build of PyTorch has no oneDNN")

@@ -10,7 +10,7 @@ import torch
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.bevformer import BEVFormer, BEVFormerOutputs
 from bevcli.model.box_coding import decode
-from bevcli.model.inference import prepare_for_inference
+from bevcli.model.prepared import prepare_for_inference
 
 CPU = torch.device("cpu")
 pytestmark = pytest.mark.slow

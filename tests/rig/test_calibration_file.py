@@ -9,9 +9,9 @@ from healthy_rigs import HEALTHY, copy_of
 from scipy.spatial.transform import Rotation
 
 from bevcli.errors import InputError, OutputError
+from bevcli.findings import errors_of
 from bevcli.geometry.cameras import CameraRig
-from bevcli.geometry.rig_findings import errors_of
-from bevcli.sequences.calibration import draft_calibration, read_calibration, write_calibration
+from bevcli.sequences.native.calibration import draft_calibration, read_calibration, write_calibration
 
 
 def written(document, folder):

@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
-from bevcli.geometry.rig_motion_checks import check_ego_motion
-from bevcli.geometry.rig_time_checks import check_camera_times
-from bevcli.sequences.ego_motion_file import read_ego_motion
+from bevcli.rig.motion_checks import check_ego_motion
+from bevcli.rig.time_checks import check_camera_times
+from bevcli.sequences.native.ego_motion_file import read_ego_motion
 
 
 def drive(speed=8.0, seconds=20.0, rate=20.0, start_yaw=0.7, turn=0.05, place=(600.0, 1600.0, 0.0)) -> EgoMotion:

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError
-from bevcli.viz.screenshot import take_screenshot
+from bevcli.viewer.screenshot import take_screenshot
 
 FILES = {"cameras.png", "coverage.png", "recording.rrd", "findings.json"}
 

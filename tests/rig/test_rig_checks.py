@@ -7,9 +7,9 @@ import pytest
 from healthy_rigs import AHEAD, HEALTHY, SIX, copy_of
 from scipy.spatial.transform import Rotation
 
-from bevcli.geometry.rig_checks import check_rig
-from bevcli.geometry.rig_findings import errors_of
-from bevcli.sequences.calibration import draft_calibration
+from bevcli.findings import errors_of
+from bevcli.rig.checks import check_rig
+from bevcli.sequences.native.calibration import draft_calibration
 
 ALL = tuple(SIX["cameras"])
 

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 from bevcli.cli.main import app
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import BevMap
-from bevcli.sequences.map_file import write_map
-from bevcli.sequences.native_writer import NativeWriter
+from bevcli.sequences.files.map_file import write_map
+from bevcli.sequences.native.writer import NativeWriter
 from bevcli.sequences.open import InputOptions, open_sequence
 
 

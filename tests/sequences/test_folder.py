@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bevcli.sequences.folder import FolderSequence
+from bevcli.sequences.native.folder import FolderSequence
 from bevcli.sequences.open import InputOptions, open_sequence
 
 

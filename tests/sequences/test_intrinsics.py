@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bevcli.errors import InputError
-from bevcli.sequences.intrinsics import read_rig
+from bevcli.sequences.files.intrinsics import read_rig
 
 KALIBR = """
 cam0:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from bevcli.geometry.cameras import CameraRig
-from bevcli.sequences.folder import FolderSequence
-from bevcli.sequences.native_writer import NativeWriter
+from bevcli.sequences.native.folder import FolderSequence
+from bevcli.sequences.native.writer import NativeWriter
 from bevcli.sequences.open import InputOptions, open_sequence
 
 

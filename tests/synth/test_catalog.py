@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from bevcli.geometry.boxes import CLASSES
-from bevcli.synth.actors import draw_body
+from bevcli.synth.assets.paint import linear
 from bevcli.synth.drive import Stock
-from bevcli.synth.palette import linear
+from bevcli.synth.world.actors import draw_body
 
 VEHICLES = ("car", "truck", "construction_vehicle", "bus", "trailer", "motorcycle", "bicycle")
 # Shortest and longest length, width and height in metres that the class may have.

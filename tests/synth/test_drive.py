@@ -8,9 +8,9 @@ import pytest
 
 from bevcli.geometry.boxes import CLASSES
 from bevcli.geometry.transforms import inverse, wrap_angle
-from bevcli.synth.actors import State
 from bevcli.synth.drive import ANNOTATED_M, Drive, RenderedFrame, Stock
 from bevcli.synth.rig import nuscenes_like_rig
+from bevcli.synth.world.actors import State
 
 
 def test_same_seed_gives_the_same_bytes(drive: Drive, frame: RenderedFrame, stock: Stock):

@@ -11,7 +11,7 @@ from bevcli.checkpoints import bundled_weights
 from bevcli.config import load_config, load_training
 from bevcli.errors import WeightsError
 from bevcli.model.bevformer import BEVFormer
-from bevcli.model.inference import prepare_for_inference
+from bevcli.model.prepared import prepare_for_inference
 from bevcli.pipeline.model_loading import load_model
 from bevcli.pipeline.runner import Runner
 from bevcli.training.drives import FolderDrives

@@ -10,7 +10,7 @@ import torch
 from bevcli.model.bevformer import BEVFormerInputs
 from bevcli.training.detection_loss import DetectionLossConfig
 from bevcli.training.detection_targets import DetectionTargets
-from bevcli.training.picture_loss import PictureLossConfig, PictureReader, _taught_pixels, picture_loss
+from bevcli.training.image_loss import PictureLossConfig, PictureReader, _taught_pixels, picture_loss
 
 SIZE, SHAPE = (224, 384), (28, 48)  # a picture, and its features at stride 8
 INTRINSICS = torch.tensor([[200.0, 0, 192, 0], [0, 200, 112, 0], [0, 0, 1, 0], [0, 0, 0, 1]])

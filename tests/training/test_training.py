@@ -19,8 +19,8 @@ from bevcli.training.checkpoint import save_checkpoint
 from bevcli.training.clips import ClipConfig
 from bevcli.training.dense_loss import DenseLossConfig
 from bevcli.training.drives import RenderedDrives
+from bevcli.training.image_loss import PictureLossConfig
 from bevcli.training.optimizer import OptimizerConfig, make_optimizer, set_rate
-from bevcli.training.picture_loss import PictureLossConfig
 from bevcli.training.trainer import Trainer, TrainingConfig, TrainingJob, _in_turn
 
 SHORT = TrainingConfig(

@@ -1,0 +1,78 @@
+"""BEV maps into a recording: features on the ground and seen from above, segmentation, history, probed cells."""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from bevcli.frame import MAP_CLASSES, BevMap, Probe
+from bevcli.geometry.bev_grid import BevGrid
+from bevcli.geometry.transforms import Array, apply
+from bevcli.recording import entities
+from bevcli.recording.colors import MAP_COLORS, colormap
+
+GROUND_OPACITY = 110  # of 255: boxes, rings and the trajectory stay readable on the map
+BELOW_GROUND_M = 0.06  # so that the map does not flicker with what lies on the ground
+
+
+def log_features(stream: rr.RecordingStream, picture: NDArray[np.uint8], grid: BevGrid, ego_from_bev: Array) -> None:
+    """Writes a picture (rows, columns, 3) of the BEV features, the largest y on top, on the ground and from above."""
+    stream.log(
+        entities.BEV_FEATURES, rr.Image(picture, draw_order=-10), _placed(picture, grid.x_range_m, grid.y_range_m)
+    )
+    quad = rr.Mesh3D(
+        vertex_positions=_ground_corners(grid, ego_from_bev),
+        triangle_indices=[[0, 1, 2], [0, 2, 3]],
+        vertex_texcoords=[[0, 1], [1, 1], [1, 0], [0, 0]],
+        albedo_texture=picture,
+        albedo_factor=[255, 255, 255, GROUND_OPACITY],
+    )
+    stream.log(entities.BEV_ON_GROUND, quad)
+
+
+def log_segmentation(stream: rr.RecordingStream, segmentation: BevMap) -> None:
+    """Writes what lies on the ground, in the classes' colours."""
+    colors = np.zeros((*segmentation.cells.shape, 3), dtype=np.uint8)
+    for name, bit in MAP_CLASSES.items():  # later classes lie on top of earlier ones
+        colors[(segmentation.cells & bit) > 0] = MAP_COLORS[name]
+    image = rr.Image(colors, draw_order=-5)
+    stream.log(entities.BEV_SEGMENTATION, image, _placed(colors, segmentation.x_range_m, segmentation.y_range_m))
+
+
+def log_history(stream: rr.RecordingStream, weight: Array | None, grid: BevGrid) -> None:
+    """Writes how much each cell (rows, columns) took from history, 0 to 1; without history the map is taken away."""
+    if weight is None:
+        stream.log(entities.BEV_HISTORY, rr.Clear(recursive=False))
+        return
+    picture = colormap(weight[::-1], "viridis")
+    stream.log(entities.BEV_HISTORY, rr.Image(picture, draw_order=-8), _placed(picture, grid.x_range_m, grid.y_range_m))
+
+
+def log_probes(stream: rr.RecordingStream, probes: tuple[Probe, ...], ego_from_bev: Array, grid: BevGrid) -> None:
+    """Marks the probed cells: a dot from above, a pillar in the scene."""
+    if not probes:
+        return
+    centers = np.array([probe.cell_center for probe in probes])
+    radius = rr.Radius.ui_points(5.0)
+    dots = rr.Points2D(centers * (1, -1), colors=[255, 80, 220], radii=radius, draw_order=50)
+    stream.log(entities.BEV_PROBES, dots)
+    low, high = grid.pillar_heights()[[0, -1]]
+    ends = np.stack([np.column_stack([centers, np.full(len(centers), z)]) for z in (low, high)], axis=1)
+    stream.log(
+        entities.PROBES,
+        rr.LineStrips3D(apply(ego_from_bev, ends).astype(np.float32), colors=[255, 80, 220], radii=0.05),
+    )
+
+
+def _placed(picture: NDArray[np.uint8], x_range: tuple[float, float], y_range: tuple[float, float]) -> rr.Transform3D:
+    rows, columns = picture.shape[:2]
+    cell = [(x_range[1] - x_range[0]) / columns, (y_range[1] - y_range[0]) / rows, 1.0]
+    return rr.Transform3D(translation=[x_range[0], -y_range[1], 0], scale=cell)
+
+
+def _ground_corners(grid: BevGrid, ego_from_bev: Array) -> Array:
+    (x0, x1), (y0, y1) = grid.x_range_m, grid.y_range_m
+    corners = apply(ego_from_bev, [[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0]])
+    corners[:, 2] = -BELOW_GROUND_M
+    return corners

@@ -1,0 +1,124 @@
+"""Boxes into a recording: in the 3D scene and in the BEV view; ground truth apart from predictions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.transforms import Array
+from bevcli.recording import entities
+from bevcli.recording.colors import FALSE_COLOR, GROUND_TRUTH_COLOR, MISSED_COLOR, class_color
+from bevcli.recording.labels import labels_in_scene
+
+MOVING_M_S = 0.5  # slower things get no velocity arrow
+THIN, THICK = rr.Radius.ui_points(0.8), rr.Radius.ui_points(1.6)
+
+
+def box_colors(boxes: Boxes3D, class_names: Sequence[str]) -> np.ndarray:
+    """(N, 3) uint8, the colours of the boxes' classes."""
+    places = {name: place for place, name in enumerate(class_names)}
+    colors = {name: class_color(name, places.get(name, len(places))) for name in np.unique(boxes.classes)}
+    return np.array([colors[name] for name in boxes.classes], dtype=np.uint8).reshape(-1, 3)
+
+
+def log_boxes_3d(
+    stream: rr.RecordingStream, boxes: Boxes3D, false: np.ndarray, class_names: Sequence[str], ego_xy: Array
+) -> None:
+    """Writes predicted boxes of the recording's world; `false` (N,) crosses out those that no ground truth has."""
+    ids = [1 + list(class_names).index(name) if name in class_names else 0 for name in boxes.classes]
+    labels = labels_in_scene(boxes, ego_xy)
+    archetype = rr.Boxes3D(**_shape(boxes), class_ids=ids, labels=labels, show_labels=True, radii=THICK)
+    facts = rr.AnyValues(
+        score=np.ones(len(boxes)) if boxes.scores is None else boxes.scores,
+        velocity_x=boxes.velocities[:, 0],
+        velocity_y=boxes.velocities[:, 1],
+        name=_names(boxes),
+    )
+    stream.log(entities.BOXES, archetype, facts)
+    moving = np.linalg.norm(boxes.velocities, axis=-1) > MOVING_M_S
+    arrows = rr.Arrows3D(
+        vectors=np.column_stack([boxes.velocities[moving], np.zeros(moving.sum())]),
+        origins=boxes.centers[moving],
+        colors=box_colors(boxes[moving], class_names),
+        radii=rr.Radius.ui_points(1.2),
+    )
+    stream.log(entities.VELOCITY, arrows)
+    stream.log(
+        entities.FALSE_BOXES,
+        rr.LineStrips3D(_crosses(boxes[false]).astype(np.float32), colors=FALSE_COLOR, radii=THICK),
+    )
+
+
+def log_ground_truth_3d(stream: rr.RecordingStream, truth: Boxes3D, found: np.ndarray) -> None:
+    """Writes ground-truth boxes of the recording's world: pale where found (M,), red where missed."""
+    pale = rr.Boxes3D(**_shape(truth[found]), colors=[*GROUND_TRUTH_COLOR, 150], radii=THIN)
+    stream.log(entities.GROUND_TRUTH, pale, rr.AnyValues(name=_names(truth[found])))
+    missed = truth[~found]
+    red = rr.Boxes3D(**_shape(missed), colors=MISSED_COLOR, radii=THIN)
+    stream.log(entities.MISSED, red, rr.AnyValues(name=_names(missed)))
+
+
+def log_boxes_bev(stream: rr.RecordingStream, boxes: Boxes3D, false: np.ndarray, class_names: Sequence[str]) -> None:
+    """Writes predicted boxes of the bev frame, seen from above."""
+    colors = box_colors(boxes, class_names)
+    outlines, headings = footprints(boxes)
+    strips = [*outlines, *headings]
+    doubled = np.concatenate([colors, colors])
+    stream.log(entities.BEV_BOXES, rr.LineStrips2D(strips, colors=doubled, radii=THICK, draw_order=30))
+    moving = np.linalg.norm(boxes.velocities, axis=-1) > MOVING_M_S
+    arrows = rr.Arrows2D(
+        vectors=boxes.velocities[moving] * (1, -1),
+        origins=boxes.centers[moving, :2] * (1, -1),
+        colors=colors[moving],
+        radii=rr.Radius.ui_points(1.0),
+        draw_order=31,
+    )
+    stream.log(entities.BEV_VELOCITY, arrows)
+    crosses = (_crosses(boxes[false])[..., :2] * (1, -1)).astype(np.float32)
+    stream.log(entities.BEV_FALSE, rr.LineStrips2D(crosses, colors=FALSE_COLOR, radii=THIN, draw_order=32))
+
+
+def log_ground_truth_bev(stream: rr.RecordingStream, truth: Boxes3D, found: np.ndarray) -> None:
+    """Writes ground-truth boxes of the bev frame, seen from above."""
+    for entity, part, color in (
+        (entities.BEV_GROUND_TRUTH, truth[found], GROUND_TRUTH_COLOR),
+        (entities.BEV_MISSED, truth[~found], MISSED_COLOR),
+    ):
+        outlines, headings = footprints(part)
+        strips = [*outlines, *headings]
+        stream.log(entity, rr.LineStrips2D(strips, colors=[*color, 200], radii=THIN, draw_order=20))
+
+
+def footprints(boxes: Boxes3D) -> tuple[Array, Array]:
+    """Boxes seen from above in the flat bev picture: closed outlines (N, 5, 2), and lines to the front (N, 2, 2)."""
+    ground = boxes.corners()[:, :4, :2] * (1, -1)
+    outlines = np.concatenate([ground, ground[:, :1]], axis=1)
+    front = (ground[:, 0] + ground[:, 3]) / 2
+    return outlines, np.stack([ground.mean(1), front], axis=1)
+
+
+def _shape(boxes: Boxes3D) -> dict[str, Any]:
+    halves = boxes.yaws / 2
+    zeros = np.zeros(len(boxes))
+    quaternions = np.stack([zeros, zeros, np.sin(halves), np.cos(halves)], axis=-1)  # rerun's order is x, y, z, w
+    return {
+        "centers": boxes.centers,
+        "half_sizes": boxes.sizes_lwh / 2,
+        "quaternions": quaternions,
+        "fill_mode": "majorwireframe",
+    }
+
+
+def _names(boxes: Boxes3D) -> pa.Array:
+    return pa.array([str(name) for name in boxes.classes], pa.utf8())  # typed, so that no boxes are a value, too
+
+
+def _crosses(boxes: Boxes3D) -> Array:
+    """(2 N, 2, 3) the diagonals of the boxes' tops."""
+    tops = boxes.corners()[:, 4:]
+    return tops[:, [[0, 2], [1, 3]]].reshape(-1, 2, 3)

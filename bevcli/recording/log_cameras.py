@@ -1,0 +1,124 @@
+"""One camera's frame into a recording: its pose, its picture, and what is drawn into it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import rerun as rr
+
+from bevcli.frame import CameraSamples, Picture
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.cameras import Camera
+from bevcli.geometry.transforms import Array, apply, inverse
+from bevcli.recording import entities
+from bevcli.recording.box_lines import lines_in_picture
+from bevcli.recording.colors import GROUND_TRUTH_COLOR, MISSED_COLOR, colormap
+from bevcli.recording.labels import box_labels, labels_in_picture
+from bevcli.recording.log_boxes import box_colors
+
+JPEG_QUALITY = 85  # of pictures that come without bytes of their own, as a video's do
+POINT = rr.Radius.ui_points(2.0)
+
+
+@dataclass(frozen=True)
+class CameraShot:
+    """One camera at its picture's time. world_from_camera: (4, 4), of the recording's world."""
+
+    camera: Camera
+    world_from_camera: Array
+
+    @property
+    def camera_from_world(self) -> Array:
+        """(4, 4)."""
+        return inverse(self.world_from_camera)
+
+
+def log_picture(stream: rr.RecordingStream, shot: CameraShot, picture: Picture | None) -> None:
+    """Writes the pose and the picture's own bytes; where there is no picture, the last one is taken away."""
+    entity = entities.camera(shot.camera.name)
+    pose = shot.world_from_camera
+    stream.log(entity, rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
+    if picture is None:
+        stream.log(entities.picture(shot.camera.name), rr.Clear(recursive=False))
+        return
+    contents, media_type = _encoded(picture)
+    stream.log(entities.picture(shot.camera.name), rr.EncodedImage(contents=contents, media_type=media_type))
+
+
+def log_boxes_in_picture(
+    stream: rr.RecordingStream, shot: CameraShot, boxes: Boxes3D, class_names: Sequence[str]
+) -> None:
+    """Writes the lines and labels of predicted boxes, given in the recording's world."""
+    name = shot.camera.name
+    lines = lines_in_picture(boxes, shot.camera, shot.camera_from_world)
+    colors = box_colors(boxes, class_names)
+    stream.log(
+        entities.overlay(name, "boxes"),
+        rr.LineStrips2D(
+            lines.segments.astype(np.float32),
+            colors=colors[lines.owners],
+            radii=rr.Radius.ui_points(1.0),
+            draw_order=30,
+        ),
+    )
+    texts = box_labels(boxes)
+    places, owners = labels_in_picture(lines, texts, shot.camera.width, shot.camera.height)
+    labels = rr.Points2D(
+        places,
+        labels=[texts[owner] for owner in owners],
+        colors=colors[owners],
+        radii=rr.Radius.ui_points(0.01),
+        show_labels=True,
+        draw_order=31,
+    )
+    stream.log(entities.overlay(name, "boxes/labels"), labels)
+
+
+def log_ground_truth_in_picture(
+    stream: rr.RecordingStream, shot: CameraShot, truth: Boxes3D, found: np.ndarray
+) -> None:
+    """Writes the lines of ground-truth boxes, given in the recording's world: pale where found, red where missed."""
+    lines = lines_in_picture(truth, shot.camera, shot.camera_from_world)
+    colors = np.where(found[:, None], GROUND_TRUTH_COLOR, MISSED_COLOR).astype(np.uint8).reshape(-1, 3)
+    stream.log(
+        entities.overlay(shot.camera.name, "ground_truth"),
+        rr.LineStrips2D(
+            lines.segments.astype(np.float32),
+            colors=colors[lines.owners],
+            radii=rr.Radius.ui_points(0.6),
+            draw_order=20,
+        ),
+    )
+
+
+def log_pillar_hits(stream: rr.RecordingStream, shot: CameraShot, points_world: Array, colors: np.ndarray) -> None:
+    """Writes where 3D reference points (K, 3) of the recording's world land in the picture. colors: (K, 3) uint8."""
+    pixels, depth = shot.camera.project(apply(shot.camera_from_world, points_world))
+    hits = shot.camera.contains(pixels, depth)
+    points = rr.Points2D(pixels[hits], colors=colors[hits], radii=POINT, draw_order=10)
+    stream.log(entities.overlay(shot.camera.name, "pillars"), points)
+
+
+def log_samples(stream: rr.RecordingStream, shot: CameraShot, samples: Sequence[CameraSamples]) -> None:
+    """Writes the points that spatial cross-attention sampled in this picture: larger and brighter by weight."""
+    pixels = np.concatenate([np.zeros((0, 2)), *(s.pixels for s in samples)])
+    weights = np.concatenate([np.zeros(0), *(s.weights for s in samples)])
+    inside = shot.camera.contains(pixels, np.ones(len(pixels)))
+    shares = weights[inside] / max(float(weights.max(initial=0.0)), 1e-9)
+    points = rr.Points2D(
+        pixels[inside],
+        colors=colormap(0.25 + 0.75 * shares, "plasma"),
+        radii=rr.Radius.ui_points(1.5 + 5.0 * np.sqrt(shares)),
+        draw_order=40,
+    )
+    stream.log(entities.overlay(shot.camera.name, "probes"), points)
+
+
+def _encoded(picture: Picture) -> tuple[bytes, str]:
+    if picture.encoded is not None and picture.media_type is not None:
+        return picture.encoded, picture.media_type
+    _, data = cv2.imencode(".jpg", picture.pixels_bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return data.tobytes(), "image/jpeg"

@@ -1,0 +1,137 @@
+"""A camera's picture with what its calibration says: pillars, ground grid, horizon. Drawn at the size of display."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.geometry.bev_grid import BevGrid
+from bevcli.geometry.cameras import Camera
+from bevcli.geometry.transforms import Array, apply
+from bevcli.recording.colors import Color, colormap
+from bevcli.rig.coverage import pillar_pixels
+from bevcli.rig.pose import horizon
+
+GRID_STEP_M, GRID_REACH_M = 5.0, 30.0
+PILLAR_LINES_M = 25.0  # farther pillars stand so close that their lines would hide the picture
+PILLAR_GRID = BevGrid(rows=20, columns=20)  # one pillar every 5.12 m: more would hide the picture
+LABELLED_M = (5.0, 10.0, 20.0, 40.0)
+GROUND: Color = (120, 205, 140)
+HORIZON: Color = (255, 214, 64)
+PILLAR: Color = (235, 238, 245)
+BACKDROP: Color = (44, 49, 58)
+Picture = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class PillarPoints:
+    """What of the pillars a camera sees: pixels (M, 2), distances (M,) in metres, colours (M, 3) RGB by height."""
+
+    pixels: Array
+    distances: Array
+    colors: NDArray[np.uint8]
+
+
+def pillars_in(camera: Camera, ego_from_bev: Array, grid: BevGrid = PILLAR_GRID) -> PillarPoints:
+    """The pillars' points that lie in the camera's picture, the farthest first."""
+    points = apply(ego_from_bev, grid.pillars()).reshape(-1, 3)
+    pixels = pillar_pixels(camera, points)
+    distances = np.linalg.norm(points - camera.ego_from_camera[:3, 3], axis=1)
+    colors = np.tile(height_colors(grid), (grid.rows * grid.columns, 1))
+    order = np.argsort(-distances)
+    order = order[np.isfinite(pixels[order]).all(-1)]
+    return PillarPoints(pixels[order], distances[order], colors[order])
+
+
+def height_colors(grid: BevGrid) -> NDArray[np.uint8]:
+    """(Z, 3) RGB of the heights of a pillar's points, the lowest first."""
+    return colormap(np.linspace(0.12, 0.9, grid.pillar_points), "turbo")
+
+
+def ground_lines(camera: Camera) -> list[Array]:
+    """Lines (P, 2) in pixels of a 5 m grid on the ground around the ego origin, where they are near the picture."""
+    along = np.arange(-GRID_REACH_M, GRID_REACH_M + 0.05, 0.1)
+    lines: list[Array] = []
+    for offset in np.arange(-GRID_REACH_M, GRID_REACH_M + 0.1, GRID_STEP_M):
+        across, flat = np.full_like(along, offset), np.zeros_like(along)
+        for line in (np.stack([along, across, flat], axis=-1), np.stack([across, along, flat], axis=-1)):
+            lines += visible_runs(_near_picture(camera, line))
+    return lines
+
+
+def pillar_lines(camera: Camera, ego_from_bev: Array, grid: BevGrid = PILLAR_GRID) -> list[Array]:
+    """Lines (P, 2) in pixels from the lowest to the highest point of each pillar nearer than 25 m."""
+    pillars = grid.pillars().reshape(-1, grid.pillar_points, 3)
+    low, high = pillars[:, :1], pillars[:, -1:]
+    points = apply(ego_from_bev, low + np.linspace(0, 1, 24)[:, None] * (high - low))  # (Y X, 24, 3)
+    near = np.linalg.norm(points[:, 0, :2] - camera.ego_from_camera[:2, 3], axis=-1) < PILLAR_LINES_M
+    return [run for line in points[near] for run in visible_runs(_near_picture(camera, line))]
+
+
+def _near_picture(camera: Camera, points_ego: Array) -> Array:
+    """Pixels (P, 2) of points (P, 3), NaN a picture's size outside: what is drawn is clipped to the picture anyway."""
+    pixels, depth = camera.project_ego(points_ego)
+    size = np.array([camera.width, camera.height])
+    with np.errstate(invalid="ignore"):
+        near = ((pixels > -size) & (pixels < 2 * size)).all(-1) & (depth > 0.1)
+    return np.where(near[:, None], pixels, np.nan)
+
+
+def visible_runs(pixels: Array) -> list[Array]:
+    """A line (P, 2) cut where it has NaN: its parts of two points or more."""
+    seen = np.isfinite(pixels).all(-1)
+    cuts = np.flatnonzero(np.diff(seen.astype(int))) + 1
+    return [run for run in np.split(pixels, cuts) if len(run) > 1 and np.isfinite(run).all()]
+
+
+def draw_overlay(camera: Camera, ego_from_bev: Array, picture_bgr: Picture | None, width: int) -> Picture:
+    """The camera's picture (H, W, 3) BGR, or a dark one without picture, resized to `width`, with the overlay; RGB."""
+    shown = camera.scaled(width / camera.width)
+    if picture_bgr is None:
+        canvas = np.full((shown.height, shown.width, 3), BACKDROP, dtype=np.uint8)
+    else:
+        resized = cv2.resize(picture_bgr, (shown.width, shown.height), interpolation=cv2.INTER_AREA)
+        canvas = (resized[..., ::-1] * 0.85).astype(np.uint8)  # a little darker, so that the overlay stands out
+    _draw_lines(canvas, ground_lines(shown), GROUND, 0.55)
+    _draw_lines(canvas, visible_runs(horizon(shown)), HORIZON, 0.9, thickness=2)
+    _draw_lines(canvas, pillar_lines(shown, ego_from_bev), PILLAR, 0.35)
+    _draw_pillars(canvas, pillars_in(shown, ego_from_bev))
+    _draw_distances(canvas, shown)
+    return canvas
+
+
+def _draw_lines(canvas: Picture, lines: list[Array], color: Color, opacity: float, thickness: int = 1) -> None:
+    layer = canvas.copy()
+    cv2.polylines(
+        layer, [np.round(line * 16).astype(np.int32) for line in lines], False, color, thickness, cv2.LINE_AA, 4
+    )
+    cv2.addWeighted(layer, opacity, canvas, 1 - opacity, 0, dst=canvas)
+
+
+def _draw_pillars(canvas: Picture, points: PillarPoints) -> None:
+    scale = canvas.shape[1] / 800
+    for pixel, distance, color in zip(points.pixels, points.distances, points.colors, strict=True):
+        radius = float(np.clip(60 / distance, 1.2, 6)) * scale
+        center = tuple(np.round(pixel * 16).astype(int).tolist())
+        cv2.circle(canvas, center, round(radius * 16), color.tolist(), -1, cv2.LINE_AA, 4)
+
+
+def _draw_distances(canvas: Picture, camera: Camera) -> None:
+    """How far the ground is along the viewing direction, where the labels have room."""
+    ahead = np.array([np.cos(camera.yaw), np.sin(camera.yaw), 0.0])
+    start = camera.ego_from_camera[:3, 3] * [1, 1, 0]
+    last = np.inf
+    for distance in LABELLED_M:
+        pixel = pillar_pixels(camera, start + distance * ahead)
+        if np.isfinite(pixel).all() and last - pixel[1] > 22:
+            last = float(pixel[1])
+            _label(canvas, f"{distance:g} m", (round(pixel[0]), round(pixel[1])))
+
+
+def _label(canvas: Picture, text: str, place: tuple[int, int]) -> None:
+    font, size = cv2.FONT_HERSHEY_SIMPLEX, 0.5 * canvas.shape[1] / 800
+    for color, thickness in (((10, 12, 16), 4), ((240, 244, 248), 1)):
+        cv2.putText(canvas, text, place, font, size, color, thickness, cv2.LINE_AA)

@@ -1,0 +1,1 @@
+"""Single files that several formats share: boxes, maps, poses, intrinsics."""

@@ -1,0 +1,86 @@
+"""ego_motion.csv: where the vehicle was, as rows of world_from_ego, with what its sensors said."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.errors import InputError
+from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
+from bevcli.geometry.transforms import Array
+from bevcli.sequences.native.csv_table import CsvRow, CsvTable, read_csv
+
+TRANSLATION = ("x", "y", "z")
+QUATERNION = ("qw", "qx", "qy", "qz")
+ACCELERATION = ("ax", "ay", "az")
+ANGULAR_RATE = ("wx", "wy", "wz")
+VELOCITY = ("vx", "vy", "vz")
+NORM_TOLERANCE = 1e-3  # how far a quaternion's norm may be from 1 before it is taken for a mistake
+
+
+def read_ego_motion(path: Path) -> EgoMotion:
+    """Read world_from_ego at T times; accelerations, angular rates and velocities that are not there are derived.
+
+    Raises InputError where a column or cell is wrong, times do not increase, or a quaternion is no rotation.
+    """
+    required = ("timestamp_ns", *TRANSLATION, *QUATERNION)
+    table = read_csv(path, required, (*ACCELERATION, *ANGULAR_RATE, *VELOCITY))
+    times = _times(table)
+    translations = _columns(table, TRANSLATION)
+    quaternions = np.stack([_quaternion(row) for row in table.rows])
+    derived = derive_kinematics(times, translations, quaternions)
+    stated = [_group(table, names) for names in (ACCELERATION, ANGULAR_RATE, VELOCITY)]
+    kinematics = [from_poses if own is None else own for own, from_poses in zip(stated, derived, strict=True)]
+    return EgoMotion(times, translations, quaternions, *kinematics)
+
+
+def write_ego_motion(path: Path, ego_motion: EgoMotion) -> None:
+    """Write all columns, so that `read_ego_motion` gives the same numbers back."""
+    columns = (
+        ego_motion.translations,
+        ego_motion.quaternions,
+        ego_motion.accelerations,
+        ego_motion.angular_rates,
+        ego_motion.velocities,
+    )
+    numbers = np.concatenate(columns, axis=1)  # (T, 16)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["timestamp_ns", *TRANSLATION, *QUATERNION, *ACCELERATION, *ANGULAR_RATE, *VELOCITY])
+        for time, row in zip(ego_motion.timestamps_ns, numbers, strict=True):
+            writer.writerow([int(time), *(repr(float(value)) for value in row)])
+
+
+def _times(table: CsvTable) -> NDArray[np.int64]:
+    times = [row.integer("timestamp_ns") for row in table.rows]
+    for row, earlier, time in zip(table.rows[1:], times, times[1:], strict=False):
+        if time <= earlier:
+            raise row.error("timestamp_ns", f"{time} does not come after the row before ({earlier}): sort the rows")
+    return np.array(times, dtype=np.int64)
+
+
+def _columns(table: CsvTable, names: tuple[str, ...]) -> Array:
+    return np.array([[row.number(name) for name in names] for row in table.rows])
+
+
+def _group(table: CsvTable, names: tuple[str, ...]) -> Array | None:
+    """Three columns that are there together or not at all."""
+    there = [name for name in names if name in table.columns]
+    if there and len(there) < len(names):
+        raise InputError(
+            f"{table.path}: columns {', '.join(names)} come together (found only {', '.join(there)}): "
+            "add the others, or leave all out to have them derived from the poses"
+        )
+    return _columns(table, names) if there else None
+
+
+def _quaternion(row: CsvRow) -> Array:
+    """(4,) as stored, its norm made exactly 1."""
+    quaternion = np.array([row.number(name) for name in QUATERNION])
+    norm = float(np.linalg.norm(quaternion))
+    if abs(norm - 1) > NORM_TOLERANCE:
+        raise row.error("qw..qz", f"the quaternion's norm is {norm:.6g} (expected 1): it is no rotation")
+    return quaternion / norm

@@ -1,0 +1,134 @@
+"""The native sequence folder: calibration.json, frames.csv, ego_motion.csv, pictures or videos, ground truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from bevcli.errors import InputError
+from bevcli.frame import Frame, FrameStamp
+from bevcli.geometry.cameras import CameraRig
+from bevcli.geometry.ego_motion import GRAVITY, TOLERANCE_NS, EgoMotion, Kinematics
+from bevcli.geometry.transforms import Pose
+from bevcli.sequences.images import PictureReader
+from bevcli.sequences.native.calibration import read_calibration
+from bevcli.sequences.native.ego_motion_file import read_ego_motion
+from bevcli.sequences.native.frames_table import FrameEntry, check_times, read_frames_table
+from bevcli.sequences.native.ground_truth import FolderGroundTruth
+from bevcli.sequences.native.unlisted_frames import find_frames
+
+# required: ego_motion.csv must be there. static: the vehicle stands, the file is not read.
+# none: the file is read where it is there; without it there are no poses.
+EgoMotionUse = Literal["required", "static", "none"]
+AT_REST = Kinematics(np.array([0.0, 0.0, GRAVITY]), np.zeros(3), np.zeros(3))
+
+
+class FolderSequence:
+    """A native sequence folder as a `Sequence`. `rig` replaces calibration.json's."""
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        ego_motion: EgoMotionUse = "required",
+        strict: bool = False,
+        rig: CameraRig | None = None,
+    ) -> None:
+        if not path.is_dir():
+            raise InputError(f"{path}: the sequence folder is missing")
+        self.path = path
+        self.name = path.resolve().name
+        self.rig = read_calibration(path / "calibration.json") if rig is None else rig
+        self._entries, notes = _read_entries(path, self.rig)
+        self.ego_motion, motion_notes = _read_motion(path, ego_motion, self._entries)
+        self.has_ego_motion = self.ego_motion is not None
+        self.notes = (*_rig_notes(self.rig), *notes, *motion_notes)
+        self._truth = FolderGroundTruth(path)
+        self._pictures = PictureReader(strict=strict)
+
+    @property
+    def stamps(self) -> tuple[FrameStamp, ...]:
+        """When each frame is, in order."""
+        return tuple(entry.stamp for entry in self._entries)
+
+    def load(self, place: int) -> Frame:
+        """The frame at a place, its pictures decoded. Raises InputError for wrong sizes, or missing ones if strict."""
+        entry = self._entries[place]
+        pictures, dropped = self._pictures.read(entry.sources, self.rig, entry.dropped)
+        times = _camera_times(entry, self.rig)
+        index, world_from_ego = entry.stamp.index, self._pose_at(entry.stamp.timestamp_ns)
+        truth_pose = world_from_ego if self.has_ego_motion else None
+        return Frame(
+            stamp=entry.stamp,
+            rig=self.rig,
+            pictures=pictures,
+            world_from_ego=world_from_ego,
+            world_from_ego_at={name: self._pose_at(time) for name, time in times.items()},
+            kinematics=self._kinematics_at(entry.stamp.timestamp_ns),
+            dropped=dropped,
+            ground_truth=self._truth.boxes(index, truth_pose, self.rig.ego_from_bev),
+            ground_truth_map=self._truth.bev_map(index),
+        )
+
+    def _pose_at(self, timestamp_ns: int) -> Pose:
+        return self.ego_motion.pose_at(timestamp_ns) if self.ego_motion else Pose.identity()
+
+    def _kinematics_at(self, timestamp_ns: int) -> Kinematics:
+        return self.ego_motion.kinematics_at(timestamp_ns) if self.ego_motion else AT_REST
+
+
+def _read_entries(path: Path, rig: CameraRig) -> tuple[tuple[FrameEntry, ...], tuple[str, ...]]:
+    table = path / "frames.csv"
+    if table.is_file():
+        return read_frames_table(table, rig.names), ()
+    found = find_frames(path, rig.names)
+    check_times(found.entries)
+    return found.entries, (found.note,)
+
+
+def _camera_times(entry: FrameEntry, rig: CameraRig) -> dict[str, int]:
+    """Each camera's own time, the frame's where it has no picture."""
+    frame_ns = entry.stamp.timestamp_ns
+    return {name: entry.sources[name].timestamp_ns if name in entry.sources else frame_ns for name in rig.names}
+
+
+def _read_motion(
+    path: Path, use: EgoMotionUse, entries: tuple[FrameEntry, ...]
+) -> tuple[EgoMotion | None, tuple[str, ...]]:
+    file = path / "ego_motion.csv"
+    if use == "static":
+        unread = " (ego_motion.csv is not read)" if file.is_file() else ""
+        return None, (f"the vehicle is taken to stand still{unread}",)
+    if file.is_file():
+        motion = read_ego_motion(file)
+        _check_coverage(file, motion, entries)
+        return motion, ()
+    if use == "required":
+        raise InputError(
+            f"{file}: the file is missing (where the vehicle was): add it, say --static if the vehicle stands, "
+            "or --no-temporal to run without history"
+        )
+    return None, ("ego_motion.csv is missing: boxes are given in the ego frame",)
+
+
+def _check_coverage(file: Path, motion: EgoMotion, entries: tuple[FrameEntry, ...]) -> None:
+    first, last = int(motion.timestamps_ns[0]), int(motion.timestamps_ns[-1])
+    for entry in entries:
+        times = {"the frame": entry.stamp.timestamp_ns}
+        times |= {f"camera {name}": source.timestamp_ns for name, source in entry.sources.items()}
+        for what, time in times.items():
+            if not first - TOLERANCE_NS <= time <= last + TOLERANCE_NS:
+                listed = entry.place.startswith(str(file.with_name("frames.csv")))
+                advice = "extend the ego-motion, or cut the frames" if listed else "state the start in timing.toml"
+                raise InputError(
+                    f"{file}: covers {first} to {last} ns, but {what} is at {time} ns ({entry.place}; at most 50 ms "
+                    f"outside is allowed): {advice}"
+                )
+
+
+def _rig_notes(rig: CameraRig) -> tuple[str, ...]:
+    if not rig.ego_from_bev_assumed:
+        return ()
+    return ('calibration.json has no "ego_from_bev": a level frame at (0.94, 0, 1.84) m in ego is taken',)

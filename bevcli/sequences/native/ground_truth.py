@@ -1,0 +1,50 @@
+"""A native folder's ground truth, by frame: boxes moved to the world, and maps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bevcli.frame import BevMap
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.transforms import Array, Pose, inverse
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes
+from bevcli.sequences.files.map_file import open_maps
+
+BOXES_FILE = "ground_truth.json"
+MAPS_FOLDER = "ground_truth_map"
+
+
+class FolderGroundTruth:
+    """ground_truth.json (read at once) and ground_truth_map/ (read frame by frame), where they are there."""
+
+    def __init__(self, folder: Path) -> None:
+        boxes_path, maps_path = folder / BOXES_FILE, folder / MAPS_FOLDER
+        self._boxes: BoxesFile | None = read_boxes(boxes_path) if boxes_path.is_file() else None
+        self._frames = {frame.stamp.index: frame for frame in self._boxes.frames} if self._boxes else {}
+        self._maps = open_maps(maps_path) if maps_path.is_dir() else None
+
+    def boxes(self, frame: int, world_from_ego: Pose | None, ego_from_bev: Array) -> Boxes3D | None:
+        """A frame's boxes in the world; None where nothing is known of the frame.
+
+        world_from_ego: of the sequence; None where it has no ego-motion: then the ego frame stands for the world.
+        """
+        truth = self._frames.get(frame)
+        if truth is None or self._boxes is None:
+            return None
+        if self._boxes.frame_of_reference == "world":
+            return truth.boxes if world_from_ego else _world_to_ego(truth)
+        boxes = truth.boxes
+        if self._boxes.frame_of_reference == "bev":
+            stated = self._boxes.ego_from_bev
+            boxes = boxes.transformed(stated.matrix if stated else ego_from_bev)
+        return boxes.transformed(world_from_ego.matrix) if world_from_ego else boxes
+
+    def bev_map(self, frame: int) -> BevMap | None:
+        """A frame's map; None where there is none."""
+        return self._maps.load(frame) if self._maps and self._maps.has(frame) else None
+
+
+def _world_to_ego(truth: FrameBoxes) -> Boxes3D | None:
+    if truth.world_from_ego is None:
+        return None
+    return truth.boxes.transformed(inverse(truth.world_from_ego.matrix))

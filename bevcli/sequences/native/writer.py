@@ -1,0 +1,192 @@
+"""Writes frames, one after the other, as a native sequence folder."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+from collections.abc import Mapping
+from contextlib import ExitStack
+from itertools import pairwise
+from pathlib import Path
+from types import TracebackType
+
+import cv2
+import numpy as np
+
+from bevcli.errors import InputError, OutputError
+from bevcli.frame import Frame, Picture
+from bevcli.geometry.cameras import CameraRig
+from bevcli.geometry.ego_motion import EgoMotion, Kinematics
+from bevcli.geometry.transforms import Pose
+from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
+from bevcli.sequences.files.map_file import write_map
+from bevcli.sequences.native.calibration import write_calibration
+from bevcli.sequences.native.ego_motion_file import write_ego_motion
+from bevcli.sequences.native.ground_truth import BOXES_FILE, MAPS_FOLDER
+
+# What this writer makes, and what `force` removes; anything else in the folder stays.
+PARTS = ("calibration.json", "frames.csv", "ego_motion.csv", "images", BOXES_FILE, MAPS_FOLDER)
+SUFFIXES = {"image/jpeg": ".jpg", "image/png": ".png"}
+
+
+class NativeWriter:
+    """`with NativeWriter(folder, with_ego_motion=True) as writer: writer.write(frame)`.
+
+    Pictures keep their bytes; decoded ones (of a video) become PNG. ego_motion.csv gets the pose at every frame's and
+    picture's time. calibration.json is written last: a folder that was not finished is no sequence.
+    Raises OutputError where the folder exists (but with `force`) or cannot be written, InputError where a frame does
+    not go with those before it: another calibration, a number twice, or scenes that overlap in time.
+    """
+
+    def __init__(self, folder: Path, *, with_ego_motion: bool, force: bool = False) -> None:
+        self.folder = folder
+        _make_room(folder, force)
+        self._with_ego_motion = with_ego_motion
+        self._rig: CameraRig | None = None
+        self._numbers: set[int] = set()
+        self._motion: dict[int, tuple[Pose, Kinematics]] = {}
+        self._scenes: dict[str, tuple[int, int]] = {}  # the first and last time of each
+        self._boxes: BoxesWriter | None = None
+        self._open = ExitStack()
+        try:
+            table = self._open.enter_context((folder / "frames.csv").open("w", newline="", encoding="utf-8"))
+        except OSError as error:
+            raise OutputError(f"{folder / 'frames.csv'}: cannot be written ({error.strerror})") from None
+        self._rows = csv.writer(table, lineterminator="\n")
+
+    def write(self, frame: Frame) -> None:
+        """Append a frame."""
+        self._check(frame)
+        cells = {name: self._write_picture(frame.stamp.index, name, p) for name, p in frame.pictures.items()}
+        self._write_row(frame, cells)
+        if self._with_ego_motion:
+            self._note_motion(frame)
+        if frame.ground_truth is not None:
+            self._write_boxes(frame)
+        if frame.ground_truth_map is not None:
+            write_map(self.folder / MAPS_FOLDER, frame.stamp.index, frame.ground_truth_map)
+
+    def __enter__(self) -> NativeWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._open.close()
+        if kind is None:
+            self._finish()
+
+    def _finish(self) -> None:
+        if self._rig is None:
+            raise OutputError(f"{self.folder}: no frame was written")
+        if self._with_ego_motion:
+            self._check_scenes()
+            write_ego_motion(self.folder / "ego_motion.csv", _ego_motion(self._motion))
+        write_calibration(self.folder / "calibration.json", self._rig)
+
+    def _check(self, frame: Frame) -> None:
+        stamp = frame.stamp
+        if self._rig is None:
+            self._rig = frame.rig
+            times = [f"{name}.timestamp_ns" for name in frame.rig.names]
+            self._rows.writerow(["frame", "scene", "timestamp_ns", *frame.rig.names, *times])
+        elif frame.rig is not self._rig and not same_rig(frame.rig, self._rig):
+            raise InputError(
+                f"frame {stamp.index} ({stamp.scene}): another calibration than the frames before, but a native "
+                "sequence has one: convert scene by scene (--scene)"
+            )
+        if stamp.index in self._numbers:
+            raise InputError(
+                f"frame {stamp.index} ({stamp.scene}): its number was there before: number the frames anew"
+            )
+        self._numbers.add(stamp.index)
+
+    def _write_picture(self, number: int, camera: str, picture: Picture) -> str:
+        """Write it, and give its cell."""
+        encoded, suffix = picture.encoded, SUFFIXES.get(picture.media_type or "", ".png")
+        if encoded is None or picture.media_type not in SUFFIXES:
+            encoded = cv2.imencode(".png", picture.pixels_bgr)[1].tobytes()
+        name = f"images/{camera}/{number:06d}{suffix}"
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            path.write_bytes(encoded)
+        except OSError as error:
+            raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
+        return name
+
+    def _write_row(self, frame: Frame, cells: Mapping[str, str]) -> None:
+        names = frame.rig.names
+        times = [frame.pictures[name].timestamp_ns if name in cells else "" for name in names]
+        stamp = frame.stamp
+        row = [stamp.index, stamp.scene, stamp.timestamp_ns, *(cells.get(name, "") for name in names), *times]
+        self._rows.writerow(row)
+
+    def _note_motion(self, frame: Frame) -> None:
+        for name, picture in frame.pictures.items():
+            self._motion.setdefault(picture.timestamp_ns, (frame.world_from_ego_at[name], frame.kinematics))
+        times = [frame.stamp.timestamp_ns, *(picture.timestamp_ns for picture in frame.pictures.values())]
+        self._motion[frame.stamp.timestamp_ns] = (frame.world_from_ego, frame.kinematics)
+        first, last = self._scenes.get(frame.stamp.scene, (times[0], times[0]))
+        self._scenes[frame.stamp.scene] = (min(first, *times), max(last, *times))
+
+    def _check_scenes(self) -> None:
+        """Scenes share one ego_motion.csv, so they must follow each other in time."""
+        spans = sorted((first, last, name) for name, (first, last) in self._scenes.items())
+        for (_, end, earlier), (start, _, later) in pairwise(spans):
+            if start <= end:
+                raise InputError(f"scenes {earlier} and {later} overlap in time: convert scene by scene (--scene)")
+
+    def _write_boxes(self, frame: Frame) -> None:
+        assert frame.ground_truth is not None
+        if self._boxes is None:
+            frame_of_reference = "world" if self._with_ego_motion else "ego"
+            self._boxes = self._open.enter_context(BoxesWriter(self.folder / BOXES_FILE, frame_of_reference))
+        pose = frame.world_from_ego if self._with_ego_motion else None
+        extras = {"sample_token": frame.sample_token} if frame.sample_token else {}
+        self._boxes.write(FrameBoxes(frame.stamp, pose, frame.ground_truth, extras))
+
+
+def same_rig(one: CameraRig, other: CameraRig) -> bool:
+    """Whether two rigs are equal in all their numbers."""
+    return (
+        one.names == other.names
+        and np.array_equal(one.ego_from_bev, other.ego_from_bev)
+        and all(
+            (a.width, a.height, a.distortion) == (b.width, b.height, b.distortion)
+            and np.array_equal(a.intrinsics, b.intrinsics)
+            and np.array_equal(a.ego_from_camera, b.ego_from_camera)
+            for a, b in zip(one.cameras, other.cameras, strict=True)
+        )
+    )
+
+
+def _make_room(folder: Path, force: bool) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder}: is a file (expected a folder to write)")
+    if folder.is_dir() and any(folder.iterdir()):
+        if not force:
+            raise OutputError(f"{folder}: exists already: name another folder, or add --force to replace it")
+        for part in PARTS:
+            path = folder / part
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be made ({error.strerror})") from None
+
+
+def _ego_motion(rows: Mapping[int, tuple[Pose, Kinematics]]) -> EgoMotion:
+    times = sorted(rows)
+    poses, kinematics = zip(*(rows[time] for time in times), strict=True)
+    return EgoMotion(
+        np.array(times, dtype=np.int64),
+        np.stack([pose.translation for pose in poses]),
+        np.stack([pose.quaternion for pose in poses]),
+        np.stack([k.acceleration for k in kinematics]),
+        np.stack([k.angular_rate for k in kinematics]),
+        np.stack([k.velocity for k in kinematics]),
+    )

@@ -1,0 +1,186 @@
+"""nuScenes' JSON tables -> NuScenesIndex. Tokens are joined by sorting, rows are put in order of scene and time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.errors import InputError
+from bevcli.geometry.transforms import Array
+from bevcli.sequences.nuscenes.annotations import read_annotations
+from bevcli.sequences.nuscenes.index import Ints, NuScenesIndex, Pictures, Samples, Scenes, Sensors
+from bevcli.sequences.nuscenes.json_tables import (
+    Row,
+    column,
+    integers,
+    places_of,
+    read_batches,
+    read_rows,
+    tokens,
+    vectors,
+    without_garbage_collection,
+)
+
+LIDAR = "LIDAR_TOP"  # the sensor whose frame the published models predict in
+
+
+@dataclass(frozen=True)
+class _SensorData:
+    """The rows of sample_data.json that are needed: cameras, and LIDAR_TOP's keyframes."""
+
+    samples: Ints
+    sensors: Ints
+    poses: NDArray[np.bytes_]
+    times_us: Ints
+    keys: NDArray[np.bool_]
+    sizes: Ints
+    files: NDArray[np.bytes_]
+
+    def __getitem__(self, rows: NDArray) -> _SensorData:
+        return _SensorData(**{name: values[rows] for name, values in vars(self).items()})
+
+
+def build_index(tables: Path) -> NuScenesIndex:
+    """Read the folder of one version's tables. Raises InputError where one is missing or they do not fit together."""
+    with without_garbage_collection():
+        sensor_tokens, sensors = _read_sensors(tables)
+        names, sample_tokens, sample_times, sample_scenes = _read_samples(tables)
+        data = _read_sensor_data(tables, sample_tokens, sensor_tokens, sensors)
+        translations, quaternions = _read_poses(tables, data.poses)
+        lidar = sensors.channels[data.sensors] == LIDAR
+        lidar_rows = _lidar_of_samples(tables, data.samples, np.flatnonzero(lidar), len(sample_tokens), sample_tokens)
+        picture_rows = _by_scene_and_time(data, ~lidar, sample_scenes)
+        annotations, first_annotation = read_annotations(tables, sample_tokens, sample_times)
+    pictures = data[picture_rows]
+    return NuScenesIndex(
+        Scenes(
+            names,
+            _starts(sample_scenes, len(names)),
+            _starts(sample_scenes[pictures.samples], len(names)),
+        ),
+        sensors,
+        Samples(
+            sample_tokens,
+            sample_times,
+            translations[lidar_rows],
+            quaternions[lidar_rows],
+            data.sensors[lidar_rows],
+            first_annotation,
+        ),
+        Pictures(
+            pictures.samples,
+            pictures.sensors,
+            pictures.times_us,
+            pictures.keys,
+            pictures.sizes,
+            translations[picture_rows],
+            quaternions[picture_rows],
+            pictures.files,
+        ),
+        annotations,
+    )
+
+
+def _read_sensors(tables: Path) -> tuple[NDArray[np.bytes_], Sensors]:
+    path = tables / "calibrated_sensor.json"
+    channels = {row["token"]: row["channel"] for row in read_rows(tables / "sensor.json")}
+    rows = read_rows(path)
+    none = np.full((3, 3), np.nan)
+    sensors = Sensors(
+        np.array([channels.get(token, "") for token in column(rows, "sensor_token", path)], dtype=np.str_),
+        vectors(rows, "translation", path, 3),
+        vectors(rows, "rotation", path, 4),
+        np.array([row.get("camera_intrinsic") or none for row in rows], dtype=np.float64),
+    )
+    return tokens(rows, "token", path), sensors
+
+
+def _read_samples(tables: Path) -> tuple[NDArray[np.str_], NDArray[np.bytes_], Ints, Ints]:
+    """Scenes' names (S,), and samples' tokens, times in us and scenes (N,), ordered by scene and time."""
+    scene_path, path = tables / "scene.json", tables / "sample.json"
+    scenes, rows = read_rows(scene_path), read_rows(path)
+    if not scenes or not rows:
+        raise InputError(f"{path if scenes else scene_path}: the table has no rows")
+    in_scene = places_of(tokens(rows, "scene_token", path), tokens(scenes, "token", scene_path), scene_path)
+    times = integers(rows, "timestamp", path)
+    order = np.lexsort((times, in_scene))
+    names = np.array(column(scenes, "name", scene_path), dtype=np.str_)
+    return names, tokens(rows, "token", path)[order], times[order], in_scene[order]
+
+
+def _read_sensor_data(
+    tables: Path, sample_tokens: NDArray[np.bytes_], sensor_tokens: NDArray[np.bytes_], sensors: Sensors
+) -> _SensorData:
+    path = tables / "sample_data.json"
+    lidars = {token.decode() for token in sensor_tokens[sensors.channels == LIDAR]}
+    cameras = {token.decode() for token in sensor_tokens[np.isfinite(sensors.intrinsics).all((1, 2))]}
+    parts = []
+    for batch in read_batches(path):
+        owners, keys = column(batch, "calibrated_sensor_token", path), column(batch, "is_key_frame", path)
+        needed = [
+            row
+            for row, owner, key in zip(batch, owners, keys, strict=True)
+            if owner in cameras or (key and owner in lidars)
+        ]
+        if needed:
+            parts.append(_sensor_data_of(needed, path, sample_tokens, sensor_tokens))
+    if not parts:
+        raise InputError(f"{path}: has no row of a camera")
+    return _SensorData(**{name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])})
+
+
+def _sensor_data_of(
+    rows: list[Row], path: Path, sample_tokens: NDArray[np.bytes_], sensor_tokens: NDArray[np.bytes_]
+) -> _SensorData:
+    return _SensorData(
+        samples=places_of(tokens(rows, "sample_token", path), sample_tokens, path.with_name("sample.json")),
+        sensors=places_of(
+            tokens(rows, "calibrated_sensor_token", path), sensor_tokens, path.with_name("calibrated_sensor.json")
+        ),
+        poses=tokens(rows, "ego_pose_token", path),
+        times_us=integers(rows, "timestamp", path),
+        keys=integers(rows, "is_key_frame", path).astype(bool),
+        sizes=np.stack([integers(rows, "width", path), integers(rows, "height", path)], axis=1),
+        files=np.array([str(name).encode() for name in column(rows, "filename", path)]),
+    )
+
+
+def _read_poses(tables: Path, wanted: NDArray[np.bytes_]) -> tuple[Array, Array]:
+    """world_from_ego translations (P, 3) and quaternions (P, 4) of the poses with these tokens (P,)."""
+    path = tables / "ego_pose.json"
+    needed = {token.decode() for token in wanted}
+    found, translations, quaternions = [], [], []
+    for batch in read_batches(path):
+        rows = [row for row, token in zip(batch, column(batch, "token", path), strict=True) if token in needed]
+        if rows:
+            found.append(tokens(rows, "token", path))
+            translations.append(vectors(rows, "translation", path, 3))
+            quaternions.append(vectors(rows, "rotation", path, 4))
+    places = places_of(wanted, np.concatenate(found) if found else np.zeros(0, "S32"), path)
+    chosen = np.concatenate(quaternions)[places]
+    return np.concatenate(translations)[places], chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
+
+
+def _lidar_of_samples(
+    tables: Path, samples: Ints, lidar_rows: Ints, count: int, sample_tokens: NDArray[np.bytes_]
+) -> Ints:
+    """(N,) the row of LIDAR_TOP's keyframe of each sample."""
+    rows = np.full(count, -1, dtype=np.int64)
+    rows[samples[lidar_rows]] = lidar_rows
+    if (rows < 0).any():
+        token = sample_tokens[rows < 0][0].decode()
+        raise InputError(f'{tables / "sample_data.json"}: sample "{token}" has no keyframe of {LIDAR}')
+    return rows
+
+
+def _by_scene_and_time(data: _SensorData, chosen: NDArray[np.bool_], sample_scenes: Ints) -> Ints:
+    rows = np.flatnonzero(chosen)
+    return rows[np.lexsort((data.times_us[rows], sample_scenes[data.samples[rows]]))]
+
+
+def _starts(sorted_owners: Ints, count: int) -> Ints:
+    """(count + 1,) where each owner's rows begin."""
+    return np.searchsorted(sorted_owners, np.arange(count + 1))

@@ -1,0 +1,83 @@
+"""The index of a large nuScenes version, kept as memory-mapped arrays: opening it again reads almost nothing.
+
+It lies in $XDG_CACHE_HOME/bevcli/nuscenes (~/.cache/... by default), one folder a version and place, never in the
+dataset. It is made anew when a table's size or time of change differs. Small versions are read each time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import numpy as np
+
+from bevcli.sequences.nuscenes.build import build_index
+from bevcli.sequences.nuscenes.index import NuScenesIndex
+
+FORMAT = 1  # raised when the index changes
+SMALLEST_BYTES = 64 << 20  # tables below this in all are read in a second or two
+FINGERPRINT = "fingerprint.json"
+
+
+def open_index(tables: Path) -> tuple[NuScenesIndex, str]:
+    """The index of a folder of tables, from the cache where it is fresh, and a note for the user ("" none)."""
+    if sum(path.stat().st_size for path in tables.glob("*.json")) < SMALLEST_BYTES:
+        return build_index(tables), ""
+    folder = _cache_folder(tables)
+    fingerprint = _fingerprint(tables)
+    if _is_fresh(folder, fingerprint):
+        return _load(folder), ""
+    index = build_index(tables)
+    try:
+        _save(index, folder, fingerprint)
+    except OSError as error:
+        return index, f"{folder}: the index cannot be kept ({error.strerror}): opening takes as long the next time"
+    return index, f"the index of the tables is kept in {folder}"
+
+
+def _cache_folder(tables: Path) -> Path:
+    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    name = hashlib.sha256(str(tables.resolve()).encode()).hexdigest()[:16]
+    return root / "bevcli" / "nuscenes" / f"{tables.name}-{name}"
+
+
+def _fingerprint(tables: Path) -> str:
+    facts = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in sorted(tables.glob("*.json"))]
+    return json.dumps({"format": FORMAT, "tables": facts})
+
+
+def _is_fresh(folder: Path, fingerprint: str) -> bool:
+    try:
+        return (folder / FINGERPRINT).read_text() == fingerprint
+    except OSError:
+        return False
+
+
+def _save(index: NuScenesIndex, folder: Path, fingerprint: str) -> None:
+    """Written beside and moved into place, so that an interrupted run leaves no half index."""
+    unfinished = folder.with_name(f"{folder.name}.{os.getpid()}")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    unfinished.mkdir(parents=True)
+    for part in fields(index):
+        for column in fields(getattr(index, part.name)):
+            values = getattr(getattr(index, part.name), column.name)
+            np.save(unfinished / f"{part.name}.{column.name}.npy", values, allow_pickle=False)
+    (unfinished / FINGERPRINT).write_text(fingerprint)
+    shutil.rmtree(folder, ignore_errors=True)
+    unfinished.rename(folder)
+
+
+def _load(folder: Path) -> NuScenesIndex:
+    parts: dict[str, Any] = {}
+    for name, kind in get_type_hints(NuScenesIndex).items():
+        columns = {
+            column.name: np.load(folder / f"{name}.{column.name}.npy", mmap_mode="r", allow_pickle=False)
+            for column in fields(kind)
+        }
+        parts[name] = kind(**columns)
+    return NuScenesIndex(**parts)

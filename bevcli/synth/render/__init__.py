@@ -1,0 +1,1 @@
+"""The rasteriser and its shading."""

@@ -1,0 +1,81 @@
+"""The ground's texture: a window of painted ground around the vehicle, with mip levels, sampled per pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bevcli.synth.assets.paint import linear
+from bevcli.synth.world.ground_plan import ASPHALT, GroundPiece
+
+SUBPIXEL_BITS = 4
+LEVELS = 6
+ROUGH_SIZE = 256
+
+
+@dataclass(frozen=True)
+class GroundTexture:
+    """texels: (K, 3) uint8 of all levels, square root of linear light, coarser levels after finer ones.
+    rough: of `roughness`.
+
+    offsets: (LEVELS,) first texel of each level. origin: (x, y) of the first texel's corner, metres, rows along y.
+    size: texels a side of the finest level, a multiple of 2^(LEVELS - 1).
+    """
+
+    texels: NDArray[np.uint8]
+    rough: NDArray[np.float32]
+    offsets: NDArray[np.int64]
+    origin: tuple[float, float]
+    texel_m: float
+    size: int
+
+
+def paint_ground(pieces: list[GroundPiece], center: ArrayLike, extent_m: float, texel_m: float) -> GroundTexture:
+    """Paint a square of `extent_m` around a world point (2,)."""
+    block = 2 ** (LEVELS - 1)
+    size = round(extent_m / texel_m / block) * block
+    origin = np.asarray(center, dtype=np.float64) - size * texel_m / 2
+    canvas = np.empty((size, size, 3), np.uint8)
+    canvas[:] = _stored(ASPHALT)
+    for piece in pieces:
+        for paint in piece.paints:
+            if paint.width_m > texel_m / 2:
+                fill(canvas, (paint.outline - origin) / texel_m - 0.5, _stored(paint.color))
+    levels = [canvas]
+    for _ in range(LEVELS - 1):
+        levels.append(cv2.resize(levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+    counts = [level.shape[0] ** 2 for level in levels]
+    offsets = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
+    texels = np.concatenate([level.reshape(-1, 3) for level in levels])
+    return GroundTexture(texels, roughness(), offsets, (float(origin[0]), float(origin[1])), texel_m, size)
+
+
+def fill(canvas: NDArray[np.uint8], outline: NDArray[np.float64], color: tuple[int, ...] | int) -> None:
+    """Fill a polygon (P, 2), in pixels of x and y, into a picture with sub-pixel edges, in place."""
+    low, high = outline.min(0), outline.max(0)
+    if high[0] < 0 or high[1] < 0 or low[0] > canvas.shape[1] or low[1] > canvas.shape[0]:
+        return
+    fixed = np.round(outline * 2**SUBPIXEL_BITS).astype(np.int32)
+    smooth = cv2.LINE_AA if canvas.ndim == 3 else cv2.LINE_8
+    cv2.fillPoly(canvas, [fixed], color, smooth, SUBPIXEL_BITS)
+
+
+@lru_cache(maxsize=256)
+def _stored(color: tuple[int, int, int]) -> tuple[int, ...]:
+    return tuple(round(float(np.sqrt(c)) * 255) for c in linear(color))
+
+
+def roughness() -> NDArray[np.float32]:
+    """(256, 256) relative brightness of worn ground, repeating, in texels of shading_kernels.ROUGH_TEXEL_M."""
+    rng = np.random.Generator(np.random.PCG64(7))
+    total = np.zeros((ROUGH_SIZE, ROUGH_SIZE))
+    for cells, strength in ((8, 0.22), (64, 0.20)):
+        coarse = np.pad(rng.random((cells, cells)), 2, mode="wrap") - 0.5
+        scale = ROUGH_SIZE // cells
+        fine = cv2.resize(coarse, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+        total += strength * fine[2 * scale : 2 * scale + ROUGH_SIZE, 2 * scale : 2 * scale + ROUGH_SIZE]
+    return total.astype(np.float32)

@@ -1,0 +1,360 @@
+"""The kernels that colour a picture's pixels: `shade_pixels` and all that it calls.
+
+They share one file because numba's cache on the disk asks only whether a function's own file has changed.
+"""
+
+# mypy: disable-error-code="no-untyped-def"
+# numba takes the arguments' types from the first call.
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from bevcli.synth.assets.mesh import Material
+
+LIGHT_LIMIT = 1.6  # brightest light that the display table distinguishes
+ROUGH_TEXEL_M = 0.25  # of the ground's roughness
+GROUND, FACADE, GLASS, PAINT, GLOW = (
+    int(m) for m in (Material.GROUND, Material.FACADE, Material.GLASS, Material.PAINT, Material.GLOW)
+)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, picture):
+    """Colour every pixel of `picture` (H, W, 3); the groups of arrays and numbers are those of `shading.shade`.
+
+    One long function: in parts it would pass a dozen numbers to and fro for every pixel.
+    """
+    triangles, inverse_depth = buffer
+    normals, albedo, material, facade, facades = surfaces
+    light, to_sun, clouds, haze_m, lamps = weather
+    ray_from_image, eye, pixel_angle = view
+    sun, sky, bounce, haze = light[0], light[1], light[2], light[5]
+    a = np.empty(3)  # albedo, then colour
+    mirror = np.empty(3)
+    table_scale = (table.shape[0] - 1) / LIGHT_LIMIT
+    height, width = triangles.shape
+    for v in range(height):
+        for u in range(width):
+            rx = ray_from_image[0, 0] * u + ray_from_image[0, 1] * v + ray_from_image[0, 2]
+            ry = ray_from_image[1, 0] * u + ray_from_image[1, 1] * v + ray_from_image[1, 2]
+            rz = ray_from_image[2, 0] * u + ray_from_image[2, 1] * v + ray_from_image[2, 2]
+            length = np.sqrt(rx * rx + ry * ry + rz * rz)
+            t = triangles[v, u]
+            kind = GROUND
+            nx, ny, nz = 0.0, 0.0, 1.0
+            if t >= 0:
+                z = 1.0 / inverse_depth[v, u]
+                kind = material[t]
+                nx, ny, nz = normals[t, 0], normals[t, 1], normals[t, 2]
+            elif rz < -1e-4 * length:
+                z = -eye[2] / rz
+            else:
+                _sky(rx / length, ry / length, rz / length, light, to_sun, clouds, a)
+                _put(picture, v, u, a, table, table_scale)
+                continue
+            px, py, pz = eye[0] + z * rx, eye[1] + z * ry, eye[2] + z * rz
+            distance = z * length
+            footprint = z * pixel_angle
+            grain = 0.0
+            if kind == GROUND:
+                along = footprint * length / max(-rz, 0.02 * length)
+                grain = _ground(ground, px, py, footprint, along, rx, ry, a)
+            elif kind == FACADE:
+                if _facade(facades[facade[t]], px, py, pz, footprint, lamps, a):
+                    kind = GLASS
+            else:
+                a[0], a[1], a[2] = albedo[t, 0], albedo[t, 1], albedo[t, 2]
+            if kind == GLOW:
+                for c in range(3):
+                    a[c] *= 0.35 + 0.65 * lamps
+            else:
+                lit = nx * to_sun[0] + ny * to_sun[1] + nz * to_sun[2]
+                if lit > 0:
+                    # Look from a little outside, or surfaces shade themselves.
+                    off = 0.02 + 1.6 * shadows[3] * (1.0 - lit)
+                    lit *= 1.0 - _shadow(shadows, px + off * nx, py + off * ny, pz + off * nz)
+                else:
+                    lit = 0.0
+                up = 0.5 + 0.5 * nz
+                near_ground = 1.0
+                if t >= 0 and nz < 0.5:  # less sky is seen from low down
+                    near_ground = min(1.0, 0.62 + 0.2 * pz)
+                for c in range(3):
+                    a[c] *= sun[c] * lit + near_ground * (sky[c] * up + bounce[c] * (1.0 - up))
+                    a[c] *= 1.0 + grain
+                if kind == GLASS or kind == PAINT:  # noqa: SIM109  (numba is faster so)
+                    x, y, z = rx / length, ry / length, rz / length
+                    _reflect(x, y, z, nx, ny, nz, kind, light, to_sun, clouds, lit > 0.02, mirror, a)
+            far = distance / haze_m
+            veil = 1.0 - 1.0 / (1.0 + far + 0.48 * far * far + 0.235 * far * far * far)  # near 1 - exp(-far)
+            veil *= veil
+            for c in range(3):
+                a[c] += (haze[c] - a[c]) * veil
+            _put(picture, v, u, a, table, table_scale)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _put(picture, v, u, color, table, scale):
+    for c in range(3):
+        level = int(color[c] * scale)
+        picture[v, u, 2 - c] = table[min(max(level, 0), table.shape[0] - 1)]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sky(x, y, z, light, to_sun, clouds, out):
+    """Light from direction (x, y, z): horizon to zenith, clouds on a plane overhead, a glow around the sun."""
+    zenith, horizon, cloud = light[3], light[4], light[6]
+    up = max(z, 0.0)
+    mix = 1.0 - (1.0 - up) * (1.0 - up) * (1.0 - up)
+    size = clouds.shape[0]
+    spread = 90.0 / (up + 0.18)
+    fu, fv = x * spread, y * spread
+    iu, iv = int(np.floor(fu)), int(np.floor(fv))
+    wu, wv = fu - iu, fv - iv
+    i0, i1, j0, j1 = iu & (size - 1), (iu + 1) & (size - 1), iv & (size - 1), (iv + 1) & (size - 1)
+    cover = (clouds[j0, i0] * (1 - wu) + clouds[j0, i1] * wu) * (1 - wv) + (
+        clouds[j1, i0] * (1 - wu) + clouds[j1, i1] * wu
+    ) * wv
+    cover *= min(1.0, up * 5.0) * 0.85
+    toward = max(x * to_sun[0] + y * to_sun[1] + z * to_sun[2], 0.0)
+    toward2 = toward * toward
+    toward8 = toward2 * toward2 * toward2 * toward2
+    glow = 0.18 * toward8 + 0.8 * toward8**24
+    for c in range(3):
+        base = horizon[c] + (zenith[c] - horizon[c]) * mix
+        out[c] = base + (cloud[c] - base) * cover + glow * light[0, c]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _reflect(x, y, z, nx, ny, nz, kind, light, to_sun, clouds, sunlit, mirror, color):
+    """Mix the sky as mirrored by glass or paint into `color`; below the horizon a street is mirrored."""
+    facing = -(x * nx + y * ny + z * nz)
+    mx, my, mz = x + 2 * facing * nx, y + 2 * facing * ny, z + 2 * facing * nz
+    grazing = 1.0 - min(max(facing, 0.0), 1.0)
+    fresnel = grazing * grazing * grazing * grazing * grazing
+    if mz > 0:
+        if kind == GLASS:
+            _sky(mx, my, mz, light, to_sun, clouds, mirror)
+        else:
+            for c in range(3):
+                mirror[c] = light[4, c] + (light[3, c] - light[4, c]) * mz
+        fade = min(1.0, mz * 4.0)
+        for c in range(3):
+            mirror[c] = mirror[c] * fade + 0.22 * light[4, c] * (1 - fade)
+    else:
+        for c in range(3):
+            mirror[c] = 0.22 * light[4, c]
+    share = 0.16 + 0.7 * fresnel if kind == GLASS else 0.035 + 0.5 * fresnel
+    for c in range(3):
+        color[c] += (mirror[c] - color[c]) * share
+    if sunlit:
+        toward = max(mx * to_sun[0] + my * to_sun[1] + mz * to_sun[2], 0.0)
+        shine = toward**40 * (0.5 if kind == GLASS else 0.3)
+        for c in range(3):
+            color[c] += shine * light[0, c]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _shadow(shadows, x, y, z):
+    """Share of the light, 0 to 1, that the shadow map holds back from a point."""
+    heights, origin_x, origin_y, texel, shear_x, shear_y, softness = shadows
+    x, y = x + shear_x * z, y + shear_y * z
+    size = heights.shape[0]
+    bias = z + 0.03 + texel * 0.5
+    fu, fv = (x - origin_x) / texel - 0.5, (y - origin_y) / texel - 0.5
+    if fu < 3 or fv < 3 or fu > size - 5 or fv > size - 5:
+        return 0.0
+    if softness > 0.5:  # no sun: a wide, weak occlusion under and beside things
+        step = softness / texel * 0.35
+        blocked = 0.0
+        for j in range(-2, 3):
+            for i in range(-2, 3):
+                row = min(max(int(fv + j * step), 0), size - 1)
+                column = min(max(int(fu + i * step), 0), size - 1)
+                blocked += 1.0 if heights[row, column] > bias else 0.0
+        return blocked / 25.0
+    iu, iv = int(fu), int(fv)
+    wu, wv = fu - iu, fv - iv
+    b00 = 1.0 if heights[iv, iu] > bias else 0.0
+    b01 = 1.0 if heights[iv, iu + 1] > bias else 0.0
+    b10 = 1.0 if heights[iv + 1, iu] > bias else 0.0
+    b11 = 1.0 if heights[iv + 1, iu + 1] > bias else 0.0
+    return (b00 * (1 - wu) + b01 * wu) * (1 - wv) + (b10 * (1 - wu) + b11 * wu) * wv
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _ground(ground, x, y, across, along, rx, ry, out):
+    """Linear albedo at (x, y) into out (3,); returns the grain, a relative brightness of the rough surface.
+
+    across, along: metres that the pixel spans, `along` in the direction (rx, ry): up to three samples there.
+    """
+    texels, offsets, rough, origin_x, origin_y, texel_m, size = ground
+    flat = np.sqrt(rx * rx + ry * ry) + 1e-9
+    samples = min(max(int(0.6 * along / across), 1), 3)
+    width = max(across, along / samples * 0.5)
+    level = 0
+    span = texel_m * 1.4
+    while width > span and level < offsets.shape[0] - 1:
+        level += 1
+        span *= 2
+    n = size >> level
+    scale = 1.0 / (texel_m * (1 << level))
+    red = green = blue = 0.0
+    step_x, step_y = along / samples * rx / flat * scale, along / samples * ry / flat * scale
+    start_x = (x - origin_x) * scale - 0.5 - 0.5 * (samples - 1) * step_x
+    start_y = (y - origin_y) * scale - 0.5 - 0.5 * (samples - 1) * step_y
+    for i in range(samples):
+        u = min(max(start_x + i * step_x, 0.0), n - 1.001)
+        v = min(max(start_y + i * step_y, 0.0), n - 1.001)
+        iu, iv = int(u), int(v)
+        wu, wv = u - iu, v - iv
+        w00, w01, w10, w11 = (1 - wu) * (1 - wv), wu * (1 - wv), (1 - wu) * wv, wu * wv
+        at = offsets[level] + iv * n + iu
+        under = at + n
+        r = texels[at, 0] * w00 + texels[at + 1, 0] * w01 + texels[under, 0] * w10 + texels[under + 1, 0] * w11
+        g = texels[at, 1] * w00 + texels[at + 1, 1] * w01 + texels[under, 1] * w10 + texels[under + 1, 1] * w11
+        b = texels[at, 2] * w00 + texels[at + 1, 2] * w01 + texels[under, 2] * w10 + texels[under + 1, 2] * w11
+        red, green, blue = red + r * r, green + g * g, blue + b * b
+    share = 1.0 / (65025.0 * samples)
+    out[0], out[1], out[2] = red * share, green * share, blue * share
+    size_n = rough.shape[0]
+    u, v = x / ROUGH_TEXEL_M, y / ROUGH_TEXEL_M
+    iu, iv = int(np.floor(u)), int(np.floor(v))
+    wu, wv = u - iu, v - iv
+    i0, i1, j0, j1 = iu & (size_n - 1), (iu + 1) & (size_n - 1), iv & (size_n - 1), (iv + 1) & (size_n - 1)
+    grain = (rough[j0, i0] * (1 - wu) + rough[j0, i1] * wu) * (1 - wv) + (
+        rough[j1, i0] * (1 - wu) + rough[j1, i1] * wu
+    ) * wv
+    if width < 0.05:
+        fine = _scramble(int(np.floor(x * 45)), int(np.floor(y * 45))) % 256 / 255.0 - 0.5
+        grain += 0.22 * fine * min(1.0, (0.05 - width) / 0.035)
+    return grain
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _facade(row, x, y, z, footprint, lamps, out):
+    """Albedo of the wall `row` at a world point into out (3,); returns whether the point is glass.
+
+    footprint: metres that a pixel spans there; detail that is finer fades into its mean.
+    """
+    u = (x - row[0]) * row[2] + (y - row[1]) * row[3]
+    height, length = row[4], row[5]
+    floor_m, pitch, window_w, window_h, shop_m, brick = row[6], row[7], row[8], row[9], row[10], row[11]
+    coded = int(row[12])
+    band, seed = coded % 2 == 1, coded // 2
+    out[0], out[1], out[2] = row[13], row[14], row[15]
+    if z > height - 0.7:  # cornice
+        shade = 0.8 if z > height - 0.2 or z < height - 0.6 else 1.12
+        for c in range(3):
+            out[c] *= shade
+        return False
+    if z < shop_m and shop_m < 1.0:  # a plinth of stone
+        out[0], out[1], out[2] = 0.5 * out[0] + 0.08, 0.5 * out[1] + 0.08, 0.5 * out[2] + 0.08
+        return False
+    if z < shop_m:
+        return _shop(u, z, length, shop_m, seed, out)
+    floors = np.floor((height - 0.9 - shop_m) / floor_m)
+    storey = np.floor((z - shop_m) / floor_m)
+    columns = max(1.0, np.floor((length - 0.8) / pitch))
+    margin = (length - columns * pitch) / 2
+    column = np.floor((u - margin) / pitch)
+    inside = 0 <= column < columns and storey < floors
+    wu = u - margin - column * pitch - pitch / 2
+    wv = z - shop_m - storey * floor_m - floor_m * 0.52
+    if brick > 0:
+        _courses(u, z, footprint, brick, out)
+    if not inside:
+        return False
+    if band:
+        glass = abs(wv) < window_h / 2
+        frame = abs(wu) > pitch / 2 - 0.06
+    else:
+        glass = abs(wu) < window_w / 2 and abs(wv) < window_h / 2
+        frame = abs(wu) < 0.035 or abs(wu) > window_w / 2 - 0.07 or abs(wv) > window_h / 2 - 0.07
+        if abs(wu) < window_w / 2 + 0.12 and -window_h / 2 - 0.16 < wv < -window_h / 2:  # sill
+            for c in range(3):
+                out[c] = out[c] * 0.5 + 0.34
+            return False
+        if abs(wu) < window_w / 2 + 0.05 and window_h / 2 < wv < window_h / 2 + 0.18:  # lintel
+            for c in range(3):
+                out[c] *= 0.72
+            return False
+    if not glass:
+        return False
+    if frame and footprint < 0.12:
+        out[0], out[1], out[2] = 0.5, 0.5, 0.48
+        return False
+    _pane(seed, int(column), int(storey), wv / window_h, lamps, out)
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _courses(u, z, footprint, brick, out):
+    """Mortar joints and bricks of uneven tone, where a pixel is fine enough to show them."""
+    strength = brick * min(1.0, max(0.0, (0.09 - footprint) / 0.06))
+    if strength <= 0:
+        return
+    course = int(np.floor(z / 0.09))
+    shifted = u / 0.26 + 0.5 * (course % 2)
+    along = int(np.floor(shifted))
+    tone = (_scramble(along, course) % 64) / 64.0 - 0.5
+    joint = z / 0.09 - course < 0.16 or shifted - along < 0.06
+    factor = 1.0 + strength * (0.35 * tone + (0.35 if joint else 0.0))
+    for c in range(3):
+        out[c] *= factor
+
+
+@njit(cache=True, nogil=True)
+def _pane(seed, column, storey, up, lamps, out):
+    """What is behind a window: dark rooms, a curtain, or a lamp."""
+    chance = _scramble(seed + column * 7919, storey * 104729 + seed) % 100
+    out[0], out[1], out[2] = 0.035, 0.045, 0.055
+    if chance < 26 and up > -0.5 + (chance % 5) * 0.2:  # curtain or blind
+        out[0], out[1], out[2] = 0.32, 0.30, 0.26
+    elif chance > 100 - 30 * (lamps - 0.4):
+        out[0], out[1], out[2] = 1.5, 1.1, 0.6
+
+
+@njit(cache=True, nogil=True)
+def _shop(u, z, length, shop_m, seed, out):
+    """The ground floor: a plinth, panes between posts, doors, and a coloured sign above."""
+    unit = 4.2
+    count = max(1.0, np.floor(length / unit))
+    width = length / count
+    index = int(np.floor(u / width))
+    wu = u - index * width
+    kind = _scramble(seed + 31 * index, seed) % 5
+    if z > shop_m - 0.75:
+        if z > shop_m - 0.68 and 0.25 < wu < width - 0.25:
+            pick = _scramble(index + 5, seed) % 6
+            out[0] = 0.30 if pick in (0, 3) else 0.07
+            out[1] = 0.20 if pick in (1, 3, 4) else 0.06
+            out[2] = 0.22 if pick in (2, 4) else 0.07
+        return False
+    if wu < 0.25 or wu > width - 0.25 or (z < 0.45 and kind != 0):
+        for c in range(3):
+            out[c] *= 0.7
+        return False
+    if kind == 4:  # a closed front
+        stripe = z * 8 - np.floor(z * 8) < 0.15
+        for c in range(3):
+            out[c] = (0.16 if stripe else 0.24) + 0.02 * c
+        return False
+    if abs(wu - width / 2) < 0.05 or (kind == 0 and abs(wu - width * 0.7) < 0.04):
+        out[0], out[1], out[2] = 0.08, 0.08, 0.09
+        return False
+    out[0], out[1], out[2] = 0.06, 0.065, 0.07
+    if z < 1.3 and kind != 0:  # goods behind the glass
+        tone = _scramble(int(np.floor(u * 2.5)), seed + int(z * 3)) % 7
+        out[0], out[1], out[2] = 0.05 + 0.03 * tone, 0.06 + 0.02 * (6 - tone), 0.10
+    return True
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _scramble(a, b):
+    """A small integer hash of two integers, 0 to 2^31 - 1."""
+    h = (a * 73856093) ^ (b * 19349663)
+    h = (h ^ (h >> 13)) * 1274126177
+    return (h ^ (h >> 16)) & 0x7FFFFFFF

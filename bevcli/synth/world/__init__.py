@@ -1,0 +1,1 @@
+"""The simulated city: streets, traffic and people."""

@@ -1,0 +1,265 @@
+"""What is painted on the ground: roads, lane lines, crossings and pavements, as polygons in the world.
+
+The ground's texture and the ground truth map are both drawn from these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bevcli.geometry.transforms import Array
+from bevcli.synth.assets.paint import Color
+from bevcli.synth.world.city import (
+    CORNER_M,
+    CROSSING_FROM_M,
+    CROSSING_TO_M,
+    STOP_LINE_M,
+    CityPlan,
+    Street,
+    along,
+    rounded_rectangle,
+)
+from bevcli.synth.world.landuse import landuse
+
+WHITE: Color = (222, 222, 216)
+YELLOW: Color = (214, 170, 54)
+ASPHALT: Color = (92, 92, 95)
+PARKING: Color = (99, 98, 99)
+BIKE_LANE: Color = (96, 78, 74)
+PAVEMENT: Color = (158, 154, 146)
+JOINT: Color = (132, 128, 121)
+KERB: Color = (186, 184, 178)
+YARD: dict[str, Color] = {"houses": (128, 124, 116), "park": (92, 112, 62), "site": (142, 120, 92)}
+LINE_M = 0.14
+
+
+@dataclass(frozen=True)
+class GroundPaint:
+    """One colour on the ground. outline: (P, 2) world. width_m: of a line; finer textures than that show it."""
+
+    outline: Array
+    color: Color
+    width_m: float = float("inf")
+
+
+@dataclass(frozen=True)
+class GroundPiece:
+    """The ground of one block or stretch of street: what is painted, in order, and what the map must show.
+
+    lane_boundaries: polylines (P, 2). roads, crossings: polygons (P, 2). All in the world, metres.
+    """
+
+    paints: tuple[GroundPaint, ...]
+    roads: tuple[Array, ...] = ()
+    lane_boundaries: tuple[Array, ...] = ()
+    crossings: tuple[Array, ...] = ()
+
+
+class GroundPlan:
+    """The painted ground of a city, piece by piece."""
+
+    def __init__(self, city: CityPlan) -> None:
+        self.city = city
+        self._pieces: dict[tuple[str, int, int], GroundPiece] = {}
+
+    def pieces_around(self, center: ArrayLike, reach_m: float) -> list[GroundPiece]:
+        """Pieces within `reach_m` of a world point, in the order in which they must be painted."""
+        x, y = self.city.unbend(center)
+        reach = reach_m * 1.1 + 10
+        columns = self.city.streets_between(1, x - reach, x + reach)
+        rows = self.city.streets_between(0, y - reach, y + reach)
+        found = []
+        for i in range(columns[0].index - 1, columns[-1].index + 1):
+            for j in range(rows[0].index - 1, rows[-1].index + 1):
+                found.append(self._piece("block", i, j))
+        for street in columns + rows:
+            others = rows if street.axis == 1 else columns
+            for k in range(others[0].index - 1, others[-1].index + 1):
+                found.append(self._piece(f"stretch{street.axis}", street.index, k))
+        for i in range(columns[0].index, columns[-1].index + 1):
+            for j in range(rows[0].index, rows[-1].index + 1):
+                found.append(self._piece("junction", i, j))
+        return found
+
+    def _piece(self, kind: str, i: int, j: int) -> GroundPiece:
+        key = (kind, i, j)
+        if key not in self._pieces:
+            makers = {"block": self._block, "junction": self._junction}
+            make = makers.get(kind)
+            self._pieces[key] = make(i, j) if make else self._stretch(int(kind[-1]), i, j)
+        return self._pieces[key]
+
+    def _block(self, column: int, row: int) -> GroundPiece:
+        """Pavement with joints and a kerb; the road's fillet at the corners comes from its round outline."""
+        city, block = self.city, self.city.block(column, row)
+        outline = city.bend(rounded_rectangle(block.low, block.high, CORNER_M))
+        inner = rounded_rectangle(
+            (block.low[0] + 0.25, block.low[1] + 0.25), (block.high[0] - 0.25, block.high[1] - 0.25), CORNER_M - 0.25
+        )
+        paints = [GroundPaint(outline, KERB), GroundPaint(city.bend(inner), PAVEMENT)]
+        south, east, north, west = block.sidewalks
+        (x0, y0), (x1, y1) = block.low, block.high
+        x, y = np.arange(x0 + 1, x1 - 1, 1.5), np.arange(y0 + 1, y1 - 1, 1.5)
+        for low, high in ((y0 + 0.3, y0 + south), (y1 - north, y1 - 0.3)):
+            paints += self._bars(_pairs(x, low), _pairs(x, high), 0.04, JOINT)
+        for low, high in ((x0 + 0.3, x0 + west), (x1 - east, x1 - 0.3)):
+            paints += self._bars(_pairs(y, low)[:, ::-1], _pairs(y, high)[:, ::-1], 0.04, JOINT)
+        yard_low = (x0 + west, y0 + south)
+        yard_high = (x1 - east, y1 - north)
+        yard = city.bend(rounded_rectangle(yard_low, yard_high, 0.5))
+        paints.append(GroundPaint(yard, YARD[landuse(city, column, row)]))
+        return GroundPiece(tuple(paints))
+
+    def _junction(self, column: int, row: int) -> GroundPiece:
+        """The box where two streets meet, with its four corner fillets, crossings and stop lines."""
+        a, b = self.city.street(1, column), self.city.street(0, row)
+        x, y = a.position, b.position
+        reach_x, reach_y = a.half_width + CORNER_M, b.half_width + CORNER_M
+        outline = _junction_outline(x, y, a.half_width, b.half_width, reach_x, reach_y)
+        paints: list[GroundPaint] = []
+        crossings = []
+        for street, across, sign in ((a, b, 1), (a, b, -1), (b, a, 1), (b, a, -1)):
+            edge = (y if street is a else x) + sign * across.half_width
+            crossings.append(self._band(street, edge + sign * CROSSING_FROM_M, edge + sign * CROSSING_TO_M))
+            offsets = np.arange(-street.half_width + 0.75, street.half_width - 0.05, 1.1)
+            start = [self._at(street, edge + sign * CROSSING_FROM_M, offset) for offset in offsets]
+            end = [self._at(street, edge + sign * CROSSING_TO_M, offset) for offset in offsets]
+            paints += self._bars(start, end, 0.55, WHITE)
+            side = self._approach_side(street, sign)
+            stop = edge + sign * STOP_LINE_M
+            paints.append(
+                self._bar(self._at(street, stop, side * 0.15),
+                          self._at(street, stop, side * (street.lanes * street.lane_m + street.bike_m)), 0.4, WHITE)
+            )  # fmt: skip
+        road = self.city.bend(outline)
+        return GroundPiece(tuple(paints), roads=(road,), crossings=tuple(crossings))
+
+    def _stretch(self, axis: int, index: int, cross: int) -> GroundPiece:
+        """A street between two junctions: asphalt from centre to centre, its lines between the stop lines."""
+        street = self.city.street(axis, index)
+        before, after = self.city.street(1 - axis, cross), self.city.street(1 - axis, cross + 1)
+        start, end = before.position, after.position
+        low = start + before.half_width + STOP_LINE_M
+        high = end - after.half_width - STOP_LINE_M
+        paints = [GroundPaint(self._band(street, start, end), ASPHALT)]
+        boundaries = []
+        lanes_edge = street.lanes * street.lane_m
+        for side in (-1, 1):
+            if street.painted_bike:
+                paints.append(
+                    GroundPaint(self._band(street, low, high, side * lanes_edge, side * (lanes_edge + street.bike_m)),
+                                BIKE_LANE)
+                )  # fmt: skip
+            if street.parking_m:
+                inner = lanes_edge + street.bike_m
+                paints.append(
+                    GroundPaint(self._band(street, low, high, side * inner, side * street.half_width), PARKING)
+                )
+            for offset, color, dash in self._lines(street):
+                boundaries.append(self.city.bend(self._run(street, low, high, side * offset)))
+                dashes = list(self._dashes(street, low, high, side * offset, dash))
+                paints += self._bars([a for a, _ in dashes], [b for _, b in dashes], LINE_M, color)
+        paints += self._marks(street, low, high)
+        return GroundPiece(tuple(paints), (self._band(street, start, end),), tuple(boundaries))
+
+    def _lines(self, street: Street) -> Iterator[tuple[float, Color, float]]:
+        """Offset, colour and dash length (0 unbroken) of the lines right of the centre."""
+        yield (0.16 if street.lanes > 1 else 0.0), YELLOW, 0.0 if street.lanes > 1 else 3.0
+        for lane in range(1, street.lanes):
+            yield lane * street.lane_m, WHITE, 3.0
+        yield street.lanes * street.lane_m, WHITE, 0.0
+        if street.parking_m:
+            yield street.lanes * street.lane_m + street.bike_m, WHITE, 0.0
+
+    def _marks(self, street: Street, low: float, high: float) -> Iterator[GroundPaint]:
+        """Arrows before the stop lines, repairs and manholes."""
+        rng = self.city.stream("marks", street.axis, street.index, int(low))
+        for sign, stop in ((1, low), (-1, high)):
+            side = self._approach_side(street, sign)
+            for lane in range(street.lanes):
+                for back in (5.0, 17.0):
+                    yield from self._arrow(street, stop + sign * back, side * street.lane_offset(lane), sign)
+        for _ in range(rng.poisson(5)):
+            at, offset = rng.uniform(low, high), rng.uniform(-1, 1) * (street.half_width - 1.5)
+            size = rng.uniform(0.5, 3.5), rng.uniform(0.3, 1.2)
+            tone = int(rng.choice([70, 74, 98]))
+            yield GroundPaint(self._band(street, at, at + size[0], offset, offset + size[1]), (tone, tone, tone + 2))
+        for _ in range(3):
+            at, offset = rng.uniform(low, high), rng.uniform(-1, 1) * (street.half_width - 2)
+            angle = np.linspace(0, 2 * np.pi, 14)[:-1]
+            yield GroundPaint(
+                self.city.bend(
+                    np.array(self._at(street, at, offset)) + 0.36 * np.stack([np.cos(angle), np.sin(angle)], -1)
+                ),
+                (58, 56, 55),
+            )
+
+    def _arrow(self, street: Street, at: float, offset: float, sign: int) -> Iterator[GroundPaint]:
+        yield self._bar(self._at(street, at, offset), self._at(street, at + sign * 2.2, offset), 0.16, WHITE)
+        head = [self._at(street, at - sign * 1.1, offset), self._at(street, at, offset + 0.42),
+                self._at(street, at, offset - 0.42)]  # fmt: skip
+        yield GroundPaint(self.city.bend(head), WHITE)
+
+    def _approach_side(self, street: Street, sign: int) -> int:
+        """On which side of the centre (+ or -) vehicles come towards a junction that lies before this stretch's end."""
+        towards = -sign  # their direction along the street
+        return -towards if street.axis == 0 else towards
+
+    def _at(self, street: Street, position: float, offset: float) -> tuple[float, float]:
+        """Plan point at a position along a street and an offset across it (+ is +y or +x)."""
+        if street.axis == 0:
+            return position, street.position + offset
+        return street.position + offset, position
+
+    def _run(self, street: Street, start: float, end: float, offset: float) -> Array:
+        return along(self._at(street, start, offset), self._at(street, end, offset))
+
+    def _band(
+        self, street: Street, start: float, end: float, low: float | None = None, high: float | None = None
+    ) -> Array:
+        """World outline of a strip of a street, over its whole width by default."""
+        low = -street.half_width if low is None else low
+        high = street.half_width if high is None else high
+        return self.city.bend(
+            np.concatenate([self._run(street, start, end, low), self._run(street, start, end, high)[::-1]])
+        )
+
+    def _dashes(
+        self, street: Street, low: float, high: float, offset: float, dash: float
+    ) -> Iterator[tuple[tuple[float, float], tuple[float, float]]]:
+        step = dash * 2.5 if dash else 4.0
+        for start in np.arange(low, high, step):
+            end = min(start + (dash or step), high)
+            yield self._at(street, start, offset), self._at(street, end, offset)
+
+    def _bar(self, start: tuple[float, float], end: tuple[float, float], width: float, color: Color) -> GroundPaint:
+        """A painted line between two plan points."""
+        return self._bars([start], [end], width, color)[0]
+
+    def _bars(self, starts: ArrayLike, ends: ArrayLike, width: float, color: Color) -> list[GroundPaint]:
+        """Painted lines between plan points (L, 2) and (L, 2)."""
+        a, b = np.asarray(starts, dtype=np.float64), np.asarray(ends, dtype=np.float64)
+        way = b - a
+        normal = np.stack([-way[:, 1], way[:, 0]], -1) / np.linalg.norm(way, axis=1, keepdims=True) * width / 2
+        corners = self.city.bend(np.stack([a + normal, b + normal, b - normal, a - normal], axis=1))
+        return [GroundPaint(outline, color, width) for outline in corners]
+
+
+def _pairs(varying: Array, fixed: float) -> Array:
+    """(L, 2) points of varying first and fixed second coordinate."""
+    return np.stack([varying, np.full(len(varying), fixed)], -1)
+
+
+def _junction_outline(x: float, y: float, half_x: float, half_y: float, reach_x: float, reach_y: float) -> Array:
+    """Plan outline of a junction: a cross whose inner corners are rounded by CORNER_M, counter-clockwise."""
+    points = []
+    for sx, sy in ((1, 1), (-1, 1), (-1, -1), (1, -1)):
+        sweep = np.linspace(0, np.pi / 2, 6)[:: sx * sy]
+        points.append(
+            np.stack([x + sx * (reach_x - CORNER_M * np.sin(sweep)), y + sy * (reach_y - CORNER_M * np.cos(sweep))], -1)
+        )
+    return np.concatenate(points)

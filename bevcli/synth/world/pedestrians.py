@@ -1,0 +1,146 @@
+"""Pedestrians: they stroll along pavements and cross at junctions when the signal lets them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.geometry.transforms import Array
+from bevcli.synth.assets.catalog import Catalog
+from bevcli.synth.assets.people import PERSON_NAMES
+from bevcli.synth.world.actors import MOVING_M_S, Body, State, draw_body
+from bevcli.synth.world.city import KERB_M, CityPlan, along, rounded_rectangle
+from bevcli.synth.world.route import DIRECTIONS, node_center, street_of
+from bevcli.synth.world.signals import Signals
+
+STRIDE_M = 0.72
+CROSSING_LINE_M = 3.2  # where people cross, measured from the junction's box
+ALONG_PAVEMENT_M = 26.0  # how far people come from, and go on to
+STROLLERS_PER_BLOCK = 4.5
+SECONDS_BETWEEN_CROSSERS = 8.0
+
+
+@dataclass(frozen=True)
+class Walker:
+    """A person on a path. path: (P, 2) plan points; positions: (P,) metres along it.
+
+    times, places: (K,) knots of the walk: where on the path, in metres, the person is when.
+    road: the span of the path that lies on a road, metres.
+    """
+
+    city: CityPlan
+    body: Body
+    path: Array
+    positions: Array
+    times: NDArray[np.float64]
+    places: NDArray[np.float64]
+    road: tuple[float, float]
+
+    def plan_at(self, time_s: float) -> Array:
+        """Plan point (2,) at a time."""
+        place = np.interp(time_s, self.times, self.places)
+        return np.array([np.interp(place, self.positions, self.path[:, k]) for k in (0, 1)])
+
+    def on_road(self, time_s: float) -> bool:
+        """Whether vehicles must mind the person."""
+        return self.road[0] - 0.3 < float(np.interp(time_s, self.times, self.places)) < self.road[1] + 0.3
+
+    def state(self, time_s: float) -> State | None:
+        """None before the walk begins and after it ends."""
+        if not self.times[0] <= time_s <= self.times[-1]:
+            return None
+        moments = np.array([time_s - 0.02, time_s, time_s + 0.02])
+        places = np.interp(moments, self.times, self.places)
+        plan = np.stack([np.interp(places, self.positions, self.path[:, k]) for k in (0, 1)], -1)
+        before, here, after = self.city.bend(plan)
+        velocity = (after - before) / 0.04
+        moving = float(np.hypot(*velocity)) > MOVING_M_S
+        if moving:
+            yaw = float(np.arctan2(velocity[1], velocity[0]))
+        else:  # waiting: towards the other side
+            segment = int(np.searchsorted(self.positions, places[1], side="right"))
+            yaw = self.city.heading(plan[1], _unit(self.path[segment] - self.path[segment - 1]))
+        inside = min(places[1] - self.road[0], self.road[1] - places[1])  # metres into the road, negative on pavements
+        position = np.array([here[0], here[1], KERB_M * float(np.clip(0.5 - inside / 0.3, 0, 1))])
+        attribute = "pedestrian.moving" if moving else "pedestrian.standing"
+        return State(self.body, position, yaw, velocity, attribute, int(places[1] / STRIDE_M) % 2)
+
+
+def _unit(way: Array) -> Array:
+    return way / max(float(np.hypot(*way)), 1e-9)
+
+
+def _make(
+    city: CityPlan, body: Body, path: Array, times: list[float], places: list[float], road: tuple[float, float]
+) -> Walker:
+    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    return Walker(city, body, path, np.concatenate([[0], np.cumsum(steps)]), np.array(times), np.array(places), road)
+
+
+def strollers(city: CityPlan, catalog: Catalog, column: int, row: int, span_s: tuple[float, float]) -> list[Walker]:
+    """People who walk around a block on its pavement."""
+    rng = city.stream("strollers", column, row)
+    land = city.block(column, row)
+    walkers = []
+    for k in range(int(rng.poisson(STROLLERS_PER_BLOCK))):
+        inset = rng.uniform(1.3, min(land.sidewalks) - 2.1)
+        low, high = (land.low[0] + inset, land.low[1] + inset), (land.high[0] - inset, land.high[1] - inset)
+        ring = np.roll(rounded_rectangle(low, high, 3.5), int(rng.integers(100)), axis=0)
+        if rng.random() < 0.5:
+            ring = ring[::-1]
+        speed = rng.uniform(0.8, 1.7)
+        lap = float(np.linalg.norm(np.diff(ring, axis=0, append=ring[:1]), axis=1).sum())
+        laps = int(np.ceil((span_s[1] - span_s[0]) * speed / lap)) + 1
+        path = np.concatenate([ring] * laps + [ring[:1]])
+        body = _person(catalog, rng, f"stroller-{column}-{row}-{k}")
+        walked = (span_s[1] - span_s[0]) * speed
+        walkers.append(_make(city, body, path, list(span_s), [0.0, walked], (-1.0, -1.0)))
+    return walkers
+
+
+def crossers(
+    city: CityPlan, catalog: Catalog, signals: Signals, node: tuple[int, int], span_s: tuple[float, float]
+) -> list[Walker]:
+    """People who cross at a junction, one after another over the whole time."""
+    rng = city.stream("crossers", *node)
+    walkers: list[Walker] = []
+    begin = span_s[0] - 30
+    while begin < span_s[1]:
+        name = f"crosser-{node[0]}-{node[1]}-{len(walkers)}"
+        walkers.append(_crosser(city, catalog, signals, node, begin, rng, name, len(walkers)))
+        begin += rng.exponential(SECONDS_BETWEEN_CROSSERS)
+    return walkers
+
+
+def _crosser(
+    city: CityPlan, catalog: Catalog, signals: Signals, node: tuple[int, int], begin: float,
+    rng: np.random.Generator, name: str, index: int,
+) -> Walker:  # fmt: skip
+    """One person: along the pavement to a kerb, over the road when the signal says walk, and on."""
+    arm = int(rng.integers(4))
+    street, cross = street_of(city, node, arm), street_of(city, node, arm + 1)
+    side = 1 if rng.random() < 0.5 else -1  # who goes one way keeps to one side of the crossing
+    sideways = DIRECTIONS[(arm + 1) % 4] * side
+    spot = node_center(city, node) + DIRECTIONS[arm] * (
+        cross.half_width + CROSSING_LINE_M + side * (0.25 + 0.72 * (index % 3))
+    )
+    reach = street.half_width + ALONG_PAVEMENT_M
+    path = along(spot - sideways * reach, spot + sideways * reach)
+    speed = max(rng.uniform(1.0, 1.7), street.half_width / 6.5)  # over within 13 s
+    kerb, far = ALONG_PAVEMENT_M - 0.5 - 0.85 * (index // 3 % 3), ALONG_PAVEMENT_M + 2 * street.half_width
+    arrival = begin + kerb / speed
+    start = arrival
+    while not signals.walk(node, arm % 2, start):
+        start += 0.25
+    start += rng.uniform(0, 1.0) if start > arrival else 0.0
+    end = start + (2 * reach - kerb) / speed
+    body = _person(catalog, rng, name)
+    return _make(city, body, path, [begin, arrival, start, end], [0.0, kerb, kerb, 2 * reach],
+                 (ALONG_PAVEMENT_M, far))  # fmt: skip
+
+
+def _person(catalog: Catalog, rng: np.random.Generator, name: str) -> Body:
+    names = [n for n in PERSON_NAMES if n != "worker"]
+    return draw_body(catalog.draw("pedestrian", rng, names), rng, name, 0.03, rng.uniform(0.94, 1.05))

@@ -1,0 +1,200 @@
+"""Routes: where a vehicle drives, as a smooth line in the world with the junctions that it passes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import gaussian_filter1d
+
+from bevcli.geometry.transforms import Array
+from bevcli.synth.world.city import CROSSING_TO_M, STOP_LINE_M, CityPlan, Street
+
+STEP_M = 0.25
+SMOOTHING_M = 1.2  # corners are rounded over this, so that yaw rates rise and fall as a steering wheel turns
+LATERAL_ACCELERATION = 2.2  # m/s², how fast curves are taken
+BRAKING = 1.7  # m/s², how early drivers slow for curves
+DIRECTIONS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)], dtype=np.float64)  # east, north, west, south
+BICYCLE_OFFSET_M = 0.5  # from the outermost lane's edge to the line that bicycles keep
+
+
+@dataclass(frozen=True)
+class JunctionPass:
+    """One junction on a route. stop, enter, leave: route positions of stop line, junction box and its far end, m.
+
+    node: (column, row). direction: 0 to 3 on approach. turn: -1 right, 0 straight on, 1 left.
+    """
+
+    node: tuple[int, int]
+    direction: int
+    turn: int
+    stop: float
+    enter: float
+    leave: float
+
+
+@dataclass(frozen=True)
+class Route:
+    """points: (P, 2) world. positions: (P,) metres along. yaws: (P,) unwrapped. speed_limits: (P,) m/s."""
+
+    points: Array
+    positions: Array
+    yaws: Array
+    speed_limits: Array
+    passes: tuple[JunctionPass, ...]
+
+    @property
+    def length(self) -> float:
+        """Metres from the first to the last point."""
+        return float(self.positions[-1])
+
+    def at(self, position: ArrayLike) -> Array:
+        """World points (..., 2) at positions (...,) in metres along the route."""
+        s = np.asarray(position, dtype=np.float64)
+        return np.stack(
+            [np.interp(s, self.positions, self.points[:, 0]), np.interp(s, self.positions, self.points[:, 1])], -1
+        )
+
+    def yaw_at(self, position: ArrayLike) -> Array:
+        """Heading (...,) in radians."""
+        return np.interp(np.asarray(position, dtype=np.float64), self.positions, self.yaws)
+
+
+@dataclass(frozen=True)
+class LaneStart:
+    """Where a route begins: on the way in `direction` towards the junction `node`, `before` metres from its centre."""
+
+    node: tuple[int, int]
+    direction: int
+    lane: int
+    before: float
+
+
+def street_of(city: CityPlan, node: tuple[int, int], direction: int) -> Street:
+    """The street on which one passes a junction in a direction."""
+    return city.street(0, node[1]) if direction % 2 == 0 else city.street(1, node[0])
+
+
+def node_center(city: CityPlan, node: tuple[int, int]) -> Array:
+    """Plan point (2,) in the middle of a junction."""
+    return np.array([city.street(1, node[0]).position, city.street(0, node[1]).position])
+
+
+def right_of(direction: int) -> Array:
+    """Unit vector (2,) to the right of a direction."""
+    return DIRECTIONS[(direction - 1) % 4]
+
+
+def draw_turns(city: CityPlan, start: LaneStart, rng: np.random.Generator, straight_on: float = 0.6) -> Iterator[int]:
+    """Endless turns that a driver may take from the lane that they are in."""
+    node, direction, lane = start.node, start.direction, start.lane
+    while True:
+        lanes = street_of(city, node, direction).lanes
+        options = [1, -1, -1] if lanes == 1 else ([1] if lane == 0 else [-1])  # left turns hold up those behind
+        turn = 0 if rng.random() < straight_on else int(options[int(rng.integers(len(options)))])
+        yield turn
+        direction = (direction + turn) % 4
+        node = (node[0] + int(DIRECTIONS[direction][0]), node[1] + int(DIRECTIONS[direction][1]))
+        lane = _lane_after(city, node, direction, turn, lane)
+
+
+def bicycle_turns(rng: np.random.Generator) -> Iterator[int]:
+    """Endless turns of a bicycle: straight on or right, as it keeps right."""
+    while True:
+        yield 0 if rng.random() < 0.7 else -1
+
+
+def _lane_after(city: CityPlan, node: tuple[int, int], direction: int, turn: int, lane: int) -> int:
+    lanes = street_of(city, node, direction).lanes
+    return min(lane, lanes - 1) if turn == 0 else (0 if turn > 0 else lanes - 1)
+
+
+def build_route(
+    city: CityPlan, start: LaneStart, turns: Iterable[int], length: float, speed: float, bicycle: bool = False
+) -> Route:
+    """A route of at least `length` metres at a preferred speed in m/s; a bicycle keeps right of the lanes."""
+    node, direction, lane = start.node, start.direction, start.lane
+    street = street_of(city, node, direction)
+    offset = lane_offset(street, lane, bicycle)
+    at = node_center(city, node) - DIRECTIONS[direction] * start.before + right_of(direction) * offset
+    corners, marks, travelled = [at[None]], [], 0.0
+    choose = iter(turns)
+    while travelled < length:
+        turn = next(choose)
+        center, cross = node_center(city, node), street_of(city, node, direction + 1)
+        after = (direction + turn) % 4
+        following = (node[0] + int(DIRECTIONS[after][0]), node[1] + int(DIRECTIONS[after][1]))
+        lane = _lane_after(city, following, after, turn, lane)
+        new_street = street_of(city, following, after)
+        new_offset = lane_offset(new_street, lane, bicycle)
+        corner = center + right_of(direction) * offset
+        if turn != 0:
+            corner = corner + DIRECTIONS[direction] * (right_of(after) @ DIRECTIONS[direction]) * new_offset
+        radius = _radius(cross, new_offset, turn)
+        begin, end = corner - DIRECTIONS[direction] * radius, corner + DIRECTIONS[after] * radius
+        stop = corner_at(center, direction, offset, -(cross.half_width + STOP_LINE_M))
+        enter = corner_at(center, direction, offset, -cross.half_width)
+        across = street_of(city, node, after + 1)
+        leave = corner_at(center, after, new_offset, across.half_width + CROSSING_TO_M)
+        marks.append((node, direction, turn, stop, enter, leave))
+        piece = _arc(begin, corner, end) if turn != 0 else np.stack([begin, end])
+        corners.append(piece)
+        travelled += float(np.linalg.norm(piece[0] - at)) + radius * 1.6
+        at, node, direction, offset = piece[-1], following, after, new_offset
+    corners.append((at + DIRECTIONS[direction] * 40)[None])
+    return _finish(city, np.concatenate(corners), marks, speed)
+
+
+def corner_at(center: Array, direction: int, offset: float, ahead: float) -> Array:
+    """Plan point on the lane that passes a junction's centre at `offset` to the right, `ahead` metres beyond it."""
+    return center + right_of(direction) * offset + DIRECTIONS[direction] * ahead
+
+
+def lane_offset(street: Street, lane: int, bicycle: bool) -> float:
+    """Metres right of the street's centre line on which a vehicle keeps; bicycles keep right of all lanes."""
+    return street.lanes * street.lane_m + BICYCLE_OFFSET_M if bicycle else street.lane_offset(lane)
+
+
+def _radius(cross: Street, new_offset: float, turn: int) -> float:
+    if turn == 0:
+        return cross.half_width
+    return cross.half_width + turn * new_offset + (1.5 if turn < 0 else 0.0)
+
+
+def _arc(begin: Array, corner: Array, end: Array) -> Array:
+    """(17, 2) quarter circle from begin to end, tangent to the ways to and from the corner."""
+    center = begin + end - corner
+    angle = np.linspace(0, np.pi / 2, 17)[:, None]
+    return center + (begin - center) * np.cos(angle) + (end - center) * np.sin(angle)
+
+
+def _finish(city: CityPlan, corners: Array, marks: list, speed: float) -> Route:
+    """Sample the plan line, bend it to the world, smooth it, and find the marks on it."""
+    along_corners = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    samples = np.arange(0, along_corners[-1], STEP_M)
+    plan = np.stack([np.interp(samples, along_corners, corners[:, k]) for k in (0, 1)], -1)
+    points = gaussian_filter1d(city.bend(plan), SMOOTHING_M / STEP_M, axis=0, mode="nearest")
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    positions = np.concatenate([[0], np.cumsum(steps)])
+    way = np.gradient(points, axis=0)
+    yaws = np.unwrap(np.arctan2(way[:, 1], way[:, 0]))
+    limits = _speed_limits(positions, yaws, speed)
+    passes, start = [], 0
+    for node, direction, turn, *places in marks:
+        found = []
+        for place in places:
+            window = plan[start : start + int(160 / STEP_M)]
+            start += int(np.argmin(np.linalg.norm(window - place, axis=1)))
+            found.append(float(positions[start]))
+        passes.append(JunctionPass(node, direction, turn, *found))
+    return Route(points, positions, yaws, limits, tuple(passes))
+
+
+def _speed_limits(positions: Array, yaws: Array, speed: float) -> NDArray[np.float64]:
+    """Speeds (P,) that curves allow, lowered before them so that nobody must brake harder than BRAKING."""
+    curvature = np.abs(np.gradient(yaws) / np.maximum(np.gradient(positions), 1e-6))
+    squared = np.minimum(speed**2, LATERAL_ACCELERATION / np.maximum(curvature, 1e-4))
+    falling = squared + 2 * BRAKING * positions
+    return np.sqrt(np.minimum.accumulate(falling[::-1])[::-1] - 2 * BRAKING * positions)

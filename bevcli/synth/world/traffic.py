@@ -1,0 +1,179 @@
+"""Traffic: vehicles that follow routes, keep distance, obey signals and yield, step by step and reproducibly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from bevcli.geometry.transforms import Array
+from bevcli.synth.assets.catalog import Variant
+from bevcli.synth.world.route import JunctionPass, Route
+from bevcli.synth.world.signals import Light, Signals
+
+STEP_S = 0.1
+LOOK_AHEAD_M, LOOK_STEPS = 42.0, 54
+CORRIDOR_M = 1.55  # something this near to the middle of a vehicle's way is in its way
+COMFORT = 2.0  # m/s², usual braking
+HARDEST = -3.4  # m/s², what the traffic ever brakes with
+
+
+@dataclass(frozen=True)
+class Unit:
+    """One body of a road train. lag: metres from the train's foremost point to this body's front."""
+
+    variant: Variant
+    size_lwh: Array
+    paint: NDArray[np.float32]
+    dye: NDArray[np.float32]
+    instance: str
+    lag: float
+
+
+@dataclass(eq=False)
+class Vehicle:
+    """A vehicle, or a road train, on its route. front: route position of its foremost point, metres.
+
+    track: (time, front, speed) of every step since it appeared.
+    """
+
+    route: Route
+    units: tuple[Unit, ...]
+    front: float
+    speed: float
+    liveliness: float
+    bicycle: bool = False
+    track: list[tuple[float, float, float]] = field(default_factory=list)
+
+    @cached_property
+    def length(self) -> float:
+        """Metres from the foremost to the last point."""
+        return self.units[-1].lag + float(self.units[-1].size_lwh[0])
+
+    def next_pass(self) -> JunctionPass | None:
+        """The junction that is not yet left behind."""
+        return next((p for p in self.route.passes if self.front < p.leave + self.length), None)
+
+    def body_points(self) -> Array:
+        """(B, 2) points along the vehicle, at most 2.5 m apart, its ends included."""
+        count = max(int(np.ceil(self.length / 2.5)) + 1, 2)
+        return points_between(self.route.points, self.route.positions, self.front - self.length, self.front, count)
+
+
+def step(vehicles: list[Vehicle], people: Array, signals: Signals, time_s: float) -> None:
+    """Move all vehicles on by STEP_S. people: (H, 2) world points of persons who may stand in the way."""
+    bodies = [vehicle.body_points() for vehicle in vehicles]
+    owners = np.repeat(np.arange(len(bodies)), [len(b) for b in bodies])
+    obstacles = np.concatenate([*bodies, people.reshape(-1, 2)])
+    owners = np.concatenate([owners, np.full(len(people), -1)])
+    speeds = np.array([v.speed for v in vehicles] + [0.0])
+    accelerations = [
+        _acceleration(index, vehicle, vehicles, obstacles, owners, speeds, signals, time_s)
+        for index, vehicle in enumerate(vehicles)
+    ]
+    for vehicle, acceleration in zip(vehicles, accelerations, strict=True):
+        faster = max(vehicle.speed + acceleration * STEP_S, 0.0)
+        vehicle.front += (vehicle.speed + faster) / 2 * STEP_S
+        vehicle.speed = faster
+        vehicle.track.append((time_s + STEP_S, vehicle.front, vehicle.speed))
+
+
+def _acceleration(
+    index: int, vehicle: Vehicle, vehicles: list[Vehicle], obstacles: Array, owners: NDArray, speeds: Array,
+    signals: Signals, time_s: float,
+) -> float:  # fmt: skip
+    """The Intelligent Driver Model towards whatever limits the vehicle most."""
+    route = vehicle.route
+    limit = float(np.interp(vehicle.front, route.positions, route.speed_limits))
+    speed, strongest = vehicle.speed, 1.6 * vehicle.liveliness
+    free = strongest * (1 - (speed / max(limit, 0.3)) ** 4) if speed <= limit else max(-2.2, (limit - speed) * 2.0)
+    corridor = 0.9 if vehicle.bicycle else CORRIDOR_M
+    gap, other = _nearest_in_way(route.points, route.positions, vehicle.front, obstacles, owners, index, corridor)
+    wanted = free
+    if gap < np.inf:
+        lead = float(speeds[other]) if other >= 0 else 0.0
+        lead = lead if _same_way(vehicle, vehicles, other) else 0.0
+        wanted = min(wanted, _follow(speed, limit, strongest, gap, lead))
+    crossing = vehicle.next_pass()
+    if crossing is not None and vehicle.front < crossing.stop + 0.5:
+        room = crossing.stop - vehicle.front
+        needed = speed**2 / (2 * max(room, 0.1))
+        if needed < 3.0 and not _may_enter(vehicle, crossing, vehicles, signals, time_s):
+            wanted = min(wanted, _follow(speed, limit, strongest, room + 1.4, 0.0))
+    return float(np.clip(wanted, HARDEST, strongest))
+
+
+def _follow(speed: float, limit: float, strongest: float, gap: float, lead_speed: float) -> float:
+    """IDM: keep 2 m and 1.2 s from what drives at `lead_speed`, `gap` metres ahead."""
+    desired = 2.0 + max(0.0, speed * 1.2 + speed * (speed - lead_speed) / (2 * np.sqrt(strongest * COMFORT)))
+    return strongest * (1 - (speed / max(limit, 0.3)) ** 4 - (desired / max(gap, 0.1)) ** 2)
+
+
+def _same_way(vehicle: Vehicle, vehicles: list[Vehicle], other: int) -> bool:
+    """Whether the other one drives roughly in the vehicle's direction; what crosses counts as standing."""
+    if other < 0:
+        return False
+    mine = vehicle.route.yaw_at(vehicle.front)
+    theirs = vehicles[other].route.yaw_at(vehicles[other].front)
+    return bool(np.cos(mine - theirs) > 0.5)
+
+
+def _may_enter(
+    vehicle: Vehicle, crossing: JunctionPass, vehicles: list[Vehicle], signals: Signals, time_s: float
+) -> bool:
+    """Green, and nobody there to whom the vehicle must give way. Left turns may use the yellow, too."""
+    light = signals.light(crossing.node, crossing.direction % 2, time_s)
+    if light != "green" and (light == "red" or crossing.turn <= 0):
+        return False
+    return not any(
+        _has_priority(other, theirs, vehicle, crossing, light)
+        for other in vehicles
+        if other is not vehicle and (theirs := other.next_pass()) is not None and theirs.node == crossing.node
+    )
+
+
+def _has_priority(other: Vehicle, theirs: JunctionPass, vehicle: Vehicle, crossing: JunctionPass, light: Light) -> bool:
+    """Oncoming traffic before left turns; bicycles before right turns beside them, until these have begun."""
+    if theirs.direction == (crossing.direction + 2) % 4 and crossing.turn == 1 and theirs.turn != 1:
+        near = theirs.stop - 15 < other.front < theirs.leave - 5
+        waits = other.speed < 0.5 and (light == "yellow" or other.front < theirs.stop - 6)
+        return near and (not waits or other.front > theirs.stop + 1)
+    if theirs.direction == crossing.direction and other.bicycle != vehicle.bicycle:
+        if vehicle.bicycle:
+            return theirs.turn == -1 and theirs.stop + 0.5 < other.front < theirs.leave + 2
+        return crossing.turn == -1 and theirs.stop - 8 < other.front < theirs.leave
+    return False
+
+
+@njit(cache=True, nogil=True)
+def points_between(points: Array, positions: Array, start: float, end: float, count: int) -> Array:
+    """(count, 2) points at even positions from start to end along a route."""
+    found = np.empty((count, 2))
+    for i in range(count):
+        place = start + (end - start) * i / (count - 1)
+        k = min(max(int(np.searchsorted(positions, place)) - 1, 0), len(positions) - 2)
+        w = min(max((place - positions[k]) / (positions[k + 1] - positions[k]), 0.0), 1.0)
+        found[i, 0] = points[k, 0] + w * (points[k + 1, 0] - points[k, 0])
+        found[i, 1] = points[k, 1] + w * (points[k + 1, 1] - points[k, 1])
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _nearest_in_way(
+    points: Array, positions: Array, front: float, obstacles: Array, owners: NDArray, own: int, corridor: float
+) -> tuple[float, int]:
+    """Distance along a route from `front` to the first obstacle in its corridor, and its owner; inf, -1 for none."""
+    squared = corridor * corridor
+    way = points_between(points, positions, front + 0.3, front + LOOK_AHEAD_M, LOOK_STEPS)
+    reach = (LOOK_AHEAD_M + 5.0) ** 2
+    near = [k for k in range(obstacles.shape[0]) if owners[k] != own
+            and (obstacles[k, 0] - way[0, 0]) ** 2 + (obstacles[k, 1] - way[0, 1]) ** 2 < reach]  # fmt: skip
+    for i in range(LOOK_STEPS):
+        for k in near:
+            dx, dy = obstacles[k, 0] - way[i, 0], obstacles[k, 1] - way[i, 1]
+            if dx * dx + dy * dy < squared:
+                return max(i * (LOOK_AHEAD_M - 0.3) / (LOOK_STEPS - 1) - 0.4, 0.05), owners[k]
+    return np.inf, -1

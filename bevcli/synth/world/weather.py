@@ -1,0 +1,145 @@
+"""Weather and hour: sun, sky and haze of one drive."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.synth.assets.paint import linear
+
+WeatherName = Literal["noon", "evening", "overcast"]
+WEATHER_NAMES: tuple[str, ...] = get_args(WeatherName)
+
+
+@dataclass(frozen=True)
+class Weather:
+    """Light in linear units, where 1 is a white surface's brightness in full sun at noon.
+
+    to_sun: (3,) unit vector in the world. sun, sky, bounce: (3,) light from the sun, from above and from below.
+    zenith, horizon, haze: (3,) colours. clouds: (512, 512) cover 0 to 1 on a plane overhead, repeating.
+    haze_m: distance after which 63 % of the light is haze. lamps: how strongly lamps and windows glow.
+    """
+
+    name: str
+    to_sun: NDArray[np.float64]
+    sun: NDArray[np.float32]
+    sky: NDArray[np.float32]
+    bounce: NDArray[np.float32]
+    zenith: NDArray[np.float32]
+    horizon: NDArray[np.float32]
+    haze: NDArray[np.float32]
+    cloud_color: NDArray[np.float32]
+    clouds: NDArray[np.float32]
+    haze_m: float
+    lamps: float
+    shadow_softness_m: float
+
+
+def make_weather(name: str, rng: np.random.Generator) -> Weather:
+    """Weather of this name, with sun and clouds drawn from `rng`."""
+    azimuth = rng.uniform(0, 2 * np.pi)
+    if name == "noon":
+        elevation = rng.uniform(0.65, 1.05)
+        return _weather(
+            name,
+            azimuth,
+            elevation,
+            (1.0, 0.95, 0.86),
+            1.25,
+            (0.32, 0.39, 0.50),
+            (84, 136, 206),
+            (190, 212, 232),
+            (255, 255, 255),
+            _clouds(rng, rng.uniform(0.45, 0.62)),
+            420.0,
+            0.5,
+            0.05,
+        )
+    if name == "evening":
+        elevation = rng.uniform(0.22, 0.38)
+        return _weather(
+            name,
+            azimuth,
+            elevation,
+            (1.0, 0.70, 0.42),
+            0.95,
+            (0.26, 0.28, 0.38),
+            (92, 118, 178),
+            (250, 206, 160),
+            (255, 214, 178),
+            _clouds(rng, rng.uniform(0.42, 0.6)),
+            300.0,
+            1.2,
+            0.12,
+        )
+    return _weather(
+        "overcast",
+        azimuth,
+        1.35,
+        (0.95, 0.98, 1.0),
+        0.22,
+        (0.50, 0.53, 0.57),
+        (150, 158, 168),
+        (205, 210, 214),
+        (222, 226, 230),
+        _clouds(rng, 0.2),
+        230.0,
+        0.8,
+        0.8,
+    )
+
+
+def _weather(
+    name: str,
+    azimuth: float,
+    elevation: float,
+    sun: tuple[float, float, float],
+    strength: float,
+    sky: tuple[float, float, float],
+    zenith: tuple[int, int, int],
+    horizon: tuple[int, int, int],
+    cloud: tuple[int, int, int],
+    clouds: NDArray[np.float32],
+    haze_m: float,
+    lamps: float,
+    softness: float,
+) -> Weather:
+    to_sun = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
+    sun_light = (np.array(sun) * strength).astype(np.float32)
+    sky_light = np.array(sky, np.float32)
+    bounce = (0.22 * (sun_light * np.sin(elevation) + sky_light) + 0.25 * sky_light).astype(np.float32)
+    haze = linear(horizon) * np.float32(0.95)
+    return Weather(
+        name,
+        to_sun,
+        sun_light,
+        sky_light,
+        bounce,
+        linear(zenith),
+        linear(horizon),
+        haze,
+        linear(cloud),
+        clouds,
+        haze_m,
+        lamps,
+        softness,
+    )
+
+
+def _clouds(rng: np.random.Generator, threshold: float) -> NDArray[np.float32]:
+    """(512, 512) cloud cover on a plane overhead that repeats in both directions: octaves of noise."""
+    size = 512
+    total = np.zeros((size, size))
+    for octave in range(5):
+        cells = 4 * 2**octave
+        coarse = np.pad(rng.random((cells, cells)), 2, mode="wrap")
+        scale = size // cells
+        fine = cv2.resize(coarse, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+        total += fine[2 * scale : 2 * scale + size, 2 * scale : 2 * scale + size] * 0.5**octave
+    total = (total - total.min()) / (total.max() - total.min())
+    cover = np.clip((total - threshold) / 0.25, 0, 1)
+    return (cover * cover * (3 - 2 * cover)).astype(np.float32)

@@ -1,0 +1,1 @@
+"""What shows a recording: windows, web pages, screenshots, videos, summaries and exports."""

@@ -1,0 +1,81 @@
+"""Draws the flat parts of a recording, lines, arrows and labels, with OpenCV: no viewer, GPU or screen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.geometry.transforms import Array
+from bevcli.viewer.recording_reader import RecordedFrame
+
+Canvas = NDArray[np.uint8]
+ToCanvas = Callable[[Array], Array]  # (K, 2) of an entity's space -> (K, 2) pixels of a canvas
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+SUBPIXEL_BITS = 3
+
+
+def draw_strips(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: ToCanvas, thickness: int = 1) -> None:
+    """Draws an entity's line strips."""
+    strips = frame.values(entity, "LineStrips2D:strips")
+    colors = entity_colors(frame, entity, "LineStrips2D:colors", len(strips))
+    for strip, color in zip(strips, colors, strict=True):
+        points = _fixed_point(to_canvas(np.array(strip)))
+        cv2.polylines(canvas, [points], False, color, thickness, cv2.LINE_AA, SUBPIXEL_BITS)
+
+
+def draw_arrows(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: ToCanvas) -> None:
+    """Draws an entity's 2D arrows."""
+    starts = frame.array(entity, "Arrows2D:origins", 2)
+    ends = starts + frame.array(entity, "Arrows2D:vectors", 2)
+    colors = entity_colors(frame, entity, "Arrows2D:colors", len(starts))
+    for start, end, color in zip(to_canvas(starts), to_canvas(ends), colors, strict=True):
+        cv2.arrowedLine(canvas, start.astype(int).tolist(), end.astype(int).tolist(), color, 1, cv2.LINE_AA, 0, 0.25)
+
+
+def draw_labels(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: ToCanvas, size: float = 0.4) -> None:
+    """Draws an entity's labelled points as text on a dark ground."""
+    places = to_canvas(frame.array(entity, "Points2D:positions", 2))
+    colors = entity_colors(frame, entity, "Points2D:colors", len(places))
+    for text, place, color in zip(frame.values(entity, "Points2D:labels"), places, colors, strict=False):
+        draw_text(canvas, text, (int(place[0]), int(place[1])), color, size, centered=True)
+
+
+def draw_text(
+    canvas: Canvas,
+    text: str,
+    place: tuple[int, int],
+    color: tuple[int, int, int],
+    size: float = 0.45,
+    *,
+    centered: bool = False,
+) -> None:
+    """Writes text, its middle left (or its middle) at `place`, BGR."""
+    (width, height), _ = cv2.getTextSize(text, FONT, size, 1)
+    left = place[0] - width // 2 if centered else place[0]
+    bottom = place[1] + height // 2
+    if centered:
+        cv2.rectangle(canvas, (left - 2, bottom - height - 3), (left + width + 2, bottom + 3), (24, 20, 18), -1)
+    cv2.putText(canvas, text, (left, bottom), FONT, size, color, 1, cv2.LINE_AA)
+
+
+def entity_colors(frame: RecordedFrame, entity: str, component: str, count: int) -> list[tuple[int, int, int]]:
+    """`count` colours as BGR; one recorded colour holds for all, none means white."""
+    packed = frame.values(entity, component) or [0xFFFFFFFF]
+    colors = [((c >> 8) & 255, (c >> 16) & 255, (c >> 24) & 255) for c in packed]
+    return colors if len(colors) == count else colors[:1] * count
+
+
+def recorded_image(frame: RecordedFrame, entity: str) -> Canvas | None:
+    """An entity's raw RGB picture as (H, W, 3) BGR; None where there is none."""
+    formats = frame.values(entity, "Image:format")
+    if not formats:
+        return None
+    pixels = np.frombuffer(frame.blob(entity, "Image:buffer"), dtype=np.uint8)
+    return pixels.reshape(formats[0]["height"], formats[0]["width"], 3)[..., ::-1]
+
+
+def _fixed_point(points: Array) -> NDArray[np.int32]:
+    return np.round(np.clip(points, -1e5, 1e5) * (1 << SUBPIXEL_BITS)).astype(np.int32)

@@ -1,0 +1,41 @@
+"""LiveView: a viewer that follows a recording while it is written.
+
+The run serves the stream on loopback and never waits for who watches: a viewer that is closed, killed or hangs costs
+it nothing, and the file is written beside the stream, not through it.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+
+import rerun as rr
+
+from bevcli.viewer.native import LOOPBACK, display_is_there, free_port, start_viewer
+from bevcli.viewer.web import WebViewer, web_viewer_assets
+
+KEPT_FOR_LATE_VIEWERS = "256MB"  # of memory; beyond it the oldest frames are forgotten by the stream, not by the file
+
+
+class LiveView:
+    """Opens the viewer: a window where there is a display, else a page whose address is printed to stderr."""
+
+    def __init__(self) -> None:
+        port = free_port(9876)
+        self.sink = rr.GrpcServerSink(LOOPBACK, port, server_memory_limit=KEPT_FOR_LATE_VIEWERS)
+        self.stream_address = f"rerun+http://{LOOPBACK}:{port}/proxy"
+        self._web: WebViewer | None = None
+
+    def open(self) -> None:
+        """Starts the viewer. The window stays after the run, until the user closes it."""
+        if display_is_there():
+            start_viewer("--bind", LOOPBACK, "--port", "auto", "--connect", self.stream_address)
+            return
+        self._web = WebViewer(web_viewer_assets(), self.stream_address)
+        threading.Thread(target=self._web.serve, daemon=True).start()
+        print(f"live view: {self._web.address}", file=sys.stderr)
+
+    def close(self) -> None:
+        """Ends the page's server, where there is one."""
+        if self._web is not None:
+            self._web.close()

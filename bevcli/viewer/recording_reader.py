@@ -1,0 +1,114 @@
+"""Reads a recording back, frame by frame, in the order in which it was written; one frame at a time in memory."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from rerun.chunk import Chunk, RrdReader
+
+from bevcli.errors import InputError
+from bevcli.geometry.transforms import Array
+from bevcli.recording import entities
+
+Row = dict[str, pa.Scalar]
+
+
+@dataclass(frozen=True)
+class RecordedFrame:
+    """What holds at one frame: the newest row of every entity, static ones included, by component."""
+
+    index: int
+    rows: Mapping[str, Row]
+
+    def has(self, entity: str, component: str) -> bool:
+        """Whether the entity has a value."""
+        return component in self.rows.get(entity, {}) and self.rows[entity][component].is_valid
+
+    def values(self, entity: str, component: str) -> list[Any]:
+        """The values as Python objects, empty where there are none."""
+        return self.rows[entity][component].as_py() if self.has(entity, component) else []
+
+    def array(self, entity: str, component: str, width: int) -> Array:
+        """(N, width) numbers of a component whose values have `width` each; (0, width) where there are none."""
+        if not self.has(entity, component):
+            return np.zeros((0, width))
+        values = self.rows[entity][component].values
+        while pa.types.is_nested(values.type):
+            values = values.flatten()
+        return np.asarray(values, dtype=np.float64).reshape(-1, width)
+
+    def blob(self, entity: str, component: str) -> bytes:
+        """The bytes of a component that holds one blob, such as a JPEG."""
+        if not self.has(entity, component):
+            return b""
+        values = self.rows[entity][component].values
+        while pa.types.is_nested(values.type):
+            values = values.flatten()
+        return np.asarray(values, dtype=np.uint8).tobytes()
+
+
+@dataclass(frozen=True)
+class RecordingReader:
+    """A recording that was written by `Recording`. Raises InputError where the file is none of ours."""
+
+    path: Path
+    _reader: RrdReader = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a file without its end is read part by part, and that is what we do
+            try:
+                object.__setattr__(self, "_reader", RrdReader(self.path))
+            except RuntimeError as error:
+                raise InputError(f"{self.path}: this is no readable recording ({error})") from error
+
+    def chunks(self) -> Iterator[Chunk]:
+        """All parts of the recording, in the file's order."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                yield from self._reader.stream()
+            except (RuntimeError, ValueError) as error:
+                raise InputError(f"{self.path}: this is no readable recording ({error})") from error
+
+    def frames(self) -> Iterator[RecordedFrame]:
+        """Each frame with all that holds at it."""
+        state: dict[str, Row] = {}
+        current: int | None = None
+        for entity, frame, row in self._rows():
+            if frame is not None and current is not None and frame > current:
+                yield RecordedFrame(current, dict(state))
+            if frame is not None and (current is None or frame > current):
+                current = frame
+            if frame is None or frame == current:  # an earlier frame's late BEV picture holds no more
+                _apply(state, entity, row)
+        if current is not None:
+            yield RecordedFrame(current, dict(state))
+
+    def _rows(self) -> Iterator[tuple[str, int | None, Row]]:
+        for chunk in self.chunks():
+            batch = chunk.to_record_batch()
+            names = [name for name in batch.schema.names if ":" in name or name in OWN_COMPONENTS]
+            timed = entities.FRAME_TIMELINE in batch.schema.names
+            for place in range(batch.num_rows):
+                frame = batch.column(entities.FRAME_TIMELINE)[place].as_py() if timed else None
+                yield chunk.entity_path.strip("/"), frame, {n: batch.column(n)[place] for n in names}
+
+
+OWN_COMPONENTS = frozenset(
+    ("score", "velocity_x", "velocity_y", "name", "scene", "timestamp_ns", "pose", "origin")
+    + ("title", "untrained", "class_names", "camera_names")
+)
+
+
+def _apply(state: dict[str, Row], entity: str, row: Row) -> None:
+    if "Clear:is_recursive" in row:
+        state.pop(entity, None)
+        return
+    state[entity] = {**state.get(entity, {}), **{n: value for n, value in row.items() if value.is_valid}}

@@ -1,0 +1,86 @@
+"""A picture of a recording in the viewer, without a screen: the viewer runs headless and draws with Vulkan."""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+from rerun.experimental import ViewerClient
+from rerun.experimental._viewer_client import ViewerState
+
+from bevcli.errors import InputError, OutputError
+from bevcli.recording import entities
+from bevcli.viewer.native import LOOPBACK, free_port, start_viewer, stop
+
+Answer = TypeVar("Answer")
+START_TIMEOUT_S = 40.0
+SETTLE_S = 2.5  # pictures are decoded after the views have opened, and nothing says when they are there
+NO_DRIVER = "the viewer cannot draw here: it needs a Vulkan driver (Debian: apt-get install mesa-vulkan-drivers)"
+
+
+def take_screenshot(recording: Path, picture: Path, frame: int | None = None) -> tuple[str, ...]:
+    """Writes a PNG of the whole viewer at a frame (its number; default the first), and returns the views' names.
+
+    Takes about 6 s. Raises OutputError where the viewer cannot draw (no Vulkan driver) or the file cannot be written,
+    InputError for a frame that the recording does not have.
+    """
+    port = free_port()
+    process = start_viewer("--headless", "--bind", LOOPBACK, "--port", str(port))
+    try:
+        client = _connect(process, port)
+        client.open(str(recording))
+        state = _wait(process, lambda: _opened(client), "the recording does not open in the viewer")
+        _go_to(client, state, frame)
+        time.sleep(SETTLE_S)
+        _write(picture, client.take_screenshot())
+        return tuple(view.name for view in client.get_state().views)
+    finally:
+        stop(process)
+
+
+def _connect(process: subprocess.Popen[bytes], port: int) -> ViewerClient:
+    def answer() -> ViewerClient | None:
+        try:
+            client = ViewerClient.connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
+            client.get_state()
+        except ConnectionError:
+            return None
+        return client
+
+    return _wait(process, answer, NO_DRIVER)
+
+
+def _opened(client: ViewerClient) -> ViewerState | None:
+    state = client.get_state()
+    ready = state.recordings and state.recordings[0].timelines and state.views and not state.loading
+    return state if ready else None
+
+
+def _go_to(client: ViewerClient, state: ViewerState, frame: int | None) -> None:
+    timeline = next((t for t in state.recordings[0].timelines if t.name == entities.FRAME_TIMELINE), None)
+    if timeline is None or timeline.start is None or timeline.end is None:
+        raise InputError("the recording has no frames (expected one that `bevcli run` wrote)")
+    wanted = timeline.start if frame is None else frame
+    if not timeline.start <= wanted <= timeline.end:
+        raise InputError(f"--frame {wanted}: the recording has the frames {timeline.start} to {timeline.end}")
+    client.set_time(entities.FRAME_TIMELINE, sequence=wanted, play_state="paused")
+
+
+def _wait(process: subprocess.Popen[bytes], attempt: Callable[[], Answer | None], complaint: str) -> Answer:
+    deadline = time.monotonic() + START_TIMEOUT_S
+    while time.monotonic() < deadline and process.poll() is None:
+        result = attempt()
+        if result is not None:
+            return result
+        time.sleep(0.1)
+    raise OutputError(complaint)
+
+
+def _write(picture: Path, png: bytes) -> None:
+    try:
+        picture.write_bytes(png)
+    except OSError as error:
+        raise OutputError(f"{picture}: cannot be written ({error.strerror})") from error

@@ -1,0 +1,87 @@
+"""What a recording holds, in numbers: frames, time span, boxes per class, size by entity."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from bevcli.recording import entities
+from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
+
+SHOWN_ENTITIES = 15
+
+
+@dataclass(frozen=True)
+class RecordingSummary:
+    """timestamps_ns: of the frames, in order. boxes: shown boxes by class. bytes_by_entity: in memory, by size."""
+
+    path: Path
+    file_bytes: int
+    title: str
+    untrained: bool
+    frames: int
+    timestamps_ns: tuple[int, ...]
+    boxes: Mapping[str, int]
+    bytes_by_entity: Mapping[str, int]
+
+    def text(self) -> str:
+        """The summary as lines for a terminal."""
+        lines = [f"{self.path}: {self.title}" + (" (UNTRAINED weights)" if self.untrained else "")]
+        lines += [f"  frames    {self.frames}{self._span()}", f"  size      {_size(self.file_bytes)}"]
+        lines += [f"  boxes     {sum(self.boxes.values())}"]
+        lines += [f"    {count:7d} {name}" for name, count in self.boxes.items()]
+        lines += [f"  entities  {len(self.bytes_by_entity)}, by size"]
+        largest = list(self.bytes_by_entity.items())[:SHOWN_ENTITIES]
+        lines += [f"    {_size(count):>9} {entity}" for entity, count in largest]
+        rest = list(self.bytes_by_entity.values())[SHOWN_ENTITIES:]
+        lines += [f"    {_size(sum(rest)):>9} in {len(rest)} others"] if rest else []
+        return "\n".join(lines)
+
+    def _span(self) -> str:
+        if not self.timestamps_ns:
+            return ""
+        first, last = min(self.timestamps_ns), max(self.timestamps_ns)
+        start = datetime.fromtimestamp(first / 1e9, UTC).isoformat(sep=" ", timespec="milliseconds")
+        return f", {(last - first) / 1e9:.2f} s from {start}"
+
+
+def summarise(path: Path, read_from: Path | None = None) -> RecordingSummary:
+    """The summary of the recording at `path`, read from a mended copy where there is one."""
+    reader = RecordingReader(path if read_from is None else read_from)
+    sizes: Counter[str] = Counter()
+    for chunk in reader.chunks():
+        sizes[chunk.entity_path] += chunk.to_record_batch().nbytes
+    boxes: Counter[str] = Counter()
+    times: list[int] = []
+    title: list[str] = []
+    untrained = False
+    for frame in reader.frames():
+        boxes.update(frame.values(entities.BOXES, "name"))
+        times += frame.values(entities.EGO, "timestamp_ns")
+        title = frame.values(entities.RUN, "title")
+        untrained = _flag(frame, "untrained")
+    return RecordingSummary(
+        path=path,
+        file_bytes=path.stat().st_size,
+        title=title[0] if title else "a recording",
+        untrained=untrained,
+        frames=len(times),
+        timestamps_ns=tuple(times),
+        boxes=dict(boxes.most_common()),
+        bytes_by_entity=dict(sizes.most_common()),
+    )
+
+
+def _flag(frame: RecordedFrame, name: str) -> bool:
+    return any(frame.values(entities.RUN, name))
+
+
+def _size(count: int) -> str:
+    for unit in ("B", "kB", "MB"):
+        if count < 1000:
+            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
+        count = count / 1000  # type: ignore[assignment]
+    return f"{count:.1f} GB"

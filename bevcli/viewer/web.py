@@ -1,0 +1,131 @@
+"""The web viewer and a recording behind one address: a small server of ours, so that nothing else keeps running.
+
+Rerun's own web server binds all interfaces and keeps a core busy. Ours takes the viewer's files out of the installed
+binary once, and serves them and the recording from one origin. The pages may connect to that origin only, which also
+keeps the viewer in the browser from sending telemetry.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import time
+import urllib.error
+import urllib.request
+from functools import partial
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from urllib.parse import parse_qs, quote, urlsplit
+
+from bevcli.errors import OutputError
+from bevcli.viewer.native import LOOPBACK, free_port, start_viewer, stop
+
+ASSETS = {
+    "/": "text/html; charset=utf-8",
+    "/re_viewer.js": "text/javascript",
+    "/re_viewer_bg.wasm": "application/wasm",
+    "/favicon.ico": "image/x-icon",
+}
+RECORDING = "/recording.rrd"
+START_TIMEOUT_S = 15.0
+OUTSIDE = re.compile(rb"<link[^>]*https://fonts[^>]*>", re.DOTALL)  # the page asks Google for a font: not ours
+
+
+def web_viewer_assets() -> dict[str, bytes]:
+    """The files of the web viewer by path, as the installed viewer serves them (43 MB, about a second)."""
+    port = free_port()
+    address = f"http://{LOOPBACK}:{port}"
+    # With a recording's address given, the viewer starts no other server; nobody asks for that recording.
+    process = start_viewer("--serve-web", "--bind", LOOPBACK, "--web-viewer-port", str(port), f"{address}/none.rrd")
+    try:
+        files = {path: _fetch(address + path) for path in ASSETS}
+    finally:
+        stop(process)
+    return {**files, "/": OUTSIDE.sub(b"", files["/"])}
+
+
+class WebViewer:
+    """`with WebViewer(assets, recording) as viewer: print(viewer.address); viewer.serve()`.
+
+    source: a recording's file, or the address of a live stream (rerun+http://…). Port: the preferred one or, where it
+    is in use, another.
+    """
+
+    def __init__(
+        self, assets: dict[str, bytes], source: Path | str, host: str = LOOPBACK, port: int | None = 9090
+    ) -> None:
+        self.host, self.port = host, free_port(port, host)
+        handler = partial(_Handler, assets, source)
+        self._server = ThreadingHTTPServer((host, self.port), handler)
+        self._server.daemon_threads = True
+
+    @property
+    def address(self) -> str:
+        """What to open in a browser."""
+        return f"http://{self.host}:{self.port}"
+
+    def serve(self) -> None:
+        """Answers until `close`, from this thread."""
+        self._server.serve_forever(poll_interval=1.0)
+
+    def close(self) -> None:
+        """Ends `serve`, and frees the port."""
+        self._server.shutdown()
+        self._server.server_close()
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+
+    def __init__(self, assets: dict[str, bytes], source: Path | str, *request: object) -> None:
+        self.assets, self.source = assets, source
+        super().__init__(*request)  # type: ignore[arg-type]
+
+    def do_GET(self) -> None:
+        """Serves the viewer's files and the recording; the bare address leads to the viewer with the recording."""
+        parts = urlsplit(self.path)
+        if parts.path == RECORDING and isinstance(self.source, Path):
+            self._send_recording(self.source)
+        elif parts.path == "/" and "url" not in parse_qs(parts.query):
+            self._redirect(parts.query)
+        elif parts.path in self.assets:
+            self._send_head(200, ASSETS[parts.path], len(self.assets[parts.path]))
+            self.wfile.write(self.assets[parts.path])
+        else:
+            self._send_head(404, "text/plain", 0)
+
+    def log_message(self, format: str, *arguments: object) -> None:
+        """Says nothing: the terminal is for the user."""
+
+    def _redirect(self, query: str) -> None:
+        host = self.headers.get("Host", "")
+        url = self.source if isinstance(self.source, str) else f"http://{host}{RECORDING}"
+        self.send_response(302)
+        self.send_header("Location", f"/?url={quote(url, safe='')}" + (f"&{query}" if query else ""))
+        self.send_header("Content-Length", "0")
+        self.end_headers()
+
+    def _send_recording(self, path: Path) -> None:
+        with path.open("rb") as file:
+            self._send_head(200, "application/octet-stream", path.stat().st_size)
+            shutil.copyfileobj(file, self.wfile, 1 << 20)
+
+    def _send_head(self, status: int, media_type: str, length: int) -> None:
+        live = "" if isinstance(self.source, Path) else self.source.removeprefix("rerun+").removesuffix("/proxy")
+        self.send_response(status)
+        self.send_header("Content-Type", media_type)
+        self.send_header("Content-Length", str(length))
+        self.send_header("Content-Security-Policy", f"connect-src 'self' blob: data: {live}".strip())
+        self.end_headers()
+
+
+def _fetch(address: str) -> bytes:
+    deadline = time.monotonic() + START_TIMEOUT_S
+    while True:
+        try:
+            with urllib.request.urlopen(address, timeout=START_TIMEOUT_S) as answer:
+                return answer.read()
+        except (urllib.error.URLError, ConnectionError) as error:
+            if time.monotonic() > deadline:
+                raise OutputError(f"the web viewer does not start: {address}: {error}") from error
+            time.sleep(0.05)

@@ -1,1 +1,0 @@
-"""Recordings, pictures and videos of what the model sees."""

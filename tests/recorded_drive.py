@@ -1,0 +1,73 @@
+"""A short drive in memory with boxes of known places, and a recording of it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from memory_drive import MemorySequence
+
+from bevcli.frame import AttentionView, CameraSamples, Frame, Prediction, Probe
+from bevcli.geometry.bev_grid import BevGrid
+from bevcli.geometry.boxes import CLASSES, Boxes3D
+from bevcli.geometry.transforms import inverse
+from bevcli.recording.options import RecordingOptions
+from bevcli.recording.writer import Recording
+
+GRID = BevGrid(20, 20)
+
+
+def boxes_ahead() -> Boxes3D:
+    """A car 12 m ahead, a pedestrian to the right and a doubtful bus, in the bev frame (x right, y forward)."""
+    return Boxes3D(
+        centers=np.array([[0.0, 12, -1], [6, 9, -1], [-9, 20, -0.5]]),
+        sizes_lwh=np.array([[4.5, 1.9, 1.6], [0.7, 0.7, 1.8], [11, 2.9, 3.4]]),
+        yaws=np.array([np.pi / 2, 0.3, np.pi / 2]),
+        velocities=np.array([[0.0, 5], [1, 0], [0, 0]]),
+        classes=np.array(["car", "pedestrian", "bus"]),
+        scores=np.array([0.9, 0.6, 0.1]),
+    )
+
+
+def predict(frame: Frame) -> Prediction:
+    """The boxes above, the same in every frame's bev frame, and features that a picture can be made of."""
+    random = np.random.default_rng(frame.stamp.index)
+    return Prediction(
+        stamp=frame.stamp,
+        boxes=boxes_ahead(),
+        ego_from_bev=frame.rig.ego_from_bev,
+        world_from_ego=frame.world_from_ego,
+        grid=GRID,
+        bev=torch.tensor(random.normal(size=(GRID.rows * GRID.columns, 16)), dtype=torch.float32),
+        started_anew=frame.stamp.index == 0,
+        stage_seconds={"backbone": 0.2, "encoder": 0.1},
+        attention=AttentionView(
+            np.full((GRID.rows, GRID.columns), 0.5),
+            (Probe(np.array([0.0, 10.0]), {"CAM_FRONT": CameraSamples(np.array([[100.0, 90]]), np.array([1.0]))}),),
+        ),
+    )
+
+
+def with_truth(frame: Frame) -> Frame:
+    """Ground truth where the car is, and a cyclist that nobody predicts."""
+    world_from_bev = frame.world_from_ego.matrix @ frame.rig.ego_from_bev
+    truth = boxes_ahead()[[0, 0]]
+    truth = replace(
+        truth, scores=None, classes=np.array(["car", "bicycle"]), centers=truth.centers + [[0, 0, 0], [5, 9, 0]]
+    )
+    return replace(frame, ground_truth=truth.transformed(world_from_bev))
+
+
+def record(path: Path, drive: MemorySequence, options: RecordingOptions | None = None, **settings) -> list[Frame]:
+    """Writes the whole drive; returns its frames."""
+    frames = [with_truth(drive.load(place)) for place in range(len(drive.stamps))]
+    settings = {"class_names": CLASSES, "title": "test drive", "untrained": False, **settings}
+    with Recording(path, rig=drive.rig, options=options, **settings) as recording:
+        for frame in frames:
+            recording.log(frame, predict(frame))
+    return frames
+
+
+def bev_from_world(frame: Frame) -> np.ndarray:
+    """(4, 4) at the frame's time."""
+    return inverse(frame.world_from_ego.matrix @ frame.rig.ego_from_bev)

@@ -1,0 +1,72 @@
+"""Lines of boxes in a picture: cut at the camera and at the border, bent by the lens."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.cameras import Camera, Distortion
+from bevcli.recording.box_lines import NEAR_CLIP_M, clip_near, clip_to_picture, lines_in_picture
+
+FINE = 256  # OpenCV clips lines of whole numbers: make its pixels small
+CAMERA = Camera("front", 640, 360, np.array([[400.0, 0, 320], [0, 400, 180], [0, 0, 1]]), np.eye(4))
+
+
+def one_box(center, size=(2.0, 2.0, 2.0)) -> Boxes3D:
+    return Boxes3D(
+        np.array([center]), np.array([size]), np.zeros(1), np.zeros((1, 2)), np.array(["car"])
+    )  # in the camera frame: z is ahead
+
+
+def test_lines_are_cut_where_opencv_cuts_them():
+    random = np.random.default_rng(1)
+    segments = random.integers(-400, 1000, (400, 2, 2)).astype(float)
+    clipped, kept = clip_to_picture(segments, 640, 360)
+    for segment, ours, is_kept in zip(segments, clipped, kept, strict=True):
+        start, end = (segment * FINE).astype(int).tolist()
+        inside, start, end = cv2.clipLine((0, 0, 640 * FINE + 1, 360 * FINE + 1), start, end)
+        if not inside:
+            assert not is_kept or np.linalg.norm(ours[0] - ours[1]) < 0.1
+        elif np.linalg.norm(np.subtract(start, end)) > FINE / 10:
+            assert is_kept
+            np.testing.assert_allclose(ours, np.array([start, end]) / FINE, atol=0.1)
+
+
+def test_a_line_through_the_camera_ends_before_it():
+    ends, before = clip_near(np.array([[[0.0, 0, -1], [0, 0, 3]], [[0, 0, -1], [0, 0, -2]]]))
+    assert before.tolist() == [True, False]
+    np.testing.assert_allclose(ends[0], [[0, 0, NEAR_CLIP_M], [0, 0, 3]])
+
+
+def test_nothing_of_a_box_behind_the_camera_is_drawn():
+    assert len(lines_in_picture(one_box((0, 0, -10)), CAMERA, np.eye(4)).segments) == 0
+
+
+def test_a_box_around_the_camera_stays_inside_the_picture():
+    lines = lines_in_picture(one_box((2, 0, 0), (6, 6, 6)), CAMERA, np.eye(4))
+    assert len(lines.segments)
+    assert lines.segments.min() >= -1e-9
+    assert (lines.segments <= [640 + 1e-9, 360 + 1e-9]).all()
+
+
+def test_a_box_ahead_is_where_the_pinhole_says():
+    lines = lines_in_picture(one_box((0, 0, 10)), CAMERA, np.eye(4))
+    # Its nearest face is 9 m away and 2 m wide: 400 px/m at 1 m, 44.4 px at 9 m to each side.
+    np.testing.assert_allclose(lines.segments.reshape(-1, 2).max(0), [320 + 400 / 9, 180 + 400 / 9])
+    assert set(lines.owners) == {0}
+
+
+def test_an_edge_follows_the_lens():
+    lens = Distortion("brown_conrady", (-0.3, 0.05, 0.0, 0.0))
+    box = one_box((0, 2.2, 8), (7.0, 0.5, 0.5))
+    lines = lines_in_picture(box, replace(CAMERA, distortion=lens), np.eye(4))
+    corners = box.corners()[0, :4]
+    middle = (corners[0] + corners[1]) / 2
+    expected, _ = cv2.projectPoints(
+        middle[None], np.zeros(3), np.zeros(3), CAMERA.intrinsics, np.array(lens.coefficients)
+    )
+    away = np.linalg.norm(lines.segments.reshape(-1, 2) - expected.reshape(2), axis=-1).min()
+    straight = np.array([CAMERA.project(c)[0] for c in corners[:2]]).mean(0)
+    assert away < 1.5
+    assert np.linalg.norm(straight - expected.reshape(2)) > 3

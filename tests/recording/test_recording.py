@@ -1,0 +1,242 @@
+"""What a recording holds, read back from the file."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from memory_drive import MemorySequence, WithoutPictures
+from recorded_drive import bev_from_world, boxes_ahead, predict, record, with_truth
+
+from bevcli.errors import OutputError
+from bevcli.frame import Picture
+from bevcli.geometry.boxes import CLASSES, Boxes3D
+from bevcli.geometry.transforms import Pose
+from bevcli.recording import entities
+from bevcli.recording.options import RecordingOptions
+from bevcli.recording.writer import Recording
+from bevcli.viewer.recorded_boxes import recorded_boxes
+from bevcli.viewer.recording_reader import RecordingReader
+
+
+@pytest.fixture(scope="module")
+def standard(tmp_path_factory):
+    path = tmp_path_factory.mktemp("recording") / "recording.rrd"
+    options = RecordingOptions(probes=((0.0, 10.0),))
+    frames = record(path, MemorySequence(3), options)
+    return frames, list(RecordingReader(path).frames()), path
+
+
+def entity_rows(path: Path, entity: str) -> list[tuple[bool, int]]:
+    return [(c.is_static, c.num_rows) for c in RecordingReader(path).chunks() if c.entity_path == f"/{entity}"]
+
+
+def test_boxes_come_back_in_the_world(standard):
+    frames, recorded, _ = standard
+    assert [frame.index for frame in recorded] == [0, 1, 2]
+    for frame, read in zip(frames, recorded, strict=True):
+        boxes = recorded_boxes(read)
+        assert boxes.stamp == frame.stamp
+        np.testing.assert_allclose(boxes.world_from_ego.matrix, frame.world_from_ego.matrix, atol=1e-6)
+        back = boxes.boxes.transformed(bev_from_world(frame))
+        shown = boxes_ahead()[:2]  # the bus is below the score
+        assert back.classes.tolist() == shown.classes.tolist()
+        np.testing.assert_allclose(back.centers, shown.centers, atol=1e-3)
+        np.testing.assert_allclose(back.sizes_lwh, shown.sizes_lwh, atol=1e-5)
+        np.testing.assert_allclose(np.cos(back.yaws - shown.yaws), 1, atol=1e-6)
+        np.testing.assert_allclose(back.velocities, shown.velocities, atol=1e-5)
+        np.testing.assert_allclose(back.scores, shown.scores)
+
+
+def test_far_from_the_origin_millimetres_survive(tmp_path):
+    class Utm(MemorySequence):
+        def pose(self, place: int) -> Pose:
+            near = super().pose(place)
+            return Pose(near.translation + [654321.0, 5345678.0, 512.0], near.quaternion)
+
+    frames = record(tmp_path / "utm.rrd", Utm(2))
+    last = list(RecordingReader(tmp_path / "utm.rrd").frames())[-1]
+    back = recorded_boxes(last).boxes.transformed(bev_from_world(frames[-1]))
+    np.testing.assert_allclose(back.centers, boxes_ahead()[:2].centers, atol=1e-3)
+
+
+def test_ground_truth_is_found_or_missed(standard):
+    _, recorded, _ = standard
+    for frame in recorded:
+        assert frame.values(entities.GROUND_TRUTH, "name") == ["car"]
+        assert frame.values(entities.MISSED, "name") == ["bicycle"]
+        assert len(frame.values(entities.FALSE_BOXES, "LineStrips3D:strips")) == 2  # the pedestrian, crossed out
+
+
+def test_every_view_has_something_to_show(standard):
+    _, recorded, _ = standard
+    last = recorded[-1]
+    for entity, component in {
+        entities.EGO: "Transform3D:translation",
+        entities.VEHICLE: "Mesh3D:vertex_positions",
+        entities.RANGE_RINGS: "LineStrips3D:strips",
+        entities.BEV_ON_GROUND: "Mesh3D:albedo_texture_buffer",
+        entities.PILLARS: "Points3D:positions",
+        entities.TRAJECTORY: "LineStrips3D:strips",
+        entities.VELOCITY: "Arrows3D:vectors",
+        entities.BEV_FEATURES: "Image:buffer",
+        entities.BEV_HISTORY: "Image:buffer",
+        entities.BEV_BOXES: "LineStrips2D:strips",
+        entities.BEV_PROBES: "Points2D:positions",
+        entities.STAGE_CURVES: "Scalars:scalars",
+        entities.BOX_CURVES: "Scalars:scalars",
+        entities.picture("CAM_BACK"): "EncodedImage:blob",
+        entities.overlay("CAM_FRONT", "boxes"): "LineStrips2D:strips",
+        entities.overlay("CAM_FRONT", "ground_truth"): "LineStrips2D:strips",
+        entities.overlay("CAM_FRONT", "pillars"): "Points2D:positions",
+        entities.overlay("CAM_FRONT", "probes"): "Points2D:positions",
+    }.items():
+        assert last.has(entity, component), f"{entity} {component}"
+
+
+def test_static_things_are_written_once(standard):
+    *_, path = standard
+    for entity in (entities.VEHICLE, entities.RANGE_RINGS, entities.PILLARS, entities.RUN, entities.BEV_VEHICLE):
+        assert entity_rows(path, entity) == [(True, 1)]
+    pinholes = [c for c in RecordingReader(path).chunks() if "Pinhole:resolution" in c.to_record_batch().schema.names]
+    assert [c.is_static for c in pinholes] == [True] * 6
+
+
+def test_boxes_in_the_picture_are_where_the_camera_saw_them(tmp_path):
+    """Each camera has its own time: the vehicle stood 2 m farther back when CAM_FRONT took its picture."""
+    drive = MemorySequence(1)
+    frame = drive.load(0)
+    earlier = Pose(frame.world_from_ego.translation - [2.0, 0, 0], frame.world_from_ego.quaternion)
+    frame = replace(frame, world_from_ego_at={**frame.world_from_ego_at, "CAM_FRONT": earlier})
+    with Recording(tmp_path / "r.rrd", rig=drive.rig, class_names=CLASSES, title="", untrained=False) as recording:
+        recording.log(frame, predict(frame))
+    (read,) = RecordingReader(tmp_path / "r.rrd").frames()
+    color = 0xFF9E2CFF  # the car's
+    colors = np.array(read.values(entities.overlay("CAM_FRONT", "boxes"), "LineStrips2D:colors"))
+    strips = np.array(read.values(entities.overlay("CAM_FRONT", "boxes"), "LineStrips2D:strips"))[colors == color]
+    # bev stands at x 0.94 in ego, the camera at 0.9: the car's rear is 12 - 2.25 + 0.04 + 2 m away, 1.9 m wide.
+    focal, middle = 0.8 * 320, 160
+    half = focal * 0.95 / (12 - 2.25 + 0.94 - 0.9 + 2)
+    np.testing.assert_allclose(strips[..., 0].max(), middle + half, atol=0.1)
+    np.testing.assert_allclose(strips[..., 0].min(), middle - half, atol=0.1)
+
+
+def test_the_files_own_bytes_are_kept(tmp_path):
+    drive = MemorySequence(1)
+    frame = drive.load(0)
+    picture = frame.pictures["CAM_FRONT"]
+    jpeg = cv2.imencode(".jpg", picture.pixels_bgr)[1].tobytes()
+    own = Picture(picture.timestamp_ns, picture.pixels_bgr, jpeg, "image/jpeg")
+    frame = replace(frame, pictures={**frame.pictures, "CAM_FRONT": own})
+    with Recording(tmp_path / "r.rrd", rig=drive.rig, class_names=CLASSES, title="", untrained=False) as recording:
+        recording.log(frame, predict(frame))
+    (read,) = RecordingReader(tmp_path / "r.rrd").frames()
+    assert read.blob(entities.picture("CAM_FRONT"), "EncodedImage:blob") == jpeg
+
+
+def test_a_dropped_camera_shows_no_old_picture_and_is_an_event(tmp_path):
+    record(tmp_path / "r.rrd", WithoutPictures({1: ("CAM_BACK",)}, count=3))
+    recorded = list(RecordingReader(tmp_path / "r.rrd").frames())
+    shown = [frame.has(entities.picture("CAM_BACK"), "EncodedImage:blob") for frame in recorded]
+    assert shown == [True, False, True]
+    assert recorded[1].values(entities.EVENTS, "TextLog:text") == ["frame 1: camera CAM_BACK is missing: missing"]
+
+
+def test_an_untrained_run_says_so(tmp_path):
+    record(tmp_path / "r.rrd", MemorySequence(1), untrained=True)
+    (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
+    assert frame.values(entities.RUN, "untrained") == [True]
+    assert "untrained" in frame.values(entities.RUN, "TextDocument:text")[0]
+    assert frame.values(entities.MISSED, "name") == []  # it promised nothing: nothing is missed
+    assert any("UNTRAINED" in text for text in events(tmp_path / "r.rrd"))
+
+
+def events(path: Path) -> list[str]:
+    batches = [c.to_record_batch() for c in RecordingReader(path).chunks() if c.entity_path == "/events"]
+    return [text for batch in batches for (text,) in batch.column("TextLog:text").to_pylist()]
+
+
+def test_why_the_model_starts_anew_is_an_event(tmp_path):
+    drive = MemorySequence(4, scenes="aabb")
+    with Recording(tmp_path / "r.rrd", rig=drive.rig, class_names=CLASSES, title="", untrained=False) as recording:
+        for place in range(4):
+            frame = drive.load(place)
+            recording.log(frame, replace(predict(frame), started_anew=place != 1))
+    assert events(tmp_path / "r.rrd") == [
+        'frame 0: scene "a" begins; the model starts without history',
+        'frame 2: scene change from "a" to "b"; the model starts without history',
+        "frame 3: 0.5 s since the last frame; the model starts without history",
+    ]
+
+
+def test_minimal_has_no_insides(tmp_path):
+    record(tmp_path / "r.rrd", MemorySequence(2), RecordingOptions(level="minimal"))
+    *_, last = RecordingReader(tmp_path / "r.rrd").frames()
+    assert not {entities.BEV_FEATURES, entities.BEV_ON_GROUND, entities.PILLARS, entities.BEV_HISTORY} & set(last.rows)
+    assert last.has(entities.BOXES, "Boxes3D:centers")
+
+
+def test_a_frame_costs_less_than_its_allowance(standard):
+    """At most 5 % of the pictures' bytes and 400 kB a frame; pictures in memory are encoded, so they count as ours."""
+    *_, path = standard
+    pictures = sum(
+        len(frame.blob(entities.picture(name), "EncodedImage:blob"))
+        for frame in RecordingReader(path).frames()
+        for name in MemorySequence(1).rig.names
+    )
+    assert path.stat().st_size < 1.05 * pictures + 3 * 400_000
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_frame_without_boxes_shows_none(tmp_path, monkeypatch):
+    monkeypatch.setenv("RERUN_STRICT", "1")
+    drive = MemorySequence(2)
+    first, second = (with_truth(drive.load(place)) for place in range(2))
+    with Recording(tmp_path / "r.rrd", rig=drive.rig, class_names=CLASSES, title="", untrained=False) as recording:
+        recording.log(first, predict(first))
+        recording.log(replace(second, ground_truth=Boxes3D.empty()), replace(predict(second), boxes=Boxes3D.empty()))
+    *_, last = RecordingReader(tmp_path / "r.rrd").frames()
+    assert len(recorded_boxes(last).boxes) == 0
+    assert last.values(entities.GROUND_TRUTH, "name") == []
+    for entity in (entities.BEV_BOXES, entities.overlay("CAM_FRONT", "boxes")):
+        assert last.values(entity, "LineStrips2D:strips") == []
+
+
+def test_events_before_the_first_frame_are_kept(tmp_path):
+    drive = MemorySequence(1)
+    frame = with_truth(drive.load(0))
+    with Recording(tmp_path / "r.rrd", rig=drive.rig, class_names=CLASSES, title="", untrained=False) as recording:
+        recording.event("a note", "WARN")
+        recording.log(frame, predict(frame))
+    assert events(tmp_path / "r.rrd")[0] == "a note"
+    (read,) = RecordingReader(tmp_path / "r.rrd").frames()
+    assert read.has(entities.EVENTS, "TextLog:text")  # it has a place in time
+
+
+def test_a_file_that_cannot_be_written_is_one_line(tmp_path):
+    drive = MemorySequence(1)
+    recording = Recording(tmp_path / "no" / "r.rrd", rig=drive.rig, class_names=CLASSES, title="", untrained=False)
+    with pytest.raises(OutputError, match=r"r\.rrd"), recording:
+        pass
+
+
+def test_every_frame_survives_a_crash(tmp_path):
+    script = f"""
+import os, sys
+sys.path[:0] = {[str(Path(__file__).parent), str(Path(__file__).parents[1])]!r}
+from memory_drive import MemorySequence
+from recorded_drive import predict
+from bevcli.recording.writer import Recording
+drive = MemorySequence(4)
+with Recording({str(tmp_path / "r.rrd")!r}, rig=drive.rig, class_names=("car",), title="", untrained=False) as r:
+    for place in range(3):
+        r.log(drive.load(place), predict(drive.load(place)))
+    os._exit(9)  # as a crash does: nothing is closed
+"""
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 9
+    frames = list(RecordingReader(tmp_path / "r.rrd").frames())
+    assert [frame.index for frame in frames] == [0, 1, 2]
+    assert all(frame.values(entities.BOXES, "name") == ["car", "pedestrian"] for frame in frames)

@@ -1,0 +1,100 @@
+"""The native viewer, really opened without a screen; and a live view that cannot hold up a run."""
+
+import os
+import signal
+import socket
+import subprocess
+import time
+
+import cv2
+import numpy as np
+import pytest
+from memory_drive import MemorySequence
+from recorded_drive import predict, record
+
+from bevcli.errors import InputError, OutputError
+from bevcli.geometry.boxes import CLASSES
+from bevcli.recording.options import RecordingOptions
+from bevcli.recording.writer import Recording
+from bevcli.viewer import live
+from bevcli.viewer.native import LOOPBACK, free_port, start_viewer, stop
+from bevcli.viewer.recording_reader import RecordingReader
+from bevcli.viewer.screenshot import NO_DRIVER, take_screenshot
+
+VIEWS = {
+    "3D scene", "BEV", "BEV features", "From history", "Seconds per stage", "Boxes per class", "Events", "About",
+    "CAM_FRONT", "CAM_FRONT_LEFT", "CAM_FRONT_RIGHT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def screenshot(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("viewer")
+    record(folder / "recording.rrd", MemorySequence(3))
+    try:
+        views = take_screenshot(folder / "recording.rrd", folder / "picture.png", 1)
+    except OutputError as error:
+        if str(error) != NO_DRIVER:
+            raise
+        pytest.skip(str(error))
+    return views, cv2.imread(str(folder / "picture.png")), folder
+
+
+@pytest.mark.slow
+def test_the_viewer_shows_every_view(screenshot):
+    views, picture, _ = screenshot
+    assert set(views) == VIEWS
+    height, width = picture.shape[:2]
+    assert width >= 1280
+    for place in ((0.15, 0.15), (0.15, 0.5), (0.15, 0.85), (0.85, 0.15), (0.85, 0.5), (0.85, 0.85)):
+        row, column = round(place[0] * height), round(place[1] * width)
+        assert picture[row - 20 : row + 20, column - 20 : column + 20].std() > 10, f"no picture at {place}"
+    middle = picture[height // 3 : 2 * height // 3]
+    assert ((np.abs(middle.astype(int) - [250, 200, 90]).sum(-1) < 40).sum()) > 20  # the blue vehicle
+    assert ((np.abs(middle.astype(int) - [44, 158, 255]).sum(-1) < 40).sum()) > 20  # the orange car
+
+
+@pytest.mark.slow
+def test_a_frame_that_is_not_there_is_a_users_mistake(screenshot):
+    *_, folder = screenshot
+    with pytest.raises(InputError, match="frames 0 to 2"):
+        take_screenshot(folder / "recording.rrd", folder / "other.png", 7)
+
+
+def test_a_port_in_use_is_passed_over():
+    with socket.socket() as taken:
+        taken.bind((LOOPBACK, 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert free_port(port) != port
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fate", [signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM])
+def test_a_viewer_that_dies_or_hangs_costs_the_run_nothing(tmp_path, monkeypatch, fate):
+    viewers: list[subprocess.Popen] = []
+
+    def open_without_a_screen(view: live.LiveView) -> None:
+        port = str(free_port())
+        arguments = ("--headless", "--bind", LOOPBACK, "--port", port, "--connect", view.stream_address)
+        viewers.append(start_viewer(*arguments))
+        time.sleep(3)  # until it follows
+
+    monkeypatch.setattr(live.LiveView, "open", open_without_a_screen)
+    drive = MemorySequence(8)
+    options = RecordingOptions(live=True)
+    path = tmp_path / "recording.rrd"
+    try:
+        with Recording(
+            path, rig=drive.rig, class_names=CLASSES, title="", untrained=False, options=options
+        ) as recording:
+            for place in range(8):
+                if place == 3:
+                    os.kill(viewers[0].pid, fate)
+                frame = drive.load(place)
+                recording.log(frame, predict(frame))  # would raise, or not return, if the viewer mattered
+    finally:
+        os.kill(viewers[0].pid, signal.SIGCONT) if viewers[0].poll() is None else None
+        stop(viewers[0])
+    assert [frame.index for frame in RecordingReader(path).frames()] == list(range(8))
+    assert path.read_bytes()[-12:-4] == b"RRF2FOOT"  # whole, to its end

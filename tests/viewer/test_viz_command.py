@@ -1,0 +1,102 @@
+"""`bevcli viz`: what it prints and writes, without a viewer."""
+
+import csv
+import json
+
+import cv2
+import numpy as np
+import pytest
+from memory_drive import MemorySequence
+from recorded_drive import bev_from_world, boxes_ahead, record
+from typer.testing import CliRunner
+
+from bevcli.cli.main import app
+from bevcli.errors import InputError
+from bevcli.geometry.transforms import apply
+from bevcli.viewer.summary import summarise
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    path = tmp_path_factory.mktemp("drive") / "recording.rrd"
+    return record(path, MemorySequence(3)), path
+
+
+def viz(*arguments) -> str:
+    result = CliRunner().invoke(app, ["viz", *map(str, arguments)], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_the_summary_counts(drive):
+    _, path = drive
+    summary = summarise(path)
+    assert (summary.frames, summary.title, summary.untrained) == (3, "test drive", False)
+    assert summary.boxes == {"car": 3, "pedestrian": 3}
+    assert summary.timestamps_ns[-1] - summary.timestamps_ns[0] == 10**9
+    assert summary.file_bytes == path.stat().st_size
+    pictures = sum(size for entity, size in summary.bytes_by_entity.items() if entity.endswith("/picture"))
+    assert pictures > 0.5 * sum(summary.bytes_by_entity.values())
+    text = viz(path, "--summary")
+    assert "frames    3, 1.00 s from 2001-09-09 01:46:40" in text
+    assert "3 pedestrian" in text
+
+
+def test_the_table_has_the_boxes_in_the_world(drive, tmp_path):
+    frames, path = drive
+    viz(path, "--export", tmp_path / "boxes.csv")
+    with (tmp_path / "boxes.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 6
+    cars = [row for row in rows if row["class"] == "car"]
+    for frame, row in zip(frames, cars, strict=True):
+        assert int(row["timestamp_ns"]) == frame.stamp.timestamp_ns
+        center = apply(bev_from_world(frame), [float(row[axis]) for axis in "xyz"])
+        np.testing.assert_allclose(center, boxes_ahead().centers[0], atol=2e-3)
+        assert float(row["score"]) == pytest.approx(0.9)
+
+
+def test_the_boxes_file_says_the_same(drive, tmp_path):
+    frames, path = drive
+    viz(path, "--export", tmp_path / "boxes.json")
+    content = json.loads((tmp_path / "boxes.json").read_text())
+    assert (content["format"], content["frame_of_reference"]) == ("bevcli-boxes/1", "world")
+    assert [frame["timestamp_ns"] for frame in content["frames"]] == [frame.stamp.timestamp_ns for frame in frames]
+    assert [box["class"] for box in content["frames"][0]["boxes"]] == ["car", "pedestrian"]
+
+
+@pytest.mark.parametrize("ending", ["mp4", "webm"])
+def test_the_video_has_every_frame_and_the_boxes(drive, tmp_path, ending):
+    _, path = drive
+    viz(path, "--video", tmp_path / f"v.{ending}")
+    video = cv2.VideoCapture(str(tmp_path / f"v.{ending}"))
+    codec = int(video.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").lower()
+    assert codec in (b"vp90", b"vp09")
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(2.0)
+    pictures = []
+    while (read := video.read())[0]:
+        pictures.append(read[1])
+    assert len(pictures) == 3
+    bev = pictures[0][:, -640:].astype(int)
+    car = bev[320 - round(12 * 6.4) - 16 : 320 - round(12 * 6.4) + 16, 310:330]  # 12 m ahead, 6.4 pixels a metre
+    assert (np.abs(car - [44, 158, 255]).sum(-1) < 120).any()  # the car's orange, BGR
+
+
+def test_a_cut_off_recording_is_shown_with_a_note(drive, tmp_path):
+    _, path = drive
+    cut = tmp_path / "cut.rrd"
+    cut.write_bytes(path.read_bytes()[:-5000])
+    text = viz(cut, "--summary")
+    assert text.startswith(f"note: {cut} has no end")
+
+
+def test_unknown_endings_are_refused(drive, tmp_path):
+    _, path = drive
+    for option in ("--video", "--export"):
+        with pytest.raises(InputError, match="must end in"):
+            viz(path, option, tmp_path / "x.avi")
+
+
+def test_a_frame_without_a_picture_to_draw_is_a_mistake_in_usage(drive):
+    result = CliRunner().invoke(app, ["viz", str(drive[1]), "--frame", "1"])
+    assert result.exit_code == 2

@@ -1,0 +1,137 @@
+"""The web viewer's server: loopback, one origin, any free port; and in a real browser."""
+
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.error
+import urllib.request
+from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
+
+import cv2
+import numpy as np
+import pytest
+from memory_drive import MemorySequence
+from recorded_drive import record
+
+from bevcli.viewer.web import WebViewer, web_viewer_assets
+
+PAGE = {"/": b"<html>viewer</html>", "/re_viewer.js": b"js", "/re_viewer_bg.wasm": b"wasm", "/favicon.ico": b""}
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+WITHOUT_A_GPU = "--no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader --ignore-gpu-blocklist"
+
+
+@pytest.fixture
+def viewer(tmp_path):
+    recording = tmp_path / "recording.rrd"
+    recording.write_bytes(b"RRF2 and so on")
+    viewer = WebViewer(PAGE, recording)
+    thread = threading.Thread(target=viewer.serve)
+    thread.start()
+    yield viewer
+    viewer.close()
+    thread.join(5)
+    assert not thread.is_alive()
+
+
+def test_the_bare_address_leads_to_the_viewer_with_the_recording(viewer):
+    with urllib.request.urlopen(viewer.address + "/?renderer=webgl") as answer:
+        query = parse_qs(urlsplit(answer.url).query)
+        assert answer.read() == PAGE["/"]
+    assert query == {"url": [f"{viewer.address}/recording.rrd"], "renderer": ["webgl"]}
+    with urllib.request.urlopen(query["url"][0]) as answer:
+        assert answer.read() == b"RRF2 and so on"
+
+
+def test_the_page_may_talk_to_nobody_else(viewer):
+    with urllib.request.urlopen(viewer.address + "/?url=x") as answer:
+        assert answer.headers["Content-Security-Policy"] == "connect-src 'self' blob: data:"
+
+
+def test_only_loopback_can_reach_it(viewer):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # sends nothing: asks which address of ours would
+        except OSError:
+            pytest.skip("this machine has no address but loopback")
+        own = probe.getsockname()[0]
+    with pytest.raises(OSError), socket.create_connection((own, viewer.port), timeout=2):
+        pass
+
+
+def test_other_paths_are_not_served(viewer):
+    with pytest.raises(urllib.error.HTTPError, match="404"):
+        urllib.request.urlopen(viewer.address + "/etc/passwd")
+
+
+def test_a_port_in_use_is_no_problem(viewer, tmp_path):
+    second = WebViewer(PAGE, tmp_path / "recording.rrd", port=viewer.port)
+    assert second.port != viewer.port
+    second._server.server_close()
+
+
+def test_the_assets_are_the_viewers(viewer):
+    assets = web_viewer_assets()
+    assert assets["/re_viewer_bg.wasm"].startswith(b"\0asm")
+    assert b"the_canvas_id" in assets["/"]
+    assert b"fonts.googleapis" not in assets["/"]
+
+
+def processor_seconds(process: subprocess.Popen) -> float:
+    user, system = Path(f"/proc/{process.pid}/stat").read_text().split()[13:15]
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
+
+
+@pytest.mark.slow
+def test_a_browser_shows_the_recording(tmp_path):
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: no browser to drive")
+    if CHROMIUM is None:
+        pytest.skip("no chromium here: apt-get install chromium")
+    record(tmp_path / "recording.rrd", MemorySequence(3))
+    command = [sys.executable, "-c", "from bevcli.cli.main import run_app; run_app()", "viz"]
+    server = subprocess.Popen(
+        [*command, str(tmp_path / "recording.rrd"), "--web"], stdout=subprocess.PIPE, text=True, bufsize=1
+    )
+    try:
+        address = re.match(r"http://127\.0\.0\.1:\d+", server.stdout.readline()).group()
+        with playwright.sync_playwright() as driver:
+            browser = driver.chromium.launch(executable_path=CHROMIUM, args=WITHOUT_A_GPU.split())
+            page = browser.new_page(viewport={"width": 1280, "height": 800})
+            asked: list[str] = []
+            page.on("request", lambda request: asked.append(request.url))
+            page.goto(f"{address}/?renderer=webgl")
+            picture = wait_for_picture(page)
+            browser.close()
+        assert looks_like_views(picture)
+        assert {urlsplit(url).netloc for url in asked if url.startswith("http")} == {urlsplit(address).netloc}
+        before = processor_seconds(server)
+        time.sleep(3)
+        assert processor_seconds(server) - before < 0.1  # nobody watches: it idles
+    finally:
+        server.send_signal(signal.SIGINT)
+    assert server.wait(10) == 130
+    with pytest.raises(OSError):
+        urllib.request.urlopen(address, timeout=2)
+
+
+def wait_for_picture(page, seconds: float = 90) -> np.ndarray:
+    deadline = time.monotonic() + seconds
+    while True:
+        page.wait_for_timeout(2000)
+        picture = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+        if looks_like_views(picture) or time.monotonic() > deadline:
+            return picture
+
+
+def looks_like_views(picture: np.ndarray) -> bool:
+    """The cameras' noise above and below, and the BEV view's blue vehicle between them."""
+    height = len(picture)
+    above, middle, below = picture[: height // 4], picture[height // 4 : 3 * height // 4], picture[3 * height // 4 :]
+    vehicle = (np.abs(middle.astype(int) - [250, 200, 90]).sum(-1) < 40).sum()
+    return above.std() > 20 and below.std() > 20 and vehicle > 20
