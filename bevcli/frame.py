@@ -23,8 +23,8 @@ MAP_CLASSES = {"drivable_road": 1, "lane_boundary": 2, "pedestrian_crossing": 4,
 
 
 @dataclass(frozen=True)
-class Picture:
-    """One camera's picture.
+class CameraImage:
+    """One camera's image.
 
     pixels_bgr: (H, W, 3) uint8, as OpenCV decodes it. encoded: the file's own bytes, where there is a file.
     media_type: of these bytes, "image/jpeg" or "image/png".
@@ -41,7 +41,7 @@ class BevMap:
     """What lies on the ground, seen from above in the bev frame.
 
     cells: (rows, columns) uint8 of MAP_CLASSES' bits; columns from the smallest x to the largest, rows from the
-    LARGEST y (ahead, top) to the smallest, as in a picture.
+    LARGEST y (ahead, top) to the smallest, as in an image.
     """
 
     cells: NDArray[np.uint8]
@@ -62,14 +62,14 @@ class FrameStamp:
 class Frame:
     """All that is known of one moment.
 
-    pictures: by camera, without those that are missing. dropped: camera -> why its picture is missing.
+    images: by camera, without those that are missing. dropped: camera -> why its image is missing.
     world_from_ego: at the frame's time. world_from_ego_at: at each camera's own time, for every camera of the rig.
     kinematics: at the frame's time. ground_truth: in the world frame. sample_token: nuScenes' name of the frame.
     """
 
     stamp: FrameStamp
     rig: CameraRig
-    pictures: Mapping[str, Picture]
+    images: Mapping[str, CameraImage]
     world_from_ego: Pose
     world_from_ego_at: Mapping[str, Pose]
     kinematics: Kinematics
@@ -94,22 +94,22 @@ class Sequence(Protocol):
 
     @property
     def stamps(self) -> tuple[FrameStamp, ...]:
-        """When each frame is, in order; known without decoding a picture."""
+        """When each frame is, in order; known without decoding an image."""
         ...
 
     def load(self, place: int) -> Frame:
-        """The frame at a place (0 to len(stamps) - 1), its pictures decoded. Called in order, from one thread.
+        """The frame at a place (0 to len(stamps) - 1), its images decoded. Called in order, from one thread.
 
-        A picture that cannot be read lands in `Frame.dropped`; other mistakes raise InputError.
+        An image that cannot be read lands in `Frame.dropped`; other mistakes raise InputError.
         """
         ...
 
 
 @dataclass(frozen=True)
 class CameraSamples:
-    """Where spatial cross-attention looked in one camera's picture.
+    """Where spatial cross-attention looked in one camera's image.
 
-    pixels: (K, 2) in the picture as it was read (not the network's input), may lie outside of it.
+    pixels: (K, 2) in the image as it was read (not the network's input), may lie outside of it.
     weights: (K,) attention weights, not negative; over all cameras of a probe they sum to about 1.
     """
 
@@ -145,9 +145,9 @@ class Prediction:
     """What the model says of one frame.
 
     boxes: all decoded boxes, best first, in the bev frame, with classes and scores.
-    bev: (Y*X, C) tensor, cell index row * columns + column, rows from the smallest y; None where no picture came.
+    bev: (Y*X, C) tensor, cell index row * columns + column, rows from the smallest y; None where no image came.
     started_anew: why no history was used ("first frame", "new scene", …), "" where it was.
-    skipped: no picture at all; boxes are empty and the state was passed on.
+    skipped: no image at all; boxes are empty and the state was passed on.
     segmentation: of the model's segmentation head, where it has one. attention: where the run asked for it.
     stage_seconds: time per stage of the pipeline, in the order of the work.
     """

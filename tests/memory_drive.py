@@ -1,10 +1,10 @@
-"""A drive in memory: noise pictures, a gentle curve, any rig. For tests of everything that comes after the readers."""
+"""A drive in memory: noise images, a gentle curve, any rig. For tests of everything that comes after the readers."""
 
 from dataclasses import replace
 
 import numpy as np
 
-from bevcli.frame import Frame, FrameStamp, Picture
+from bevcli.frame import CameraImage, Frame, FrameStamp
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import GRAVITY, Kinematics
 from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
@@ -26,7 +26,7 @@ def make_rig(yaws_deg: dict[str, float] | None = None) -> CameraRig:
 
 
 class MemorySequence:
-    """A drive of noise pictures on a gentle curve, in memory, as a `Sequence`."""
+    """A drive of noise images on a gentle curve, in memory, as a `Sequence`."""
 
     name = "memory"
     notes = ()
@@ -40,8 +40,8 @@ class MemorySequence:
         stamp = self.stamps[place]
         pose = self.pose(place)
         random = np.random.default_rng(place)
-        pictures = {
-            camera.name: Picture(
+        images = {
+            camera.name: CameraImage(
                 stamp.timestamp_ns, random.integers(0, 256, (camera.height, camera.width, 3), dtype=np.uint8)
             )
             for camera in self.rig.cameras
@@ -49,7 +49,7 @@ class MemorySequence:
         return Frame(
             stamp=stamp,
             rig=self.rig,
-            pictures=pictures,
+            images=images,
             world_from_ego=pose,
             world_from_ego_at=dict.fromkeys(self.rig.names, pose),
             kinematics=Kinematics(np.array([0.1, 0.0, GRAVITY]), np.array([0, 0, 0.1]), np.array([6.0, 0, 0])),
@@ -60,8 +60,8 @@ class MemorySequence:
         return Pose(np.array([3.0 * place, 0.1 * place, 0.0]), np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]))
 
 
-class WithoutPictures(MemorySequence):
-    """The same drive, with some pictures missing: place -> cameras, or "all"."""
+class WithoutImages(MemorySequence):
+    """The same drive, with some images missing: place -> cameras, or "all"."""
 
     def __init__(self, missing, **options):
         super().__init__(**options)
@@ -71,5 +71,5 @@ class WithoutPictures(MemorySequence):
         frame = super().load(place)
         gone = self.missing.get(place, ())
         names = frame.rig.names if gone == "all" else gone
-        kept = {name: picture for name, picture in frame.pictures.items() if name not in names}
-        return replace(frame, pictures=kept, dropped=dict.fromkeys(names, "missing"))
+        kept = {name: image for name, image in frame.images.items() if name not in names}
+        return replace(frame, images=kept, dropped=dict.fromkeys(names, "missing"))

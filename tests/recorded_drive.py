@@ -30,7 +30,7 @@ def boxes_ahead() -> Boxes3D:
 
 
 def predict(frame: Frame) -> Prediction:
-    """The boxes above, the same in every frame's bev frame, and features that a picture can be made of."""
+    """The boxes above, the same in every frame's bev frame, and features that an image can be made of."""
     random = np.random.default_rng(frame.stamp.index)
     return Prediction(
         stamp=frame.stamp,

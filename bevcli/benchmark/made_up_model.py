@@ -11,7 +11,7 @@ from bevcli.model.bevformer import BEVFormer, BEVFormerConfig
 
 SEED = 0
 RESIDUAL_GAIN = 0.25  # of the backbone's blocks, which start as identities
-USUAL_DEVIATION = 57.0  # of pictures, grey levels; pictures that are not divided by it enter larger
+USUAL_DEVIATION = 57.0  # of images, grey levels; images that are not divided by it enter larger
 
 
 def made_up_model(config: BEVFormerConfig) -> BEVFormer:

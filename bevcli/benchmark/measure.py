@@ -147,7 +147,7 @@ def _prepared(drive: MadeUpDrive, config: BEVFormerConfig, place: int) -> Prepar
 
 def _hits(model: BEVFormer, prepared: PreparedFrame) -> tuple[int, ...]:
     size = (prepared.images.shape[-2], prepared.images.shape[-1])
-    projection = project_pillars(prepared.image_from_bev, model.pillars.cpu(), size, prepared.has_picture)
+    projection = project_pillars(prepared.image_from_bev, model.pillars.cpu(), size, prepared.has_image)
     return find_hits(projection).hits_per_camera
 
 

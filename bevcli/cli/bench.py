@@ -32,7 +32,7 @@ def bench(
         typer.Option(metavar="OUT", help="Run all models and precisions, and write the table of docs/speed.md."),
     ] = None,
 ) -> None:
-    """Time every stage of a model on made-up pictures and weights, beside what this machine can do at most.
+    """Time every stage of a model on made-up images and weights, beside what this machine can do at most.
 
     The limits are the rates of matrix products and of copying memory, measured in the same run. Nothing else should
     run on the machine meanwhile.

@@ -34,7 +34,7 @@ def convert(
 ) -> None:
     """Write any input as a native sequence folder.
 
-    Pictures are copied byte for byte; those of a video become PNG. Ego-motion, ground truth and maps come along.
+    Images are copied byte for byte; those of a video become PNG. Ego-motion, ground truth and maps come along.
     """
     from bevcli.cli.progress import Progress
     from bevcli.errors import OutputError
@@ -60,5 +60,5 @@ def convert(
             gaps += len(frame.dropped)
             writer.write(frame)
             progress.advance()
-    missing = f", {gaps} pictures missing" if gaps else ""
+    missing = f", {gaps} images missing" if gaps else ""
     typer.echo(f"{out}: {count} frames, {len(frame.rig.cameras)} cameras{missing}")

@@ -12,7 +12,7 @@ PANEL = "Input"
 SceneOption = Annotated[str | None, typer.Option(help="Only this scene, as scene-0103.", rich_help_panel=PANEL)]
 StrictOption = Annotated[
     bool,
-    typer.Option("--strict", help="A missing or unreadable picture is an error, not a gap.", rich_help_panel=PANEL),
+    typer.Option("--strict", help="A missing or unreadable image is an error, not a gap.", rich_help_panel=PANEL),
 ]
 VersionOption = Annotated[
     str | None,
@@ -27,7 +27,7 @@ SplitOption = Annotated[
 SweepsOption = Annotated[
     bool,
     typer.Option(
-        "--sweeps", help="nuScenes: the pictures between the keyframes too (12 a second).", rich_help_panel=PANEL
+        "--sweeps", help="nuScenes: the images between the keyframes too (12 a second).", rich_help_panel=PANEL
     ),
 ]
 IntrinsicsOption = Annotated[

@@ -1,4 +1,4 @@
-"""`bevcli project-debug`: what is wrong with a calibration, in words and pictures."""
+"""`bevcli project-debug`: what is wrong with a calibration, in words and images."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ ERRORS_FOUND = 3
 def project_debug(
     calibration: Annotated[Path, typer.Argument(help="A calibration.json, or a sequence with one.")],
     sequence: Annotated[
-        Path | None, typer.Option(help="A sequence folder whose pictures and ego-motion go with the calibration.")
+        Path | None, typer.Option(help="A sequence folder whose images and ego-motion go with the calibration.")
     ] = None,
-    frame: Annotated[int, typer.Option(min=0, help="Whose pictures to draw on: its place in the sequence.")] = 0,
+    frame: Annotated[int, typer.Option(min=0, help="Whose images to draw on: its place in the sequence.")] = 0,
     out: Annotated[
         Path | None,
-        typer.Option(help="Where the pictures go. Default: runs/<name>-project-debug.", show_default=False),
+        typer.Option(help="Where the images go. Default: runs/<name>-project-debug.", show_default=False),
     ] = None,
     json: Annotated[
         bool, typer.Option("--json", help="Print the findings and the coverage as one JSON object.")
@@ -31,7 +31,7 @@ def project_debug(
     """Find the mistake in a calibration.
 
     Checks the cameras' poses and lenses, the bev frame and, with a sequence, its ego-motion and times. Writes
-    cameras.png (pillars, ground and horizon in every picture), coverage.png (how many cameras see each BEV cell),
+    cameras.png (pillars, ground and horizon in every image), coverage.png (how many cameras see each BEV cell),
     recording.rrd (all of it, for bevcli viz) and findings.json. Files of an earlier look are overwritten.
 
     Exit code 0 without errors, 3 with findings of severity error.
@@ -78,7 +78,7 @@ def report_to_json(report: RigReport) -> dict[str, Any]:
 
 
 def _write(folder: Path, given: DebugInput, report: RigReport, document: str) -> list[str]:
-    """Write all files into the folder, and name them. Without a camera there are no pictures."""
+    """Write all files into the folder, and name them. Without a camera there are no images."""
     from bevcli.errors import OutputError
     from bevcli.rig.coverage_map import write_coverage_map
     from bevcli.rig.recording import write_calibration_recording
@@ -91,7 +91,7 @@ def _write(folder: Path, given: DebugInput, report: RigReport, document: str) ->
         raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
     if not given.rig.cameras:
         return [str(folder / "findings.json")]
-    write_sheet(folder / "cameras.png", given.rig, report, given.pictures)
+    write_sheet(folder / "cameras.png", given.rig, report, given.images)
     write_coverage_map(folder / "coverage.png", given.rig, report.coverage)
-    write_calibration_recording(folder / "recording.rrd", given.rig, report, given.pictures)
+    write_calibration_recording(folder / "recording.rrd", given.rig, report, given.images)
     return [str(folder / name) for name in ("cameras.png", "coverage.png", "recording.rrd", "findings.json")]

@@ -31,7 +31,7 @@ def report_text(name: str, rig: CameraRig, report: RigReport) -> str:
 
 
 def _rig_lines(rig: CameraRig, coverage: Coverage) -> list[str]:
-    header = ("camera", "picture", "view", "yaw", "pitch", "roll", "x", "y", "height", "lens", "sees")
+    header = ("camera", "image", "view", "yaw", "pitch", "roll", "x", "y", "height", "lens", "sees")
     rows = []
     for camera in rig.cameras:
         mounting = mounting_of(camera.ego_from_camera)

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-SMOOTHED_WIDTH = 1000  # smaller pictures show jagged edges more, and are quickly drawn
+SMOOTHED_WIDTH = 1000  # smaller images show jagged edges more, and are quickly drawn
 
 
 class WeatherChoice(StrEnum):
@@ -29,10 +29,10 @@ def render(
     ] = None,
     rate: Annotated[float, typer.Option(metavar="HZ", min=0.1, max=100, help="Frames a second.")] = 2.0,
     resolution: Annotated[
-        str | None, typer.Option(metavar="WxH", help="Size of the pictures, such as 800x450; default: the rig's.")
+        str | None, typer.Option(metavar="WxH", help="Size of the images, such as 800x450; default: the rig's.")
     ] = None,
     weather: Annotated[WeatherChoice | None, typer.Option(help="Default: drawn from the seed.")] = None,
-    quality: Annotated[int, typer.Option(min=1, max=100, help="Of the JPEG pictures.")] = 90,
+    quality: Annotated[int, typer.Option(min=1, max=100, help="Of the JPEG images.")] = 90,
     supersampling: Annotated[
         int | None,
         typer.Option(

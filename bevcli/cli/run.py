@@ -104,7 +104,7 @@ def run(
         typer.Option(help="How much goes into the recording.", rich_help_panel=RECORDING),
     ] = "standard",
     bev: Annotated[
-        str, typer.Option(help="The BEV features as a picture: norm, pca, channel:K, none.", rich_help_panel=RECORDING)
+        str, typer.Option(help="The BEV features as an image: norm, pca, channel:K, none.", rich_help_panel=RECORDING)
     ] = "pca",
     probe: Annotated[
         list[str] | None,

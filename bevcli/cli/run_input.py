@@ -36,7 +36,7 @@ def choose_frames(path: Path, options: InputOptions, choice: FrameChoice, config
     Raises InputError.
     """
     if options.sweeps and choice.rate is None and choice.every is None:
-        choice = replace(choice, rate="all")  # who asks for the pictures in between wants them
+        choice = replace(choice, rate="all")  # who asks for the images in between wants them
     sequence = _thinned(open_sequence(path, options), choice, config)
     return select(sequence, frame_range(choice.frames, len(sequence.stamps)))
 

@@ -1,4 +1,4 @@
-"""`bevcli viz`: opens a recording, or makes a picture, a video, a table or a summary of it."""
+"""`bevcli viz`: opens a recording, or makes an image, a video, a table or a summary of it."""
 
 from __future__ import annotations
 
@@ -16,11 +16,9 @@ def viz(
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="The web viewer's port; where it is in use, the next free one.")] = 9090,
     screenshot: Annotated[
-        Path | None, typer.Option(metavar="OUT.png", help="Write a picture of the viewer; needs no screen.")
+        Path | None, typer.Option(metavar="OUT.png", help="Write an image of the viewer; needs no screen.")
     ] = None,
-    frame: Annotated[
-        int | None, typer.Option(help="The number of the frame in the picture. Default: the first.")
-    ] = None,
+    frame: Annotated[int | None, typer.Option(help="The number of the frame in the image. Default: the first.")] = None,
     summary: Annotated[bool, typer.Option("--summary", help="Print what the recording holds.")] = False,
     video: Annotated[
         Path | None,
@@ -30,7 +28,7 @@ def viz(
         Path | None, typer.Option(metavar="BOXES.csv|.json", help="Write the shown boxes, in the world frame.")
     ] = None,
 ) -> None:
-    """Look at a recording: in the viewer, or as a picture, a video, a table or a summary.
+    """Look at a recording: in the viewer, or as an image, a video, a table or a summary.
 
     Without an option that writes something, the viewer opens: in a window where there is a display, else in the
     browser, at an address of this machine only. Ctrl-C ends it.
@@ -60,11 +58,11 @@ def _summarise(recording: Path, read_from: Path) -> None:
     typer.echo(summarise(recording, read_from).text())
 
 
-def _screenshot(recording: Path, picture: Path, frame: int | None) -> None:
+def _screenshot(recording: Path, image: Path, frame: int | None) -> None:
     from bevcli.viewer.screenshot import take_screenshot
 
-    views = take_screenshot(recording, picture, frame)
-    typer.echo(f"{picture}: {len(views)} views")
+    views = take_screenshot(recording, image, frame)
+    typer.echo(f"{image}: {len(views)} views")
 
 
 def _video(recording: Path, video: Path) -> None:

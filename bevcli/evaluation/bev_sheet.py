@@ -69,7 +69,7 @@ def _legend(missed: Mapping[str, ScoredBoxes], alarms: Mapping[str, ScoredBoxes]
 
 
 def _radius(scores: Scores) -> float:
-    """How far the pictures reach: the farthest thing that is scored."""
+    """How far the images reach: the farthest thing that is scored."""
     ranges = [part.ranges_m for match in scores.detection.matches for part in (match.ground_truth, match.predictions)]
     farthest = max((float(values.max()) for values in ranges if len(values)), default=10.0)
     return min(10 * np.ceil(farthest / 10), 100.0)

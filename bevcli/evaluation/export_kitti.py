@@ -62,7 +62,7 @@ def kitti_labels(boxes_ego: Boxes3D, camera: Camera) -> list[str]:
     alphas = wrap_angle(rotations_y - np.arctan2(locations[:, 0], locations[:, 2]))
     lines = []
     for place, corners in enumerate(boxes_ego.corners()):
-        seen = _picture_box(apply(camera_from_ego, corners), camera)
+        seen = _image_box(apply(camera_from_ego, corners), camera)
         if seen is None:
             continue
         rectangle, truncated = seen
@@ -74,8 +74,8 @@ def kitti_labels(boxes_ego: Boxes3D, camera: Camera) -> list[str]:
     return lines
 
 
-def _picture_box(corners: Array, camera: Camera) -> tuple[Array, float] | None:
-    """The rectangle around a box's visible part, cut at the picture's border, and the share that is cut off."""
+def _image_box(corners: Array, camera: Camera) -> tuple[Array, float] | None:
+    """The rectangle around a box's visible part, cut at the image's border, and the share that is cut off."""
     points = _before_the_camera(corners)
     if not len(points):
         return None

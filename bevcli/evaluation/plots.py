@@ -1,4 +1,4 @@
-"""Scores as pictures: precision against recall, errors by range, and where things were missed or invented."""
+"""Scores as images: precision against recall, errors by range, and where things were missed or invented."""
 
 from __future__ import annotations
 

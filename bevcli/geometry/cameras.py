@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bevcli.geometry.transforms import Array, apply, inverse, rigid
 
-NEAR_M = 1e-5  # points nearer than this to the camera's plane, or behind it, have no picture
+NEAR_M = 1e-5  # points nearer than this to the camera's plane, or behind it, have no image
 
 
 @dataclass(frozen=True)
@@ -82,20 +82,20 @@ class Camera:
         return self.project(apply(self.camera_from_ego, points_ego))
 
     def contains(self, pixels: ArrayLike, depth: ArrayLike) -> NDArray[np.bool_]:
-        """Which pixels (..., 2) at these depths (...,) lie in front of the camera and inside the picture."""
+        """Which pixels (..., 2) at these depths (...,) lie in front of the camera and inside the image."""
         p = np.asarray(pixels, dtype=np.float64)
         with np.errstate(invalid="ignore"):
             inside = (p > 0).all(-1) & (p[..., 0] < self.width) & (p[..., 1] < self.height)
         return inside & (np.asarray(depth) > NEAR_M)
 
     def scaled(self, factor_x: float, factor_y: float | None = None) -> Camera:
-        """The camera whose picture is this one's, resized. Pixels times the factor, without a half-pixel term."""
+        """The camera whose image is this one's, resized. Pixels times the factor, without a half-pixel term."""
         factors = np.diag([factor_x, factor_x if factor_y is None else factor_y, 1.0])
         width, height = round(self.width * factors[0, 0]), round(self.height * factors[1, 1])
         return replace(self, width=width, height=height, intrinsics=factors @ self.intrinsics)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
-        """The camera of a part of the picture; a part that reaches beyond the picture is padding."""
+        """The camera of a part of the image; a part that reaches beyond the image is padding."""
         shift = np.array([[1.0, 0, -left], [0, 1.0, -top], [0, 0, 1.0]])
         return replace(self, width=width, height=height, intrinsics=shift @ self.intrinsics)
 
@@ -104,7 +104,7 @@ class Camera:
         return replace(self, distortion=None)
 
     def undistort_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Maps (H, W) x and y for cv2.remap: from each pixel of `undistorted()` to this camera's picture."""
+        """Maps (H, W) x and y for cv2.remap: from each pixel of `undistorted()` to this camera's image."""
         u, v = np.meshgrid(np.arange(self.width, dtype=np.float64), np.arange(self.height, dtype=np.float64))
         pixels = np.stack([u, v, np.ones_like(u)], axis=-1)
         rays = pixels @ np.linalg.inv(self.intrinsics).T
@@ -178,7 +178,7 @@ def _distort_brown_conrady(xy: Array, coefficients: tuple[float, ...]) -> Array:
         return np.where((slope > 0)[..., None], result, np.nan)
 
 
-def undistort(picture: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
-    """The picture (H, W, 3) that `camera.undistorted()` would have taken; black where the lens saw nothing."""
+def undistort(image: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
+    """The image (H, W, 3) that `camera.undistorted()` would have taken; black where the lens saw nothing."""
     map_x, map_y = (np.nan_to_num(m, nan=-1e4) for m in camera.undistort_maps())
-    return cv2.remap(picture, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT).astype(np.uint8)
+    return cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT).astype(np.uint8)

@@ -64,7 +64,7 @@ class EgoMotion:
         first, last = int(times[0]), int(times[-1])
         if timestamp_ns < first - TOLERANCE_NS or timestamp_ns > last + TOLERANCE_NS:
             raise InputError(
-                f"ego-motion covers {first} to {last} ns, but a picture or frame is at {timestamp_ns} ns "
+                f"ego-motion covers {first} to {last} ns, but an image or frame is at {timestamp_ns} ns "
                 "(at most 50 ms outside is allowed): extend it or cut the frames"
             )
         clipped = min(max(timestamp_ns, first), last)

@@ -12,7 +12,7 @@ class SpatialSamples:
     """What K' (camera, cell) pairs sampled in spatial cross-attention.
 
     camera: (K',) index in B·N. cell: (K',) index in B·Y·X.
-    locations: (K', heads, L, P, 2) x, y, 0 to 1 over the padded picture. weights: (K', heads, L, P), of sum 1 a head.
+    locations: (K', heads, L, P, 2) x, y, 0 to 1 over the padded image. weights: (K', heads, L, P), of sum 1 a head.
     """
 
     camera: Tensor

@@ -84,8 +84,8 @@ class BEVFormerInputs:
 
     images: (B, N, 3, H, W) normalised, padded.
     image_from_bev: (B, N, 4, 4) float32, bev metres -> network-input pixels (rows u·d, v·d, d, 1).
-    camera_index: (N,) int64, which camera embedding each picture takes.
-    has_picture: (B, N) bool; a camera without a picture is seen by no BEV cell.
+    camera_index: (N,) int64, which camera embedding each image takes.
+    has_image: (B, N) bool; a camera without an image is seen by no BEV cell.
     can_bus: (B, 18) float32, after the differencing.
     shift: (B, 2) float32, history shift (x, y) in normalised BEV coordinates; zero without history.
     rotation_deg: (B,) float32, rotation of the history map.
@@ -94,7 +94,7 @@ class BEVFormerInputs:
     images: Tensor
     image_from_bev: Tensor
     camera_index: Tensor
-    has_picture: Tensor
+    has_image: Tensor
     can_bus: Tensor
     shift: Tensor
     rotation_deg: Tensor
@@ -181,13 +181,13 @@ class BEVFormer(nn.Module):
         if not self.prepared:
             return find_hits(self.project_pillars(inputs))
         size = torch.tensor(inputs.images.shape[-2:])
-        seen_from = (inputs.image_from_bev, inputs.has_picture, size)
+        seen_from = (inputs.image_from_bev, inputs.has_image, size)
         return self._kept_hits(lambda: find_hits(self.project_pillars(inputs)), *seen_from)
 
     def project_pillars(self, inputs: BEVFormerInputs) -> PillarProjection:
         """Where the pillars appear in the cameras of these inputs, and where they are visible."""
         image_size = (inputs.images.shape[-2], inputs.images.shape[-1])
-        return project_pillars(inputs.image_from_bev, self.pillars, image_size, inputs.has_picture)
+        return project_pillars(inputs.image_from_bev, self.pillars, image_size, inputs.has_image)
 
     def align_history(self, history: Tensor, rotation_deg: Tensor) -> Tensor:
         """The history map (B, Y·X, C), turned by rotation_deg (B,)."""

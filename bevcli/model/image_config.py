@@ -1,4 +1,4 @@
-"""ImageConfig: the pictures that a model takes."""
+"""ImageConfig: the images that a model takes."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class ImageConfig:
-    """How a picture becomes the network's input: resized to fit, normalised in float, padded right and bottom.
+    """How an image becomes the network's input: resized to fit, normalised in float, padded right and bottom.
 
-    size: (width, height) in pixels, before padding. A picture of another aspect is scaled to fit inside it.
+    size: (width, height) in pixels, before padding. An image of another aspect is scaled to fit inside it.
     pad_divisor: width and height are padded with zeros to a multiple of it.
     mean, std: of a channel, on 0 to 255, in the order of color_order.
-    resize: "linear", as the published weights know it, jagged where pictures shrink to less than half; "area" averages
+    resize: "linear", as the published weights know it, jagged where images shrink to less than half; "area" averages
     what falls into a pixel.
     """
 

@@ -14,7 +14,7 @@ MIN_DEPTH = 1e-5
 class PillarProjection:
     """The pillars of every BEV cell in every camera.
 
-    reference_points: (B, N, Y·X, Z, 2) float32, x and y, 0 to 1 over the padded picture; up to 1e7 behind a camera.
+    reference_points: (B, N, Y·X, Z, 2) float32, x and y, 0 to 1 over the padded image; up to 1e7 behind a camera.
     visible: (B, N, Y·X, Z) bool.
     """
 
@@ -50,18 +50,18 @@ def project_points(image_from_bev: Tensor, points: Tensor) -> tuple[Tensor, Tens
 
 
 def project_pillars(
-    image_from_bev: Tensor, pillars: Tensor, image_size: tuple[int, int], has_picture: Tensor
+    image_from_bev: Tensor, pillars: Tensor, image_size: tuple[int, int], has_image: Tensor
 ) -> PillarProjection:
     """Projects 3D reference points into the cameras.
 
-    image_from_bev: (B, N, 4, 4) float32. pillars: (Y·X, Z, 3) metres, bev frame. has_picture: (B, N) bool.
+    image_from_bev: (B, N, 4, 4) float32. pillars: (Y·X, Z, 3) metres, bev frame. has_image: (B, N) bool.
     image_size: (height, width) of the network's input, padding included, pixels.
     """
     pixels, depth = project_points(image_from_bev.float()[:, :, None, None], pillars.float())
     height, width = image_size
     points = pixels / pixels.new_tensor([width, height])  # (B, N, Y·X, Z, 2)
     inside = ((points > 0) & (points < 1)).all(-1) & (depth > MIN_DEPTH)
-    return PillarProjection(points, inside & has_picture[:, :, None, None])
+    return PillarProjection(points, inside & has_image[:, :, None, None])
 
 
 def find_hits(projection: PillarProjection) -> PillarHits:

@@ -26,9 +26,9 @@ def prepare_for_inference(model: BEVFormer, device: torch.device, precision: Pre
     """A copy of the model on the device, for inference only; the model itself stays as it is.
 
     What is the same in every frame is worked out here, what hangs on calibration and poses when these change.
-    Batch norms are folded into their convolutions, pictures are convolved channels-last, deformable operations take
+    Batch norms are folded into their convolutions, images are convolved channels-last, deformable operations take
     the device's fastest backends, and on a CPU oneDNN runs convolutions and linear layers. At half precision the
-    whole way of the pictures computes in it: backbone, neck, image tokens and their values. What follows moves boxes
+    whole way of the images computes in it: backbone, neck, image tokens and their values. What follows moves boxes
     by decimetres when it is rounded, and is a small part of the work: BEV queries, sampling locations, decoder and
     heads stay in float32.
     """

@@ -40,7 +40,7 @@ class ResNetConfig:
 
 
 class ResNet(nn.Module):
-    """Pictures to feature maps at strides 4, 8, 16 and 32; only the configured stages' maps are returned."""
+    """Images to feature maps at strides 4, 8, 16 and 32; only the configured stages' maps are returned."""
 
     def __init__(self, config: ResNetConfig) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""From the model's attention samples to what can be drawn: metres in the BEV, pixels in the pictures as read."""
+"""From the model's attention samples to what can be drawn: metres in the BEV, pixels in the images as read."""
 
 from __future__ import annotations
 
@@ -58,6 +58,6 @@ def _samples(
 
 
 def _as_read(pixels: Array, camera: Camera) -> Array:
-    """Pixels (K, 2) of the undistorted picture -> of the picture as read, NaN where the lens does not reach."""
+    """Pixels (K, 2) of the undistorted image -> of the image as read, NaN where the lens does not reach."""
     rays = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=-1) @ np.linalg.inv(camera.intrinsics).T
     return camera.project(rays)[0]

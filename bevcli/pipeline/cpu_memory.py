@@ -14,7 +14,7 @@ _USUAL_MMAP_THRESHOLD = 32 << 20
 def keep_freed_memory() -> None:
     """For the whole process: freed blocks are kept for the next tensor of that size.
 
-    By default every tensor over 32 MiB is mapped, zeroed page by page and unmapped again: in ResNet-50 on six pictures
+    By default every tensor over 32 MiB is mapped, zeroed page by page and unmapped again: in ResNet-50 on six images
     that was 2.4 million page faults and half of the time. Does nothing where the C library is not glibc.
     """
     _set_thresholds(mmap=_LARGEST_BLOCK, trim=(1 << 31) - 1)

@@ -34,7 +34,7 @@ def model_inputs(
         images=torch.cat([prepared.images for prepared in frames]),
         image_from_bev=torch.cat([prepared.image_from_bev for prepared in frames]),
         camera_index=index,
-        has_picture=torch.cat([prepared.has_picture for prepared in frames]),
+        has_image=torch.cat([prepared.has_image for prepared in frames]),
         can_bus=torch.from_numpy(np.stack([motion.can_bus for motion in motions])),
         shift=torch.from_numpy(np.stack([motion.shift for motion in motions])),
         rotation_deg=torch.tensor([motion.rotation_deg for motion in motions], dtype=torch.float32),

@@ -1,4 +1,4 @@
-"""Frame -> the network's input. Picture and calibration change together, here and nowhere else."""
+"""Frame -> the network's input. Images and calibration change together, here and nowhere else."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ LensMaps = tuple[NDArray[np.float32], NDArray[np.float32]]
 class PreparedFrame:
     """A frame and what the network takes of it.
 
-    assignment: the cameras of the N axes below. scales: (N,) network pixels per pixel of the picture.
-    images: (1, N, 3, H, W) float32, zero where a picture is missing. image_from_bev: (1, N, 4, 4) float32.
-    camera_index: (N,) int64. has_picture: (1, N) bool.
+    assignment: the cameras of the N axes below. scales: (N,) network pixels per pixel of the image.
+    images: (1, N, 3, H, W) float32, zero where an image is missing. image_from_bev: (1, N, 4, 4) float32.
+    camera_index: (N,) int64. has_image: (1, N) bool.
     """
 
     frame: Frame
@@ -38,7 +38,7 @@ class PreparedFrame:
     images: Tensor
     image_from_bev: Tensor
     camera_index: Tensor
-    has_picture: Tensor
+    has_image: Tensor
 
 
 class Preprocessor:
@@ -55,19 +55,19 @@ class Preprocessor:
         self._assignment = CameraAssignment((), ())
 
     def __call__(self, frame: Frame) -> PreparedFrame:
-        """Pictures undistorted, resized, normalised and padded; projections to match."""
+        """Images undistorted, resized, normalised and padded; projections to match."""
         self._use_rig(frame.rig)
         image, names = self.config.image, self._assignment.cameras
         width, height = image.padded_size
         images = torch.zeros(1, len(names), 3, height, width)
 
         def write(place: int, name: str) -> None:
-            pixels = self._undistorted(frame.pictures[name].pixels_bgr, frame.rig[name])
-            network_picture(pixels, image, out=images[0, place].numpy())
+            pixels = self._undistorted(frame.images[name].pixels_bgr, frame.rig[name])
+            network_image(pixels, image, out=images[0, place].numpy())
 
-        # Side by side: one after the other, pictures take longer than the model on a GPU.
+        # Side by side: one after the other, images take longer than the model on a GPU.
         with ThreadPoolExecutor(min(len(names), os.cpu_count() or 1)) as threads:
-            tasks = [threads.submit(write, i, name) for i, name in enumerate(names) if name in frame.pictures]
+            tasks = [threads.submit(write, i, name) for i, name in enumerate(names) if name in frame.images]
         for task in tasks:
             task.result()
         scales = tuple(network_scale(frame.rig[name], image) for name in names)
@@ -80,7 +80,7 @@ class Preprocessor:
             images=images,
             image_from_bev=torch.from_numpy(np.stack(scaled)).float()[None],
             camera_index=torch.tensor([self.config.cameras.index(name) for name in self._assignment.embeddings]),
-            has_picture=torch.tensor([[name in frame.pictures for name in names]]),
+            has_image=torch.tensor([[name in frame.images for name in names]]),
         )
 
     def _use_rig(self, rig: CameraRig) -> None:
@@ -100,19 +100,19 @@ class Preprocessor:
 
 
 def network_scale(camera: Camera, image: ImageConfig) -> float:
-    """Network pixels per pixel of the camera's picture: the largest at which it fits into the model's size."""
+    """Network pixels per pixel of the camera's image: the largest at which it fits into the model's size."""
     return min(image.size[0] / camera.width, image.size[1] / camera.height)
 
 
-def network_picture(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: NDArray[np.float32]) -> None:
-    """Writes a picture (H, W, 3) uint8 BGR, resized and normalised, to the top left of `out` (3, H', W'), zeros before.
+def network_image(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: NDArray[np.float32]) -> None:
+    """Writes an image (H, W, 3) uint8 BGR, resized and normalised, to the top left of `out` (3, H', W'), zeros before.
 
     Resized in float, which commutes with the original's order (normalise, then resize) up to rounding.
     """
     height, width = pixels_bgr.shape[:2]
     scale = min(image.size[0] / width, image.size[1] / height)
     new_width, new_height = round(width * scale), round(height * scale)
-    # Larger pictures are interpolated either way: areas are only for what shrinks.
+    # Larger images are interpolated either way: areas are only for what shrinks.
     interpolation = cv2.INTER_AREA if image.resize == "area" and scale < 1 else cv2.INTER_LINEAR
     resized = cv2.resize(pixels_bgr.astype(np.float32), (new_width, new_height), interpolation=interpolation)
     if image.color_order == "rgb":
@@ -125,7 +125,7 @@ def network_picture(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: NDAr
 
 
 def image_from_bev(frame: Frame, camera_name: str) -> Array:
-    """(4, 4) float64: from the bev frame at the frame's time to pixels of the undistorted picture at the camera's time.
+    """(4, 4) float64: from the bev frame at the frame's time to pixels of the undistorted image at the camera's time.
 
     A point (x, y, z, 1) becomes (u d, v d, d, 1).
     """

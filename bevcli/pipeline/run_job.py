@@ -67,9 +67,9 @@ def run_job(job: Job, *, force: bool) -> None:
 def warnings(frame: Frame, prediction: Prediction) -> list[str]:
     """What the person at the terminal should know of a frame; the recording logs its own events."""
     where = f"frame {frame.stamp.index}"
-    found = [f"{where}: camera {camera} has no picture: {why}" for camera, why in frame.dropped.items()]
+    found = [f"{where}: camera {camera} has no image: {why}" for camera, why in frame.dropped.items()]
     if prediction.skipped:
-        found.append(f"{where}: no picture at all; the state is passed on to the next frame")
+        found.append(f"{where}: no image at all; the state is passed on to the next frame")
     if prediction.started_anew.startswith("gap"):
         found.append(f"{where}: {prediction.started_anew}; the history starts anew")
     return found

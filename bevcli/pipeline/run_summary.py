@@ -91,7 +91,7 @@ class RunSummary:
         if guessed:
             rows.append(("cameras", f"{', '.join(guessed)} (embeddings; --camera changes them)"))
         if self._dropped:
-            rows.append(("dropped", f"{len(self._dropped)} pictures, {len(self._skipped)} frames without any"))
+            rows.append(("dropped", f"{len(self._dropped)} images, {len(self._skipped)} frames without any"))
         if self._job.loaded.untrained:
             rows.append(("weights", "UNTRAINED: random, the boxes mean nothing"))
         rows += [("written", path) for path in self._files()]

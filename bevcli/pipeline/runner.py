@@ -64,12 +64,12 @@ class Runner:
 
     @torch.inference_mode()
     def step(self, state: BevState | None, prepared: PreparedFrame) -> tuple[BevState | None, Prediction]:
-        """One frame. A frame without any picture passes the state on: the next alignment spans it."""
+        """One frame. A frame without any image passes the state on: the next alignment spans it."""
         frame = prepared.frame
         started_anew = self._reason_to_start_anew(state, frame.stamp)
         if started_anew:
             state = None
-        if not frame.pictures:
+        if not frame.images:
             return state, self._prediction(frame, started_anew, Boxes3D.empty(), None)
         self.clock.start()
         probe = self._probe(frame)

@@ -1,7 +1,7 @@
-"""BEV features as pictures: their norm, one channel, or three principal components as colours.
+"""BEV features as images: their norm, one channel, or three principal components as colours.
 
 The components and the range of the colours are fitted on the first two frames and then kept, so that a colour means
-the same in every frame. The first frame's picture is therefore ready only when the second frame has come.
+the same in every frame. The first frame's image is therefore ready only when the second frame has come.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ def fit_colors(kind: str, features: Features) -> BevColors:
     return BevColors(mean, basis, low, high)
 
 
-class BevPictures(Generic[Stamp]):
-    """Takes each frame's features, gives back the pictures that are ready, each with its frame's stamp."""
+class BevImages(Generic[Stamp]):
+    """Takes each frame's features, gives back the images that are ready, each with its frame's stamp."""
 
     def __init__(self, kind: str) -> None:
         self.kind = kind
@@ -73,14 +73,14 @@ class BevPictures(Generic[Stamp]):
         self._waiting: list[tuple[Stamp, Features]] = []
 
     def push(self, stamp: Stamp, features: Features) -> list[tuple[Stamp, NDArray[np.uint8]]]:
-        """features: (rows, columns, C), rows from the smallest y. Pictures: (rows, columns, 3), largest y on top."""
+        """features: (rows, columns, C), rows from the smallest y. Images: (rows, columns, 3), largest y on top."""
         self._waiting.append((stamp, features))
         if self._colors is None and len(self._waiting) < FITTED_ON:
             return []
         return self.finish()
 
     def finish(self) -> list[tuple[Stamp, NDArray[np.uint8]]]:
-        """The pictures that still wait: of the only frame, when no second one came."""
+        """The images that still wait: of the only frame, when no second one came."""
         if not self._waiting:
             return []
         if self._colors is None:

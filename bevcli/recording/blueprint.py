@@ -37,8 +37,8 @@ def recording_blueprint(rig: CameraRig, note: str = "", probes: bool = False) ->
 
 
 def _scene(rig: CameraRig, titled: str) -> rrb.Spatial3DView:
-    drawn_in_pictures = ("boxes", "ground_truth", "pillars", "probes")
-    excluded = [f"- /{entities.overlay(name, kind)}/**" for name in rig.names for kind in drawn_in_pictures]
+    drawn_in_images = ("boxes", "ground_truth", "pillars", "probes")
+    excluded = [f"- /{entities.overlay(name, kind)}/**" for name in rig.names for kind in drawn_in_images]
     since_start = [
         rr.VisibleTimeRange(timeline, start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative())
         for timeline in (entities.TIME_TIMELINE, entities.FRAME_TIMELINE)

@@ -1,4 +1,4 @@
-"""The lines of 3D boxes in a camera's picture, with the lens, clipped at the camera and at the picture's edge."""
+"""The lines of 3D boxes in a camera's image, with the lens, clipped at the camera and at the image's edge."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, apply
 
-NEAR_CLIP_M = 0.2  # lines end this far before the camera; nearer, they would shoot across the picture
+NEAR_CLIP_M = 0.2  # lines end this far before the camera; nearer, they would shoot across the image
 PIECES_BEHIND_A_LENS = 8  # a straight edge is bent by distortion: this many short lines follow it
 FRONT_EDGES = ((0, 7), (3, 4))  # the diagonals of the front face show where the box is heading
 _EDGES = np.array((*BOX_EDGES, *FRONT_EDGES))
 
 
 @dataclass(frozen=True)
-class PictureLines:
-    """Lines in a picture. segments: (M, 2, 2) pixels, inside the picture. owners: (M,) the box of each."""
+class ImageLines:
+    """Lines in an image. segments: (M, 2, 2) pixels, inside the image. owners: (M,) the box of each."""
 
     segments: Array
     owners: NDArray[np.int64]
 
 
-def lines_in_picture(boxes: Boxes3D, camera: Camera, camera_from_boxes: Array) -> PictureLines:
-    """The visible edges, and the front face's diagonals, of boxes in a camera's picture as it was taken.
+def lines_in_image(boxes: Boxes3D, camera: Camera, camera_from_boxes: Array) -> ImageLines:
+    """The visible edges, and the front face's diagonals, of boxes in a camera's image as it was taken.
 
-    camera_from_boxes: (4, 4) from the boxes' frame to the camera's at the picture's time.
+    camera_from_boxes: (4, 4) from the boxes' frame to the camera's at the image's time.
     """
     corners = apply(camera_from_boxes, boxes.corners())  # (N, 8, 3)
     edges = corners[:, _EDGES]  # (N, 14, 2, 3)
@@ -38,8 +38,8 @@ def lines_in_picture(boxes: Boxes3D, camera: Camera, camera_from_boxes: Array) -
     if camera.distortion is not None:
         ends, owners = _cut(ends, PIECES_BEHIND_A_LENS), np.repeat(owners, PIECES_BEHIND_A_LENS)
     pixels, _ = camera.project(ends)
-    segments, inside = clip_to_picture(pixels, camera.width, camera.height)
-    return PictureLines(segments[inside], owners[inside])
+    segments, inside = clip_to_image(pixels, camera.width, camera.height)
+    return ImageLines(segments[inside], owners[inside])
 
 
 def clip_near(ends: Array) -> tuple[Array, NDArray[np.bool_]]:
@@ -52,8 +52,8 @@ def clip_near(ends: Array) -> tuple[Array, NDArray[np.bool_]]:
     return np.where(before[..., None], ends, cut[:, None]), np.asarray(before.any(-1))
 
 
-def clip_to_picture(segments: Array, width: int, height: int) -> tuple[Array, NDArray[np.bool_]]:
-    """Lines (M, 2, 2) in pixels, cut at the picture's border, and which of them (M,) lie in it (Liang and Barsky).
+def clip_to_image(segments: Array, width: int, height: int) -> tuple[Array, NDArray[np.bool_]]:
+    """Lines (M, 2, 2) in pixels, cut at the image's border, and which of them (M,) lie in it (Liang and Barsky).
 
     A line with an end that is NaN is none.
     """

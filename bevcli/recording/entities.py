@@ -1,7 +1,7 @@
 """Where things lie in a recording: the entity paths, which writers, readers and the blueprint share.
 
 `world` is the drive's world frame, moved so that it starts at the first frame's ego position (the viewer computes in
-float32). `bev` is a flat picture of the bev frame in metres: to the right x, downwards -y.
+float32). `bev` is a flat image of the bev frame in metres: to the right x, downwards -y.
 """
 
 from __future__ import annotations
@@ -43,15 +43,15 @@ TIME_TIMELINE = "time"
 
 
 def camera(name: str) -> str:
-    """The entity of a camera: its pose, pinhole and all that is drawn in its picture."""
+    """The entity of a camera: its pose, pinhole and all that is drawn in its image."""
     return f"world/cameras/{name}"
 
 
-def picture(name: str) -> str:
-    """The entity of a camera's picture."""
+def image(name: str) -> str:
+    """The entity of a camera's image."""
     return f"{camera(name)}/picture"
 
 
 def overlay(name: str, kind: str) -> str:
-    """The entity of what is drawn into a camera's picture: boxes, labels, ground_truth, pillars, probes."""
+    """The entity of what is drawn into a camera's image: boxes, labels, ground_truth, pillars, probes."""
     return f"{camera(name)}/{kind}"

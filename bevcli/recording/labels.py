@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
-from bevcli.recording.box_lines import PictureLines
+from bevcli.recording.box_lines import ImageLines
 
 LABELS_IN_SCENE = 10  # the nearest boxes; the others show their colour
-LOWEST_LABELLED = 0.05  # of the picture's height: smaller boxes show their colour only
-LETTER_WIDTH, LETTER_HEIGHT = 0.019, 0.085  # of the picture's width and height, where the view is a third of the screen
+LOWEST_LABELLED = 0.05  # of the image's height: smaller boxes show their colour only
+LETTER_WIDTH, LETTER_HEIGHT = 0.019, 0.085  # of the image's width and height, where the view is a third of the screen
 
 
 def box_labels(boxes: Boxes3D) -> list[str]:
@@ -29,9 +29,7 @@ def labels_in_scene(boxes: Boxes3D, ego_xy: Array) -> list[str]:
     return [text if i in near else "" for i, text in enumerate(box_labels(boxes))]
 
 
-def labels_in_picture(
-    lines: PictureLines, texts: list[str], width: int, height: int
-) -> tuple[Array, NDArray[np.int64]]:
+def labels_in_image(lines: ImageLines, texts: list[str], width: int, height: int) -> tuple[Array, NDArray[np.int64]]:
     """Where labels stand, (L, 2) pixels, over the boxes (L,) they belong to: the largest first, none over another."""
     taken: list[tuple[float, float, float, float]] = []
     places, owners = [], []
@@ -48,8 +46,8 @@ def labels_in_picture(
     return np.array(places).reshape(-1, 2), np.array(owners, dtype=np.int64)
 
 
-def _by_height(lines: PictureLines) -> list[tuple[int, Array, Array]]:
-    """Each box in the picture with the corners of the rectangle around it, the highest first."""
+def _by_height(lines: ImageLines) -> list[tuple[int, Array, Array]]:
+    """Each box in the image with the corners of the rectangle around it, the highest first."""
     around = []
     for owner in np.unique(lines.owners):
         points = lines.segments[lines.owners == owner].reshape(-1, 2)

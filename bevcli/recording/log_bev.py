@@ -16,16 +16,14 @@ GROUND_OPACITY = 110  # of 255: boxes, rings and the trajectory stay readable on
 BELOW_GROUND_M = 0.06  # so that the map does not flicker with what lies on the ground
 
 
-def log_features(stream: rr.RecordingStream, picture: NDArray[np.uint8], grid: BevGrid, ego_from_bev: Array) -> None:
-    """Writes a picture (rows, columns, 3) of the BEV features, the largest y on top, on the ground and from above."""
-    stream.log(
-        entities.BEV_FEATURES, rr.Image(picture, draw_order=-10), _placed(picture, grid.x_range_m, grid.y_range_m)
-    )
+def log_features(stream: rr.RecordingStream, image: NDArray[np.uint8], grid: BevGrid, ego_from_bev: Array) -> None:
+    """Writes an image (rows, columns, 3) of the BEV features, the largest y on top, on the ground and from above."""
+    stream.log(entities.BEV_FEATURES, rr.Image(image, draw_order=-10), _placed(image, grid.x_range_m, grid.y_range_m))
     quad = rr.Mesh3D(
         vertex_positions=_ground_corners(grid, ego_from_bev),
         triangle_indices=[[0, 1, 2], [0, 2, 3]],
         vertex_texcoords=[[0, 1], [1, 1], [1, 0], [0, 0]],
-        albedo_texture=picture,
+        albedo_texture=image,
         albedo_factor=[255, 255, 255, GROUND_OPACITY],
     )
     stream.log(entities.BEV_ON_GROUND, quad)
@@ -45,8 +43,8 @@ def log_history(stream: rr.RecordingStream, weight: Array | None, grid: BevGrid)
     if weight is None:
         stream.log(entities.BEV_HISTORY, rr.Clear(recursive=False))
         return
-    picture = colormap(weight[::-1], "viridis")
-    stream.log(entities.BEV_HISTORY, rr.Image(picture, draw_order=-8), _placed(picture, grid.x_range_m, grid.y_range_m))
+    image = colormap(weight[::-1], "viridis")
+    stream.log(entities.BEV_HISTORY, rr.Image(image, draw_order=-8), _placed(image, grid.x_range_m, grid.y_range_m))
 
 
 def log_probes(stream: rr.RecordingStream, probes: tuple[Probe, ...], ego_from_bev: Array, grid: BevGrid) -> None:
@@ -65,8 +63,8 @@ def log_probes(stream: rr.RecordingStream, probes: tuple[Probe, ...], ego_from_b
     )
 
 
-def _placed(picture: NDArray[np.uint8], x_range: tuple[float, float], y_range: tuple[float, float]) -> rr.Transform3D:
-    rows, columns = picture.shape[:2]
+def _placed(image: NDArray[np.uint8], x_range: tuple[float, float], y_range: tuple[float, float]) -> rr.Transform3D:
+    rows, columns = image.shape[:2]
     cell = [(x_range[1] - x_range[0]) / columns, (y_range[1] - y_range[0]) / rows, 1.0]
     return rr.Transform3D(translation=[x_range[0], -y_range[1], 0], scale=cell)
 

@@ -95,7 +95,7 @@ def log_ground_truth_bev(stream: rr.RecordingStream, truth: Boxes3D, found: np.n
 
 
 def footprints(boxes: Boxes3D) -> tuple[Array, Array]:
-    """Boxes seen from above in the flat bev picture: closed outlines (N, 5, 2), and lines to the front (N, 2, 2)."""
+    """Boxes seen from above in the flat bev image: closed outlines (N, 5, 2), and lines to the front (N, 2, 2)."""
     ground = boxes.corners()[:, :4, :2] * (1, -1)
     outlines = np.concatenate([ground, ground[:, :1]], axis=1)
     front = (ground[:, 0] + ground[:, 3]) / 2

@@ -1,4 +1,4 @@
-"""One camera's frame into a recording: its pose, its picture, and what is drawn into it."""
+"""One camera's frame into a recording: its pose, its image, and what is drawn into it."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ import cv2
 import numpy as np
 import rerun as rr
 
-from bevcli.frame import CameraSamples, Picture
+from bevcli.frame import CameraImage, CameraSamples
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.recording import entities
-from bevcli.recording.box_lines import lines_in_picture
+from bevcli.recording.box_lines import lines_in_image
 from bevcli.recording.colors import GROUND_TRUTH_COLOR, MISSED_COLOR, colormap
-from bevcli.recording.labels import box_labels, labels_in_picture
+from bevcli.recording.labels import box_labels, labels_in_image
 from bevcli.recording.log_boxes import box_colors
 
-JPEG_QUALITY = 85  # of pictures that come without bytes of their own, as a video's do
+JPEG_QUALITY = 85  # of images that come without bytes of their own, as a video's do
 POINT = rr.Radius.ui_points(2.0)
 
 
 @dataclass(frozen=True)
 class CameraShot:
-    """One camera at its picture's time. world_from_camera: (4, 4), of the recording's world."""
+    """One camera at its image's time. world_from_camera: (4, 4), of the recording's world."""
 
     camera: Camera
     world_from_camera: Array
@@ -36,24 +36,24 @@ class CameraShot:
         return inverse(self.world_from_camera)
 
 
-def log_picture(stream: rr.RecordingStream, shot: CameraShot, picture: Picture | None) -> None:
-    """Writes the pose and the picture's own bytes; where there is no picture, the last one is taken away."""
+def log_image(stream: rr.RecordingStream, shot: CameraShot, image: CameraImage | None) -> None:
+    """Writes the pose and the image's own bytes; where there is no image, the last one is taken away."""
     entity = entities.camera(shot.camera.name)
     pose = shot.world_from_camera
     stream.log(entity, rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
-    if picture is None:
-        stream.log(entities.picture(shot.camera.name), rr.Clear(recursive=False))
+    if image is None:
+        stream.log(entities.image(shot.camera.name), rr.Clear(recursive=False))
         return
-    contents, media_type = _encoded(picture)
-    stream.log(entities.picture(shot.camera.name), rr.EncodedImage(contents=contents, media_type=media_type))
+    contents, media_type = _encoded(image)
+    stream.log(entities.image(shot.camera.name), rr.EncodedImage(contents=contents, media_type=media_type))
 
 
-def log_boxes_in_picture(
+def log_boxes_in_image(
     stream: rr.RecordingStream, shot: CameraShot, boxes: Boxes3D, class_names: Sequence[str]
 ) -> None:
     """Writes the lines and labels of predicted boxes, given in the recording's world."""
     name = shot.camera.name
-    lines = lines_in_picture(boxes, shot.camera, shot.camera_from_world)
+    lines = lines_in_image(boxes, shot.camera, shot.camera_from_world)
     colors = box_colors(boxes, class_names)
     stream.log(
         entities.overlay(name, "boxes"),
@@ -65,7 +65,7 @@ def log_boxes_in_picture(
         ),
     )
     texts = box_labels(boxes)
-    places, owners = labels_in_picture(lines, texts, shot.camera.width, shot.camera.height)
+    places, owners = labels_in_image(lines, texts, shot.camera.width, shot.camera.height)
     labels = rr.Points2D(
         places,
         labels=[texts[owner] for owner in owners],
@@ -77,11 +77,9 @@ def log_boxes_in_picture(
     stream.log(entities.overlay(name, "boxes/labels"), labels)
 
 
-def log_ground_truth_in_picture(
-    stream: rr.RecordingStream, shot: CameraShot, truth: Boxes3D, found: np.ndarray
-) -> None:
+def log_ground_truth_in_image(stream: rr.RecordingStream, shot: CameraShot, truth: Boxes3D, found: np.ndarray) -> None:
     """Writes the lines of ground-truth boxes, given in the recording's world: pale where found, red where missed."""
-    lines = lines_in_picture(truth, shot.camera, shot.camera_from_world)
+    lines = lines_in_image(truth, shot.camera, shot.camera_from_world)
     colors = np.where(found[:, None], GROUND_TRUTH_COLOR, MISSED_COLOR).astype(np.uint8).reshape(-1, 3)
     stream.log(
         entities.overlay(shot.camera.name, "ground_truth"),
@@ -95,7 +93,7 @@ def log_ground_truth_in_picture(
 
 
 def log_pillar_hits(stream: rr.RecordingStream, shot: CameraShot, points_world: Array, colors: np.ndarray) -> None:
-    """Writes where 3D reference points (K, 3) of the recording's world land in the picture. colors: (K, 3) uint8."""
+    """Writes where 3D reference points (K, 3) of the recording's world land in the image. colors: (K, 3) uint8."""
     pixels, depth = shot.camera.project(apply(shot.camera_from_world, points_world))
     hits = shot.camera.contains(pixels, depth)
     points = rr.Points2D(pixels[hits], colors=colors[hits], radii=POINT, draw_order=10)
@@ -103,7 +101,7 @@ def log_pillar_hits(stream: rr.RecordingStream, shot: CameraShot, points_world: 
 
 
 def log_samples(stream: rr.RecordingStream, shot: CameraShot, samples: Sequence[CameraSamples]) -> None:
-    """Writes the points that spatial cross-attention sampled in this picture: larger and brighter by weight."""
+    """Writes the points that spatial cross-attention sampled in this image: larger and brighter by weight."""
     pixels = np.concatenate([np.zeros((0, 2)), *(s.pixels for s in samples)])
     weights = np.concatenate([np.zeros(0), *(s.weights for s in samples)])
     inside = shot.camera.contains(pixels, np.ones(len(pixels)))
@@ -117,8 +115,8 @@ def log_samples(stream: rr.RecordingStream, shot: CameraShot, samples: Sequence[
     stream.log(entities.overlay(shot.camera.name, "probes"), points)
 
 
-def _encoded(picture: Picture) -> tuple[bytes, str]:
-    if picture.encoded is not None and picture.media_type is not None:
-        return picture.encoded, picture.media_type
-    _, data = cv2.imencode(".jpg", picture.pixels_bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+def _encoded(image: CameraImage) -> tuple[bytes, str]:
+    if image.encoded is not None and image.media_type is not None:
+        return image.encoded, image.media_type
+    _, data = cv2.imencode(".jpg", image.pixels_bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return data.tobytes(), "image/jpeg"

@@ -15,12 +15,12 @@ LEVELS: tuple[Level, ...] = ("minimal", "standard", "full")
 class RecordingOptions:
     """What `bevcli run` writes into a recording.
 
-    level: "minimal" pictures, boxes, ego and curves; "standard" adds the BEV map, the pillars and the history map;
-    "full" thins nothing. bev: "norm", "pca", "channel:K" or "none", how BEV features become a picture. score: boxes
+    level: "minimal" images, boxes, ego and curves; "standard" adds the BEV map, the pillars and the history map;
+    "full" thins nothing. bev: "norm", "pca", "channel:K" or "none", how BEV features become an image. score: boxes
     below it are not shown. probes: x, y in metres in the bev frame, the cells whose attention is drawn.
     live: a viewer shows the recording while it is written.
 
-    Raises InputError for an unknown level or kind of BEV picture.
+    Raises InputError for an unknown level or kind of BEV image.
     """
 
     level: Level = "standard"
@@ -33,7 +33,7 @@ class RecordingOptions:
         if self.level not in LEVELS:
             raise InputError(f'--record: unknown level "{self.level}" (expected {", ".join(LEVELS)})')
         if self.bev not in ("norm", "pca", "none") and self.channel is None:
-            raise InputError(f'--bev: unknown picture "{self.bev}" (expected norm, pca, channel:K or none)')
+            raise InputError(f'--bev: unknown image "{self.bev}" (expected norm, pca, channel:K or none)')
 
     @property
     def channel(self) -> int | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.transforms import Array
 
-CELLS_A_SIDE = 25  # more pillars than this in a row would hide the picture that they are drawn into
+CELLS_A_SIDE = 25  # more pillars than this in a row would hide the image that they are drawn into
 
 
 def drawn_pillars(grid: BevGrid, *, everything: bool = False) -> Array:

@@ -90,6 +90,6 @@ def _log_rings(stream: rr.RecordingStream, rig: CameraRig) -> None:
 
 
 def _seen_from_above(rig: CameraRig, points_ego: Array) -> Array:
-    """Points (K, 2) on the ground in ego -> (K, 2) of the flat bev picture: x to the right, -y down."""
+    """Points (K, 2) on the ground in ego -> (K, 2) of the flat bev image: x to the right, -y down."""
     points = apply(inverse(rig.ego_from_bev), np.column_stack([points_ego, np.zeros(len(points_ego))]))
     return points[:, :2] * (1, -1)

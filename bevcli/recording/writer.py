@@ -16,7 +16,7 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array, inverse, rigid
 from bevcli.recording import entities, log_bev, log_boxes, log_cameras, static_scene
 from bevcli.recording.about import about_text
-from bevcli.recording.bev_images import BevPictures
+from bevcli.recording.bev_images import BevImages
 from bevcli.recording.blueprint import recording_blueprint
 from bevcli.recording.colors import EGO_COLOR, STAGE_COLORS, class_color
 from bevcli.recording.matching import counted, match
@@ -55,9 +55,9 @@ class Recording:
         self._early_events: list[tuple[str, str]] = []  # said before there was a frame to say it at
         self._pillars: Array | None = None
         wanted = self.options.bev != "none" and self.options.shows_insides
-        self._bev_pictures: BevPictures[tuple[FrameStamp, Prediction]] | None = None
+        self._bev_images: BevImages[tuple[FrameStamp, Prediction]] | None = None
         if wanted:
-            self._bev_pictures = BevPictures(self.options.bev)
+            self._bev_images = BevImages(self.options.bev)
 
     def __enter__(self) -> Recording:
         note = UNTRAINED if self.untrained else ""
@@ -77,8 +77,8 @@ class Recording:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._bev_pictures is not None:
-            self._log_bev_pictures(self._bev_pictures.finish())
+        if self._bev_images is not None:
+            self._log_bev_images(self._bev_images.finish())
         self._stream.__exit__(kind, error, trace)
         if self._live is not None:
             self._live.close()
@@ -150,7 +150,7 @@ class Recording:
             for c in frame.rig.cameras
         )
         for shot in shots:
-            log_cameras.log_picture(self._stream, shot, frame.pictures.get(shot.camera.name))
+            log_cameras.log_image(self._stream, shot, frame.images.get(shot.camera.name))
         return shots
 
     def _log_boxes(self, frame: Frame, prediction: Prediction, shots: tuple[log_cameras.CameraShot, ...]) -> None:
@@ -171,7 +171,7 @@ class Recording:
         log_boxes.log_boxes_3d(stream, in_world, ~true, names, ego_xy)
         log_boxes.log_boxes_bev(stream, shown, ~true, names)
         for shot in shots:
-            log_cameras.log_boxes_in_picture(stream, shot, in_world, names)
+            log_cameras.log_boxes_in_image(stream, shot, in_world, names)
         counts = [float((shown.classes == name).sum()) for name in names]
         stream.log(entities.BOX_CURVES, rr.Scalars(counts))
 
@@ -182,7 +182,7 @@ class Recording:
         log_boxes.log_ground_truth_3d(self._stream, in_world, found)
         log_boxes.log_ground_truth_bev(self._stream, truth, found)
         for shot in shots:
-            log_cameras.log_ground_truth_in_picture(self._stream, shot, in_world, found)
+            log_cameras.log_ground_truth_in_image(self._stream, shot, in_world, found)
 
     def _log_curves(self, prediction: Prediction) -> None:
         stages = prediction.stage_seconds
@@ -207,7 +207,7 @@ class Recording:
         for camera, reason in frame.dropped.items():
             self.event(f"frame {frame.stamp.index}: camera {camera} is missing: {reason}", "WARN")
         if prediction.skipped:
-            self.event(f"frame {frame.stamp.index}: no picture at all, the model was not asked", "WARN")
+            self.event(f"frame {frame.stamp.index}: no image at all, the model was not asked", "WARN")
 
     def _why_anew(self, stamp: FrameStamp) -> str:
         before = None if self._last is None else self._last.stamp
@@ -226,18 +226,18 @@ class Recording:
         self._log_pillars(frame, prediction, shots)
         if prediction.segmentation is not None:
             log_bev.log_segmentation(self._stream, prediction.segmentation)
-        if self._bev_pictures is not None and prediction.bev is not None:
+        if self._bev_images is not None and prediction.bev is not None:
             grid = prediction.grid
             features = prediction.bev.detach().float().cpu().numpy().reshape(grid.rows, grid.columns, -1)
             placed = (frame.stamp, prediction)
-            self._log_bev_pictures(self._bev_pictures.push(placed, features))
+            self._log_bev_images(self._bev_images.push(placed, features))
             self._at(frame.stamp)
         self._log_attention(prediction, shots)
 
-    def _log_bev_pictures(self, ready: list[tuple[tuple[FrameStamp, Prediction], np.ndarray]]) -> None:
-        for (stamp, prediction), picture in ready:
+    def _log_bev_images(self, ready: list[tuple[tuple[FrameStamp, Prediction], np.ndarray]]) -> None:
+        for (stamp, prediction), image in ready:
             self._at(stamp)
-            log_bev.log_features(self._stream, picture, prediction.grid, prediction.ego_from_bev)
+            log_bev.log_features(self._stream, image, prediction.grid, prediction.ego_from_bev)
 
     def _log_pillars(self, frame: Frame, prediction: Prediction, shots: tuple[log_cameras.CameraShot, ...]) -> None:
         if self._pillars is None:
@@ -247,7 +247,7 @@ class Recording:
         world_from_bev = self._in_recording(prediction.world_from_ego.matrix) @ prediction.ego_from_bev
         points = self._pillars.reshape(-1, 3) @ world_from_bev[:3, :3].T + world_from_bev[:3, 3]
         for shot in shots:
-            if shot.camera.name in frame.pictures:
+            if shot.camera.name in frame.images:
                 log_cameras.log_pillar_hits(self._stream, shot, points, colors)
 
     def _log_attention(self, prediction: Prediction, shots: tuple[log_cameras.CameraShot, ...]) -> None:

@@ -41,7 +41,7 @@ class Coverage:
 
 
 def pillar_pixels(camera: Camera, points_ego: Array) -> Array:
-    """Points (..., 3) in ego -> pixels (..., 2), NaN where they are not in the picture."""
+    """Points (..., 3) in ego -> pixels (..., 2), NaN where they are not in the image."""
     pixels, depth = camera.project_ego(points_ego)
     return np.where(camera.contains(pixels, depth)[..., None], pixels, np.nan)
 

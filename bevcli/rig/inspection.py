@@ -27,17 +27,17 @@ CALIBRATION = "calibration.json"
 
 @dataclass(frozen=True)
 class DebugInput:
-    """rig_findings: from reading the calibration. sequence_findings: about the drive. pictures: (H, W, 3) BGR."""
+    """rig_findings: from reading the calibration. sequence_findings: about the drive. images: (H, W, 3) BGR."""
 
     name: str
     rig: CameraRig
     rig_findings: tuple[Finding, ...] = ()
     sequence_findings: tuple[Finding, ...] = ()
-    pictures: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
+    images: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
 
 
 def gather(path: Path, sequence: Path | None, frame: int) -> DebugInput:
-    """Read a calibration.json, or a sequence with its own; `sequence` gives pictures and ego-motion to the first.
+    """Read a calibration.json, or a sequence with its own; `sequence` gives images and ego-motion to the first.
 
     Raises InputError where nothing can be looked at: no such file, no JSON, no such frame.
     """
@@ -49,8 +49,8 @@ def gather(path: Path, sequence: Path | None, frame: int) -> DebugInput:
     name = (folder or file.with_suffix("")).resolve().name
     if folder is None or not draft.rig.cameras:
         return DebugInput(name, draft.rig, draft.findings)
-    findings, pictures = _look_into(folder, draft.rig, frame)
-    return DebugInput(name, draft.rig, draft.findings, findings, pictures)
+    findings, images = _look_into(folder, draft.rig, frame)
+    return DebugInput(name, draft.rig, draft.findings, findings, images)
 
 
 def _foreign(path: Path, frame: int) -> DebugInput:
@@ -67,7 +67,7 @@ def _look_into(folder: Path, rig: CameraRig, frame: int) -> tuple[tuple[Finding,
     except InputError as error:
         findings.append(_refused(error))
         try:
-            sequence = FolderSequence(folder, rig=rig, ego_motion="static")  # maybe the pictures can be shown
+            sequence = FolderSequence(folder, rig=rig, ego_motion="static")  # maybe the images can be shown
         except InputError:
             return tuple(findings), {}
     if sequence.ego_motion is not None:
@@ -122,10 +122,10 @@ def _refused(error: InputError) -> Finding:
 
 def _missing(frame: Frame) -> tuple[Finding, ...]:
     return tuple(
-        Finding("picture-missing", "warning", name, f"has no picture in frame {frame.stamp.index}", found=why)
+        Finding("picture-missing", "warning", name, f"has no image in frame {frame.stamp.index}", found=why)
         for name, why in frame.dropped.items()
     )
 
 
 def _pixels(frame: Frame) -> dict[str, NDArray[np.uint8]]:
-    return {name: picture.pixels_bgr for name, picture in frame.pictures.items()}
+    return {name: image.pixels_bgr for name, image in frame.images.items()}

@@ -1,4 +1,4 @@
-"""Intrinsics and lenses that cannot be, or that belong to pictures of another size."""
+"""Intrinsics and lenses that cannot be, or that belong to images of another size."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array
 from bevcli.rig.pose import seen_fov_deg
 
-CENTER_TOLERANCE = 0.15  # principal point against the picture's middle, as a share of it; real ones reach 0.08
+CENTER_TOLERANCE = 0.15  # principal point against the image's middle, as a share of it; real ones reach 0.08
 SAME_SCALE = 0.3  # how alike the two axes' scales must be to be called another resolution
 NARROWEST_DEG, WIDEST_PINHOLE_DEG = 10.0, 150.0
 WIDE_PINHOLE_DEG = 120.0  # a lens as wide as this bends straight lines
 SQUARE_PIXELS = 0.1
-REACH = 0.7  # a lens model must be valid over this share of the way to the picture's edge
+REACH = 0.7  # a lens model must be valid over this share of the way to the image's edge
 BEND = 2.0  # and not move a ray's angle by more than this factor
 _ANGLES = np.radians(np.arange(0.25, 89.5, 0.25))
 
@@ -32,7 +32,7 @@ def check_lenses(cameras: Sequence[Camera]) -> tuple[Finding, ...]:
 
 
 def _distortion(camera: Camera) -> Finding | None:
-    """A lens model that folds back inside the picture, or that bends angles beyond belief."""
+    """A lens model that folds back inside the image, or that bends angles beyond belief."""
     if camera.distortion is None:
         return None
     edges = np.array([camera.width, camera.height, 0, 0]) - np.tile(camera.intrinsics[:2, 2], 2)
@@ -71,7 +71,7 @@ def _absurd(camera: Camera, found: str, expected: str) -> Finding:
         "distortion-absurd",
         "error",
         camera.name,
-        "the lens model is absurd inside the picture",
+        "the lens model is absurd inside the image",
         found,
         expected,
         advice,
@@ -79,7 +79,7 @@ def _absurd(camera: Camera, found: str, expected: str) -> Finding:
 
 
 def _resolution(camera: Camera) -> Finding | None:
-    """Intrinsics of pictures of another size: the principal point lies where another picture's middle is."""
+    """Intrinsics of images of another size: the principal point lies where another image's middle is."""
     doubled = 2 * camera.intrinsics[[0, 1], 2]
     size = np.array([camera.width, camera.height], dtype=np.float64)
     scale = doubled / size
@@ -94,8 +94,8 @@ def _resolution(camera: Camera) -> Finding | None:
         return None
     factor = 1 / float(scale.mean())
     focal = f", focal length {camera.intrinsics[0, 0] / camera.width:.2f} of the width"
-    advice = f"scale fx, fy, cx, cy by about {factor:.2f}, or give the size of the pictures they were measured on"
-    message = f"the intrinsics belong to pictures of about {doubled[0]:.0f} x {doubled[1]:.0f}"
+    advice = f"scale fx, fy, cx, cy by about {factor:.2f}, or give the size of the images they were measured on"
+    message = f"the intrinsics belong to images of about {doubled[0]:.0f} x {doubled[1]:.0f}"
     return Finding("intrinsics-resolution", "error", camera.name, message, found + focal, expected, advice)
 
 
@@ -109,7 +109,7 @@ def _field_of_view(camera: Camera) -> Finding | None:
     found = f"{horizontal:.1f}° across, focal length {camera.intrinsics[0, 0]:.0f} px for a width of {camera.width}"
     return Finding(
         "fov-implausible", "error", camera.name, "the field of view is implausible", found, expected,
-        "give the focal length in pixels of these pictures",
+        "give the focal length in pixels of these images",
     )  # fmt: skip
 
 
@@ -117,18 +117,18 @@ def _oddities(camera: Camera) -> list[Finding]:
     warnings = []
     fx, fy = camera.intrinsics[0, 0], camera.intrinsics[1, 1]
     if abs(fx / fy - 1) > SQUARE_PIXELS:
-        advice = "right only where the pictures were squeezed along one axis"
+        advice = "right only where the images were squeezed along one axis"
         found = f"fx / fy = {fx / fy:.2f}"
         message = "the pixels are not square"
         warnings.append(Finding("pixels-not-square", "warning", camera.name, message, found, "about 1", advice))
     center, size = camera.intrinsics[:2, 2], np.array([camera.width, camera.height])
     if (np.abs(2 * center / size - 1) > 2 * CENTER_TOLERANCE).any():
         found, expected = f"{center[0]:.0f}, {center[1]:.0f}", f"about {size[0] / 2:.0f}, {size[1] / 2:.0f}"
-        message, advice = "the principal point is far off centre", "right only where the pictures were cropped"
+        message, advice = "the principal point is far off centre", "right only where the images were cropped"
         warnings.append(Finding("principal-point", "warning", camera.name, message, found, expected, advice))
     if camera.distortion is None and seen_fov_deg(camera)[0] > WIDE_PINHOLE_DEG:
         found, message = f"{seen_fov_deg(camera)[0]:.0f}°", "a lens this wide is given without distortion"
-        advice = "add the lens model, or undistort the pictures"
+        advice = "add the lens model, or undistort the images"
         warnings.append(Finding("distortion-missing", "warning", camera.name, message, found, advice=advice))
     return warnings
 

@@ -1,4 +1,4 @@
-"""A camera's picture with what its calibration says: pillars, ground grid, horizon. Drawn at the size of display."""
+"""A camera's image with what its calibration says: pillars, ground grid, horizon. Drawn at the size of display."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from bevcli.rig.coverage import pillar_pixels
 from bevcli.rig.pose import horizon
 
 GRID_STEP_M, GRID_REACH_M = 5.0, 30.0
-PILLAR_LINES_M = 25.0  # farther pillars stand so close that their lines would hide the picture
-PILLAR_GRID = BevGrid(rows=20, columns=20)  # one pillar every 5.12 m: more would hide the picture
+PILLAR_LINES_M = 25.0  # farther pillars stand so close that their lines would hide the image
+PILLAR_GRID = BevGrid(rows=20, columns=20)  # one pillar every 5.12 m: more would hide the image
 LABELLED_M = (5.0, 10.0, 20.0, 40.0)
 GROUND: Color = (120, 205, 140)
 HORIZON: Color = (255, 214, 64)
 PILLAR: Color = (235, 238, 245)
 BACKDROP: Color = (44, 49, 58)
-Picture = NDArray[np.uint8]
+Pixels = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class PillarPoints:
 
 
 def pillars_in(camera: Camera, ego_from_bev: Array, grid: BevGrid = PILLAR_GRID) -> PillarPoints:
-    """The pillars' points that lie in the camera's picture, the farthest first."""
+    """The pillars' points that lie in the camera's image, the farthest first."""
     points = apply(ego_from_bev, grid.pillars()).reshape(-1, 3)
     pixels = pillar_pixels(camera, points)
     distances = np.linalg.norm(points - camera.ego_from_camera[:3, 3], axis=1)
@@ -52,13 +52,13 @@ def height_colors(grid: BevGrid) -> NDArray[np.uint8]:
 
 
 def ground_lines(camera: Camera) -> list[Array]:
-    """Lines (P, 2) in pixels of a 5 m grid on the ground around the ego origin, where they are near the picture."""
+    """Lines (P, 2) in pixels of a 5 m grid on the ground around the ego origin, where they are near the image."""
     along = np.arange(-GRID_REACH_M, GRID_REACH_M + 0.05, 0.1)
     lines: list[Array] = []
     for offset in np.arange(-GRID_REACH_M, GRID_REACH_M + 0.1, GRID_STEP_M):
         across, flat = np.full_like(along, offset), np.zeros_like(along)
         for line in (np.stack([along, across, flat], axis=-1), np.stack([across, along, flat], axis=-1)):
-            lines += visible_runs(_near_picture(camera, line))
+            lines += visible_runs(_near_image(camera, line))
     return lines
 
 
@@ -68,11 +68,11 @@ def pillar_lines(camera: Camera, ego_from_bev: Array, grid: BevGrid = PILLAR_GRI
     low, high = pillars[:, :1], pillars[:, -1:]
     points = apply(ego_from_bev, low + np.linspace(0, 1, 24)[:, None] * (high - low))  # (Y X, 24, 3)
     near = np.linalg.norm(points[:, 0, :2] - camera.ego_from_camera[:2, 3], axis=-1) < PILLAR_LINES_M
-    return [run for line in points[near] for run in visible_runs(_near_picture(camera, line))]
+    return [run for line in points[near] for run in visible_runs(_near_image(camera, line))]
 
 
-def _near_picture(camera: Camera, points_ego: Array) -> Array:
-    """Pixels (P, 2) of points (P, 3), NaN a picture's size outside: what is drawn is clipped to the picture anyway."""
+def _near_image(camera: Camera, points_ego: Array) -> Array:
+    """Pixels (P, 2) of points (P, 3), NaN an image's size outside: what is drawn is clipped to the image anyway."""
     pixels, depth = camera.project_ego(points_ego)
     size = np.array([camera.width, camera.height])
     with np.errstate(invalid="ignore"):
@@ -87,13 +87,13 @@ def visible_runs(pixels: Array) -> list[Array]:
     return [run for run in np.split(pixels, cuts) if len(run) > 1 and np.isfinite(run).all()]
 
 
-def draw_overlay(camera: Camera, ego_from_bev: Array, picture_bgr: Picture | None, width: int) -> Picture:
-    """The camera's picture (H, W, 3) BGR, or a dark one without picture, resized to `width`, with the overlay; RGB."""
+def draw_overlay(camera: Camera, ego_from_bev: Array, image_bgr: Pixels | None, width: int) -> Pixels:
+    """The camera's image (H, W, 3) BGR, or a dark one without image, resized to `width`, with the overlay; RGB."""
     shown = camera.scaled(width / camera.width)
-    if picture_bgr is None:
+    if image_bgr is None:
         canvas = np.full((shown.height, shown.width, 3), BACKDROP, dtype=np.uint8)
     else:
-        resized = cv2.resize(picture_bgr, (shown.width, shown.height), interpolation=cv2.INTER_AREA)
+        resized = cv2.resize(image_bgr, (shown.width, shown.height), interpolation=cv2.INTER_AREA)
         canvas = (resized[..., ::-1] * 0.85).astype(np.uint8)  # a little darker, so that the overlay stands out
     _draw_lines(canvas, ground_lines(shown), GROUND, 0.55)
     _draw_lines(canvas, visible_runs(horizon(shown)), HORIZON, 0.9, thickness=2)
@@ -103,7 +103,7 @@ def draw_overlay(camera: Camera, ego_from_bev: Array, picture_bgr: Picture | Non
     return canvas
 
 
-def _draw_lines(canvas: Picture, lines: list[Array], color: Color, opacity: float, thickness: int = 1) -> None:
+def _draw_lines(canvas: Pixels, lines: list[Array], color: Color, opacity: float, thickness: int = 1) -> None:
     layer = canvas.copy()
     cv2.polylines(
         layer, [np.round(line * 16).astype(np.int32) for line in lines], False, color, thickness, cv2.LINE_AA, 4
@@ -111,7 +111,7 @@ def _draw_lines(canvas: Picture, lines: list[Array], color: Color, opacity: floa
     cv2.addWeighted(layer, opacity, canvas, 1 - opacity, 0, dst=canvas)
 
 
-def _draw_pillars(canvas: Picture, points: PillarPoints) -> None:
+def _draw_pillars(canvas: Pixels, points: PillarPoints) -> None:
     scale = canvas.shape[1] / 800
     for pixel, distance, color in zip(points.pixels, points.distances, points.colors, strict=True):
         radius = float(np.clip(60 / distance, 1.2, 6)) * scale
@@ -119,7 +119,7 @@ def _draw_pillars(canvas: Picture, points: PillarPoints) -> None:
         cv2.circle(canvas, center, round(radius * 16), color.tolist(), -1, cv2.LINE_AA, 4)
 
 
-def _draw_distances(canvas: Picture, camera: Camera) -> None:
+def _draw_distances(canvas: Pixels, camera: Camera) -> None:
     """How far the ground is along the viewing direction, where the labels have room."""
     ahead = np.array([np.cos(camera.yaw), np.sin(camera.yaw), 0.0])
     start = camera.ego_from_camera[:3, 3] * [1, 1, 0]
@@ -131,7 +131,7 @@ def _draw_distances(canvas: Picture, camera: Camera) -> None:
             _label(canvas, f"{distance:g} m", (round(pixel[0]), round(pixel[1])))
 
 
-def _label(canvas: Picture, text: str, place: tuple[int, int]) -> None:
+def _label(canvas: Pixels, text: str, place: tuple[int, int]) -> None:
     font, size = cv2.FONT_HERSHEY_SIMPLEX, 0.5 * canvas.shape[1] / 800
     for color, thickness in (((10, 12, 16), 4), ((240, 244, 248), 1)):
         cv2.putText(canvas, text, place, font, size, color, thickness, cv2.LINE_AA)

@@ -55,16 +55,16 @@ def degrees_text(angle_deg: float, digits: int = 1) -> str:
 
 
 def seen_fov_deg(camera: Camera) -> tuple[float, float]:
-    """Degrees across the picture, horizontally and vertically through the optical axis, the lens included.
+    """Degrees across the image, horizontally and vertically through the optical axis, the lens included.
 
-    At most 180: nothing behind the camera's plane has a picture.
+    At most 180: nothing behind the camera's plane has an image.
     """
     (left, right), (up, down) = seen_range_deg(camera, 0), seen_range_deg(camera, 1)
     return right - left, down - up
 
 
 def seen_range_deg(camera: Camera, axis: int) -> tuple[float, float]:
-    """From which to which angle to the optical axis the picture reaches, degrees; axis 0 to the right, 1 downwards."""
+    """From which to which angle to the optical axis the image reaches, degrees; axis 0 to the right, 1 downwards."""
     rays = np.zeros((len(_ANGLES), 3))
     rays[:, axis], rays[:, 2] = np.sin(_ANGLES), np.cos(_ANGLES)
     pixels, _ = camera.project(rays)
@@ -78,10 +78,10 @@ def seen_range_deg(camera: Camera, axis: int) -> tuple[float, float]:
 
 
 def horizon(camera: Camera) -> Array:
-    """(P, 2) pixels of the horizon, NaN where it is not in the picture. Points far away at the camera's own height."""
+    """(P, 2) pixels of the horizon, NaN where it is not in the image. Points far away at the camera's own height."""
     yaws = np.radians(np.arange(0, 360, 0.25))
     far = np.stack([np.cos(yaws), np.sin(yaws), np.zeros_like(yaws)], axis=-1) * 1e5
     pixels, depth = camera.project_ego(far + camera.ego_from_camera[:3, 3])
     seen = np.where(camera.contains(pixels, depth)[:, None], pixels, np.nan)
-    start = int(np.argmax(depth < 0))  # a gap, so that the line does not begin in the middle of the picture
+    start = int(np.argmax(depth < 0))  # a gap, so that the line does not begin in the middle of the image
     return np.roll(seen, -start, axis=0)

@@ -22,7 +22,7 @@ FARTHEST_M = 15.0  # from the ego origin: a bus or a lorry's end
 OTHER_UNIT_M = 30.0  # farther than this the translation is not in metres
 LONGEST_CM = 790.0  # longer is in millimetres: 0.79 m from the ego origin is near, 7.9 m is far
 HEIGHTS_M = (0.15, 5.0)  # bumper to the roof of a lorry
-STEEPEST_DEG = 30.0  # pitched by more, and without the horizon in the picture, a camera looks at ground or sky
+STEEPEST_DEG = 30.0  # pitched by more, and without the horizon in the image, a camera looks at ground or sky
 MOST_ROLL_DEG = 30.0
 LEVEL_DEG = (20.0, 10.0)  # pitch and roll of a pose that an explanation must arrive at
 NAME_TURN_DEG = 80.0  # and at most so far from where the camera's name says that it looks
@@ -106,7 +106,7 @@ def defects_of(camera: Camera) -> list[Finding]:
         defects.append(_defect("camera-height", name, "is not at a camera's height", found, expected, advice))
     if abs(mounting.pitch_deg) > max(STEEPEST_DEG, seen_fov_deg(camera)[1] / 2):
         where = "ground" if mounting.pitch_deg < 0 else "sky"
-        found, expected = f"pitch {mounting.pitch_deg:.0f}°", "the horizon in the picture"
+        found, expected = f"pitch {mounting.pitch_deg:.0f}°", "the horizon in the image"
         defects.append(_defect(f"looks-at-{where}", name, f"looks at the {where}", found, expected))
     elif abs(mounting.roll_deg) > MOST_ROLL_DEG:
         message = "is upside down" if abs(mounting.roll_deg) > 150 else "is rolled about its viewing direction"

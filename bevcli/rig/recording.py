@@ -1,4 +1,4 @@
-"""The recording of `project-debug`: rig, pictures with pillars, ground and horizon, coverage and findings."""
+"""The recording of `project-debug`: rig, images with pillars, ground and horizon, coverage and findings."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from bevcli.rig.overlay import (
     GROUND,
     HORIZON,
     PILLAR_GRID,
-    Picture,
+    Pixels,
     ground_lines,
     height_colors,
     pillar_lines,
@@ -38,8 +38,8 @@ BACKGROUND = [18, 20, 25]
 JPEG_QUALITY = 90
 
 
-def write_calibration_recording(path: Path, rig: CameraRig, report: RigReport, pictures: Mapping[str, Picture]) -> None:
-    """Write the recording. pictures: by camera (H, W, 3) BGR, where there are any. Raises OutputError."""
+def write_calibration_recording(path: Path, rig: CameraRig, report: RigReport, images: Mapping[str, Pixels]) -> None:
+    """Write the recording. images: by camera (H, W, 3) BGR, where there are any. Raises OutputError."""
     with rr.RecordingStream("bevcli-project-debug") as stream:
         try:
             stream.save(path, default_blueprint=_blueprint(rig))
@@ -48,7 +48,7 @@ def write_calibration_recording(path: Path, rig: CameraRig, report: RigReport, p
         static_scene.log_static(stream, rig, ())
         _log_scene(stream, rig, report.coverage)
         for camera in rig.cameras:
-            _log_camera(stream, camera, rig.ego_from_bev, pictures.get(camera.name))
+            _log_camera(stream, camera, rig.ego_from_bev, images.get(camera.name))
         stream.set_time(entities.FRAME_TIMELINE, sequence=0)  # as a run's recording has: `bevcli viz` looks for it
         stream.log(FINDINGS, rr.TextDocument(findings_markdown(report), media_type="text/markdown"))
 
@@ -71,7 +71,7 @@ def findings_markdown(report: RigReport) -> str:
     return "\n".join(lines)
 
 
-def coverage_picture(coverage: Coverage) -> Picture:
+def coverage_image(coverage: Coverage) -> Pixels:
     """(rows, columns, 3) RGB of how many cameras see each cell; the first row has the largest y."""
     colors = np.array([to_rgb(color) for color in COUNT_COLORS])
     return np.round(255 * colors[np.minimum(coverage.counts, 4)][::-1]).astype(np.uint8)
@@ -81,8 +81,8 @@ def _log_scene(stream: rr.RecordingStream, rig: CameraRig, coverage: Coverage) -
     points = apply(rig.ego_from_bev, PILLAR_GRID.pillars()).reshape(-1, 3)
     colors = np.tile(height_colors(PILLAR_GRID), (PILLAR_GRID.rows * PILLAR_GRID.columns, 1))
     stream.log(entities.PILLARS, rr.Points3D(points, colors=colors, radii=rr.Radius.ui_points(1.5)), static=True)
-    picture = coverage_picture(coverage)
-    large = np.kron(picture, np.ones((PIXELS_A_CELL, PIXELS_A_CELL, 1), dtype=np.uint8))
+    image = coverage_image(coverage)
+    large = np.kron(image, np.ones((PIXELS_A_CELL, PIXELS_A_CELL, 1), dtype=np.uint8))
     stream.log(COVERAGE, rr.Image(large, color_model="RGB"), static=True)
     (x0, x1), (y0, y1) = coverage.grid.x_range_m, coverage.grid.y_range_m
     corners = apply(rig.ego_from_bev, [(x0, y1, 0), (x1, y1, 0), (x1, y0, 0), (x0, y0, 0)])
@@ -96,14 +96,14 @@ def _log_scene(stream: rr.RecordingStream, rig: CameraRig, coverage: Coverage) -
     stream.log(COVERAGE_ON_GROUND, quad, static=True)
 
 
-def _log_camera(stream: rr.RecordingStream, camera: Camera, ego_from_bev: Array, picture: Picture | None) -> None:
+def _log_camera(stream: rr.RecordingStream, camera: Camera, ego_from_bev: Array, pixels: Pixels | None) -> None:
     entity = entities.camera(camera.name)
     pose = rr.Transform3D(translation=camera.ego_from_camera[:3, 3], mat3x3=camera.ego_from_camera[:3, :3])
     stream.log(entity, pose, static=True)
-    if picture is not None:
-        encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+    if pixels is not None:
+        encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
         image = rr.EncodedImage(contents=encoded, media_type="image/jpeg")
-        stream.log(entities.picture(camera.name), image, static=True)
+        stream.log(entities.image(camera.name), image, static=True)
     points = pillars_in(camera, ego_from_bev)
     radii = np.clip(60 / np.maximum(points.distances, 1e-3), 1.2, 6) * camera.width / 800
     dots = rr.Points2D(points.pixels, colors=points.colors, radii=radii, draw_order=30)
@@ -120,7 +120,7 @@ def _log_camera(stream: rr.RecordingStream, camera: Camera, ego_from_bev: Array,
 
 
 def _clipped(line: Array, camera: Camera) -> list[Array]:
-    """The parts of a line (P, 2) inside the picture: the viewer does not clip."""
+    """The parts of a line (P, 2) inside the image: the viewer does not clip."""
     size = np.array([camera.width, camera.height])
     inside = ((line >= 0) & (line <= size)).all(axis=-1, keepdims=True)
     return visible_runs(np.where(inside, line, np.nan))

@@ -1,4 +1,4 @@
-"""The sheet: all cameras' pictures with their overlay, laid out around the vehicle, and the coverage map amid them."""
+"""The sheet: all cameras' images with their overlay, laid out around the vehicle, and the coverage map amid them."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from bevcli.findings import Finding
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.rig.checks import RigReport
 from bevcli.rig.coverage_map import FAINT, INK, LEGEND_STYLE, PAPER, draw_coverage, save
-from bevcli.rig.overlay import GROUND, HORIZON, PILLAR_GRID, Picture, draw_overlay, height_colors
+from bevcli.rig.overlay import GROUND, HORIZON, PILLAR_GRID, Pixels, draw_overlay, height_colors
 from bevcli.rig.pose import degrees_text, mounting_of, seen_fov_deg
 
 SEVERITY_COLORS = {"error": "#ff5c72", "warning": "#ffc857", "info": "#7fb7e6"}
 SIDE_DEG = (75.0, 105.0)  # cameras that look sideways stand beside the map
 DPI = 100
-SLOT, GAP, TITLE, DETAILS, MIDDLE = 5.2, 0.3, 0.32, 0.38, 5.2  # inches: a picture's width, between, above, below, map
+SLOT, GAP, TITLE, DETAILS, MIDDLE = 5.2, 0.3, 0.32, 0.38, 5.2  # inches: an image's width, between, above, below, map
 FOOTER = 3.0  # for findings and legend where cameras stand beside the map
 LINE = 0.19
-PICTURE_WIDTH = 1040
+IMAGE_WIDTH = 1040
 
 
-def write_sheet(path: Path, rig: CameraRig, report: RigReport, pictures: Mapping[str, Picture]) -> None:
-    """Write the PNG. pictures: by camera (H, W, 3) BGR; a camera without one gets a dark field. Raises OutputError."""
+def write_sheet(path: Path, rig: CameraRig, report: RigReport, images: Mapping[str, Pixels]) -> None:
+    """Write the PNG. images: by camera (H, W, 3) BGR; a camera without one gets a dark field. Raises OutputError."""
     front, left, right, back = around(rig)
     columns = max(len(front), len(back), 3)
     heights = [_row_height(front), max(_column_height(left), _column_height(right), MIDDLE), _row_height(back)]
@@ -39,11 +39,11 @@ def write_sheet(path: Path, rig: CameraRig, report: RigReport, pictures: Mapping
     for row, top in ((front, tops[0]), (back, tops[2])):
         start = (sheet.width - len(row) * (SLOT + GAP) + GAP) / 2
         for place, camera in enumerate(row):
-            _draw_camera(sheet, (start + place * (SLOT + GAP), top), camera, rig, report, pictures)
+            _draw_camera(sheet, (start + place * (SLOT + GAP), top), camera, rig, report, images)
     for column, start in ((left, GAP), (right, sheet.width - SLOT - GAP)):
         top = tops[1]
         for camera in column:
-            _draw_camera(sheet, (start, top), camera, rig, report, pictures)
+            _draw_camera(sheet, (start, top), camera, rig, report, images)
             top += _camera_height(camera)
     size, top = MIDDLE - 1.1, tops[1] + (heights[1] - MIDDLE) / 2 + 0.35
     draw_coverage(sheet.axes((sheet.width - size) / 2 + 0.1, top, size, size), rig, report.coverage)
@@ -100,14 +100,14 @@ def _draw_camera(
     camera: Camera,
     rig: CameraRig,
     report: RigReport,
-    pictures: Mapping[str, Picture],
+    images: Mapping[str, Pixels],
 ) -> None:
     left, top = corner
     axes = sheet.axes(left, top + TITLE, SLOT, _camera_height(camera) - TITLE - DETAILS)
-    picture = pictures.get(camera.name)
-    if picture is not None and picture.shape[:2] != (camera.height, camera.width):
-        picture = cv2.resize(picture, (camera.width, camera.height)).astype(np.uint8)
-    axes.imshow(draw_overlay(camera, rig.ego_from_bev, picture, PICTURE_WIDTH))
+    image = images.get(camera.name)
+    if image is not None and image.shape[:2] != (camera.height, camera.width):
+        image = cv2.resize(image, (camera.width, camera.height)).astype(np.uint8)
+    axes.imshow(draw_overlay(camera, rig.ego_from_bev, image, IMAGE_WIDTH))
     axes.set_xticks([])
     axes.set_yticks([])
     mounting = mounting_of(camera.ego_from_camera)

@@ -1,4 +1,4 @@
-"""The pictures of one frame, decoded side by side: from files, or from videos read front to back."""
+"""The images of one frame, decoded side by side: from files, or from videos read front to back."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import Picture
+from bevcli.frame import CameraImage
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.sequences.video import VideoReader
 
 DECODING_THREADS = 6
-PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png")
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".webm", ".mov", ".m4v")
-# A picture is shown and calibrated as its pixels are stored: an EXIF orientation would turn it away from both.
+# An image is shown and calibrated as its pixels are stored: an EXIF orientation would turn it away from both.
 DECODE_FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
 
 @dataclass(frozen=True)
-class PictureSource:
-    """Where one picture is, and when it was taken. `video_index`: its number in the video `path`, from 0."""
+class ImageSource:
+    """Where one image is, and when it was taken. `video_index`: its number in the video `path`, from 0."""
 
     path: Path
     timestamp_ns: int
@@ -35,12 +35,12 @@ class PictureSource:
         return str(self.path) if self.video_index is None else f"{self.path}#{self.video_index}"
 
 
-class UnreadablePicture(Exception):
-    """A picture is missing or broken; the message is the reason."""
+class UnreadableImage(Exception):
+    """An image is missing or broken; the message is the reason."""
 
 
-class PictureReader:
-    """Reads the pictures of frames in order. With `strict`, one that is missing or broken is an InputError."""
+class ImageReader:
+    """Reads the images of frames in order. With `strict`, one that is missing or broken is an InputError."""
 
     def __init__(self, *, strict: bool = False) -> None:
         self._strict = strict
@@ -48,42 +48,42 @@ class PictureReader:
         self._threads = ThreadPoolExecutor(DECODING_THREADS, thread_name_prefix="decode")
 
     def read(
-        self, sources: Mapping[str, PictureSource], rig: CameraRig, dropped: Mapping[str, str]
-    ) -> tuple[dict[str, Picture], dict[str, str]]:
-        """The pictures by camera, and why others are missing: `dropped` (known before) and what turned up.
+        self, sources: Mapping[str, ImageSource], rig: CameraRig, dropped: Mapping[str, str]
+    ) -> tuple[dict[str, CameraImage], dict[str, str]]:
+        """The images by camera, and why others are missing: `dropped` (known before) and what turned up.
 
-        Raises InputError for a picture of another size than the calibration's.
+        Raises InputError for an image of another size than the calibration's.
         """
         if self._strict and dropped:
             camera, reason = next(iter(dropped.items()))
-            raise InputError(f"camera {camera}: {reason}: add the picture, or run without --strict")
+            raise InputError(f"camera {camera}: {reason}: add the image, or run without --strict")
         tasks = {name: self._threads.submit(self._read_one, source, rig[name]) for name, source in sources.items()}
-        pictures: dict[str, Picture] = {}
+        images: dict[str, CameraImage] = {}
         reasons = dict(dropped)
         for name, task in tasks.items():
             try:
-                pictures[name] = task.result()
-            except UnreadablePicture as unreadable:
+                images[name] = task.result()
+            except UnreadableImage as unreadable:
                 if self._strict:
-                    hint = "mend the picture, or run without --strict"
+                    hint = "mend the image, or run without --strict"
                     raise InputError(f"camera {name}: {unreadable}: {hint}") from None
                 reasons[name] = str(unreadable)
-        return pictures, reasons
+        return images, reasons
 
-    def _read_one(self, source: PictureSource, camera: Camera) -> Picture:
+    def _read_one(self, source: ImageSource, camera: Camera) -> CameraImage:
         if source.video_index is None:
-            picture = _read_file(source)
+            image = _read_file(source)
         else:
-            picture = Picture(source.timestamp_ns, self._read_video(source, camera.name))
-        height, width = picture.pixels_bgr.shape[:2]
+            image = CameraImage(source.timestamp_ns, self._read_video(source, camera.name))
+        height, width = image.pixels_bgr.shape[:2]
         if (width, height) != (camera.width, camera.height):
             raise InputError(
-                f"{source}: camera {camera.name}: the picture is {width}x{height} (expected {camera.width}x"
-                f"{camera.height}, as the calibration says): give pictures and calibration of the same size"
+                f"{source}: camera {camera.name}: the image is {width}x{height} (expected {camera.width}x"
+                f"{camera.height}, as the calibration says): give images and calibration of the same size"
             )
-        return picture
+        return image
 
-    def _read_video(self, source: PictureSource, camera: str) -> NDArray[np.uint8]:
+    def _read_video(self, source: ImageSource, camera: str) -> NDArray[np.uint8]:
         reader = self._videos.get(camera)
         if reader is None or reader.path != source.path:
             reader = self._videos[camera] = VideoReader(source.path)
@@ -91,25 +91,25 @@ class PictureReader:
         try:
             return reader.read(source.video_index)
         except InputError as error:
-            raise UnreadablePicture(str(error)) from None
+            raise UnreadableImage(str(error)) from None
 
 
-def _read_file(source: PictureSource) -> Picture:
+def _read_file(source: ImageSource) -> CameraImage:
     try:
         encoded = source.path.read_bytes()
     except FileNotFoundError:
-        raise UnreadablePicture(f"{source.path} is missing") from None
+        raise UnreadableImage(f"{source.path} is missing") from None
     except OSError as error:
-        raise UnreadablePicture(f"{source.path} cannot be read ({error.strerror})") from None
+        raise UnreadableImage(f"{source.path} cannot be read ({error.strerror})") from None
     media_type = media_type_of(encoded)
     pixels = decode(encoded)
     if pixels is None:
-        raise UnreadablePicture(f"{source.path} is not a whole picture")
-    return Picture(source.timestamp_ns, pixels, encoded if media_type else None, media_type)
+        raise UnreadableImage(f"{source.path} is not a whole image")
+    return CameraImage(source.timestamp_ns, pixels, encoded if media_type else None, media_type)
 
 
 def decode(encoded: bytes) -> NDArray[np.uint8] | None:
-    """(H, W, 3) BGR of a picture's bytes, or None where they are no picture or one cut short."""
+    """(H, W, 3) BGR of an image's bytes, or None where they are no image or one cut short."""
     if not encoded or _is_cut_short(encoded):
         return None
     pixels = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), DECODE_FLAGS)

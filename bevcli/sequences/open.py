@@ -20,7 +20,7 @@ class InputOptions:
     """What a user may say about an input beside its path.
 
     ego_motion: "required"; "static": the vehicle stands; "none": a missing file is allowed.
-    strict: a missing or unreadable picture is an error. scene: only frames of this one.
+    strict: a missing or unreadable image is an error. scene: only frames of this one.
     version, split, sweeps: of nuScenes, see `NuScenesChoice`.
     intrinsics, extrinsics: files that replace calibration.json, see `read_rig`.
     """
@@ -36,14 +36,14 @@ class InputOptions:
 
 
 def open_sequence(path: Path, options: InputOptions = InputOptions()) -> Sequence:
-    """The sequence in a native folder (with pictures or videos) or a nuScenes dataset root.
+    """The sequence in a native folder (with images or videos) or a nuScenes dataset root.
 
     Raises InputError where the path holds nothing of the kind, or something in it is wrong.
     """
     if not path.exists():
         raise InputError(f"{path}: there is no such folder")
     if not path.is_dir():
-        raise InputError(f"{path}: is a file (expected a sequence folder with calibration.json and pictures)")
+        raise InputError(f"{path}: is a file (expected a sequence folder with calibration.json and images)")
     if is_nuscenes_root(path):
         return _open_nuscenes(path, options)
     if not any((path / part).exists() for part in PARTS_OF_A_FOLDER):

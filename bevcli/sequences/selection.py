@@ -25,7 +25,7 @@ class Selection:
         return tuple(stamps[place] for place in self._places)
 
     def load(self, place: int) -> Frame:
-        """The frame at a place of the selection, its pictures decoded."""
+        """The frame at a place of the selection, its images decoded."""
         return self._sequence.load(self._places[place])
 
 

@@ -1,4 +1,4 @@
-"""A video read front to back, without seeking: OpenCV's seeking is off by some pictures in many codecs."""
+"""A video read front to back, without seeking: OpenCV's seeking is off by some images in many codecs."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from bevcli.errors import InputError
 
 @dataclass(frozen=True)
 class VideoFacts:
-    """What a video file says of itself. count: pictures, as the container states it. rate_hz: pictures a second."""
+    """What a video file says of itself. count: images, as the container states it. rate_hz: images a second."""
 
     count: int
     rate_hz: float
 
 
 class VideoReader:
-    """Gives the pictures of one video by number. Asking in order decodes each once; going back opens it anew."""
+    """Gives the images of one video by number. Asking in order decodes each once; going back opens it anew."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._capture: cv2.VideoCapture | None = None
-        self._at = -1  # the number of the picture in `_pixels`
+        self._at = -1  # the number of the image in `_pixels`
         self._pixels: NDArray[np.uint8] | None = None
-        self._end: int | None = None  # how many pictures there are, once the end was met
+        self._end: int | None = None  # how many images there are, once the end was met
 
     def read(self, index: int) -> NDArray[np.uint8]:
-        """(H, W, 3) BGR of picture `index`, from 0.
+        """(H, W, 3) BGR of image `index`, from 0.
 
-        Raises InputError where the file is missing, no video, or has no such picture.
+        Raises InputError where the file is missing, no video, or has no such image.
         """
         if self._end is not None and index >= self._end:
-            raise InputError(f"{self.path} has no picture {index} (the last one is {self._end - 1})")
+            raise InputError(f"{self.path} has no image {index} (the last one is {self._end - 1})")
         if self._capture is None or index < self._at:
             self._capture, self._at, self._pixels = open_capture(self.path), -1, None
         if index == self._at and self._pixels is not None:
@@ -44,11 +44,11 @@ class VideoReader:
         while self._at < index:
             if not self._capture.grab():
                 self._end, self._capture = self._at + 1, None
-                raise InputError(f"{self.path} has no picture {index} (the last one is {self._end - 1})")
+                raise InputError(f"{self.path} has no image {index} (the last one is {self._end - 1})")
             self._at += 1
         readable, pixels = self._capture.retrieve()
         if not readable:
-            raise InputError(f"{self.path}: picture {index} cannot be decoded")
+            raise InputError(f"{self.path}: image {index} cannot be decoded")
         self._pixels = pixels.astype(np.uint8, copy=False)
         return self._pixels
 
@@ -69,5 +69,5 @@ def video_facts(path: Path) -> VideoFacts:
     count, rate = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), float(capture.get(cv2.CAP_PROP_FPS))
     capture.release()
     if count <= 0 or not 0 < rate < 10_000:
-        raise InputError(f"{path} states {count} pictures at {rate:g} a second: list its pictures in frames.csv")
+        raise InputError(f"{path} states {count} images at {rate:g} a second: list its images in frames.csv")
     return VideoFacts(count, rate)

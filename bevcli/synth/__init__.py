@@ -1,1 +1,1 @@
-"""The rendered world: procedural drives with pictures from any rig and exact ground truth."""
+"""The rendered world: procedural drives with images from any rig and exact ground truth."""

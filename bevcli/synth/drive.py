@@ -60,7 +60,7 @@ class Detail:
 
     @staticmethod
     def for_width(width: int) -> Detail:
-        """Detail that suits pictures of a width in pixels."""
+        """Detail that suits images of a width in pixels."""
         if width <= 500:
             return Detail(0.125, 0.16, 112.0)
         return Detail(0.06, 0.08, 112.0) if width <= 1000 else Detail(0.04, 0.06, 112.0)
@@ -87,7 +87,7 @@ class RenderedFrame:
     bev_map: BevMap
 
     @property
-    def pictures(self) -> dict[str, NDArray[np.uint8]]:
+    def images(self) -> dict[str, NDArray[np.uint8]]:
         """camera -> (H, W, 3) uint8 BGR."""
         return {name: exposure.pixels_bgr for name, exposure in self.exposures.items()}
 
@@ -176,7 +176,7 @@ class Drive:
         return RenderedFrame(self.stamp(index), exposures, pose, boxes, bev_map)
 
     def expose(self, states: list[State], world_from_ego: Pose, time_s: float) -> dict[str, Exposure]:
-        """The pictures of all cameras when the annotated world is in these states."""
+        """The images of all cameras when the annotated world is in these states."""
         around = self._surroundings(world_from_ego.translation[:2])
         here = world_from_ego.translation[:2]
         near_first = np.argsort([np.hypot(*(state.position[:2] - here)) for state in states], kind="stable")

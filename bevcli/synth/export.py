@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.frame import Frame, Picture
+from bevcli.frame import CameraImage, Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.sequences.native.ego_motion_file import write_ego_motion
 from bevcli.sequences.native.writer import NativeWriter
@@ -38,14 +38,14 @@ def export_drive(
         for index in range(drive.frames):
             rendered = drive.frame(index)
             kinematics = motion.kinematics_at(rendered.stamp.timestamp_ns)
-            pictures = {
-                name: Picture(rendered.stamp.timestamp_ns, pixels, encode_jpeg(pixels, quality), "image/jpeg")
-                for name, pixels in rendered.pictures.items()
+            images = {
+                name: CameraImage(rendered.stamp.timestamp_ns, pixels, encode_jpeg(pixels, quality), "image/jpeg")
+                for name, pixels in rendered.images.items()
             }
             writer.write(
                 Frame(
-                    rendered.stamp, drive.rig, pictures, rendered.world_from_ego,
-                    dict.fromkeys(pictures, rendered.world_from_ego), kinematics,
+                    rendered.stamp, drive.rig, images, rendered.world_from_ego,
+                    dict.fromkeys(images, rendered.world_from_ego), kinematics,
                     ground_truth=rounded(rendered.boxes), ground_truth_map=rendered.bev_map,
                 )
             )  # fmt: skip

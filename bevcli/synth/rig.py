@@ -25,7 +25,7 @@ _EGO_AXES_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0,
 
 
 def nuscenes_like_rig(width: int = 1600, height: int = 900) -> CameraRig:
-    """Six level cameras around the vehicle, for pictures of this size; a wider picture sees no more."""
+    """Six level cameras around the vehicle, for images of this size; a wider image sees no more."""
     cameras = []
     for name, (x, y, z, yaw_deg, focal) in _MOUNTS.items():
         intrinsics: Array = np.array([[focal, 0, 800.0], [0, focal, 450.0], [0, 0, 1.0]])
@@ -36,9 +36,9 @@ def nuscenes_like_rig(width: int = 1600, height: int = 900) -> CameraRig:
 
 
 def rig_for_rendering(path: Path | None, size: tuple[int, int] | None) -> CameraRig:
-    """The rig of a calibration.json, or the default one, with pictures of `size` (width, height) where it is given.
+    """The rig of a calibration.json, or the default one, with images of `size` (width, height) where it is given.
 
-    Raises InputError where the file is wrong, or a camera's picture is too wide to be rendered through a pinhole.
+    Raises InputError where the file is wrong, or a camera's image is too wide to be rendered through a pinhole.
     """
     rig = nuscenes_like_rig() if path is None else read_calibration(path)
     if size is not None:

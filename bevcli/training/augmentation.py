@@ -1,4 +1,4 @@
-"""Photometric distortion and grid mask: pictures change in training, the world in them does not."""
+"""Photometric distortion and grid mask: images change in training, the world in them does not."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bevcli.frame import Frame, Picture
+from bevcli.frame import CameraImage, Frame
 
 BRIGHTNESS = 32.0  # added, at most
 CONTRAST = SATURATION = (0.5, 1.5)  # multiplied
@@ -20,9 +20,9 @@ HUE_DEG = 18.0
 
 @dataclass(frozen=True)
 class AugmentationConfig:
-    """photometric: the chance of each distortion (brightness, contrast, saturation, hue) of a picture.
+    """photometric: the chance of each distortion (brightness, contrast, saturation, hue) of an image.
 
-    grid_mask: the chance that a grid of grey squares covers a picture.
+    grid_mask: the chance that a grid of grey squares covers an image.
     """
 
     photometric: float = 0.5
@@ -33,15 +33,15 @@ class AugmentationConfig:
             raise ValueError("photometric and grid_mask are chances, from 0 to 1")
 
 
-def distort_pictures(frame: Frame, chance: float, random: np.random.Generator) -> Frame:
-    """The frame with each picture's light and colours changed."""
+def distort_images(frame: Frame, chance: float, random: np.random.Generator) -> Frame:
+    """The frame with each image's light and colours changed."""
     if chance == 0:
         return frame
-    pictures: Mapping[str, Picture] = {
-        name: replace(picture, pixels_bgr=distort(picture.pixels_bgr, chance, random))
-        for name, picture in frame.pictures.items()
+    images: Mapping[str, CameraImage] = {
+        name: replace(image, pixels_bgr=distort(image.pixels_bgr, chance, random))
+        for name, image in frame.images.items()
     }
-    return replace(frame, pictures=pictures)
+    return replace(frame, images=images)
 
 
 def distort(pixels_bgr: NDArray[np.uint8], chance: float, random: np.random.Generator) -> NDArray[np.uint8]:
@@ -59,8 +59,8 @@ def distort(pixels_bgr: NDArray[np.uint8], chance: float, random: np.random.Gene
     return pixels.clip(0, 255).astype(np.uint8)
 
 
-def mask_pictures(images: Tensor, chance: float, random: np.random.Generator) -> None:
-    """Greys a grid of squares in each of the normalised pictures (..., 3, H, W), in place."""
+def mask_images(images: Tensor, chance: float, random: np.random.Generator) -> None:
+    """Greys a grid of squares in each of the normalised images (..., 3, H, W), in place."""
     for image in images.flatten(0, -4):
         if random.random() < chance:
             height, width = image.shape[-2:]

@@ -19,7 +19,7 @@ class ClipConfig:
 
     batch: clips a step. short_share: of the batches, whose clips are shorter, as at the start of a scene.
     learn: "last" learns from the last frame of a clip, as published. "all" goes through longer clips and learns from
-    every frame, one update each, the first of them without history: no picture is looked at in vain.
+    every frame, one update each, the first of them without history: no image is looked at in vain.
     in_turn: with "all", batches a step that are gone through side by side, a frame of each in turn, so that updates
     that follow each other do not learn from the same few streets.
     """

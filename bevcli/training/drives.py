@@ -54,7 +54,7 @@ class FolderDrives:
 
 
 class RenderedDrives:
-    """Rendered drives of some seeds, in the model's picture size, kept as sequence folders under `cache`/WxH."""
+    """Rendered drives of some seeds, in the model's image size, kept as sequence folders under `cache`/WxH."""
 
     def __init__(self, seeds: Items[int], cache: Path, config: BEVFormerConfig) -> None:
         width, height = config.image.size

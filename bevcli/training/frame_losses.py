@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from bevcli.model.bevformer import BEVFormer, BEVFormerInputs, BEVFormerOutputs
 from bevcli.training.dense_loss import DenseLossConfig, DenseReader, dense_loss
 from bevcli.training.detection_loss import DetectionLossConfig, detection_loss
-from bevcli.training.image_loss import PictureLossConfig, PictureReader, picture_loss
+from bevcli.training.image_loss import ImageFeatureReader, ImageLossConfig, image_loss
 from bevcli.training.samples import Targets
 from bevcli.training.segmentation_loss import SegmentationLossConfig, segmentation_loss
 
@@ -23,13 +23,13 @@ class LossConfigs:
     detection_loss: DetectionLossConfig = field(default_factory=DetectionLossConfig)
     segmentation_loss: SegmentationLossConfig = field(default_factory=SegmentationLossConfig)
     dense_loss: DenseLossConfig = field(default_factory=DenseLossConfig)
-    picture_loss: PictureLossConfig = field(default_factory=PictureLossConfig)
+    picture_loss: ImageLossConfig = field(default_factory=ImageLossConfig)
 
 
 class FrameLosses:
     """`losses(inputs, outputs, targets)`, called right after the model's forward that it judges.
 
-    readers: the layers of the dense and the picture loss, which learn along with the model.
+    readers: the layers of the dense and the image loss, which learn along with the model.
     """
 
     def __init__(self, model: BEVFormer, configs: LossConfigs) -> None:
@@ -37,14 +37,14 @@ class FrameLosses:
         self.configs = configs
         self.groups = of_model.decoder.training_groups
         self.dense_reader: DenseReader | None = None
-        self.picture_reader: PictureReader | None = None
+        self.image_reader: ImageFeatureReader | None = None
         self.readers = nn.ModuleDict()
         if configs.dense_loss.weight > 0:
             self.dense_reader = DenseReader(of_model.channels, classes, of_model.bev_grid)
             self.readers["dense_reader"] = self.dense_reader
         if configs.picture_loss.weight > 0:
-            self.picture_reader = PictureReader(of_model.channels, classes)
-            self.readers["picture_reader"] = self.picture_reader
+            self.image_reader = ImageFeatureReader(of_model.channels, classes)
+            self.readers["image_reader"] = self.image_reader
             model.neck.register_forward_hook(self._keep_features)
 
     def __call__(self, inputs: BEVFormerInputs, outputs: BEVFormerOutputs, targets: Targets) -> dict[str, Tensor]:
@@ -56,9 +56,9 @@ class FrameLosses:
             bev, config = outputs.bev.float(), self.configs.dense_loss
             dense = dense_loss(self.dense_reader, bev, targets.detection, config, of_boxes)
             losses |= {"cell classes": dense.classes, "cell boxes": dense.boxes}
-        if self.picture_reader is not None:
+        if self.image_reader is not None:
             features, of_pixels = self._features.float(), self.configs.picture_loss
-            pixels = picture_loss(self.picture_reader, features, inputs, targets.detection, of_pixels, of_boxes)
+            pixels = image_loss(self.image_reader, features, inputs, targets.detection, of_pixels, of_boxes)
             losses |= {"pixel classes": pixels.classes, "pixel places": pixels.places}
         if outputs.segmentation is not None:
             maps = segmentation_loss(outputs.segmentation, targets.segmentation, self.configs.segmentation_loss)
@@ -66,5 +66,5 @@ class FrameLosses:
         return losses
 
     def _keep_features(self, neck: nn.Module, inputs: tuple[Any, ...], maps: Sequence[Tensor]) -> None:
-        """The finest of the neck's maps, which the picture loss reads."""
+        """The finest of the neck's maps, which the image loss reads."""
         self._features = maps[0]

@@ -23,7 +23,7 @@ from bevcli.training.focal_loss import focal_loss
 
 
 @dataclass(frozen=True)
-class PictureLossConfig:
+class ImageLossConfig:
     """weight: of the whole loss; 0 leaves it out, as published. place_weight: of depth and centre in it."""
 
     weight: float = 0.0
@@ -35,15 +35,15 @@ class PictureLossConfig:
 
 
 @dataclass(frozen=True)
-class PictureLoss:
+class ImageLoss:
     """Weighted. classes: focal. places: L1 of log depth and of the way to the projected centre."""
 
     classes: Tensor
     places: Tensor
 
 
-class PictureReader(nn.Module):
-    """(P, C, h, w) features of P pictures -> class logits (P, h, w, classes) and places (P, h, w, 3).
+class ImageFeatureReader(nn.Module):
+    """(P, C, h, w) features of P images -> class logits (P, h, w, classes) and places (P, h, w, 3).
 
     A place is (log of the depth in metres, way to the centre's projection in x, in y, in pixels of the feature map).
     """
@@ -60,14 +60,14 @@ class PictureReader(nn.Module):
         return self.classes(pixels), self.places(pixels)
 
 
-def picture_loss(
-    reader: PictureReader,
+def image_loss(
+    reader: ImageFeatureReader,
     features: Tensor,
     inputs: BEVFormerInputs,
     targets: Sequence[DetectionTargets],
-    config: PictureLossConfig,
+    config: ImageLossConfig,
     of_boxes: DetectionLossConfig,
-) -> PictureLoss:
+) -> ImageLoss:
     """features: (B·N, C, h, w), the finest of the neck's for these inputs. targets: B.
 
     Both losses are divided by the number of taught pixels; the classes weigh as those of boxes.
@@ -77,16 +77,16 @@ def picture_loss(
     found, truths = [], []
     image_size = (inputs.images.shape[-2], inputs.images.shape[-1])
     cameras = inputs.image_from_bev.shape[1]
-    for picture, matrix in enumerate(inputs.image_from_bev.flatten(0, 1)):
-        truth = targets[picture // cameras]
+    for image, matrix in enumerate(inputs.image_from_bev.flatten(0, 1)):
+        truth = targets[image // cameras]
         taught = _taught_pixels(matrix, truth.codes, (features.shape[-2], features.shape[-1]), image_size)
-        wanted[picture, taught.rows, taught.columns, truth.labels[taught.owners]] = 1
-        found.append(places[picture, taught.rows, taught.columns])
+        wanted[image, taught.rows, taught.columns, truth.labels[taught.owners]] = 1
+        found.append(places[image, taught.rows, taught.columns])
         truths.append(taught.places)
     count = max(sum(map(len, found)), 1)
     classes = of_boxes.class_weight * focal_loss(logits, wanted).sum() / count
     errors = F.l1_loss(torch.cat(found), torch.cat(truths), reduction="sum") / count
-    return PictureLoss(config.weight * classes, config.weight * config.place_weight * errors)
+    return ImageLoss(config.weight * classes, config.weight * config.place_weight * errors)
 
 
 @dataclass(frozen=True)

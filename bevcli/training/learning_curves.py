@@ -1,4 +1,4 @@
-"""The curves of a training: rows in CSV files, and a picture of them."""
+"""The curves of a training: rows in CSV files, and an image of them."""
 
 from __future__ import annotations
 

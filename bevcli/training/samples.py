@@ -15,7 +15,7 @@ from bevcli.geometry.transforms import inverse
 from bevcli.model.bevformer import BEVFormerConfig, BEVFormerInputs
 from bevcli.pipeline.model_inputs import model_inputs
 from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
-from bevcli.training.augmentation import AugmentationConfig, distort_pictures, mask_pictures
+from bevcli.training.augmentation import AugmentationConfig, distort_images, mask_images
 from bevcli.training.clips import Clip
 from bevcli.training.detection_targets import DetectionTargets, detection_targets
 from bevcli.training.drives import Drives
@@ -74,7 +74,7 @@ def load_batch(
     for number, frames in enumerate(zip(*loaded, strict=True)):
         before = [clip[number - 1].frame.world_from_ego if number else None for clip in loaded]
         inputs = model_inputs(frames, before, config)
-        mask_pictures(inputs.images, augmentation.grid_mask, random)
+        mask_images(inputs.images, augmentation.grid_mask, random)
         steps.append(inputs)
     learned = list(zip(*loaded, strict=True))[0 if learn_all else -1 :]
     return Batch(tuple(steps), tuple(_targets([prepared.frame for prepared in frames], config) for frames in learned))
@@ -110,4 +110,4 @@ def _load_clip(
 ) -> list[PreparedFrame]:
     sequence, prepare = drives.open(clip.drive), Preprocessor(config)
     frames = (sequence.load(place) for place in clip.places)
-    return [prepare(distort_pictures(frame, augmentation.photometric, random)) for frame in frames]
+    return [prepare(distort_images(frame, augmentation.photometric, random)) for frame in frames]

@@ -69,7 +69,7 @@ def entity_colors(frame: RecordedFrame, entity: str, component: str, count: int)
 
 
 def recorded_image(frame: RecordedFrame, entity: str) -> Canvas | None:
-    """An entity's raw RGB picture as (H, W, 3) BGR; None where there is none."""
+    """An entity's raw RGB image as (H, W, 3) BGR; None where there is none."""
     formats = frame.values(entity, "Image:format")
     if not formats:
         return None

@@ -86,7 +86,7 @@ class RecordingReader:
                 yield RecordedFrame(current, dict(state))
             if frame is not None and (current is None or frame > current):
                 current = frame
-            if frame is None or frame == current:  # an earlier frame's late BEV picture holds no more
+            if frame is None or frame == current:  # an earlier frame's late BEV image holds no more
                 _apply(state, entity, row)
         if current is not None:
             yield RecordedFrame(current, dict(state))

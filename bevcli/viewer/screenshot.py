@@ -1,4 +1,4 @@
-"""A picture of a recording in the viewer, without a screen: the viewer runs headless and draws with Vulkan."""
+"""An image of a recording in the viewer, without a screen: the viewer runs headless and draws with Vulkan."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from bevcli.viewer.native import LOOPBACK, free_port, start_viewer, stop
 
 Answer = TypeVar("Answer")
 START_TIMEOUT_S = 40.0
-SETTLE_S = 2.5  # pictures are decoded after the views have opened, and nothing says when they are there
+SETTLE_S = 2.5  # images are decoded after the views have opened, and nothing says when they are there
 NO_DRIVER = "the viewer cannot draw here: it needs a Vulkan driver (Debian: apt-get install mesa-vulkan-drivers)"
 
 
-def take_screenshot(recording: Path, picture: Path, frame: int | None = None) -> tuple[str, ...]:
+def take_screenshot(recording: Path, image: Path, frame: int | None = None) -> tuple[str, ...]:
     """Writes a PNG of the whole viewer at a frame (its number; default the first), and returns the views' names.
 
     Takes about 6 s. Raises OutputError where the viewer cannot draw (no Vulkan driver) or the file cannot be written,
@@ -35,7 +35,7 @@ def take_screenshot(recording: Path, picture: Path, frame: int | None = None) ->
         state = _wait(process, lambda: _opened(client), "the recording does not open in the viewer")
         _go_to(client, state, frame)
         time.sleep(SETTLE_S)
-        _write(picture, client.take_screenshot())
+        _write(image, client.take_screenshot())
         return tuple(view.name for view in client.get_state().views)
     finally:
         stop(process)
@@ -79,8 +79,8 @@ def _wait(process: subprocess.Popen[bytes], attempt: Callable[[], Answer | None]
     raise OutputError(complaint)
 
 
-def _write(picture: Path, png: bytes) -> None:
+def _write(image: Path, png: bytes) -> None:
     try:
-        picture.write_bytes(png)
+        image.write_bytes(png)
     except OSError as error:
-        raise OutputError(f"{picture}: cannot be written ({error.strerror})") from error
+        raise OutputError(f"{image}: cannot be written ({error.strerror})") from error

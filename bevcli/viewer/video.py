@@ -33,8 +33,8 @@ def write_video(recording: Path, video: Path, on_frame: Callable[[], None] = lam
     if not writer.isOpened():
         raise OutputError(f"{video}: the video cannot be written (is the folder there, and may you write in it?)")
     try:
-        for picture in _pictures(recording):
-            writer.write(picture)
+        for image in _images(recording):
+            writer.write(image)
             on_frame()
     finally:
         writer.release()
@@ -50,7 +50,7 @@ def frame_rate(recording: Path) -> tuple[int, float]:
 
 
 def frame_times_ns(recording: Path) -> np.ndarray:
-    """The frames' times, read without their pictures."""
+    """The frames' times, read without their images."""
     times: dict[int, int] = {}
     for chunk in RecordingReader(recording).chunks():
         if chunk.entity_path.strip("/") == entities.EGO:
@@ -62,16 +62,16 @@ def frame_times_ns(recording: Path) -> np.ndarray:
     return np.array([times[frame] for frame in sorted(times)], dtype=np.int64)
 
 
-def _pictures(recording: Path) -> Iterator[np.ndarray]:
+def _images(recording: Path) -> Iterator[np.ndarray]:
     placed: tuple[Tile, ...] | None = None
     for frame in RecordingReader(recording).frames():
         if placed is None:
-            placed = tiles(camera_rows_of(frame), picture_sizes(frame))
+            placed = tiles(camera_rows_of(frame), image_sizes(frame))
         yield draw_frame(frame, placed)
 
 
-def picture_sizes(frame: RecordedFrame) -> dict[str, tuple[int, int]]:
-    """(width, height) of each camera's pictures, pixels."""
+def image_sizes(frame: RecordedFrame) -> dict[str, tuple[int, int]]:
+    """(width, height) of each camera's images, pixels."""
     sizes = {}
     for name in frame.values(entities.RUN, "camera_names"):
         width, height = frame.array(entities.camera(name), "Pinhole:resolution", 2)[0]

@@ -1,4 +1,4 @@
-"""One picture of a recording for a video: all cameras with their boxes, the BEV beside them, and a legend below."""
+"""One image of a recording for a video: all cameras with their boxes, the BEV beside them, and a legend below."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ TEXT, WARNING = (225, 220, 215), (85, 70, 255)
 
 @dataclass(frozen=True)
 class Tile:
-    """Where a camera's picture goes, in pixels of the canvas."""
+    """Where a camera's image goes, in pixels of the canvas."""
 
     camera: str
     left: int
@@ -79,11 +79,11 @@ def draw_frame(frame: RecordedFrame, placed: tuple[Tile, ...]) -> Canvas:
 
 
 def _draw_camera(canvas: Canvas, frame: RecordedFrame, tile: Tile) -> None:
-    jpeg = frame.blob(entities.picture(tile.camera), "EncodedImage:blob")
+    jpeg = frame.blob(entities.image(tile.camera), "EncodedImage:blob")
     width, height = frame.array(entities.camera(tile.camera), "Pinhole:resolution", 2)[0]
-    picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR) if jpeg else None
-    if picture is not None:
-        canvas[:] = cv2.resize(picture, (tile.width, tile.height), interpolation=cv2.INTER_AREA)
+    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR) if jpeg else None
+    if image is not None:
+        canvas[:] = cv2.resize(image, (tile.width, tile.height), interpolation=cv2.INTER_AREA)
     scale = np.array([tile.width / width, tile.height / height])
 
     def to_canvas(points: Array) -> Array:
@@ -96,9 +96,9 @@ def _draw_camera(canvas: Canvas, frame: RecordedFrame, tile: Tile) -> None:
     cv2.rectangle(canvas, (0, 0), (10 * len(tile.camera) + 12, 22), BACKGROUND, -1)
     draw_text(
         canvas,
-        tile.camera if picture is not None else f"{tile.camera}: no picture",
+        tile.camera if image is not None else f"{tile.camera}: no image",
         (8, 11),
-        TEXT if picture is not None else WARNING,
+        TEXT if image is not None else WARNING,
         0.42,
     )
 
@@ -119,13 +119,13 @@ def _draw_bev(canvas: Canvas, frame: RecordedFrame) -> None:
     draw_strips(canvas, frame, entities.BEV_VEHICLE, to_canvas, 2)
 
 
-def _draw_placed(canvas: Canvas, frame: RecordedFrame, entity: str, picture: Canvas, to_canvas: ToCanvas) -> None:
+def _draw_placed(canvas: Canvas, frame: RecordedFrame, entity: str, image: Canvas, to_canvas: ToCanvas) -> None:
     start = frame.array(entity, "Transform3D:translation", 3)[0, :2]
-    extent = frame.array(entity, "Transform3D:scale", 3)[0, :2] * picture.shape[1::-1]
+    extent = frame.array(entity, "Transform3D:scale", 3)[0, :2] * image.shape[1::-1]
     left, top = to_canvas(start).astype(int)
     right, bottom = to_canvas(start + extent).astype(int)
     x0, y0, x1, y1 = max(left, 0), max(top, 0), min(right, BEV_SIDE), min(bottom, BEV_SIDE)
-    whole = cv2.resize(picture, (right - left, bottom - top), interpolation=cv2.INTER_NEAREST)
+    whole = cv2.resize(image, (right - left, bottom - top), interpolation=cv2.INTER_NEAREST)
     canvas[y0:y1, x0:x1] = whole[y0 - top : y1 - top, x0 - left : x1 - left]
 
 

@@ -8,10 +8,10 @@ from bevcli.benchmark.operations import count_operations
 from bevcli.config import load_config
 
 HITS = (400,) * 6
-RESNET50_OPERATIONS = 2 * 4.09e9  # of one picture of 224 x 224, as published with the weights
+RESNET50_OPERATIONS = 2 * 4.09e9  # of one image of 224 x 224, as published with the weights
 
 
-def test_tiny_is_a_resnet50_on_six_pictures_and_little_more():
+def test_tiny_is_a_resnet50_on_six_images_and_little_more():
     backbone = 6 * RESNET50_OPERATIONS * (480 * 800) / 224**2
     assert 1.02 * backbone < count_operations(load_config("tiny"), HITS) < 1.12 * backbone
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from memory_drive import MemorySequence, WithoutPictures
+from memory_drive import MemorySequence, WithoutImages
 
 from bevcli.errors import OutputError
 from bevcli.pipeline.model_loading import LoadedModel
@@ -125,7 +125,7 @@ def test_bev_features_are_written_with_what_explains_them(job, tmp_path):
 
 
 def test_gaps_are_in_the_summary(job):
-    out = job(WithoutPictures({0: ["CAM_BACK"], 1: "all"}, count=3))
+    out = job(WithoutImages({0: ["CAM_BACK"], 1: "all"}, count=3))
     summary = json.loads((out / "summary.json").read_text())
     assert summary["skipped_frames"] == [1]
     assert {"frame": 0, "camera": "CAM_BACK", "reason": "missing"} in summary["dropped_pictures"]
@@ -162,7 +162,7 @@ def test_what_was_done_survives_a_failure_in_a_later_frame(job, tmp_path):
     assert json.loads((tmp_path / "out/summary.json").read_text())["frames"] == 2
 
 
-def test_a_missing_picture_is_a_warning_and_with_strict_an_error(tmp_path):
+def test_a_missing_image_is_a_warning_and_with_strict_an_error(tmp_path):
     (tmp_path / "mini.toml").write_text(MINI_TOML)
     drive = tmp_path / "drive"
     shutil.copytree(SAMPLE, drive)

@@ -137,15 +137,15 @@ def test_maps_beside_the_files_are_scored(tmp_path: Path) -> None:
     assert any("1 of 2 frames lack a map" in note for note in scores["notes"])
 
 
-def test_plots_are_pictures_with_something_in_them(tmp_path: Path, files: tuple[Path, Path]) -> None:
+def test_plots_are_images_with_something_in_them(tmp_path: Path, files: tuple[Path, Path]) -> None:
     CliRunner().invoke(app, ["eval", *map(str, files), "--plot", str(tmp_path / "plots")], catch_exceptions=False)
     names = {"precision_recall.png", "errors_by_range.png", "misses_and_false_alarms.png"}
     assert {path.name for path in (tmp_path / "plots").iterdir()} == names
     for name in names:
-        picture = cv2.imread(str(tmp_path / "plots" / name))
-        assert picture is not None
-        assert min(picture.shape[:2]) > 600
-        assert (picture < 200).any(axis=2).mean() > 0.005
+        image = cv2.imread(str(tmp_path / "plots" / name))
+        assert image is not None
+        assert min(image.shape[:2]) > 600
+        assert (image < 200).any(axis=2).mean() > 0.005
 
 
 def test_plots_of_nothing_are_drawn_too(tmp_path: Path) -> None:

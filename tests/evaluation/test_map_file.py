@@ -34,13 +34,13 @@ def test_maps_of_another_extent_do_not_mix(tmp_path: Path) -> None:
     assert not open_maps(tmp_path).has(1)
 
 
-def test_a_missing_or_wrong_picture_is_named(tmp_path: Path) -> None:
+def test_a_missing_or_wrong_image_is_named(tmp_path: Path) -> None:
     write_map(tmp_path, 0, MAP)
     folder = open_maps(tmp_path)
     with pytest.raises(InputError, match=r"000001\.png: the map of frame 1 is missing"):
         folder.load(1)
     cv2.imwrite(str(tmp_path / "000002.png"), np.zeros((3, 4, 3), np.uint8))
-    with pytest.raises(InputError, match=r"000002\.png: expected an 8-bit picture with one channel"):
+    with pytest.raises(InputError, match=r"000002\.png: expected an 8-bit image with one channel"):
         folder.load(2)
     cv2.imwrite(str(tmp_path / "000003.png"), np.full((3, 4), 16, np.uint8))
     with pytest.raises(InputError, match="bits 0x10 stand for no class"):

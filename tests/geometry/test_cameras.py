@@ -62,16 +62,16 @@ def test_a_lens_that_folds_back_gives_no_pixel_beyond_the_fold():
 @pytest.mark.parametrize("lens", [Distortion("brown_conrady", BROWN), Distortion("kannala_brandt", FISHEYE)])
 def test_undistorting_moves_a_drawn_point_to_its_pinhole_place(lens):
     point = np.array([0.8, -0.5, 4.0])
-    picture = np.zeros((600, 800, 3), np.uint8)
+    image = np.zeros((600, 800, 3), np.uint8)
     seen, _ = camera(lens).project(point)
-    cv2.circle(picture, np.round(seen * 16).astype(int).tolist(), 6 * 16, (255, 255, 255), -1, shift=4)
-    mended = undistort(picture, camera(lens))[..., 0]
+    cv2.circle(image, np.round(seen * 16).astype(int).tolist(), 6 * 16, (255, 255, 255), -1, shift=4)
+    mended = undistort(image, camera(lens))[..., 0]
     ys, xs = np.nonzero(mended > 127)
     expected, _ = camera().project(point)
     assert (xs.mean(), ys.mean()) == pytest.approx(expected, abs=0.5)
 
 
-def test_scaling_and_cropping_move_pixels_with_the_picture():
+def test_scaling_and_cropping_move_pixels_with_the_image():
     pixels, _ = camera().project(points_in_view())
     assert camera().scaled(0.5).project(points_in_view())[0] == pytest.approx(pixels / 2)
     assert camera().cropped(100, 50, 300, 200).project(points_in_view())[0] == pytest.approx(pixels - [100, 50])

@@ -1,7 +1,7 @@
 """What the original BEVFormer was given and what it answered, kept in tests/data.
 
 golden_inputs.json: rig and poses of four frames. golden_keys.json: names and shapes of the official weights.
-golden_tiny.npz: the original's numbers with weights and pictures by the rule of stated_rule.py, the BEV maps on every
+golden_tiny.npz: the original's numbers with weights and images by the rule of stated_rule.py, the BEV maps on every
 23rd cell, the codes and logits of every 9th query.
 """
 
@@ -17,7 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from stated_rule import rule_picture, rule_tensor
+from stated_rule import rule_image, rule_tensor
 
 from bevcli.config import load_config
 from bevcli.geometry.boxes import Boxes3D
@@ -82,10 +82,10 @@ def image_from_bev(frame: int, config: BEVFormerConfig) -> np.ndarray:
 
 def network_image(frame: int, camera: str, config: BEVFormerConfig) -> np.ndarray:
     """(3, H, W) normalised, resized, padded."""
-    picture = rule_picture(frame, camera).astype(np.float32)
+    image = rule_image(frame, camera).astype(np.float32)
     if config.image.color_order == "rgb":
-        picture = picture[..., ::-1]
-    normalised = (picture - np.float32(config.image.mean)) / np.float32(config.image.std)
+        image = image[..., ::-1]
+    normalised = (image - np.float32(config.image.mean)) / np.float32(config.image.std)
     resized = cv2.resize(normalised, config.image.size, interpolation=cv2.INTER_LINEAR)
     padded = np.pad(resized, ((0, -resized.shape[0] % 32), (0, -resized.shape[1] % 32), (0, 0)))
     return padded.transpose(2, 0, 1)
@@ -113,7 +113,7 @@ def inputs(frame: int, config: BEVFormerConfig) -> BEVFormerInputs:
         images=torch.from_numpy(images)[None],
         image_from_bev=torch.from_numpy(image_from_bev(frame, config)).float()[None],
         camera_index=torch.arange(len(config.cameras)),
-        has_picture=torch.ones(1, len(config.cameras), dtype=torch.bool),
+        has_image=torch.ones(1, len(config.cameras), dtype=torch.bool),
         can_bus=torch.from_numpy(moved.can_bus)[None],
         shift=torch.from_numpy(moved.shift)[None],
         rotation_deg=torch.tensor([moved.rotation_deg]),

@@ -48,14 +48,14 @@ def small_model(seed: int = 0, **changes: object) -> BEVFormer:
 
 
 def small_inputs(seed: int = 0, batch: int = 1) -> BEVFormerInputs:
-    """Random pictures, one camera looking along y and one against it, a slightly moved vehicle."""
+    """Random images, one camera looking along y and one against it, a slightly moved vehicle."""
     random = torch.Generator().manual_seed(seed)
     projections = torch.from_numpy(np.stack([_image_from_bev(1.0), _image_from_bev(-1.0)])).float()
     return BEVFormerInputs(
         images=torch.randn(batch, 2, 3, HEIGHT, WIDTH, generator=random),
         image_from_bev=projections.expand(batch, -1, -1, -1) + 0.1 * torch.randn(batch, 1, 1, 1, generator=random),
         camera_index=torch.arange(2),
-        has_picture=torch.ones(batch, 2, dtype=torch.bool),
+        has_image=torch.ones(batch, 2, dtype=torch.bool),
         can_bus=torch.randn(batch, 18, generator=random),
         shift=0.1 * torch.randn(batch, 2, generator=random),
         rotation_deg=20 * torch.randn(batch, generator=random),

@@ -1,4 +1,4 @@
-"""Weights and pictures by a stated rule, so that equality with the original needs no download.
+"""Weights and images by a stated rule, so that equality with the original needs no download.
 
 The rule is part of the reference numbers in tests/data: every tensor is one draw from a generator seeded by
 the CRC-32 of its official key, scaled by what the tensor is for.
@@ -58,7 +58,7 @@ def rule_tensor(key: str, shape: tuple[int, ...], stem_gain: float) -> np.ndarra
     return (gain * draw / root).astype(np.float32)
 
 
-def rule_picture(frame: int, camera: str, height: int = 900, width: int = 1600) -> NDArray[np.uint8]:
+def rule_image(frame: int, camera: str, height: int = 900, width: int = 1600) -> NDArray[np.uint8]:
     """(H, W, 3) BGR: blocks of 100 pixels, blocks of 25 pixels and noise."""
     random = stream(f"image/{frame}/{camera}")
     coarse = random.integers(0, 150, (height // 100, width // 100, 3))

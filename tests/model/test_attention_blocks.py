@@ -56,7 +56,7 @@ def test_a_cell_hears_the_mean_of_the_cameras_that_see_it() -> None:
     bias = torch.randn(CHANNELS)
     with torch.no_grad():
         block.attention.output_projection.bias.copy_(bias)
-    tokens = torch.randn(2, 1, CHANNELS).expand(2, 12, -1)  # each camera's picture is of one colour
+    tokens = torch.randn(2, 1, CHANNELS).expand(2, 12, -1)  # each camera's image is of one colour
     hits = PillarHits(
         cell=torch.tensor([0, 1, 1]),
         reference_points=torch.full((3, 2, 2), 0.5),

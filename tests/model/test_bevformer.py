@@ -76,16 +76,16 @@ def test_the_order_of_the_cameras_does_not_matter() -> None:
     assert_same(model(inputs), model(swapped))
 
 
-def test_a_camera_without_a_picture_is_not_looked_at() -> None:
-    model, inputs = small_model(), replace(small_inputs(), has_picture=torch.tensor([[True, False]]))
+def test_a_camera_without_an_image_is_not_looked_at() -> None:
+    model, inputs = small_model(), replace(small_inputs(), has_image=torch.tensor([[True, False]]))
     other_pixels = inputs.images.clone()
     other_pixels[:, 1] = 3
     assert_same(model(inputs), model(replace(inputs, images=other_pixels)))
     assert not model.project_pillars(inputs).hit[0, 1].any()
 
 
-def test_no_picture_at_all_still_gives_an_answer() -> None:
-    inputs = replace(small_inputs(), has_picture=torch.zeros(1, 2, dtype=torch.bool))
+def test_no_image_at_all_still_gives_an_answer() -> None:
+    inputs = replace(small_inputs(), has_image=torch.zeros(1, 2, dtype=torch.bool))
     assert small_model()(inputs).box_codes.isfinite().all()
 
 

@@ -9,7 +9,7 @@ import bevcli.model.kernels.compiled_convolution as compiled
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 
 
-def layer_and_picture(stride: int) -> tuple[ModulatedDeformableConvolution, torch.Tensor]:
+def layer_and_image(stride: int) -> tuple[ModulatedDeformableConvolution, torch.Tensor]:
     random = torch.Generator().manual_seed(stride)
     layer = ModulatedDeformableConvolution(6, 5, stride).requires_grad_(False)
     for parameter in layer.parameters():
@@ -21,7 +21,7 @@ def layer_and_picture(stride: int) -> tuple[ModulatedDeformableConvolution, torc
 @pytest.mark.parametrize("stride", [1, 2])
 @pytest.mark.parametrize("tile_bytes", [1, 20_000, 8 << 20])
 def test_compiled_equals_plain(monkeypatch, stride, tile_bytes):
-    layer, x = layer_and_picture(stride)
+    layer, x = layer_and_image(stride)
     expected = layer(x)
     monkeypatch.setattr(compiled, "TILE_BYTES", tile_bytes)
     layer.backend = "compiled"
@@ -31,7 +31,7 @@ def test_compiled_equals_plain(monkeypatch, stride, tile_bytes):
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 def test_half_precision_rounds_what_it_sampled_in_float32(dtype):
-    layer, x = layer_and_picture(1)
+    layer, x = layer_and_image(1)
     expected = layer(x.to(dtype).float())
     layer.backend = "compiled"
     layer.to(dtype)

@@ -24,7 +24,7 @@ def two_steps(model: BEVFormer) -> BEVFormerOutputs:
 def model() -> BEVFormer:
     model = small_model()
     random = torch.Generator().manual_seed(1)
-    for name, buffer in model.named_buffers():  # batch norms that have seen pictures
+    for name, buffer in model.named_buffers():  # batch norms that have seen images
         if name.endswith(("running_mean", "running_var")):
             buffer.copy_(0.5 + torch.rand(buffer.shape, generator=random))
     return model
@@ -44,7 +44,7 @@ def test_another_calibration_is_noticed(model):
         for seed in (0, 1, 0):
             inputs = small_inputs(seed)
             torch.testing.assert_close(prepared(inputs).bev, model(inputs).bev, atol=1e-4, rtol=1e-4)
-        blind = replace(inputs, has_picture=torch.tensor([[True, False]]))
+        blind = replace(inputs, has_image=torch.tensor([[True, False]]))
         torch.testing.assert_close(prepared(blind).bev, model(blind).bev, atol=1e-4, rtol=1e-4)
 
 

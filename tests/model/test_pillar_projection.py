@@ -13,10 +13,10 @@ from bevcli.model.pillar_projection import PillarProjection, find_hits, project_
 SIZE = (480, 800)
 
 
-def project(image_from_bev: np.ndarray, points: np.ndarray, picture: bool = True) -> PillarProjection:
+def project(image_from_bev: np.ndarray, points: np.ndarray, image: bool = True) -> PillarProjection:
     """One camera, one sequence; points (cells, Z, 3)."""
     matrix = torch.from_numpy(image_from_bev).float()[None, None]
-    return project_pillars(matrix, torch.from_numpy(points).float(), SIZE, torch.tensor([[picture]]))
+    return project_pillars(matrix, torch.from_numpy(points).float(), SIZE, torch.tensor([[image]]))
 
 
 def test_pillars_of_a_real_rig_lie_where_opencv_projects_them() -> None:
@@ -38,10 +38,10 @@ def test_pillars_of_a_real_rig_lie_where_opencv_projects_them() -> None:
         )
         depth = (pillars @ camera_from_bev.T + translation)[..., 2]
         pixels = pixels.reshape(-1, 4, 2)
-        in_picture = ((pixels > 0) & (pixels < (800, 480))).all(-1) & (depth > 0)
+        in_image = ((pixels > 0) & (pixels < (800, 480))).all(-1) & (depth > 0)
         visible = ours.visible[0, i].numpy()
-        assert (visible != in_picture).sum() <= 2  # a point on the very edge
-        both = visible & in_picture
+        assert (visible != in_image).sum() <= 2  # a point on the very edge
+        both = visible & in_image
         np.testing.assert_allclose(ours.reference_points[0, i].numpy()[both] * (800, 480), pixels[both], atol=0.01)
 
 
@@ -51,7 +51,7 @@ def test_a_point_behind_the_camera_is_not_visible() -> None:
     assert project(image_from_bev, points).visible.flatten().tolist() == [True, False, False]
 
 
-def test_edges_of_the_picture_are_outside() -> None:
+def test_edges_of_the_image_are_outside() -> None:
     image_from_bev = np.array([[400, 0, 0, 0], [0, 240, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
     points = np.array([[[0, 1, 1.0]], [[2, 1, 1.0]], [[1, 2, 1.0]], [[1.999, 1.999, 1.0]]])
     assert project(image_from_bev, points).visible.flatten().tolist() == [False, False, False, True]
@@ -61,7 +61,7 @@ def test_a_cell_is_hit_when_any_point_of_its_pillar_is_visible() -> None:
     image_from_bev = np.array([[400, 0, 400, 0], [0, 400, 240, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
     points = np.array([[[0, 0, 5.0], [90, 0, 5.0]], [[90, 0, 5.0], [0, 0, -5.0]]])
     assert project(image_from_bev, points).hit.flatten().tolist() == [True, False]
-    assert not project(image_from_bev, points, picture=False).hit.any()
+    assert not project(image_from_bev, points, image=False).hit.any()
 
 
 def test_hits_list_every_seen_pair_of_camera_and_cell_once() -> None:

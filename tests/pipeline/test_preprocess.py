@@ -3,14 +3,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from memory_drive import MemorySequence, WithoutPictures, make_camera, make_rig
+from memory_drive import MemorySequence, WithoutImages, make_camera, make_rig
 
 from bevcli.geometry.cameras import CameraRig, Distortion
 from bevcli.geometry.transforms import Pose, apply, inverse
 from bevcli.pipeline.preprocess import Preprocessor
 
 
-def textbook_picture(pixels, image):
+def textbook_image(pixels, image):
     """The original's order: normalise in float, resize, pad right and bottom."""
     rgb = pixels[..., ::-1] if image.color_order == "rgb" else pixels
     normalised = (rgb.astype(np.float32) - np.float32(image.mean)) / np.float32(image.std)
@@ -22,27 +22,27 @@ def textbook_picture(pixels, image):
 
 
 @pytest.mark.parametrize("order", ["rgb", "bgr"])
-def test_pictures_are_those_of_the_originals_order(mini_config, order):
+def test_images_are_those_of_the_originals_order(mini_config, order):
     config = replace(mini_config, image=replace(mini_config.image, color_order=order))
     frame = MemorySequence().load(1)
     images = Preprocessor(config)(frame).images[0].numpy()
-    expected = [textbook_picture(frame.pictures[name].pixels_bgr, config.image) for name in config.cameras]
+    expected = [textbook_image(frame.images[name].pixels_bgr, config.image) for name in config.cameras]
     assert images == pytest.approx(np.stack(expected), abs=1e-5)
 
 
-def test_shrunk_pictures_may_be_averaged(mini_config):
+def test_shrunk_images_may_be_averaged(mini_config):
     """Stripes finer than the network's pixels become grey, and not stripes again."""
     config = replace(mini_config, image=replace(mini_config.image, resize="area"))
     frame = MemorySequence().load(1)
     name = config.cameras[0]
-    stripes = np.zeros_like(frame.pictures[name].pixels_bgr)
+    stripes = np.zeros_like(frame.images[name].pixels_bgr)
     stripes[:, ::2] = 200  # a network's pixel is two by two of them
-    frame = replace(frame, pictures={**frame.pictures, name: replace(frame.pictures[name], pixels_bgr=stripes)})
-    picture = Preprocessor(config)(frame).images[0, 0].numpy()
+    frame = replace(frame, images={**frame.images, name: replace(frame.images[name], pixels_bgr=stripes)})
+    image = Preprocessor(config)(frame).images[0, 0].numpy()
     width, height = config.image.size
     mean, std = (np.array(values)[:, None, None] for values in (config.image.mean, config.image.std))
     expected = np.broadcast_to((100 - mean) / std, (3, height, width))
-    assert picture[:, :height, :width] == pytest.approx(expected, abs=1e-4)
+    assert image[:, :height, :width] == pytest.approx(expected, abs=1e-4)
 
 
 def test_projection_goes_through_the_world_at_each_cameras_own_time(mini_config):
@@ -57,7 +57,7 @@ def test_projection_goes_through_the_world_at_each_cameras_own_time(mini_config)
     assert (d, one) == pytest.approx((float(depth), 1.0), abs=1e-4)
 
 
-def test_a_picture_of_another_aspect_is_fitted_inside_and_its_calibration_follows(mini_config):
+def test_an_image_of_another_aspect_is_fitted_inside_and_its_calibration_follows(mini_config):
     camera = make_camera("CAM_FRONT", 0, width=300, height=300)
     sequence = MemorySequence(rig=CameraRig((camera,), make_rig().ego_from_bev))
     prepared = Preprocessor(mini_config)(sequence.load(0))
@@ -72,7 +72,7 @@ def test_a_picture_of_another_aspect_is_fitted_inside_and_its_calibration_follow
     assert (u / d, v / d) == pytest.approx(0.3 * expected, abs=1e-3)
 
 
-def test_pictures_of_several_sizes_go_into_one_batch(mini_config):
+def test_images_of_several_sizes_go_into_one_batch(mini_config):
     cameras = (make_camera("CAM_FRONT", 0, 320, 180), make_camera("CAM_BACK", 180, 640, 400))
     sequence = MemorySequence(rig=CameraRig(cameras, make_rig().ego_from_bev))
     prepared = Preprocessor(mini_config)(sequence.load(0))
@@ -90,7 +90,7 @@ def test_a_lens_is_undone_before_anything_else(mini_config):
     cv2.circle(drawn, np.round(seen * 16).astype(int).tolist(), 5 * 16, (255, 255, 255), -1, shift=4)
     sequence = MemorySequence(rig=CameraRig((bent,), make_rig().ego_from_bev))
     frame = sequence.load(0)
-    frame = replace(frame, pictures={"CAM_FRONT": replace(frame.pictures["CAM_FRONT"], pixels_bgr=drawn)})
+    frame = replace(frame, images={"CAM_FRONT": replace(frame.images["CAM_FRONT"], pixels_bgr=drawn)})
     bright = Preprocessor(mini_config)(frame).images[0, 0, 0].numpy() > 0
     ys, xs = np.nonzero(bright)
     expected, _ = plain.project_ego(point_ego)
@@ -98,8 +98,8 @@ def test_a_lens_is_undone_before_anything_else(mini_config):
     assert np.linalg.norm(seen - expected) > 2
 
 
-def test_a_missing_picture_is_black_and_marked(mini_config):
-    prepared = Preprocessor(mini_config)(WithoutPictures({0: ["CAM_BACK"]}).load(0))
+def test_a_missing_image_is_black_and_marked(mini_config):
+    prepared = Preprocessor(mini_config)(WithoutImages({0: ["CAM_BACK"]}).load(0))
     place = prepared.assignment.cameras.index("CAM_BACK")
-    assert prepared.has_picture[0].tolist() == [name != "CAM_BACK" for name in prepared.assignment.cameras]
+    assert prepared.has_image[0].tolist() == [name != "CAM_BACK" for name in prepared.assignment.cameras]
     assert (prepared.images[0, place] == 0).all()

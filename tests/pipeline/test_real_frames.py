@@ -19,7 +19,7 @@ from bevcli.pipeline.preprocess import Preprocessor, image_from_bev
 from bevcli.pipeline.runner import Runner
 from bevcli.sequences.open import open_sequence
 
-# Rectangles (left, top, right, bottom) around objects of frame 0, measured by hand in the enlarged pictures.
+# Rectangles (left, top, right, bottom) around objects of frame 0, measured by hand in the enlarged images.
 MEASURED = [
     ("CAM_FRONT", "car", (1003, 483, 1075, 531)),
     ("CAM_FRONT", "pedestrian", (1371, 451, 1420, 582)),
@@ -81,7 +81,7 @@ def test_pillars_agree_with_opencv_on_the_whole_chain(shared, first_frame):
     ego_rotation, ego_place = pose(first_frame.stamp.timestamp_ns)
     world = ego_rotation.apply(bev_rotation.apply(pillars) + bev_place) + ego_place
     for name, entry in calibration["cameras"].items():
-        later_rotation, later_place = pose(first_frame.pictures[name].timestamp_ns)
+        later_rotation, later_place = pose(first_frame.images[name].timestamp_ns)
         camera_rotation, camera_place = rigid_of(entry["ego_from_camera"])
         in_ego = later_rotation.inv().apply(world - later_place)
         in_camera = camera_rotation.inv().apply(in_ego - camera_place)

@@ -1,4 +1,4 @@
-"""A rendered rig with a known lens: what we undo looks like the picture that never had one."""
+"""A rendered rig with a known lens: what we undo looks like the image that never had one."""
 
 from dataclasses import replace
 
@@ -25,11 +25,11 @@ def rendered(stock, lens):
     rig = nuscenes_like_rig(320, 180)
     camera = replace(rig["CAM_FRONT"], distortion=lens)
     drive = Drive(113, frames=20, rig=CameraRig((camera,), rig.ego_from_bev), stock=stock, weather="noon")
-    return drive.frame(9).pictures["CAM_FRONT"].astype(np.float64), camera
+    return drive.frame(9).images["CAM_FRONT"].astype(np.float64), camera
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_undistorting_a_rendered_picture_gives_the_picture_without_a_lens(stock, name):
+def test_undistorting_a_rendered_image_gives_the_image_without_a_lens(stock, name):
     plain, _ = rendered(stock, None)
     bent, camera = rendered(stock, LENSES[name])
     mended = undistort(bent.astype(np.uint8), camera).astype(np.float64)

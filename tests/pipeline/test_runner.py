@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from memory_drive import MemorySequence, WithoutPictures, make_rig
+from memory_drive import MemorySequence, WithoutImages, make_rig
 
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import apply
@@ -61,8 +61,8 @@ def test_a_gap_in_time_starts_anew(mini_model):
     assert predictions[1].started_anew == "gap of 2.5 s"
 
 
-def test_a_frame_without_pictures_passes_the_state_on(mini_model):
-    sequence = WithoutPictures({1: "all"}, count=3)
+def test_a_frame_without_images_passes_the_state_on(mini_model):
+    sequence = WithoutImages({1: "all"}, count=3)
     predictions, _ = run(mini_model, sequence)
     assert [p.skipped for p in predictions] == [False, True, False]
     assert len(predictions[1].boxes) == 0
@@ -95,7 +95,7 @@ def test_the_probe_answers_in_pixels_and_shares(mini_model):
     assert view.history_weight.max() <= 1
     samples = view.probes[0].cameras["CAM_FRONT"]
     assert sum(camera.weights.sum() for camera in view.probes[0].cameras.values()) == pytest.approx(1)
-    # Freshly made offsets stay near the pillar, which stands ahead of the camera: near the picture's middle column.
+    # Freshly made offsets stay near the pillar, which stands ahead of the camera: near the image's middle column.
     assert np.average(samples.pixels[:, 0], weights=samples.weights) == pytest.approx(160, abs=60)
 
 
@@ -132,10 +132,10 @@ def test_removing_a_camera_changes_only_the_cells_that_it_saw(mini_model):
     whole = preprocess(MemorySequence(1).load(0))
     runner.step(None, whole)
     with_camera = seen["queries"]
-    runner.step(None, preprocess(WithoutPictures({0: ["CAM_FRONT_LEFT"]}, count=1).load(0)))
+    runner.step(None, preprocess(WithoutImages({0: ["CAM_FRONT_LEFT"]}, count=1).load(0)))
     handle.remove()
     changed = (seen["queries"] - with_camera).abs().amax(-1)[0] > 1e-6
-    projection = project_pillars(whole.image_from_bev, mini_model.pillars, (96, 160), whole.has_picture)
+    projection = project_pillars(whole.image_from_bev, mini_model.pillars, (96, 160), whole.has_image)
     hits = projection.hit[0, mini_model.config.cameras.index("CAM_FRONT_LEFT")]
     assert changed.any()
     assert not (changed & ~hits).any()

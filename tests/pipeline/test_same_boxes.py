@@ -38,9 +38,9 @@ def test_a_native_folder_and_six_lossless_videos(mini_model, shared, tmp_path):
     for folder in (drive / "images").iterdir():
         video = f"videos/{folder.name}.mkv"
         writer = cv2.VideoWriter(str(tmp_path / video), cv2.VideoWriter_fourcc(*"FFV1"), 2, (1600, 900))
-        for number, picture in enumerate(sorted(folder.iterdir())):
-            writer.write(cv2.imread(str(picture)))
-            table = table.replace(f"images/{folder.name}/{picture.name}", f"{video}#{number}")
+        for number, image in enumerate(sorted(folder.iterdir())):
+            writer.write(cv2.imread(str(image)))
+            table = table.replace(f"images/{folder.name}/{image.name}", f"{video}#{number}")
         writer.release()
     (tmp_path / "frames.csv").write_text(table)
     assert_same_boxes(mini_model, drive, tmp_path)

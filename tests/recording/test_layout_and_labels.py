@@ -3,9 +3,9 @@
 import numpy as np
 from memory_drive import make_rig
 
-from bevcli.recording.box_lines import PictureLines
+from bevcli.recording.box_lines import ImageLines
 from bevcli.recording.camera_layout import camera_rows, rows_by_yaw
-from bevcli.recording.labels import LETTER_HEIGHT, LETTER_WIDTH, labels_in_picture
+from bevcli.recording.labels import LETTER_HEIGHT, LETTER_WIDTH, labels_in_image
 
 
 def test_nuscenes_cameras_stand_around_the_vehicle():
@@ -29,7 +29,7 @@ def test_a_single_camera_has_one_row():
 def test_labels_do_not_overlap_and_the_largest_box_wins():
     boxes = np.array([[100, 100, 30], [110, 100, 90], [500, 100, 60], [600, 300, 2]])  # x, y, height
     segments = np.array([[[x, y], [x + 5, y + h]] for x, y, h in boxes], dtype=float)
-    places, owners = labels_in_picture(PictureLines(segments, np.arange(4)), ["car 0.50"] * 4, 800, 450)
+    places, owners = labels_in_image(ImageLines(segments, np.arange(4)), ["car 0.50"] * 4, 800, 450)
     assert owners.tolist() == [1, 2]  # the first is covered by the second, the last is too small
     size = np.array([8 * LETTER_WIDTH * 800, LETTER_HEIGHT * 450])
     assert (np.abs(places[0] - places[1]) >= size - 1e-9).any()

@@ -7,7 +7,7 @@ from bevcli.recording.options import RecordingOptions
 
 
 @pytest.mark.parametrize("bev", ["norm", "pca", "none", "channel:0", "channel:17"])
-def test_known_pictures(bev):
+def test_known_images(bev):
     assert RecordingOptions(bev=bev).channel == (int(bev[8:]) if ":" in bev else None)
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from memory_drive import MemorySequence, WithoutPictures
+from memory_drive import MemorySequence, WithoutImages
 from recorded_drive import bev_from_world, boxes_ahead, predict, record, with_truth
 
 from bevcli.errors import OutputError
-from bevcli.frame import Picture
+from bevcli.frame import CameraImage
 from bevcli.geometry.boxes import CLASSES, Boxes3D
 from bevcli.geometry.transforms import Pose
 from bevcli.recording import entities
@@ -88,7 +88,7 @@ def test_every_view_has_something_to_show(standard):
         entities.BEV_PROBES: "Points2D:positions",
         entities.STAGE_CURVES: "Scalars:scalars",
         entities.BOX_CURVES: "Scalars:scalars",
-        entities.picture("CAM_BACK"): "EncodedImage:blob",
+        entities.image("CAM_BACK"): "EncodedImage:blob",
         entities.overlay("CAM_FRONT", "boxes"): "LineStrips2D:strips",
         entities.overlay("CAM_FRONT", "ground_truth"): "LineStrips2D:strips",
         entities.overlay("CAM_FRONT", "pillars"): "Points2D:positions",
@@ -105,8 +105,8 @@ def test_static_things_are_written_once(standard):
     assert [c.is_static for c in pinholes] == [True] * 6
 
 
-def test_boxes_in_the_picture_are_where_the_camera_saw_them(tmp_path):
-    """Each camera has its own time: the vehicle stood 2 m farther back when CAM_FRONT took its picture."""
+def test_boxes_in_the_image_are_where_the_camera_saw_them(tmp_path):
+    """Each camera has its own time: the vehicle stood 2 m farther back when CAM_FRONT took its image."""
     drive = MemorySequence(1)
     frame = drive.load(0)
     earlier = Pose(frame.world_from_ego.translation - [2.0, 0, 0], frame.world_from_ego.quaternion)
@@ -127,20 +127,20 @@ def test_boxes_in_the_picture_are_where_the_camera_saw_them(tmp_path):
 def test_the_files_own_bytes_are_kept(tmp_path):
     drive = MemorySequence(1)
     frame = drive.load(0)
-    picture = frame.pictures["CAM_FRONT"]
-    jpeg = cv2.imencode(".jpg", picture.pixels_bgr)[1].tobytes()
-    own = Picture(picture.timestamp_ns, picture.pixels_bgr, jpeg, "image/jpeg")
-    frame = replace(frame, pictures={**frame.pictures, "CAM_FRONT": own})
+    image = frame.images["CAM_FRONT"]
+    jpeg = cv2.imencode(".jpg", image.pixels_bgr)[1].tobytes()
+    own = CameraImage(image.timestamp_ns, image.pixels_bgr, jpeg, "image/jpeg")
+    frame = replace(frame, images={**frame.images, "CAM_FRONT": own})
     with Recording(tmp_path / "r.rrd", rig=drive.rig, class_names=CLASSES, title="", untrained=False) as recording:
         recording.log(frame, predict(frame))
     (read,) = RecordingReader(tmp_path / "r.rrd").frames()
-    assert read.blob(entities.picture("CAM_FRONT"), "EncodedImage:blob") == jpeg
+    assert read.blob(entities.image("CAM_FRONT"), "EncodedImage:blob") == jpeg
 
 
-def test_a_dropped_camera_shows_no_old_picture_and_is_an_event(tmp_path):
-    record(tmp_path / "r.rrd", WithoutPictures({1: ("CAM_BACK",)}, count=3))
+def test_a_dropped_camera_shows_no_old_image_and_is_an_event(tmp_path):
+    record(tmp_path / "r.rrd", WithoutImages({1: ("CAM_BACK",)}, count=3))
     recorded = list(RecordingReader(tmp_path / "r.rrd").frames())
-    shown = [frame.has(entities.picture("CAM_BACK"), "EncodedImage:blob") for frame in recorded]
+    shown = [frame.has(entities.image("CAM_BACK"), "EncodedImage:blob") for frame in recorded]
     assert shown == [True, False, True]
     assert recorded[1].values(entities.EVENTS, "TextLog:text") == ["frame 1: camera CAM_BACK is missing: missing"]
 
@@ -180,14 +180,14 @@ def test_minimal_has_no_insides(tmp_path):
 
 
 def test_a_frame_costs_less_than_its_allowance(standard):
-    """At most 5 % of the pictures' bytes and 400 kB a frame; pictures in memory are encoded, so they count as ours."""
+    """At most 5 % of the images' bytes and 400 kB a frame; images in memory are encoded, so they count as ours."""
     *_, path = standard
-    pictures = sum(
-        len(frame.blob(entities.picture(name), "EncodedImage:blob"))
+    images = sum(
+        len(frame.blob(entities.image(name), "EncodedImage:blob"))
         for frame in RecordingReader(path).frames()
         for name in MemorySequence(1).rig.names
     )
-    assert path.stat().st_size < 1.05 * pictures + 3 * 400_000
+    assert path.stat().st_size < 1.05 * images + 3 * 400_000
 
 
 @pytest.mark.filterwarnings("error")

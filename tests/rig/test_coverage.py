@@ -24,7 +24,7 @@ def test_one_level_camera_sees_its_quadrant(tmp_path):
     grid = BevGrid(rows=40, columns=42)  # no cell lies on the diagonal
     coverage = coverage_of(rig_of(document, tmp_path), grid)
     x, y = np.moveaxis(grid.cell_centers(), -1, 0)
-    far = y > 12  # nearer, the highest and lowest points leave the picture, yet some of each pillar stays in it
+    far = y > 12  # nearer, the highest and lowest points leave the image, yet some of each pillar stays in it
     np.testing.assert_array_equal(coverage.counts[far], (np.abs(x) < y)[far].astype(int))
     assert (coverage.counts[y < 0] == 0).all()
     assert coverage.shares["front"] == coverage.counts.mean() == 1 - coverage.unseen

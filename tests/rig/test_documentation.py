@@ -22,6 +22,6 @@ def test_every_code_is_explained():
     assert in_sources == explained
 
 
-def test_the_pictures_are_there():
-    for picture in re.findall(r"\]\((images/[^)]+)\)", DOCUMENT.read_text()):
-        assert (DOCUMENT.parent / picture).stat().st_size > 10_000
+def test_the_images_are_there():
+    for image in re.findall(r"\]\((images/[^)]+)\)", DOCUMENT.read_text()):
+        assert (DOCUMENT.parent / image).stat().st_size > 10_000

@@ -133,6 +133,6 @@ def test_a_camera_whose_offset_wanders_is_named():
     assert (finding.severity, finding.camera) == ("warning", "back")
 
 
-def test_a_camera_without_any_picture_is_named():
+def test_a_camera_without_any_image_is_named():
     (finding,) = check_camera_times(FRAMES, {"front": FRAMES, "back": [None] * len(FRAMES)})
-    assert (finding.code, finding.camera) == ("camera-without-pictures", "back")
+    assert (finding.code, finding.camera) == ("camera-without-images", "back")

@@ -1,4 +1,4 @@
-"""The command: exit codes, the JSON, the pictures, and what it says of a sequence."""
+"""The command: exit codes, the JSON, the images, and what it says of a sequence."""
 
 import json
 import shutil
@@ -59,8 +59,8 @@ def test_every_healthy_rig_gets_all_files_and_exit_code_0(name, tmp_path):
     result = run(calibration(copy_of(name), tmp_path), "--out", tmp_path / "out")
     assert result.exit_code == 0, result.output
     assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
-    for picture in ("cameras.png", "coverage.png"):
-        assert cv2.imread(str(tmp_path / "out" / picture)).std() > 10
+    for image in ("cameras.png", "coverage.png"):
+        assert cv2.imread(str(tmp_path / "out" / image)).std() > 10
     assert max(map(len, result.stdout.splitlines()[:-1])) <= 110
 
 
@@ -120,7 +120,7 @@ def test_a_drive_sideways_is_found(small_drive, tmp_path):
     assert errors == ["ego-sideways"]
 
 
-def test_a_calibration_with_another_folder_s_pictures(small_drive, tmp_path):
+def test_a_calibration_with_another_folder_s_images(small_drive, tmp_path):
     path = tmp_path / "mine.json"
     shutil.move(small_drive / "calibration.json", path)
     result = run(path, "--sequence", small_drive, "--frame", 2, "--out", tmp_path / "out")
@@ -128,7 +128,7 @@ def test_a_calibration_with_another_folder_s_pictures(small_drive, tmp_path):
     assert "drive: 2 cameras" in result.stdout
 
 
-def test_pictures_of_another_size_are_explained(small_drive, tmp_path):
+def test_images_of_another_size_are_explained(small_drive, tmp_path):
     document = json.loads((small_drive / "calibration.json").read_text())
     for camera in document["cameras"].values():
         camera["width"], camera["height"] = 320, 180
@@ -140,7 +140,7 @@ def test_pictures_of_another_size_are_explained(small_drive, tmp_path):
     assert "160" in error["message"]
 
 
-def test_ego_motion_that_does_not_cover_the_frames_is_explained_and_the_pictures_shown(small_drive, tmp_path):
+def test_ego_motion_that_does_not_cover_the_frames_is_explained_and_the_images_shown(small_drive, tmp_path):
     rows = (small_drive / "ego_motion.csv").read_text().splitlines()
     (small_drive / "ego_motion.csv").write_text("\n".join(rows[:6]))
     result = run(small_drive, "--out", tmp_path / "out", "--json")

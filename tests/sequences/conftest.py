@@ -7,7 +7,7 @@ from pathlib import Path
 
 import cv2
 import pytest
-from small_drive import CAMERAS, SIZE, picture_of
+from small_drive import CAMERAS, SIZE, image_of
 
 FRONT_WXYZ, BACK_WXYZ = [0.5, -0.5, 0.5, -0.5], [0.5, -0.5, -0.5, 0.5]
 
@@ -30,19 +30,19 @@ def _calibration() -> dict:
 def drive(tmp_path: Path) -> Path:
     """Four frames, 2 a second from 1 s on, two cameras, driving straight along x at 10 m/s; the back camera 20 ms late.
 
-    Frame numbers 10 to 13; pictures are PNG.
+    Frame numbers 10 to 13; images are PNG.
     """
     folder = tmp_path / "drive"
     for camera in CAMERAS:
         (folder / "images" / camera).mkdir(parents=True)
         for number in range(4):
-            cv2.imwrite(str(folder / "images" / camera / f"{number}.png"), picture_of(camera, number))
+            cv2.imwrite(str(folder / "images" / camera / f"{number}.png"), image_of(camera, number))
     (folder / "calibration.json").write_text(json.dumps(_calibration()))
     rows = ["frame,timestamp_ns,CAM_FRONT,CAM_BACK,CAM_BACK.timestamp_ns"]
     for number in range(4):
         time = 1_000_000_000 + number * 500_000_000
-        pictures = f"images/CAM_FRONT/{number}.png,images/CAM_BACK/{number}.png"
-        rows.append(f"{10 + number},{time},{pictures},{time + 20_000_000}")
+        images = f"images/CAM_FRONT/{number}.png,images/CAM_BACK/{number}.png"
+        rows.append(f"{10 + number},{time},{images},{time + 20_000_000}")
     (folder / "frames.csv").write_text("\n".join(rows) + "\n")
     motion = ["timestamp_ns,x,y,z,qw,qx,qy,qz"]
     motion += [f"{time},{time / 1e8},0,0,1,0,0,0" for time in range(900_000_000, 2_700_000_000, 100_000_000)]

@@ -46,7 +46,7 @@ def test_missing_ego_motion_says_what_to_do(drive):
     assert "--no-temporal" in message(drive)
 
 
-def test_neither_table_nor_pictures(drive):
+def test_neither_table_nor_images(drive):
     (drive / "frames.csv").unlink()
     shutil.rmtree(drive / "images")
     line = message(drive)
@@ -125,7 +125,7 @@ def test_a_column_without_a_camera(drive):
     assert 'unknown column "CAM_BACK"' in message(drive)
 
 
-def test_a_picture_of_another_size(drive):
+def test_an_image_of_another_size(drive):
     cv2.imwrite(str(drive / "images/CAM_BACK/2.png"), np.zeros((30, 64, 3), np.uint8))
     line = message(drive, place=2)
     assert "CAM_BACK/2.png" in line
@@ -133,8 +133,8 @@ def test_a_picture_of_another_size(drive):
     assert "64x36" in line
 
 
-@pytest.mark.parametrize("content", [None, b"no picture"], ids=["missing", "unreadable"])
-def test_strict_makes_a_bad_picture_an_error(drive, content):
+@pytest.mark.parametrize("content", [None, b"no image"], ids=["missing", "unreadable"])
+def test_strict_makes_a_bad_image_an_error(drive, content):
     path = drive / "images/CAM_BACK/1.png"
     path.unlink() if content is None else path.write_bytes(content)
     line = message(drive, InputOptions(strict=True), place=1)

@@ -6,7 +6,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from small_drive import CAMERAS, picture_of
+from small_drive import CAMERAS, image_of
 from typer.testing import CliRunner
 
 from bevcli.cli.main import app
@@ -28,11 +28,11 @@ def test_a_gap_and_the_order_of_cameras_are_kept(edit, tmp_path):
     assert one.stamps == other.stamps
     for place in range(4):
         a, b = one.load(place), other.load(place)
-        assert list(a.pictures) == list(b.pictures)
+        assert list(a.images) == list(b.images)
         assert a.dropped == b.dropped
         assert a.rig.names == b.rig.names
-        for camera, picture in a.pictures.items():
-            assert picture.encoded == b.pictures[camera].encoded
+        for camera, image in a.images.items():
+            assert image.encoded == b.images[camera].encoded
             np.testing.assert_allclose(
                 a.world_from_ego_at[camera].matrix, b.world_from_ego_at[camera].matrix, atol=1e-9
             )
@@ -56,14 +56,14 @@ def test_a_drive_without_ego_motion_stays_without(drive, tmp_path):
         open_sequence(tmp_path / "out")
 
 
-def test_pictures_of_a_video_become_png(drive, edit, tmp_path):
+def test_images_of_a_video_become_png(drive, edit, tmp_path):
     writer = cv2.VideoWriter(str(drive / "v.mkv"), cv2.VideoWriter_fourcc(*"FFV1"), 2, (64, 36))
-    writer.write(picture_of("CAM_BACK", 9))
+    writer.write(image_of("CAM_BACK", 9))
     writer.release()
     edit("frames.csv", "images/CAM_BACK/2.png", "v.mkv#0")
     convert(drive, tmp_path / "out")
     written = tmp_path / "out" / "images" / "CAM_BACK" / "000012.png"
-    np.testing.assert_array_equal(cv2.imread(str(written)), picture_of("CAM_BACK", 9))
+    np.testing.assert_array_equal(cv2.imread(str(written)), image_of("CAM_BACK", 9))
 
 
 def test_an_existing_folder_is_replaced_only_by_force(drive, tmp_path):
@@ -83,7 +83,7 @@ def test_an_existing_folder_is_replaced_only_by_force(drive, tmp_path):
 def test_the_input_is_never_overwritten(drive, target):
     answer = convert(drive, drive.parent / target, "--force")
     assert isinstance(answer.exception, OutputError)
-    assert open_sequence(drive).load(3).pictures
+    assert open_sequence(drive).load(3).images
 
 
 def write_native(folder, frames):

@@ -1,4 +1,4 @@
-"""A native folder becomes frames: times, poses and pictures as written."""
+"""A native folder becomes frames: times, poses and images as written."""
 
 import cv2
 import numpy as np
@@ -26,14 +26,14 @@ def test_poses_are_those_at_the_frame_and_at_each_camera(drive):
     np.testing.assert_allclose(frame.kinematics.acceleration, [0, 0, 9.81], atol=1e-6)
 
 
-def test_pictures_are_the_files(drive):
+def test_images_are_the_files(drive):
     frame = open_sequence(drive).load(2)
-    for camera, picture in frame.pictures.items():
+    for camera, image in frame.images.items():
         path = drive / "images" / camera / "2.png"
-        np.testing.assert_array_equal(picture.pixels_bgr, cv2.imread(str(path)))
-        assert picture.encoded == path.read_bytes()
-        assert picture.media_type == "image/png"
-    assert frame.pictures["CAM_BACK"].timestamp_ns == 2_020_000_000
+        np.testing.assert_array_equal(image.pixels_bgr, cv2.imread(str(path)))
+        assert image.encoded == path.read_bytes()
+        assert image.media_type == "image/png"
+    assert frame.images["CAM_BACK"].timestamp_ns == 2_020_000_000
 
 
 def test_times_beyond_the_precision_of_floats_are_kept(edit):
@@ -45,22 +45,22 @@ def test_times_beyond_the_precision_of_floats_are_kept(edit):
     (drive / "frames.csv").write_text(text)
     sequence = open_sequence(drive)
     assert sequence.stamps[3].timestamp_ns == 2**60 + 1
-    assert sequence.load(3).pictures["CAM_BACK"].timestamp_ns == 2**60 + 2
+    assert sequence.load(3).images["CAM_BACK"].timestamp_ns == 2**60 + 2
 
 
-def test_an_empty_cell_is_a_dropped_picture(edit):
+def test_an_empty_cell_is_a_dropped_image(edit):
     frame = open_sequence(edit("frames.csv", "images/CAM_BACK/1.png", "")).load(1)
-    assert list(frame.pictures) == ["CAM_FRONT"]
-    assert frame.dropped == {"CAM_BACK": "no picture in frames.csv"}
+    assert list(frame.images) == ["CAM_FRONT"]
+    assert frame.dropped == {"CAM_BACK": "no image in frames.csv"}
     assert set(frame.world_from_ego_at) == {"CAM_FRONT", "CAM_BACK"}
 
 
 @pytest.mark.parametrize("keep", [0, 40, -20], ids=["empty", "header", "cut short"])
-def test_a_broken_picture_is_dropped_with_its_name(drive, keep):
+def test_a_broken_image_is_dropped_with_its_name(drive, keep):
     path = drive / "images/CAM_BACK/1.png"
     path.write_bytes(path.read_bytes()[:keep])
     frame = open_sequence(drive).load(1)
-    assert list(frame.pictures) == ["CAM_FRONT"]
+    assert list(frame.images) == ["CAM_FRONT"]
     assert str(path) in frame.dropped["CAM_BACK"]
 
 
@@ -70,9 +70,9 @@ def test_a_jpeg_cut_short_is_dropped(drive, edit):
     path = drive / "images/CAM_BACK/1.jpg"
     path.write_bytes(encoded)
     edit("frames.csv", "CAM_BACK/1.png", "CAM_BACK/1.jpg")
-    assert open_sequence(drive).load(1).pictures["CAM_BACK"].encoded == encoded
+    assert open_sequence(drive).load(1).images["CAM_BACK"].encoded == encoded
     path.write_bytes(encoded[: len(encoded) // 2])
-    assert "not a whole picture" in open_sequence(drive).load(1).dropped["CAM_BACK"]
+    assert "not a whole image" in open_sequence(drive).load(1).dropped["CAM_BACK"]
 
 
 def test_without_ego_motion_every_pose_is_the_identity(drive):
@@ -100,9 +100,9 @@ def test_one_scene_can_be_picked(drive):
     assert sequence.load(0).stamp.index == 12
 
 
-def test_pictures_named_by_their_time_need_no_table(drive):
+def test_images_named_by_their_time_need_no_table(drive):
     table = open_sequence(drive)
-    last = table.load(3).pictures["CAM_BACK"].pixels_bgr
+    last = table.load(3).images["CAM_BACK"].pixels_bgr
     for camera in ("CAM_FRONT", "CAM_BACK"):
         for number, stamp in enumerate(table.stamps):
             path = drive / "images" / camera / f"{number}.png"
@@ -111,10 +111,10 @@ def test_pictures_named_by_their_time_need_no_table(drive):
     sequence = open_sequence(drive, InputOptions(ego_motion="static"))
     assert [stamp.timestamp_ns for stamp in sequence.stamps] == [s.timestamp_ns * 10**5 for s in table.stamps]
     assert [stamp.index for stamp in sequence.stamps] == [0, 1, 2, 3]
-    np.testing.assert_array_equal(sequence.load(3).pictures["CAM_BACK"].pixels_bgr, last)
+    np.testing.assert_array_equal(sequence.load(3).images["CAM_BACK"].pixels_bgr, last)
 
 
-def test_numbered_pictures_take_their_times_from_timing_toml(drive):
+def test_numbered_images_take_their_times_from_timing_toml(drive):
     table = open_sequence(drive)
     (drive / "frames.csv").unlink()
     (drive / "timing.toml").write_text("start_ns = 1000000000\nrate_hz = 2\n[cameras.CAM_BACK]\noffset_ns = 20000000\n")
@@ -122,9 +122,9 @@ def test_numbered_pictures_take_their_times_from_timing_toml(drive):
     for place in range(4):
         mine, stated = sequence.load(place), table.load(place)
         assert mine.stamp.timestamp_ns == stated.stamp.timestamp_ns
-        for camera, picture in stated.pictures.items():
-            assert mine.pictures[camera].timestamp_ns == picture.timestamp_ns
-            np.testing.assert_array_equal(mine.pictures[camera].pixels_bgr, picture.pixels_bgr)
+        for camera, image in stated.images.items():
+            assert mine.images[camera].timestamp_ns == image.timestamp_ns
+            np.testing.assert_array_equal(mine.images[camera].pixels_bgr, image.pixels_bgr)
 
 
 def test_a_missing_number_leaves_a_gap_in_time(drive):
@@ -154,13 +154,13 @@ def test_the_real_drive_is_read_whole(real_drive):
     sequence = open_sequence(real_drive)
     assert len(sequence.stamps) == 4
     frame = sequence.load(0)
-    assert len(frame.pictures) == 6
+    assert len(frame.images) == 6
     assert not frame.dropped
     assert frame.world_from_ego.quaternion[0] < 0  # as stored, its sign kept
-    for camera, picture in frame.pictures.items():
+    for camera, image in frame.images.items():
         path = real_drive / "images" / camera / "000000.jpg"
-        np.testing.assert_array_equal(picture.pixels_bgr, cv2.imread(str(path)))
-        assert picture.encoded == path.read_bytes()
+        np.testing.assert_array_equal(image.pixels_bgr, cv2.imread(str(path)))
+        assert image.encoded == path.read_bytes()
 
 
 def test_an_exif_orientation_does_not_turn_the_pixels(drive, edit):
@@ -171,7 +171,7 @@ def test_an_exif_orientation_does_not_turn_the_pixels(drive, edit):
     turned = encoded[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + encoded[2:]
     (drive / "images/CAM_BACK/1.jpg").write_bytes(turned)
     edit("frames.csv", "CAM_BACK/1.png", "CAM_BACK/1.jpg")
-    assert open_sequence(drive).load(1).pictures["CAM_BACK"].pixels_bgr.shape == (36, 64, 3)
+    assert open_sequence(drive).load(1).images["CAM_BACK"].pixels_bgr.shape == (36, 64, 3)
     assert cv2.imdecode(np.frombuffer(turned, np.uint8), cv2.IMREAD_COLOR).shape == (64, 36, 3)
 
 

@@ -1,4 +1,4 @@
-"""nuScenes tables with known contents, of any size: poses, pictures, annotations, splits, the cached index."""
+"""nuScenes tables with known contents, of any size: poses, images, annotations, splits, the cached index."""
 
 import json
 import os
@@ -13,8 +13,8 @@ from bevcli.errors import InputError
 from bevcli.sequences.nuscenes.build import build_index
 from bevcli.sequences.nuscenes.can_bus import read_can_bus
 from bevcli.sequences.nuscenes.scenes import NuScenesChoice, NuScenesSequence
-from bevcli.sequences.nuscenes.scenes import cache as nuscenes_cache
-from bevcli.sequences.nuscenes.scenes import json_tables as nuscenes_json
+from bevcli.sequences.nuscenes import cache as nuscenes_cache
+from bevcli.sequences.nuscenes import json_tables as nuscenes_json
 from bevcli.sequences.nuscenes.splits import MINI_TRAIN, MINI_VAL, TEST, VAL, numbers, split_of
 
 SMALL = Size(scenes=3, samples=4, objects=8)
@@ -41,11 +41,11 @@ def test_keyframes_of_all_scenes_in_order(root):
     ]
 
 
-def test_poses_are_those_of_the_lidar_and_of_each_picture(root):
+def test_poses_are_those_of_the_lidar_and_of_each_image(root):
     frame = NuScenesSequence(root).load(6)
     assert frame.world_from_ego.translation[0] == ego_x(1, sample_time(1, 2))
     assert frame.rig.names == CAMERAS
-    # The pictures' files are not there; each camera has its own time between 10 and 40 ms before, on a 5 m/s drive.
+    # The images' files are not there; each camera has its own time between 10 and 40 ms before, on a 5 m/s drive.
     assert set(frame.dropped) == set(CAMERAS)
     lags = [frame.world_from_ego.translation[0] - frame.world_from_ego_at[name].translation[0] for name in CAMERAS]
     np.testing.assert_allclose(lags, [0.05, 0.08, 0.11, 0.14, 0.17, 0.2], atol=1e-9)
@@ -99,8 +99,8 @@ def test_the_order_of_rows_does_not_matter(root, tmp_path):
         edit_table(root, name, lambda rows: rows[::-1])
     turned = build_index(root / "v1.0-trainval")
     assert plain.samples.tokens.tolist() == turned.samples.tokens.tolist()
-    assert plain.pictures.files.tolist() == turned.pictures.files.tolist()
-    np.testing.assert_array_equal(plain.pictures.translations, turned.pictures.translations)
+    assert plain.images.files.tolist() == turned.images.files.tolist()
+    np.testing.assert_array_equal(plain.images.translations, turned.images.translations)
 
 
 def test_tables_read_in_batches_are_the_tables(root, monkeypatch):
@@ -121,8 +121,8 @@ def test_can_bus_is_the_first_message_after_the_time(tmp_path):
     assert read_can_bus(tmp_path, "scene-0002") is None
 
 
-def test_sweeps_are_the_front_pictures_between(root):
-    """Six front pictures a keyframe, so twelve frames a second; keyframes keep their samples and times."""
+def test_sweeps_are_the_front_images_between(root):
+    """Six front images a keyframe, so twelve frames a second; keyframes keep their samples and times."""
     keyframes, sweeps = NuScenesSequence(root), NuScenesSequence(root, NuScenesChoice(sweeps=True))
     times = np.array([stamp.timestamp_ns for stamp in sweeps.stamps if stamp.scene == scene_name(1)])
     assert len(times) == 4 * 6
@@ -226,7 +226,7 @@ def test_the_cached_index_is_the_index(cached, monkeypatch):
     monkeypatch.delattr(nuscenes_cache, "build_index")  # the second time reads no table
     second, note = nuscenes_cache.open_index(cached / "v1.0-trainval")
     assert note == ""
-    for part in ("scenes", "sensors", "samples", "pictures", "annotations"):
+    for part in ("scenes", "sensors", "samples", "images", "annotations"):
         for name, values in vars(getattr(first, part)).items():
             np.testing.assert_array_equal(values, getattr(getattr(second, part), name))
 

@@ -3,33 +3,33 @@
 import cv2
 import numpy as np
 import pytest
-from small_drive import CAMERAS, SIZE, picture_of
+from small_drive import CAMERAS, SIZE, image_of
 
 from bevcli.errors import InputError
 from bevcli.sequences.open import InputOptions, open_sequence
 from bevcli.sequences.video import VideoReader
 
 
-def write_video(path, pictures, rate, codec="FFV1"):
+def write_video(path, images, rate, codec="FFV1"):
     path.parent.mkdir(exist_ok=True)
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), rate, SIZE)
     assert writer.isOpened()
-    for picture in pictures:
-        writer.write(picture)
+    for image in images:
+        writer.write(image)
     writer.release()
 
 
 @pytest.fixture
 def videos(drive):
-    """The small drive without frames.csv and pictures, front at 10 Hz and back at 5 Hz, ten and five pictures."""
+    """The small drive without frames.csv and images, front at 10 Hz and back at 5 Hz, ten and five images."""
     (drive / "frames.csv").unlink()
     for path in (drive / "images").rglob("*.png"):
         path.unlink()
     for camera in CAMERAS:
         (drive / "images" / camera).rmdir()
     (drive / "images").rmdir()
-    write_video(drive / "videos/CAM_FRONT.mkv", [picture_of("CAM_FRONT", n) for n in range(10)], 10)
-    write_video(drive / "videos/CAM_BACK.avi", [picture_of("CAM_BACK", n) for n in range(5)], 5)
+    write_video(drive / "videos/CAM_FRONT.mkv", [image_of("CAM_FRONT", n) for n in range(10)], 10)
+    write_video(drive / "videos/CAM_BACK.avi", [image_of("CAM_BACK", n) for n in range(5)], 5)
     return drive
 
 
@@ -37,61 +37,61 @@ STANDING = InputOptions(ego_motion="static")
 
 
 @pytest.mark.parametrize("suffix", ["mkv", "avi"])
-def test_pictures_come_by_number_in_any_order(tmp_path, suffix):
-    pictures = [picture_of("CAM_FRONT", number) for number in range(8)]
-    write_video(tmp_path / f"v.{suffix}", pictures, 10)
+def test_images_come_by_number_in_any_order(tmp_path, suffix):
+    images = [image_of("CAM_FRONT", number) for number in range(8)]
+    write_video(tmp_path / f"v.{suffix}", images, 10)
     reader = VideoReader(tmp_path / f"v.{suffix}")
     for number in (0, 1, 1, 4, 7, 2, 2, 3):
-        np.testing.assert_array_equal(reader.read(number), pictures[number])
+        np.testing.assert_array_equal(reader.read(number), images[number])
 
 
 def test_a_number_beyond_the_end_is_refused_again_and_again(tmp_path):
-    write_video(tmp_path / "v.mkv", [picture_of("CAM_FRONT", number) for number in range(3)], 10)
+    write_video(tmp_path / "v.mkv", [image_of("CAM_FRONT", number) for number in range(3)], 10)
     reader = VideoReader(tmp_path / "v.mkv")
     for _ in range(2):
-        with pytest.raises(InputError, match=r"no picture 3 \(the last one is 2\)"):
+        with pytest.raises(InputError, match=r"no image 3 \(the last one is 2\)"):
             reader.read(3)
-    np.testing.assert_array_equal(reader.read(2), picture_of("CAM_FRONT", 2))
+    np.testing.assert_array_equal(reader.read(2), image_of("CAM_FRONT", 2))
 
 
-def test_cells_of_frames_csv_name_pictures_of_a_video(drive, edit):
-    write_video(drive / "videos/BACK.mkv", [picture_of("CAM_BACK", n) for n in range(9)], 10)
+def test_cells_of_frames_csv_name_images_of_a_video(drive, edit):
+    write_video(drive / "videos/BACK.mkv", [image_of("CAM_BACK", n) for n in range(9)], 10)
     edit("frames.csv", "images/CAM_BACK/0.png", "videos/BACK.mkv#8")
     edit("frames.csv", "images/CAM_BACK/1.png", "videos/BACK.mkv#0")
     edit("frames.csv", "images/CAM_BACK/2.png", "videos/BACK.mkv#9")
     sequence = open_sequence(drive)
-    np.testing.assert_array_equal(sequence.load(0).pictures["CAM_BACK"].pixels_bgr, picture_of("CAM_BACK", 8))
-    np.testing.assert_array_equal(sequence.load(1).pictures["CAM_BACK"].pixels_bgr, picture_of("CAM_BACK", 0))
-    assert "no picture 9" in sequence.load(2).dropped["CAM_BACK"]
+    np.testing.assert_array_equal(sequence.load(0).images["CAM_BACK"].pixels_bgr, image_of("CAM_BACK", 8))
+    np.testing.assert_array_equal(sequence.load(1).images["CAM_BACK"].pixels_bgr, image_of("CAM_BACK", 0))
+    assert "no image 9" in sequence.load(2).dropped["CAM_BACK"]
 
 
 def test_whole_videos_are_aligned_by_time(videos):
-    """A frame for each picture of the slower camera; the faster one's nearest is twice its number."""
+    """A frame for each image of the slower camera; the faster one's nearest is twice its number."""
     sequence = open_sequence(videos, STANDING)
     assert [stamp.timestamp_ns for stamp in sequence.stamps] == [n * 200_000_000 for n in range(5)]
     for place in range(5):
         frame = sequence.load(place)
-        np.testing.assert_array_equal(frame.pictures["CAM_BACK"].pixels_bgr, picture_of("CAM_BACK", place))
-        np.testing.assert_array_equal(frame.pictures["CAM_FRONT"].pixels_bgr, picture_of("CAM_FRONT", 2 * place))
-        assert frame.pictures["CAM_FRONT"].encoded is None
+        np.testing.assert_array_equal(frame.images["CAM_BACK"].pixels_bgr, image_of("CAM_BACK", place))
+        np.testing.assert_array_equal(frame.images["CAM_FRONT"].pixels_bgr, image_of("CAM_FRONT", 2 * place))
+        assert frame.images["CAM_FRONT"].encoded is None
 
 
 def test_offsets_and_rates_come_from_timing_toml(videos):
-    """The front camera starts 0.31 s late: its picture n is at 0.31 + n / 10 s; the back one's at n / 4 s."""
+    """The front camera starts 0.31 s late: its image n is at 0.31 + n / 10 s; the back one's at n / 4 s."""
     (videos / "timing.toml").write_text(
         "start_ns = 5000000000\n[cameras.CAM_FRONT]\noffset_ns = 310000000\n[cameras.CAM_BACK]\nrate_hz = 4\n"
     )
     sequence = open_sequence(videos, STANDING)
     assert [stamp.timestamp_ns for stamp in sequence.stamps] == [5_000_000_000 + n * 250_000_000 for n in range(5)]
     assert "CAM_FRONT" in sequence.load(0).dropped
-    assert "CAM_FRONT" in sequence.load(1).dropped  # 0.25 s is 60 ms before its first picture
+    assert "CAM_FRONT" in sequence.load(1).dropped  # 0.25 s is 60 ms before its first image
     for place, number in ((2, 2), (3, 4), (4, 7)):
-        picture = sequence.load(place).pictures["CAM_FRONT"]
-        assert picture.timestamp_ns == 5_310_000_000 + number * 100_000_000
-        np.testing.assert_array_equal(picture.pixels_bgr, picture_of("CAM_FRONT", number))
+        image = sequence.load(place).images["CAM_FRONT"]
+        assert image.timestamp_ns == 5_310_000_000 + number * 100_000_000
+        np.testing.assert_array_equal(image.pixels_bgr, image_of("CAM_FRONT", number))
 
 
-def test_poses_are_taken_at_the_pictures_own_times(videos):
+def test_poses_are_taken_at_the_images_own_times(videos):
     """The drive's ego-motion is at time / 0.1 s metres, from 0.9 s on."""
     (videos / "timing.toml").write_text("start_ns = 1000000000\n[cameras.CAM_FRONT]\noffset_ns = 30000000\n")
     frame = open_sequence(videos).load(2)
@@ -119,5 +119,5 @@ def test_a_file_that_is_no_video(videos):
 
 def test_motion_jpeg_is_read(videos):
     (videos / "videos/CAM_BACK.avi").unlink()
-    write_video(videos / "videos/CAM_BACK.avi", [picture_of("CAM_BACK", n) for n in range(5)], 5, "MJPG")
-    assert open_sequence(videos, STANDING).load(4).pictures["CAM_BACK"].pixels_bgr.shape == (36, 64, 3)
+    write_video(videos / "videos/CAM_BACK.avi", [image_of("CAM_BACK", n) for n in range(5)], 5, "MJPG")
+    assert open_sequence(videos, STANDING).load(4).images["CAM_BACK"].pixels_bgr.shape == (36, 64, 3)

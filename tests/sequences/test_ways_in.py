@@ -31,9 +31,9 @@ def assert_same_frames(one, other, *, same_bytes: bool) -> None:
         np.testing.assert_allclose(a.world_from_ego.quaternion, b.world_from_ego.quaternion, atol=1e-6)
         for name in a.rig.names:
             np.testing.assert_allclose(a.world_from_ego_at[name].matrix, b.world_from_ego_at[name].matrix, atol=1e-9)
-            assert a.pictures[name].timestamp_ns == b.pictures[name].timestamp_ns
-            np.testing.assert_array_equal(a.pictures[name].pixels_bgr, b.pictures[name].pixels_bgr)
-            assert not same_bytes or a.pictures[name].encoded == b.pictures[name].encoded
+            assert a.images[name].timestamp_ns == b.images[name].timestamp_ns
+            np.testing.assert_array_equal(a.images[name].pixels_bgr, b.images[name].pixels_bgr)
+            assert not same_bytes or a.images[name].encoded == b.images[name].encoded
         for quantity in ("acceleration", "angular_rate", "velocity"):
             np.testing.assert_allclose(getattr(a.kinematics, quantity), getattr(b.kinematics, quantity), atol=1e-12)
         np.testing.assert_allclose(a.ground_truth.centers, b.ground_truth.centers, atol=1e-9)
@@ -42,7 +42,7 @@ def assert_same_frames(one, other, *, same_bytes: bool) -> None:
         assert a.ground_truth.classes.tolist() == b.ground_truth.classes.tolist()
 
 
-def copy_without_pictures(source: Path, target: Path) -> None:
+def copy_without_images(source: Path, target: Path) -> None:
     target.mkdir()
     for name in ("calibration.json", "ego_motion.csv", "frames.csv", "ground_truth.json"):
         (target / name).write_bytes((source / name).read_bytes())
@@ -53,8 +53,8 @@ def write_videos(source: Path, target: Path, suffix: str) -> None:
     for folder in (source / "images").iterdir():
         path = target / "videos" / f"{folder.name}{suffix}"
         writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"FFV1"), 2, (1600, 900))
-        for picture in sorted(folder.iterdir()):
-            writer.write(cv2.imread(str(picture)))
+        for image in sorted(folder.iterdir()):
+            writer.write(cv2.imread(str(image)))
         writer.release()
 
 
@@ -72,7 +72,7 @@ def test_samples_of_a_root_have_their_tokens(nuscenes_root):
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".mkv", ".avi"])
 def test_six_lossless_videos(real_drive, tmp_path, suffix):
-    copy_without_pictures(real_drive, tmp_path / "videos_in")
+    copy_without_images(real_drive, tmp_path / "videos_in")
     write_videos(real_drive, tmp_path / "videos_in", suffix)
     table = (real_drive / "frames.csv").read_text()
     for number in range(4):

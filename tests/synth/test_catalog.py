@@ -58,7 +58,7 @@ def test_meshes_have_no_holes_and_no_face_turned_inwards(stock: Stock, name: str
 
 
 def _silhouettes(faces, view, size=400):
-    """(size, size) bool pictures along -view: of all faces, and of those that look towards the viewer."""
+    """(size, size) bool images along -view: of all faces, and of those that look towards the viewer."""
     view = view / np.linalg.norm(view)
     right = np.cross((0, 0, 1), view) / np.linalg.norm(np.cross((0, 0, 1), view))
     axes = np.stack([right, np.cross(view, right)], -1)
@@ -66,11 +66,11 @@ def _silhouettes(faces, view, size=400):
     x, y = flat[..., 0], flat[..., 1]
     area = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (x[:, 2] - x[:, 0]) * (y[:, 1] - y[:, 0])
     pixels = np.round((flat - flat.min((0, 1))) * size * 0.55 * 16).astype(np.int32)
-    pictures = [np.zeros((size, size), np.uint8) for _ in range(2)]
+    images = [np.zeros((size, size), np.uint8) for _ in range(2)]
     for corners, turned in zip(pixels, area, strict=True):
-        for picture in pictures if turned > 0 else pictures[:1]:
-            cv2.fillConvexPoly(picture, corners, 1, cv2.LINE_8, 4)
-    return pictures[0] > 0, cv2.dilate(pictures[1], np.ones((3, 3), np.uint8)) > 0
+        for image in images if turned > 0 else images[:1]:
+            cv2.fillConvexPoly(image, corners, 1, cv2.LINE_8, 4)
+    return images[0] > 0, cv2.dilate(images[1], np.ones((3, 3), np.uint8)) > 0
 
 
 def test_white_stays_white_and_black_black():

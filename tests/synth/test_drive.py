@@ -1,4 +1,4 @@
-"""A drive's ground truth: what is said of an object is what the pictures show and what happens over time."""
+"""A drive's ground truth: what is said of an object is what the images show and what happens over time."""
 
 from dataclasses import replace
 
@@ -18,15 +18,15 @@ def test_same_seed_gives_the_same_bytes(drive: Drive, frame: RenderedFrame, stoc
     again = Drive(113, frames=20, rig=drive.rig, stock=stock, weather="noon", threads=2)
     again.frame(2)
     other = again.frame(9)
-    for name, picture in frame.pictures.items():
-        assert picture.tobytes() == other.pictures[name].tobytes()
+    for name, image in frame.images.items():
+        assert image.tobytes() == other.images[name].tobytes()
     assert frame.boxes.centers.tobytes() == other.boxes.centers.tobytes()
     assert frame.bev_map.cells.tobytes() == other.bev_map.cells.tobytes()
 
 
 def test_another_seed_is_another_drive(frame: RenderedFrame, stock: Stock):
     other = Drive(114, rig=nuscenes_like_rig(320, 180), stock=stock, weather="noon").frame(9)
-    difference = np.abs(other.pictures["CAM_FRONT"].astype(int) - frame.pictures["CAM_FRONT"])
+    difference = np.abs(other.images["CAM_FRONT"].astype(int) - frame.images["CAM_FRONT"])
     assert difference.mean() > 10
 
 
@@ -59,7 +59,7 @@ def test_projected_box_contains_the_objects_pixels(drive: Drive, frame: Rendered
 
 
 def test_visibility_agrees_with_rendering_each_object_alone(drive: Drive, frame: RenderedFrame):
-    """Another way to count: a scene with nothing but the object, and the difference of two pictures."""
+    """Another way to count: a scene with nothing but the object, and the difference of two images."""
     states = drive.states(9)
     rows = {instance: k for k, instance in enumerate(frame.boxes.instances)}
     checked = 0
@@ -178,7 +178,7 @@ def test_supersampling_changes_counts_little(drive: Drive, frame: RenderedFrame,
     np.testing.assert_allclose(fine.boxes.num_points[large], frame.boxes.num_points[large], rtol=0.12)
 
 
-def test_a_lens_bends_the_picture_as_its_camera_says(drive: Drive, frame: RenderedFrame, stock: Stock):
+def test_a_lens_bends_the_image_as_its_camera_says(drive: Drive, frame: RenderedFrame, stock: Stock):
     """Through a lens with distortion, an object's box still contains its pixels."""
     from bevcli.geometry.cameras import CameraRig, Distortion
 

@@ -30,8 +30,8 @@ def test_the_reader_gives_back_what_was_rendered(written: tuple[Drive, Path]):
     assert [stamp.index for stamp in sequence.stamps] == [0, 1]
     read, rendered = sequence.load(1), drive.frame(1)
     assert read.stamp.timestamp_ns == rendered.stamp.timestamp_ns
-    for name, picture in rendered.pictures.items():
-        assert np.abs(read.pictures[name].pixels_bgr.astype(int) - picture).mean() < 4  # JPEG
+    for name, image in rendered.images.items():
+        assert np.abs(read.images[name].pixels_bgr.astype(int) - image).mean() < 4  # JPEG
     assert read.ground_truth is not None
     assert read.ground_truth_map is not None
     np.testing.assert_allclose(read.ground_truth.centers, rendered.boxes.centers, atol=1e-4)
@@ -69,7 +69,7 @@ def test_the_command_renders_any_rig_at_any_size(tmp_path: Path):
     assert result.exit_code == 0, result.output
     frame = open_sequence(tmp_path / "out").load(0)
     assert frame.rig.names == ("CAM_FRONT", "CAM_FRONT_RIGHT")
-    assert frame.pictures["CAM_FRONT"].pixels_bgr.shape == (54, 96, 3)
+    assert frame.images["CAM_FRONT"].pixels_bgr.shape == (54, 96, 3)
     np.testing.assert_allclose(frame.rig["CAM_FRONT"].intrinsics[0, 0], 1266 * 96 / 1600)
 
 

@@ -1,4 +1,4 @@
-"""Drives of two cameras in memory, in whose pictures boxes stand as coloured shapes on grey ground."""
+"""Drives of two cameras in memory, in whose images boxes stand as coloured shapes on grey ground."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from memory_drive import make_rig
 
-from bevcli.frame import BevMap, Frame, FrameStamp, Picture
+from bevcli.frame import BevMap, CameraImage, Frame, FrameStamp
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera
@@ -60,12 +60,12 @@ class PaintedDrive:
         """The frame; nothing but the ego vehicle moves, 1 m ahead."""
         pose = Pose(np.array([float(place - 1), 0, 0]), np.array([1.0, 0, 0, 0]))
         stamp = self.stamps[place]
-        pictures = {c.name: Picture(stamp.timestamp_ns, self._picture(c, pose)) for c in RIG.cameras}
+        images = {c.name: CameraImage(stamp.timestamp_ns, self._image(c, pose)) for c in RIG.cameras}
         still = Kinematics(np.array([0, 0, GRAVITY]), np.zeros(3), np.array([2.0, 0, 0]))
-        frame = Frame(stamp, RIG, pictures, pose, dict.fromkeys(RIG.names, pose), still)
+        frame = Frame(stamp, RIG, images, pose, dict.fromkeys(RIG.names, pose), still)
         return replace(frame, ground_truth=self._boxes, ground_truth_map=_map()) if place or self._told else frame
 
-    def _picture(self, camera: Camera, pose: Pose) -> np.ndarray:
+    def _image(self, camera: Camera, pose: Pose) -> np.ndarray:
         pixels = np.full((camera.height, camera.width, 3), 120, dtype=np.uint8)
         pixels[: camera.height // 2] = 200
         camera_from_world = camera.camera_from_ego @ inverse(pose.matrix)

@@ -1,4 +1,4 @@
-"""Which frames make a clip, and what may change in its pictures."""
+"""Which frames make a clip, and what may change in its images."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from memory_drive import MemorySequence
 
 from bevcli.errors import InputError
-from bevcli.training.augmentation import distort, distort_pictures, mask_pictures
+from bevcli.training.augmentation import distort, distort_images, mask_images
 from bevcli.training.clips import ClipConfig, draw_clips, draw_places
 
 
@@ -68,11 +68,11 @@ def test_the_clips_of_a_batch_are_of_one_length_and_some_batches_are_short() -> 
     assert lengths[3] / 300 == pytest.approx(0.7, abs=0.1)
 
 
-def test_pictures_are_left_alone_where_nothing_is_asked_for() -> None:
+def test_images_are_left_alone_where_nothing_is_asked_for() -> None:
     frame, random = MemorySequence(1).load(0), np.random.default_rng(0)
-    assert distort_pictures(frame, 0.0, random) is frame
+    assert distort_images(frame, 0.0, random) is frame
     images = torch.ones(1, 2, 3, 8, 8)
-    mask_pictures(images, 0.0, random)
+    mask_images(images, 0.0, random)
     assert (images == 1).all()
 
 
@@ -86,7 +86,7 @@ def test_distortion_changes_light_and_colour_and_repeats_with_its_seed() -> None
 
 def test_half_of_the_rows_and_columns_of_the_grid_mask_cross() -> None:
     images = torch.ones(2, 6, 3, 64, 64)
-    mask_pictures(images, 1.0, np.random.default_rng(0))
+    mask_images(images, 1.0, np.random.default_rng(0))
     covered = (images == 0).float().mean((-1, -2, -3))
     assert ((covered > 0.05) & (covered < 0.6)).all()
     assert covered.mean().item() == pytest.approx(0.25, abs=0.1)

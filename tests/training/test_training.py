@@ -19,7 +19,7 @@ from bevcli.training.checkpoint import save_checkpoint
 from bevcli.training.clips import ClipConfig
 from bevcli.training.dense_loss import DenseLossConfig
 from bevcli.training.drives import RenderedDrives
-from bevcli.training.image_loss import PictureLossConfig
+from bevcli.training.image_loss import ImageLossConfig
 from bevcli.training.optimizer import OptimizerConfig, make_optimizer, set_rate
 from bevcli.training.trainer import Trainer, TrainingConfig, TrainingJob, _in_turn
 
@@ -93,10 +93,10 @@ def test_batches_in_turn_give_a_frame_each_after_another() -> None:
 
 
 def test_all_that_helps_to_learn_survives_a_kill_too(tmp_path: Path) -> None:
-    """Every frame learned from, batches in turn, groups of queries, the dense and the picture loss."""
+    """Every frame learned from, batches in turn, groups of queries, the dense and the image loss."""
     settings = replace(
         SHORT, steps=3, evaluate_every=3, checkpoint_every=1, clips=ClipConfig(2, 2, 0.0, "all", in_turn=2),
-        dense_loss=DenseLossConfig(1.0), picture_loss=PictureLossConfig(1.0),
+        dense_loss=DenseLossConfig(1.0), picture_loss=ImageLossConfig(1.0),
     )  # fmt: skip
 
     def helped(out: Path, resume: bool = False) -> Trainer:
@@ -243,6 +243,6 @@ def test_a_rendered_drive_is_rendered_once_and_taught(tmp_path: Path) -> None:
     assert len(drives.open(1).stamps) == 20
     assert [path.name for path in tmp_path.glob("64x36/*")] == ["000005"]
     frame = drives.open(1).load(0)
-    assert frame.pictures["CAM_FRONT"].pixels_bgr.shape == (36, 64, 3)
+    assert frame.images["CAM_FRONT"].pixels_bgr.shape == (36, 64, 3)
     assert len(frame.ground_truth) > 0
     assert frame.ground_truth_map.x_range_m == (-16, 16)

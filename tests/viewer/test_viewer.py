@@ -32,24 +32,24 @@ def screenshot(tmp_path_factory):
     folder = tmp_path_factory.mktemp("viewer")
     record(folder / "recording.rrd", MemorySequence(3))
     try:
-        views = take_screenshot(folder / "recording.rrd", folder / "picture.png", 1)
+        views = take_screenshot(folder / "recording.rrd", folder / "image.png", 1)
     except OutputError as error:
         if str(error) != NO_DRIVER:
             raise
         pytest.skip(str(error))
-    return views, cv2.imread(str(folder / "picture.png")), folder
+    return views, cv2.imread(str(folder / "image.png")), folder
 
 
 @pytest.mark.slow
 def test_the_viewer_shows_every_view(screenshot):
-    views, picture, _ = screenshot
+    views, image, _ = screenshot
     assert set(views) == VIEWS
-    height, width = picture.shape[:2]
+    height, width = image.shape[:2]
     assert width >= 1280
     for place in ((0.15, 0.15), (0.15, 0.5), (0.15, 0.85), (0.85, 0.15), (0.85, 0.5), (0.85, 0.85)):
         row, column = round(place[0] * height), round(place[1] * width)
-        assert picture[row - 20 : row + 20, column - 20 : column + 20].std() > 10, f"no picture at {place}"
-    middle = picture[height // 3 : 2 * height // 3]
+        assert image[row - 20 : row + 20, column - 20 : column + 20].std() > 10, f"no image at {place}"
+    middle = image[height // 3 : 2 * height // 3]
     assert ((np.abs(middle.astype(int) - [250, 200, 90]).sum(-1) < 40).sum()) > 20  # the blue vehicle
     assert ((np.abs(middle.astype(int) - [44, 158, 255]).sum(-1) < 40).sum()) > 20  # the orange car
 

@@ -35,8 +35,8 @@ def test_the_summary_counts(drive):
     assert summary.boxes == {"car": 3, "pedestrian": 3}
     assert summary.timestamps_ns[-1] - summary.timestamps_ns[0] == 10**9
     assert summary.file_bytes == path.stat().st_size
-    pictures = sum(size for entity, size in summary.bytes_by_entity.items() if entity.endswith("/picture"))
-    assert pictures > 0.5 * sum(summary.bytes_by_entity.values())
+    images = sum(size for entity, size in summary.bytes_by_entity.items() if entity.endswith("/picture"))
+    assert images > 0.5 * sum(summary.bytes_by_entity.values())
     text = viz(path, "--summary")
     assert "frames    3, 1.00 s from 2001-09-09 01:46:40" in text
     assert "3 pedestrian" in text
@@ -73,11 +73,11 @@ def test_the_video_has_every_frame_and_the_boxes(drive, tmp_path, ending):
     codec = int(video.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").lower()
     assert codec in (b"vp90", b"vp09")
     assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(2.0)
-    pictures = []
+    images = []
     while (read := video.read())[0]:
-        pictures.append(read[1])
-    assert len(pictures) == 3
-    bev = pictures[0][:, -640:].astype(int)
+        images.append(read[1])
+    assert len(images) == 3
+    bev = images[0][:, -640:].astype(int)
     car = bev[320 - round(12 * 6.4) - 16 : 320 - round(12 * 6.4) + 16, 310:330]  # 12 m ahead, 6.4 pixels a metre
     assert (np.abs(car - [44, 158, 255]).sum(-1) < 120).any()  # the car's orange, BGR
 
@@ -97,6 +97,6 @@ def test_unknown_endings_are_refused(drive, tmp_path):
             viz(path, option, tmp_path / "x.avi")
 
 
-def test_a_frame_without_a_picture_to_draw_is_a_mistake_in_usage(drive):
+def test_a_frame_without_an_image_to_draw_is_a_mistake_in_usage(drive):
     result = CliRunner().invoke(app, ["viz", str(drive[1]), "--frame", "1"])
     assert result.exit_code == 2

@@ -106,9 +106,9 @@ def test_a_browser_shows_the_recording(tmp_path):
             asked: list[str] = []
             page.on("request", lambda request: asked.append(request.url))
             page.goto(f"{address}/?renderer=webgl")
-            picture = wait_for_picture(page)
+            image = wait_for_image(page)
             browser.close()
-        assert looks_like_views(picture)
+        assert looks_like_views(image)
         assert {urlsplit(url).netloc for url in asked if url.startswith("http")} == {urlsplit(address).netloc}
         before = processor_seconds(server)
         time.sleep(3)
@@ -120,18 +120,18 @@ def test_a_browser_shows_the_recording(tmp_path):
         urllib.request.urlopen(address, timeout=2)
 
 
-def wait_for_picture(page, seconds: float = 90) -> np.ndarray:
+def wait_for_image(page, seconds: float = 90) -> np.ndarray:
     deadline = time.monotonic() + seconds
     while True:
         page.wait_for_timeout(2000)
-        picture = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
-        if looks_like_views(picture) or time.monotonic() > deadline:
-            return picture
+        image = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+        if looks_like_views(image) or time.monotonic() > deadline:
+            return image
 
 
-def looks_like_views(picture: np.ndarray) -> bool:
+def looks_like_views(image: np.ndarray) -> bool:
     """The cameras' noise above and below, and the BEV view's blue vehicle between them."""
-    height = len(picture)
-    above, middle, below = picture[: height // 4], picture[height // 4 : 3 * height // 4], picture[3 * height // 4 :]
+    height = len(image)
+    above, middle, below = image[: height // 4], image[height // 4 : 3 * height // 4], image[3 * height // 4 :]
     vehicle = (np.abs(middle.astype(int) - [250, 200, 90]).sum(-1) < 40).sum()
     return above.std() > 20 and below.std() > 20 and vehicle > 20

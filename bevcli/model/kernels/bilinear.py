@@ -203,22 +203,22 @@ def sample_taps(x, offsets, mask, stride, first, out, begin, end) -> None:  # ty
     total = np.empty(channels, dtype=np.float32)
     for row in range(begin, end):
         position = first + row
-        picture = position // (out_height * out_width)
+        image = position // (out_height * out_width)
         line = position // out_width % out_height
         column = position % out_width
         for tap in range(taps):
-            place_y = np.float32(line * stride - 1 + tap // 3) + offsets[picture, line, column, tap, 0]
-            place_x = np.float32(column * stride - 1 + tap % 3) + offsets[picture, line, column, tap, 1]
+            place_y = np.float32(line * stride - 1 + tap // 3) + offsets[image, line, column, tap, 0]
+            place_x = np.float32(column * stride - 1 + tap % 3) + offsets[image, line, column, tap, 1]
             target = out[row, tap]
             if not (place_x > -1 and place_x < width and place_y > -1 and place_y < height):
                 target[:] = 0
                 continue
             top, bottom, left, right, shares = bilinear_corners(place_x, place_y, height, width)
-            weight = mask[picture, line, column, tap]
+            weight = mask[image, line, column, tap]
             w00, w01 = weight * shares[0], weight * shares[1]
             w10, w11 = weight * shares[2], weight * shares[3]
-            a, b = x[picture, top, left], x[picture, top, right]
-            c, d = x[picture, bottom, left], x[picture, bottom, right]
+            a, b = x[image, top, left], x[image, top, right]
+            c, d = x[image, bottom, left], x[image, bottom, right]
             for channel in range(channels):
                 total[channel] = (
                     w00 * as_float32(a[channel])

@@ -28,17 +28,17 @@ class MapFolder:
 
     def has(self, frame: int) -> bool:
         """Whether there is a map of this frame."""
-        return _picture(self.path, frame).is_file()
+        return _image(self.path, frame).is_file()
 
     def load(self, frame: int) -> BevMap:
         """The map of a frame. Raises InputError where it is missing, unreadable or has an unknown bit."""
-        path = _picture(self.path, frame)
+        path = _image(self.path, frame)
         if not path.is_file():
             raise InputError(f"{path}: the map of frame {frame} is missing")
         cells = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if cells is None or cells.ndim != 2 or cells.dtype != np.uint8:
-            found = "no picture" if cells is None else f"{cells.dtype} of shape {cells.shape}"
-            raise InputError(f"{path}: expected an 8-bit picture with one channel, found {found}")
+            found = "no image" if cells is None else f"{cells.dtype} of shape {cells.shape}"
+            raise InputError(f"{path}: expected an 8-bit image with one channel, found {found}")
         unknown = int(np.bitwise_or.reduce(cells, axis=None)) & ~sum(MAP_CLASSES[name] for name in self.classes)
         if unknown:
             raise InputError(f"{path}: bits {unknown:#x} stand for no class of {LEGEND} ({', '.join(self.classes)})")
@@ -46,7 +46,7 @@ class MapFolder:
 
 
 def open_maps(path: Path) -> MapFolder:
-    """Read a folder's map.json; the pictures are read when they are asked for. Raises InputError."""
+    """Read a folder's map.json; the images are read when they are asked for. Raises InputError."""
     legend_path = path / LEGEND
     try:
         legend = json.loads(legend_path.read_bytes())
@@ -72,7 +72,7 @@ def write_map(folder: Path, frame: int, bev_map: BevMap) -> None:
         if not (folder / LEGEND).exists():
             (folder / LEGEND).write_text(json.dumps(_legend(bev_map), indent=1) + "\n")
         _check_extent(open_maps(folder), bev_map)
-        _picture(folder, frame).write_bytes(cv2.imencode(".png", bev_map.cells)[1].tobytes())
+        _image(folder, frame).write_bytes(cv2.imencode(".png", bev_map.cells)[1].tobytes())
     except OSError as error:
         raise OutputError(f"{folder}: maps cannot be written ({error.strerror})") from None
 
@@ -85,7 +85,7 @@ def _check_extent(folder: MapFolder, bev_map: BevMap) -> None:
         )
 
 
-def _picture(folder: Path, frame: int) -> Path:
+def _image(folder: Path, frame: int) -> Path:
     return folder / f"{frame:06d}.png"
 
 

@@ -13,7 +13,7 @@ from bevcli.sequences.files.field_report import Report, parse_numbers
 from bevcli.sequences.files.pose_field import parse_transform
 
 KEYS = ("width", "height", "intrinsics", "distortion", "ego_from_camera")
-FOCAL_RANGE = (0.05, 50.0)  # focal length over picture size: beyond these there is no lens, fisheye or tele
+FOCAL_RANGE = (0.05, 50.0)  # focal length over image size: beyond these there is no lens, fisheye or tele
 COEFFICIENT_COUNTS = {"brown_conrady": (4, 5, 8), "kannala_brandt": (4,)}
 
 
@@ -49,7 +49,7 @@ def parse_intrinsics(camera: Mapping[str, Any], report: Report) -> Array | None:
     fx, fy = matrix[0, 0], matrix[1, 1]
     if min(fx, fy) <= 0:
         found = f"fx {fx:g}, fy {fy:g}"
-        message = "is singular or mirrors the picture"
+        message = "is singular or mirrors the image"
         report.error("intrinsics-singular", "intrinsics", message, expected="fx > 0 and fy > 0", found=found)
         return None
     return matrix
@@ -83,28 +83,28 @@ def parse_distortion(camera: Mapping[str, Any], report: Report) -> Distortion | 
 def _parse_size(camera: Mapping[str, Any], name: str, report: Report) -> int | None:
     value = camera.get(name)
     if value is None:
-        report.missing(name, "the pictures' size in pixels")
+        report.missing(name, "the images' size in pixels")
         return None
     if isinstance(value, bool) or not isinstance(value, int) or value <= 0:
-        report.error("wrong-size", name, "is no size of a picture", expected="a positive whole number", found=value)
+        report.error("wrong-size", name, "is no size of an image", expected="a positive whole number", found=value)
         return None
     return value
 
 
 def _are_sane(intrinsics: Array, width: int, height: int, report: Report) -> bool:
-    """Whether focal length and principal point can be meant in pixels of such a picture at all."""
+    """Whether focal length and principal point can be meant in pixels of such an image at all."""
     low, high = FOCAL_RANGE
     for axis, (letter, size) in enumerate((("x", width), ("y", height))):
         focal, center = intrinsics[axis, axis], intrinsics[axis, 2]
         if not low * size <= focal <= high * size:
             expected, found = f"{low * size:g} to {high * size:g} px for a size of {size}", f"f{letter} {focal:g}"
-            advice = "give it in pixels of the pictures, not in millimetres"
+            advice = "give it in pixels of the images, not in millimetres"
             message = "has an absurd focal length"
             report.error("intrinsics-absurd", "intrinsics", message, expected=expected, found=found, advice=advice)
             return False
         if not -2 * size <= center <= 3 * size:
             expected, found = f"about {size / 2:g} px for a size of {size}", f"c{letter} {center:g}"
-            message = "has its principal point far outside the picture"
+            message = "has its principal point far outside the image"
             report.error("intrinsics-absurd", "intrinsics", message, expected=expected, found=found)
             return False
     return True

@@ -1,4 +1,4 @@
-"""The native sequence folder: calibration.json, frames.csv, ego_motion.csv, pictures or videos, ground truth."""
+"""The native sequence folder: calibration.json, frames.csv, ego_motion.csv, images or videos, ground truth."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import GRAVITY, TOLERANCE_NS, EgoMotion, Kinematics
 from bevcli.geometry.transforms import Pose
-from bevcli.sequences.images import PictureReader
+from bevcli.sequences.images import ImageReader
 from bevcli.sequences.native.calibration import read_calibration
 from bevcli.sequences.native.ego_motion_file import read_ego_motion
 from bevcli.sequences.native.frames_table import FrameEntry, check_times, read_frames_table
@@ -46,7 +46,7 @@ class FolderSequence:
         self.has_ego_motion = self.ego_motion is not None
         self.notes = (*_rig_notes(self.rig), *notes, *motion_notes)
         self._truth = FolderGroundTruth(path)
-        self._pictures = PictureReader(strict=strict)
+        self._images = ImageReader(strict=strict)
 
     @property
     def stamps(self) -> tuple[FrameStamp, ...]:
@@ -54,16 +54,16 @@ class FolderSequence:
         return tuple(entry.stamp for entry in self._entries)
 
     def load(self, place: int) -> Frame:
-        """The frame at a place, its pictures decoded. Raises InputError for wrong sizes, or missing ones if strict."""
+        """The frame at a place, its images decoded. Raises InputError for wrong sizes, or missing ones if strict."""
         entry = self._entries[place]
-        pictures, dropped = self._pictures.read(entry.sources, self.rig, entry.dropped)
+        images, dropped = self._images.read(entry.sources, self.rig, entry.dropped)
         times = _camera_times(entry, self.rig)
         index, world_from_ego = entry.stamp.index, self._pose_at(entry.stamp.timestamp_ns)
         truth_pose = world_from_ego if self.has_ego_motion else None
         return Frame(
             stamp=entry.stamp,
             rig=self.rig,
-            pictures=pictures,
+            images=images,
             world_from_ego=world_from_ego,
             world_from_ego_at={name: self._pose_at(time) for name, time in times.items()},
             kinematics=self._kinematics_at(entry.stamp.timestamp_ns),
@@ -89,7 +89,7 @@ def _read_entries(path: Path, rig: CameraRig) -> tuple[tuple[FrameEntry, ...], t
 
 
 def _camera_times(entry: FrameEntry, rig: CameraRig) -> dict[str, int]:
-    """Each camera's own time, the frame's where it has no picture."""
+    """Each camera's own time, the frame's where it has no image."""
     frame_ns = entry.stamp.timestamp_ns
     return {name: entry.sources[name].timestamp_ns if name in entry.sources else frame_ns for name in rig.names}
 

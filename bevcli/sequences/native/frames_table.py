@@ -1,4 +1,4 @@
-"""frames.csv: one row a frame, with its time and where each camera's picture is."""
+"""frames.csv: one row a frame, with its time and where each camera's image is."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from pathlib import Path
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
-from bevcli.sequences.images import PictureSource
+from bevcli.sequences.images import ImageSource
 from bevcli.sequences.native.csv_table import CsvRow, CsvTable, read_csv
 
 VIDEO_CELL = re.compile(r"(?P<path>.+)#(?P<index>\d+)")
-NO_PICTURE = "no picture in frames.csv"
+NO_IMAGE = "no image in frames.csv"
 
 
 @dataclass(frozen=True)
 class FrameEntry:
-    """One frame before its pictures are read.
+    """One frame before its images are read.
 
-    sources: by camera, where its picture is. dropped: camera -> why it has none. Together they name every camera.
+    sources: by camera, where its image is. dropped: camera -> why it has none. Together they name every camera.
     place: for messages, where the frame is described, as "frames.csv: line 3".
     """
 
     stamp: FrameStamp
-    sources: Mapping[str, PictureSource]
+    sources: Mapping[str, ImageSource]
     dropped: Mapping[str, str]
     place: str
 
@@ -70,17 +70,17 @@ def _read_columns(path: Path, cameras: Sequence[str]) -> CsvTable:
 def _entry(row: CsvRow, cameras: Sequence[str], folder: Path) -> FrameEntry:
     stamp = FrameStamp(row.integer("frame"), row.cells.get("scene", ""), row.integer("timestamp_ns"))
     sources = {name: _source(row, name, folder, stamp.timestamp_ns) for name in cameras if row.cells[name]}
-    dropped = {name: NO_PICTURE for name in cameras if not row.cells[name]}
+    dropped = {name: NO_IMAGE for name in cameras if not row.cells[name]}
     return FrameEntry(stamp, sources, dropped, f"{row.path}: line {row.line}")
 
 
-def _source(row: CsvRow, camera: str, folder: Path, frame_ns: int) -> PictureSource:
+def _source(row: CsvRow, camera: str, folder: Path, frame_ns: int) -> ImageSource:
     time_column = f"{camera}.timestamp_ns"
     timestamp_ns = row.integer(time_column) if row.cells.get(time_column) else frame_ns
     video = VIDEO_CELL.fullmatch(row.cells[camera])
     if video:
-        return PictureSource(folder / video["path"], timestamp_ns, int(video["index"]))
-    return PictureSource(folder / row.cells[camera], timestamp_ns)
+        return ImageSource(folder / video["path"], timestamp_ns, int(video["index"]))
+    return ImageSource(folder / row.cells[camera], timestamp_ns)
 
 
 def _check_numbers(rows: Sequence[CsvRow], entries: Sequence[FrameEntry]) -> None:

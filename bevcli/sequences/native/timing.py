@@ -1,9 +1,9 @@
-"""timing.toml: when pictures were taken, for folders whose frames.csv does not say it.
+"""timing.toml: when images were taken, for folders whose frames.csv does not say it.
 
-start_ns = 1533151603547590000   # time of the first picture; 0 if left out
-rate_hz = 12.0                   # pictures a second; videos: what the file states if left out
+start_ns = 1533151603547590000   # time of the first image; 0 if left out
+rate_hz = 12.0                   # images a second; videos: what the file states if left out
 [cameras.CAM_BACK]               # where one camera differs
-offset_ns = 25000000             # its first picture is this much later than start_ns
+offset_ns = 25000000             # its first image is this much later than start_ns
 rate_hz = 24.0
 """
 
@@ -30,19 +30,19 @@ class CameraTiming:
 
 @dataclass(frozen=True)
 class Timing:
-    """Start and rate of numbered pictures or videos. rate_hz None: not stated."""
+    """Start and rate of numbered images or videos. rate_hz None: not stated."""
 
     start_ns: int = 0
     rate_hz: float | None = None
     cameras: Mapping[str, CameraTiming] = field(default_factory=dict)
 
     def rate_of(self, camera: str) -> float | None:
-        """Pictures a second of one camera, None where nothing is stated."""
+        """Images a second of one camera, None where nothing is stated."""
         own = self.cameras.get(camera, CameraTiming()).rate_hz
         return self.rate_hz if own is None else own
 
     def time_of(self, camera: str, number: int, rate_hz: float) -> int:
-        """Nanoseconds of a camera's picture `number`, counted from 0."""
+        """Nanoseconds of a camera's image `number`, counted from 0."""
         offset = self.cameras.get(camera, CameraTiming()).offset_ns
         return self.start_ns + offset + round(number * 1e9 / rate_hz)
 
@@ -94,5 +94,5 @@ def _rate(path: Path, where: str, table: Mapping[str, Any]) -> float | None:
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < 10_000:
-        raise InputError(f"{path}: {where}rate_hz: expected pictures a second over 0, found {value!r}")
+        raise InputError(f"{path}: {where}rate_hz: expected images a second over 0, found {value!r}")
     return float(value)

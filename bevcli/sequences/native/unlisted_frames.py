@@ -1,4 +1,4 @@
-"""Frames of a folder without frames.csv: from the pictures' names, or from one video a camera, aligned by time."""
+"""Frames of a folder without frames.csv: from the images' names, or from one video a camera, aligned by time."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
-from bevcli.sequences.images import PICTURE_SUFFIXES, VIDEO_SUFFIXES, PictureSource
+from bevcli.sequences.images import IMAGE_SUFFIXES, VIDEO_SUFFIXES, ImageSource
 from bevcli.sequences.native.frames_table import FrameEntry
 from bevcli.sequences.native.timing import FILE_NAME, Timing, read_timing
 from bevcli.sequences.video import VideoFacts, video_facts
 
 # Names that are numbers are times from this on (a day after 1970 in nanoseconds), running numbers below.
 SMALLEST_TIMESTAMP = 10**13
-ASSUMED_RATE_HZ = 2.0  # of numbered pictures where timing.toml is missing: the rate of the published models
+ASSUMED_RATE_HZ = 2.0  # of numbered images where timing.toml is missing: the rate of the published models
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class UnlistedFrames:
 def find_frames(folder: Path, cameras: tuple[str, ...]) -> UnlistedFrames:
     """The frames of `images/CAMERA/*` or of `videos/CAMERA.*`.
 
-    Raises InputError where there is neither, or where cameras do not have the same set of picture names.
+    Raises InputError where there is neither, or where cameras do not have the same set of image names.
     """
     timing = read_timing(folder, cameras)
     if (folder / "images").is_dir():
@@ -45,31 +45,31 @@ def find_frames(folder: Path, cameras: tuple[str, ...]) -> UnlistedFrames:
 
 
 def _from_names(folder: Path, cameras: tuple[str, ...], timing: Timing) -> UnlistedFrames:
-    pictures = {name: _numbered(folder / "images" / name) for name in cameras}
-    numbers = _common_numbers(folder, pictures)
+    images = {name: _numbered(folder / "images" / name) for name in cameras}
+    numbers = _common_numbers(folder, images)
     are_times = numbers[0] >= SMALLEST_TIMESTAMP
     rate = timing.rate_hz or ASSUMED_RATE_HZ
     entries = []
     for place, number in enumerate(numbers):
         time = number if are_times else timing.time_of("", number - numbers[0], rate)
         sources = {
-            name: PictureSource(found[number], time + timing.time_of(name, 0, rate) - timing.start_ns)
-            for name, found in pictures.items()
+            name: ImageSource(found[number], time + timing.time_of(name, 0, rate) - timing.start_ns)
+            for name, found in images.items()
         }
         stamp = FrameStamp(place if are_times else number, "", time)
-        entries.append(FrameEntry(stamp, sources, {}, f"{folder / 'images'}: picture {number}"))
-    how = "their names are the timestamps" if are_times else f"numbered pictures, {rate:g} a second"
+        entries.append(FrameEntry(stamp, sources, {}, f"{folder / 'images'}: image {number}"))
+    how = "their names are the timestamps" if are_times else f"numbered images, {rate:g} a second"
     where = "" if are_times or timing.rate_hz else f" (assumed: state rate_hz in {FILE_NAME})"
     return UnlistedFrames(tuple(entries), f"frames.csv is missing: {len(numbers)} frames, {how}{where}")
 
 
 def _numbered(folder: Path) -> dict[int, Path]:
-    """The pictures of a folder by the number that is their name."""
+    """The images of a folder by the number that is their name."""
     if not folder.is_dir():
         raise InputError(f"{folder}: the folder is missing (calibration.json has the camera {folder.name})")
     found: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
-        if path.suffix.lower() not in PICTURE_SUFFIXES:
+        if path.suffix.lower() not in IMAGE_SUFFIXES:
             continue
         if not (path.stem.isascii() and path.stem.isdigit()):
             raise InputError(f"{path}: the name is no number (expected a timestamp or number): list it in frames.csv")
@@ -77,25 +77,25 @@ def _numbered(folder: Path) -> dict[int, Path]:
             raise InputError(f"{path}: {found[int(path.stem)].name} has the same number: remove one")
         found[int(path.stem)] = path
     if not found:
-        raise InputError(f"{folder}: no pictures (expected files that end in {', '.join(PICTURE_SUFFIXES)})")
+        raise InputError(f"{folder}: no images (expected files that end in {', '.join(IMAGE_SUFFIXES)})")
     return found
 
 
-def _common_numbers(folder: Path, pictures: Mapping[str, Mapping[int, Path]]) -> list[int]:
+def _common_numbers(folder: Path, images: Mapping[str, Mapping[int, Path]]) -> list[int]:
     """The numbers in order, the same in every camera."""
-    everywhere = sorted(set().union(*pictures.values()))
-    for name, found in pictures.items():
+    everywhere = sorted(set().union(*images.values()))
+    for name, found in images.items():
         missing = [number for number in everywhere if number not in found]
         if missing:
             raise InputError(
-                f"{folder / 'images' / name}: {len(missing)} pictures that other cameras have are missing, the first "
+                f"{folder / 'images' / name}: {len(missing)} images that other cameras have are missing, the first "
                 f"is {missing[0]}: add them, or list the frames in frames.csv with empty cells"
             )
     return everywhere
 
 
 def _from_videos(folder: Path, cameras: tuple[str, ...], timing: Timing) -> UnlistedFrames:
-    """A frame for each picture of the slowest camera, with the nearest picture of every other one."""
+    """A frame for each image of the slowest camera, with the nearest image of every other one."""
     paths = {name: _video_of(folder / "videos", name) for name in cameras}
     facts = {name: video_facts(path) for name, path in paths.items()}
     rates = {name: timing.rate_of(name) or facts[name].rate_hz for name in cameras}
@@ -107,14 +107,14 @@ def _from_videos(folder: Path, cameras: tuple[str, ...], timing: Timing) -> Unli
         for name in cameras:
             source = _nearest(paths[name], facts[name], name, timing, rates[name], time)
             if source is None:
-                dropped[name] = f"{paths[name].name} has no picture within {500 / rates[name]:.0f} ms of {time} ns"
+                dropped[name] = f"{paths[name].name} has no image within {500 / rates[name]:.0f} ms of {time} ns"
             else:
                 sources[name] = source
         entries.append(FrameEntry(FrameStamp(place, "", time), sources, dropped, f"{paths[leading]}#{place}"))
     stated = (
         f"as {FILE_NAME} says" if (folder / FILE_NAME).is_file() else f"all from time 0 ({FILE_NAME} can change it)"
     )
-    note = f"frames.csv is missing: {len(entries)} frames at the pictures of {leading}, {rates[leading]:g} a second"
+    note = f"frames.csv is missing: {len(entries)} frames at the images of {leading}, {rates[leading]:g} a second"
     return UnlistedFrames(tuple(entries), f"{note}, {stated}")
 
 
@@ -128,11 +128,11 @@ def _video_of(folder: Path, camera: str) -> Path:
 
 def _nearest(
     path: Path, facts: VideoFacts, camera: str, timing: Timing, rate_hz: float, time: int
-) -> PictureSource | None:
-    """The camera's picture nearest to a time, None where it is more than half a picture's time away."""
+) -> ImageSource | None:
+    """The camera's image nearest to a time, None where it is more than half an image's time away."""
     first = timing.time_of(camera, 0, rate_hz)
     number = int(np.clip(round((time - first) * rate_hz / 1e9), 0, facts.count - 1))
     taken = timing.time_of(camera, number, rate_hz)
     if abs(taken - time) > 0.501e9 / rate_hz:
         return None
-    return PictureSource(path, taken, number)
+    return ImageSource(path, taken, number)

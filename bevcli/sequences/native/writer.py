@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from bevcli.errors import InputError, OutputError
-from bevcli.frame import Frame, Picture
+from bevcli.frame import CameraImage, Frame
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
 from bevcli.geometry.transforms import Pose
@@ -32,8 +32,8 @@ SUFFIXES = {"image/jpeg": ".jpg", "image/png": ".png"}
 class NativeWriter:
     """`with NativeWriter(folder, with_ego_motion=True) as writer: writer.write(frame)`.
 
-    Pictures keep their bytes; decoded ones (of a video) become PNG. ego_motion.csv gets the pose at every frame's and
-    picture's time. calibration.json is written last: a folder that was not finished is no sequence.
+    Images keep their bytes; decoded ones (of a video) become PNG. ego_motion.csv gets the pose at every frame's and
+    image's time. calibration.json is written last: a folder that was not finished is no sequence.
     Raises OutputError where the folder exists (but with `force`) or cannot be written, InputError where a frame does
     not go with those before it: another calibration, a number twice, or scenes that overlap in time.
     """
@@ -57,7 +57,7 @@ class NativeWriter:
     def write(self, frame: Frame) -> None:
         """Append a frame."""
         self._check(frame)
-        cells = {name: self._write_picture(frame.stamp.index, name, p) for name, p in frame.pictures.items()}
+        cells = {name: self._write_image(frame.stamp.index, name, p) for name, p in frame.images.items()}
         self._write_row(frame, cells)
         if self._with_ego_motion:
             self._note_motion(frame)
@@ -101,11 +101,11 @@ class NativeWriter:
             )
         self._numbers.add(stamp.index)
 
-    def _write_picture(self, number: int, camera: str, picture: Picture) -> str:
+    def _write_image(self, number: int, camera: str, image: CameraImage) -> str:
         """Write it, and give its cell."""
-        encoded, suffix = picture.encoded, SUFFIXES.get(picture.media_type or "", ".png")
-        if encoded is None or picture.media_type not in SUFFIXES:
-            encoded = cv2.imencode(".png", picture.pixels_bgr)[1].tobytes()
+        encoded, suffix = image.encoded, SUFFIXES.get(image.media_type or "", ".png")
+        if encoded is None or image.media_type not in SUFFIXES:
+            encoded = cv2.imencode(".png", image.pixels_bgr)[1].tobytes()
         name = f"images/{camera}/{number:06d}{suffix}"
         path = self.folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -117,15 +117,15 @@ class NativeWriter:
 
     def _write_row(self, frame: Frame, cells: Mapping[str, str]) -> None:
         names = frame.rig.names
-        times = [frame.pictures[name].timestamp_ns if name in cells else "" for name in names]
+        times = [frame.images[name].timestamp_ns if name in cells else "" for name in names]
         stamp = frame.stamp
         row = [stamp.index, stamp.scene, stamp.timestamp_ns, *(cells.get(name, "") for name in names), *times]
         self._rows.writerow(row)
 
     def _note_motion(self, frame: Frame) -> None:
-        for name, picture in frame.pictures.items():
-            self._motion.setdefault(picture.timestamp_ns, (frame.world_from_ego_at[name], frame.kinematics))
-        times = [frame.stamp.timestamp_ns, *(picture.timestamp_ns for picture in frame.pictures.values())]
+        for name, image in frame.images.items():
+            self._motion.setdefault(image.timestamp_ns, (frame.world_from_ego_at[name], frame.kinematics))
+        times = [frame.stamp.timestamp_ns, *(image.timestamp_ns for image in frame.images.values())]
         self._motion[frame.stamp.timestamp_ns] = (frame.world_from_ego, frame.kinematics)
         first, last = self._scenes.get(frame.stamp.scene, (times[0], times[0]))
         self._scenes[frame.stamp.scene] = (min(first, *times), max(last, *times))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array
 from bevcli.sequences.nuscenes.annotations import read_annotations
-from bevcli.sequences.nuscenes.index import Ints, NuScenesIndex, Pictures, Samples, Scenes, Sensors
+from bevcli.sequences.nuscenes.index import Images, Ints, NuScenesIndex, Samples, Scenes, Sensors
 from bevcli.sequences.nuscenes.json_tables import (
     Row,
     column,
@@ -52,14 +52,14 @@ def build_index(tables: Path) -> NuScenesIndex:
         translations, quaternions = _read_poses(tables, data.poses)
         lidar = sensors.channels[data.sensors] == LIDAR
         lidar_rows = _lidar_of_samples(tables, data.samples, np.flatnonzero(lidar), len(sample_tokens), sample_tokens)
-        picture_rows = _by_scene_and_time(data, ~lidar, sample_scenes)
+        image_rows = _by_scene_and_time(data, ~lidar, sample_scenes)
         annotations, first_annotation = read_annotations(tables, sample_tokens, sample_times)
-    pictures = data[picture_rows]
+    images = data[image_rows]
     return NuScenesIndex(
         Scenes(
             names,
             _starts(sample_scenes, len(names)),
-            _starts(sample_scenes[pictures.samples], len(names)),
+            _starts(sample_scenes[images.samples], len(names)),
         ),
         sensors,
         Samples(
@@ -70,15 +70,15 @@ def build_index(tables: Path) -> NuScenesIndex:
             data.sensors[lidar_rows],
             first_annotation,
         ),
-        Pictures(
-            pictures.samples,
-            pictures.sensors,
-            pictures.times_us,
-            pictures.keys,
-            pictures.sizes,
-            translations[picture_rows],
-            quaternions[picture_rows],
-            pictures.files,
+        Images(
+            images.samples,
+            images.sensors,
+            images.times_us,
+            images.keys,
+            images.sizes,
+            translations[image_rows],
+            quaternions[image_rows],
+            images.files,
         ),
         annotations,
     )

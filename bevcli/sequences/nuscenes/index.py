@@ -34,11 +34,11 @@ BICYCLE_RACK = "static_object.bicycle_rack"
 
 @dataclass(frozen=True)
 class Scenes:
-    """S scenes. names: (S,). first_sample, first_picture: (S + 1,) where each scene's begin."""
+    """S scenes. names: (S,). first_sample, first_image: (S + 1,) where each scene's begin."""
 
     names: NDArray[np.str_]
     first_sample: Ints
-    first_picture: Ints
+    first_image: Ints
 
 
 @dataclass(frozen=True)
@@ -70,11 +70,11 @@ class Samples:
 
 
 @dataclass(frozen=True)
-class Pictures:
-    """P camera pictures, by time in each scene; keyframes and those between.
+class Images:
+    """P camera images, by time in each scene; keyframes and those between.
 
     samples, sensors: (P,) places. times_us: (P,). keys: (P,) bool. sizes: (P, 2) width, height.
-    translations (P, 3), quaternions (P, 4): world_from_ego at the picture's time. files: (P,) below the root.
+    translations (P, 3), quaternions (P, 4): world_from_ego at the image's time. files: (P,) below the root.
     """
 
     samples: Ints
@@ -113,7 +113,7 @@ class NuScenesIndex:
     scenes: Scenes
     sensors: Sensors
     samples: Samples
-    pictures: Pictures
+    images: Images
     annotations: Annotations
 
     def ground_truth(self, sample: int) -> Boxes3D | None:

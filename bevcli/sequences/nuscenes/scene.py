@@ -44,8 +44,8 @@ def read_scene_facts(index: NuScenesIndex, root: Path, scene: int) -> SceneFacts
 
 def scene_rig(index: NuScenesIndex, scene: int) -> tuple[CameraRig, dict[int, str]]:
     """The rig of a scene, and the camera's name of each of its calibrated sensors."""
-    first, last = index.scenes.first_picture[scene : scene + 2]
-    sensors, rows = np.unique(index.pictures.sensors[first:last], return_index=True)
+    first, last = index.scenes.first_image[scene : scene + 2]
+    sensors, rows = np.unique(index.images.sensors[first:last], return_index=True)
     cameras = [_camera(index, int(sensor), first + row) for sensor, row in zip(sensors, rows, strict=True)]
     cameras.sort(key=lambda camera: (CAMERAS.index(camera.name) if camera.name in CAMERAS else 99, camera.name))
     names = {int(sensor): str(index.sensors.channels[sensor]) for sensor in sensors}
@@ -56,20 +56,20 @@ def scene_rig(index: NuScenesIndex, scene: int) -> tuple[CameraRig, dict[int, st
 
 
 def scene_motion(index: NuScenesIndex, scene: int) -> EgoMotion:
-    """A scene's poses at its keyframes' and pictures' times; kinematics are derived from the keyframes' alone.
+    """A scene's poses at its keyframes' and images' times; kinematics are derived from the keyframes' alone.
 
     Poses a few milliseconds apart would make differences of differences of their noise.
     """
-    samples, pictures = index.samples, index.pictures
+    samples, images = index.samples, index.images
     keys = slice(*index.scenes.first_sample[scene : scene + 2])
-    rows = slice(*index.scenes.first_picture[scene : scene + 2])
+    rows = slice(*index.scenes.first_image[scene : scene + 2])
     key_times = samples.times_us[keys] * 1000
     keyframes = (samples.translations[keys], samples.quaternions[keys])
     rough = EgoMotion(key_times, *keyframes, *derive_kinematics(key_times, *keyframes))
     # The first of equal times is kept: keyframes come first.
-    times, first = np.unique(np.concatenate([key_times, pictures.times_us[rows] * 1000]), return_index=True)
-    translations = np.concatenate([keyframes[0], pictures.translations[rows]])[first]
-    quaternions = np.concatenate([keyframes[1], pictures.quaternions[rows]])[first]
+    times, first = np.unique(np.concatenate([key_times, images.times_us[rows] * 1000]), return_index=True)
+    translations = np.concatenate([keyframes[0], images.translations[rows]])[first]
+    quaternions = np.concatenate([keyframes[1], images.quaternions[rows]])[first]
     inside = np.clip(times, key_times[0], key_times[-1])
     derived = [rough.kinematics_at(int(time)) for time in inside]
     return EgoMotion(
@@ -82,8 +82,8 @@ def scene_motion(index: NuScenesIndex, scene: int) -> EgoMotion:
     )
 
 
-def _camera(index: NuScenesIndex, sensor: int, picture: int) -> Camera:
-    width, height = (int(value) for value in index.pictures.sizes[picture])
+def _camera(index: NuScenesIndex, sensor: int, image: int) -> Camera:
+    width, height = (int(value) for value in index.images.sizes[image])
     name = str(index.sensors.channels[sensor])
     return Camera(name, width, height, np.array(index.sensors.intrinsics[sensor]), _sensor_pose(index, sensor).matrix)
 

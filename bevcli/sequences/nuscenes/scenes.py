@@ -12,7 +12,7 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.transforms import Pose
-from bevcli.sequences.images import PictureReader, PictureSource
+from bevcli.sequences.images import ImageReader, ImageSource
 from bevcli.sequences.nuscenes.cache import open_index
 from bevcli.sequences.nuscenes.index import Ints, NuScenesIndex
 from bevcli.sequences.nuscenes.scene import SceneFacts, read_scene_facts, scene_rig
@@ -32,7 +32,7 @@ class NuScenesChoice:
 
 @dataclass(frozen=True)
 class _Moment:
-    """A frame before its pictures are read. sample: its place for a keyframe. rows: its pictures' rows."""
+    """A frame before its images are read. sample: its place for a keyframe. rows: its images' rows."""
 
     stamp: FrameStamp
     scene: int
@@ -41,7 +41,7 @@ class _Moment:
 
 
 class NuScenesSequence:
-    """Keyframes of nuScenes (and the pictures between, if asked for), scene after scene, numbered from 0.
+    """Keyframes of nuScenes (and the images between, if asked for), scene after scene, numbered from 0.
 
     The bev frame is the scene's LIDAR_TOP. The world is the map's frame.
     """
@@ -56,7 +56,7 @@ class NuScenesSequence:
         self.name = choice.scene or choice.split or self.tables.name
         self.rig = scene_rig(self.index, scenes[0])[0]
         self._moments = tuple(self._find_moments(scenes, choice.sweeps))
-        self._pictures = PictureReader(strict=strict)
+        self._images = ImageReader(strict=strict)
         self._facts = lru_cache(maxsize=2)(partial(read_scene_facts, self.index, root))
         self.notes = tuple(text for text in (note, self._can_bus_note(scenes)) if text)
 
@@ -66,20 +66,20 @@ class NuScenesSequence:
         return tuple(moment.stamp for moment in self._moments)
 
     def load(self, place: int) -> Frame:
-        """The frame at a place, its pictures decoded. Raises InputError for wrong sizes, or missing ones if strict."""
+        """The frame at a place, its images decoded. Raises InputError for wrong sizes, or missing ones if strict."""
         moment = self._moments[place]
         facts = self._facts(moment.scene)
-        rows = {facts.sensor_names[int(self.index.pictures.sensors[row])]: int(row) for row in moment.rows}
-        dropped = {name: "no picture in sample_data.json" for name in facts.rig.names if name not in rows}
+        rows = {facts.sensor_names[int(self.index.images.sensors[row])]: int(row) for row in moment.rows}
+        dropped = {name: "no image in sample_data.json" for name in facts.rig.names if name not in rows}
         sources = {name: self._source(rows[name]) for name in facts.rig.names if name in rows}
-        pictures, dropped = self._pictures.read(sources, facts.rig, dropped)
+        images, dropped = self._images.read(sources, facts.rig, dropped)
         pose = self._pose(moment, facts)
         return Frame(
             stamp=moment.stamp,
             rig=facts.rig,
-            pictures=pictures,
+            images=images,
             world_from_ego=pose,
-            world_from_ego_at={n: self._picture_pose(rows[n]) if n in rows else pose for n in facts.rig.names},
+            world_from_ego_at={n: self._image_pose(rows[n]) if n in rows else pose for n in facts.rig.names},
             kinematics=facts.kinematics_at(moment.stamp.timestamp_ns),
             dropped=dropped,
             ground_truth=None if moment.sample is None else self.index.ground_truth(moment.sample),
@@ -95,13 +95,13 @@ class NuScenesSequence:
                 yield _Moment(FrameStamp(number, name, time_us * 1000), scene, sample, rows)
                 number += 1
 
-    def _source(self, row: int) -> PictureSource:
-        pictures = self.index.pictures
-        return PictureSource(self.root / pictures.files[row].decode(), int(pictures.times_us[row]) * 1000)
+    def _source(self, row: int) -> ImageSource:
+        images = self.index.images
+        return ImageSource(self.root / images.files[row].decode(), int(images.times_us[row]) * 1000)
 
-    def _picture_pose(self, row: int) -> Pose:
-        pictures = self.index.pictures
-        return Pose(np.array(pictures.translations[row]), np.array(pictures.quaternions[row]))
+    def _image_pose(self, row: int) -> Pose:
+        images = self.index.images
+        return Pose(np.array(images.translations[row]), np.array(images.quaternions[row]))
 
     def _pose(self, moment: _Moment, facts: SceneFacts) -> Pose:
         if moment.sample is None:
@@ -160,10 +160,10 @@ def _versions(root: Path) -> list[str]:
 
 
 def _keyframes(index: NuScenesIndex, scene: int) -> Iterable[tuple[int, int, Ints]]:
-    """Time in us, sample and picture rows of each keyframe of a scene."""
-    first, last = index.scenes.first_picture[scene : scene + 2]
-    keys = first + np.flatnonzero(index.pictures.keys[first:last])
-    samples = index.pictures.samples[keys]
+    """Time in us, sample and image rows of each keyframe of a scene."""
+    first, last = index.scenes.first_image[scene : scene + 2]
+    keys = first + np.flatnonzero(index.images.keys[first:last])
+    samples = index.images.samples[keys]
     keys = keys[np.argsort(samples, kind="stable")]
     start, end = index.scenes.first_sample[scene : scene + 2]
     bounds = np.searchsorted(np.sort(samples), np.arange(start, end + 1))

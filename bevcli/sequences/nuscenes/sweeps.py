@@ -1,4 +1,4 @@
-"""Frames between the keyframes of nuScenes: one for each picture of the front camera."""
+"""Frames between the keyframes of nuScenes: one for each image of the front camera."""
 
 from __future__ import annotations
 
@@ -9,42 +9,42 @@ import numpy as np
 from bevcli.sequences.nuscenes.index import Ints, NuScenesIndex
 
 LEADING_CAMERA = "CAM_FRONT"
-# The cameras run at 12 Hz, each triggered as the lidar's beam comes by: a picture further away belongs to another turn.
+# The cameras run at 12 Hz, each triggered as the lidar's beam comes by: an image further away belongs to another turn.
 NEAR_US = 60_000
 
 
 def sweep_frames(index: NuScenesIndex, scene: int) -> Iterator[tuple[int, int | None, Ints]]:
-    """Time in us, sample (None between keyframes) and picture rows of every frame of a scene.
+    """Time in us, sample (None between keyframes) and image rows of every frame of a scene.
 
-    A frame between keyframes is as long after its front picture as keyframes are, and has each camera's picture
+    A frame between keyframes is as long after its front image as keyframes are, and has each camera's image
     nearest to that time.
     """
-    first, last = index.scenes.first_picture[scene : scene + 2]
+    first, last = index.scenes.first_image[scene : scene + 2]
     rows = np.arange(first, last)
-    pictures = index.pictures
-    cameras = index.sensors.channels[pictures.sensors[first:last]]
+    images = index.images
+    cameras = index.sensors.channels[images.sensors[first:last]]
     names = sorted(set(cameras.tolist()))
     leading = rows[cameras == (LEADING_CAMERA if LEADING_CAMERA in names else names[0])]
-    sample_times = index.samples.times_us[pictures.samples[leading]]
-    keys = pictures.keys[leading]
-    lag = int(np.median((sample_times - pictures.times_us[leading])[keys])) if keys.any() else 0
+    sample_times = index.samples.times_us[images.samples[leading]]
+    keys = images.keys[leading]
+    lag = int(np.median((sample_times - images.times_us[leading])[keys])) if keys.any() else 0
     by_camera = [rows[cameras == name] for name in names]
-    key_rows = rows[pictures.keys[first:last]]
+    key_rows = rows[images.keys[first:last]]
     time = -1
     for row, is_key in zip(leading, keys, strict=True):
-        earlier, sample = time, int(pictures.samples[row])
+        earlier, sample = time, int(images.samples[row])
         if is_key:
             time = int(index.samples.times_us[sample])
-            found = key_rows[pictures.samples[key_rows] == sample]
+            found = key_rows[images.samples[key_rows] == sample]
         else:
-            time = int(pictures.times_us[row]) + lag
+            time = int(images.times_us[row]) + lag
             found = _nearest(index, by_camera, time)
         if time > earlier:
             yield time, sample if is_key else None, found
 
 
 def _nearest(index: NuScenesIndex, by_camera: list[Ints], time: int) -> Ints:
-    """Each camera's picture nearest to a time, without those too far from it."""
-    times = index.pictures.times_us
+    """Each camera's image nearest to a time, without those too far from it."""
+    times = index.images.times_us
     nearest = np.array([rows[np.argmin(np.abs(times[rows] - time))] for rows in by_camera])
     return nearest[np.abs(times[nearest] - time) <= NEAR_US]

@@ -55,7 +55,7 @@ def paint_ground(pieces: list[GroundPiece], center: ArrayLike, extent_m: float, 
 
 
 def fill(canvas: NDArray[np.uint8], outline: NDArray[np.float64], color: tuple[int, ...] | int) -> None:
-    """Fill a polygon (P, 2), in pixels of x and y, into a picture with sub-pixel edges, in place."""
+    """Fill a polygon (P, 2), in pixels of x and y, into an image with sub-pixel edges, in place."""
     low, high = outline.min(0), outline.max(0)
     if high[0] < 0 or high[1] < 0 or low[0] > canvas.shape[1] or low[1] > canvas.shape[0]:
         return

@@ -1,4 +1,4 @@
-"""Lenses: a picture through a distorting lens is resampled from a wider pinhole picture."""
+"""Lenses: an image through a distorting lens is resampled from a wider pinhole image."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from bevcli.errors import InputError
 from bevcli.geometry.cameras import Camera, distort
 from bevcli.geometry.transforms import Array
 
-WIDEST = 4.0  # tangent of the widest angle off the axis that a pinhole picture can show with sense
+WIDEST = 4.0  # tangent of the widest angle off the axis that a pinhole image can show with sense
 REFINEMENTS = 15  # fixed-point steps; OpenCV's own result is good to some pixels only at strong distortion
 
 
 @dataclass(frozen=True)
 class LensMaps:
-    """pinhole: the camera whose picture is resampled. x, y: (H, W) float32 where in it each pixel looks."""
+    """pinhole: the camera whose image is resampled. x, y: (H, W) float32 where in it each pixel looks."""
 
     pinhole: Camera
     x: NDArray[np.float32]
@@ -26,7 +26,7 @@ class LensMaps:
 
 
 def distortion_maps(camera: Camera) -> LensMaps:
-    """How to get the picture of a camera with distortion. Raises InputError where its view is too wide for a plane."""
+    """How to get the image of a camera with distortion. Raises InputError where its view is too wide for a plane."""
     u, v = np.meshgrid(np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64))
     rays = _undistorted_rays(camera, np.stack([u, v], -1).reshape(-1, 2)).reshape(camera.height, camera.width, 2)
     if not np.isfinite(rays).all() or np.abs(rays).max() > WIDEST:

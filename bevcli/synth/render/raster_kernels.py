@@ -59,7 +59,7 @@ def rasterise_runs(corners, normals, runs, run_objects, run_spheres, camera_from
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _is_hidden(center, radius, pinhole, inverse_depth):
-    """Whether everything that the sphere's picture may cover is nearer than the sphere already."""
+    """Whether everything that the sphere's image may cover is nearer than the sphere already."""
     near, far = center[2] - radius, center[2] + radius
     left, right = center[0] - radius, center[0] + radius
     above, below = center[1] - radius, center[1] + radius
@@ -102,9 +102,9 @@ def _draw_triangle(p, cut, t, owner, pinhole, triangles, inverse_depth, stamps, 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill(p, q, a, b, c, pinhole, t, owner, triangles, inverse_depth, stamps, unoccluded):
-    """Scan the rows of the picture that points a, b, c of q span; each edge bounds the columns of a row.
+    """Scan the rows of the image that points a, b, c of q span; each edge bounds the columns of a row.
 
-    p: (3, 3) the whole triangle in the camera frame. 1 / z is affine over the picture, so its plane gives it exactly.
+    p: (3, 3) the whole triangle in the camera frame. 1 / z is affine over the image, so its plane gives it exactly.
     """
     fx, skew, cx, fy, cy = pinhole[0], pinhole[1], pinhole[2], pinhole[3], pinhole[4]
     height, width = triangles.shape

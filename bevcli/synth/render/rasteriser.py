@@ -18,10 +18,10 @@ from bevcli.synth.render.raster_kernels import rasterise_heights, rasterise_runs
 
 @dataclass(frozen=True)
 class VisibilityBuffer:
-    """What each pixel of one picture sees.
+    """What each pixel of one image sees.
 
     triangles: (H, W) int32 index of the nearest triangle, -1 for none. inverse_depth: (H, W) float32, 1/m.
-    unoccluded: (O,) int64 pixels that each object would cover alone in the picture; for one that is wholly hidden by
+    unoccluded: (O,) int64 pixels that each object would cover alone in the image; for one that is wholly hidden by
     what was drawn before it, it may be 0.
     """
 
@@ -40,7 +40,7 @@ def rasterise(
     camera_from_world: Array,
     object_count: int,
 ) -> VisibilityBuffer:
-    """Rasterise triangles into one picture. The camera's distortion is not applied.
+    """Rasterise triangles into one image. The camera's distortion is not applied.
 
     corners: (T, 3, 3) world metres, counter-clockwise seen from outside; back faces are not drawn. normals: (T, 3).
     runs: (R, 2) first and last-plus-one triangle of each run. run_objects: (R,) object that the run belongs to,

@@ -1,4 +1,4 @@
-"""Pictures of a moment: rasterise and shade every camera of a rig, and count what each object shows."""
+"""Images of a moment: rasterise and shade every camera of a rig, and count what each object shows."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Moment:
 
 @dataclass(frozen=True)
 class Exposure:
-    """One camera's picture. pixels_bgr: (H, W, 3) uint8. objects: (H, W) int32 object that each pixel sees, or -1.
+    """One camera's image. pixels_bgr: (H, W, 3) uint8. objects: (H, W) int32 object that each pixel sees, or -1.
 
     visible, unoccluded: (O,) pixels that each object shows, and would show if nothing stood before it.
     """
@@ -43,10 +43,10 @@ class Exposure:
 
 
 def expose(moment: Moment, camera: Camera, world_from_ego: Array, supersampling: int = 1) -> Exposure:
-    """The picture that a camera takes. world_from_ego: (4, 4) at the camera's time.
+    """The image that a camera takes. world_from_ego: (4, 4) at the camera's time.
 
-    supersampling: samples a pixel along each side, averaged for the picture; pixels are counted in whole pixels.
-    A lens with distortion is served by resampling a wider pinhole picture, objects by its nearest pixel.
+    supersampling: samples a pixel along each side, averaged for the image; pixels are counted in whole pixels.
+    A lens with distortion is served by resampling a wider pinhole image, objects by its nearest pixel.
     """
     if camera.distortion is not None:
         lens = distortion_maps(camera)
@@ -63,27 +63,25 @@ def expose(moment: Moment, camera: Camera, world_from_ego: Array, supersampling:
         inverse(world_from_camera),
         moment.object_count,
     )
-    picture = shade(
-        buffer, moment.soup.surfaces, moment.ground, moment.shadows, moment.weather, fine, world_from_camera
-    )
+    image = shade(buffer, moment.soup.surfaces, moment.ground, moment.shadows, moment.weather, fine, world_from_camera)
     objects = seen_objects(buffer, moment.soup)
     area = supersampling**2
     visible = np.bincount(objects[objects >= 0], minlength=moment.object_count)
     if supersampling > 1:
-        picture = cv2.resize(picture, (camera.width, camera.height), interpolation=cv2.INTER_AREA).astype(np.uint8)
+        image = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA).astype(np.uint8)
         objects = np.ascontiguousarray(objects[::supersampling, ::supersampling])
-    return Exposure(picture, objects, visible // area, -(-buffer.unoccluded // area))
+    return Exposure(image, objects, visible // area, -(-buffer.unoccluded // area))
 
 
 def _through(lens: LensMaps, pinhole: Exposure, object_count: int) -> Exposure:
-    """What the lens makes of its pinhole picture; unoccluded pixels are scaled as the visible ones."""
-    picture = cv2.remap(pinhole.pixels_bgr, lens.x, lens.y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    """What the lens makes of its pinhole image; unoccluded pixels are scaled as the visible ones."""
+    image = cv2.remap(pinhole.pixels_bgr, lens.x, lens.y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     rows, columns = np.round(lens.y).astype(int), np.round(lens.x).astype(int)
     objects = pinhole.objects[rows, columns]
     visible = np.bincount(objects[objects >= 0], minlength=object_count)
     share = np.minimum(pinhole.visible / np.maximum(pinhole.unoccluded, 1), 1.0)
     unoccluded = np.where(visible > 0, np.ceil(visible / np.maximum(share, 1e-6)), pinhole.unoccluded)
-    return Exposure(picture.astype(np.uint8), objects, visible, unoccluded.astype(np.int64))
+    return Exposure(image.astype(np.uint8), objects, visible, unoccluded.astype(np.int64))
 
 
 def supersampled(camera: Camera, factor: int) -> Camera:

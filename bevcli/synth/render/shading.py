@@ -1,4 +1,4 @@
-"""Shading: a visibility buffer -> a picture, each pixel once, with sun shadows, windows, reflections and haze.
+"""Shading: a visibility buffer -> an image, each pixel once, with sun shadows, windows, reflections and haze.
 
 Light is linear; surfaces answer as matte reflectors, glass and paint also mirror the sky. The ground needs no
 triangles: a pixel that sees none and looks down sees the plane z = 0.
@@ -54,11 +54,11 @@ def shade(
     camera: Camera,
     world_from_camera: Array,
 ) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 BGR picture of what the visibility buffer of this camera (without distortion) saw."""
+    """(H, W, 3) uint8 BGR image of what the visibility buffer of this camera (without distortion) saw."""
     w = weather
     light = np.stack([w.sun, w.sky, w.bounce, w.zenith, w.horizon, w.haze, w.cloud_color]).astype(np.float64)
     ray_from_image = world_from_camera[:3, :3] @ np.linalg.inv(camera.intrinsics)
-    picture = np.empty((*buffer.triangles.shape, 3), np.uint8)
+    image = np.empty((*buffer.triangles.shape, 3), np.uint8)
     shade_pixels(
         (buffer.triangles, buffer.inverse_depth),
         (surfaces.normals, surfaces.albedo, surfaces.material, surfaces.facade, surfaces.facades),
@@ -67,6 +67,6 @@ def shade(
         (light, w.to_sun, w.clouds, w.haze_m, w.lamps),
         (ray_from_image, np.ascontiguousarray(world_from_camera[:3, 3]), 1.0 / camera.intrinsics[0, 0]),
         display_table(limit=LIGHT_LIMIT),
-        picture,
+        image,
     )
-    return picture
+    return image

@@ -1,4 +1,4 @@
-"""The kernels that colour a picture's pixels: `shade_pixels` and all that it calls.
+"""The kernels that colour an image's pixels: `shade_pixels` and all that it calls.
 
 They share one file because numba's cache on the disk asks only whether a function's own file has changed.
 """
@@ -21,8 +21,8 @@ GROUND, FACADE, GLASS, PAINT, GLOW = (
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, picture):
-    """Colour every pixel of `picture` (H, W, 3); the groups of arrays and numbers are those of `shading.shade`.
+def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, image):
+    """Colour every pixel of `image` (H, W, 3); the groups of arrays and numbers are those of `shading.shade`.
 
     One long function: in parts it would pass a dozen numbers to and fro for every pixel.
     """
@@ -52,7 +52,7 @@ def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, pictur
                 z = -eye[2] / rz
             else:
                 _sky(rx / length, ry / length, rz / length, light, to_sun, clouds, a)
-                _put(picture, v, u, a, table, table_scale)
+                _put(image, v, u, a, table, table_scale)
                 continue
             px, py, pz = eye[0] + z * rx, eye[1] + z * ry, eye[2] + z * rz
             distance = z * length
@@ -92,14 +92,14 @@ def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, pictur
             veil *= veil
             for c in range(3):
                 a[c] += (haze[c] - a[c]) * veil
-            _put(picture, v, u, a, table, table_scale)
+            _put(image, v, u, a, table, table_scale)
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _put(picture, v, u, color, table, scale):
+def _put(image, v, u, color, table, scale):
     for c in range(3):
         level = int(color[c] * scale)
-        picture[v, u, 2 - c] = table[min(max(level, 0), table.shape[0] - 1)]
+        image[v, u, 2 - c] = table[min(max(level, 0), table.shape[0] - 1)]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -10,9 +10,9 @@ import torch
 from bevcli.model.bevformer import BEVFormerInputs
 from bevcli.training.detection_loss import DetectionLossConfig
 from bevcli.training.detection_targets import DetectionTargets
-from bevcli.training.image_loss import PictureLossConfig, PictureReader, _taught_pixels, picture_loss
+from bevcli.training.image_loss import ImageFeatureReader, ImageLossConfig, _taught_pixels, image_loss
 
-SIZE, SHAPE = (224, 384), (28, 48)  # a picture, and its features at stride 8
+SIZE, SHAPE = (224, 384), (28, 48)  # an image, and its features at stride 8
 INTRINSICS = torch.tensor([[200.0, 0, 192, 0], [0, 200, 112, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 CAMERA_FROM_BEV = torch.tensor([[1.0, 0, 0, 0], [0, 0, -1, 1.5], [0, 1, 0, 0], [0, 0, 0, 1]])  # ahead is +y
 IMAGE_FROM_BEV = INTRINSICS @ CAMERA_FROM_BEV
@@ -32,7 +32,7 @@ def seen(image_from_bev: torch.Tensor) -> BEVFormerInputs:
         images=torch.zeros(frames, cameras, 3, *SIZE),
         image_from_bev=image_from_bev,
         camera_index=torch.arange(cameras),
-        has_picture=torch.ones(frames, cameras, dtype=torch.bool),
+        has_image=torch.ones(frames, cameras, dtype=torch.bool),
         can_bus=torch.zeros(frames, 18),
         shift=torch.zeros(frames, 2),
         rotation_deg=torch.zeros(frames),
@@ -59,20 +59,20 @@ def test_the_nearer_of_two_objects_teaches():
 
 
 @pytest.mark.parametrize("codes", [(), (code(0, -10),), (code(300, 10),)])
-def test_nothing_in_the_picture_teaches_nothing(codes: tuple[list[float], ...]):
+def test_nothing_in_the_image_teaches_nothing(codes: tuple[list[float], ...]):
     assert not len(taught(*codes).rows)
 
 
 def test_what_is_said_rightly_costs_little_and_every_weight_learns():
-    reader = PictureReader(channels=8, classes=2)
+    reader = ImageFeatureReader(channels=8, classes=2)
     truth = DetectionTargets(torch.tensor([1]), torch.tensor([code(2, 10)]))
     nothing = DetectionTargets(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 10))
     features = torch.randn(4, 8, *SHAPE)  # two frames of two cameras
     inputs = seen(IMAGE_FROM_BEV.expand(2, 2, 4, 4))
-    config = PictureLossConfig(weight=1.0)
+    config = ImageLossConfig(weight=1.0)
 
     def loss():
-        return picture_loss(reader, features, inputs, (truth, nothing), config, DetectionLossConfig())
+        return image_loss(reader, features, inputs, (truth, nothing), config, DetectionLossConfig())
 
     first = loss()
     optimizer = torch.optim.Adam(reader.parameters(), lr=0.05)
@@ -88,8 +88,8 @@ def test_what_is_said_rightly_costs_little_and_every_weight_learns():
 
 def test_frames_without_objects_cost_no_place():
     nothing = DetectionTargets(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 10))
-    reader = PictureReader(channels=8, classes=2)
+    reader = ImageFeatureReader(channels=8, classes=2)
     features, inputs = torch.randn(1, 8, *SHAPE), seen(IMAGE_FROM_BEV[None, None])
-    result = picture_loss(reader, features, inputs, [nothing], PictureLossConfig(1.0), DetectionLossConfig())
+    result = image_loss(reader, features, inputs, [nothing], ImageLossConfig(1.0), DetectionLossConfig())
     assert result.places == 0
     assert result.classes.isfinite()
