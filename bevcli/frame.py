@@ -1,4 +1,4 @@
-"""The vocabulary between the parts: what a reader hands over, and what the model answers, frame by frame."""
+"""The types that pass between the parts: a frame as readers return it, and a prediction as the model returns it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from bevcli.geometry.transforms import Array, Pose
 if TYPE_CHECKING:
     from torch import Tensor
 
-# The bits of a BEV map's cells: a cell may be several at once (design of ground_truth_map/NNNNNN.png).
+# The bits of a BEV map's cells. A cell may belong to several classes (file format ground_truth_map/NNNNNN.png).
 MAP_CLASSES = {"drivable_road": 1, "lane_boundary": 2, "pedestrian_crossing": 4, "vehicle": 8}
 
 
@@ -26,8 +26,11 @@ MAP_CLASSES = {"drivable_road": 1, "lane_boundary": 2, "pedestrian_crossing": 4,
 class CameraImage:
     """One camera's image.
 
-    pixels_bgr: (H, W, 3) uint8, as OpenCV decodes it. encoded: the file's own bytes, where there is a file.
-    media_type: of these bytes, "image/jpeg" or "image/png".
+    Attributes:
+        timestamp_ns: when it was taken.
+        pixels_bgr: (H, W, 3) uint8, as OpenCV decodes it.
+        encoded: the bytes of the image file, None where there is no file.
+        media_type: of `encoded`, "image/jpeg" or "image/png".
     """
 
     timestamp_ns: int
@@ -38,10 +41,13 @@ class CameraImage:
 
 @dataclass(frozen=True)
 class BevMap:
-    """What lies on the ground, seen from above in the bev frame.
+    """A map of the ground in the bev frame.
 
-    cells: (rows, columns) uint8 of MAP_CLASSES' bits; columns from the smallest x to the largest, rows from the
-    LARGEST y (ahead, top) to the smallest, as in an image.
+    Attributes:
+        cells: (rows, columns) uint8, the bits of MAP_CLASSES. Columns run from the smallest x to the largest, rows
+            from the LARGEST y (ahead, top) to the smallest, as in an image.
+        x_range_m: smallest and largest x, metres.
+        y_range_m: smallest and largest y, metres.
     """
 
     cells: NDArray[np.uint8]
@@ -51,7 +57,13 @@ class BevMap:
 
 @dataclass(frozen=True)
 class FrameStamp:
-    """When a frame is: `index` is the number that files and the user see; scene "" where there is one only."""
+    """The identity and the time of a frame.
+
+    Attributes:
+        index: the number of the frame in files and on the command line.
+        scene: the name of its scene, "" where the sequence has only one.
+        timestamp_ns: its time.
+    """
 
     index: int
     scene: str
@@ -60,11 +72,19 @@ class FrameStamp:
 
 @dataclass(frozen=True)
 class Frame:
-    """All that is known of one moment.
+    """The sensor data and the ground truth of one moment.
 
-    images: by camera, without those that are missing. dropped: camera -> why its image is missing.
-    world_from_ego: at the frame's time. world_from_ego_at: at each camera's own time, for every camera of the rig.
-    kinematics: at the frame's time. ground_truth: in the world frame. sample_token: nuScenes' name of the frame.
+    Attributes:
+        stamp: identity and time.
+        rig: the cameras.
+        images: camera -> image; missing images are left out.
+        world_from_ego: the vehicle's pose at the frame's time.
+        world_from_ego_at: camera -> the vehicle's pose at that camera's own time, for every camera of the rig.
+        kinematics: acceleration, angular rate and velocity at the frame's time.
+        dropped: camera -> why its image is missing.
+        ground_truth: boxes in the world frame.
+        ground_truth_map: a map in the bev frame.
+        sample_token: nuScenes' name of the frame.
     """
 
     stamp: FrameStamp
@@ -80,11 +100,14 @@ class Frame:
 
 
 class Sequence(Protocol):
-    """A drive, from whatever files. Readers in `bevcli.sequences` follow it.
+    """A drive: frames in order. The readers in `bevcli.sequences` follow this protocol.
 
-    `rig` is the first frame's; a frame's own stands in `Frame.rig` (nuScenes' scenes differ). `notes` are what the
-    user should be told once (an assumption, a default). Without ego-motion (`has_ego_motion` false) every pose is the
-    identity, and boxes can be given in the ego frame only.
+    Attributes:
+        name: of the drive, for output folders and titles.
+        rig: the cameras of the first frame; `Frame.rig` holds each frame's own (nuScenes' scenes differ).
+        has_ego_motion: whether poses are known. If not, every pose is the identity, and boxes can be given in the ego
+            frame only.
+        notes: assumptions and defaults that the user should be told once.
     """
 
     name: str
@@ -94,23 +117,24 @@ class Sequence(Protocol):
 
     @property
     def stamps(self) -> tuple[FrameStamp, ...]:
-        """When each frame is, in order; known without decoding an image."""
+        """Identity and time of each frame, in order. No image is decoded for this."""
         ...
 
     def load(self, place: int) -> Frame:
-        """The frame at a place (0 to len(stamps) - 1), its images decoded. Called in order, from one thread.
+        """The frame at a place (0 to len(stamps) - 1), with decoded images. Called in order, from one thread.
 
-        An image that cannot be read lands in `Frame.dropped`; other mistakes raise InputError.
+        An image that cannot be read is listed in `Frame.dropped`; other mistakes raise InputError.
         """
         ...
 
 
 @dataclass(frozen=True)
 class CameraSamples:
-    """Where spatial cross-attention looked in one camera's image.
+    """The sampling points of spatial cross-attention in one camera's image.
 
-    pixels: (K, 2) in the image as it was read (not the network's input), may lie outside of it.
-    weights: (K,) attention weights, not negative; over all cameras of a probe they sum to about 1.
+    Attributes:
+        pixels: (K, 2) x, y in the image as read (not the network's input); may lie outside of it.
+        weights: (K,) attention weights, 0 or larger; over all cameras of a probe they sum to about 1.
     """
 
     pixels: Array
@@ -119,9 +143,11 @@ class CameraSamples:
 
 @dataclass(frozen=True)
 class Probe:
-    """One BEV cell that was asked where it looks.
+    """The sampling points of one BEV cell.
 
-    cell_center: (2,) x, y of its centre in the bev frame, metres. cameras: name -> samples, of the cameras it hits.
+    Attributes:
+        cell_center: (2,) x, y of the cell's centre in the bev frame, metres.
+        cameras: camera -> sampling points, for the cameras that see the cell's pillar.
     """
 
     cell_center: Array
@@ -130,10 +156,12 @@ class Probe:
 
 @dataclass(frozen=True)
 class AttentionView:
-    """What a frame's attention did, where the model was asked.
+    """What the attentions of the last encoder layer sampled.
 
-    history_weight: (rows, columns) 0 to 1, how much each cell took from the previous BEV map in temporal
-    self-attention, rows from the smallest y; None where no history was used. probes: in the order asked for.
+    Attributes:
+        history_weight: (rows, columns) 0 to 1, the share of the previous BEV map in what temporal self-attention
+            sampled for each cell; rows from the smallest y. None where no history was used.
+        probes: one a probed cell, in the order of the request.
     """
 
     history_weight: Array | None = None
@@ -142,14 +170,22 @@ class AttentionView:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What the model says of one frame.
+    """The model's results for one frame.
 
-    boxes: all decoded boxes, best first, in the bev frame, with classes and scores.
-    bev: (Y*X, C) tensor, cell index row * columns + column, rows from the smallest y; None where no image came.
-    started_anew: why no history was used ("first frame", "new scene", …), "" where it was.
-    skipped: no image at all; boxes are empty and the state was passed on.
-    segmentation: of the model's segmentation head, where it has one. attention: where the run asked for it.
-    stage_seconds: time per stage of the pipeline, in the order of the work.
+    Attributes:
+        stamp: of the frame.
+        boxes: all decoded boxes in the bev frame, highest score first, with classes and scores.
+        ego_from_bev: (4, 4) pose of the bev frame in the ego frame.
+        world_from_ego: the vehicle's pose at the frame's time.
+        grid: the BEV grid.
+        bev: (Y·X, C) tensor, the BEV feature map; cell index row * columns + column, rows from the smallest y. None
+            where the frame has no image.
+        started_anew: why no history was used ("first frame", "new scene", …), "" where it was used.
+        camera_embeddings: camera of the rig -> camera of the model whose embedding it took, in the model's order.
+        skipped: whether the frame has no image at all: no boxes, and the state was passed on.
+        segmentation: the map of the segmentation head, None without one.
+        attention: what the attentions sampled, where this was asked for.
+        stage_seconds: stage of the pipeline -> seconds, in the order of execution.
     """
 
     stamp: FrameStamp
@@ -159,6 +195,7 @@ class Prediction:
     grid: BevGrid
     bev: Tensor | None
     started_anew: str
+    camera_embeddings: Mapping[str, str] = field(default_factory=dict)
     skipped: bool = False
     segmentation: BevMap | None = None
     attention: AttentionView | None = None
@@ -171,5 +208,5 @@ class Prediction:
 
     @property
     def boxes_world(self) -> Boxes3D:
-        """The boxes in the world frame. Velocities are over ground already: only their direction turns."""
+        """The boxes in the world frame. Velocities are over ground in every frame; only their direction changes."""
         return self.boxes.transformed(self.world_from_ego.matrix @ self.ego_from_bev)

@@ -1,4 +1,4 @@
-"""`bevcli`: the commands, and what becomes of mistakes.
+"""`bevcli`: the commands and the exit codes.
 
 Exit codes: 0 success, 1 a mistake in the input, 2 a mistake in usage (click's own), 130 interrupted; a command
 may have one of its own. No command module imports torch, OpenCV or rerun before it is called.
@@ -28,7 +28,7 @@ from bevcli.cli.weights import weights_app
 from bevcli.errors import BevcliError
 
 app = typer.Typer(
-    help="Run BEVFormer on sequences from any camera rig, and see what it sees.",
+    help="Run BEVFormer on sequences from any camera rig, and look at the results.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -47,7 +47,7 @@ def root(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
-    """Run BEVFormer on sequences from any camera rig, and see what it sees."""
+    """Run BEVFormer on sequences from any camera rig, and look at the results."""
 
 
 app.command()(bench)

@@ -1,9 +1,9 @@
-"""`bevcli run`: the main job, from a drive to boxes and a recording."""
+"""`bevcli run`: a sequence in, boxes and a recording out."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -18,17 +18,22 @@ from bevcli.cli.input_options import (
     VersionOption,
 )
 
+if TYPE_CHECKING:
+    from bevcli.frame import Frame, Prediction, Sequence
+    from bevcli.pipeline.model_loading import Model
+
 MODEL, OUTPUT, RECORDING = "Model", "Output", "Recording"
 
 
 def run(
     sequence: Annotated[
-        Path, typer.Argument(help="A sequence folder, a folder of videos (one a camera), or a nuScenes root.")
+        Path,
+        typer.Argument(help="A sequence folder, a folder with one video per camera, or a nuScenes root."),
     ],
     model: Annotated[
         str | None,
         typer.Option(
-            help="tiny, small, base, demo, or a FILE.toml. Default: what WEIGHTS are for, else demo.",
+            help="tiny, small, base, demo, or a FILE.toml. Default: the model that WEIGHTS fit, else demo.",
             rich_help_panel=MODEL,
             show_default=False,
         ),
@@ -36,45 +41,59 @@ def run(
     weights: Annotated[
         Path | None,
         typer.Option(
-            help="The official .pth as published, or a .safetensors. Default: the package's own, which only demo has.",
+            help="An official .pth file or a .safetensors file. Default: the weights in the package (demo only).",
             rich_help_panel=MODEL,
             show_default=False,
         ),
     ] = None,
     untrained: Annotated[
-        bool, typer.Option("--untrained", help="Run on random weights; everything says so.", rich_help_panel=MODEL)
+        bool,
+        typer.Option(
+            "--untrained", help="Use random weights; all outputs are labelled UNTRAINED.", rich_help_panel=MODEL
+        ),
     ] = False,
     device: Annotated[
-        Literal["auto", "cpu", "cuda"], typer.Option(help="auto takes a GPU where there is one.", rich_help_panel=MODEL)
+        Literal["auto", "cpu", "cuda"], typer.Option(help="auto uses a GPU if there is one.", rich_help_panel=MODEL)
     ] = "auto",
     precision: Annotated[
         Literal["fp32", "bf16", "fp16"] | None,
-        typer.Option(help="Default: fp32 on the CPU, bf16 on a GPU.", rich_help_panel=MODEL, show_default=False),
+        typer.Option(
+            help="Precision of the image features. Default: fp32 on a CPU, bf16 on a GPU.",
+            rich_help_panel=MODEL,
+            show_default=False,
+        ),
     ] = None,
     temporal: Annotated[
-        bool, typer.Option("--temporal/--no-temporal", help="Use the previous BEV map.", rich_help_panel=MODEL)
+        bool,
+        typer.Option("--temporal/--no-temporal", help="Use the BEV map of the previous frame.", rich_help_panel=MODEL),
     ] = True,
     camera: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME=MODEL_CAMERA",
-            help="Take this camera's embedding for NAME. Repeatable. Default: by name, else by direction.",
+            help="Use the embedding of MODEL_CAMERA for camera NAME. Repeatable. Default: the model's camera of the "
+            "same name, else the one with the nearest viewing direction.",
             rich_help_panel=MODEL,
         ),
     ] = None,
     frames: Annotated[
         str | None,
-        typer.Option(metavar="A:B", help="Only these places in the sequence, B exclusive.", rich_help_panel=PANEL),
+        typer.Option(metavar="A:B", help="Frame range A:B; B is excluded.", rich_help_panel=PANEL),
     ] = None,
     rate: Annotated[
         str | None,
-        typer.Option(metavar="HZ|all", help="Thin to this rate. Default: the model's own.", rich_help_panel=PANEL),
+        typer.Option(
+            metavar="HZ|all",
+            help="Reduce the frame rate to this. Default: the rate that the model was trained on.",
+            rich_help_panel=PANEL,
+        ),
     ] = None,
     every: Annotated[
-        int | None, typer.Option(min=1, help="Take every N-th frame, whatever the rate.", rich_help_panel=PANEL)
+        int | None, typer.Option(min=1, help="Use every N-th frame, whatever the rate.", rich_help_panel=PANEL)
     ] = None,
     static: Annotated[
-        bool, typer.Option("--static", help="The vehicle stands: no ego-motion is needed.", rich_help_panel=PANEL)
+        bool,
+        typer.Option("--static", help="The vehicle stands still: ego-motion is not needed.", rich_help_panel=PANEL),
     ] = False,
     strict: StrictOption = False,
     scene: SceneOption = None,
@@ -87,62 +106,100 @@ def run(
         Path | None, typer.Option(help="Default: runs/SEQUENCE-MODEL.", rich_help_panel=OUTPUT, show_default=False)
     ] = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Overwrite an existing output folder.", rich_help_panel=OUTPUT)
+        bool,
+        typer.Option(
+            "--force", help="Replace the files of an earlier run in the output folder.", rich_help_panel=OUTPUT
+        ),
     ] = False,
     score: Annotated[
-        float, typer.Option(min=0, max=1, help="Boxes below are neither shown nor counted.", rich_help_panel=OUTPUT)
+        float,
+        typer.Option(
+            min=0,
+            max=1,
+            help="Hide boxes scored below this; predictions.json keeps all of them.",
+            rich_help_panel=OUTPUT,
+        ),
     ] = 0.25,
     save_bev: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Write each frame's BEV features as float16 .npy.", rich_help_panel=OUTPUT),
+        typer.Option(
+            metavar="DIR", help="Write the BEV features of each frame, as float16 .npy files.", rich_help_panel=OUTPUT
+        ),
     ] = None,
     live: Annotated[
-        bool, typer.Option("--live", help="Open a viewer that follows the run.", rich_help_panel=RECORDING)
+        bool,
+        typer.Option(
+            "--live", help="Open a viewer that shows the recording while it is written.", rich_help_panel=RECORDING
+        ),
     ] = False,
     record: Annotated[
         Literal["minimal", "standard", "full"],
-        typer.Option(help="How much goes into the recording.", rich_help_panel=RECORDING),
+        typer.Option(help="How much the recording contains.", rich_help_panel=RECORDING),
     ] = "standard",
     bev: Annotated[
-        str, typer.Option(help="The BEV features as an image: norm, pca, channel:K, none.", rich_help_panel=RECORDING)
+        str,
+        typer.Option(help="How the BEV features are drawn: norm, pca, channel:K or none.", rich_help_panel=RECORDING),
     ] = "pca",
     probe: Annotated[
         list[str] | None,
         typer.Option(
             metavar="X,Y",
-            help="Draw where the cell at X, Y (bev frame, m) looks. Repeatable.",
+            help="Show the image points that the BEV cell at X, Y (bev frame, metres) attends to. Repeatable.",
             rich_help_panel=RECORDING,
         ),
     ] = None,
 ) -> None:
-    """Run BEVFormer on SEQUENCE, frame by frame; write boxes and a recording to look at.
+    """Run BEVFormer on SEQUENCE, frame by frame, and write boxes and a recording.
 
-    The output folder gets recording.rrd (open it with `bevcli viz`), predictions.json (all boxes, whatever their
-    score) and summary.json.
+    The output folder gets recording.rrd (open it with `bevcli viz`), predictions.json (all boxes of all frames),
+    summary.json and, for models with a segmentation head, segmentation/.
     """
+    from bevcli.cli.progress import Progress
     from bevcli.cli.run_input import FrameChoice, choose_frames, ego_motion_use
-    from bevcli.pipeline.model_loading import choose_device, choose_precision, load_model
-    from bevcli.pipeline.run_job import Job, run_job
-    from bevcli.pipeline.runner import StepOptions
+    from bevcli.pipeline.model_loading import load_model
+    from bevcli.pipeline.run import RunOptions, run_into_folder
     from bevcli.recording.options import RecordingOptions
     from bevcli.sequences.open import InputOptions
 
     recording = RecordingOptions(record, bev, score, tuple(map(parse_probe, probe or ())), live)
-    loaded = load_model(model, weights, untrained=untrained)
+    loaded = load_model(model, weights, device=device, precision=precision, untrained=untrained)
     motion = ego_motion_use(static=static, temporal=temporal)
-    options = InputOptions(motion, strict, scene, version, split, sweeps, intrinsics, extrinsics)
-    drive = choose_frames(sequence, options, FrameChoice(frames, rate, every), loaded.model.config)
-    target = choose_device(device)
-    step = StepOptions(
-        choose_precision(precision, target),
-        temporal,
-        ask_attention=recording.shows_insides,
-        probes=recording.probes,
-    )
-    out = Path("runs") / f"{drive.name}-{loaded.model.config.name}" if out is None else out
-    run_job(
-        Job(drive, loaded, target, step, recording, dict(map(parse_camera, camera or ())), out, save_bev), force=force
-    )
+    inputs = InputOptions(motion, strict, scene, version, split, sweeps, intrinsics, extrinsics)
+    drive = choose_frames(sequence, inputs, FrameChoice(frames, rate, every), loaded.config)
+    out = Path("runs") / f"{drive.name}-{loaded.name}" if out is None else out
+    options = RunOptions(temporal, dict(map(parse_camera, camera or ())), recording, save_bev)
+
+    def show(frame: Frame, prediction: Prediction) -> None:
+        for warning in warnings(frame, prediction):
+            progress.message(f"warning: {warning}")
+        progress.advance()
+
+    with Progress(len(drive.stamps), "frames") as progress:
+        for note in notes(loaded, drive):
+            progress.message(f"note: {note}")
+        summary = run_into_folder(loaded, drive, out, options, force=force, after_frame=show)
+    print(summary.table())
+
+
+def notes(model: Model, drive: Sequence) -> list[str]:
+    """What the user should know before the run starts."""
+    found = list(drive.notes)
+    if model.untrained:
+        found.append("the weights are UNTRAINED: random weights, the boxes are meaningless")
+    if model.bundled:
+        found.append("these weights were trained on rendered streets, not on the real world (docs/model-card.md)")
+    return found
+
+
+def warnings(frame: Frame, prediction: Prediction) -> list[str]:
+    """What the user should know about a frame; the recording logs its own events."""
+    where = f"frame {frame.stamp.index}"
+    found = [f"{where}: camera {camera} has no image: {why}" for camera, why in frame.dropped.items()]
+    if prediction.skipped:
+        found.append(f"{where}: no camera has an image; the state is passed on to the next frame")
+    if prediction.started_anew.startswith("gap"):
+        found.append(f"{where}: {prediction.started_anew}; the history starts anew")
+    return found
 
 
 def parse_probe(text: str) -> tuple[float, float]:
@@ -151,7 +208,7 @@ def parse_probe(text: str) -> tuple[float, float]:
         x, y = map(float, text.split(","))
     except ValueError:
         raise typer.BadParameter(
-            f'"{text}" is no place (expected X,Y in metres, as 10,-2.5)', param_hint="--probe"
+            f'"{text}" is not a position (expected X,Y in metres, such as 10,-2.5)', param_hint="--probe"
         ) from None
     return x, y
 
@@ -160,5 +217,5 @@ def parse_camera(text: str) -> tuple[str, str]:
     """ "NAME=MODEL_CAMERA" -> both names. Raises click's usage error."""
     name, equals, embedding = text.partition("=")
     if not (name and equals and embedding):
-        raise typer.BadParameter(f'"{text}" (expected NAME=MODEL_CAMERA)', param_hint="--camera")
+        raise typer.BadParameter(f'"{text}" is not an assignment (expected NAME=MODEL_CAMERA)', param_hint="--camera")
     return name, embedding

@@ -41,17 +41,13 @@ def validate(
     from bevcli.cli.train import open_drives
     from bevcli.evaluation.scores_json import scores_to_json
     from bevcli.evaluation.scores_table import scores_table
-    from bevcli.model.prepared import prepare_for_inference
-    from bevcli.pipeline.model_loading import choose_device, choose_precision, load_model
+    from bevcli.pipeline.model_loading import load_model
     from bevcli.pipeline.runner import Runner, StepOptions
     from bevcli.training.validation import validate as validate_model
 
-    loaded = load_model(model, weights, untrained=False)
-    drives = open_drives(data or [], rendered, cache, loaded.model.config)
-    target = choose_device(device)
-    precision = choose_precision(None, target)
-    prepared = prepare_for_inference(loaded.model, target, precision)
-    runner = Runner(prepared, target, StepOptions(precision, temporal))
+    loaded = load_model(model, weights, device=device)
+    drives = open_drives(data or [], rendered, cache, loaded.config)
+    runner = Runner(loaded.prepared, loaded.device, StepOptions(loaded.precision, temporal))
     with Progress(sum(len(drives.open(place).stamps) for place in range(len(drives))), "frames") as progress:
         scores = validate_model(runner, drives, max_range, progress.advance)
     if as_json:

@@ -1,8 +1,9 @@
-"""A configured model with its weights, on the device that the user wants."""
+"""`load_model`: a configured model with its weights, on a device."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -10,51 +11,98 @@ import torch
 from bevcli.checkpoints import bundled_weights, inspect, load_weights
 from bevcli.config import known_models, load_config
 from bevcli.errors import BevcliError, WeightsError
-from bevcli.model.bevformer import BEVFormer
-from bevcli.model.prepared import Precision
+from bevcli.model.bevformer import BEVFormer, BEVFormerConfig
+from bevcli.model.prepared import Precision, prepare_for_inference
 
 DEFAULT_MODEL = "demo"
-UNTRAINED_SEED = 0  # so that two untrained runs of one drive agree
+UNTRAINED_SEED = 0  # two untrained runs of one drive agree
 
 
 @dataclass(frozen=True)
-class LoadedModel:
-    """weights: the file they came from, None when untrained. bundled: whether that file is the package's own."""
+class Model:
+    """A model with its weights, and the device that it runs on.
 
-    model: BEVFormer
-    weights: Path | None
+    Attributes:
+        network: the plain BEVFormer, as in the paper, on the CPU.
+        device: where it runs.
+        precision: of the image features; the rest of the network computes in float32.
+        weights: the file that the weights came from, None for random weights.
+        bundled: whether that file is part of the package.
+    """
+
+    network: BEVFormer
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+    precision: Precision = "fp32"
+    weights: Path | None = None
     bundled: bool = False
 
     @property
+    def config(self) -> BEVFormerConfig:
+        """The model's configuration, as its TOML file states it."""
+        return self.network.config
+
+    @property
+    def name(self) -> str:
+        """The model's name, such as "tiny"."""
+        return self.config.name
+
+    @property
     def untrained(self) -> bool:
-        """Whether the weights are random: then nothing that the model says means anything."""
+        """Whether the weights are random: boxes and maps are then meaningless."""
         return self.weights is None
 
+    @cached_property
+    def prepared(self) -> BEVFormer:
+        """The network on its device, made ready for inference on the first use: same results, faster."""
+        return prepare_for_inference(self.network, self.device, self.precision)
 
-def load_model(name_or_path: str | None, weights: Path | None, *, untrained: bool) -> LoadedModel:
-    """The model of a known name or TOML file, with a file of weights or, if the user says so, with none.
 
-    name_or_path: None takes the model that the weights fit, or without weights the package's own.
-    Raises ConfigError or WeightsError, the latter also when there are no weights and `untrained` is not given.
+def load_model(
+    name: str | Path | None = None,
+    weights: str | Path | None = None,
+    *,
+    device: str | torch.device = "auto",
+    precision: Precision | None = None,
+    untrained: bool = False,
+) -> Model:
+    """Loads a model and its weights.
+
+        model = bevcli.load_model("tiny", weights="bevformer_tiny_epoch_24.pth", device="cuda")
+
+    Args:
+        name: a known model ("tiny", "small", "base", "demo") or a FILE.toml. None takes the model that the weights
+            fit, or "demo" where there are no weights.
+        weights: an official .pth as published, or a .safetensors. None takes the weights of the package, which only
+            "demo" has.
+        device: "auto" takes a GPU where there is one, else the CPU; or "cpu", "cuda".
+        precision: "fp32", "bf16" or "fp16". None takes fp32 on a CPU and bf16 on a GPU.
+        untrained: use random weights, always the same ones.
+
+    Raises:
+        ConfigError: the model's TOML file is missing or wrong.
+        WeightsError: there are no weights, they do not fit, or both weights and `untrained` are given.
+        BevcliError: the device is not there.
     """
+    weights = None if weights is None else Path(weights)
     if weights is not None and untrained:
         raise WeightsError(f"--weights {weights} and --untrained exclude each other: give one of them")
-    if name_or_path is None:
-        name_or_path = DEFAULT_MODEL if weights is None else _model_of(weights)
-    config = load_config(name_or_path)
-    bundled = bundled_weights(name_or_path) if weights is None and not untrained else None
+    if name is None:
+        name = DEFAULT_MODEL if weights is None else _model_of(weights)
+    config = load_config(name)
+    bundled = bundled_weights(str(name)) if weights is None and not untrained else None
     file = weights or bundled
     if file is None and not untrained:
         raise WeightsError(
             f"model {config.name} has no weights: give --weights FILE (the official .pth or a .safetensors), "
-            "or say --untrained to see the machinery run on random weights"
+            "or --untrained to try the program with random weights"
         )
+    target = choose_device(device)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(UNTRAINED_SEED)
-        model = BEVFormer(config)
+        network = BEVFormer(config)
     if file is not None:
-        load_weights(file, model)
-    return LoadedModel(model, file, bundled=bundled is not None)
+        load_weights(file, network)
+    return Model(network.eval(), target, choose_precision(precision, target), file, bundled=bundled is not None)
 
 
 def _model_of(weights: Path) -> str:
@@ -67,8 +115,12 @@ def _model_of(weights: Path) -> str:
     return models[0]
 
 
-def choose_device(name: str) -> torch.device:
-    """ "auto", "cpu" or "cuda" -> the device; auto takes a GPU where there is one."""
+def choose_device(name: str | torch.device) -> torch.device:
+    """The device of a name: "auto" (a GPU where there is one), "cpu" or "cuda". Raises BevcliError."""
+    if isinstance(name, torch.device):
+        return name
+    if name not in ("auto", "cpu", "cuda"):
+        raise BevcliError(f'--device {name}: unknown device (expected "auto", "cpu" or "cuda")')
     available = torch.cuda.is_available()
     if name == "cuda" and not available:
         raise BevcliError(
@@ -78,7 +130,7 @@ def choose_device(name: str) -> torch.device:
 
 
 def choose_precision(chosen: Precision | None, device: torch.device) -> Precision:
-    """The user's choice, or fp32 on the CPU and bf16 on a GPU."""
+    """The chosen precision, or by default fp32 on the CPU and bf16 on a GPU."""
     if chosen is not None:
         return chosen
     return "bf16" if device.type == "cuda" else "fp32"

@@ -1,4 +1,4 @@
-"""The files of a run: each is whole after every frame."""
+"""The files of a run. Each of them is complete after every frame."""
 
 from __future__ import annotations
 
@@ -6,30 +6,29 @@ import contextlib
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING
 
 from bevcli.errors import OutputError
 from bevcli.evaluation.submission import SubmissionWriter
-from bevcli.frame import Frame, Prediction
+from bevcli.frame import Frame, Prediction, Sequence
 from bevcli.geometry.attributes import attributes_by_speed
 from bevcli.pipeline.bev_files import save_bev
+from bevcli.pipeline.model_loading import Model
+from bevcli.pipeline.run_summary import SUMMARY
+from bevcli.recording.options import RecordingOptions
 from bevcli.recording.writer import Recording
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.map_file import write_map
 
-if TYPE_CHECKING:
-    from bevcli.pipeline.run_job import Job
-
 RECORDING, PREDICTIONS, SUBMISSION = "recording.rrd", "predictions.json", "results_nusc.json"
-SUMMARY, SEGMENTATION = "summary.json", "segmentation"
+SEGMENTATION = "segmentation"
 
 
 def prepare_folder(out: Path, *, force: bool) -> None:
-    """Makes the output folder; an earlier run's files are removed only if the user says so. Raises OutputError."""
+    """Makes the output folder of a run. With `force` it removes the files of an earlier run. Raises OutputError."""
     if out.exists() and not out.is_dir():
         raise OutputError(f"{out}: is a file (expected a folder to write to)")
     if out.exists() and any(out.iterdir()) and not force:
-        raise OutputError(f"{out}: exists already; say --force to overwrite it, or --out DIR for another folder")
+        raise OutputError(f"{out}: exists already; pass --force to overwrite it, or --out DIR for another folder")
     try:
         out.mkdir(parents=True, exist_ok=True)
         earlier = [out / name for name in (RECORDING, PREDICTIONS, SUBMISSION, SUMMARY)]
@@ -40,29 +39,37 @@ def prepare_folder(out: Path, *, force: bool) -> None:
 
 
 class RunFiles:
-    """`with RunFiles(job) as files: files.write(frame, prediction)`: recording, boxes, maps, BEV features."""
+    """`with RunFiles(…) as files: files.write(frame, prediction)`: recording, boxes, maps and BEV features."""
 
-    def __init__(self, job: Job) -> None:
-        self._job = job
+    def __init__(
+        self,
+        out: Path,
+        sequence: Sequence,
+        model: Model,
+        recording: RecordingOptions,
+        bev_folder: Path | None = None,
+    ) -> None:
+        self._out, self._sequence, self._model, self._bev_folder = out, sequence, model, bev_folder
+        self._options = recording
         self._stack = contextlib.ExitStack()
         self._submission: SubmissionWriter | None = None
 
     def __enter__(self) -> RunFiles:
-        job, config = self._job, self._job.loaded.model.config
+        out, sequence, model = self._out, self._sequence, self._model
         recording = Recording(
-            job.out / RECORDING,
-            rig=job.drive.rig,
-            class_names=config.classes,
-            title=f"{job.drive.name} · {config.name}",
-            untrained=job.loaded.untrained,
-            options=job.recording,
+            out / RECORDING,
+            rig=sequence.rig,
+            class_names=model.config.classes,
+            title=f"{sequence.name} · {model.name}",
+            untrained=model.untrained,
+            options=self._options,
         )
-        extras = {"model": config.name, "untrained": job.loaded.untrained, "classes": list(config.classes)}
-        boxes = BoxesWriter(job.out / PREDICTIONS, "world" if job.drive.has_ego_motion else "ego", extras)
-        with self._stack:  # what is open is closed again where the next cannot be opened
+        extras = {"model": model.name, "untrained": model.untrained, "classes": list(model.config.classes)}
+        boxes = BoxesWriter(out / PREDICTIONS, "world" if sequence.has_ego_motion else "ego", extras)
+        with self._stack:  # closes what is open if the next one cannot be opened
             self._recording = self._stack.enter_context(recording)
             self._boxes = self._stack.enter_context(boxes)
-            for note in job.drive.notes:
+            for note in sequence.notes:
                 self._recording.event(note, "WARN")
             self._stack = self._stack.pop_all()
         return self
@@ -74,23 +81,27 @@ class RunFiles:
 
     def write(self, frame: Frame, prediction: Prediction) -> None:
         """Adds a frame to every file."""
-        job = self._job
         self._recording.log(frame, prediction)
-        boxes = frame_boxes(frame, prediction, world=job.drive.has_ego_motion)
+        boxes = frame_boxes(frame, prediction, world=self._sequence.has_ego_motion)
         self._boxes.write(boxes)
         if frame.sample_token is not None:
             if self._submission is None:
-                self._submission = self._stack.enter_context(SubmissionWriter(job.out / SUBMISSION))
+                self._submission = self._stack.enter_context(SubmissionWriter(self._out / SUBMISSION))
             self._submission.write(boxes)
         if prediction.segmentation is not None:
-            write_map(job.out / SEGMENTATION, frame.stamp.index, prediction.segmentation)
-        if job.save_bev is not None and prediction.bev is not None:
-            facts = {"model": job.loaded.model.config.name, "untrained": job.loaded.untrained}
-            save_bev(job.save_bev, prediction, facts)
+            write_map(self._out / SEGMENTATION, frame.stamp.index, prediction.segmentation)
+        if self._bev_folder is not None and prediction.bev is not None:
+            facts = {"model": self._model.name, "untrained": self._model.untrained}
+            save_bev(self._bev_folder, prediction, facts)
+
+    def written(self) -> tuple[Path, ...]:
+        """The files and folders that exist so far."""
+        paths = [self._out / name for name in (RECORDING, PREDICTIONS, SUBMISSION, SEGMENTATION)]
+        return tuple(path for path in (*paths, self._bev_folder) if path is not None and path.exists())
 
 
 def frame_boxes(frame: Frame, prediction: Prediction, *, world: bool) -> FrameBoxes:
-    """A prediction as the boxes file holds it: all boxes, with attributes, in the world or the ego frame."""
+    """A prediction as predictions.json holds it: all boxes, with attributes, in the world frame or the ego frame."""
     extras: dict[str, object] = {"skipped": True} if prediction.skipped else {}
     if frame.sample_token is not None:
         extras["sample_token"] = frame.sample_token

@@ -70,7 +70,7 @@ class Runner:
         if started_anew:
             state = None
         if not frame.images:
-            return state, self._prediction(frame, started_anew, Boxes3D.empty(), None)
+            return state, self._prediction(prepared, started_anew, Boxes3D.empty(), None)
         self.clock.start()
         probe = self._probe(frame)
         with self._autocast():
@@ -80,7 +80,7 @@ class Runner:
         self.clock.mark("box_decoding")
         segmentation = self._segmentation(outputs)
         view = None if probe is None else attention_view(probe, prepared, self.config)
-        prediction = self._prediction(frame, started_anew, boxes, outputs.bev[0], view, segmentation)
+        prediction = self._prediction(prepared, started_anew, boxes, outputs.bev[0], view, segmentation)
         return BevState(outputs.bev, frame.world_from_ego, frame.stamp), prediction
 
     def run(
@@ -130,13 +130,14 @@ class Runner:
 
     def _prediction(
         self,
-        frame: Frame,
+        prepared: PreparedFrame,
         started_anew: str,
         boxes: Boxes3D,
         bev: Tensor | None,
         attention: AttentionView | None = None,
         segmentation: BevMap | None = None,
     ) -> Prediction:
+        frame, assignment = prepared.frame, prepared.assignment
         return Prediction(
             stamp=frame.stamp,
             boxes=boxes,
@@ -145,6 +146,7 @@ class Runner:
             grid=self.config.bev_grid,
             bev=bev,
             started_anew=started_anew,
+            camera_embeddings=dict(zip(assignment.cameras, assignment.embeddings, strict=True)),
             skipped=bev is None,
             segmentation=segmentation,
             attention=attention,

@@ -14,9 +14,8 @@ import torch
 from memory_drive import MemorySequence, WithoutImages
 
 from bevcli.errors import OutputError
-from bevcli.pipeline.model_loading import LoadedModel
-from bevcli.pipeline.run_job import Job, run_job
-from bevcli.pipeline.runner import StepOptions
+from bevcli.pipeline.model_loading import Model
+from bevcli.pipeline.run import RunOptions, run_into_folder
 from bevcli.recording.options import RecordingOptions
 from bevcli.sequences.files.boxes_file import read_boxes
 
@@ -54,13 +53,9 @@ def job(mini_model, tmp_path):
     """Runs a sequence in process; gives back the output folder."""
 
     def make(sequence, *, score=0.0, force=False, out="out", **options) -> Path:
-        step = StepOptions(ask_attention=True, **options)
-        recording = RecordingOptions(score=score)
-        loaded = LoadedModel(mini_model, None)
-        folder = tmp_path / out
-        bev = tmp_path / "bev"
-        run_job(Job(sequence, loaded, torch.device("cpu"), step, recording, {}, folder, bev), force=force)
-        return folder
+        run_options = RunOptions(recording=RecordingOptions(score=score), save_bev=tmp_path / "bev", **options)
+        run_into_folder(Model(mini_model), sequence, tmp_path / out, run_options, force=force)
+        return tmp_path / out
 
     return make
 

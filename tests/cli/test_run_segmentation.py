@@ -7,18 +7,16 @@ from memory_drive import MemorySequence
 
 from bevcli.frame import MAP_CLASSES
 from bevcli.model.bevformer import BEVFormer
-from bevcli.pipeline.model_loading import LoadedModel
-from bevcli.pipeline.run_job import Job, run_job
-from bevcli.pipeline.runner import StepOptions
+from bevcli.pipeline.model_loading import Model
+from bevcli.pipeline.run import RunOptions, run_into_folder
 from bevcli.recording.options import RecordingOptions
 from bevcli.sequences.files.map_file import open_maps
 
 
 def run(config, out, frames, *, force=False):
     torch.manual_seed(0)
-    loaded = LoadedModel(BEVFormer(config), None)
-    drive, device = MemorySequence(frames), torch.device("cpu")
-    run_job(Job(drive, loaded, device, StepOptions(), RecordingOptions("minimal"), {}, out, None), force=force)
+    options = RunOptions(recording=RecordingOptions("minimal"))
+    run_into_folder(Model(BEVFormer(config).eval()), MemorySequence(frames), out, options, force=force)
 
 
 def test_maps_are_written_and_an_earlier_runs_maps_are_gone(mini_config, tmp_path):

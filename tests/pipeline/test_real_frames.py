@@ -3,7 +3,6 @@
 import json
 import os
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -100,8 +99,8 @@ def test_official_tiny_weights_give_the_official_boxes(shared, first_frame):
     if not weights:
         pytest.skip("BEVCLI_OFFICIAL_TINY does not name the official weights of tiny")
     at_rest = Kinematics(np.zeros(3), np.zeros(3), np.zeros(3))
-    loaded = load_model("tiny", Path(weights), untrained=False)
-    runner = Runner(loaded.model, torch.device("cpu"))
+    loaded = load_model("tiny", weights)
+    runner = Runner(loaded.network, torch.device("cpu"))
     prepared = Preprocessor(runner.config)(replace(first_frame, kinematics=at_rest))
     found = runner.step(None, prepared)[1].boxes
     reference = json.loads((shared / "golden/official_tiny_scene-0103_frame0.json").read_text())

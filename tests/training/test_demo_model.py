@@ -40,8 +40,8 @@ def test_the_demo_model_trains_with_history() -> None:
 
 
 def test_its_weights_come_with_the_package_and_are_the_default() -> None:
-    loaded = load_model(None, None, untrained=False)
-    assert loaded.model.config.name == "demo"
+    loaded = load_model()
+    assert loaded.name == "demo"
     assert loaded.weights == bundled_weights("demo")
     assert loaded.bundled
     assert loaded.weights.stat().st_size <= 20e6
@@ -50,25 +50,25 @@ def test_its_weights_come_with_the_package_and_are_the_default() -> None:
 @pytest.mark.parametrize("name", ["tiny", "small", "base"])
 def test_other_models_refuse_to_run_without_weights(name: str) -> None:
     with pytest.raises(WeightsError, match=f"model {name} has no weights: give --weights FILE"):
-        load_model(name, None, untrained=False)
+        load_model(name)
 
 
 def test_a_file_of_the_users_own_does_not_get_the_packages_weights(tmp_path: Path) -> None:
     own = tmp_path / "demo.toml"
     own.write_text((STREET.parents[1] / "configs" / "demo.toml").read_text())
     with pytest.raises(WeightsError, match="has no weights"):
-        load_model(str(own), None, untrained=False)
+        load_model(str(own))
 
 
 def test_weights_alone_say_which_model_they_are_for() -> None:
-    loaded = load_model(None, bundled_weights("demo"), untrained=False)
-    assert loaded.model.config.name == "demo"
+    loaded = load_model(None, bundled_weights("demo"))
+    assert loaded.name == "demo"
     assert not loaded.bundled
 
 
 def test_it_sees_the_street_in_the_samples() -> None:
     """Far below what the model card states: enough to tell weights from noise."""
-    model = load_model(None, None, untrained=False).model
+    model = load_model().network
     cpu = torch.device("cpu")
     scores = validate(Runner(prepare_for_inference(model, cpu), cpu), FolderDrives([STREET], 2.0))
     assert scores.detection.overall.classes["car"].mean_ap > 0.2
