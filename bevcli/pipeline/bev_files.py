@@ -1,4 +1,4 @@
-"""BEV features on disk, for whatever comes after: one float16 .npy a frame, and a JSON that explains it."""
+"""BEV features as files: one float16 .npy per frame, and a JSON file that describes it."""
 
 from __future__ import annotations
 
@@ -15,9 +15,17 @@ from bevcli.sequences.files.pose_json import pose_to_json
 
 
 def save_bev(folder: Path, prediction: Prediction, extras: Mapping[str, object]) -> None:
-    """Writes NNNNNN.npy, (rows, columns, C) float16, and NNNNNN.json: grid, ranges, frame and poses.
+    """Writes NNNNNN.npy, (rows, columns, C) float16, and NNNNNN.json with grid, ranges, frame and poses.
 
-    Rows run from the smallest y, columns from the smallest x, both in the bev frame. Raises OutputError.
+    Rows run from the smallest y, columns from the smallest x, both in the bev frame.
+
+    Args:
+        folder: where to write; made if missing.
+        prediction: of a frame with at least one image.
+        extras: further entries of the JSON file.
+
+    Raises:
+        OutputError: the files cannot be written.
     """
     assert prediction.bev is not None
     grid = prediction.grid

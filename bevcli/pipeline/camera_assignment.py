@@ -1,4 +1,4 @@
-"""Which of a rig's cameras go into the model, in which order, and which camera embedding each of them takes."""
+"""The order in which a rig's cameras enter the model, and the camera embedding that each of them takes."""
 
 from __future__ import annotations
 
@@ -24,24 +24,30 @@ NUSCENES_YAWS_DEG = {
 
 @dataclass(frozen=True)
 class CameraAssignment:
-    """cameras: the rig's, in the model's order. embeddings: for each, the model's camera whose embedding it takes."""
+    """The cameras of a rig, assigned to the cameras that the model was trained with.
+
+    Attributes:
+        cameras: the rig's cameras in the model's order.
+        embeddings: for each of them, the model's camera whose embedding it takes.
+    """
 
     cameras: tuple[str, ...]
     embeddings: tuple[str, ...]
-
-    @property
-    def guessed(self) -> tuple[tuple[str, str], ...]:
-        """(camera, embedding) of those that the weights do not know by name."""
-        pairs = zip(self.cameras, self.embeddings, strict=True)
-        return tuple((camera, embedding) for camera, embedding in pairs if camera != embedding)
 
 
 def assign_cameras(
     rig: CameraRig, model_cameras: tuple[str, ...], chosen: Mapping[str, str] | None = None
 ) -> CameraAssignment:
-    """By name where the model knows it, else by `chosen` (camera -> the model's camera), else by viewing direction.
+    """Assigns each camera of a rig to a camera of the model: as `chosen`, else by name, else by viewing direction.
 
-    Raises InputError where `chosen` names a camera that the rig or the model does not have.
+    Args:
+        rig: the cameras.
+        model_cameras: the names of the model's cameras, in the order of their embeddings.
+        chosen: camera of the rig -> camera of the model.
+
+    Raises:
+        InputError: `chosen` names a camera that the rig or the model does not have, or the model's cameras have no
+            known viewing direction.
     """
     chosen = {} if chosen is None else chosen
     for camera, embedding in chosen.items():
@@ -62,5 +68,7 @@ def _embedding(camera: Camera, model_cameras: tuple[str, ...]) -> str:
     yaws = np.radians([NUSCENES_YAWS_DEG.get(name, np.nan) for name in model_cameras])
     distances = np.abs(wrap_angle(yaws - camera.yaw))
     if np.isnan(distances).all():
-        raise InputError(f"camera {camera.name}: the model knows none of its name; say --camera {camera.name}=NAME")
+        raise InputError(
+            f"camera {camera.name}: the model has no camera of this name; pass --camera {camera.name}=NAME"
+        )
     return model_cameras[int(np.nanargmin(distances))]

@@ -1,4 +1,4 @@
-"""Prepared frames of several drives as one step of the model."""
+"""Preprocessed frames of several sequences as the inputs of one step of the model."""
 
 from __future__ import annotations
 
@@ -17,17 +17,22 @@ from bevcli.pipeline.preprocess import PreparedFrame
 def model_inputs(
     frames: Sequence[PreparedFrame], previous_poses: Sequence[Pose | None], config: BEVFormerConfig
 ) -> BEVFormerInputs:
-    """B frames, each of another drive, as a batch.
+    """B frames, each of another sequence, as a batch.
 
-    previous_poses: world_from_ego of the frame before, of each drive; None at its start. Raises InputError where the
-    drives' cameras do not take the same camera embeddings.
+    Args:
+        frames: B preprocessed frames.
+        previous_poses: world_from_ego of the frame before in each sequence; None at its start.
+        config: of the model.
+
+    Raises:
+        InputError: the cameras of the sequences do not take the same camera embeddings.
     """
     index = frames[0].camera_index
     for prepared in frames:
         if not torch.equal(prepared.camera_index, index):
             raise InputError(
                 f"cameras {', '.join(prepared.assignment.cameras)} and {', '.join(frames[0].assignment.cameras)} "
-                "cannot go into one batch: use drives of one rig, or batches of 1"
+                "cannot go into one batch: use sequences of one rig, or batches of 1"
             )
     motions = [_motion(prepared, pose, config) for prepared, pose in zip(frames, previous_poses, strict=True)]
     return BEVFormerInputs(

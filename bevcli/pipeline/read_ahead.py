@@ -1,4 +1,4 @@
-"""Work of the next frames done in the background while the model is busy with this one."""
+"""Prepares the next frames in the background while the model computes the current one."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ T = TypeVar("T")
 
 
 def read_ahead(work: Callable[[S], T], items: Iterable[S], depth: int = 2, threads: int = 1) -> Iterator[T]:
-    """Yields work(item) for every item, in order, worked out in background threads up to `depth` items ahead.
+    """Yields work(item) for every item, in order, computed in background threads up to `depth` items ahead.
 
-    An exception in `work` is raised at its item. Stopping early leaves nothing running but the item at work.
+    An exception in `work` is raised when its item is due. If the caller stops early, the items that have not begun
+    are cancelled.
     """
     source = iter(items)
     pool = ThreadPoolExecutor(threads, thread_name_prefix="read-ahead")
