@@ -11,12 +11,12 @@ def test_known_names_take_the_models_order_whatever_the_rigs_order():
     rig = make_rig(dict(reversed(NUSCENES_YAWS_DEG.items())))
     assignment = assign_cameras(rig, MODEL)
     assert assignment.cameras == assignment.embeddings == MODEL
-    assert assignment.guessed == ()
 
 
 def test_unknown_names_go_by_viewing_direction():
     rig = make_rig({"nose": 4.0, "tail": -176.0, "left": 80.0, "right": -92.0})
-    given = dict(assign_cameras(rig, MODEL).guessed)
+    assignment = assign_cameras(rig, MODEL)
+    given = dict(zip(assignment.cameras, assignment.embeddings, strict=True))
     assert given == {"nose": "CAM_FRONT", "tail": "CAM_BACK", "left": "CAM_FRONT_LEFT", "right": "CAM_BACK_RIGHT"}
 
 
