@@ -28,7 +28,7 @@ test-all: $(VENV)/.viewers
 	$(BIN)/pytest
 
 $(VENV)/.viewers: $(INSTALLED)
-	$(BIN)/pip install --quiet --constraint constraints.txt playwright
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev,notebook]' playwright
 	.ci/install-viewers
 	touch $@
 

@@ -21,7 +21,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from bevcli.errors import BevcliError
     from bevcli.evaluation.scoring import evaluate
-    from bevcli.frame import BevMap, CameraImage, Frame, FrameStamp, Prediction, Sequence
+    from bevcli.frame import MAP_CLASSES, BevMap, CameraImage, Frame, FrameStamp, Prediction, Sequence
     from bevcli.geometry.boxes import Boxes3D
     from bevcli.geometry.cameras import Camera, CameraRig
     from bevcli.geometry.transforms import Pose
@@ -32,9 +32,11 @@ if TYPE_CHECKING:
     from bevcli.rig.inspection import check_calibration
     from bevcli.sequences.open import open_sequence
     from bevcli.synth.export import render
+    from bevcli.viewer.notebook import show
 
 # The public names, and the modules that define them.
 _MODULES = {
+    "MAP_CLASSES": "bevcli.frame",
     "BevMap": "bevcli.frame",
     "BevcliError": "bevcli.errors",
     "Boxes3D": "bevcli.geometry.boxes",
@@ -57,9 +59,11 @@ _MODULES = {
     "render": "bevcli.synth.export",
     "run": "bevcli.pipeline.run",
     "run_into_folder": "bevcli.pipeline.run",
+    "show": "bevcli.viewer.notebook",
 }
 
 __all__ = [
+    "MAP_CLASSES",
     "BevMap",
     "BevcliError",
     "Boxes3D",
@@ -82,6 +86,7 @@ __all__ = [
     "render",
     "run",
     "run_into_folder",
+    "show",
 ]
 
 
