@@ -1,10 +1,12 @@
-# make demo: run the main job on a sample.  make test / test-all: the tests, without and with the slow ones.
-# make check: lint and types.  make bench: measure this machine and write docs/speed.md (nothing else may run).
+# make demo       run the model on samples/street; the recording is runs/street/recording.rrd
+# make test       the fast tests; make test-all: all tests
+# make check      lint and types; make format: fix what ruff can fix
+# make bench      measure this machine and rewrite the table of docs/speed.md; nothing else should run meanwhile
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-# Real nuScenes frames and reference numbers, where somebody has laid them beside the checkout.
+# Reference data that is not in this repository (real nuScenes frames, reference numbers). Tests skip without it.
 ifneq ($(wildcard ../shared),)
 export BEVCLI_SHARED ?= $(abspath ../shared)
 endif

@@ -1,0 +1,127 @@
+"""Every link, command, option and path that a document names exists; the CI workflow calls targets of the Makefile."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+import yaml
+
+from bevcli.cli.main import app
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")] + sorted(ROOT.glob("docs/*.md"))
+# These two describe earlier versions, whose commands and files may be gone.
+OF_TODAY = [path for path in DOCUMENTS if path.name not in ("CHANGELOG.md", "history.md")]
+
+FENCED = re.compile(r"^ *```.*?^ *```", flags=re.MULTILINE | re.DOTALL)
+CODE_SPAN = re.compile(r"(`+)(.+?)\1", flags=re.DOTALL)
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+HEADING = re.compile(r"^#+ +(.+?) *$", flags=re.MULTILINE)
+HELP = {"--help", "-h"}
+
+
+def each(documents: list[Path]) -> pytest.MarkDecorator:
+    return pytest.mark.parametrize("document", documents, ids=lambda path: path.name)
+
+
+def prose(document: Path) -> str:
+    """The text without its fenced blocks."""
+    return FENCED.sub("", document.read_text())
+
+
+def code_spans(document: Path) -> list[str]:
+    return [" ".join(text.split()) for _, text in CODE_SPAN.findall(prose(document))]
+
+
+def anchors(document: Path) -> set[str]:
+    """The anchors that GitHub gives to the headings: lower case, spaces as hyphens, without punctuation."""
+    headings = (re.sub(r"\]\([^)]*\)", "", heading) for heading in HEADING.findall(prose(document)))
+    names = [re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings]
+    repeated = (names[:place].count(name) for place, name in enumerate(names))
+    return {f"{name}-{count}" if count else name for name, count in zip(names, repeated, strict=True)}
+
+
+@each(DOCUMENTS)
+def test_links_lead_to_files_and_headings(document: Path) -> None:
+    for link in LINK.findall(CODE_SPAN.sub("", prose(document))):
+        if link.startswith(("http://", "https://")):
+            continue
+        path, _, anchor = link.partition("#")
+        target = (document.parent / path).resolve() if path else document
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+def shown_commands(document: Path) -> list[str]:
+    """`bevcli …` in code spans and in the lines of fenced blocks, also as a module that Python runs."""
+    blocks = "\n".join(FENCED.findall(document.read_text())).replace("\\\n", " ")
+    lines = re.findall(r"^ *(?:\$ )?(?:[\w.]+ .*-m )?(bevcli(?: .*)?)$", blocks, flags=re.MULTILINE)
+    return lines + [span for span in code_spans(document) if span == "bevcli" or span.startswith("bevcli ")]
+
+
+def option_names(command: Any) -> set[str]:
+    return HELP | {name for parameter in command.params for name in (*parameter.opts, *parameter.secondary_opts)}
+
+
+def options_of_all_commands(command: Any) -> set[str]:
+    return option_names(command).union(*map(options_of_all_commands, getattr(command, "commands", {}).values()))
+
+
+@each(OF_TODAY)
+def test_shown_commands_and_options_are_known(document: Path) -> None:
+    for line in shown_commands(document):
+        words = shlex.split(line, comments=True)[1:]
+        command = typer.main.get_command(app)
+        while words and hasattr(command, "commands") and not words[0].startswith("-"):
+            assert words[0] in command.commands, line
+            command = command.commands[words.pop(0)]
+        options = {word.partition("=")[0] for word in words if re.match(r"--?[a-z]", word)}
+        assert options <= option_names(command), f"{line}: {options - option_names(command)}"
+
+
+@each(OF_TODAY)
+def test_options_in_the_prose_are_those_of_some_command(document: Path) -> None:
+    mentioned = {name for span in code_spans(document) for name in re.findall(r"^--[\w-]+", span)}
+    unknown = mentioned - options_of_all_commands(typer.main.get_command(app))
+    assert not unknown
+
+
+@each(OF_TODAY)
+def test_files_of_the_repository_in_the_prose_exist(document: Path) -> None:
+    for span in code_spans(document):
+        if re.fullmatch(r"(bevcli|tests|docs|samples|configs|\.github)/[\w./-]+", span):
+            assert (ROOT / span).exists(), span
+
+
+def make_targets() -> set[str]:
+    return set(re.findall(r"^([a-z][\w-]*):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE))
+
+
+@each(OF_TODAY)
+def test_make_targets_in_the_prose_exist(document: Path) -> None:
+    mentioned = {span.split()[-1] for span in code_spans(document) if re.fullmatch(r"(\w+=\S+ )?make [\w-]+", span)}
+    assert mentioned <= make_targets()
+
+
+def test_the_workflow_calls_make_targets_on_two_versions_of_python() -> None:
+    workflow = yaml.safe_load((ROOT / ".github/workflows/test.yml").read_text())
+    job = workflow["jobs"]["test"]
+    assert job["strategy"]["matrix"]["python"] == ["3.11", "3.13"]
+    calls = [step["run"].split() for step in job["steps"] if "run" in step]
+    assert {program for program, *_ in calls} == {"make"}
+    called = {target for _, *targets in calls for target in targets}
+    assert {"check", "test"} <= called <= make_targets()
+
+
+def test_pre_commit_runs_the_same_ruff_as_make_check() -> None:
+    [repository] = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
+    assert f"ruff=={repository['rev'].removeprefix('v')}" in (ROOT / "constraints.txt").read_text().splitlines()
+    assert {hook["id"]: hook.get("args") for hook in repository["hooks"]} == {
+        "ruff-check": ["--fix"],
+        "ruff-format": None,
+    }
