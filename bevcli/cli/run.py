@@ -8,14 +8,20 @@ from typing import Annotated, Literal
 import typer
 
 from bevcli.cli.input_options import (
-    PANEL,
+    EveryOption,
     ExtrinsicsOption,
+    FramesOption,
     IntrinsicsOption,
+    RateOption,
     SceneOption,
     SplitOption,
+    StaticOption,
     StrictOption,
     SweepsOption,
     VersionOption,
+    ego_motion_use,
+    parse_frames,
+    parse_rate,
 )
 
 MODEL, OUTPUT, RECORDING = "Model", "Output", "Recording"
@@ -62,20 +68,10 @@ def run(
             rich_help_panel=MODEL,
         ),
     ] = None,
-    frames: Annotated[
-        str | None,
-        typer.Option(metavar="A:B", help="Only these places in the sequence, B exclusive.", rich_help_panel=PANEL),
-    ] = None,
-    rate: Annotated[
-        str | None,
-        typer.Option(metavar="HZ|all", help="Thin to this rate. Default: the model's own.", rich_help_panel=PANEL),
-    ] = None,
-    every: Annotated[
-        int | None, typer.Option(min=1, help="Take every N-th frame, whatever the rate.", rich_help_panel=PANEL)
-    ] = None,
-    static: Annotated[
-        bool, typer.Option("--static", help="The vehicle stands: no ego-motion is needed.", rich_help_panel=PANEL)
-    ] = False,
+    frames: FramesOption = None,
+    rate: RateOption = None,
+    every: EveryOption = None,
+    static: StaticOption = False,
     strict: StrictOption = False,
     scene: SceneOption = None,
     version: VersionOption = None,
@@ -120,18 +116,28 @@ def run(
     The output folder gets recording.rrd (open it with `bevcli viz`), predictions.json (all boxes, whatever their
     score) and summary.json.
     """
-    from bevcli.cli.run_input import FrameChoice, choose_frames, ego_motion_use
     from bevcli.pipeline.model_loading import choose_device, choose_precision, load_model
     from bevcli.pipeline.run_job import Job, run_job
     from bevcli.pipeline.runner import StepOptions
     from bevcli.recording.options import RecordingOptions
-    from bevcli.sequences.open import InputOptions
+    from bevcli.sequences.open import open_sequence
 
     recording = RecordingOptions(record, bev, score, tuple(map(parse_probe, probe or ())), live)
     loaded = load_model(model, weights, untrained=untrained)
-    motion = ego_motion_use(static=static, temporal=temporal)
-    options = InputOptions(motion, strict, scene, version, split, sweeps, intrinsics, extrinsics)
-    drive = choose_frames(sequence, options, FrameChoice(frames, rate, every), loaded.model.config)
+    drive = open_sequence(
+        sequence,
+        frames=parse_frames(frames),
+        rate_hz=parse_rate(rate, default_hz=None if every or sweeps else loaded.model.config.rate_hz),
+        every=every,
+        ego_motion=ego_motion_use(static=static, temporal=temporal),
+        strict=strict,
+        scene=scene,
+        version=version,
+        split=split,
+        sweeps=sweeps,
+        intrinsics=intrinsics,
+        extrinsics=extrinsics,
+    )
     target = choose_device(device)
     step = StepOptions(
         choose_precision(precision, target),

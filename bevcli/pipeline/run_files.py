@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 from bevcli.errors import OutputError
 from bevcli.evaluation.submission import SubmissionWriter
 from bevcli.frame import Frame, Prediction
-from bevcli.geometry.attributes import attributes_by_speed
+from bevcli.geometry.boxes import attributes_by_speed
 from bevcli.pipeline.bev_files import save_bev
 from bevcli.recording.writer import Recording
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
-from bevcli.sequences.files.map_file import write_map
+from bevcli.sequences.files.map_folder import write_map
 
 if TYPE_CHECKING:
     from bevcli.pipeline.run_job import Job

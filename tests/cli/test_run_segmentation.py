@@ -11,7 +11,7 @@ from bevcli.pipeline.model_loading import LoadedModel
 from bevcli.pipeline.run_job import Job, run_job
 from bevcli.pipeline.runner import StepOptions
 from bevcli.recording.options import RecordingOptions
-from bevcli.sequences.files.map_file import open_maps
+from bevcli.sequences.files.map_folder import open_maps
 
 
 def run(config, out, frames, *, force=False):

@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from bevcli.errors import InputError
-from bevcli.geometry.ego_motion import EgoMotion, current_from_previous, derive_kinematics
-from bevcli.geometry.transforms import Pose, apply
+from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
 
 
 def circle_drive(radius=20.0, speed=8.0, count=200, step_s=0.02):
@@ -43,9 +42,3 @@ def test_times_outside_are_refused_beyond_50_ms():
     assert (drive.pose_at(last + 50_000_000).translation == drive.translations[-1]).all()
     with pytest.raises(InputError, match="50 ms"):
         drive.pose_at(last + 50_000_001)
-
-
-def test_a_standing_point_moves_backwards_in_the_frame_of_a_driving_vehicle():
-    previous = Pose(np.array([5.0, 0, 0]), np.array([1.0, 0, 0, 0]))
-    current = Pose(np.array([7.0, 0, 0]), np.array([1.0, 0, 0, 0]))
-    assert apply(current_from_previous(current, previous), [10.0, 1, 0]) == pytest.approx([8, 1, 0])

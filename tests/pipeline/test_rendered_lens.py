@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bevcli.geometry.cameras import CameraRig, Distortion, undistort
+from bevcli.geometry.cameras import CameraRig, Distortion
 from bevcli.synth.drive import Drive, Stock
 from bevcli.synth.rig import nuscenes_like_rig
 
@@ -32,7 +32,7 @@ def rendered(stock, lens):
 def test_undistorting_a_rendered_image_gives_the_image_without_a_lens(stock, name):
     plain, _ = rendered(stock, None)
     bent, camera = rendered(stock, LENSES[name])
-    mended = undistort(bent.astype(np.uint8), camera).astype(np.float64)
+    mended = camera.undistort(bent.astype(np.uint8)).astype(np.float64)
     seen = mended.sum(-1) > 0  # black where the lens saw nothing
     assert seen.mean() > 0.85
     before, after = np.abs(bent - plain)[seen].mean(), np.abs(mended - plain)[seen].mean()

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from bevcli.sequences.native.folder import FolderSequence
-from bevcli.sequences.open import InputOptions, open_sequence
+from bevcli.sequences.open import open_sequence
 
 
 def test_stamps_are_the_rows_of_frames_csv(drive):
@@ -72,13 +72,13 @@ def test_a_jpeg_cut_short_is_dropped(drive, edit):
     edit("frames.csv", "CAM_BACK/1.png", "CAM_BACK/1.jpg")
     assert open_sequence(drive).load(1).images["CAM_BACK"].encoded == encoded
     path.write_bytes(encoded[: len(encoded) // 2])
-    assert "not a whole image" in open_sequence(drive).load(1).dropped["CAM_BACK"]
+    assert "not a complete image" in open_sequence(drive).load(1).dropped["CAM_BACK"]
 
 
 def test_without_ego_motion_every_pose_is_the_identity(drive):
     (drive / "ego_motion.csv").unlink()
-    for use in ("static", "none"):
-        sequence = open_sequence(drive, InputOptions(ego_motion=use))
+    for use in ("static", "optional"):
+        sequence = open_sequence(drive, ego_motion=use)
         assert not sequence.has_ego_motion
         assert sequence.notes
         np.testing.assert_array_equal(sequence.load(3).world_from_ego.matrix, np.eye(4))
@@ -86,7 +86,7 @@ def test_without_ego_motion_every_pose_is_the_identity(drive):
 
 
 def test_a_vehicle_said_to_stand_stands_whatever_the_file_says(drive):
-    sequence = open_sequence(drive, InputOptions(ego_motion="static"))
+    sequence = open_sequence(drive, ego_motion="static")
     np.testing.assert_array_equal(sequence.load(3).world_from_ego.matrix, np.eye(4))
     assert any("not read" in note for note in sequence.notes)
 
@@ -95,7 +95,7 @@ def test_one_scene_can_be_picked(drive):
     lines = (drive / "frames.csv").read_text().splitlines()
     scenes = ["scene", "first", "first", "second", "second"]
     (drive / "frames.csv").write_text("\n".join(f"{s},{line}" for s, line in zip(scenes, lines, strict=True)))
-    sequence = open_sequence(drive, InputOptions(scene="second"))
+    sequence = open_sequence(drive, scene="second")
     assert [stamp.index for stamp in sequence.stamps] == [12, 13]
     assert sequence.load(0).stamp.index == 12
 
@@ -108,7 +108,7 @@ def test_images_named_by_their_time_need_no_table(drive):
             path = drive / "images" / camera / f"{number}.png"
             path.rename(path.with_name(f"{stamp.timestamp_ns * 10**5}.png"))
     (drive / "frames.csv").unlink()
-    sequence = open_sequence(drive, InputOptions(ego_motion="static"))
+    sequence = open_sequence(drive, ego_motion="static")
     assert [stamp.timestamp_ns for stamp in sequence.stamps] == [s.timestamp_ns * 10**5 for s in table.stamps]
     assert [stamp.index for stamp in sequence.stamps] == [0, 1, 2, 3]
     np.testing.assert_array_equal(sequence.load(3).images["CAM_BACK"].pixels_bgr, last)
@@ -146,7 +146,7 @@ def test_ground_truth_in_the_ego_frame_is_moved_to_the_world(drive):
     sequence = open_sequence(drive)
     np.testing.assert_allclose(sequence.load(1).ground_truth.centers, [[20, 1, 0.8]])
     assert sequence.load(0).ground_truth is None
-    standing = open_sequence(drive, InputOptions(ego_motion="static"))
+    standing = open_sequence(drive, ego_motion="static")
     np.testing.assert_allclose(standing.load(1).ground_truth.centers, [[5, 1, 0.8]])
 
 

@@ -10,12 +10,12 @@ import pytest
 from nuscenes_tables import CAMERAS, SAMPLE_US, Size, ego_x, sample_time, scene_name, write_tables
 
 from bevcli.errors import InputError
-from bevcli.sequences.nuscenes.build import build_index
-from bevcli.sequences.nuscenes.can_bus import read_can_bus
-from bevcli.sequences.nuscenes.scenes import NuScenesChoice, NuScenesSequence
 from bevcli.sequences.nuscenes import cache as nuscenes_cache
 from bevcli.sequences.nuscenes import json_tables as nuscenes_json
-from bevcli.sequences.nuscenes.splits import MINI_TRAIN, MINI_VAL, TEST, VAL, numbers, split_of
+from bevcli.sequences.nuscenes.build import build_index
+from bevcli.sequences.nuscenes.choice import MINI_VAL, TEST, VAL, NuScenesChoice, numbers, split_of
+from bevcli.sequences.nuscenes.scene import read_can_bus
+from bevcli.sequences.nuscenes.sequence import NuScenesSequence
 
 SMALL = Size(scenes=3, samples=4, objects=8)
 
@@ -139,7 +139,7 @@ def test_sweeps_are_the_front_images_between(root):
 
 
 def test_splits_are_disjoint_and_whole():
-    assert (len(numbers(VAL)), len(numbers(TEST)), len(numbers(MINI_TRAIN)), len(numbers(MINI_VAL))) == (150, 150, 8, 2)
+    assert (len(numbers(VAL)), len(numbers(TEST)), len(numbers(MINI_VAL))) == (150, 150, 2)
     assert not numbers(VAL) & numbers(TEST)
     assert split_of("scene-0103", mini=True) == "mini_val"
     assert split_of("scene-0103", mini=False) == "val"
@@ -250,7 +250,7 @@ def test_large_tables_take_little_memory(tmp_path):
     scenes = int(os.environ.get("BEVCLI_SCENES", "40"))
     write_tables(tmp_path / "v1.0-trainval", Size(scenes=scenes))
     code = (
-        "import sys; from pathlib import Path; from bevcli.sequences.nuscenes.scenes import NuScenesSequence\n"
+        "import sys; from pathlib import Path; from bevcli.sequences.nuscenes.sequence import NuScenesSequence\n"
         "sequence = NuScenesSequence(Path(sys.argv[1]))\n"
         # Not getrusage: a child's peak there begins with what its parent had.
         "peak = Path('/proc/self/status').read_text().split('VmHWM:')[1].split()[0]\n"

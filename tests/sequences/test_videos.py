@@ -6,7 +6,7 @@ import pytest
 from small_drive import CAMERAS, SIZE, image_of
 
 from bevcli.errors import InputError
-from bevcli.sequences.open import InputOptions, open_sequence
+from bevcli.sequences.open import open_sequence
 from bevcli.sequences.video import VideoReader
 
 
@@ -33,9 +33,6 @@ def videos(drive):
     return drive
 
 
-STANDING = InputOptions(ego_motion="static")
-
-
 @pytest.mark.parametrize("suffix", ["mkv", "avi"])
 def test_images_come_by_number_in_any_order(tmp_path, suffix):
     images = [image_of("CAM_FRONT", number) for number in range(8)]
@@ -49,7 +46,7 @@ def test_a_number_beyond_the_end_is_refused_again_and_again(tmp_path):
     write_video(tmp_path / "v.mkv", [image_of("CAM_FRONT", number) for number in range(3)], 10)
     reader = VideoReader(tmp_path / "v.mkv")
     for _ in range(2):
-        with pytest.raises(InputError, match=r"no image 3 \(the last one is 2\)"):
+        with pytest.raises(InputError, match=r"no image 3 \(the last is 2\)"):
             reader.read(3)
     np.testing.assert_array_equal(reader.read(2), image_of("CAM_FRONT", 2))
 
@@ -67,7 +64,7 @@ def test_cells_of_frames_csv_name_images_of_a_video(drive, edit):
 
 def test_whole_videos_are_aligned_by_time(videos):
     """A frame for each image of the slower camera; the faster one's nearest is twice its number."""
-    sequence = open_sequence(videos, STANDING)
+    sequence = open_sequence(videos, ego_motion="static")
     assert [stamp.timestamp_ns for stamp in sequence.stamps] == [n * 200_000_000 for n in range(5)]
     for place in range(5):
         frame = sequence.load(place)
@@ -81,7 +78,7 @@ def test_offsets_and_rates_come_from_timing_toml(videos):
     (videos / "timing.toml").write_text(
         "start_ns = 5000000000\n[cameras.CAM_FRONT]\noffset_ns = 310000000\n[cameras.CAM_BACK]\nrate_hz = 4\n"
     )
-    sequence = open_sequence(videos, STANDING)
+    sequence = open_sequence(videos, ego_motion="static")
     assert [stamp.timestamp_ns for stamp in sequence.stamps] == [5_000_000_000 + n * 250_000_000 for n in range(5)]
     assert "CAM_FRONT" in sequence.load(0).dropped
     assert "CAM_FRONT" in sequence.load(1).dropped  # 0.25 s is 60 ms before its first image
@@ -108,16 +105,16 @@ def test_videos_that_miss_the_ego_motion_ask_for_their_start(videos):
 def test_a_camera_without_a_video(videos):
     (videos / "videos/CAM_BACK.avi").unlink()
     with pytest.raises(InputError, match="camera CAM_BACK: expected one video"):
-        open_sequence(videos, STANDING)
+        open_sequence(videos, ego_motion="static")
 
 
 def test_a_file_that_is_no_video(videos):
     (videos / "videos/CAM_BACK.avi").write_bytes(b"no video at all" * 100)
     with pytest.raises(InputError, match=r"CAM_BACK.avi"):
-        open_sequence(videos, STANDING)
+        open_sequence(videos, ego_motion="static")
 
 
 def test_motion_jpeg_is_read(videos):
     (videos / "videos/CAM_BACK.avi").unlink()
     write_video(videos / "videos/CAM_BACK.avi", [image_of("CAM_BACK", n) for n in range(5)], 5, "MJPG")
-    assert open_sequence(videos, STANDING).load(4).images["CAM_BACK"].pixels_bgr.shape == (36, 64, 3)
+    assert open_sequence(videos, ego_motion="static").load(4).images["CAM_BACK"].pixels_bgr.shape == (36, 64, 3)

@@ -10,7 +10,7 @@ import pytest
 from bevcli.geometry.cameras import CameraRig
 from bevcli.sequences.native.folder import FolderSequence
 from bevcli.sequences.native.writer import NativeWriter
-from bevcli.sequences.open import InputOptions, open_sequence
+from bevcli.sequences.open import open_sequence
 
 
 def assert_same_rig(one: CameraRig, other: CameraRig) -> None:
@@ -93,11 +93,11 @@ def test_converted(real_drive, nuscenes_root, tmp_path, which):
 
 def test_a_scene_and_a_split_are_chosen(nuscenes_root):
     for options in (
-        InputOptions(scene="scene-0103"),
-        InputOptions(split="mini_val"),
-        InputOptions(version="v1.0-mini"),
+        {"scene": "scene-0103"},
+        {"split": "mini_val"},
+        {"version": "v1.0-mini"},
     ):
-        assert len(open_sequence(nuscenes_root, options).stamps) == 4
+        assert len(open_sequence(nuscenes_root, **options).stamps) == 4
 
 
 def test_without_can_bus_kinematics_come_from_the_poses(nuscenes_root, tmp_path):

@@ -1,4 +1,4 @@
-"""A nuScenes dataset root as a Sequence, read directly (the official devkit needs an old NumPy)."""
+"""A nuScenes dataset root as a Sequence."""
 
 from __future__ import annotations
 
@@ -9,30 +9,26 @@ from pathlib import Path
 
 import numpy as np
 
-from bevcli.errors import InputError
 from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.transforms import Pose
 from bevcli.sequences.images import ImageReader, ImageSource
 from bevcli.sequences.nuscenes.cache import open_index
-from bevcli.sequences.nuscenes.index import Ints, NuScenesIndex
+from bevcli.sequences.nuscenes.choice import NuScenesChoice, chosen_scenes, tables_of
+from bevcli.sequences.nuscenes.frames import keyframes, sweep_frames
+from bevcli.sequences.nuscenes.index import Ints
 from bevcli.sequences.nuscenes.scene import SceneFacts, read_scene_facts, scene_rig
-from bevcli.sequences.nuscenes.splits import SPLITS, split_of
-from bevcli.sequences.nuscenes.sweeps import sweep_frames
-
-
-@dataclass(frozen=True)
-class NuScenesChoice:
-    """Which part of a dataset: version None is the only one there; scene and split None are all; sweeps too or not."""
-
-    version: str | None = None
-    scene: str | None = None
-    split: str | None = None
-    sweeps: bool = False
 
 
 @dataclass(frozen=True)
 class _Moment:
-    """A frame before its images are read. sample: its place for a keyframe. rows: its images' rows."""
+    """A frame before its images are read.
+
+    Attributes:
+        stamp: index, scene and time of the frame.
+        scene: row of the scene in the index.
+        sample: row of the sample in the index, None between keyframes.
+        rows: rows of the frame's images in the index.
+    """
 
     stamp: FrameStamp
     scene: int
@@ -41,9 +37,10 @@ class _Moment:
 
 
 class NuScenesSequence:
-    """Keyframes of nuScenes (and the images between, if asked for), scene after scene, numbered from 0.
+    """Frames of a nuScenes root, scene after scene, numbered from 0: keyframes, and sweeps if they are chosen.
 
-    The bev frame is the scene's LIDAR_TOP. The world is the map's frame.
+    The bev frame is the scene's LIDAR_TOP frame. The world frame is that of nuScenes' map.
+    Raises InputError if a table is missing or invalid, or the choice contains no scene.
     """
 
     has_ego_motion = True
@@ -62,11 +59,11 @@ class NuScenesSequence:
 
     @property
     def stamps(self) -> tuple[FrameStamp, ...]:
-        """When each frame is, in order."""
+        """Index, scene and time of each frame, in order."""
         return tuple(moment.stamp for moment in self._moments)
 
     def load(self, place: int) -> Frame:
-        """The frame at a place, its images decoded. Raises InputError for wrong sizes, or missing ones if strict."""
+        """The frame at position `place`, with decoded images. Raises InputError as `ImageReader.read`."""
         moment = self._moments[place]
         facts = self._facts(moment.scene)
         rows = {facts.sensor_names[int(self.index.images.sensors[row])]: int(row) for row in moment.rows}
@@ -89,7 +86,7 @@ class NuScenesSequence:
     def _find_moments(self, scenes: Iterable[int], sweeps: bool) -> Iterable[_Moment]:
         number = 0
         for scene in scenes:
-            found = sweep_frames(self.index, scene) if sweeps else _keyframes(self.index, scene)
+            found = sweep_frames(self.index, scene) if sweeps else keyframes(self.index, scene)
             name = str(self.index.scenes.names[scene])
             for time_us, sample, rows in found:
                 yield _Moment(FrameStamp(number, name, time_us * 1000), scene, sample, rows)
@@ -115,57 +112,4 @@ class NuScenesSequence:
         if not without:
             return ""
         which = without[0] if len(without) == 1 else f"{len(without)} of {len(names)} scenes"
-        return f"{which}: no CAN bus data in {self.root / 'can_bus'}, so it is derived from the poses"
-
-
-def is_nuscenes_root(path: Path) -> bool:
-    """Whether a folder holds the tables of a nuScenes version, as ROOT/v1.0-mini/scene.json."""
-    return bool(_versions(path))
-
-
-def tables_of(root: Path, version: str | None) -> Path:
-    """The folder of a version's tables. Raises InputError where it is missing, or several are there to choose from."""
-    versions = _versions(root)
-    if version is None and len(versions) == 1:
-        return root / versions[0]
-    if version in versions:
-        return root / version
-    found = ", ".join(versions) or "none"
-    wanted = f'has no version "{version}"' if version else "has several versions: choose one with --version"
-    raise InputError(f"{root}: {wanted} (found: {found})")
-
-
-def chosen_scenes(index: NuScenesIndex, tables: Path, choice: NuScenesChoice) -> list[int]:
-    """The places of the chosen scenes. Raises InputError where none is left."""
-    names = [str(name) for name in index.scenes.names]
-    if choice.split is not None and choice.split not in SPLITS:
-        raise InputError(f'--split "{choice.split}": expected one of {", ".join(SPLITS)}')
-    if choice.scene is not None and choice.scene not in names:
-        few = ", ".join(names[:6]) + (f", ... {len(names)} in all" if len(names) > 6 else "")
-        raise InputError(f'{tables}: has no scene "{choice.scene}" (found: {few})')
-    mini = (choice.split or "").startswith("mini")
-    scenes = [
-        place
-        for place, name in enumerate(names)
-        if choice.scene in (None, name) and choice.split in (None, split_of(name, mini=mini))
-    ]
-    if not scenes:
-        what = f"scene {choice.scene} is not in" if choice.scene else "no scene is in"
-        raise InputError(f"{tables}: {what} the split {choice.split}: choose another --split or --version")
-    return scenes
-
-
-def _versions(root: Path) -> list[str]:
-    return sorted(path.parent.name for path in root.glob("v1.*/scene.json"))
-
-
-def _keyframes(index: NuScenesIndex, scene: int) -> Iterable[tuple[int, int, Ints]]:
-    """Time in us, sample and image rows of each keyframe of a scene."""
-    first, last = index.scenes.first_image[scene : scene + 2]
-    keys = first + np.flatnonzero(index.images.keys[first:last])
-    samples = index.images.samples[keys]
-    keys = keys[np.argsort(samples, kind="stable")]
-    start, end = index.scenes.first_sample[scene : scene + 2]
-    bounds = np.searchsorted(np.sort(samples), np.arange(start, end + 1))
-    for place, sample in enumerate(range(start, end)):
-        yield int(index.samples.times_us[sample]), sample, keys[bounds[place] : bounds[place + 1]]
+        return f"{which}: no CAN bus data in {self.root / 'can_bus'}; kinematics are derived from the poses"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bevcli.errors import InputError
-from bevcli.sequences.files.intrinsics import read_rig
+from bevcli.sequences.files.kalibr_ros import read_rig
 
 KALIBR = """
 cam0:
@@ -107,7 +107,7 @@ def test_nothing_given_is_nothing():
         (KALIBR.replace("T_cn_cnm1", "T_other"), {"cam0": POSE}, 'camera cam1: "ego_from_camera" is missing'),
         (KALIBR, {"cam0": {**POSE, "rotation_wxyz": [1, 1, 0, 0]}}, "cam0.*norm"),
         ("a: [", {}, "broken YAML"),
-        ("a: 1", {}, "neither"),
+        ("a: 1", {}, "expected a Kalibr camchain"),
         ("!!python/object/apply:os.getcwd []", {}, "YAML"),
     ],
 )
@@ -121,5 +121,5 @@ def test_mistakes_name_file_and_camera(tmp_path, text, poses, expected):
 def test_one_without_the_other(tmp_path):
     intrinsics, extrinsics = write(tmp_path, KALIBR, {})
     for pair in ((intrinsics, None), (None, extrinsics)):
-        with pytest.raises(InputError, match="go together"):
+        with pytest.raises(InputError, match="must be given together"):
             read_rig(*pair)
