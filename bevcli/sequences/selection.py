@@ -118,7 +118,7 @@ def _nearest_to_clock(times_ns: np.ndarray, rate_hz: float) -> list[int]:
 def _nearest_in_piece(seconds: np.ndarray, rate_hz: float) -> np.ndarray:
     if len(seconds) == 1:
         return np.zeros(1, dtype=np.int64)
-    # Later ticks have no frame of their own: the last frame is not theirs.
+    # A tick later than half a frame period after the last frame has no frame of its own.
     end = seconds[-1] + 0.5 * np.median(np.diff(seconds))
     ticks = np.arange(0, end, 1 / rate_hz)
     later = np.clip(np.searchsorted(seconds, ticks), 1, len(seconds) - 1)

@@ -21,13 +21,13 @@ def points_in_view(count=200):
     return np.random.default_rng(2).uniform([-2, -1, 3], [2, 1, 9], size=(count, 3))
 
 
-def test_a_point_straight_ahead_falls_on_the_principal_point():
+def test_point_straight_ahead_falls_on_the_principal_point():
     pixels, depth = camera().project_ego([11.5, 0, 1.6])
     assert pixels == pytest.approx([400, 300])
     assert depth == pytest.approx(10)
 
 
-def test_left_is_left_and_up_is_up():
+def test_left_and_upper_points_have_smaller_pixel_coordinates():
     pixels, _ = camera().project_ego([[11.5, 2, 1.6], [11.5, 0, 3.6]])
     assert pixels == pytest.approx(np.array([[300, 300], [400, 198]]))
 
@@ -56,7 +56,7 @@ def test_points_behind_the_camera_have_no_pixel():
     assert camera().contains(pixels, depth).tolist() == [False, False, True]
 
 
-def test_a_lens_that_folds_back_gives_no_pixel_beyond_the_fold():
+def test_distortion_that_is_not_monotonic_gives_no_pixel_beyond_its_limit():
     pixels, _ = camera(Distortion("brown_conrady", (-0.3, 0, 0, 0))).project([[8.0, 0, 4]])
     assert np.isnan(pixels).all()
 
@@ -118,7 +118,7 @@ def test_yaw_is_the_viewing_direction(yaw_deg):
     assert np.degrees(replace(camera(), ego_from_camera=mounted).yaw) == pytest.approx(yaw_deg)
 
 
-def test_the_default_bev_frame_has_y_ahead_and_x_to_the_right():
+def test_default_bev_frame_has_y_ahead_and_x_to_the_right():
     assert apply(default_ego_from_bev(), [[0.0, 10, 0], [3, 0, 0]]) == pytest.approx(
         np.array([[10.94, 0, 1.84], [0.94, -3, 1.84]])
     )

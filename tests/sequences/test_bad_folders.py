@@ -1,4 +1,4 @@
-"""Mistakes in a native folder: one line each, with the file and the camera, line or column."""
+"""A mistake in a native folder gives a message of one line that names the file and the camera, line or column."""
 
 import json
 import shutil
@@ -12,7 +12,7 @@ from bevcli.sequences.open import open_sequence
 
 
 def message(folder, place=0, **options):
-    """The one line that opening the folder, or loading a frame of it, ends with."""
+    """The error message of opening the folder or loading a frame."""
     with pytest.raises(InputError) as caught:
         open_sequence(folder, **options).load(place)
     line = str(caught.value)
@@ -24,11 +24,11 @@ def test_missing_folder(tmp_path):
     assert str(tmp_path / "nothing") in message(tmp_path / "nothing")
 
 
-def test_a_folder_of_something_else(tmp_path):
+def test_folder_of_unknown_format(tmp_path):
     assert "is not a sequence folder" in message(tmp_path)
 
 
-def test_a_file_in_place_of_a_folder(drive):
+def test_file_instead_of_a_folder(drive):
     assert "is a file" in message(drive / "frames.csv")
 
 
@@ -93,7 +93,7 @@ def test_wrong_cells_and_columns(edit, file, old, new, expected):
         assert part in line
 
 
-def test_optional_columns_come_in_groups(drive):
+def test_incomplete_group_of_optional_columns(drive):
     rows = (drive / "ego_motion.csv").read_text().splitlines()
     (drive / "ego_motion.csv").write_text("\n".join([rows[0] + ",vx", *(row + ",1" for row in rows[1:])]))
     line = message(drive)
@@ -111,21 +111,21 @@ def test_no_rows(drive, file, rows):
     assert ("no rows" if rows else "empty") in line
 
 
-def test_a_camera_without_a_column(drive):
+def test_camera_without_a_column(drive):
     rows = (drive / "frames.csv").read_text().splitlines()
     (drive / "frames.csv").write_text("\n".join(",".join(row.split(",")[:3]) for row in rows))
     line = message(drive)
     assert "frames.csv: camera CAM_BACK" in line
 
 
-def test_a_column_without_a_camera(drive):
+def test_column_without_a_camera(drive):
     calibration = json.loads((drive / "calibration.json").read_text())
     del calibration["cameras"]["CAM_BACK"]
     (drive / "calibration.json").write_text(json.dumps(calibration))
     assert 'unknown column "CAM_BACK"' in message(drive)
 
 
-def test_an_image_of_another_size(drive):
+def test_image_of_another_size(drive):
     cv2.imwrite(str(drive / "images/CAM_BACK/2.png"), np.zeros((30, 64, 3), np.uint8))
     line = message(drive, place=2)
     assert "CAM_BACK/2.png" in line
@@ -160,7 +160,7 @@ def test_cameras_with_different_sets_of_names(drive):
     assert "first is 2" in line
 
 
-def test_names_that_are_no_numbers(drive):
+def test_image_name_that_is_not_a_number(drive):
     (drive / "frames.csv").unlink()
     (drive / "images/CAM_BACK/2.png").rename(drive / "images/CAM_BACK/two.png")
     assert "two.png" in message(drive)

@@ -20,7 +20,7 @@ from bevcli.sequences.nuscenes.scene import SceneFacts, read_scene_facts, scene_
 
 
 @dataclass(frozen=True)
-class _Moment:
+class _FrameEntry:
     """A frame before its images are read.
 
     Attributes:
@@ -52,7 +52,7 @@ class NuScenesSequence:
         scenes = chosen_scenes(self.index, self.tables, choice)
         self.name = choice.scene or choice.split or self.tables.name
         self.rig = scene_rig(self.index, scenes[0])[0]
-        self._moments = tuple(self._find_moments(scenes, choice.sweeps))
+        self._frames = tuple(self._find_frames(scenes, choice.sweeps))
         self._images = ImageReader(strict=strict)
         self._facts = lru_cache(maxsize=2)(partial(read_scene_facts, self.index, root))
         self.notes = tuple(text for text in (note, self._can_bus_note(scenes)) if text)
@@ -60,36 +60,36 @@ class NuScenesSequence:
     @property
     def stamps(self) -> tuple[FrameStamp, ...]:
         """Index, scene and time of each frame, in order."""
-        return tuple(moment.stamp for moment in self._moments)
+        return tuple(entry.stamp for entry in self._frames)
 
     def load(self, place: int) -> Frame:
         """The frame at position `place`, with decoded images. Raises InputError as `ImageReader.read`."""
-        moment = self._moments[place]
-        facts = self._facts(moment.scene)
-        rows = {facts.sensor_names[int(self.index.images.sensors[row])]: int(row) for row in moment.rows}
+        entry = self._frames[place]
+        facts = self._facts(entry.scene)
+        rows = {facts.sensor_names[int(self.index.images.sensors[row])]: int(row) for row in entry.rows}
         dropped = {name: "no image in sample_data.json" for name in facts.rig.names if name not in rows}
         sources = {name: self._source(rows[name]) for name in facts.rig.names if name in rows}
         images, dropped = self._images.read(sources, facts.rig, dropped)
-        pose = self._pose(moment, facts)
+        pose = self._pose(entry, facts)
         return Frame(
-            stamp=moment.stamp,
+            stamp=entry.stamp,
             rig=facts.rig,
             images=images,
             world_from_ego=pose,
             world_from_ego_at={n: self._image_pose(rows[n]) if n in rows else pose for n in facts.rig.names},
-            kinematics=facts.kinematics_at(moment.stamp.timestamp_ns),
+            kinematics=facts.kinematics_at(entry.stamp.timestamp_ns),
             dropped=dropped,
-            ground_truth=None if moment.sample is None else self.index.ground_truth(moment.sample),
-            sample_token=None if moment.sample is None else self.index.samples.tokens[moment.sample].decode(),
+            ground_truth=None if entry.sample is None else self.index.ground_truth(entry.sample),
+            sample_token=None if entry.sample is None else self.index.samples.tokens[entry.sample].decode(),
         )
 
-    def _find_moments(self, scenes: Iterable[int], sweeps: bool) -> Iterable[_Moment]:
+    def _find_frames(self, scenes: Iterable[int], sweeps: bool) -> Iterable[_FrameEntry]:
         number = 0
         for scene in scenes:
             found = sweep_frames(self.index, scene) if sweeps else keyframes(self.index, scene)
             name = str(self.index.scenes.names[scene])
             for time_us, sample, rows in found:
-                yield _Moment(FrameStamp(number, name, time_us * 1000), scene, sample, rows)
+                yield _FrameEntry(FrameStamp(number, name, time_us * 1000), scene, sample, rows)
                 number += 1
 
     def _source(self, row: int) -> ImageSource:
@@ -100,11 +100,11 @@ class NuScenesSequence:
         images = self.index.images
         return Pose(np.array(images.translations[row]), np.array(images.quaternions[row]))
 
-    def _pose(self, moment: _Moment, facts: SceneFacts) -> Pose:
-        if moment.sample is None:
-            return facts.motion.pose_at(moment.stamp.timestamp_ns)
+    def _pose(self, entry: _FrameEntry, facts: SceneFacts) -> Pose:
+        if entry.sample is None:
+            return facts.motion.pose_at(entry.stamp.timestamp_ns)
         samples = self.index.samples
-        return Pose(np.array(samples.translations[moment.sample]), np.array(samples.quaternions[moment.sample]))
+        return Pose(np.array(samples.translations[entry.sample]), np.array(samples.quaternions[entry.sample]))
 
     def _can_bus_note(self, scenes: Iterable[int]) -> str:
         names = [str(self.index.scenes.names[scene]) for scene in scenes]
