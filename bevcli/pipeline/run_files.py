@@ -10,14 +10,14 @@ from types import TracebackType
 from bevcli.errors import OutputError
 from bevcli.evaluation.submission import SubmissionWriter
 from bevcli.frame import Frame, Prediction, Sequence
-from bevcli.geometry.attributes import attributes_by_speed
+from bevcli.geometry.boxes import attributes_by_speed
 from bevcli.pipeline.bev_files import save_bev
 from bevcli.pipeline.model_loading import Model
 from bevcli.pipeline.run_summary import SUMMARY
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.writer import Recording
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
-from bevcli.sequences.files.map_file import write_map
+from bevcli.sequences.files.map_folder import write_map
 
 RECORDING, PREDICTIONS, SUBMISSION = "recording.rrd", "predictions.json", "results_nusc.json"
 SEGMENTATION = "segmentation"

@@ -9,7 +9,7 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.transforms import Array, rigid, rotation_about_z
-from bevcli.sequences.native.calibration import read_calibration
+from bevcli.sequences.files.calibration_file import read_calibration
 from bevcli.synth.render.lens import distortion_maps
 
 # name: x, y, z in ego (m), yaw (degrees), focal length (px at 1600 x 900)

@@ -9,7 +9,7 @@ import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.frame import Sequence
-from bevcli.sequences.rate import scenes_of
+from bevcli.sequences.selection import scenes_of
 from bevcli.training.drives import Drives
 
 

@@ -12,8 +12,6 @@ from typing import Protocol
 from bevcli.frame import Sequence
 from bevcli.model.bevformer import BEVFormerConfig
 from bevcli.sequences.open import open_sequence
-from bevcli.sequences.rate import thin
-from bevcli.sequences.selection import select
 from bevcli.synth.bev_truth import MapWindow
 from bevcli.synth.drive import Drive, Stock
 from bevcli.synth.export import export_drive
@@ -48,8 +46,7 @@ class FolderDrives:
         """The drive at a place, thinned to the model's rate."""
         opened: dict[int, Sequence] = vars(self._of_thread).setdefault("opened", {})
         if place not in opened:
-            sequence = open_sequence(self._folders[place])
-            opened[place] = select(sequence, thin(sequence.stamps, self._rate_hz).places)
+            opened[place] = open_sequence(self._folders[place], rate_hz=self._rate_hz)
         return opened[place]
 
 

@@ -11,8 +11,7 @@ from bevcli.evaluation.detection import evaluate
 from bevcli.evaluation.detection_scores import DetectionScores
 from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmentation
 from bevcli.frame import MAP_CLASSES, Frame, Prediction
-from bevcli.geometry.attributes import attributes_by_speed
-from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.transforms import inverse
 from bevcli.model.bevformer import BEVFormerConfig
 from bevcli.pipeline.preprocess import Preprocessor

@@ -1,11 +1,11 @@
-"""A rendered rig with a known lens: what we undo looks like the image that never had one."""
+"""An undistorted rendering of a camera with a known lens resembles the rendering without a lens."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from bevcli.geometry.cameras import CameraRig, Distortion, undistort
+from bevcli.geometry.cameras import CameraRig, Distortion
 from bevcli.synth.drive import Drive, Stock
 from bevcli.synth.rig import nuscenes_like_rig
 
@@ -21,7 +21,7 @@ def stock():
 
 
 def rendered(stock, lens):
-    """CAM_FRONT of one frame, with or without a lens."""
+    """An image of CAM_FRONT with the given distortion, and its camera."""
     rig = nuscenes_like_rig(320, 180)
     camera = replace(rig["CAM_FRONT"], distortion=lens)
     drive = Drive(113, frames=20, rig=CameraRig((camera,), rig.ego_from_bev), stock=stock, weather="noon")
@@ -29,10 +29,10 @@ def rendered(stock, lens):
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_undistorting_a_rendered_image_gives_the_image_without_a_lens(stock, name):
+def test_undistorted_rendering_resembles_the_rendering_without_a_lens(stock, name):
     plain, _ = rendered(stock, None)
     bent, camera = rendered(stock, LENSES[name])
-    mended = undistort(bent.astype(np.uint8), camera).astype(np.float64)
+    mended = camera.undistort(bent.astype(np.uint8)).astype(np.float64)
     seen = mended.sum(-1) > 0  # black where the lens saw nothing
     assert seen.mean() > 0.85
     before, after = np.abs(bent - plain)[seen].mean(), np.abs(mended - plain)[seen].mean()

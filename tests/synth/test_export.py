@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from bevcli.cli.render import parse_resolution, render
 from bevcli.errors import InputError, OutputError
-from bevcli.sequences.native.calibration import write_calibration
+from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.sequences.open import open_sequence
 from bevcli.synth.drive import Drive, Stock
 from bevcli.synth.export import export_drive

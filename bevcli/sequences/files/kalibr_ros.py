@@ -1,4 +1,4 @@
-"""Kalibr camchain and ROS camera_info YAML as intrinsics; with a JSON of extrinsics they make a rig."""
+"""A rig from intrinsics in YAML (Kalibr camchain or ROS camera_info) and extrinsics in JSON."""
 
 from __future__ import annotations
 
@@ -15,28 +15,30 @@ from bevcli.errors import InputError
 from bevcli.findings import errors_of
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.transforms import Array, inverse
-from bevcli.sequences.files.field_report import Report, parse_numbers
-from bevcli.sequences.files.pose_field import parse_transform, transform_to_json
-from bevcli.sequences.native.calibration_fields import parse_camera
+from bevcli.sequences.files.camera_fields import parse_camera
+from bevcli.sequences.files.json_fields import Report, parse_numbers
+from bevcli.sequences.files.transform_json import parse_transform, transform_to_json
 
-Fields = dict[str, Any]  # one camera's, as in calibration.json
+Fields = dict[str, Any]  # the fields of one camera, as in calibration.json
 YAML_SUFFIXES = (".yaml", ".yml")
 KALIBR_LENSES = {"radtan": "brown_conrady", "equidistant": "kannala_brandt", "none": "none"}
 ROS_LENSES = {"plumb_bob": "brown_conrady", "rational_polynomial": "brown_conrady", "equidistant": "kannala_brandt"}
-CHAIN = "camera_from_previous"  # Kalibr's T_cn_cnm1, kept beside the fields until the poses are known
+CHAIN = "camera_from_previous"  # key of Kalibr's T_cn_cnm1 in Fields, until all poses are known
 
 
 def read_rig(intrinsics: Path | None, extrinsics: Path | None) -> CameraRig | None:
-    """The rig of two files; None where neither is given.
+    """The rig of an intrinsics and an extrinsics file; None if neither is given.
 
-    intrinsics: a Kalibr camchain, a ROS camera_info, or a folder of either. extrinsics: JSON with each camera's pose:
-    {"ego_from_bev": {...}, "cameras": {"cam0": {"ego_from_camera": {"translation": ..., "rotation_wxyz": ...}}}}.
-    A camera without one is placed by Kalibr's chain from its neighbour. Raises InputError.
+    intrinsics: a Kalibr camchain, a ROS camera_info, or a folder of these.
+    extrinsics: JSON with each camera's pose and, optionally, the bev frame:
+        {"ego_from_bev": {...}, "cameras": {"cam0": {"ego_from_camera": {"translation": ..., "rotation_wxyz": ...}}}}
+        A camera that is missing there gets its pose from its neighbour and T_cn_cnm1 of the camchain.
+    Raises InputError if one file is given without the other, or one is missing or invalid.
     """
     if intrinsics is None and extrinsics is None:
         return None
     if intrinsics is None or extrinsics is None:
-        raise InputError("--intrinsics and --extrinsics go together: give both, or write a calibration.json")
+        raise InputError("--intrinsics and --extrinsics must be given together: pass both, or write a calibration.json")
     cameras = dict(_read_intrinsics(intrinsics))
     document = _read_extrinsics(extrinsics)
     poses = _poses(document.get("cameras", {}), cameras, extrinsics)
@@ -51,17 +53,17 @@ def read_rig(intrinsics: Path | None, extrinsics: Path | None) -> CameraRig | No
 
 
 def _read_intrinsics(path: Path) -> Iterator[tuple[str, Fields]]:
-    """Name and fields of every camera in a file or folder."""
+    """Name and fields of every camera in a file or in the files of a folder."""
     files = [path]
     if path.is_dir():
         files = [file for file in sorted(path.iterdir()) if file.suffix.lower() in YAML_SUFFIXES]
         if not files:
-            raise InputError(f"{path}: no .yaml file (expected Kalibr or ROS intrinsics)")
+            raise InputError(f"{path}: the folder has no .yaml file (expected Kalibr or ROS intrinsics)")
     seen: set[str] = set()
     for file in files:
         for name, fields in _cameras_in(file):
             if name in seen:
-                raise InputError(f"{file}: camera {name} is in two files: keep one")
+                raise InputError(f"{file}: camera {name} is in another file too: keep one")
             seen.add(name)
             yield name, fields
 
@@ -74,7 +76,7 @@ def _cameras_in(path: Path) -> Iterator[tuple[str, Fields]]:
         for name, entry in document.items():
             yield str(name), _kalibr_fields(entry, f"{path}: camera {name}")
     else:
-        raise InputError(f"{path}: is neither a Kalibr camchain (cam0: intrinsics: ...) nor a ROS camera_info")
+        raise InputError(f"{path}: expected a Kalibr camchain (cam0: intrinsics: ...) or a ROS camera_info")
 
 
 def _load_yaml(path: Path) -> Mapping[str, Any]:
@@ -95,7 +97,7 @@ def _kalibr_fields(entry: Any, where: str) -> Fields:
     if not isinstance(entry, dict):
         raise InputError(f"{where}: expected a mapping with intrinsics and resolution")
     if entry.get("camera_model", "pinhole") != "pinhole":
-        raise InputError(f"{where}: camera_model {entry['camera_model']} is not read (expected pinhole)")
+        raise InputError(f"{where}: camera_model {entry['camera_model']} is not supported (expected pinhole)")
     fx, fy, cx, cy = _numbers(entry, "intrinsics", 4, where)
     width, height = _numbers(entry, "resolution", 2, where)
     fields: Fields = {
@@ -115,7 +117,7 @@ def _kalibr_fields(entry: Any, where: str) -> Fields:
 
 
 def _ros_fields(document: Mapping[str, Any], path: Path) -> Fields:
-    """Of a calibration file (camera_matrix: {data: ...}) or of a printed message (k: [...] or K: [...])."""
+    """Fields of a ROS calibration file (camera_matrix: {data: ...}) or printed message (k: [...] or K: [...])."""
     where = str(path)
     matrix = document.get("camera_matrix", {}).get("data") or document.get("k") or document.get("K")
     coefficients = document.get("distortion_coefficients", {}).get("data") or document.get("d") or document.get("D")
@@ -139,7 +141,7 @@ def _numbers(owner: Mapping[str, Any], name: str, count: int, where: str) -> lis
 
 def _lens(model: str, coefficients: list[float], known: Mapping[str, str], where: str) -> Fields:
     if model not in known:
-        raise InputError(f"{where}: distortion_model {model} is not read (expected {', '.join(known)})")
+        raise InputError(f"{where}: distortion_model {model} is not supported (expected {', '.join(known)})")
     if not any(coefficients):
         return {"model": "none"}
     return {"model": known[model], "coefficients": coefficients}
@@ -160,10 +162,10 @@ def _read_extrinsics(path: Path) -> Mapping[str, Any]:
 
 
 def _poses(stated: Mapping[str, Any], cameras: Mapping[str, Fields], path: Path) -> dict[str, Array]:
-    """ego_from_camera (4, 4) of the cameras: as stated, else along Kalibr's chain in the file's order."""
+    """ego_from_camera (4, 4) by camera: as stated, otherwise along Kalibr's chain in the file's order."""
     for name in stated:
         if name not in cameras:
-            raise InputError(f"{path}: camera {name}: has no intrinsics (these have: {', '.join(cameras)})")
+            raise InputError(f"{path}: camera {name}: has no intrinsics (found those of {', '.join(cameras)})")
     poses: dict[str, Array] = {}
     for name, entry in stated.items():
         report = Report(camera=name)
@@ -172,10 +174,10 @@ def _poses(stated: Mapping[str, Any], cameras: Mapping[str, Fields], path: Path)
         assert pose is not None
         poses[name] = pose
     order = list(cameras)
-    for earlier, name in pairwise(order):  # forwards
+    for earlier, name in pairwise(order):  # along the chain
         if name not in poses and earlier in poses and CHAIN in cameras[name]:
             poses[name] = poses[earlier] @ inverse(cameras[name][CHAIN])
-    for earlier, name in zip(order[-2::-1], order[:0:-1], strict=False):  # and backwards
+    for earlier, name in zip(order[-2::-1], order[:0:-1], strict=False):  # and back
         if earlier not in poses and name in poses and CHAIN in cameras[name]:
             poses[earlier] = poses[name] @ cameras[name][CHAIN]
     return poses
@@ -183,7 +185,7 @@ def _poses(stated: Mapping[str, Any], cameras: Mapping[str, Fields], path: Path)
 
 def _camera(name: str, fields: Fields, ego_from_camera: Array | None, path: Path) -> Camera:
     if ego_from_camera is None:
-        raise InputError(f'{path}: camera {name}: "ego_from_camera" is missing: add its pose')
+        raise InputError(f'{path}: camera {name}: "ego_from_camera" is missing: add the camera\'s pose')
     report = Report(camera=name)
     own = {key: value for key, value in fields.items() if key != CHAIN}
     camera = parse_camera(name, {**own, "ego_from_camera": transform_to_json(ego_from_camera)}, report)

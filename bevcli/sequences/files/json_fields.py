@@ -1,4 +1,7 @@
-"""Reading numbers out of JSON: what is wrong is reported as findings, so that one reader serves strict and lenient."""
+"""Reads numbers from JSON objects and collects what is wrong as findings.
+
+`bevcli run` stops at the first finding; `bevcli project-debug` shows all of them.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +17,12 @@ from bevcli.geometry.transforms import Array
 
 @dataclass(frozen=True)
 class Report:
-    """Collects findings about one camera, or about the whole file where camera is None.
+    """Collects findings while a file is read.
 
-    prefix: the key around the fields at hand, as "ego_from_camera.".
+    Attributes:
+        camera: the camera that the fields belong to, None for the whole file.
+        prefix: path of the enclosing keys, such as "ego_from_camera.".
+        findings: the findings so far; reports made by `about` and `within` share the list.
     """
 
     camera: str | None = None
@@ -24,27 +30,27 @@ class Report:
     findings: list[Finding] = field(default_factory=list)
 
     def about(self, camera: str) -> Report:
-        """A report on one camera, into the same list."""
+        """A report on one camera that adds to the same findings."""
         return replace(self, camera=camera)
 
     def within(self, name: str) -> Report:
-        """A report on the fields inside the field `name`, into the same list."""
+        """A report on the fields inside the field `name` that adds to the same findings."""
         return replace(self, prefix=f"{self.prefix}{name}.")
 
     def error(
         self, code: str, name: str, message: str, *, expected: str = "", found: object = "", advice: str = ""
     ) -> None:
-        """Add a finding of severity error on the field `name`; `message` goes on from its name."""
+        """Add an error about the field `name`. `message` continues a sentence that begins with the name."""
         text = f'"{self.prefix}{name}" {message}'
         self.findings.append(Finding(code, "error", self.camera, text, shortened(found), expected, advice))
 
     def missing(self, name: str, expected: str) -> None:
-        """Add that a key is missing."""
+        """Add an error for a missing key."""
         self.error("missing-key", name, "is missing", expected=expected)
 
 
 def parse_numbers(owner: Mapping[str, Any], name: str, shape: tuple[int, ...], report: Report) -> Array | None:
-    """The array of finite numbers under a key, of exactly this shape; else None, and why is reported."""
+    """The array of finite numbers with this shape under the key `name`; None, with a finding, if it is invalid."""
     expected = "x".join(map(str, shape)) if len(shape) > 1 else f"{shape[0]} numbers"
     value = owner.get(name)
     if value is None:
@@ -52,14 +58,14 @@ def parse_numbers(owner: Mapping[str, Any], name: str, shape: tuple[int, ...], r
         return None
     array = _array_of_numbers(value)
     if array is None:
-        report.error("wrong-shape", name, "is not all numbers", expected=expected, found=value)
+        report.error("wrong-shape", name, "is not an array of numbers", expected=expected, found=value)
         return None
     if array.shape != shape:
         found = "x".join(map(str, array.shape)) or value
         report.error("wrong-shape", name, "has the wrong shape", expected=expected, found=found)
         return None
     if not np.isfinite(array).all():
-        report.error("not-finite", name, "holds NaN or infinity", expected="finite numbers", found=value)
+        report.error("not-finite", name, "contains NaN or infinity", expected="finite numbers", found=value)
         return None
     return array
 

@@ -1,4 +1,4 @@
-"""Kalibr and ROS intrinsics with extrinsics of our own form."""
+"""Rigs from Kalibr or ROS intrinsics and extrinsics in JSON."""
 
 import json
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bevcli.errors import InputError
-from bevcli.sequences.files.intrinsics import read_rig
+from bevcli.sequences.files.kalibr_ros import read_rig
 
 KALIBR = """
 cam0:
@@ -67,7 +67,7 @@ def test_kalibr(tmp_path):
 
 
 @pytest.mark.parametrize(("known", "other", "sign"), [("cam0", "cam1", 1), ("cam1", "cam0", -1)])
-def test_kalibrs_chain_places_the_neighbour(tmp_path, known, other, sign):
+def test_kalibr_chain_gives_the_pose_of_the_neighbour(tmp_path, known, other, sign):
     """cam1 is 0.11 m right of cam0, 0.02 m above it and 0.03 m behind it: in ego -y, +z and -x."""
     rig = read_rig(*write(tmp_path, KALIBR, {known: POSE}))
     shift = rig[other].ego_from_camera[:3, 3] - rig[known].ego_from_camera[:3, 3]
@@ -75,7 +75,7 @@ def test_kalibrs_chain_places_the_neighbour(tmp_path, known, other, sign):
     assert rig.ego_from_bev_assumed
 
 
-def test_ros_files_of_a_folder(tmp_path):
+def test_folder_of_ros_files(tmp_path):
     (tmp_path / "yaml").mkdir()
     (tmp_path / "yaml" / "wide.yaml").write_text(ROS_MESSAGE)
     _, extrinsics = write(tmp_path / "yaml", ROS, {"narrow": POSE, "wide": POSE}, name="a.yml")
@@ -86,12 +86,12 @@ def test_ros_files_of_a_folder(tmp_path):
     np.testing.assert_allclose(rig["wide"].intrinsics, [[500, 0, 320], [0, 501, 240], [0, 0, 1]])
 
 
-def test_a_lens_of_zeros_is_none(tmp_path):
+def test_distortion_with_zero_coefficients_is_none(tmp_path):
     text = ROS.replace("[0.1, -0.2, 0.001, 0.002, 0.03]", "[0, 0, 0, 0, 0]")
     assert read_rig(*write(tmp_path, text, {"narrow": POSE}))["narrow"].distortion is None
 
 
-def test_nothing_given_is_nothing():
+def test_without_files_there_is_no_rig():
     assert read_rig(None, None) is None
 
 
@@ -107,7 +107,7 @@ def test_nothing_given_is_nothing():
         (KALIBR.replace("T_cn_cnm1", "T_other"), {"cam0": POSE}, 'camera cam1: "ego_from_camera" is missing'),
         (KALIBR, {"cam0": {**POSE, "rotation_wxyz": [1, 1, 0, 0]}}, "cam0.*norm"),
         ("a: [", {}, "broken YAML"),
-        ("a: 1", {}, "neither"),
+        ("a: 1", {}, "expected a Kalibr camchain"),
         ("!!python/object/apply:os.getcwd []", {}, "YAML"),
     ],
 )
@@ -118,8 +118,8 @@ def test_mistakes_name_file_and_camera(tmp_path, text, poses, expected):
     assert str(tmp_path) in str(caught.value)
 
 
-def test_one_without_the_other(tmp_path):
+def test_intrinsics_without_extrinsics_and_vice_versa_are_an_error(tmp_path):
     intrinsics, extrinsics = write(tmp_path, KALIBR, {})
     for pair in ((intrinsics, None), (None, extrinsics)):
-        with pytest.raises(InputError, match="go together"):
+        with pytest.raises(InputError, match="must be given together"):
             read_rig(*pair)

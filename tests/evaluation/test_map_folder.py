@@ -11,7 +11,7 @@ import pytest
 
 from bevcli.errors import InputError
 from bevcli.frame import BevMap
-from bevcli.sequences.files.map_file import open_maps, write_map
+from bevcli.sequences.files.map_folder import open_maps, write_map
 
 MAP = BevMap(np.arange(12, dtype=np.uint8).reshape(3, 4), (-32.0, 32.0), (-24.0, 24.0))
 
@@ -43,7 +43,7 @@ def test_a_missing_or_wrong_image_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"000002\.png: expected an 8-bit image with one channel"):
         folder.load(2)
     cv2.imwrite(str(tmp_path / "000003.png"), np.full((3, 4), 16, np.uint8))
-    with pytest.raises(InputError, match="bits 0x10 stand for no class"):
+    with pytest.raises(InputError, match="bits 0x10 belong to no class"):
         folder.load(3)
 
 

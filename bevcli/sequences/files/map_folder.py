@@ -1,4 +1,4 @@
-"""Folders of BEV maps: ground_truth_map/ and segmentation/, one PNG a frame and a map.json ("bevcli-map/1")."""
+"""BEV maps in ground_truth_map/ and segmentation/: one PNG per frame, and map.json ("bevcli-map/1")."""
 
 from __future__ import annotations
 
@@ -19,7 +19,14 @@ LEGEND = "map.json"
 
 @dataclass(frozen=True)
 class MapFolder:
-    """A folder of maps that share their extent in the bev frame. classes: those that its maps may show."""
+    """A folder of maps with one extent in the bev frame.
+
+    Attributes:
+        path: the folder.
+        x_range_m: smallest and largest x, metres.
+        y_range_m: smallest and largest y, metres.
+        classes: names of the classes that the maps may contain.
+    """
 
     path: Path
     x_range_m: tuple[float, float]
@@ -27,31 +34,33 @@ class MapFolder:
     classes: tuple[str, ...]
 
     def has(self, frame: int) -> bool:
-        """Whether there is a map of this frame."""
+        """Whether the folder has a map of this frame."""
         return _image(self.path, frame).is_file()
 
     def load(self, frame: int) -> BevMap:
-        """The map of a frame. Raises InputError where it is missing, unreadable or has an unknown bit."""
+        """The map of a frame. Raises InputError if it is missing, unreadable or has an unknown bit."""
         path = _image(self.path, frame)
         if not path.is_file():
             raise InputError(f"{path}: the map of frame {frame} is missing")
         cells = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if cells is None or cells.ndim != 2 or cells.dtype != np.uint8:
-            found = "no image" if cells is None else f"{cells.dtype} of shape {cells.shape}"
+            found = "an unreadable image" if cells is None else f"{cells.dtype} of shape {cells.shape}"
             raise InputError(f"{path}: expected an 8-bit image with one channel, found {found}")
         unknown = int(np.bitwise_or.reduce(cells, axis=None)) & ~sum(MAP_CLASSES[name] for name in self.classes)
         if unknown:
-            raise InputError(f"{path}: bits {unknown:#x} stand for no class of {LEGEND} ({', '.join(self.classes)})")
+            raise InputError(f"{path}: bits {unknown:#x} belong to no class in {LEGEND} ({', '.join(self.classes)})")
         return BevMap(cells.astype(np.uint8), self.x_range_m, self.y_range_m)
 
 
 def open_maps(path: Path) -> MapFolder:
-    """Read a folder's map.json; the images are read when they are asked for. Raises InputError."""
+    """Open a folder of maps. Only map.json is read here. Raises InputError if it is missing or invalid."""
     legend_path = path / LEGEND
     try:
         legend = json.loads(legend_path.read_bytes())
     except FileNotFoundError:
-        raise InputError(f"{legend_path}: the file is missing (it states the extent of the maps beside it)") from None
+        raise InputError(
+            f"{legend_path}: the file is missing (expected the extent and classes of the maps in this folder)"
+        ) from None
     except (ValueError, OSError) as error:
         raise InputError(f"{legend_path}: cannot be read as JSON ({error})") from None
     found = legend.get("format") if isinstance(legend, dict) else type(legend).__name__
@@ -62,10 +71,9 @@ def open_maps(path: Path) -> MapFolder:
 
 
 def write_map(folder: Path, frame: int, bev_map: BevMap) -> None:
-    """Write a frame's map as NNNNNN.png, and map.json where it is not there yet.
+    """Write a frame's map as NNNNNN.png. The folder and map.json are created if they are missing.
 
-    folder: made where it is missing. Raises OutputError where it cannot be written, and InputError where the
-    folder's maps have another extent.
+    Raises OutputError if the map cannot be written, and InputError if the folder's maps have another extent.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -74,7 +82,7 @@ def write_map(folder: Path, frame: int, bev_map: BevMap) -> None:
         _check_extent(open_maps(folder), bev_map)
         _image(folder, frame).write_bytes(cv2.imencode(".png", bev_map.cells)[1].tobytes())
     except OSError as error:
-        raise OutputError(f"{folder}: maps cannot be written ({error.strerror})") from None
+        raise OutputError(f"{folder}: the map cannot be written ({error.strerror})") from None
 
 
 def _check_extent(folder: MapFolder, bev_map: BevMap) -> None:

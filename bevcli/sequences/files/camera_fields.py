@@ -1,4 +1,4 @@
-"""The fields of one camera in calibration.json -> Camera. What is wrong goes into the report."""
+"""One camera in calibration.json: its fields are checked and become a Camera."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import numpy as np
 
 from bevcli.geometry.cameras import Camera, Distortion
 from bevcli.geometry.transforms import Array
-from bevcli.sequences.files.field_report import Report, parse_numbers
-from bevcli.sequences.files.pose_field import parse_transform
+from bevcli.sequences.files.json_fields import Report, parse_numbers
+from bevcli.sequences.files.transform_json import parse_transform
 
 KEYS = ("width", "height", "intrinsics", "distortion", "ego_from_camera")
-FOCAL_RANGE = (0.05, 50.0)  # focal length over image size: beyond these there is no lens, fisheye or tele
+FOCAL_RANGE = (0.05, 50.0)  # focal length divided by image size, from extreme fisheye to extreme telephoto
 COEFFICIENT_COUNTS = {"brown_conrady": (4, 5, 8), "kannala_brandt": (4,)}
 
 
 def parse_camera(name: str, value: object, report: Report) -> Camera | None:
-    """The camera; None where a field cannot be used. All its fields are read, so that all mistakes are reported."""
+    """The camera, or None if a field is invalid. All fields are read, so that all mistakes are reported."""
     if not isinstance(value, dict):
-        report.error("wrong-shape", name, "is no camera", expected="an object with " + ", ".join(KEYS), found=value)
+        report.error("wrong-shape", name, "is not a camera", expected="an object with " + ", ".join(KEYS), found=value)
         return None
     width, height = _parse_size(value, "width", report), _parse_size(value, "height", report)
     intrinsics = parse_intrinsics(value, report)
@@ -28,21 +28,21 @@ def parse_camera(name: str, value: object, report: Report) -> Camera | None:
     distortion = parse_distortion(value, report)
     if width is None or height is None or intrinsics is None or ego_from_camera is None:
         return None
-    if not _are_sane(intrinsics, width, height, report):
+    if not _are_plausible(intrinsics, width, height, report):
         return None
     return Camera(name, width, height, intrinsics, ego_from_camera, distortion)
 
 
 def parse_intrinsics(camera: Mapping[str, Any], report: Report) -> Array | None:
-    """(3, 3) image_from_camera in pixels, upper triangular and not singular."""
+    """(3, 3) image_from_camera in pixels, upper triangular and not singular; None if invalid."""
     matrix = parse_numbers(camera, "intrinsics", (3, 3), report)
     if matrix is None:
         return None
     if not np.allclose(matrix[2], [0, 0, 1], atol=1e-9) or abs(matrix[1, 0]) > 1e-9:
         expected = "[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]"
-        advice = "write it row by row, scaled so that its last number is 1"
+        advice = "write it row by row and scale it so that the last number is 1"
         report.error(
-            "intrinsics-form", "intrinsics", "is no camera matrix",
+            "intrinsics-form", "intrinsics", "is not a camera matrix",
             expected=expected, found=matrix.tolist(), advice=advice,
         )  # fmt: skip
         return None
@@ -56,7 +56,7 @@ def parse_intrinsics(camera: Mapping[str, Any], report: Report) -> Array | None:
 
 
 def parse_distortion(camera: Mapping[str, Any], report: Report) -> Distortion | None:
-    """The lens; None for a pinhole, which is what a missing "distortion" means."""
+    """The lens distortion. None for a pinhole camera ("none", or no "distortion") and for an invalid one."""
     value = camera.get("distortion")
     if value is None:
         return None
@@ -64,7 +64,9 @@ def parse_distortion(camera: Mapping[str, Any], report: Report) -> Distortion | 
     model = value.get("model") if isinstance(value, dict) else None
     if model not in models:
         found = value if model is None else model
-        report.error("distortion-model", "distortion", "has no known model", expected=" or ".join(models), found=found)
+        report.error(
+            "distortion-model", "distortion", "has an unknown model", expected=" or ".join(models), found=found
+        )
         return None
     given = value.get("coefficients", [])
     count = len(given) if isinstance(given, list) else 0
@@ -83,23 +85,23 @@ def parse_distortion(camera: Mapping[str, Any], report: Report) -> Distortion | 
 def _parse_size(camera: Mapping[str, Any], name: str, report: Report) -> int | None:
     value = camera.get(name)
     if value is None:
-        report.missing(name, "the images' size in pixels")
+        report.missing(name, "the image size in pixels")
         return None
     if isinstance(value, bool) or not isinstance(value, int) or value <= 0:
-        report.error("wrong-size", name, "is no size of an image", expected="a positive whole number", found=value)
+        report.error("wrong-size", name, "is not an image size", expected="a positive integer", found=value)
         return None
     return value
 
 
-def _are_sane(intrinsics: Array, width: int, height: int, report: Report) -> bool:
-    """Whether focal length and principal point can be meant in pixels of such an image at all."""
+def _are_plausible(intrinsics: Array, width: int, height: int, report: Report) -> bool:
+    """Whether focal length and principal point are plausible in pixels of an image of this size."""
     low, high = FOCAL_RANGE
     for axis, (letter, size) in enumerate((("x", width), ("y", height))):
         focal, center = intrinsics[axis, axis], intrinsics[axis, 2]
         if not low * size <= focal <= high * size:
             expected, found = f"{low * size:g} to {high * size:g} px for a size of {size}", f"f{letter} {focal:g}"
-            advice = "give it in pixels of the images, not in millimetres"
-            message = "has an absurd focal length"
+            advice = "give it in pixels, not in millimetres"
+            message = "has an implausible focal length"
             report.error("intrinsics-absurd", "intrinsics", message, expected=expected, found=found, advice=advice)
             return False
         if not -2 * size <= center <= 3 * size:
