@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from bevcli.geometry.boxes import CLASSES
+from bevcli.synth.assets.catalog import Assets, draw_body
 from bevcli.synth.assets.paint import linear
-from bevcli.synth.drive import Stock
-from bevcli.synth.world.actors import draw_body
 
 VEHICLES = ("car", "truck", "construction_vehicle", "bus", "trailer", "motorcycle", "bicycle")
 # Shortest and longest length, width and height in metres that the class may have.
@@ -21,23 +20,23 @@ PLAUSIBLE = {
 
 
 @pytest.mark.parametrize("name", CLASSES)
-def test_there_are_enough_variants(stock: Stock, name: str):
-    looks = {v.name.removesuffix("_standing") for v in stock.catalog.by_class[name]}
+def test_there_are_enough_variants(assets: Assets, name: str):
+    looks = {v.name.removesuffix("_standing") for v in assets.catalog.by_class[name]}
     assert len(looks) >= (6 if name in VEHICLES else 4)
 
 
 @pytest.mark.parametrize("name", CLASSES)
-def test_sizes_are_those_of_such_things(stock: Stock, name: str):
+def test_sizes_are_those_of_such_things(assets: Assets, name: str):
     low, high = np.array(PLAUSIBLE[name])
-    for variant in stock.catalog.by_class[name]:
+    for variant in assets.catalog.by_class[name]:
         assert (variant.size_lwh > low).all(), variant.name
         assert (variant.size_lwh < high).all(), variant.name
 
 
 @pytest.mark.parametrize("name", CLASSES)
-def test_mesh_fills_its_box_exactly(stock: Stock, name: str):
+def test_mesh_fills_its_box_exactly(assets: Assets, name: str):
     rng = np.random.default_rng(3)
-    for variant in stock.catalog.by_class[name]:
+    for variant in assets.catalog.by_class[name]:
         body = draw_body(variant, rng, "one")
         for pose in variant.poses:
             points = pose.fitted(body.size_lwh).faces.reshape(-1, 3)
@@ -47,9 +46,9 @@ def test_mesh_fills_its_box_exactly(stock: Stock, name: str):
 
 
 @pytest.mark.parametrize("name", CLASSES)
-def test_meshes_have_no_holes_and_no_face_turned_inwards(stock: Stock, name: str):
+def test_meshes_have_no_holes_and_no_face_turned_inwards(assets: Assets, name: str):
     """From any side the faces that look this way cover as much as all faces together."""
-    for variant in stock.catalog.by_class[name]:
+    for variant in assets.catalog.by_class[name]:
         for pose in variant.poses:
             faces = pose.fitted(variant.size_lwh / variant.size_lwh.max()).faces
             for view in ((1, 0.3, 0.4), (-0.7, 1, 0.2), (0.2, -1, 1), (-1, -0.4, -0.6)):

@@ -11,20 +11,21 @@ from bevcli.cli.render import parse_resolution, render
 from bevcli.errors import InputError, OutputError
 from bevcli.sequences.native.calibration import write_calibration
 from bevcli.sequences.open import open_sequence
-from bevcli.synth.drive import Drive, Stock
+from bevcli.synth.assets.catalog import Assets
+from bevcli.synth.drive import RenderedDrive
 from bevcli.synth.export import export_drive
 from bevcli.synth.rig import nuscenes_like_rig
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory, stock: Stock) -> tuple[Drive, Path]:
+def written(tmp_path_factory: pytest.TempPathFactory, assets: Assets) -> tuple[RenderedDrive, Path]:
     folder = tmp_path_factory.mktemp("rendered") / "drive"
-    drive = Drive(5, frames=2, rig=nuscenes_like_rig(160, 90), stock=stock)
+    drive = RenderedDrive(5, frames=2, rig=nuscenes_like_rig(160, 90), assets=assets)
     export_drive(drive, folder)
     return drive, folder
 
 
-def test_the_reader_gives_back_what_was_rendered(written: tuple[Drive, Path]):
+def test_the_reader_gives_back_what_was_rendered(written: tuple[RenderedDrive, Path]):
     drive, folder = written
     sequence = open_sequence(folder)
     assert [stamp.index for stamp in sequence.stamps] == [0, 1]
@@ -40,21 +41,23 @@ def test_the_reader_gives_back_what_was_rendered(written: tuple[Drive, Path]):
     np.testing.assert_allclose(read.world_from_ego.matrix, rendered.world_from_ego.matrix, atol=1e-9)
 
 
-def test_ego_motion_is_denser_than_the_frames(written: tuple[Drive, Path]):
+def test_ego_motion_is_denser_than_the_frames(written: tuple[RenderedDrive, Path]):
     rows = (written[1] / "ego_motion.csv").read_text().splitlines()
     assert rows[0].endswith("ax,ay,az,wx,wy,wz,vx,vy,vz")
     assert len(rows) - 1 == 26  # 0.5 s at 50 Hz, both ends
 
 
-def test_a_second_export_gives_the_same_files(written: tuple[Drive, Path], tmp_path: Path, stock: Stock):
-    export_drive(Drive(5, frames=2, rig=nuscenes_like_rig(160, 90), stock=stock, threads=2), tmp_path / "again")
+def test_a_second_export_gives_the_same_files(written: tuple[RenderedDrive, Path], tmp_path: Path, assets: Assets):
+    export_drive(
+        RenderedDrive(5, frames=2, rig=nuscenes_like_rig(160, 90), assets=assets, threads=2), tmp_path / "again"
+    )
     names = sorted(p.relative_to(written[1]) for p in written[1].rglob("*") if p.is_file())
     assert names == sorted(p.relative_to(tmp_path / "again") for p in (tmp_path / "again").rglob("*") if p.is_file())
     for name in names:
         assert (written[1] / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
 
 
-def test_an_existing_sequence_is_not_overwritten(written: tuple[Drive, Path]):
+def test_an_existing_sequence_is_not_overwritten(written: tuple[RenderedDrive, Path]):
     with pytest.raises(OutputError, match="exists already"):
         export_drive(written[0], written[1])
 

@@ -8,8 +8,8 @@ import pytest
 
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import inverse, rigid, rotation_about_z
+from bevcli.synth.assets.triangles import gather, make_run
 from bevcli.synth.render.rasteriser import rasterise
-from bevcli.synth.render.triangles import gather, make_run
 from bevcli.synth.rig import nuscenes_like_rig
 
 CAMERA = nuscenes_like_rig(160, 90)["CAM_FRONT_LEFT"]
