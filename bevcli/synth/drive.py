@@ -36,8 +36,8 @@ FIRST_TIMESTAMP_NS = 1_700_000_000_000_000_000
 
 
 @dataclass(frozen=True)
-class Resolution:
-    """Resolution of the ground texture and of the shadow map.
+class TextureDetail:
+    """How fine the ground texture and the shadow map are.
 
     Attributes:
         ground_m: size of a texel of the ground, metres.
@@ -50,11 +50,11 @@ class Resolution:
     extent_m: float
 
     @staticmethod
-    def for_width(width: int) -> Resolution:
-        """The resolution that suits images of a width in pixels."""
+    def for_width(width: int) -> TextureDetail:
+        """The detail that suits images of a width in pixels."""
         if width <= 500:
-            return Resolution(0.125, 0.16, 112.0)
-        return Resolution(0.06, 0.08, 112.0) if width <= 1000 else Resolution(0.04, 0.06, 112.0)
+            return TextureDetail(0.125, 0.16, 112.0)
+        return TextureDetail(0.06, 0.08, 112.0) if width <= 1000 else TextureDetail(0.04, 0.06, 112.0)
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ class RenderedDrive:
         self.weather = make_weather(name, self._city.stream("weather"))
         self.simulation = Simulation(self._city, self._assets.catalog, frames / rate_hz)
         self._ground = GroundPlan(self._city)
-        self._resolution = Resolution.for_width(max(camera.width for camera in self.rig.cameras) * supersampling)
+        self._detail = TextureDetail.for_width(max(camera.width for camera in self.rig.cameras) * supersampling)
         self._scenery = Scenery(self._city, self._assets.furniture)
         self._around: Surroundings | None = None
         self._templates: dict[tuple[str, int], MeshTemplate] = {}
@@ -215,12 +215,12 @@ class RenderedDrive:
         """The surroundings of the nearest point of a grid with SNAP_M spacing, so that they are rarely made again."""
         center = (float(np.round(here[0] / SNAP_M) * SNAP_M), float(np.round(here[1] / SNAP_M) * SNAP_M))
         if self._around is None or self._around.center != center:
-            extent = self._resolution.extent_m + SNAP_M
+            extent = self._detail.extent_m + SNAP_M
             pieces = self._ground.pieces_around(center, extent * 0.71)
-            texture = paint_ground(pieces, center, extent, self._resolution.ground_m)
+            texture = paint_ground(pieces, center, extent, self._detail.ground_m)
             scenery = self._scenery.around(center, SCENERY_M)
             shadows = ShadowMap.of(
-                scenery.triangles.corners, self.weather.to_sun, center, extent, self._resolution.shadow_m
+                scenery.triangles.corners, self.weather.to_sun, center, extent, self._detail.shadow_m
             )
             self._around = Surroundings(center, scenery, texture, shadows)
         return self._around

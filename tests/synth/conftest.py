@@ -1,4 +1,4 @@
-"""What the tests of the rendered world share: the meshes, made once, and one small drive."""
+"""Fixtures of the rendered world: the meshes, built once, and one small drive."""
 
 import pytest
 
@@ -16,7 +16,7 @@ def assets() -> Assets:
 
 @pytest.fixture(scope="session")
 def drive(assets: Assets) -> RenderedDrive:
-    """Seed 113: the ego vehicle brakes and turns right at a building site."""
+    """Seed 113: the ego vehicle brakes and turns right at a building site. Images of 320x180."""
     return RenderedDrive(113, frames=20, rig=nuscenes_like_rig(320, 180), assets=assets, weather="noon")
 
 

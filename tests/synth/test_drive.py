@@ -1,4 +1,4 @@
-"""A drive's ground truth: what is said of an object is what the images show and what happens over time."""
+"""The ground truth of a drive agrees with its images, with its motion over time, and with its map."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from bevcli.synth.world.actors import ActorState
 
 
 def test_same_seed_gives_the_same_bytes(drive: RenderedDrive, frame: RenderedFrame, assets: Assets):
-    """Whatever was rendered before, and with two threads."""
+    """Independent of the frames rendered before, and of the number of threads."""
     again = RenderedDrive(113, frames=20, rig=drive.rig, assets=assets, weather="noon", threads=2)
     again.frame(2)
     other = again.frame(9)
@@ -60,13 +60,13 @@ def test_projected_box_contains_the_objects_pixels(drive: RenderedDrive, frame: 
 
 
 def test_visibility_agrees_with_rendering_each_object_alone(drive: RenderedDrive, frame: RenderedFrame):
-    """Another way to count: a scene with nothing but the object, and the difference of two images."""
+    """The visibility is the number of pixels seen over the number of pixels of the object drawn alone by OpenCV."""
     states = drive.states(9)
     rows = {instance: k for k, instance in enumerate(frame.boxes.instances)}
     checked = 0
     for k, state in enumerate(states):
         row = rows.get(state.body.instance)
-        solid = state.body.variant.class_name in ("car", "truck", "bus", "trailer")  # OpenCV fattens thin bars
+        solid = state.body.variant.class_name in ("car", "truck", "bus", "trailer")  # OpenCV draws thin bars too wide
         if row is None or not solid or frame.boxes.num_points[row] < 300:
             continue
         alone = sum(int(_silhouette(drive, state, camera, frame).sum()) for camera in drive.rig.cameras)
@@ -78,7 +78,7 @@ def test_visibility_agrees_with_rendering_each_object_alone(drive: RenderedDrive
 
 
 def _silhouette(drive: RenderedDrive, state: ActorState, camera, frame: RenderedFrame):
-    """(H, W) bool mask of an object alone, filled triangle by triangle with OpenCV."""
+    """(H, W) bool mask of an object without occlusion, filled triangle by triangle with OpenCV."""
     faces = drive._template(state.body, state.pose).mesh.faces.astype(np.float64)
     c, s = np.cos(state.yaw), np.sin(state.yaw)
     world = faces @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + state.position
@@ -93,7 +93,7 @@ def _silhouette(drive: RenderedDrive, state: ActorState, camera, frame: Rendered
 
 
 def test_velocities_are_differences_of_positions(drive: RenderedDrive):
-    """Over a tenth of a second, but for those who start or stop just then."""
+    """Differences over 0.1 s, except for objects whose velocity changes in this time."""
     rate = drive.rate_hz
     h, checked = 0.05, 0
     for index in (3, 9, 15):
@@ -104,7 +104,7 @@ def test_velocities_are_differences_of_positions(drive: RenderedDrive):
             if any(s is None for s in states):
                 continue
             if max(np.hypot(*(s.velocity - states[1].velocity)) for s in states) > 0.25:
-                continue  # a person who starts or stops does so within a step
+                continue  # people start and stop within one simulation step
             difference = (states[2].position - states[0].position)[:2] / (2 * h)
             assert np.hypot(*(difference - states[1].velocity)) < 0.2
             checked += bool(np.hypot(*difference) > 1)
@@ -135,8 +135,8 @@ def _turned(drive: RenderedDrive, index: int) -> float:
     return float(abs(wrap_angle(poses[1].yaw - poses[0].yaw)))
 
 
-def test_ego_motion_is_that_of_a_car(assets: Assets):
-    """No matter the seed: acceleration below 4 m/s², and rates and velocities that fit the poses."""
+def test_ego_motion_is_plausible_for_a_car(assets: Assets):
+    """For several seeds: accelerations below 4 m/s², and velocities that agree with the poses."""
     for seed in (113, 3, 8):
         motion = RenderedDrive(seed, frames=20, assets=assets).ego_motion(20.0)
         assert np.hypot(*motion.accelerations[:, :2].T).max() < 4.0
@@ -148,8 +148,8 @@ def test_ego_motion_is_that_of_a_car(assets: Assets):
         assert motion.velocities[:, 0].max() > 1.0
 
 
-def test_map_agrees_with_what_stands_on_it(drive: RenderedDrive, frame: RenderedFrame):
-    """DrivingActor vehicles stand on road cells, and the middle of every vehicle's box is a vehicle cell."""
+def test_map_agrees_with_the_boxes(drive: RenderedDrive, frame: RenderedFrame):
+    """The middle of every vehicle's box is a vehicle cell; moving and parked vehicles are on road cells."""
     window = drive.map_window
     bev = frame.boxes.transformed(inverse(frame.world_from_ego.matrix @ drive.rig.ego_from_bev))
     near = (np.abs(bev.centers[:, :2]) < window.half_extent_m - 1).all(axis=1)
@@ -163,7 +163,7 @@ def test_map_agrees_with_what_stands_on_it(drive: RenderedDrive, frame: Rendered
             assert cell & 1
 
 
-def test_boxes_are_kept_near_and_complete(drive: RenderedDrive, frame: RenderedFrame):
+def test_boxes_are_near_unique_and_have_valid_visibilities(drive: RenderedDrive, frame: RenderedFrame):
     boxes = frame.boxes
     origin = (frame.world_from_ego.matrix @ drive.rig.ego_from_bev)[:2, 3]
     assert np.hypot(*(boxes.centers[:, :2] - origin).T).max() < ANNOTATED_M
@@ -173,14 +173,14 @@ def test_boxes_are_kept_near_and_complete(drive: RenderedDrive, frame: RenderedF
     np.testing.assert_array_equal(boxes.num_points > 0, boxes.visibilities > 0)
 
 
-def test_supersampling_changes_counts_little(drive: RenderedDrive, frame: RenderedFrame, assets: Assets):
+def test_supersampling_barely_changes_the_pixel_counts(drive: RenderedDrive, frame: RenderedFrame, assets: Assets):
     fine = RenderedDrive(113, frames=20, rig=drive.rig, assets=assets, weather="noon", supersampling=2).frame(9)
     large = frame.boxes.num_points > 200
+    assert large.sum() > 5
     np.testing.assert_allclose(fine.boxes.num_points[large], frame.boxes.num_points[large], rtol=0.12)
 
 
-def test_a_lens_bends_the_image_as_its_camera_says(drive: RenderedDrive, frame: RenderedFrame, assets: Assets):
-    """Through a lens with distortion, an object's box still contains its pixels."""
+def test_boxes_contain_their_pixels_with_lens_distortion(drive: RenderedDrive, frame: RenderedFrame, assets: Assets):
     from bevcli.geometry.cameras import CameraRig, Distortion
 
     lens = Distortion("brown_conrady", (-0.25, 0.08, 0.001, -0.0005))
@@ -206,7 +206,7 @@ def test_a_lens_bends_the_image_as_its_camera_says(drive: RenderedDrive, frame: 
 
 @pytest.mark.slow
 def test_drives_are_dense(assets: Assets):
-    """Eight drives, every fourth frame: the density that forty whole drives must have, by share."""
+    """Eight drives, every fourth frame: at least 15 boxes within 32 m, 15 % of them barely visible, all classes."""
     counts, near, hidden, frames = dict.fromkeys(CLASSES, 0), 0, 0, 0
     for seed in range(200, 208):
         drive = RenderedDrive(seed, frames=20, rig=nuscenes_like_rig(200, 112), assets=assets)
@@ -238,7 +238,7 @@ def test_vehicles_do_not_drive_through_each_other(assets: Assets):
 
 
 def _overlap(one: ActorState, other: ActorState, tolerance_m: float = 0.15) -> bool:
-    """Whether two boxes overlap on the ground, by the separating axis theorem."""
+    """Whether two boxes overlap on the ground by more than a tolerance, by the separating axis theorem."""
     corners = []
     for state in (one, other):
         length, width = state.body.size_lwh[:2] / 2
@@ -252,8 +252,3 @@ def _overlap(one: ActorState, other: ActorState, tolerance_m: float = 0.15) -> b
             if min(a.max(), b.max()) - max(a.min(), b.min()) < tolerance_m:
                 return False
     return True
-
-
-def test_a_block_too_short_for_road_works_has_none(assets: Assets):
-    drive = RenderedDrive(22, 2, assets=assets)  # starts beside one
-    assert len(drive.states(0)) > 0

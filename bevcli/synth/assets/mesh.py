@@ -147,8 +147,8 @@ def loft(rings: Sequence[ArrayLike], color: Color, material: Material = Material
     return from_trimesh(trimesh.Trimesh(shape.vertices, shape.faces[sound], process=False), color, material)
 
 
-def prism(rings: ArrayLike, color: Color, material: Material = Material.MATTE) -> Mesh:
-    """A faster `loft` between two horizontal rings.
+def prism(rings: ArrayLike, color: Color) -> Mesh:
+    """A faster `loft` between two horizontal rings, with the material MATTE.
 
     rings: (2, P, 3), the lower ring first; both convex and counter-clockwise seen from above.
     """
@@ -161,7 +161,7 @@ def prism(rings: ArrayLike, color: Color, material: Material = Material.MATTE) -
             np.stack([upper[0], upper[i], upper[i + 1]])[None],
         ]
     joint = np.concatenate(faces)
-    return Mesh(joint, np.tile(linear(color), (len(joint), 1)), np.full(len(joint), material, np.uint8))
+    return Mesh(joint, np.tile(linear(color), (len(joint), 1)), np.full(len(joint), Material.MATTE, np.uint8))
 
 
 def side_profile(

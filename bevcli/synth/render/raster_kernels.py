@@ -198,7 +198,7 @@ def rasterise_heights(corners, shear_x, shear_y, origin_x, origin_y, scale, heig
         if high_u < 0 or high_v < 0 or low_u > size - 1 or low_v > size - 1:
             continue
         area = (q[1, 0] - q[0, 0]) * (q[2, 1] - q[0, 1]) - (q[2, 0] - q[0, 0]) * (q[1, 1] - q[0, 1])
-        if area <= 0:  # faces away from the sun; the other side of the mesh casts the shadow
+        if area <= 0:  # faces away from the sun: the side that faces it casts the whole shadow of a closed mesh
             continue
         du = ((q[1, 2] - q[0, 2]) * (q[2, 1] - q[0, 1]) - (q[2, 2] - q[0, 2]) * (q[1, 1] - q[0, 1])) / area
         dv = ((q[2, 2] - q[0, 2]) * (q[1, 0] - q[0, 0]) - (q[1, 2] - q[0, 2]) * (q[2, 0] - q[0, 0])) / area

@@ -21,6 +21,7 @@ KERB_M = 0.15  # height of kerbs
 CORNER_M = 5.0  # radius of the kerb at a junction
 CROSSING_FROM_M, CROSSING_TO_M = 1.5, 5.0  # extent of a pedestrian crossing, measured from the edge of the junction
 STOP_LINE_M = 6.2  # from the edge of the junction to the stop line
+SIDE_STEP_M, LINE_STEP_M = 6.0, 4.0  # distances between the points of outlines and lines, so that they can be bent
 
 Landuse = Literal["houses", "park", "site"]
 
@@ -197,8 +198,8 @@ class CityPlan:
         return index if position - before <= after - position else index + 1
 
 
-def rounded_rectangle(low: tuple[float, float], high: tuple[float, float], radius: float, step: float = 6.0) -> Array:
-    """(P, 2) counter-clockwise outline with round corners. Points on its sides are at most `step` metres apart."""
+def rounded_rectangle(low: tuple[float, float], high: tuple[float, float], radius: float) -> Array:
+    """(P, 2) counter-clockwise outline with round corners and with points about every SIDE_STEP_M on its sides."""
     (x0, y0), (x1, y1) = low, high
     radius = min(radius, (x1 - x0) / 2, (y1 - y0) / 2)
     centers = [(x1 - radius, y0 + radius, -np.pi / 2), (x1 - radius, y1 - radius, 0.0),
@@ -210,13 +211,13 @@ def rounded_rectangle(low: tuple[float, float], high: tuple[float, float], radiu
     pieces = []
     for this, following in zip(corners, corners[1:] + corners[:1], strict=True):
         pieces.append(this)
-        count = max(int(np.linalg.norm(following[0] - this[-1]) / step), 1)
+        count = max(int(np.linalg.norm(following[0] - this[-1]) / SIDE_STEP_M), 1)
         pieces.append(this[-1] + (following[0] - this[-1]) * (np.arange(1, count) / count)[:, None])
     return np.concatenate(pieces)
 
 
-def along(start: ArrayLike, end: ArrayLike, step: float = 4.0) -> Array:
-    """(P, 2) points from start to end, at most `step` metres apart, both ends included."""
+def along(start: ArrayLike, end: ArrayLike) -> Array:
+    """(P, 2) points from start to end, at most LINE_STEP_M apart, both ends included."""
     a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
-    count = max(int(np.ceil(np.linalg.norm(b - a) / step)), 1)
+    count = max(int(np.ceil(np.linalg.norm(b - a) / LINE_STEP_M)), 1)
     return a + (b - a) * np.linspace(0, 1, count + 1)[:, None]

@@ -127,8 +127,7 @@ class GroundPlan:
         """The area where two streets meet, with its crossings and stop lines."""
         a, b = self.city.street(1, column), self.city.street(0, row)
         x, y = a.position, b.position
-        reach_x, reach_y = a.half_width + CORNER_M, b.half_width + CORNER_M
-        outline = _junction_outline(x, y, a.half_width, b.half_width, reach_x, reach_y)
+        outline = _junction_outline(x, y, a.half_width + CORNER_M, b.half_width + CORNER_M)
         paints: list[GroundPaint] = []
         crossings = []
         for street, across, sign in ((a, b, 1), (a, b, -1), (b, a, 1), (b, a, -1)):
@@ -266,8 +265,11 @@ def _pairs(varying: Array, fixed: float) -> Array:
     return np.stack([varying, np.full(len(varying), fixed)], -1)
 
 
-def _junction_outline(x: float, y: float, half_x: float, half_y: float, reach_x: float, reach_y: float) -> Array:
-    """Plan outline (24, 2) of a junction, counter-clockwise: a cross whose inner corners have the radius CORNER_M."""
+def _junction_outline(x: float, y: float, reach_x: float, reach_y: float) -> Array:
+    """Plan outline (24, 2) of a junction, counter-clockwise: a cross whose inner corners have the radius CORNER_M.
+
+    x, y: centre. reach_x, reach_y: from the centre to the ends of its arms, metres.
+    """
     points = []
     for sx, sy in ((1, 1), (-1, 1), (-1, -1), (1, -1)):
         sweep = np.linspace(0, np.pi / 2, 6)[:: sx * sy]

@@ -143,7 +143,7 @@ class Simulation:
                 taken.append(new.body_points())
 
     def _renew(self, vehicles: list[Vehicle], time_s: float) -> list[Vehicle]:
-        """Remove vehicles that are far away or at the end of their route, and spawn others. Returns the removed ones."""
+        """Remove vehicles that are far away or at the end of their route, and spawn others. Returns those removed."""
         here = self._ego.route.at(self._ego.front)
         gone = []
         for vehicle in vehicles[1:]:
