@@ -7,7 +7,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from bevcli.cli.render import parse_resolution, render
+from bevcli.cli.render import WeatherChoice, parse_resolution, render
 from bevcli.errors import InputError, OutputError
 from bevcli.sequences.native.calibration import write_calibration
 from bevcli.sequences.open import open_sequence
@@ -16,6 +16,7 @@ from bevcli.synth.drive import RenderedDrive
 from bevcli.synth.export import export_drive
 from bevcli.synth.export import render as render_sequence
 from bevcli.synth.rig import nuscenes_like_rig
+from bevcli.synth.world.weather import WEATHER_NAMES
 
 
 @pytest.fixture(scope="module")
@@ -75,6 +76,10 @@ def test_the_command_renders_any_rig_at_any_size(tmp_path: Path):
     assert frame.rig.names == ("CAM_FRONT", "CAM_FRONT_RIGHT")
     assert frame.images["CAM_FRONT"].pixels_bgr.shape == (54, 96, 3)
     np.testing.assert_allclose(frame.rig["CAM_FRONT"].intrinsics[0, 0], 1266 * 96 / 1600)
+
+
+def test_the_command_offers_every_weather():
+    assert tuple(choice.value for choice in WeatherChoice) == WEATHER_NAMES
 
 
 def test_a_wrong_resolution_is_a_usage_error():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import cv2
 import numpy as np
@@ -12,8 +11,7 @@ from numpy.typing import NDArray
 from bevcli.errors import InputError
 from bevcli.synth.assets.paint import linear
 
-WeatherName = Literal["noon", "evening", "overcast"]
-WEATHER_NAMES: tuple[str, ...] = get_args(WeatherName)
+WEATHER_NAMES = ("noon", "evening", "overcast")
 
 
 @dataclass(frozen=True)
