@@ -31,7 +31,7 @@ def render(
         str | None,
         typer.Option(metavar="WxH", help="Size of the images in pixels, such as 800x450. Default: that of the rig."),
     ] = None,
-    weather: Annotated[WeatherChoice | None, typer.Option(help="Default: drawn from the seed.")] = None,
+    weather: Annotated[WeatherChoice | None, typer.Option(help="Light and sky. Default: drawn from the seed.")] = None,
     quality: Annotated[int, typer.Option(min=1, max=100, help="JPEG quality.")] = 90,
     supersampling: Annotated[
         int | None,

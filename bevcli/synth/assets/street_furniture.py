@@ -12,9 +12,7 @@ BARK: Color = (92, 74, 58)
 GALVANISED_STEEL: Color = (112, 116, 120)
 DARK: Color = (44, 46, 48)
 LEAF_TONES: tuple[Color, ...] = ((86, 118, 52), (70, 104, 48), (110, 128, 58), (64, 92, 54), (140, 120, 52))
-
-
-TREE_KINDS = 12
+TREE_KINDS = 12  # number of tree meshes
 
 
 class StreetFurniture:
