@@ -12,9 +12,10 @@ from typing import Protocol
 from bevcli.frame import Sequence
 from bevcli.model.bevformer import BEVFormerConfig
 from bevcli.sequences.open import open_sequence
-from bevcli.synth.bev_truth import MapWindow
-from bevcli.synth.drive import Drive, Stock
+from bevcli.synth.assets.catalog import Assets
+from bevcli.synth.drive import RenderedDrive
 from bevcli.synth.export import export_drive
+from bevcli.synth.render.bev_map import MapWindow
 from bevcli.synth.rig import nuscenes_like_rig
 
 FIRST_HELD_OUT_SEED = 1_000_000  # drives from here on are for evaluation only
@@ -59,7 +60,7 @@ class RenderedDrives:
         self._seeds = tuple(seeds)
         self._config = config
         self._rendering = threading.Lock()
-        self._stock: Stock | None = None
+        self._assets: Assets | None = None
         self._drives = FolderDrives(self._folders, config.rate_hz)
 
     def __len__(self) -> int:
@@ -75,16 +76,16 @@ class RenderedDrives:
 
     def _render(self, seed: int, folder: Path) -> None:
         """Under another name until it is whole, so that a kill leaves no half drive behind."""
-        self._stock = self._stock or Stock.make()
+        self._assets = self._assets or Assets.build()
         width, height = self._config.image.size
         grid = self._config.bev_grid
         reach = max(abs(end) for end in (*grid.x_range_m, *grid.y_range_m))
-        drive = Drive(
+        drive = RenderedDrive(
             seed,
             FRAMES_A_DRIVE,
             self._config.rate_hz,
             nuscenes_like_rig(width, height),
-            stock=self._stock,
+            assets=self._assets,
             map_window=MapWindow(half_extent_m=reach),
         )
         unfinished = folder.with_suffix(f".unfinished-{os.getpid()}")

@@ -14,7 +14,7 @@ from bevcli.frame import MAP_CLASSES, BevMap
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.segmentation_head import STUFF_CLASSES
-from bevcli.synth.bev_truth import VEHICLE_CLASSES
+from bevcli.synth.render.bev_map import VEHICLE_CLASSES
 from bevcli.training.detection_targets import seen
 
 # How much of a BEV cell a class covers for the cell to count as it: least for lines, which are thinner than a cell.

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from bevcli.geometry.cameras import CameraRig, Distortion
-from bevcli.synth.drive import Drive, Stock
+from bevcli.synth.assets.catalog import Assets
+from bevcli.synth.drive import RenderedDrive
 from bevcli.synth.rig import nuscenes_like_rig
 
 LENSES = {
@@ -16,22 +17,22 @@ LENSES = {
 
 
 @pytest.fixture(scope="module")
-def stock():
-    return Stock.make()
+def assets():
+    return Assets.build()
 
 
-def rendered(stock, lens):
+def rendered(assets, lens):
     """An image of CAM_FRONT with the given distortion, and its camera."""
     rig = nuscenes_like_rig(320, 180)
     camera = replace(rig["CAM_FRONT"], distortion=lens)
-    drive = Drive(113, frames=20, rig=CameraRig((camera,), rig.ego_from_bev), stock=stock, weather="noon")
+    drive = RenderedDrive(113, frames=20, rig=CameraRig((camera,), rig.ego_from_bev), assets=assets, weather="noon")
     return drive.frame(9).images["CAM_FRONT"].astype(np.float64), camera
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_undistorted_rendering_resembles_the_rendering_without_a_lens(stock, name):
-    plain, _ = rendered(stock, None)
-    bent, camera = rendered(stock, LENSES[name])
+def test_undistorted_rendering_resembles_the_rendering_without_a_lens(assets, name):
+    plain, _ = rendered(assets, None)
+    bent, camera = rendered(assets, LENSES[name])
     mended = camera.undistort(bent.astype(np.uint8)).astype(np.float64)
     seen = mended.sum(-1) > 0  # black where the lens saw nothing
     assert seen.mean() > 0.85

@@ -1,13 +1,13 @@
-"""Houses along the blocks' edges: walls with facades, roofs, cornices, awnings and what stands on roofs."""
+"""Houses along the edges of a block, and the kerb around it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bevcli.geometry.transforms import Array
-from bevcli.synth.assets.facades import FacadeStyle, facade_row
 from bevcli.synth.assets.mesh import Material, Mesh, prism
 from bevcli.synth.assets.paint import Color, darker, linear
 from bevcli.synth.world.city import KERB_M, Block, CityPlan
@@ -27,23 +27,73 @@ ROOF: Color = (104, 98, 94)
 
 
 @dataclass(frozen=True)
+class FacadeStyle:
+    """The look of a wall.
+
+    Attributes:
+        wall: sRGB colour of the wall.
+        floor_m: height of a storey, metres.
+        pitch_m: distance between the middles of two windows, metres.
+        window_m: width and height of a window, metres.
+        shop_m: height of the ground floor, metres; below 1 it is a plinth instead of a shop front.
+        brick: contrast of the brick pattern, 0 to 1; 0 is plaster.
+        band: whether the windows of a storey form one horizontal band.
+        seed: seed of the random details, 0 to 4095.
+    """
+
+    wall: Color
+    floor_m: float
+    pitch_m: float
+    window_m: tuple[float, float]
+    shop_m: float
+    brick: float
+    band: bool
+    seed: int
+
+
+def facade_row(
+    style: FacadeStyle, origin: NDArray[np.float64], tangent: NDArray[np.float64], height: float, length: float
+) -> NDArray[np.float32]:
+    """(16,) numbers that describe a wall to the shading kernel.
+
+    origin: (2,) world point of the wall's start, metres. tangent: (2,) unit vector along the wall, counter-clockwise
+    around the house. height, length: of the wall, metres.
+    """
+    wall = linear(style.wall)
+    return np.array(
+        [*origin, *tangent, height, length, style.floor_m, style.pitch_m, *style.window_m, style.shop_m, style.brick,
+         float(style.band) + 2.0 * (style.seed % 4096), *wall], np.float32,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
 class Wall:
-    """Upright quads with one facade. mesh: its faces are FACADE; row: (16,) of `facade_row`."""
+    """One wall of a house, in the world frame.
+
+    Attributes:
+        mesh: two triangles with the material FACADE.
+        row: (16,) made by `facade_row`.
+    """
 
     mesh: Mesh
-    row: np.ndarray
+    row: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class House:
-    """One building: facaded walls, and the rest as a plain mesh in the world."""
+    """One building, in the world frame.
+
+    Attributes:
+        walls: its four walls.
+        rest: roof, awnings and roof structures.
+    """
 
     walls: tuple[Wall, ...]
     rest: tuple[Mesh, ...]
 
 
 def houses(city: CityPlan, land: Block) -> list[House]:
-    """Row houses along the four sides of a block, with gaps; deterministic for the block."""
+    """Row houses along the four sides of a block, with some gaps."""
     rng = city.stream("houses", land.column, land.row)
     south, east, north, west = land.sidewalks
     x0, y0 = land.low[0] + west, land.low[1] + south
@@ -62,7 +112,7 @@ def houses(city: CityPlan, land: Block) -> list[House]:
 
 
 def _lots(rng: np.random.Generator, start: float, end: float) -> list[tuple[float, float]]:
-    """Cut a block's side into lots of 9 to 24 m; one in ten stays a gap."""
+    """Cut a side of a block into lots of 9 to 24 m, given by start and end. One lot in ten stays empty."""
     lots, at = [], start
     while at < end - 8:
         to = min(at + rng.uniform(9, 24), end)
@@ -90,7 +140,7 @@ def _style(rng: np.random.Generator, height: float) -> FacadeStyle:
 
 
 def _house(city: CityPlan, rng: np.random.Generator, low: tuple[float, float], high: tuple[float, float]) -> House:
-    """A house over a plan rectangle, its four corners bent with the city."""
+    """A house on a plan rectangle, with its four corners mapped to the world."""
     storeys = int(rng.choice([2, 3, 4, 5, 6, 8, 11], p=[0.12, 0.22, 0.22, 0.18, 0.12, 0.09, 0.05]))
     style = _style(rng, storeys * 3.2)
     height = style.shop_m + storeys * style.floor_m + 0.9 + KERB_M
@@ -120,7 +170,7 @@ def _wall(start: Array, end: Array, height: float, style: FacadeStyle) -> Wall:
 
 
 def _roof(ground: Array, height: float, style: FacadeStyle) -> Mesh:
-    """A flat roof behind a parapet that overhangs a little, so that eaves cast a line of shadow."""
+    """A flat slab that overhangs the walls by 0.25 m."""
     middle = ground.mean(0)
     wide = middle + (ground - middle) * (1 + 0.25 / np.linalg.norm(ground - middle, axis=1, keepdims=True))
     rings = [np.column_stack([wide, np.full(4, z)]) for z in (height - 0.22, height + 0.12)]
@@ -128,7 +178,7 @@ def _roof(ground: Array, height: float, style: FacadeStyle) -> Mesh:
 
 
 def _awnings(rng: np.random.Generator, ground: Array) -> list[Mesh]:
-    """Slanted awnings over parts of the shop fronts."""
+    """Slanted awnings over some of the shop fronts."""
     colors: tuple[Color, ...] = ((164, 44, 40), (42, 92, 66), (44, 66, 120), (206, 196, 176), (198, 138, 44))
     parts = []
     for k in range(4):
@@ -146,7 +196,7 @@ def _awnings(rng: np.random.Generator, ground: Array) -> list[Mesh]:
 
 
 def kerb_slab(city: CityPlan, outline: Array) -> Mesh:
-    """A block's raised ground over a plan outline (P, 2): a kerb all around and a top that shows the ground's paint."""
+    """The raised ground of a block over a plan outline (P, 2): kerb stones around a top with the material GROUND."""
     ring = city.bend(outline)
     middle = ring.mean(0)
     following = np.roll(ring, -1, axis=0)

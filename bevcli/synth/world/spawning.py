@@ -1,12 +1,11 @@
-"""Who drives: vehicles are put on lanes around the ego vehicle at the start, and ahead of it as it moves on."""
+"""Spawning of vehicles: the ego vehicle, and traffic on the lanes around a point."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from bevcli.geometry.transforms import Array
-from bevcli.synth.assets.catalog import Catalog
-from bevcli.synth.world.actors import Body, draw_body
+from bevcli.synth.assets.catalog import Catalog, draw_body
 from bevcli.synth.world.city import STOP_LINE_M, CityPlan
 from bevcli.synth.world.route import (
     DIRECTIONS,
@@ -32,16 +31,16 @@ DRIVING_MACHINES = ("loader", "backhoe", "crane", "mixer")
 SEMITRAILERS = ("box", "curtain", "container", "tanker", "flatbed")
 
 
-class Population:
-    """Draws vehicles for a city; each one's route is long enough for `route_m` metres."""
+class VehicleSpawner:
+    """Draws vehicles and their routes. route_m: length of the ego vehicle's route, metres; others in proportion."""
 
     def __init__(self, city: CityPlan, catalog: Catalog, route_m: float) -> None:
         self.city, self.catalog, self.route_m = city, catalog, route_m
         self._rng = city.stream("population")
         self._count = 0
 
-    def ego(self, units: tuple[Unit, ...]) -> Vehicle:
-        """The ego vehicle, on its way to junction (0, 0)."""
+    def spawn_ego(self, units: tuple[Unit, ...]) -> Vehicle:
+        """The ego vehicle, on the approach to junction (0, 0)."""
         rng = self.city.stream("ego")
         direction = int(rng.integers(4))
         street = street_of(self.city, (0, 0), direction)
@@ -53,10 +52,11 @@ class Population:
         route = build_route(self.city, start, draw_turns(self.city, start, rng, 0.4), self.route_m, speed)
         return Vehicle(route, units, 8.0, speed * 0.6, 1.0)
 
-    def appear(self, around: Array, near_m: float, far_m: float, taken: Array, bicycle: bool) -> Vehicle | None:
-        """A vehicle somewhere on a lane between near_m and far_m of a world point, or None where there is no room.
+    def spawn(self, around: Array, near_m: float, far_m: float, taken: Array, bicycle: bool) -> Vehicle | None:
+        """Try to place a vehicle on a lane at a random point; None where it does not fit.
 
-        taken: (M, 2) world points where vehicles are.
+        around: world point (2,). near_m, far_m: least and greatest distance from it, metres.
+        taken: (M, 2) world points of other vehicles. bicycle: whether to place a bicycle.
         """
         rng = self._rng
         x, y = self.city.unbend(around)
@@ -72,7 +72,7 @@ class Population:
         before = float((node_center(self.city, node) - _on_axis(axis, at, street.position)) @ DIRECTIONS[direction])
         lane = int(rng.integers(street.lanes))
         units = self._units(bicycle)
-        length = units[-1].lag + float(units[-1].size_lwh[0])
+        length = units[-1].lag + float(units[-1].body.size_lwh[0])
         cross = street_of(self.city, node, direction + 1)
         if before < cross.half_width + STOP_LINE_M + 1:
             return None
@@ -80,9 +80,9 @@ class Population:
         front = self.city.bend(_on_axis(axis, at, street.position) + offset)
         if not near_m <= np.hypot(*(front - around)) <= far_m:
             return None
-        reach = np.linspace(-length - 6, 8, 10)[:, None] * DIRECTIONS[direction]  # nobody close before or behind
-        lane_ahead = self.city.bend(_on_axis(axis, at, street.position) + offset + reach)
-        if _nearest(lane_ahead, taken) < (1.6 if bicycle else 2.2):
+        reach = np.linspace(-length - 6, 8, 10)[:, None] * DIRECTIONS[direction]  # the space needed before and behind
+        needed = self.city.bend(_on_axis(axis, at, street.position) + offset + reach)
+        if _nearest(needed, taken) < (1.6 if bicycle else 2.2):
             return None
         start = LaneStart(node, direction, lane, before + length + 2)
         turns = bicycle_turns(rng) if bicycle else draw_turns(self.city, start, rng)
@@ -111,15 +111,11 @@ class Population:
             second = draw("trailer", rng, SEMITRAILERS if heavy else ("utility",))
             tractor, towed = draw_body(first, rng, name), draw_body(second, rng, f"{name}-trailer")
             lag = float(tractor.size_lwh[0]) + (0.35 if not heavy else 0.25)
-            return _unit(tractor, 0.0), _unit(towed, lag)
+            return Unit(tractor, 0.0), Unit(towed, lag)
         names = RIDERS.get(class_name)
         if class_name == "construction_vehicle":
             names = DRIVING_MACHINES
-        return (_unit(draw_body(draw(class_name, rng, names), rng, name), 0.0),)
-
-
-def _unit(body: Body, lag: float) -> Unit:
-    return Unit(body.variant, body.size_lwh, body.paint, body.dye, body.instance, lag)
+        return (Unit(draw_body(draw(class_name, rng, names), rng, name), 0.0),)
 
 
 def _on_axis(axis: int, at: float, across: float) -> Array:
@@ -127,7 +123,7 @@ def _on_axis(axis: int, at: float, across: float) -> Array:
 
 
 def _nearest(points: Array, others: Array) -> float:
-    """Smallest distance between points (P, 2) and (M, 2), infinite where there are none."""
+    """Smallest distance between points (P, 2) and (M, 2), metres; infinite where M is 0."""
     if not len(others):
         return float("inf")
     return float(np.sqrt(((points[:, None] - others[None]) ** 2).sum(-1).min()))

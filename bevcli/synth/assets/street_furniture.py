@@ -1,4 +1,4 @@
-"""What stands in a street and is not annotated: trees, lamps, signs, signals, benches and bins."""
+"""Meshes of objects that are not annotated: trees, lamps, signs, traffic signals, benches, bins."""
 
 from __future__ import annotations
 
@@ -6,15 +6,31 @@ import numpy as np
 
 from bevcli.synth.assets.mesh import Material, Mesh, ball, block, cone, joined, rod
 from bevcli.synth.assets.paint import Color
+from bevcli.synth.assets.triangles import MeshTemplate
 
 BARK: Color = (92, 74, 58)
-STEEL: Color = (112, 116, 120)
+GALVANISED_STEEL: Color = (112, 116, 120)
 DARK: Color = (44, 46, 48)
 LEAF_TONES: tuple[Color, ...] = ((86, 118, 52), (70, 104, 48), (110, 128, 58), (64, 92, 54), (140, 120, 52))
+TREE_KINDS = 12  # number of tree meshes
+
+
+class StreetFurniture:
+    """The templates of all repeated objects. They do not depend on the drive."""
+
+    def __init__(self) -> None:
+        rng = np.random.Generator(np.random.PCG64(20))
+        self.trees = [MeshTemplate.of(tree(k, rng)) for k in range(TREE_KINDS)]
+        self.bushes = [MeshTemplate.of(bush(rng)) for _ in range(4)]
+        self.lamp = MeshTemplate.of(lamp_post())
+        self.signs = [MeshTemplate.of(sign_post(k)) for k in range(6)]
+        self.small = [MeshTemplate.of(mesh) for mesh in (bench(), litter_bin(), hydrant())]
+        self.shelter = MeshTemplate.of(bus_shelter())
+        self.signals = {light: MeshTemplate.of(signal_head(light)) for light in ("red", "yellow", "green")}
 
 
 def tree(variant: int, rng: np.random.Generator) -> Mesh:
-    """A tree, 5 to 10 m high: round, tall or conifer, of crumpled leaf balls of uneven tone."""
+    """A tree, 5 to 10 m high. variant: modulo 4: 0 and 1 round, 2 narrow, 3 conifer."""
     tone = LEAF_TONES[int(rng.integers(len(LEAF_TONES)))]
     height = rng.uniform(5.5, 9.5)
     trunk = height * rng.uniform(0.32, 0.42)
@@ -40,7 +56,7 @@ def tree(variant: int, rng: np.random.Generator) -> Mesh:
 
 
 def _leaves(crown: Mesh, rng: np.random.Generator) -> Mesh:
-    """Crumple the crown's corners, each corner once so that faces stay joined, and vary its faces' tone."""
+    """Move the corners of a crown at random, shared corners together, and vary the brightness of its faces."""
     points = crown.faces.reshape(-1, 3)
     unique, where = np.unique(np.round(points, 3), axis=0, return_inverse=True)
     middle = unique.mean(0)
@@ -61,18 +77,18 @@ def lamp_post() -> Mesh:
     """A street lamp whose arm reaches along x."""
     return joined(
         [
-            cone(0, 0, 0, 7.6, 0.1, 0.06, STEEL, sections=6),
-            rod((0, 0, 7.5), (1.8, 0, 7.9), 0.045, STEEL, sections=5),
+            cone(0, 0, 0, 7.6, 0.1, 0.06, GALVANISED_STEEL, sections=6),
+            rod((0, 0, 7.5), (1.8, 0, 7.9), 0.045, GALVANISED_STEEL, sections=5),
             block((2.1, 0, 7.9), (0.8, 0.26, 0.12), DARK),
             block((2.1, 0, 7.82), (0.6, 0.2, 0.05), (255, 236, 190), Material.GLOW),
-            block((0, 0, 0.3), (0.3, 0.3, 0.6), STEEL),
+            block((0, 0, 0.3), (0.3, 0.3, 0.6), GALVANISED_STEEL),
         ]
     )
 
 
 def sign_post(kind: int) -> Mesh:
-    """A traffic sign that faces along x: stop, speed limit, yield, direction, warning or parking."""
-    pole = rod((0, 0, 0), (0, 0, 2.6), 0.035, STEEL, sections=5)
+    """A traffic sign that faces along x. kind: 0 stop, 1 speed limit, 2 yield, 3 direction, 4 warning, 5 parking."""
+    pole = rod((0, 0, 0), (0, 0, 2.6), 0.035, GALVANISED_STEEL, sections=5)
     colors: tuple[tuple[Color, Color], ...] = (
         ((190, 26, 30), (235, 235, 232)),
         ((235, 235, 232), (190, 26, 30)),
@@ -93,7 +109,7 @@ def sign_post(kind: int) -> Mesh:
 
 
 def signal_head(lit: str) -> Mesh:
-    """A traffic signal on a pole with an arm; it faces along x and hangs at +y. lit: red, yellow or green."""
+    """A traffic signal that faces along x, on a pole with an arm towards +y. lit: red, yellow or green."""
     lamps: dict[str, tuple[Color, Color]] = {
         "red": ((255, 40, 30), (60, 14, 14)),
         "yellow": ((255, 190, 40), (58, 44, 12)),
@@ -121,7 +137,7 @@ def bench() -> Mesh:
     )
 
 
-def bin_() -> Mesh:
+def litter_bin() -> Mesh:
     """A litter bin."""
     return joined([cone(0, 0, 0, 0.9, 0.26, 0.3, (52, 84, 66)), cone(0, 0, 0.9, 1.0, 0.31, 0.2, DARK)])
 
@@ -139,7 +155,7 @@ def hydrant() -> Mesh:
 
 
 def bus_shelter() -> Mesh:
-    """A bus stop with a glass back wall; it opens along x."""
+    """A bus shelter with a glass back wall, open towards +x."""
     return joined(
         [
             block((0, 0, 2.45), (1.5, 4.0, 0.1), DARK),

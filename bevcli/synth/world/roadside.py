@@ -1,20 +1,18 @@
-"""What stands along the streets and is annotated: parked vehicles, road works, building sites, people."""
+"""Annotated objects that stand still: parked vehicles, road works, building sites, standing people."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from bevcli.geometry.transforms import Array
-from bevcli.synth.assets.catalog import Catalog
+from bevcli.synth.assets.catalog import Body, Catalog, draw_body
 from bevcli.synth.assets.people import PERSON_NAMES
-from bevcli.synth.world.actors import Body, Standing, draw_body
+from bevcli.synth.world.actors import StandingActor
 from bevcli.synth.world.city import KERB_M, STOP_LINE_M, CityPlan, Street
-from bevcli.synth.world.landuse import landuse
-from bevcli.synth.world.scenery import side_of
 
 PARKED_MIX = {"car": 0.78, "truck": 0.09, "trailer": 0.05, "motorcycle": 0.05, "bus": 0.03}
-FILLED = 0.55  # share of parking places that are taken
-WORKS_SHARE = 0.27  # share of the sides of stretches with parking that have road works
+FILLED = 0.55  # share of parking spaces that are taken
+WORKS_SHARE = 0.27  # share of parking lanes (one side of a stretch) with road works
 WITHOUT_RIDER = {
     "motorcycle": ("sport", "cruiser", "scooter"),
     "bicycle": ("city", "racer", "cargo", "mountain"),
@@ -22,30 +20,33 @@ WITHOUT_RIDER = {
 
 
 class Roadside:
-    """The standing actors of a city, stretch by stretch and block by block."""
+    """The standing actors of a city. They are made when they are first needed, and kept."""
 
     def __init__(self, city: CityPlan, catalog: Catalog) -> None:
         self.city, self.catalog = city, catalog
-        self._made: dict[tuple[str, int, int], list[Standing]] = {}
+        self._made: dict[tuple[str, int, int], list[StandingActor]] = {}
 
-    def stretch(self, axis: int, index: int, cross: int) -> list[Standing]:
-        """What stands at the kerbs of the stretch that follows the crossing street `cross`."""
+    def stretch(self, axis: int, index: int, cross: int) -> list[StandingActor]:
+        """Actors on the parking lanes of a stretch.
+
+        axis, index: of the street. cross: index of the street that crosses it at the beginning of the stretch.
+        """
         key = (f"stretch{axis}", index, cross)
         if key not in self._made:
             self._made[key] = [*self._kerbside(axis, index, cross, -1), *self._kerbside(axis, index, cross, 1)]
         return self._made[key]
 
-    def block(self, column: int, row: int) -> list[Standing]:
-        """What stands on the pavements and on the land of a block."""
+    def block(self, column: int, row: int) -> list[StandingActor]:
+        """Actors on the pavements of a block, and on its building site."""
         key = ("block", column, row)
         if key not in self._made:
             self._made[key] = self._on_pavement(column, row)
-            if landuse(self.city, column, row) == "site":
+            if self.city.landuse(column, row) == "site":
                 self._made[key] += self._site(column, row)
         return self._made[key]
 
-    def _kerbside(self, axis: int, index: int, cross: int, side: int) -> list[Standing]:
-        """One side of a stretch; side is the sign of the offset across the street."""
+    def _kerbside(self, axis: int, index: int, cross: int, side: int) -> list[StandingActor]:
+        """One side of a stretch. side: +1 or -1, the sign of the offset from the centre line."""
         street = self.city.street(axis, index)
         if not street.parking_m:
             return []
@@ -54,11 +55,11 @@ class Roadside:
         low = before.position + before.half_width + STOP_LINE_M + 2.5
         high = after.position - after.half_width - STOP_LINE_M - 2.5
         name = f"{axis}.{index}.{cross}.{side}"
-        made: list[Standing] = []
+        made: list[StandingActor] = []
         closed = (high + 1, high + 1)
         if rng.random() < WORKS_SHARE:
             length = rng.uniform(15, 24)
-            if length < high - low:  # a short block has no room for them
+            if length < high - low:  # there is no room for them in a short block
                 begin = rng.uniform(low, high - length)
                 closed = (begin, begin + length)
                 made += self._works(street, side, closed, rng, name)
@@ -81,8 +82,11 @@ class Roadside:
 
     def _works(
         self, street: Street, side: int, closed: tuple[float, float], rng: np.random.Generator, name: str
-    ) -> list[Standing]:
-        """Road works over a span of the parking lane: barriers along the traffic, cones, machines, workers."""
+    ) -> list[StandingActor]:
+        """Road works on a part of the parking lane: barriers along the traffic, cones, a machine and workers.
+
+        closed: start and end along the street, plan coordinates, metres.
+        """
         draw, made = self.catalog.draw, []
         edge, middle = street.half_width - 3.05, street.half_width - 1.4
         barrier = draw("barrier", rng)
@@ -133,29 +137,31 @@ class Roadside:
         side: int,
         attribute: str,
         turn: float = 0.0,
-    ) -> Standing:
-        """Stand a body at a place of a street, facing as traffic on its side drives, turned by `turn`."""
+    ) -> StandingActor:
+        """An actor on a street that faces in the direction of the traffic on its side, turned by `turn` radians.
+
+        at: position along the street; offset: from its centre line; metres, plan coordinates.
+        """
         plan = (at, street.position + offset) if street.axis == 0 else (street.position + offset, at)
         forward = -side if street.axis == 0 else side
         direction = (float(forward), 0.0) if street.axis == 0 else (0.0, float(forward))
         x, y = self.city.bend(plan)
         class_name = body.variant.class_name
         attribute = "cycle.without_rider" if class_name in ("motorcycle", "bicycle") else attribute
-        return Standing(body, np.array([x, y, 0.0]), self.city.heading(plan, direction) + turn, attribute)
+        return StandingActor(body, np.array([x, y, 0.0]), self.city.heading(plan, direction) + turn, attribute)
 
-    def _on_pavement(self, column: int, row: int) -> list[Standing]:
-        """Parked bicycles near houses, and people who stand and talk."""
+    def _on_pavement(self, column: int, row: int) -> list[StandingActor]:
+        """Parked bicycles and motorcycles, and groups of standing people."""
         rng = self.city.stream("pavement", column, row)
         land, made = self.city.block(column, row), []
         for side in range(4):
-            start, end, inward = side_of(land, side)
+            start, end, inward = land.side(side)
             length = float(np.hypot(*(end - start)))
             way = (end - start) / length
             depth = land.sidewalks[side]
             for group in range(int(rng.poisson(0.7))):
-                at = (
-                    9 + (length - 22) * (group + rng.random()) / 4
-                )  # racks do not overlap: each has its part of the side
+                # Racks do not overlap: each has a quarter of the side for itself.
+                at = 9 + (length - 22) * (group + rng.random()) / 4
                 for k in range(int(rng.integers(1, 4)) if group < 4 else 0):
                     class_name = "bicycle" if rng.random() < 0.75 else "motorcycle"
                     variant = self.catalog.draw(class_name, rng, WITHOUT_RIDER[class_name])
@@ -179,12 +185,12 @@ class Roadside:
                     made.append(self._stand_on_land(body, point, facing, "pedestrian.standing"))
         return made
 
-    def _stand_on_land(self, body: Body, point: Array, yaw: float, attribute: str) -> Standing:
+    def _stand_on_land(self, body: Body, point: Array, yaw: float, attribute: str) -> StandingActor:
         x, y = self.city.bend(point)
-        return Standing(body, np.array([x, y, KERB_M]), yaw, attribute)
+        return StandingActor(body, np.array([x, y, KERB_M]), yaw, attribute)
 
-    def _site(self, column: int, row: int) -> list[Standing]:
-        """A building site over a whole block: a line of barriers, machines, trucks, cones and workers within."""
+    def _site(self, column: int, row: int) -> list[StandingActor]:
+        """A building site on a block: barriers around machines, trucks, trailers, cones and workers."""
         rng = self.city.stream("site", column, row)
         land, made = self.city.block(column, row), []
         south, east, north, west = land.sidewalks

@@ -1,4 +1,4 @@
-"""The ground truth map: roads, lane boundaries, crossings and vehicles seen from above in the bev frame."""
+"""The ground truth map: roads, lane boundaries, crossings and vehicles from above, in the bev frame."""
 
 from __future__ import annotations
 
@@ -14,31 +14,40 @@ from bevcli.geometry.transforms import Array, apply
 from bevcli.synth.render.ground_texture import SUBPIXEL_BITS, fill
 from bevcli.synth.world.ground_plan import GroundPiece
 
-BOUNDARY_M = 0.5  # how wide lane boundaries are drawn, wider than their paint so that cells do not miss them
+BOUNDARY_M = 0.5  # width of lane boundaries in the map; wider than their paint, so that no cell misses them
 VEHICLE_CLASSES = ("car", "truck", "construction_vehicle", "bus", "trailer", "motorcycle", "bicycle")
 
 
 @dataclass(frozen=True)
 class MapWindow:
-    """A square of the bev frame: half_extent_m to each side, in cells of cell_m."""
+    """The square of the bev frame that a map covers.
+
+    Attributes:
+        half_extent_m: from the origin to each side, metres.
+        cell_m: size of a cell, metres.
+    """
 
     half_extent_m: float = 32.0
     cell_m: float = 0.25
 
     @property
     def cells(self) -> int:
-        """Cells along a side."""
+        """Number of cells along a side."""
         return round(2 * self.half_extent_m / self.cell_m)
 
     def pixels(self, points_bev: Array) -> Array:
-        """Points (P, 2+) in the bev frame -> (P, 2) column and row; the first cell's middle is (0, 0)."""
+        """Column and row (P, 2) of points (P, 2 or 3) in the bev frame. (0, 0) is the middle of the first cell."""
         columns = (points_bev[..., 0] + self.half_extent_m) / self.cell_m - 0.5
         rows = (self.half_extent_m - points_bev[..., 1]) / self.cell_m - 0.5
         return np.stack([columns, rows], -1)
 
 
 def draw_map(pieces: list[GroundPiece], boxes_world: Boxes3D, bev_from_world: Array, window: MapWindow) -> BevMap:
-    """The map of painted ground (world) and of boxes (world) around the vehicle. bev_from_world: (4, 4)."""
+    """Draw the map.
+
+    pieces: the painted ground around the vehicle. boxes_world: boxes in the world frame; only those of
+    VEHICLE_CLASSES are drawn. bev_from_world: (4, 4).
+    """
 
     def pixels(points: Array) -> Array:
         world = np.column_stack([points[:, :2], np.zeros(len(points))])
