@@ -11,7 +11,7 @@ from memory_drive import MemorySequence
 
 from bevcli.errors import InputError
 from bevcli.training.augmentation import distort, distort_images, mask_images
-from bevcli.training.clips import ClipConfig, draw_clips, draw_places
+from bevcli.training.clips import ClipConfig, draw_clips, draw_frames
 
 
 class Drives:
@@ -23,13 +23,13 @@ class Drives:
     def __len__(self) -> int:
         return self._count
 
-    def open(self, place: int) -> MemorySequence:
+    def open(self, index: int) -> MemorySequence:
         return self._sequence
 
 
 def drawn(sequence: MemorySequence, frames: int, times: int = 200) -> Counter[tuple[int, ...]]:
     random = np.random.default_rng(0)
-    return Counter(draw_places(sequence, frames, random) for _ in range(times))
+    return Counter(draw_frames(sequence, frames, random) for _ in range(times))
 
 
 def test_one_of_the_frames_before_is_left_out_and_the_order_kept() -> None:
@@ -41,7 +41,7 @@ def test_one_of_the_frames_before_is_left_out_and_the_order_kept() -> None:
 def test_clips_that_are_learned_from_as_a_whole_have_no_gap() -> None:
     random = np.random.default_rng(0)
     config = ClipConfig(frames=3, batch=50, short_share=0.0, learn="all")
-    found = {clip.places for clip in draw_clips(Drives(MemorySequence(5)), config, random)}
+    found = {clip.frames for clip in draw_clips(Drives(MemorySequence(5)), config, random)}
     assert found == {(0, 1, 2), (1, 2, 3), (2, 3, 4)}
 
 
@@ -54,7 +54,7 @@ def test_a_clip_of_one_frame_has_no_history() -> None:
 
 
 def test_a_drive_too_short_for_a_clip_is_refused() -> None:
-    with pytest.raises(InputError, match="memory: no scene of it has the 4 frames of a clip"):
+    with pytest.raises(InputError, match="memory: no scene has 4 frames or more"):
         drawn(MemorySequence(6, scenes="aaabbb"), frames=4)
 
 
@@ -62,8 +62,8 @@ def test_the_clips_of_a_batch_are_of_one_length_and_some_batches_are_short() -> 
     random, lengths = np.random.default_rng(0), Counter()
     for _ in range(300):
         clips = draw_clips(Drives(MemorySequence(8)), ClipConfig(frames=3, batch=4, short_share=0.3), random)
-        assert len({len(clip.places) for clip in clips}) == 1
-        lengths[len(clips[0].places)] += 1
+        assert len({len(clip.frames) for clip in clips}) == 1
+        lengths[len(clips[0].frames)] += 1
     assert set(lengths) == {1, 2, 3}
     assert lengths[3] / 300 == pytest.approx(0.7, abs=0.1)
 

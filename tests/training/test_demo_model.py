@@ -15,7 +15,7 @@ from bevcli.model.prepared import prepare_for_inference
 from bevcli.pipeline.model_loading import load_model
 from bevcli.pipeline.runner import Runner
 from bevcli.training.drives import FolderDrives
-from bevcli.training.trainer import TrainingConfig
+from bevcli.training.job import TrainingConfig
 from bevcli.training.validation import validate
 
 STREET = Path(__file__).parents[2] / "samples" / "street"

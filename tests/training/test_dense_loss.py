@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.training.dense_loss import DenseLossConfig, DenseReader, dense_loss
+from bevcli.training.dense_loss import DenseHead, DenseLossConfig, dense_loss
 from bevcli.training.detection_loss import DetectionLossConfig
 from bevcli.training.detection_targets import DetectionTargets
 
@@ -17,8 +17,8 @@ def code(x: float, y: float) -> list[float]:
     return [x, y, 0, 0, 0, 0, 0, 0, 0, 0]
 
 
-def reader_that_says_nothing() -> DenseReader:
-    reader = DenseReader(2, 3, GRID)
+def reader_that_says_nothing() -> DenseHead:
+    reader = DenseHead(2, 3, GRID)
     for parameter in reader.parameters():
         torch.nn.init.zeros_(parameter)
     return reader

@@ -10,7 +10,7 @@ import torch
 from bevcli.model.bevformer import BEVFormerInputs
 from bevcli.training.detection_loss import DetectionLossConfig
 from bevcli.training.detection_targets import DetectionTargets
-from bevcli.training.image_loss import ImageFeatureReader, ImageLossConfig, _taught_pixels, image_loss
+from bevcli.training.image_loss import ImageHead, ImageLossConfig, _positive_pixels, image_loss
 
 SIZE, SHAPE = (224, 384), (28, 48)  # an image, and its features at stride 8
 INTRINSICS = torch.tensor([[200.0, 0, 192, 0], [0, 200, 112, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
@@ -23,7 +23,7 @@ def code(x: float, y: float, width: float = 2.0, length: float = 4.0, height: fl
 
 
 def taught(*codes: list[float]):
-    return _taught_pixels(IMAGE_FROM_BEV, torch.tensor(codes).reshape(-1, 10), SHAPE, SIZE)
+    return _positive_pixels(IMAGE_FROM_BEV, torch.tensor(codes).reshape(-1, 10), SHAPE, SIZE)
 
 
 def seen(image_from_bev: torch.Tensor) -> BEVFormerInputs:
@@ -54,8 +54,8 @@ def test_a_small_object_still_teaches_a_pixel():
 
 
 def test_the_nearer_of_two_objects_teaches():
-    assert set(taught(code(2, 10), code(4, 20)).owners.tolist()) == {0}
-    assert set(taught(code(4, 20), code(2, 10)).owners.tolist()) == {1}
+    assert set(taught(code(2, 10), code(4, 20)).objects.tolist()) == {0}
+    assert set(taught(code(4, 20), code(2, 10)).objects.tolist()) == {1}
 
 
 @pytest.mark.parametrize("codes", [(), (code(0, -10),), (code(300, 10),)])
@@ -64,7 +64,7 @@ def test_nothing_in_the_image_teaches_nothing(codes: tuple[list[float], ...]):
 
 
 def test_what_is_said_rightly_costs_little_and_every_weight_learns():
-    reader = ImageFeatureReader(channels=8, classes=2)
+    reader = ImageHead(channels=8, classes=2)
     truth = DetectionTargets(torch.tensor([1]), torch.tensor([code(2, 10)]))
     nothing = DetectionTargets(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 10))
     features = torch.randn(4, 8, *SHAPE)  # two frames of two cameras
@@ -88,7 +88,7 @@ def test_what_is_said_rightly_costs_little_and_every_weight_learns():
 
 def test_frames_without_objects_cost_no_place():
     nothing = DetectionTargets(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 10))
-    reader = ImageFeatureReader(channels=8, classes=2)
+    reader = ImageHead(channels=8, classes=2)
     features, inputs = torch.randn(1, 8, *SHAPE), seen(IMAGE_FROM_BEV[None, None])
     result = image_loss(reader, features, inputs, [nothing], ImageLossConfig(1.0), DetectionLossConfig())
     assert result.places == 0

@@ -11,15 +11,15 @@ import torch
 
 from bevcli.training.detection_loss import DetectionLossConfig, detection_loss
 from bevcli.training.detection_targets import DetectionTargets
-from bevcli.training.dice_loss import dice_costs, dice_loss
 from bevcli.training.focal_loss import focal_cost, focal_loss
-from bevcli.training.matcher import match
+from bevcli.training.hungarian_matching import hungarian_matching
+from bevcli.training.segmentation_loss import dice_costs, dice_loss
 
 
 @pytest.mark.parametrize("shape", [(5, 3), (3, 5), (4, 4), (6, 1)])
 def test_no_permutation_is_cheaper_than_the_matching(shape: tuple[int, int]) -> None:
     costs = np.random.default_rng(sum(shape)).normal(size=shape)
-    pairs = match(torch.from_numpy(costs))
+    pairs = hungarian_matching(torch.from_numpy(costs))
     small, large = sorted(shape)
     wide = costs if shape[0] == small else costs.T
     cheapest = min(sum(wide[i, p] for i, p in enumerate(order)) for order in permutations(range(large), small))
@@ -29,11 +29,11 @@ def test_no_permutation_is_cheaper_than_the_matching(shape: tuple[int, int]) -> 
 
 
 def test_nothing_to_match_gives_no_pair() -> None:
-    assert len(match(torch.zeros(4, 0)).queries) == 0
+    assert len(hungarian_matching(torch.zeros(4, 0)).queries) == 0
 
 
 def test_a_pair_of_no_finite_cost_is_the_last_choice() -> None:
-    pairs = match(torch.tensor([[float("nan"), 0.0], [1.0, 5.0]]))
+    pairs = hungarian_matching(torch.tensor([[float("nan"), 0.0], [1.0, 5.0]]))
     assert (pairs.queries.tolist(), pairs.truths.tolist()) == ([0, 1], [1, 0])
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import bevcli
-from bevcli.training.trainer import TrainingConfig
+from bevcli.training.job import TrainingConfig
 
 DOCUMENT = Path(bevcli.__file__).parents[1] / "docs" / "training.md"
 

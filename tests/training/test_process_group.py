@@ -12,8 +12,9 @@ from torch import nn
 
 from bevcli.model.bevformer import BEVFormer
 from bevcli.training.clips import ClipConfig
-from bevcli.training.team import Team, join_team, leave_team
-from bevcli.training.trainer import Trainer, TrainingConfig, TrainingJob
+from bevcli.training.job import TrainingConfig, TrainingJob
+from bevcli.training.process_group import ProcessGroup, join_process_group, leave_process_group
+from bevcli.training.trainer import Trainer
 
 SHORT = TrainingConfig(
     steps=2, held_out=0, evaluate_every=2, checkpoint_every=2, clips=ClipConfig(frames=2, batch=1, short_share=0.0)
@@ -23,32 +24,32 @@ SHORT = TrainingConfig(
 def work_together(place: int, folder: Path) -> None:
     torch.set_num_threads(1)
     torch.distributed.init_process_group("gloo", f"file://{folder}/meet", rank=place, world_size=2)
-    team = Team(place, 2)
-    assert_averages(team)
-    train(team, folder)
-    leave_team(team)
+    group = ProcessGroup(place, 2)
+    assert_averages(group)
+    train(group, folder)
+    leave_process_group(group)
 
 
-def assert_averages(team: Team) -> None:
+def assert_averages(group: ProcessGroup) -> None:
     layers = nn.Sequential(nn.Linear(2, 1), nn.BatchNorm1d(1))
-    if team.leads:
+    if group.leads:
         layers[0].weight.grad = torch.full((1, 2), 4.0)  # the other has none
-    layers[1].running_mean.fill_(team.place)
-    team.average_gradients(layers)
-    team.average_statistics(layers)
+    layers[1].running_mean.fill_(group.rank)
+    group.average_gradients(layers)
+    group.average_statistics(layers)
     assert torch.equal(layers[0].weight.grad, torch.full((1, 2), 2.0))
     assert layers[1].running_mean.item() == 0.5
 
 
-def train(team: Team, folder: Path) -> None:
+def train(group: ProcessGroup, folder: Path) -> None:
     torch.manual_seed(0)
     drives = PaintedDrives(2)
-    trainer = Trainer(TrainingJob(BEVFormer(CONFIG), SHORT, drives, drives, folder, torch.device("cpu"), 0, team))
+    trainer = Trainer(TrainingJob(BEVFormer(CONFIG), SHORT, drives, drives, folder, torch.device("cpu"), 0, group))
     trainer.run()
-    torch.save(trainer.job.model.state_dict(), folder / f"{team.place}-of-{team.size}.pt")
+    torch.save(trainer.job.model.state_dict(), folder / f"{group.rank}-of-{group.size}.pt")
 
 
-def test_a_team_learns_one_model_and_its_leader_alone_writes(tmp_path: Path) -> None:
+def test_a_group_learns_one_model_and_its_leader_alone_writes(tmp_path: Path) -> None:
     torch.multiprocessing.spawn(work_together, (tmp_path,), nprocs=2)
     leader, other = (torch.load(tmp_path / f"{place}-of-2.pt") for place in (0, 1))
     assert all(torch.equal(leader[key], other[key]) for key in leader)
@@ -56,14 +57,14 @@ def test_a_team_learns_one_model_and_its_leader_alone_writes(tmp_path: Path) -> 
     assert (tmp_path / "weights.safetensors").is_file()
     alone = tmp_path / "alone"
     alone.mkdir()
-    train(Team(), alone)
+    train(ProcessGroup(), alone)
     one = torch.load(alone / "0-of-1.pt")
     assert any(not torch.equal(leader[key], one[key]) for key in one)  # the other's clips counted
 
 
 def test_without_torchrun_a_process_is_its_own_leader(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("WORLD_SIZE", raising=False)
-    team = join_team(torch.device("cpu"))
-    assert team == Team(0, 1)
-    assert team.leads
-    leave_team(team)
+    group = join_process_group(torch.device("cpu"))
+    assert group == ProcessGroup(0, 1)
+    assert group.leads
+    leave_process_group(group)
