@@ -21,10 +21,10 @@ SHORT = TrainingConfig(
 )
 
 
-def work_together(place: int, folder: Path) -> None:
+def train_in_a_group_of_two(rank: int, folder: Path) -> None:
     torch.set_num_threads(1)
-    torch.distributed.init_process_group("gloo", f"file://{folder}/meet", rank=place, world_size=2)
-    group = ProcessGroup(place, 2)
+    torch.distributed.init_process_group("gloo", f"file://{folder}/meet", rank=rank, world_size=2)
+    group = ProcessGroup(rank, 2)
     assert_averages(group)
     train(group, folder)
     leave_process_group(group)
@@ -33,7 +33,7 @@ def work_together(place: int, folder: Path) -> None:
 def assert_averages(group: ProcessGroup) -> None:
     layers = nn.Sequential(nn.Linear(2, 1), nn.BatchNorm1d(1))
     if group.leads:
-        layers[0].weight.grad = torch.full((1, 2), 4.0)  # the other has none
+        layers[0].weight.grad = torch.full((1, 2), 4.0)  # the other process has no gradient
     layers[1].running_mean.fill_(group.rank)
     group.average_gradients(layers)
     group.average_statistics(layers)
@@ -49,9 +49,9 @@ def train(group: ProcessGroup, folder: Path) -> None:
     torch.save(trainer.job.model.state_dict(), folder / f"{group.rank}-of-{group.size}.pt")
 
 
-def test_a_group_learns_one_model_and_its_leader_alone_writes(tmp_path: Path) -> None:
-    torch.multiprocessing.spawn(work_together, (tmp_path,), nprocs=2)
-    leader, other = (torch.load(tmp_path / f"{place}-of-2.pt") for place in (0, 1))
+def test_two_processes_train_one_model_and_only_the_leader_writes(tmp_path: Path) -> None:
+    torch.multiprocessing.spawn(train_in_a_group_of_two, (tmp_path,), nprocs=2)
+    leader, other = (torch.load(tmp_path / f"{rank}-of-2.pt") for rank in (0, 1))
     assert all(torch.equal(leader[key], other[key]) for key in leader)
     assert len((tmp_path / "loss.csv").read_text().splitlines()) == 1 + SHORT.steps
     assert (tmp_path / "weights.safetensors").is_file()
@@ -59,7 +59,7 @@ def test_a_group_learns_one_model_and_its_leader_alone_writes(tmp_path: Path) ->
     alone.mkdir()
     train(ProcessGroup(), alone)
     one = torch.load(alone / "0-of-1.pt")
-    assert any(not torch.equal(leader[key], one[key]) for key in one)  # the other's clips counted
+    assert any(not torch.equal(leader[key], one[key]) for key in one)  # the clips of the second process had an effect
 
 
 def test_without_torchrun_a_process_is_its_own_leader(monkeypatch: pytest.MonkeyPatch) -> None:
