@@ -9,9 +9,7 @@ import typer
 
 
 def train(
-    config: Annotated[
-        str, typer.Argument(help="A model name or a FILE.toml. Its [training] table holds the training settings.")
-    ],
+    config: Annotated[str, typer.Argument(help="A model name or a FILE.toml. Its training table holds the settings.")],
     data: Annotated[
         list[Path] | None,
         typer.Option(metavar="DIR", help="A sequence with ground truth (see bevcli convert). Repeatable."),
@@ -35,14 +33,14 @@ def train(
     ] = None,
     steps: Annotated[
         int | None,
-        typer.Option(min=1, help="Number of steps. Default: as in the [training] table.", show_default=False),
+        typer.Option(min=1, help="Number of steps. Default: as in the training table.", show_default=False),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
     device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="auto uses a GPU if there is one.")] = "auto",
 ) -> None:
     """Train a model; write its weights, checkpoints and learning curves.
 
-    The last drives are held out for evaluation (`held_out` in the [training] table). An interrupted training continues
+    The last drives are held out for evaluation (`held_out` in the training table). An interrupted training continues
     with --resume; on a CPU the result is the same. Run weights.safetensors with `bevcli run --weights`.
 
     `torchrun --nproc-per-node N -m bevcli train …` trains with N processes, one for each GPU or CPU core.
@@ -72,7 +70,7 @@ def train(
     if job.group.leads:
         with Progress(job.config.steps - trainer.done, "steps") as progress:
             progress.message(
-                f"training on {len(job.drives)} drives, evaluating on {len(job.held_out)}; output: {job.out}"
+                f"drives: {len(job.drives)} to train on, {len(job.held_out)} to evaluate on; output: {job.out}"
             )
             trainer.run(progress.advance, lambda step, scores: progress.message(f"step {step}: {scores}"))
     else:

@@ -179,7 +179,7 @@ def test_a_kill_while_writing_leaves_the_checkpoint_before(tmp_path: Path, monke
     assert (tmp_path / "checkpoint.pt").read_bytes() == before
 
 
-def test_resuming_from_nothing_or_from_another_model_is_refused(tmp_path: Path) -> None:
+def test_resuming_from_nothing_or_from_another_model_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(WeightsError, match="no checkpoint to resume from"):
         trainer(tmp_path, resume=True)
     other = BEVFormer(replace(CONFIG, channels=16))
