@@ -114,6 +114,16 @@ def run(
             rich_help_panel=RECORDING,
         ),
     ] = None,
+    vehicle_mesh: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Draw the ego vehicle from this mesh (.glb, .ply, .obj, …; metres, origin on the ground under the "
+            "rear axle; axes in docs/recording.md). Default: a plain car.",
+            rich_help_panel=RECORDING,
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
     """Run BEVFormer on SEQUENCE, frame by frame; write boxes and a recording to look at.
 
@@ -127,7 +137,7 @@ def run(
     from bevcli.recording.options import RecordingOptions
     from bevcli.sequences.open import InputOptions
 
-    recording = RecordingOptions(record, bev, score, tuple(map(parse_probe, probe or ())), live)
+    recording = RecordingOptions(record, bev, score, tuple(map(parse_probe, probe or ())), vehicle_mesh)
     loaded = load_model(model, weights, untrained=untrained)
     motion = ego_motion_use(static=static, temporal=temporal)
     options = InputOptions(motion, strict, scene, version, split, sweeps, intrinsics, extrinsics)
@@ -136,13 +146,17 @@ def run(
     step = StepOptions(
         choose_precision(precision, target),
         temporal,
-        ask_attention=recording.shows_insides,
+        ask_attention=recording.shows_internals,
         probes=recording.probes,
     )
     out = Path("runs") / f"{drive.name}-{loaded.model.config.name}" if out is None else out
-    run_job(
-        Job(drive, loaded, target, step, recording, dict(map(parse_camera, camera or ())), out, save_bev), force=force
-    )
+    view = None
+    if live:
+        from bevcli.viewer.live import LiveView
+
+        view = LiveView()
+    cameras = dict(map(parse_camera, camera or ()))
+    run_job(Job(drive, loaded, target, step, recording, cameras, out, save_bev, view), force=force)
 
 
 def parse_probe(text: str) -> tuple[float, float]:

@@ -10,7 +10,7 @@ import torch
 from bevcli.checkpoints import bundled_weights, inspect, load_weights
 from bevcli.config import known_models, load_config
 from bevcli.errors import BevcliError, WeightsError
-from bevcli.model.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer, BEVFormerConfig
 from bevcli.model.prepared import Precision
 
 DEFAULT_MODEL = "demo"
@@ -24,6 +24,11 @@ class LoadedModel:
     model: BEVFormer
     weights: Path | None
     bundled: bool = False
+
+    @property
+    def config(self) -> BEVFormerConfig:
+        """The model's configuration."""
+        return self.model.config
 
     @property
     def untrained(self) -> bool:

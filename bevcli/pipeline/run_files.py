@@ -49,14 +49,7 @@ class RunFiles:
 
     def __enter__(self) -> RunFiles:
         job, config = self._job, self._job.loaded.model.config
-        recording = Recording(
-            job.out / RECORDING,
-            rig=job.drive.rig,
-            class_names=config.classes,
-            title=f"{job.drive.name} · {config.name}",
-            untrained=job.loaded.untrained,
-            options=job.recording,
-        )
+        recording = Recording(job.out / RECORDING, job.drive, job.loaded, job.recording, job.live)
         extras = {"model": config.name, "untrained": job.loaded.untrained, "classes": list(config.classes)}
         boxes = BoxesWriter(job.out / PREDICTIONS, "world" if job.drive.has_ego_motion else "ego", extras)
         with self._stack:  # what is open is closed again where the next cannot be opened

@@ -19,11 +19,15 @@ from bevcli.pipeline.run_files import RunFiles, prepare_folder
 from bevcli.pipeline.run_summary import RunSummary
 from bevcli.pipeline.runner import Runner, StepOptions
 from bevcli.recording.options import RecordingOptions
+from bevcli.recording.writer import LiveSink
 
 
 @dataclass(frozen=True)
 class Job:
-    """All that a run needs. chosen_cameras: camera -> the model's camera whose embedding it takes."""
+    """All that a run needs.
+
+    chosen_cameras: camera -> the model's camera whose embedding it takes. live: a viewer that follows the recording.
+    """
 
     drive: Sequence
     loaded: LoadedModel
@@ -33,6 +37,7 @@ class Job:
     chosen_cameras: Mapping[str, str]
     out: Path
     save_bev: Path | None
+    live: LiveSink | None = None
 
 
 def run_job(job: Job, *, force: bool) -> None:
