@@ -49,7 +49,7 @@ def predict(frame: Frame) -> Prediction:
         world_from_ego=frame.world_from_ego,
         grid=GRID,
         bev=torch.tensor(random.normal(size=(GRID.rows * GRID.columns, 16)), dtype=torch.float32),
-        started_anew=frame.stamp.index == 0,
+        started_anew="" if frame.stamp.index else "first frame",
         stage_seconds={"backbone": 0.2, "encoder": 0.1},
         attention=AttentionView(
             np.full((GRID.rows, GRID.columns), 0.5),

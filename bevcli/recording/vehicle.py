@@ -23,6 +23,7 @@ GLASS: Color = (32, 40, 52)
 RUBBER: Color = (20, 22, 26)
 OUTLINE = np.array([[3.65, -0.93], [3.65, 0.93], [-0.95, 0.93], [-0.95, -0.93], [3.65, -0.93]])  # in ego, from above
 FRONT_ARROW = np.array([[2.2, -0.8], [3.3, 0.0], [2.2, 0.8]])
+SMOOTH_BELOW_RAD = np.radians(40.0)  # faces that meet at a smaller angle are shaded as one curved surface
 LONGEST_M = 50.0  # a longer mesh is not in metres
 GLTF_FILES = (".glb", ".gltf")
 EGO_FROM_GLTF = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # glTF: y up, z forward, x left
@@ -95,16 +96,25 @@ def _read_meshes(path: Path) -> list[trimesh.Trimesh]:
 
 
 def _part(mesh: trimesh.Trimesh) -> tuple[Array, Array, NDArray[np.int64], NDArray[np.uint8]]:
-    """Vertices, normals, faces and colours of one mesh."""
+    """Vertices, normals, faces and colours of one mesh, with sharp edges."""
+    import trimesh
+
     visual: Any = mesh.visual
     if visual.kind == "face":
-        mesh.unmerge_vertices()  # so that no vertex is shared by faces of different colours
+        mesh.unmerge_vertices()  # no vertex may be shared by faces of different colours
         visual = mesh.visual
     if visual.kind == "texture":
         visual = visual.to_color()  # of each vertex; one colour for all of them where there is no texture image
-    colors = np.atleast_2d(visual.vertex_colors)[:, :3] if visual.defined else EGO_COLOR
-    colors = np.broadcast_to(np.asarray(colors, dtype=np.uint8), (len(mesh.vertices), 3))
-    return np.array(mesh.vertices), np.array(mesh.vertex_normals), np.array(mesh.faces), colors
+    colors = visual.vertex_colors if visual.defined else (*EGO_COLOR, 255)
+    mesh.visual = trimesh.visual.ColorVisuals(vertex_colors=np.broadcast_to(colors, (len(mesh.vertices), 4)))
+    mesh = trimesh.graph.smooth_shade(mesh, angle=SMOOTH_BELOW_RAD, facet_minarea=None)
+    shaded: Any = mesh.visual
+    return (
+        np.array(mesh.vertices),
+        np.array(mesh.vertex_normals),
+        np.array(mesh.faces),
+        np.array(shaded.vertex_colors, dtype=np.uint8)[:, :3],
+    )
 
 
 def _top_view(low: Array, high: Array) -> tuple[Array, ...]:

@@ -234,21 +234,12 @@ class Recording:
         while self._early_events:
             self.event(*self._early_events.pop(0))
         if prediction.started_anew:
-            self.event(
-                f"frame {frame.stamp.index}: {self._restart_reason(frame.stamp)}; the model starts without history"
-            )
+            scene = f' of scene "{frame.stamp.scene}"' if frame.stamp.scene else ""
+            self.event(f"{where}{scene}: the model runs without history: {prediction.started_anew}")
         for camera, reason in frame.dropped.items():
             self.event(f"{where}: camera {camera} has no image: {reason}", "WARN")
         if prediction.skipped:
             self.event(f"{where}: no camera has an image; the model was not run", "WARN")
-
-    def _restart_reason(self, stamp: FrameStamp) -> str:
-        before = None if self._last is None else self._last.stamp
-        if before is None:
-            return f'scene "{stamp.scene}" begins' if stamp.scene else "the sequence begins"
-        if before.scene != stamp.scene:
-            return f'the scene changes from "{before.scene}" to "{stamp.scene}"'
-        return f"{(stamp.timestamp_ns - before.timestamp_ns) / 1e9:.1f} s passed since the frame before"
 
     def _log_internals(self, frame: Frame, prediction: Prediction, cameras: PosedCameras) -> None:
         self._log_pillars(frame, prediction, cameras)

@@ -161,14 +161,15 @@ def events(path: Path) -> list[str]:
 
 def test_the_reason_of_a_restart_without_history_is_an_event(tmp_path):
     drive = MemorySequence(4, scenes="aabb")
+    reasons = ("first frame", "", "new scene", "gap of 9.0 s")
     with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
         for place in range(4):
             frame = drive.load(place)
-            recording.log(frame, replace(predict(frame), started_anew=place != 1))
+            recording.log(frame, replace(predict(frame), started_anew=reasons[place]))
     assert events(tmp_path / "r.rrd") == [
-        'frame 0: scene "a" begins; the model starts without history',
-        'frame 2: the scene changes from "a" to "b"; the model starts without history',
-        "frame 3: 0.5 s passed since the frame before; the model starts without history",
+        'frame 0 of scene "a": the model runs without history: first frame',
+        'frame 2 of scene "b": the model runs without history: new scene',
+        'frame 3 of scene "b": the model runs without history: gap of 9.0 s',
     ]
 
 

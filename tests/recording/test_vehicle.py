@@ -34,6 +34,7 @@ def assert_is_the_van(vehicle) -> None:
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     outward = triangles.mean(1) - (1.5, 0, 1.3)
     assert ((normals * outward).sum(-1) > 0).all()
+    np.testing.assert_allclose(np.abs(vehicle.normals).max(-1), 1)  # the edges of a box are sharp
     assert (vehicle.colors == RED).all()
     outline, arrow = vehicle.top_view
     np.testing.assert_allclose((outline.min(0), outline.max(0)), [(-1, -1), (4, 1)], atol=1e-6)
