@@ -234,8 +234,8 @@ class Recording:
         while self._early_events:
             self.event(*self._early_events.pop(0))
         if prediction.started_anew:
-            scene = f' of scene "{frame.stamp.scene}"' if frame.stamp.scene else ""
-            self.event(f"{where}{scene}: the model runs without history: {prediction.started_anew}")
+            scene = f', scene "{frame.stamp.scene}"' if frame.stamp.scene else ""
+            self.event(f"{where}: no history: {prediction.started_anew}{scene}")
         for camera, reason in frame.dropped.items():
             self.event(f"{where}: camera {camera} has no image: {reason}", "WARN")
         if prediction.skipped:

@@ -167,9 +167,9 @@ def test_the_reason_of_a_restart_without_history_is_an_event(tmp_path):
             frame = drive.load(place)
             recording.log(frame, replace(predict(frame), started_anew=reasons[place]))
     assert events(tmp_path / "r.rrd") == [
-        'frame 0 of scene "a": the model runs without history: first frame',
-        'frame 2 of scene "b": the model runs without history: new scene',
-        'frame 3 of scene "b": the model runs without history: gap of 9.0 s',
+        'frame 0: no history: first frame, scene "a"',
+        'frame 2: no history: new scene, scene "b"',
+        'frame 3: no history: gap of 9.0 s, scene "b"',
     ]
 
 
