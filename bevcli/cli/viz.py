@@ -37,23 +37,23 @@ def viz(
     The viewer opens if none of --summary, --screenshot, --video and --export is given: in a window if there is a
     display, else in the browser at an address that only this machine can reach. Ctrl-C closes it.
     """
-    from bevcli.viewer.recording_file import whole_recording
+    from bevcli.viewer.recording_file import open_recording
 
     if frame is not None and screenshot is None:
         raise typer.BadParameter("is only valid with --screenshot", param_hint="--frame")
-    with whole_recording(recording) as whole:
-        if whole.repaired:
+    with open_recording(recording) as file:
+        if file.repaired:
             typer.echo(f"note: {recording} is incomplete (its run was stopped or is still going)")
         if summary:
-            _summarise(recording, whole.path)
+            _summarise(recording, file.path)
         if screenshot is not None:
-            _screenshot(whole.path, screenshot, frame)
+            _screenshot(file.path, screenshot, frame)
         if video is not None:
-            _video(whole.path, video)
+            _video(file.path, video)
         if export is not None:
-            _export(whole.path, export)
+            _export(file.path, export)
         if not (summary or screenshot or video or export):
-            _open(whole.path, web=web, host=host, port=port)
+            _open(file.path, web=web, host=host, port=port)
 
 
 def _summarise(recording: Path, read_from: Path) -> None:

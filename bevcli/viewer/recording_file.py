@@ -16,8 +16,8 @@ MAGIC, FOOTER = b"RRF2", b"RRF2FOOT"  # the first bytes of an .rrd file, and the
 
 
 @dataclass(frozen=True)
-class WholeRecording:
-    """A recording with a valid end.
+class RecordingFile:
+    """The file to read a recording from.
 
     Attributes:
         path: the user's file, or its repaired copy.
@@ -29,13 +29,13 @@ class WholeRecording:
 
 
 @contextmanager
-def whole_recording(path: Path) -> Iterator[WholeRecording]:
+def open_recording(path: Path) -> Iterator[RecordingFile]:
     """The recording at a path. If its end is missing: a repaired copy, which is deleted when the context ends.
 
     Raises InputError if the file is missing, is not a recording, or was cut off before its first frame.
     """
     if _is_whole(path):
-        yield WholeRecording(path, repaired=False)
+        yield RecordingFile(path, repaired=False)
         return
     with tempfile.TemporaryDirectory(prefix="bevcli-") as folder:
         copy = Path(folder) / path.name
@@ -43,7 +43,7 @@ def whole_recording(path: Path) -> Iterator[WholeRecording]:
         subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, env=viewer_environment(), check=False)
         if not copy.is_file() or copy.stat().st_size < 1000:
             raise InputError(f"{path}: the recording was cut off before its first frame; nothing can be shown")
-        yield WholeRecording(copy, repaired=True)
+        yield RecordingFile(copy, repaired=True)
 
 
 def _is_whole(path: Path) -> bool:

@@ -5,7 +5,7 @@ from memory_drive import MemorySequence
 from recorded_drive import record
 
 from bevcli.errors import InputError
-from bevcli.viewer.recording_file import whole_recording
+from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.recording_reader import RecordingReader
 
 
@@ -17,8 +17,8 @@ def recording(tmp_path_factory):
 
 
 def test_a_complete_recording_is_read_from_its_own_file(recording):
-    with whole_recording(recording) as whole:
-        assert (whole.path, whole.repaired) == (recording, False)
+    with open_recording(recording) as file:
+        assert (file.path, file.repaired) == (recording, False)
 
 
 @pytest.mark.parametrize("share", [0.5, 0.75, 0.98])
@@ -26,10 +26,10 @@ def test_a_recording_cut_anywhere_keeps_its_first_frames(recording, tmp_path, sh
     content = recording.read_bytes()
     cut = tmp_path / "cut.rrd"
     cut.write_bytes(content[: int(share * len(content))])
-    with whole_recording(cut) as whole:
-        assert whole.repaired
-        frames = [frame.index for frame in RecordingReader(whole.path).frames()]
-        copy = whole.path
+    with open_recording(cut) as file:
+        assert file.repaired
+        frames = [frame.index for frame in RecordingReader(file.path).frames()]
+        copy = file.path
     assert frames == list(range(len(frames)))
     assert 1 <= len(frames) <= 3
     assert not copy.exists()
@@ -43,14 +43,14 @@ def test_a_recording_cut_anywhere_keeps_its_first_frames(recording, tmp_path, sh
 def test_a_file_that_is_not_a_recording_is_an_error_of_one_line(tmp_path, content, message):
     path = tmp_path / "x.rrd"
     path.write_bytes(content)
-    with pytest.raises(InputError, match=message) as caught, whole_recording(path):
+    with pytest.raises(InputError, match=message) as caught, open_recording(path):
         pass
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_a_missing_file_and_a_folder_are_errors(tmp_path):
-    with pytest.raises(InputError, match="no such recording"), whole_recording(tmp_path / "none.rrd"):
+    with pytest.raises(InputError, match="no such recording"), open_recording(tmp_path / "none.rrd"):
         pass
-    with pytest.raises(InputError, match="folder"), whole_recording(tmp_path):
+    with pytest.raises(InputError, match="folder"), open_recording(tmp_path):
         pass
