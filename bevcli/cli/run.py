@@ -139,6 +139,16 @@ def run(
             rich_help_panel=RECORDING,
         ),
     ] = None,
+    vehicle_mesh: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Draw the ego vehicle from this mesh (.glb, .ply, .obj, …; metres, origin on the ground under the "
+            "rear axle; axes in docs/recording.md). Default: a plain car.",
+            rich_help_panel=RECORDING,
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
     """Run BEVFormer on SEQUENCE, frame by frame, and write boxes and a recording.
 
@@ -151,7 +161,7 @@ def run(
     from bevcli.recording.options import RecordingOptions
     from bevcli.sequences.open import open_sequence
 
-    recording = RecordingOptions(record, bev, score, tuple(map(parse_probe, probe or ())), live)
+    recording = RecordingOptions(record, bev, score, tuple(map(parse_probe, probe or ())), vehicle_mesh)
     loaded = load_model(model, weights, device=device, precision=precision, untrained=untrained)
     drive = open_sequence(
         sequence,
@@ -170,6 +180,12 @@ def run(
     out = Path("runs") / f"{drive.name}-{loaded.name}" if out is None else out
     options = RunOptions(temporal, dict(map(parse_camera, camera or ())), recording, save_bev)
 
+    view = None
+    if live:
+        from bevcli.viewer.live import LiveView
+
+        view = LiveView()
+
     def show(frame: Frame, prediction: Prediction) -> None:
         for warning in warnings(frame, prediction):
             progress.message(f"warning: {warning}")
@@ -178,7 +194,7 @@ def run(
     with Progress(len(drive.stamps), "frames") as progress:
         for note in notes(loaded, drive):
             progress.message(f"note: {note}")
-        summary = run_into_folder(loaded, drive, out, options, force=force, after_frame=show)
+        summary = run_into_folder(loaded, drive, out, options, live=view, force=force, after_frame=show)
     print(summary.table())
 
 

@@ -15,7 +15,7 @@ from bevcli.pipeline.bev_files import save_bev
 from bevcli.pipeline.model_loading import Model
 from bevcli.pipeline.run_summary import SUMMARY
 from bevcli.recording.options import RecordingOptions
-from bevcli.recording.writer import Recording
+from bevcli.recording.writer import LiveSink, Recording
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.map_folder import write_map
 
@@ -48,22 +48,16 @@ class RunFiles:
         model: Model,
         recording: RecordingOptions,
         bev_folder: Path | None = None,
+        live: LiveSink | None = None,
     ) -> None:
         self._out, self._sequence, self._model, self._bev_folder = out, sequence, model, bev_folder
-        self._options = recording
+        self._options, self._live = recording, live
         self._stack = contextlib.ExitStack()
         self._submission: SubmissionWriter | None = None
 
     def __enter__(self) -> RunFiles:
         out, sequence, model = self._out, self._sequence, self._model
-        recording = Recording(
-            out / RECORDING,
-            rig=sequence.rig,
-            class_names=model.config.classes,
-            title=f"{sequence.name} · {model.name}",
-            untrained=model.untrained,
-            options=self._options,
-        )
+        recording = Recording(out / RECORDING, sequence, model, self._options, self._live)
         extras = {"model": model.name, "untrained": model.untrained, "classes": list(model.config.classes)}
         boxes = BoxesWriter(out / PREDICTIONS, "world" if sequence.has_ego_motion else "ego", extras)
         with self._stack:  # closes what is open if the next one cannot be opened
