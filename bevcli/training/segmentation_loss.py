@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bevcli.model.segmentation_head import STUFF_CLASSES, SegmentationOutputs
+from bevcli.model.segmentation import STUFF_CLASSES, SegmentationOutputs
 from bevcli.training.dice_loss import dice_costs, dice_loss
 from bevcli.training.focal_loss import focal_cost, focal_loss
 from bevcli.training.matcher import match

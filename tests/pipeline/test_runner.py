@@ -135,7 +135,7 @@ def test_removing_a_camera_changes_only_the_cells_that_it_saw(mini_model):
     runner.step(None, preprocess(WithoutImages({0: ["CAM_FRONT_LEFT"]}, count=1).load(0)))
     handle.remove()
     changed = (seen["queries"] - with_camera).abs().amax(-1)[0] > 1e-6
-    projection = project_pillars(whole.image_from_bev, mini_model.pillars, (96, 160), whole.has_image)
+    projection = project_pillars(whole.image_from_bev, mini_model.pillars.points, (96, 160), whole.has_image)
     hits = projection.hit[0, mini_model.config.cameras.index("CAM_FRONT_LEFT")]
     assert changed.any()
     assert not (changed & ~hits).any()
