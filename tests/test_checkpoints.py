@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import pickle
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 import safetensors.torch
 import torch
+from typer.testing import CliRunner
 
 from bevcli.checkpoints import (
     compare,
@@ -20,10 +22,13 @@ from bevcli.checkpoints import (
     load_weights,
     read_checkpoint,
 )
-from bevcli.config import load_config
+from bevcli.cli.main import app
+from bevcli.config import known_models, load_config
 from bevcli.errors import WeightsError
 from bevcli.geometry.bev_grid import BevGrid
+from bevcli.model.bevformer import BEVFormer
 from bevcli.model.official_keys import from_official
+from bevcli.model.parts import model_parts
 
 sys.path.insert(0, str(Path(__file__).parent / "model"))
 
@@ -209,6 +214,54 @@ def test_a_file_without_a_state_dict_is_an_error(tmp_path: Path, contents: objec
 def test_the_error_for_a_missing_file_names_it(tmp_path: Path) -> None:
     with pytest.raises(WeightsError, match=r"nothing\.pth: weights file not found"):
         inspect(tmp_path / "nothing.pth")
+
+
+def test_every_parameter_of_a_model_belongs_to_one_part() -> None:
+    for name in known_models():
+        config = load_config(name)
+        with torch.device("meta"):
+            expected = sum(parameter.numel() for parameter in BEVFormer(config).parameters())
+        assert sum(part.parameters for part in model_parts(config)) == expected
+
+
+def test_the_parts_of_base_have_the_published_sizes() -> None:
+    parts = {part.name: part for part in model_parts(load_config("base"))}
+    assert parts["BEV queries"].shapes == ((200 * 200, 256),)
+    assert parts["camera embeddings"].parameters == 6 * 256
+    # 8 heads, 4 levels, 8 points: offsets (x, y) and weights; then value and output projection; all with biases.
+    samples = 8 * 4 * 8
+    expected = (2 * samples + samples) * (256 + 1) + 2 * 256 * (256 + 1)
+    assert parts["encoder layer 5: spatial cross-attention"].parameters == expected
+    not_learned = ("running_mean", "running_var", "num_batches_tracked", "code_weights")
+    published = sum(math.prod(shape) for key, shape in KEYS["base"].items() if not key.endswith(not_learned))
+    assert sum(part.parameters for part in parts.values()) == published
+
+
+def test_weights_inspect_lists_the_parts_of_a_model() -> None:
+    answer = CliRunner().invoke(app, ["weights", "inspect", "--model", "tiny"], catch_exceptions=False)
+    lines = answer.stdout.splitlines()
+    assert any(line.startswith("BEV queries ") and "640,000  2500 × 256" in line for line in lines)
+    end = lines[0].index("  shapes")  # of the column "parameters", which is aligned to the right
+    total = sum(int(line[:end].split()[-1].replace(",", "")) for line in lines[1:-1])
+    assert lines[-1].split() == ["total", f"{total:,}"]
+
+
+def test_weights_inspect_gives_file_and_parts_as_json(official_tiny: Path) -> None:
+    command = ["weights", "inspect", str(official_tiny), "--model", "tiny", "--json"]
+    data = json.loads(CliRunner().invoke(app, command, catch_exceptions=False).stdout)
+    assert (data["models"], data["model"]) == (["tiny"], "tiny")
+    assert data["model_parameters"] == sum(part["parameters"] for part in data["parts"]) < data["parameters"]
+    queries = next(part for part in data["parts"] if part["name"] == "BEV queries")
+    assert queries == {
+        "name": "BEV queries", "modules": ["bev_queries.embedding"], "parameters": 640_000, "shapes": [[2500, 256]],
+    }  # fmt: skip
+
+
+def test_weights_inspect_needs_a_file_that_fits_the_model(official_tiny: Path) -> None:
+    answer = CliRunner().invoke(app, ["weights", "inspect", str(official_tiny), "--model", "base"])
+    assert isinstance(answer.exception, WeightsError)
+    assert "expected weights of model base, found those of tiny" in str(answer.exception)
+    assert CliRunner().invoke(app, ["weights", "inspect"]).exit_code == 2
 
 
 def _pickle(contents: object, path: Path) -> None:
