@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import pytest
 import torch
 from small_model import small_inputs, small_model
+from torch import nn
 
 from bevcli.benchmark.textbook import textbook_version
 from bevcli.model.bevformer import BEVFormer, BEVFormerOutputs
-from bevcli.model.prepared import prepare_for_inference
+from bevcli.model.prepared import fold_batch_norms, prepare_for_inference
 
 CPU = torch.device("cpu")
 
@@ -47,6 +49,16 @@ def test_a_changed_calibration_changes_the_cached_hits(model):
             torch.testing.assert_close(prepared(inputs).bev, model(inputs).bev, atol=1e-4, rtol=1e-4)
         blind = replace(inputs, has_image=torch.tensor([[True, False]]))
         torch.testing.assert_close(prepared(blind).bev, model(blind).bev, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_folding_batch_norms_changes_no_feature_map(model, device):
+    """The device decides only which module takes the place of deformable convolutions; all of them run on a CPU."""
+    folded, images = copy.deepcopy(model.backbone).requires_grad_(False), small_inputs(0).images[0]
+    fold_batch_norms(folded, torch.device(device))
+    assert not any(isinstance(module, nn.BatchNorm2d) for module in folded.modules())
+    for found, expected in zip(folded(images), model.backbone(images), strict=True):
+        torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
 
 
 def test_a_batch_of_two_is_two_batches_of_one(model):
