@@ -26,6 +26,7 @@ from bevcli.cli.validate import validate
 from bevcli.cli.viz import viz
 from bevcli.cli.weights import weights_app
 from bevcli.errors import BevcliError
+from bevcli.pipeline.cpu_memory import keep_freed_memory
 
 app = typer.Typer(
     help="Run BEVFormer on sequences from any camera rig, and look at the results.",
@@ -69,6 +70,7 @@ def run_app() -> None:
     # Read when PyTorch is loaded: its threads sleep while they wait, so that a frame on a busy machine is not held up
     # by spinning.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    keep_freed_memory()
     try:
         app()
     except BevcliError as error:
