@@ -8,7 +8,7 @@ from healthy_rigs import camera, copy_of, rig
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.rig.coverage import coverage_of
-from bevcli.rig.pose import horizon, mounting_of, seen_fov_deg
+from bevcli.rig.mounting import horizon, mounting_of, seen_fov_deg
 from bevcli.sequences.native.calibration import read_calibration
 
 

@@ -8,7 +8,7 @@ from healthy_rigs import AHEAD, HEALTHY, SIX, copy_of
 from scipy.spatial.transform import Rotation
 
 from bevcli.findings import errors_of
-from bevcli.rig.checks import check_rig
+from bevcli.rig.rig_report import check_rig
 from bevcli.sequences.native.calibration import draft_calibration
 
 ALL = tuple(SIX["cameras"])

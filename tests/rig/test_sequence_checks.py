@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
-from bevcli.rig.motion_checks import check_ego_motion
-from bevcli.rig.time_checks import check_camera_times
+from bevcli.rig.sequence_checks import check_camera_times, check_ego_motion
 from bevcli.sequences.native.ego_motion_file import read_ego_motion
 
 
@@ -135,4 +134,4 @@ def test_a_camera_whose_offset_wanders_is_named():
 
 def test_a_camera_without_any_image_is_named():
     (finding,) = check_camera_times(FRAMES, {"front": FRAMES, "back": [None] * len(FRAMES)})
-    assert (finding.code, finding.camera) == ("camera-without-images", "back")
+    assert (finding.code, finding.camera) == ("camera-without-pictures", "back")
