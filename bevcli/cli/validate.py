@@ -39,8 +39,7 @@ def validate(
 
     from bevcli.cli.progress import Progress
     from bevcli.cli.train import open_drives
-    from bevcli.evaluation.scores_json import scores_to_json
-    from bevcli.evaluation.scores_table import scores_table
+    from bevcli.evaluation.scores_report import scores_table, scores_to_dict
     from bevcli.model.prepared import prepare_for_inference
     from bevcli.pipeline.model_loading import choose_device, choose_precision, load_model
     from bevcli.pipeline.runner import Runner, StepOptions
@@ -55,6 +54,6 @@ def validate(
     with Progress(sum(len(drives.open(place).stamps) for place in range(len(drives))), "frames") as progress:
         scores = validate_model(runner, drives, max_range, progress.advance)
     if as_json:
-        print(json.dumps(scores_to_json(scores.detection, scores.config, scores.segmentation), indent=1))
+        print(json.dumps(scores_to_dict(scores.detection, scores.config, scores.segmentation), indent=1))
     else:
         print(f"drives  {len(drives)}\n\n{scores_table(scores.detection, scores.segmentation)}")

@@ -132,9 +132,9 @@ def test_kitti_files_do_not_depend_on_the_world(tmp_path: Path) -> None:
     np.testing.assert_allclose(CAMERA.ego_from_camera @ velo, default_ego_from_bev(), atol=1e-9)
 
 
-def test_kitti_refuses_frame_numbers_that_repeat(tmp_path: Path) -> None:
+def test_kitti_refuses_repeated_frame_indices(tmp_path: Path) -> None:
     file = file_of(boxes_around(), Pose.identity())
-    with pytest.raises(InputError, match="frame numbers repeat"):
+    with pytest.raises(InputError, match="frame indices repeat"):
         write_kitti(BoxesFile("world", file.frames * 2), CAMERA, default_ego_from_bev(), tmp_path)
 
 

@@ -10,7 +10,7 @@ import pytest
 from random_boxes import as_predictions, random_truth
 
 from bevcli.errors import InputError
-from bevcli.evaluation.detection import evaluate
+from bevcli.evaluation.detection import evaluate_detections
 from bevcli.evaluation.pairing import FramePairs, pair_frames
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
@@ -24,7 +24,10 @@ POSES = [Pose.from_matrix(rigid((500 + 10 * k, -20.0, 1.0), rotation_about_z(0.4
 
 
 def boxes_file(frames: list[Boxes3D], reference: str = "ego", **stamps: Any) -> BoxesFile:
-    """Boxes given in the ego frame, told in another; stamps: scene, first (frame number), start_ns, poses."""
+    """A file of boxes given in the ego frame, in another frame of reference.
+
+    stamps: scene, first (frame index), start_ns, poses.
+    """
     bev = Pose.from_matrix(default_ego_from_bev())
     rows = []
     for place, boxes in enumerate(frames):
@@ -42,7 +45,7 @@ def boxes_file(frames: list[Boxes3D], reference: str = "ego", **stamps: Any) -> 
 
 
 def nds(pairs: FramePairs) -> float:
-    return evaluate(pairs.predictions, pairs.ground_truth, None, pairs.ego_xy).overall.nd_score
+    return evaluate_detections(pairs.predictions, pairs.ground_truth, None, pairs.ego_xy).overall.nd_score
 
 
 @pytest.mark.parametrize("one", ["world", "ego", "bev"])
@@ -57,7 +60,7 @@ def test_the_frame_of_reference_does_not_matter(one: str, other: str) -> None:
 def test_boxes_that_no_pose_can_move_are_an_error() -> None:
     world = boxes_file(TRUTH, "world")
     bev = replace(boxes_file(PREDICTIONS, "bev"), ego_from_bev=None)
-    with pytest.raises(InputError, match=r'frame 0: boxes in the bev frame .* state "ego_from_bev"'):
+    with pytest.raises(InputError, match=r'frame 0: boxes in the bev frame .* add "ego_from_bev"'):
         pair_frames(bev, world)
 
 
@@ -67,8 +70,8 @@ def test_boxes_that_no_pose_can_move_are_an_error() -> None:
         ({}, "scene and timestamp_ns"),
         ({"first": 7}, "scene and timestamp_ns"),
         ({"scene": "b"}, "timestamp_ns"),
-        ({"start_ns": 1}, "scene and frame number"),
-        ({"start_ns": 1, "scene": "b"}, "frame number"),
+        ({"start_ns": 1}, "scene and frame index"),
+        ({"start_ns": 1, "scene": "b"}, "frame index"),
     ],
 )
 def test_what_frames_are_matched_by(stamps: dict[str, Any], matched_by: str) -> None:
@@ -105,5 +108,5 @@ def test_files_of_different_drives_are_refused() -> None:
     other = boxes_file(TRUTH, scene="b", first=100, start_ns=10**18)
     with pytest.raises(InputError, match='no frame in common: predictions start with scene "a" frame 0 at 0 ns'):
         pair_frames(boxes_file(PREDICTIONS), other)
-    with pytest.raises(InputError, match="the predictions hold no frame at all"):
+    with pytest.raises(InputError, match="the predictions contain no frame"):
         pair_frames(BoxesFile("ego", ()), boxes_file(TRUTH))

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from bevcli.errors import InputError
-from bevcli.evaluation.read_submission import is_submission, read_submission
-from bevcli.evaluation.submission import SubmissionWriter, write_submission
+from bevcli.evaluation.submission import SubmissionWriter, is_submission, read_submission, write_submission
 from bevcli.frame import FrameStamp
 from bevcli.geometry.attributes import attributes_by_speed
 from bevcli.geometry.boxes import CLASSES, Boxes3D

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError
+from bevcli.rig.check_calibration import check_calibration
 from bevcli.viewer.screenshot import take_screenshot
 
 FILES = {"cameras.png", "coverage.png", "recording.rrd", "findings.json"}
@@ -171,3 +172,14 @@ def test_the_viewer_shows_all_views_of_the_recording(small_drive, tmp_path):
     views = take_screenshot(tmp_path / "out" / "recording.rrd", tmp_path / "shot.png")
     assert set(views) == {"The rig", "Cameras per BEV cell", "Findings", "CAM_FRONT", "CAM_BACK"}
     assert cv2.imread(str(tmp_path / "shot.png")).std() > 10
+
+
+def test_the_command_prints_what_the_library_returns(small_drive, tmp_path):
+    write_motion(small_drive, heading=(0.5**0.5, 0, 0, 0.5**0.5))
+    check = check_calibration(str(small_drive), frame=3)
+    assert [error.code for error in check.errors] == ["ego-sideways"]
+    assert (check.images["CAM_BACK"] == 120).all()  # frame 3
+    assert {path.name for path in check.write(tmp_path / "here")} == FILES
+    printed = run(small_drive, "--frame", 3, "--out", tmp_path / "out", "--json").stdout
+    assert printed == check.to_json() + "\n" == (tmp_path / "here" / "findings.json").read_text()
+    assert run(small_drive, "--frame", 3, "--out", tmp_path / "out").stdout.startswith(check.text())
