@@ -121,8 +121,8 @@ def _ranges(detection: DetectionScores) -> str:
     for name in detection.overall.classes:
         found = [part.table.classes.get(name) for part in bins]
         rows.append((name, *(_number(scores.mean_ap) if scores else "-" for scores in found)))
-    rows.append(("mAP of these", *(_number(part.table.mean_ap) for part in bins)))
-    rows.append(("NDS of these", *(_number(part.table.nd_score) for part in bins)))
+    rows.append(("mAP", *(_number(part.table.mean_ap) for part in bins)))
+    rows.append(("NDS", *(_number(part.table.nd_score) for part in bins)))
     return _aligned(rows)
 
 

@@ -19,7 +19,7 @@ from bevcli.evaluation.evaluate import evaluate
 from bevcli.geometry.boxes import Boxes3D
 
 GOLDEN = json.loads((Path(__file__).parents[1] / "data" / "detection_metrics.json").read_text())
-TOLERANCE = 1e-9  # stated in README.md and docs/scoring.md
+TOLERANCE = 1e-9  # docs/scoring.md and README.md state it
 
 
 def boxes(rows: list[dict[str, Any]]) -> Boxes3D:
