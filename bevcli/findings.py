@@ -1,4 +1,4 @@
-"""What a check of a calibration found: one mistake or oddity, with its numbers and what to do about it."""
+"""Findings: what a check of a calibration found, with numbers and advice."""
 
 from __future__ import annotations
 
@@ -12,11 +12,16 @@ SEVERITIES: tuple[Severity, ...] = ("error", "warning", "info")
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing to say about a calibration.
+    """One mistake or implausible value in a calibration or a sequence.
 
-    code: stable name of the kind, listed in docs/calibration.md. camera: which one, None for the whole rig.
-    message: what is wrong. found, expected: the numbers with their units, "" where there is none.
-    advice: what to do.
+    Attributes:
+        code: stable name of the kind, listed in docs/calibration.md.
+        severity: "error", "warning" or "info".
+        camera: name of the camera; None for the whole rig.
+        message: what is wrong.
+        found: the value with its unit, or "".
+        expected: the expected value with its unit, or "".
+        advice: what to do, or "".
     """
 
     code: str
@@ -29,7 +34,7 @@ class Finding:
 
     @property
     def line(self) -> str:
-        """All of it on one line: `camera CAM_BACK: "intrinsics" is missing (expected 3x3)`."""
+        """The finding on one line, such as `camera CAM_BACK: "intrinsics" is missing (expected 3x3)`."""
         where = f"camera {self.camera}: " if self.camera else ""
         numbers = [f"{word} {value}" for word, value in (("expected", self.expected), ("found", self.found)) if value]
         brackets = f" ({', '.join(numbers)})" if numbers else ""
@@ -37,5 +42,5 @@ class Finding:
 
 
 def errors_of(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Those of severity error, in their order."""
+    """The findings of severity error, in their order."""
     return tuple(finding for finding in findings if finding.severity == "error")

@@ -28,7 +28,7 @@ def evaluate(
         float | None,
         typer.Option(
             metavar="METRES",
-            help="Largest distance from the ego vehicle that is scored. Default: nuScenes' range of each class.",
+            help="Cut nuScenes' class ranges at this distance from the ego vehicle.",
         ),
     ] = None,
     count_missing: Annotated[

@@ -1,4 +1,4 @@
-"""Detection scores: numbers worked out by hand, and what must hold for any boxes."""
+"""Detection scores: numbers computed by hand, and properties that hold for any boxes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from random_boxes import as_predictions, random_truth
 
-from bevcli.evaluation.config import ERRORS, DetectionConfig
+from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import evaluate_detections
 from bevcli.evaluation.detection_scores import DetectionScores
 from bevcli.evaluation.matching import descending_scores, match_greedily
@@ -40,22 +40,22 @@ def numbers(scores: DetectionScores) -> dict[str, float]:
     return found
 
 
-def test_average_precision_worked_out_by_hand() -> None:
-    # A false alarm, then both cars. Precision 0, 1/2, 2/3 at recall 0, 1/2, 1, straight lines between. What counts
+def test_average_precision_computed_by_hand() -> None:
+    # A false positive, then both cars. Precision 0, 1/2, 2/3 at recall 0, 1/2, 1, linear between them. Counted
     # are recalls 0.11 to 1.00: the sum of (p - 0.1) is 0.01 + ... + 0.40 = 8.2 up to the half,
     # and 50 * 0.4 + (0.01 + ... + 0.50) / 3 = 24.25 beyond; over 90 recalls, over 0.9.
     scores = evaluate_detections([cars([40, 0, 20], [0.9, 0.8, 0.7])], [cars([0, 20])])
     assert scores.overall.classes["car"].aps[2.0] == pytest.approx((8.2 + 24.25) / 90 / 0.9)
 
 
-def test_half_of_the_cars_found_without_a_mistake() -> None:
+def test_half_of_the_cars_found_without_a_false_positive() -> None:
     # Precision 1 up to recall 0.5: of recalls 0.11 to 1.00, 40 of 90 count.
     scores = evaluate_detections([cars([0, 10], [0.9, 0.8])], [cars([0, 10, 20, 30])])
     assert scores.overall.classes["car"].aps[0.5] == pytest.approx(40 / 90)
     assert scores.overall.classes["car"].recall == 0.5
 
 
-def test_the_distance_decides() -> None:
+def test_a_match_is_closer_than_the_matching_distance() -> None:
     found = evaluate_detections([cars([1.5], [0.9])], [cars([0.0])]).overall.classes["car"].aps
     assert found == pytest.approx({0.5: 0, 1.0: 0, 2.0: 1, 4.0: 1})
 
@@ -65,14 +65,14 @@ def test_a_car_is_found_once() -> None:
     assert twice.overall.classes["car"].recall == 0.5
 
 
-def test_the_better_score_chooses_first() -> None:
-    # The second best is nearer, but the car is taken: it goes to the other one, 1.9 m away.
+def test_the_highest_score_is_matched_first() -> None:
+    # The second prediction is nearer to the first car, but it is taken: it matches the other one, 1.9 m away.
     truth = gather([cars([0.0, 2.0])], np.zeros((1, 2)))
     predictions = gather([cars([0.4, 0.1], [0.9, 0.8])], np.zeros((1, 2)))
     np.testing.assert_array_equal(match_greedily(truth, predictions, (2.0, 1.0)), [[0, 1], [0, -1]])
 
 
-def test_the_five_errors_worked_out_by_hand() -> None:
+def test_the_five_errors_computed_by_hand() -> None:
     truth = replace(cars([0.0]), velocities=np.array([[3.0, 0.0]]))
     found = replace(
         cars([0.6], [0.9]),
@@ -112,7 +112,7 @@ def test_no_predictions_score_zero() -> None:
     assert set(scores.overall.errors.values()) == {1.0}
 
 
-def test_nothing_on_either_side_scores_zero() -> None:
+def test_no_boxes_on_either_side_score_zero() -> None:
     scores = evaluate_detections([Boxes3D.empty()], [Boxes3D.empty()])
     assert (scores.overall.mean_ap, scores.overall.nd_score) == (0, 0)
 
@@ -168,7 +168,7 @@ def test_ground_truth_given_as_predictions_is_perfect() -> None:
     assert scores.overall.nd_score == pytest.approx(1)
 
 
-def test_an_error_that_nobody_knows_is_left_out_of_nds() -> None:
+def test_an_error_without_ground_truth_is_left_out_of_nds() -> None:
     truth = random_truth(1)
     untold = [replace(boxes, attributes=None, velocities=np.full((len(boxes), 2), np.nan)) for boxes in truth]
     scores = evaluate_detections(as_predictions(truth, 2), untold)
@@ -177,7 +177,7 @@ def test_an_error_that_nobody_knows_is_left_out_of_nds() -> None:
     assert scores.overall.nd_score == pytest.approx(1)
 
 
-def test_range_bins_share_out_what_there_is() -> None:
+def test_each_box_counts_in_one_range_bin() -> None:
     truth = random_truth(8)
     scores = evaluate_detections(as_predictions(truth, 9, noise_m=0.5, false_per_frame=20), truth)
     counts = [sum(c.ground_truth_count for c in part.table.classes.values()) for part in scores.by_range]
@@ -188,7 +188,7 @@ def test_range_bins_share_out_what_there_is() -> None:
     )
 
 
-def test_a_pair_across_a_bins_border_stays_whole() -> None:
+def test_a_pair_across_the_border_of_bins_is_not_split() -> None:
     scores = evaluate_detections([cars([10.4], [0.9])], [cars([9.6])])
     bins = {part.low_m: part.table for part in scores.by_range}
     assert bins[0].classes["car"].aps[1.0] == pytest.approx(1)
@@ -204,7 +204,7 @@ def test_recall_by_visibility_counts_at_two_metres() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_matching_equals_the_rule_written_out_plainly(seed: int) -> None:
+def test_matching_equals_a_plain_loop(seed: int) -> None:
     truth = random_truth(seed, per_class=8)
     predictions = as_predictions(truth, seed + 100, noise_m=1.5, false_per_frame=200)
     ego = np.zeros((len(truth), 2))
@@ -225,7 +225,3 @@ def test_matching_equals_the_rule_written_out_plainly(seed: int) -> None:
             taken.discard(-1)
             expected.append(best)
         np.testing.assert_array_equal(match_greedily(true, found, (limit,))[0], expected)
-
-
-def test_errors_are_named_as_the_devkit_names_them() -> None:
-    assert ERRORS == ("trans_err", "scale_err", "orient_err", "vel_err", "attr_err")

@@ -1,4 +1,4 @@
-"""Exports say what the boxes file says; KITTI labels are read back by KITTI's own formulas."""
+"""Exports contain the boxes of the file; KITTI labels are read back with the formulas of KITTI's development kit."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_kitti_labels_are_the_boxes_in_the_cameras_frame() -> None:
         assert len(fields) == 16
 
 
-def test_a_label_stands_for_every_box_in_view_and_frames_it() -> None:
+def test_every_box_in_view_has_a_label_with_its_2d_box() -> None:
     boxes = boxes_around()
     rotation, translation = cv2.Rodrigues(CAMERA.camera_from_ego[:3, :3])[0], CAMERA.camera_from_ego[:3, 3]
     labels = kitti_labels(boxes, CAMERA)

@@ -1,4 +1,4 @@
-"""Frames of two files find each other, and their boxes meet in one frame of reference."""
+"""Frames of two files are paired, and their boxes are moved into one frame of reference."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_the_frame_of_reference_does_not_matter(one: str, other: str) -> None:
     assert pairs.ego_pose_known == ("world" in (one, other))
 
 
-def test_boxes_that_no_pose_can_move_are_an_error() -> None:
+def test_boxes_without_a_pose_for_the_transformation_are_an_error() -> None:
     world = boxes_file(TRUTH, "world")
     bev = replace(boxes_file(PREDICTIONS, "bev"), ego_from_bev=None)
     with pytest.raises(InputError, match=r'frame 0: boxes in the bev frame .* add "ego_from_bev"'):
@@ -74,7 +74,7 @@ def test_boxes_that_no_pose_can_move_are_an_error() -> None:
         ({"start_ns": 1, "scene": "b"}, "frame index"),
     ],
 )
-def test_what_frames_are_matched_by(stamps: dict[str, Any], matched_by: str) -> None:
+def test_the_key_that_frames_are_matched_by(stamps: dict[str, Any], matched_by: str) -> None:
     pairs = pair_frames(boxes_file(PREDICTIONS, **stamps), boxes_file(TRUTH))
     assert pairs.matched_by == matched_by
     assert len(pairs.predictions) == 4
@@ -92,7 +92,7 @@ def test_sample_tokens_go_first() -> None:
     assert nds(pairs) == pytest.approx(nds(pair_frames(boxes_file(PREDICTIONS), boxes_file(TRUTH))))
 
 
-def test_frames_of_one_side_are_left_out_or_counted_and_said() -> None:
+def test_frames_of_one_side_are_left_out_or_counted_with_a_note() -> None:
     half = boxes_file(PREDICTIONS[:2])
     left_out = pair_frames(half, boxes_file(TRUTH))
     assert len(left_out.predictions) == 2

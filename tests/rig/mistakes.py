@@ -1,4 +1,4 @@
-"""Common mistakes in a calibration or in ego-motion, planted in healthy ones: (code of the finding, what plants it)."""
+"""Common mistakes in a calibration or in ego-motion: pairs of a finding's code and what plants the mistake."""
 
 from dataclasses import replace
 

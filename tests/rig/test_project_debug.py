@@ -1,4 +1,4 @@
-"""The command: exit codes, the JSON, the images, and what it says of a sequence."""
+"""The command and its library function: exit codes, JSON, images, and findings about a sequence."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""Each usual mistake, planted in a healthy calibration, is found, and nothing else is called an error."""
+"""Each common mistake, planted in a healthy calibration, is found, and is the only error."""
 
 import json
 
@@ -65,7 +65,7 @@ def test_a_mistake_in_all_cameras_is_one_error(code, mistake, tmp_path):
         mistake(camera["ego_from_camera"])
     errors = errors_of(report_of(document, tmp_path).findings)
     assert {error.code for error in errors} == {code}
-    if not code.startswith("rotation"):  # what the file itself lacks is said of each camera
+    if not code.startswith("rotation"):  # mistakes in the file itself are findings on each camera
         assert [error.camera for error in errors] == [None]
 
 
@@ -88,7 +88,7 @@ def test_mistakes_in_all_cameras_of_other_rigs(rig, code, mistake, tmp_path):
     assert {error.code for error in errors} == {code}
 
 
-def test_a_rounded_quaternion_is_named_by_its_norm(tmp_path):
+def test_a_rounded_quaternion_has_the_wrong_norm(tmp_path):
     document = copy_of("six")
     rounded(document["cameras"]["CAM_FRONT_LEFT"]["ego_from_camera"])
     (error,) = errors_of(report_of(document, tmp_path).findings)
@@ -104,7 +104,7 @@ def test_one_camera_with_a_wrong_lens_is_named(code, mistake, camera, tmp_path):
     assert [(error.code, error.camera) for error in errors] == [(code, camera)]
 
 
-def test_the_resolution_that_the_intrinsics_belong_to_is_said(tmp_path):
+def test_the_message_names_the_image_size_of_the_intrinsics(tmp_path):
     document = copy_of("six")
     for camera in document["cameras"].values():
         scaled(0.5)(camera)
@@ -115,7 +115,7 @@ def test_the_resolution_that_the_intrinsics_belong_to_is_said(tmp_path):
 
 
 @pytest.mark.parametrize(("a", "b"), [("FRONT_LEFT", "FRONT_RIGHT"), ("FRONT", "BACK"), ("FRONT_LEFT", "BACK_LEFT")])
-def test_swapped_names_are_both_named(a, b, tmp_path):
+def test_the_message_names_both_swapped_cameras(a, b, tmp_path):
     document = copy_of("six")
     cameras = document["cameras"]
     cameras[f"CAM_{a}"], cameras[f"CAM_{b}"] = cameras[f"CAM_{b}"], cameras[f"CAM_{a}"]
@@ -162,14 +162,14 @@ def test_a_wrong_bev_frame(code, mistake, tmp_path):
     assert [(error.code, error.camera) for error in errors] == [(code, None)]
 
 
-def test_a_rig_without_rear_cameras_is_warned_of_what_it_does_not_see(tmp_path):
+def test_a_rig_without_rear_cameras_has_unseen_cells_behind_it(tmp_path):
     report = report_of(copy_of("five"), tmp_path)
     (unseen,) = [finding for finding in report.findings if finding.code == "cells-unseen"]
     assert unseen.severity == "warning"
     assert "mostly back" in unseen.found
 
 
-def test_an_error_silences_what_follows_from_it(tmp_path):
+def test_consequences_of_an_error_are_suppressed(tmp_path):
     document = copy_of("six")
     for camera in document["cameras"].values():
         millimetres(camera["ego_from_camera"])
@@ -187,12 +187,12 @@ def test_two_mistakes_in_two_cameras_are_both_found(tmp_path):
     }
 
 
-def test_a_lorry_is_told_that_it_is_far_from_nuscenes(tmp_path):
+def test_a_lorry_is_far_from_nuscenes(tmp_path):
     codes = {finding.code for finding in report_of(copy_of("lorry"), tmp_path).findings}
     assert {"height-far", "pitch-far", "fov-far"} <= codes
 
 
-def test_without_ego_from_bev_the_assumption_is_said(tmp_path):
+def test_a_missing_ego_from_bev_is_an_info(tmp_path):
     document = copy_of("six")
     del document["ego_from_bev"]
     findings = report_of(document, tmp_path).findings

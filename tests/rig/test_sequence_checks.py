@@ -10,7 +10,7 @@ from bevcli.sequences.native.ego_motion_file import read_ego_motion
 
 @pytest.mark.parametrize("start_yaw", [0.0, 0.7, 2.0, -3.0])
 @pytest.mark.parametrize("speed", [0.0, 3.0, 8.0, 35.0])
-def test_a_healthy_drive_gives_nothing(speed, start_yaw):
+def test_a_healthy_drive_gives_no_finding(speed, start_yaw):
     assert check_ego_motion(drive(speed=speed, start_yaw=start_yaw)) == ()
 
 
@@ -30,11 +30,11 @@ def test_parking_in_reverse_for_a_while_is_no_mistake():
     assert check_ego_motion(motion_of(times[:count], places[:count], quaternions[:count])) == ()
 
 
-def test_the_real_drive_gives_nothing(shared):
+def test_the_real_drive_gives_no_finding(shared):
     assert check_ego_motion(read_ego_motion(shared / "data/nuscenes-scene-0103/ego_motion.csv")) == ()
 
 
-def test_one_row_gives_nothing():
+def test_one_row_gives_no_finding():
     motion = drive(seconds=0.05)
     assert len(motion.timestamps_ns) == 1
     assert check_ego_motion(motion) == ()
@@ -47,7 +47,7 @@ def late_by(milliseconds):
     return [time + milliseconds * 1_000_000 for time in FRAMES]
 
 
-def test_cameras_within_a_few_hundredths_of_a_second_give_nothing():
+def test_cameras_within_a_few_hundredths_of_a_second_give_no_finding():
     assert check_camera_times(FRAMES, {"front": FRAMES, "back": late_by(-43), "left": late_by(40)}) == ()
 
 
@@ -60,7 +60,7 @@ def test_a_camera_that_is_late_or_early_is_named(offset, severity):
     assert f"{offset:+d} ms" in finding.found
 
 
-def test_a_camera_whose_offset_wanders_is_named():
+def test_a_camera_with_jitter_is_named():
     wandering = [time + (i % 2) * 140_000_000 for i, time in enumerate(FRAMES)]
     (finding,) = check_camera_times(FRAMES, {"front": FRAMES, "back": wandering})
     assert (finding.severity, finding.camera) == ("warning", "back")
