@@ -1,4 +1,4 @@
-"""The sheet: all cameras' images with their overlay, laid out around the vehicle, and the coverage map amid them."""
+"""cameras.png: all cameras' images with their overlay, arranged around the vehicle and the coverage map."""
 
 from __future__ import annotations
 
@@ -14,23 +14,27 @@ from matplotlib.lines import Line2D
 
 from bevcli.findings import Finding
 from bevcli.geometry.cameras import Camera, CameraRig
-from bevcli.rig.checks import RigReport
 from bevcli.rig.coverage_map import FAINT, INK, LEGEND_STYLE, PAPER, draw_coverage, save
+from bevcli.rig.mounting import degrees_text, mounting_of, seen_fov_deg
 from bevcli.rig.overlay import GROUND, HORIZON, PILLAR_GRID, Pixels, draw_overlay, height_colors
-from bevcli.rig.pose import degrees_text, mounting_of, seen_fov_deg
+from bevcli.rig.rig_report import RigReport
 
 SEVERITY_COLORS = {"error": "#ff5c72", "warning": "#ffc857", "info": "#7fb7e6"}
-SIDE_DEG = (75.0, 105.0)  # cameras that look sideways stand beside the map
+SIDE_DEG = (75.0, 105.0)  # cameras with a yaw in this range are placed beside the map
 DPI = 100
-SLOT, GAP, TITLE, DETAILS, MIDDLE = 5.2, 0.3, 0.32, 0.38, 5.2  # inches: an image's width, between, above, below, map
-FOOTER = 3.0  # for findings and legend where cameras stand beside the map
-LINE = 0.19
-IMAGE_WIDTH = 1040
+# Layout in inches: width of an image, gap between images, title above and details below an image, size of the map.
+SLOT, GAP, TITLE, DETAILS, MIDDLE = 5.2, 0.3, 0.32, 0.38, 5.2
+FOOTER = 3.0  # findings and legend, where cameras are placed beside the map
+LINE = 0.19  # height of a line of text
+IMAGE_WIDTH = 1040  # pixels
 
 
-def write_sheet(path: Path, rig: CameraRig, report: RigReport, images: Mapping[str, Pixels]) -> None:
-    """Write the PNG. images: by camera (H, W, 3) BGR; a camera without one gets a dark field. Raises OutputError."""
-    front, left, right, back = around(rig)
+def write_camera_sheet(path: Path, rig: CameraRig, report: RigReport, images: Mapping[str, Pixels]) -> None:
+    """Write the PNG. Raises OutputError.
+
+    images: by camera, (H, W, 3) BGR; a camera without an image is drawn on a dark background.
+    """
+    front, left, right, back = _cameras_by_side(rig)
     columns = max(len(front), len(back), 3)
     heights = [_row_height(front), max(_column_height(left), _column_height(right), MIDDLE), _row_height(back)]
     footer = FOOTER if left or right else 0.0
@@ -79,8 +83,8 @@ def _column_height(cameras: Sequence[Camera]) -> float:
     return sum(map(_camera_height, cameras))
 
 
-def around(rig: CameraRig) -> tuple[list[Camera], list[Camera], list[Camera], list[Camera]]:
-    """The cameras that look ahead (left to right), left, right, and back (the vehicle's left first)."""
+def _cameras_by_side(rig: CameraRig) -> tuple[list[Camera], list[Camera], list[Camera], list[Camera]]:
+    """The cameras that look ahead (from left to right), left, right, and back (from the vehicle's left to right)."""
     yaws = {camera.name: float(np.degrees(camera.yaw)) for camera in rig.cameras}
     low, high = SIDE_DEG
     ahead = [c for c in rig.cameras if abs(yaws[c.name]) < low]
@@ -102,6 +106,7 @@ def _draw_camera(
     report: RigReport,
     images: Mapping[str, Pixels],
 ) -> None:
+    """Draw a camera's image with title, angles and its first finding. corner: left and top, inches."""
     left, top = corner
     axes = sheet.axes(left, top + TITLE, SLOT, _camera_height(camera) - TITLE - DETAILS)
     image = images.get(camera.name)
@@ -119,7 +124,7 @@ def _draw_camera(
     axes.set_title(camera.name, loc="left", color=INK, fontsize=11)
     angles = (degrees_text(mounting.yaw_deg, 0), degrees_text(mounting.pitch_deg), degrees_text(mounting.roll_deg))
     details = "yaw {}  pitch {}  roll {}".format(*angles)
-    details += f"  height {mounting.height:.2f} m  view {seen_fov_deg(camera)[0]:.0f}°"
+    details += f"  height {mounting.height:.2f} m  FOV {seen_fov_deg(camera)[0]:.0f}°"
     axes.set_xlabel(details, color=FAINT, fontsize=9, loc="left", labelpad=5)
     if mine:
         box = {"facecolor": PAPER, "edgecolor": color, "alpha": 0.9, "boxstyle": "round,pad=0.4"}
@@ -128,19 +133,19 @@ def _draw_camera(
 
 
 def _write_findings(axes: Axes, height: float, findings: Sequence[Finding]) -> None:
-    """As many findings as have room in axes of this height, inches."""
+    """Write as many findings as fit. height: of the axes, inches."""
     axes.axis("off")
     axes.set_ylim(height, 0)
     axes.text(0, 0, "Findings", color=INK, fontsize=13, va="top")
     if not findings:
-        axes.text(0, 0.45, "none: the rig looks healthy", color="#7fd6a0", fontsize=10, va="top")
+        axes.text(0, 0.45, "none: the rig is plausible", color="#7fd6a0", fontsize=10, va="top")
     top = 0.45
     for finding in findings:
         where = f"{finding.camera}: " if finding.camera else ""
         numbers = f" ({finding.found})" if finding.found else ""
         lines = textwrap.wrap(f"{where}{finding.message}{numbers}", 56)[:4]
         if top + LINE * len(lines) > height - LINE:
-            axes.text(0, top, "and more: see the table", color=FAINT, fontsize=9, va="top")
+            axes.text(0, top, "more in findings.json", color=FAINT, fontsize=9, va="top")
             break
         axes.text(0, top, finding.severity, color=SEVERITY_COLORS[finding.severity], fontsize=9, va="top")
         axes.text(0.15, top, "\n".join(lines), color=INK, fontsize=9, va="top", linespacing=1.25)
@@ -149,7 +154,7 @@ def _write_findings(axes: Axes, height: float, findings: Sequence[Finding]) -> N
 
 def _write_legend(axes: Axes) -> None:
     axes.axis("off")
-    axes.text(0.1, 1.0, "How to read it", color=INK, fontsize=13, va="top", transform=axes.transAxes)
+    axes.text(0.1, 1.0, "Legend", color=INK, fontsize=13, va="top", transform=axes.transAxes)
     heights = PILLAR_GRID.pillar_heights()
     colors = [tuple(color / 255) for color in height_colors(PILLAR_GRID)]
     dots = [
@@ -159,7 +164,7 @@ def _write_legend(axes: Axes) -> None:
         for color, height in zip(colors[::-1], heights[::-1], strict=True)
     ]
     lines = [
-        Line2D([], [], color=tuple(np.array(HORIZON) / 255), label="the horizon: far away, at the camera's height"),
-        Line2D([], [], color=tuple(np.array(GROUND) / 255), label="the ground, every 5 m: it should lie on the road"),
+        Line2D([], [], color=tuple(np.array(HORIZON) / 255), label="horizon: infinitely far, at the camera's height"),
+        Line2D([], [], color=tuple(np.array(GROUND) / 255), label="ground grid of 5 m: should lie on the road"),
     ]
     axes.legend(handles=dots + lines, loc="upper left", bbox_to_anchor=(0.08, 0.94), labelspacing=0.9, **LEGEND_STYLE)

@@ -1,4 +1,4 @@
-"""The terminal's table of `project-debug`: the rig, the findings, and the distance from nuScenes', in 100 columns."""
+"""The report for the terminal: the rig, its coverage, the findings, and the comparison with nuScenes."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from collections.abc import Sequence
 
 from bevcli.findings import SEVERITIES, Finding
 from bevcli.geometry.cameras import CameraRig
-from bevcli.rig.checks import RigReport
 from bevcli.rig.coverage import Coverage
-from bevcli.rig.pose import degrees_text, mounting_of, seen_fov_deg
+from bevcli.rig.mounting import degrees_text, mounting_of, seen_fov_deg
+from bevcli.rig.rig_report import RigReport
 
 WIDTH = 100
 INDENT = " " * 10
 
 
 def report_text(name: str, rig: CameraRig, report: RigReport) -> str:
-    """All of it as plain text, no line wider than 100 columns unless a camera's name is."""
+    """The report as plain text, wrapped at 100 columns."""
     parts = [
         f"{name}: {len(rig.cameras)} cameras",
         "",
@@ -31,7 +31,7 @@ def report_text(name: str, rig: CameraRig, report: RigReport) -> str:
 
 
 def _rig_lines(rig: CameraRig, coverage: Coverage) -> list[str]:
-    header = ("camera", "image", "view", "yaw", "pitch", "roll", "x", "y", "height", "lens", "sees")
+    header = ("camera", "image", "FOV", "yaw", "pitch", "roll", "x", "y", "height", "lens", "sees")
     rows = []
     for camera in rig.cameras:
         mounting = mounting_of(camera.ego_from_camera)
@@ -64,7 +64,7 @@ def _coverage_lines(coverage: Coverage) -> list[str]:
 
 def _finding_lines(findings: Sequence[Finding]) -> list[str]:
     if not findings:
-        return ["No findings: the rig looks healthy."]
+        return ["No findings: the rig is plausible."]
     counts = {severity: sum(f.severity == severity for f in findings) for severity in SEVERITIES}
     total = ", ".join(f"{count} {severity}{'s' if count != 1 else ''}" for severity, count in counts.items() if count)
     lines = [f"Findings: {total}"]
@@ -83,13 +83,13 @@ def _finding_lines(findings: Sequence[Finding]) -> list[str]:
 
 
 def _measure_lines(report: RigReport) -> list[str]:
-    rows = [("against nuScenes", "this rig", "nuScenes", "")]
+    rows = [("compared with nuScenes", "this rig", "nuScenes", "")]
     rows += [(m.name, m.value, m.reference, "" if m.is_near else "far") for m in report.measures]
     return _table(rows, left={0, 3})
 
 
 def _table(rows: Sequence[Sequence[str]], left: set[int]) -> list[str]:
-    """Columns side by side, as wide as their widest cell; numbers to the right."""
+    """Rows as aligned columns. left: indices of the columns that are aligned to the left, all others to the right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
         "  ".join(

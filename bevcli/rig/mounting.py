@@ -1,4 +1,4 @@
-"""How a camera stands on the vehicle, in the words of whoever mounts it: height, yaw, pitch, roll, field of view."""
+"""How a camera is mounted on the vehicle: position, yaw, pitch, roll, field of view, and its horizon."""
 
 from __future__ import annotations
 
@@ -9,17 +9,19 @@ import numpy as np
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array
 
-FRONT_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # ego axes of a camera looking ahead
 _STEP_DEG = 0.1
 _ANGLES = np.radians(np.arange(-90 + _STEP_DEG / 2, 90, _STEP_DEG))
 
 
 @dataclass(frozen=True)
 class Mounting:
-    """position: (3,) metres in ego. Angles in degrees.
+    """Position and angles of a camera in the ego frame.
 
-    yaw_deg: counter-clockwise from straight ahead. pitch_deg: up is positive. roll_deg: positive when the camera leans
-    to its right; 180 is upside down.
+    Attributes:
+        position: (3,), metres.
+        yaw_deg: viewing direction, counter-clockwise from straight ahead.
+        pitch_deg: positive upwards.
+        roll_deg: positive when the camera leans to its right; 180 is upside down.
     """
 
     position: Array
@@ -29,12 +31,12 @@ class Mounting:
 
     @property
     def height(self) -> float:
-        """Metres above the ego frame's ground."""
+        """Height above the ground plane of the ego frame, metres."""
         return float(self.position[2])
 
     @property
-    def reach(self) -> float:
-        """Metres from the ego frame's origin, seen from above."""
+    def horizontal_distance(self) -> float:
+        """Distance from the ego origin on the ground plane, metres."""
         return float(np.hypot(self.position[0], self.position[1]))
 
 
@@ -50,21 +52,24 @@ def mounting_of(ego_from_camera: Array) -> Mounting:
 
 
 def degrees_text(angle_deg: float, digits: int = 1) -> str:
-    """As "0.4°", never "-0.0°"."""
+    """An angle as text, such as "0.4°"; zero has no sign."""
     return f"{round(angle_deg, digits) + 0.0:.{digits}f}°"
 
 
 def seen_fov_deg(camera: Camera) -> tuple[float, float]:
-    """Degrees across the image, horizontally and vertically through the optical axis, the lens included.
+    """Horizontal and vertical field of view through the optical axis, in degrees, lens distortion included.
 
-    At most 180: nothing behind the camera's plane has an image.
+    At most 180, because points behind the camera's plane are not projected.
     """
     (left, right), (up, down) = seen_range_deg(camera, 0), seen_range_deg(camera, 1)
     return right - left, down - up
 
 
 def seen_range_deg(camera: Camera, axis: int) -> tuple[float, float]:
-    """From which to which angle to the optical axis the image reaches, degrees; axis 0 to the right, 1 downwards."""
+    """Smallest and largest angle to the optical axis that is inside the image, degrees.
+
+    axis: 0 counts angles to the right, 1 downwards. (0, 0) where no ray is inside the image.
+    """
     rays = np.zeros((len(_ANGLES), 3))
     rays[:, axis], rays[:, 2] = np.sin(_ANGLES), np.cos(_ANGLES)
     pixels, _ = camera.project(rays)
@@ -78,10 +83,10 @@ def seen_range_deg(camera: Camera, axis: int) -> tuple[float, float]:
 
 
 def horizon(camera: Camera) -> Array:
-    """(P, 2) pixels of the horizon, NaN where it is not in the image. Points far away at the camera's own height."""
+    """(P, 2) pixels of points 100 km away at the camera's own height; NaN where they are outside the image."""
     yaws = np.radians(np.arange(0, 360, 0.25))
     far = np.stack([np.cos(yaws), np.sin(yaws), np.zeros_like(yaws)], axis=-1) * 1e5
     pixels, depth = camera.project_ego(far + camera.ego_from_camera[:3, 3])
     seen = np.where(camera.contains(pixels, depth)[:, None], pixels, np.nan)
-    start = int(np.argmax(depth < 0))  # a gap, so that the line does not begin in the middle of the image
+    start = int(np.argmax(depth < 0))  # start behind the camera, so that the line is not cut inside the image
     return np.roll(seen, -start, axis=0)

@@ -1,4 +1,4 @@
-"""The recording of `project-debug`: rig, images with pillars, ground and horizon, coverage and findings."""
+"""recording.rrd of a calibration check: rig, images with pillars, ground and horizon, coverage and findings."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Array, apply
 from bevcli.recording import entities, log_static
 from bevcli.recording.camera_layout import camera_rows
-from bevcli.rig.checks import RigReport
 from bevcli.rig.coverage import Coverage
 from bevcli.rig.coverage_map import COUNT_COLORS
+from bevcli.rig.mounting import horizon
 from bevcli.rig.overlay import (
     GROUND,
     HORIZON,
@@ -30,16 +30,16 @@ from bevcli.rig.overlay import (
     pillars_in,
     visible_runs,
 )
-from bevcli.rig.pose import horizon
+from bevcli.rig.rig_report import RigReport
 
 COVERAGE, COVERAGE_ON_GROUND, FINDINGS = "coverage", f"{entities.EGO}/coverage", "findings"
-PIXELS_A_CELL = 6
+PIXELS_PER_CELL = 6
 BACKGROUND = [18, 20, 25]
 JPEG_QUALITY = 90
 
 
-def write_calibration_recording(path: Path, rig: CameraRig, report: RigReport, images: Mapping[str, Pixels]) -> None:
-    """Write the recording. images: by camera (H, W, 3) BGR, where there are any. Raises OutputError."""
+def write_rig_recording(path: Path, rig: CameraRig, report: RigReport, images: Mapping[str, Pixels]) -> None:
+    """Write the recording. images: by camera, (H, W, 3) BGR; any may be missing. Raises OutputError."""
     with rr.RecordingStream("bevcli-project-debug") as stream:
         try:
             stream.save(path, default_blueprint=_blueprint(rig))
@@ -49,12 +49,12 @@ def write_calibration_recording(path: Path, rig: CameraRig, report: RigReport, i
         _log_scene(stream, rig, report.coverage)
         for camera in rig.cameras:
             _log_camera(stream, camera, rig.ego_from_bev, images.get(camera.name))
-        stream.set_time(entities.FRAME_TIMELINE, sequence=0)  # as a run's recording has: `bevcli viz` looks for it
-        stream.log(FINDINGS, rr.TextDocument(findings_markdown(report), media_type="text/markdown"))
+        stream.set_time(entities.FRAME_TIMELINE, sequence=0)  # `bevcli viz` expects this timeline
+        stream.log(FINDINGS, rr.TextDocument(_findings_markdown(report), media_type="text/markdown"))
 
 
-def findings_markdown(report: RigReport) -> str:
-    """The findings and the rig against nuScenes', as Markdown."""
+def _findings_markdown(report: RigReport) -> str:
+    """The findings and the comparison with nuScenes, as Markdown."""
     lines = ["## Findings", ""]
     for finding in report.findings:
         where = f"`{finding.camera}` " if finding.camera else ""
@@ -64,15 +64,15 @@ def findings_markdown(report: RigReport) -> str:
         ]
         lines += [f"    - {text}" for text in (", ".join(numbers), finding.advice) if text]
     if not report.findings:
-        lines.append("None: the rig looks healthy.")
+        lines.append("None: the rig is plausible.")
     if report.measures:
-        lines += ["", "## Against nuScenes", "", "| | this rig | nuScenes |", "|---|---|---|"]
+        lines += ["", "## Comparison with nuScenes", "", "| | this rig | nuScenes |", "|---|---|---|"]
         lines += [f"| {m.name} | {m.value} | {m.reference} |" for m in report.measures]
     return "\n".join(lines)
 
 
-def coverage_image(coverage: Coverage) -> Pixels:
-    """(rows, columns, 3) RGB of how many cameras see each cell; the first row has the largest y."""
+def _coverage_image(coverage: Coverage) -> Pixels:
+    """(rows, columns, 3) RGB, the number of cameras that see each cell; the first row has the largest y."""
     colors = np.array([to_rgb(color) for color in COUNT_COLORS])
     return np.round(255 * colors[np.minimum(coverage.counts, 4)][::-1]).astype(np.uint8)
 
@@ -81,12 +81,12 @@ def _log_scene(stream: rr.RecordingStream, rig: CameraRig, coverage: Coverage) -
     points = apply(rig.ego_from_bev, PILLAR_GRID.pillars()).reshape(-1, 3)
     colors = np.tile(height_colors(PILLAR_GRID), (PILLAR_GRID.rows * PILLAR_GRID.columns, 1))
     stream.log(entities.PILLARS, rr.Points3D(points, colors=colors, radii=rr.Radius.ui_points(1.5)), static=True)
-    image = coverage_image(coverage)
-    large = np.kron(image, np.ones((PIXELS_A_CELL, PIXELS_A_CELL, 1), dtype=np.uint8))
+    image = _coverage_image(coverage)
+    large = np.kron(image, np.ones((PIXELS_PER_CELL, PIXELS_PER_CELL, 1), dtype=np.uint8))
     stream.log(COVERAGE, rr.Image(large, color_model="RGB"), static=True)
     (x0, x1), (y0, y1) = coverage.grid.x_range_m, coverage.grid.y_range_m
     corners = apply(rig.ego_from_bev, [(x0, y1, 0), (x1, y1, 0), (x1, y0, 0), (x0, y0, 0)])
-    corners[:, 2] = -0.05  # on the ground, just under the range rings
+    corners[:, 2] = -0.05  # on the ground, slightly below the range rings
     quad = rr.Mesh3D(
         vertex_positions=corners,
         triangle_indices=[(0, 1, 2), (0, 2, 3)],
@@ -120,7 +120,7 @@ def _log_camera(stream: rr.RecordingStream, camera: Camera, ego_from_bev: Array,
 
 
 def _clipped(line: Array, camera: Camera) -> list[Array]:
-    """The parts of a line (P, 2) inside the image: the viewer does not clip."""
+    """The parts of a line (P, 2) inside the image. The viewer does not clip lines."""
     size = np.array([camera.width, camera.height])
     inside = ((line >= 0) & (line <= size)).all(axis=-1, keepdims=True)
     return visible_runs(np.where(inside, line, np.nan))
