@@ -86,13 +86,13 @@ def explain(
 
 
 def parse_cell(text: str) -> tuple[float, float]:
-    """ "X,Y" -> x, y in metres. Raises InputError."""
-    from bevcli.errors import InputError
-
+    """ "X,Y" -> x, y in metres. Raises click's usage error."""
     try:
         x, y = (float(part) for part in text.split(","))
     except ValueError:
-        raise InputError(f'--cell "{text}": expected two numbers X,Y in metres, such as -7.5,13.5') from None
+        raise typer.BadParameter(
+            f'"{text}": expected two numbers X,Y in metres, such as -7.5,13.5', param_hint="--cell"
+        ) from None
     return x, y
 
 

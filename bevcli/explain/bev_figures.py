@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
 
 from bevcli.explain.drawing import (
@@ -38,7 +39,7 @@ def bev_queries(trace: Trace) -> Figure:
         f"{grid.rows} × {grid.columns} cells of {size_x:.3g} m × {size_y:.3g} m, {channels} channels each. "
         "The square marks the followed cell.\nThe queries are the same in every frame, except for the can-bus "
         "embedding that is added to all of them.",
-        inches=1.6,
+        heading_inches=1.6,
     )
     spec = figure.add_gridspec(1, 3, wspace=0.14, bottom=0.08)
     axes = figure.add_subplot(spec[0])
@@ -74,7 +75,7 @@ def temporal_attention(trace: Trace) -> Figure:
         f"The vehicle turned by {rotation:+.1f}° (+ is counter-clockwise) and moved by {shift[0]:+.2f} m in x and "
         f"{shift[1]:+.2f} m in y since the previous frame.\nColours: PCA of the BEV features. Outlines: boxes "
         "predicted in the current frame; dashed: boxes predicted in the previous frame.",
-        inches=1.6,
+        heading_inches=1.6,
     )
     spec = figure.add_gridspec(1, 4, wspace=0.1, left=0.04, right=0.955, bottom=0.06)
     panels = [figure.add_subplot(spec[i]) for i in range(4)]
@@ -99,7 +100,7 @@ def temporal_attention(trace: Trace) -> Figure:
     image = show_bev(panels[3], trace, weight, cmap="RdBu_r", vmin=0, vmax=1)
     outline_boxes(panels[3], confident(now.boxes), INK, width=1.2)
     bounds = panels[3].get_position()
-    bar = figure.colorbar(image, cax=figure.add_axes((0.963, bounds.y0 + 0.12, 0.009, 0.44)), ticks=(0, 0.5, 1))  # type: ignore[arg-type]
+    bar = figure.colorbar(image, cax=figure.add_axes((0.963, bounds.y0 + 0.12, 0.009, 0.44)), ticks=(0, 0.5, 1))
     bar.ax.set_yticklabels(["0 current", "0.5", "1 history"], fontsize=9, color=GREY, rotation=90, va="center")
     return figure
 
@@ -117,7 +118,7 @@ def encoder_layers(trace: Trace) -> Figure:
         "The encoder: empty queries become a map of the surroundings",
         "Top: BEV features as colours (PCA). Bottom: cosine similarity of each cell to the followed cell (square).\n"
         "Outlines: boxes that the decoder predicts from the last map.",
-        inches=1.55,
+        heading_inches=1.55,
     )
     spec = figure.add_gridspec(2, len(maps), wspace=0.06, hspace=0.16, left=0.05, right=0.95, bottom=0.06)
     for column, (features, image, title) in enumerate(zip(maps, colors, titles, strict=True)):
@@ -133,7 +134,7 @@ def encoder_layers(trace: Trace) -> Figure:
                 outline_boxes(axes, boxes, INK, width=1.0, halo=axes is top)
                 axes.set_ylabel("")
                 axes.set_yticklabels([])
-    bar = figure.colorbar(shown, cax=figure.add_axes((0.958, 0.12, 0.01, 0.24)), ticks=(-1, 0, 1))  # type: ignore[arg-type]
+    bar = figure.colorbar(shown, cax=figure.add_axes((0.958, 0.12, 0.01, 0.24)), ticks=(-1, 0, 1))
     bar.ax.tick_params(labelsize=10, colors=GREY)
     return figure
 
@@ -148,7 +149,7 @@ def recurrence(trace: Trace) -> Figure:
         "The recurrence: each BEV map is the history of the next frame",
         "Top: the front camera. Bottom: BEV features as colours (PCA), with the predicted boxes.\n"
         "The state between two frames is the last BEV map and the pose of the vehicle; nothing else is kept.",
-        inches=1.6,
+        heading_inches=1.6,
     )
     spec = figure.add_gridspec(
         2, len(recent), height_ratios=(0.6, 1), wspace=0.1, hspace=0.16, left=0.04, right=0.985, bottom=0.06
@@ -166,9 +167,13 @@ def recurrence(trace: Trace) -> Figure:
             axes.set_ylabel("")
             axes.set_yticklabels([])
             axes.annotate(
-                "", (0.0, 0.5), xytext=(-0.13, 0.5), xycoords="axes fraction", zorder=30,
-                arrowprops={"arrowstyle": "simple,head_width=1.1,head_length=0.8,tail_width=0.5", "fc": ACCENT, "ec": "white"},
-            )  # fmt: skip
+                "",
+                (0.0, 0.5),
+                xytext=(-0.13, 0.5),
+                xycoords="axes fraction",
+                zorder=30,
+                arrowprops={"arrowstyle": "simple,head_width=1.1,head_length=0.8", "fc": ACCENT, "ec": "white"},
+            )
     return figure
 
 
@@ -187,15 +192,20 @@ def _draw_grid_lines(axes: Axes, trace: Trace) -> None:
     axes.add_patch(Rectangle((grid.x_range_m[0], y - size_y / 2), wide, size_y, fc=SECOND, alpha=0.28, zorder=2))
     axes.add_patch(Rectangle((x - size_x / 2, grid.y_range_m[0]), size_x, high, fc=ACCENT, alpha=0.28, zorder=2))
     mark_cell(axes, trace, least_m=1.5)
-    style = {"fontsize": 11, "fontweight": "bold", "zorder": 12}
-    box = {"boxstyle": "round,pad=0.2", "fc": "white", "ec": "none", "alpha": 0.9}
-    axes.text(grid.x_range_m[1] - 0.02 * wide, y, f"row {trace.cell[0]}", color=SECOND, ha="right", va="center", bbox=box, **style)  # type: ignore[arg-type]
-    axes.text(x, grid.y_range_m[0] + 0.04 * high, f"column {trace.cell[1]}", color=ACCENT, ha="center", bbox=box, **style)  # type: ignore[arg-type]
+    right, bottom = grid.x_range_m[1] - 0.02 * wide, grid.y_range_m[0] + 0.04 * high
+    labels = (
+        (right, y, f"row {trace.cell[0]}", SECOND, "right"),
+        (x, bottom, f"column {trace.cell[1]}", ACCENT, "center"),
+    )
+    for label_x, label_y, text, color, align in labels:
+        label = axes.text(label_x, label_y, text, color=color, ha=align, va="center", fontsize=11, fontweight="bold")
+        label.set_bbox({"boxstyle": "round,pad=0.2", "fc": "white", "ec": "none", "alpha": 0.9})
+        label.set_zorder(12)
 
 
-def _inner_bar(axes: Axes, image: object, ticks: tuple[float, ...]) -> None:
+def _inner_bar(axes: Axes, image: AxesImage, ticks: tuple[float, ...]) -> None:
     inset = axes.inset_axes((0.05, 0.05, 0.35, 0.035), zorder=15)
-    bar = axes.figure.colorbar(image, cax=inset, orientation="horizontal", ticks=ticks)  # type: ignore[arg-type]
+    bar = axes.figure.colorbar(image, cax=inset, orientation="horizontal", ticks=ticks)
     bar.ax.xaxis.set_ticks_position("top")
     bar.ax.tick_params(labelsize=10, colors=INK, length=2)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -41,7 +42,7 @@ def image_features(trace: Trace) -> Figure:
         "Image features: what the backbone and the neck make of the images",
         "Top: the images. Below: the length of the feature vector at each position, one row per feature level.\n"
         "Each of these positions becomes one token that BEV cells can sample.",
-        inches=1.45,
+        heading_inches=1.45,
     )
     grid = figure.add_gridspec(rows, len(names), wspace=0.04, hspace=0.22, left=0.06, right=0.99, bottom=0.02)
     width, height = trace.config.image.padded_size
@@ -75,7 +76,7 @@ def pillars(trace: Trace) -> Figure:
         "Pillars and 3D reference points: from a BEV cell into the cameras",
         f"A pillar of {len(heights)} points stands on each BEV cell. Its points are projected into every camera with "
         "the calibration.\nThe cell attends in a camera only if at least one of its points is visible there.",
-        inches=1.5,
+        heading_inches=1.5,
     )
     grid = figure.add_gridspec(2, 2, width_ratios=(1, 1.1), wspace=0.09, hspace=0.12, bottom=0.03, left=0.012)
     for place in range(2):
@@ -112,7 +113,7 @@ def spatial_attention(trace: Trace) -> Figure:
         f"Cell at x = {x:.1f} m, y = {y:.1f} m, last encoder layer, all heads and feature levels. Crosses: projected "
         "pillar points.\nDots: learned sampling points around them; larger and brighter dots have a larger attention "
         "weight.",
-        inches=1.55,
+        heading_inches=1.55,
     )
     grid = figure.add_gridspec(rows, 2, wspace=0.03, hspace=0.14, bottom=0.02, left=0.012, right=0.935)
     if not cameras:
@@ -130,7 +131,7 @@ def spatial_attention(trace: Trace) -> Figure:
         dots = _draw_samples(zoomed, trace, name, samples[name], largest, size=160)
         zoomed.set_xlim(window[0], window[0] + window[2])
         zoomed.set_ylim(window[1] + window[3], window[1])
-    bar = figure.colorbar(dots, cax=figure.add_axes((0.944, 0.08, 0.011, 0.6)))  # type: ignore[arg-type]
+    bar = figure.colorbar(dots, cax=figure.add_axes((0.944, 0.08, 0.011, 0.6)))
     bar.set_label("attention weight", fontsize=11, color=GREY)
     bar.ax.tick_params(labelsize=10, colors=GREY)
     return figure
@@ -183,7 +184,7 @@ def _draw_camera_counts(axes: Axes, trace: Trace) -> None:
         zorder=12,
         bbox={"boxstyle": "round,pad=0.25", "fc": "white", "ec": "none", "alpha": 0.85},
     )
-    bar = axes.figure.colorbar(image, ax=axes, ticks=range(colors.N), shrink=0.55, pad=0.02)  # type: ignore[arg-type]
+    bar = axes.figure.colorbar(image, ax=axes, ticks=range(colors.N), shrink=0.55, pad=0.02)
     bar.ax.tick_params(labelsize=11, colors=GREY, length=0)
 
 
@@ -203,18 +204,19 @@ def _zoom_window(trace: Trace, name: str, samples: CameraSamples) -> tuple[float
 
 def _draw_samples(
     axes: Axes, trace: Trace, name: str, samples: CameraSamples, largest: float, size: float
-) -> object:
+) -> PathCollection:
     camera = trace.frame.rig[name]
     points, weights = _inside(samples, camera.width, camera.height)
     order = np.argsort(weights)
     shares = weights[order] / largest
     own, visible = project_bev(trace.frame, camera, trace.grid.pillars()[trace.cell])
-    axes.scatter(*own[visible].T, marker="x", s=3 * size, c="white", linewidths=0.03 * size + 1.5, zorder=3)
-    axes.scatter(*own[visible].T, marker="x", s=2.4 * size, c=SECOND, linewidths=0.014 * size + 0.8, zorder=3)
-    return axes.scatter(
-        *points[order].T, s=size * (0.12 + shares), c=weights[order], cmap="viridis", vmin=0, vmax=largest,
-        edgecolors="white", linewidths=0.02 * size ** 0.8, zorder=4,
-    )  # fmt: skip
+    x, y = own[visible].T
+    axes.scatter(x, y, marker="x", s=3 * size, c="white", linewidths=0.03 * size + 1.5, zorder=3)
+    axes.scatter(x, y, marker="x", s=2.4 * size, c=SECOND, linewidths=0.014 * size + 0.8, zorder=3)
+    x, y = points[order].T
+    dots = axes.scatter(x, y, s=size * (0.12 + shares), c=weights[order], cmap="viridis", vmin=0, vmax=largest)
+    dots.set(edgecolors="white", linewidths=0.02 * size**0.8, zorder=4)
+    return dots
 
 
 def _inside(samples: CameraSamples, width: int, height: int) -> tuple[Array, Array]:

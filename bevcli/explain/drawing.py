@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.patches import Polygon, Rectangle
-from matplotlib.patheffects import Normal, Stroke
+from matplotlib.patheffects import AbstractPathEffect, Normal, Stroke
 from numpy.typing import NDArray
 
 from bevcli.explain.trace import Trace
@@ -26,16 +28,13 @@ LEAST_VISIBILITY = 0.2  # ground truth below this is not drawn
 VEHICLE_M = (4.6, 1.9)  # length and width of the drawn vehicle
 
 
-def titled_figure(height_inches: float, title: str, subtitle: str, top: float = 0.86, inches: float = 0.0) -> Figure:
-    """A figure without global state. The area above `top` holds the title and a subtitle of one or two lines.
-
-    inches: height of the title area; it replaces `top` where it is given.
-    """
+def titled_figure(height_inches: float, title: str, subtitle: str, heading_inches: float = 1.55) -> Figure:
+    """A figure without global state. Its top `heading_inches` hold the title and a subtitle of one or two lines."""
     figure = Figure(figsize=(WIDTH_INCHES, height_inches), dpi=DPI, facecolor="white")
     inch = 1 / height_inches
     figure.text(0.015, 1 - 0.16 * inch, title, fontsize=19, fontweight="bold", color=INK, va="top")
     figure.text(0.015, 1 - 0.56 * inch, subtitle, fontsize=13, color=GREY, va="top", linespacing=1.35)
-    figure.subplots_adjust(left=0.045, right=0.985, bottom=0.55 * inch, top=1 - inches * inch if inches else top)
+    figure.subplots_adjust(left=0.045, right=0.985, bottom=0.55 * inch, top=1 - heading_inches * inch)
     return figure
 
 
@@ -68,11 +67,11 @@ def vehicle_outline(frame: Frame) -> Array:
     return outline
 
 
-def show_bev(axes: Axes, trace: Trace, image: NDArray, **options: object) -> object:
+def show_bev(axes: Axes, trace: Trace, image: NDArray, **options: Any) -> AxesImage:
     """An array (Y, X) or (Y, X, 3), rows from the smallest y, over the grid's area. Returns matplotlib's image."""
     grid = trace.grid
     extent = (*grid.x_range_m, *grid.y_range_m)
-    return axes.imshow(image, extent=extent, origin="lower", interpolation="nearest", zorder=0, **options)  # type: ignore[arg-type]
+    return axes.imshow(image, extent=extent, origin="lower", interpolation="nearest", zorder=0, **options)
 
 
 def mark_cell(axes: Axes, trace: Trace, color: str = ACCENT, least_m: float = 0.0) -> None:
@@ -91,9 +90,13 @@ def outline_boxes(
     halo: a white border around the lines, for boxes on coloured maps.
     """
     corners = boxes.corners()[:, :4, :2]
-    effects = [Stroke(linewidth=width + 1.8, foreground="white", alpha=0.85), Normal()] if halo else [Normal()]
+    effects: list[AbstractPathEffect] = [Normal()]
+    if halo:
+        effects.insert(0, Stroke(linewidth=width + 1.8, foreground="white", alpha=0.85))
     for box, center in zip(corners, boxes.centers[:, :2], strict=True):
-        axes.add_patch(Polygon(box, closed=True, fc="none", ec=color, lw=width, ls=style, zorder=6, path_effects=effects))
+        outline = Polygon(box, closed=True, fc="none", ec=color, lw=width, ls=style, zorder=6)
+        outline.set_path_effects(effects)
+        axes.add_patch(outline)
         nose = (box[0] + box[3]) / 2
         axes.plot(*zip(center, nose, strict=True), color=color, lw=width, zorder=6, path_effects=effects)
 

@@ -30,7 +30,7 @@ def can_bus(trace: Trace) -> Figure:
         "Ego-motion: the 18 can-bus numbers, the shift and the rotation",
         "Left: the numbers that become one embedding, which is added to every BEV query. Bars are scaled per group.\n"
         "Right: the same motion seen from above. It gives the shift and the rotation of the history map.",
-        inches=1.5,
+        heading_inches=1.5,
     )
     spec = figure.add_gridspec(1, 2, width_ratios=(1.25, 1), wspace=0.06, left=0.015, right=0.985, bottom=0.075)
     _draw_numbers(figure.add_subplot(spec[0]), trace)
@@ -81,9 +81,19 @@ def _draw_motion(axes: Axes, trace: Trace) -> None:
     axes.add_patch(Polygon(outline, fc="#fde3dc", ec=ACCENT, lw=2.2, zorder=4, alpha=0.95))
     if np.hypot(*moved) > 0.05:
         axes.annotate(
-            "", (0, 0), xytext=tuple(-moved), zorder=6,
-            arrowprops={"arrowstyle": "-|>", "lw": 2.6, "color": SECOND, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 20},
-        )  # fmt: skip
+            "",
+            (0, 0),
+            xytext=tuple(-moved),
+            zorder=6,
+            arrowprops={
+                "arrowstyle": "-|>",
+                "lw": 2.6,
+                "color": SECOND,
+                "shrinkA": 0,
+                "shrinkB": 0,
+                "mutation_scale": 20,
+            },
+        )
     cells = share * (grid.columns, grid.rows)
     lines = (
         f"shift  ({share[0]:+.4f}, {share[1]:+.4f}) of the map\n"
@@ -93,9 +103,16 @@ def _draw_motion(axes: Axes, trace: Trace) -> None:
     if trace.prediction.started_anew:
         lines = f"no history ({trace.prediction.started_anew}):\nno shift, no rotation"
     axes.text(
-        0.03, 0.03, lines, transform=axes.transAxes, fontsize=12, color=INK, zorder=9, linespacing=1.5,
+        0.03,
+        0.03,
+        lines,
+        transform=axes.transAxes,
+        fontsize=12,
+        color=INK,
+        zorder=9,
+        linespacing=1.5,
         bbox={"boxstyle": "round,pad=0.45", "fc": "white", "ec": FAINT},
-    )  # fmt: skip
+    )
     axes.set_title("Vehicle: previous frame dashed, current frame solid", fontsize=13, color=INK, loc="left", pad=7)
     axes.tick_params(labelsize=10, colors=GREY, length=3)
     axes.set_xlabel("x, m (bev frame)", fontsize=11, color=GREY)

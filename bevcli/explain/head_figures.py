@@ -52,7 +52,7 @@ def decoder(trace: Trace) -> Figure:
         f"{points.shape[1]} object queries, {len(points) - 1} layers. Left: every query starts at a learned place; "
         f"the {len(chosen)} queries with a final score of at least {LEAST_SCORE:g}\nare coloured, the others grey. "
         "Right: the boxes of these queries.",
-        inches=1.55,
+        heading_inches=1.55,
     )
     spec = figure.add_gridspec(1, 2, wspace=0.1, bottom=0.075)
     axes = figure.add_subplot(spec[0])
@@ -76,7 +76,7 @@ def box_code(trace: Trace) -> Figure:
         "Box code: ten numbers per object query",
         f"Query {query}, class {name}. Left: its code after each decoder layer, and what the last one means.\n"
         "Right: its box after each layer (dotted to solid) and its reference point at the start (cross).",
-        inches=1.5,
+        heading_inches=1.5,
     )
     spec = figure.add_gridspec(1, 2, width_ratios=(1.75, 1), wspace=0.09, left=0.015, right=0.985, bottom=0.085)
     axes = figure.add_subplot(spec[0])
@@ -122,7 +122,7 @@ def segmentation(trace: Trace) -> Figure:
         "Segmentation head: each query paints one mask on the BEV grid",
         "Top: mask probability times class probability of the three stuff queries, and the maximum over the "
         f"{len(masks) - len(stuff)} vehicle queries.\nBottom: the merged map of the model, and the ground truth.",
-        inches=1.6,
+        heading_inches=1.6,
     )
     spec = figure.add_gridspec(1, 4, wspace=0.1, left=0.045, right=0.94, top=0.805, bottom=0.52)
     for column, (name, share) in enumerate(zip((*stuff, "vehicle"), shares, strict=True)):
@@ -133,7 +133,7 @@ def segmentation(trace: Trace) -> Figure:
         if column:
             axes.set_ylabel("")
             axes.set_yticklabels([])
-    bar = figure.colorbar(image, cax=figure.add_axes((0.95, 0.55, 0.01, 0.22)), ticks=(0, 0.5, 1))  # type: ignore[arg-type]
+    bar = figure.colorbar(image, cax=figure.add_axes((0.95, 0.55, 0.01, 0.22)), ticks=(0, 0.5, 1))
     bar.ax.tick_params(labelsize=10, colors=GREY)
     lower = figure.add_gridspec(1, 3, wspace=0.1, left=0.045, right=1.06, top=0.445, bottom=0.06)
     shown: list[tuple[str, BevMap | None]] = [
@@ -177,9 +177,19 @@ def _draw_paths(axes: Axes, points: Array, chosen: np.ndarray) -> None:
         lines = np.stack([points[layer, chosen], points[layer + 1, chosen]], axis=1)
         color = (*np.array([228, 87, 46]) / 255, float(shades[layer]))
         axes.add_collection(LineCollection(list(lines), colors=[color], linewidths=2.0, zorder=4))
-        axes.plot(*points[layer + 1, chosen].T, "o", color=color, ms=4.5 if layer < layers - 1 else 7, zorder=5,
-                  mec="white" if layer == layers - 1 else "none", mew=0.8, label=f"after layer {layer + 1}")  # fmt: skip
-    axes.plot(*points[0, chosen].T, "o", mfc="white", mec=INK, ms=6, mew=1.3, zorder=4, label="its start, if chosen")
+        axes.plot(
+            *points[layer + 1, chosen].T,
+            "o",
+            color=color,
+            ms=4.5 if layer < layers - 1 else 7,
+            zorder=5,
+            mec="white" if layer == layers - 1 else "none",
+            mew=0.8,
+            label=f"after layer {layer + 1}",
+        )
+    axes.plot(
+        *points[0, chosen].T, "o", mfc="white", mec=INK, ms=6, mew=1.3, zorder=4, label="start of a coloured query"
+    )
     axes.legend(fontsize=10.5, loc="lower right", framealpha=0.95).set_zorder(20)
 
 
@@ -196,9 +206,13 @@ def _draw_boxes(axes: Axes, trace: Trace) -> None:
     for center, velocity in zip(boxes.centers[:, :2], boxes.velocities, strict=True):
         if np.hypot(*velocity) > 0.5:
             axes.annotate(
-                "", tuple(center + velocity), xytext=tuple(center), zorder=9, annotation_clip=True,
+                "",
+                tuple(center + velocity),
+                xytext=tuple(center),
+                zorder=9,
+                annotation_clip=True,
                 arrowprops={"arrowstyle": "-|>", "color": SECOND, "lw": 1.6, "shrinkA": 0, "shrinkB": 0},
-            )  # fmt: skip
+            )
     _label_boxes(axes, boxes, trace.grid)
     axes.legend(handles=handles, fontsize=11, loc="lower right", framealpha=0.95).set_zorder(20)
 
@@ -214,9 +228,15 @@ def _label_boxes(axes: Axes, boxes: Boxes3D, grid: BevGrid) -> None:
             continue
         labelled.append(place)
         axes.text(
-            *place, f"{name.replace('_', ' ')} {score:.2f}", fontsize=9, color=INK, zorder=10, clip_on=True,
+            place[0],
+            place[1],
+            f"{name.replace('_', ' ')} {score:.2f}",
+            fontsize=9,
+            color=INK,
+            zorder=10,
+            clip_on=True,
             bbox={"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.7},
-        )  # fmt: skip
+        )
 
 
 def _query_at_cell(trace: Trace, codes: Array, scores: Array) -> int:
@@ -257,14 +277,23 @@ def _draw_code_table(axes: Axes, codes: Array, scores: Array, name: str) -> None
             axes.add_patch(Rectangle((0, row - 0.5), 10, 1, fc="#f5f6f8", ec="none"))
         axes.text(0.15, row, code_name, fontsize=12.5, color=INK, va="center", fontweight="bold")
         for x, layer in zip(columns, shown, strict=True):
-            axes.text(x, row, f"{codes[layer, row]:+.2f}", ha="right", va="center", fontsize=12, family="monospace",
-                      color=ACCENT if layer == layers - 1 else INK)  # fmt: skip
+            axes.text(
+                x,
+                row,
+                f"{codes[layer, row]:+.2f}",
+                ha="right",
+                va="center",
+                fontsize=12,
+                family="monospace",
+                color=ACCENT if layer == layers - 1 else INK,
+            )
         axes.text(meaning_x, row, meaning, fontsize=12, color=INK, va="center")
     axes.plot([0, 10], [9.75, 9.75], color=FAINT)
     axes.text(0.15, 10.4, "score", fontsize=12.5, color=INK, va="center", fontweight="bold")
     for x, layer in zip(columns, shown, strict=True):
-        axes.text(x, 10.4, f"{scores[layer]:.2f}", ha="right", va="center", fontsize=12, family="monospace",
-                  color=THIRD)  # fmt: skip
+        axes.text(
+            x, 10.4, f"{scores[layer]:.2f}", ha="right", va="center", fontsize=12, family="monospace", color=THIRD
+        )
     axes.text(meaning_x, 10.4, f"sigmoid of the logit of class {name}", fontsize=12, color=INK, va="center")
 
 

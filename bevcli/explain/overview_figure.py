@@ -27,6 +27,7 @@ from bevcli.explain.trace import Trace
 
 HEIGHT = 7.7  # inches
 MOST_CAMERAS = 6
+BLOCK = "#e3eefb"  # fill of a learned part
 
 
 def overview(trace: Trace) -> Figure:
@@ -36,7 +37,7 @@ def overview(trace: Trace) -> Figure:
         "BEVFormer: one frame through the model",
         f"Model {trace.config.name}, frame {trace.frame.stamp.index}. Blue: learned parts of the model. "
         "Orange: the recurrent state.",
-        inches=1.0,
+        heading_inches=1.0,
     )
     canvas = figure.add_axes((0, 0, 1, 1), zorder=0)
     canvas.set_xlim(0, 1)
@@ -121,11 +122,18 @@ def _flow(canvas: Axes, trace: Trace) -> None:
         canvas.text(0.485, 0.2, "no history in\nthis frame", fontsize=11.5, color=ACCENT, va="center", ha="center")
     canvas.add_patch(
         FancyArrowPatch(
-            (0.715, 0.285), (0.542, 0.135), connectionstyle="arc3,rad=-0.35", arrowstyle="-|>", mutation_scale=18,
-            lw=2.2, color=ACCENT, ls="--",
+            (0.715, 0.285),
+            (0.542, 0.135),
+            connectionstyle="arc3,rad=-0.35",
+            arrowstyle="-|>",
+            mutation_scale=18,
+            lw=2.2,
+            color=ACCENT,
+            ls="--",
         )
-    )  # fmt: skip
-    canvas.text(0.63, 0.075, "the state: BEV map and pose,\nkept for the next frame", fontsize=11.5, color=ACCENT, va="top")
+    )
+    state = "the state: BEV map and pose,\nkept for the next frame"
+    canvas.text(0.63, 0.075, state, fontsize=11.5, color=ACCENT, va="top")
     _block(canvas, (0.778, 0.63, 0.082, 0.115), "Object\ndecoder", 11.5)
     _arrow(canvas, (0.745, 0.615), (0.776, 0.685))
     _arrow(canvas, (0.861, 0.685), (0.873, 0.685))
@@ -135,14 +143,14 @@ def _flow(canvas: Axes, trace: Trace) -> None:
         _arrow(canvas, (0.864, 0.22), (0.873, 0.22))
 
 
-def _block(
-    canvas: Axes, place: tuple[float, float, float, float], text: str, size: float = 12.5
-) -> None:
+def _block(canvas: Axes, place: tuple[float, float, float, float], text: str, size: float = 12.5) -> None:
     x, y, width, height = place
     canvas.add_patch(
-        FancyBboxPatch((x, y), width, height, boxstyle="round,pad=0,rounding_size=0.012", fc="#e3eefb", ec=SECOND, lw=1.6)
+        FancyBboxPatch((x, y), width, height, boxstyle="round,pad=0,rounding_size=0.012", fc=BLOCK, ec=SECOND, lw=1.6)
     )
-    canvas.text(x + width / 2, y + height / 2, text, ha="center", va="center", fontsize=size, color=INK, linespacing=1.4)
+    canvas.text(
+        x + width / 2, y + height / 2, text, ha="center", va="center", fontsize=size, color=INK, linespacing=1.4
+    )
 
 
 def _arrow(canvas: Axes, start: tuple[float, float], end: tuple[float, float], color: str = GREY) -> None:

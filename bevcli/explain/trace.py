@@ -15,6 +15,7 @@ from bevcli.frame import Frame, Prediction, Sequence
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.model.bevformer import BEVFormer, BEVFormerConfig, BEVFormerInputs, BEVFormerOutputs
+from bevcli.model.pillar_projection import project_pillars
 from bevcli.pipeline.model_inputs import model_inputs
 from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
 from bevcli.pipeline.runner import BevState, Runner, StepOptions
@@ -175,9 +176,16 @@ def _traced_step(
         layer_maps=tuple(outputs[layer][0] for layer in model.encoder.layers),
         aligned_history=aligned,
         first_reference_points=model.decoder.reference_points(position).sigmoid(),
-        visible=model.project_pillars(inputs).visible[0],
+        visible=_visible_points(inputs, config),
         cell=cell,
     )
+
+
+def _visible_points(inputs: BEVFormerInputs, config: BEVFormerConfig) -> Tensor:
+    """(N, Y·X, Z) bool, which pillar points each camera sees."""
+    points = torch.as_tensor(config.bev_grid.pillars(), dtype=torch.float32, device=inputs.images.device)
+    height, width = inputs.images.shape[-2:]
+    return project_pillars(inputs.image_from_bev, points.flatten(0, 1), (height, width), inputs.has_image).visible[0]
 
 
 @contextmanager

@@ -10,11 +10,11 @@ import pytest
 from nuscenes_tables import CAMERAS, SAMPLE_US, Size, ego_x, sample_time, scene_name, write_tables
 
 from bevcli.errors import InputError
+from bevcli.sequences.nuscenes import cache as nuscenes_cache
+from bevcli.sequences.nuscenes import json_tables as nuscenes_json
 from bevcli.sequences.nuscenes.build import build_index
 from bevcli.sequences.nuscenes.can_bus import read_can_bus
 from bevcli.sequences.nuscenes.scenes import NuScenesChoice, NuScenesSequence
-from bevcli.sequences.nuscenes import cache as nuscenes_cache
-from bevcli.sequences.nuscenes import json_tables as nuscenes_json
 from bevcli.sequences.nuscenes.splits import MINI_TRAIN, MINI_VAL, TEST, VAL, numbers, split_of
 
 SMALL = Size(scenes=3, samples=4, objects=8)
