@@ -50,7 +50,7 @@ def bev_queries(trace: Trace) -> Figure:
     show_bev(axes, trace, feature_colors([trace.cell_map(trace.bev_embedding)])[0])
     mark_cell(axes, trace, least_m=1.5)
     axes = figure.add_subplot(spec[2])
-    bev_axes(axes, trace, "Similarity of position embeddings to the cell's")
+    bev_axes(axes, trace, "Similarity of position embeddings")
     similarity = cosine_to(trace.cell_map(trace.position), trace.cell)
     image = show_bev(axes, trace, similarity, cmap="RdBu_r", vmin=-1, vmax=1)
     mark_cell(axes, trace, least_m=1.5)
@@ -157,7 +157,7 @@ def recurrence(trace: Trace) -> Figure:
     for column, ((frame, prediction), image) in enumerate(zip(recent, colors, strict=True)):
         seconds = (frame.stamp.timestamp_ns - trace.frame.stamp.timestamp_ns) / 1e9
         show_camera(
-            figure.add_subplot(spec[0, column]), frame, front, f"frame {frame.stamp.index}   t = {seconds:+.1f} s"
+            figure.add_subplot(spec[0, column]), frame, front, f"frame {frame.stamp.index}   t = {seconds:.1f} s"
         )
         axes = figure.add_subplot(spec[1, column])
         bev_axes(axes, trace, "")

@@ -55,7 +55,7 @@ def _draw_numbers(axes: Axes, trace: Trace) -> None:
         for offset, value in enumerate(group):
             row = start + offset
             axes.text(0.15, row, f"{row}", fontsize=10.5, color=GREY, va="center")
-            axes.text(6.1, row, f"{value:.3f}", fontsize=12, color=INK, ha="right", va="center", family="monospace")
+            axes.text(6.1, row, f"{round(float(value), 3) + 0.0:.3f}", fontsize=12, color=INK, ha="right", va="center", family="monospace")
             axes.text(6.25, row, unit, fontsize=11, color=GREY, va="center")
             width = 1.25 * float(value) / largest
             axes.add_patch(Rectangle((8.5, row - 0.3), width, 0.6, fc=COLORS[place], ec="none", alpha=0.85))
@@ -77,7 +77,7 @@ def _draw_motion(axes: Axes, trace: Trace) -> None:
     axes.set_ylim(-moved[1] / 2 - reach * 1.08, -moved[1] / 2 + reach * 1.08)
     axes.set_aspect("equal")
     _draw_cells(axes, trace)
-    axes.add_patch(Polygon(before, fc="white", ec=GREY, lw=1.6, ls="--", zorder=3, alpha=0.9))
+    axes.add_patch(Polygon(before, fc="none", ec=GREY, lw=1.8, ls="--", zorder=5))
     axes.add_patch(Polygon(outline, fc="#fde3dc", ec=ACCENT, lw=2.2, zorder=4, alpha=0.95))
     if np.hypot(*moved) > 0.05:
         axes.annotate(
