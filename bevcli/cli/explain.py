@@ -45,7 +45,9 @@ def explain(
             show_default=False,
         ),
     ] = None,
-    untrained: Annotated[bool, typer.Option("--untrained", help="Use random weights.")] = False,
+    untrained: Annotated[
+        bool, typer.Option("--untrained", help="Use random weights; every figure is labelled UNTRAINED.")
+    ] = False,
     device: Annotated[
         Literal["auto", "cpu", "cuda"], typer.Option(help="auto takes a GPU where there is one.")
     ] = "auto",
@@ -78,10 +80,10 @@ def explain(
     place = place_of_frame(frame, [stamp.index for stamp in drive.stamps])
     traced = trace(loaded.model, choose_device(device), drive, place, followed)
     if loaded.untrained:
-        typer.echo("note: the weights are UNTRAINED (random): the figures show the data flow only", err=True)
+        typer.echo("note: the weights are UNTRAINED (random): the figures only show how data flows", err=True)
     x, y = traced.cell_center
     typer.echo(f"frame {traced.frame.stamp.index}, BEV cell at x {x:.2f} m, y {y:.2f} m (bev frame)")
-    for figure in write_figures(traced, out, image_format):
+    for figure in write_figures(traced, out, image_format, untrained=loaded.untrained):
         typer.echo(f"{figure.step}: left out, {figure.left_out}" if figure.path is None else str(figure.path))
 
 

@@ -55,7 +55,16 @@ def _draw_numbers(axes: Axes, trace: Trace) -> None:
         for offset, value in enumerate(group):
             row = start + offset
             axes.text(0.15, row, f"{row}", fontsize=10.5, color=GREY, va="center")
-            axes.text(6.1, row, f"{round(float(value), 3) + 0.0:.3f}", fontsize=12, color=INK, ha="right", va="center", family="monospace")
+            axes.text(
+                6.1,
+                row,
+                f"{round(float(value), 3) + 0.0:.3f}",
+                fontsize=12,
+                color=INK,
+                ha="right",
+                va="center",
+                family="monospace",
+            )
             axes.text(6.25, row, unit, fontsize=11, color=GREY, va="center")
             width = 1.25 * float(value) / largest
             axes.add_patch(Rectangle((8.5, row - 0.3), width, 0.6, fc=COLORS[place], ec="none", alpha=0.85))

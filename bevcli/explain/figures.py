@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from bevcli.errors import OutputError
 from bevcli.explain.bev_figures import bev_queries, encoder_layers, recurrence, temporal_attention
 from bevcli.explain.camera_figures import image_features, pillars, spatial_attention
+from bevcli.explain.drawing import ACCENT
 from bevcli.explain.ego_motion_figure import can_bus
 from bevcli.explain.head_figures import box_code, decoder, segmentation
 from bevcli.explain.overview_figure import overview
@@ -51,9 +52,12 @@ class FigureFile:
     left_out: str = ""
 
 
-def write_figures(trace: Trace, folder: Path, image_format: ImageFormat = "png") -> Iterator[FigureFile]:
+def write_figures(
+    trace: Trace, folder: Path, image_format: ImageFormat = "png", *, untrained: bool = False
+) -> Iterator[FigureFile]:
     """Writes `bevformer-STEP.png` (or .jpg) per step into a folder, which is created; yields each file when written.
 
+    untrained: whether the weights are random; then every figure is labelled UNTRAINED.
     Files of the same name are overwritten. Raises OutputError when the folder or a file cannot be written.
     """
     try:
@@ -66,7 +70,10 @@ def write_figures(trace: Trace, folder: Path, image_format: ImageFormat = "png")
             yield FigureFile(step, None, reason)
             continue
         path = folder / f"bevformer-{step}.{image_format}"
-        _save(draw(trace), path, image_format)
+        figure = draw(trace)
+        if untrained:
+            figure.text(0.985, 0.985, "UNTRAINED", color=ACCENT, fontsize=17, fontweight="bold", ha="right", va="top")
+        _save(figure, path, image_format)
         yield FigureFile(step, path)
 
 

@@ -92,6 +92,17 @@ def test_the_first_frame_of_a_scene_has_no_figures_of_history(mini_model, tmp_pa
     assert left_out == HISTORY_FIGURES | {"segmentation"}
 
 
+def test_figures_of_random_weights_are_labelled(mini_model, tmp_path):
+    traced = trace(mini_model, CPU, MemorySequence(1), 0, None)
+    corners = []
+    for untrained in (False, True):
+        written = list(write_figures(traced, tmp_path, untrained=untrained))
+        images = [cv2.imread(str(file.path)) for file in written if file.path is not None]
+        corners.append([(image[:40, -250:] < 250).any() for image in images])
+    assert not any(corners[0])
+    assert all(corners[1])
+
+
 def test_a_cell_that_no_camera_sees_still_gives_figures(mini_model, tmp_path):
     traced = trace(mini_model, CPU, MemorySequence(2, make_rig({"FRONT": 0.0})), 1, (0.0, -20.0))
     assert not traced.visible[:, traced.cell_index].any()
