@@ -17,6 +17,7 @@ from bevcli.cli.bench import bench
 from bevcli.cli.convert import convert
 from bevcli.cli.demo import demo
 from bevcli.cli.eval import evaluate
+from bevcli.cli.explain import explain
 from bevcli.cli.export import export
 from bevcli.cli.project_debug import project_debug
 from bevcli.cli.render import render
@@ -55,6 +56,7 @@ app.command()(bench)
 app.command()(convert)
 app.command()(demo)
 app.command("eval")(evaluate)
+app.command()(explain)
 app.command()(export)
 app.command()(project_debug)
 app.command()(render)
