@@ -59,7 +59,7 @@ class StepOptions:
 
 
 class Runner:
-    """Runs a model on a device, step by step. It keeps nothing between frames: the state is an argument and a result."""
+    """Runs a model on a device, step by step. The state is an argument and a result; the runner keeps none."""
 
     def __init__(self, model: BEVFormer, device: torch.device, options: StepOptions | None = None) -> None:
         self.model = model.to(device).eval()
