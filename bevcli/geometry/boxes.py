@@ -25,7 +25,9 @@ class Boxes3D:
     centers: (N, 3) box middles, metres. sizes_lwh: (N, 3) length, width, height, metres.
     yaws: (N,) radians, counter-clockwise about z, 0 along x. velocities: (N, 2) m/s along x and y, NaN unknown.
     classes: (N,) names. Optional, None where unknown for all: scores (N,) 0 to 1; attributes (N,) nuScenes
-    names, "" for none; instances (N,) identities over time; visibilities (N,) 0 to 1, NaN unknown;
+    names, "" for none; instances (N,) identities over time, "" for none; track_scores (N,) 0 to 1, of the track that a
+    box belongs to, NaN without one; duplicates (N,) bool, whether a better box lies on the same object;
+    visibilities (N,) 0 to 1, NaN unknown;
     num_points (N,) int, 0: not to be scored, -1 unknown.
     """
 
@@ -37,6 +39,8 @@ class Boxes3D:
     scores: Array | None = None
     attributes: NDArray[np.str_] | None = None
     instances: NDArray[np.str_] | None = None
+    track_scores: Array | None = None
+    duplicates: NDArray[np.bool_] | None = None
     visibilities: Array | None = None
     num_points: NDArray[np.int64] | None = None
 
