@@ -26,14 +26,14 @@ class Gates:
         other: for classes that are not listed.
     """
 
-    car: float = 4.0
-    truck: float = 4.0
+    car: float = 3.0
+    truck: float = 3.0
     construction_vehicle: float = 4.0
-    bus: float = 5.5
+    bus: float = 5.0
     trailer: float = 4.0
     barrier: float = 1.0
     motorcycle: float = 4.0
-    bicycle: float = 3.0
+    bicycle: float = 2.5
     pedestrian: float = 2.0
     traffic_cone: float = 1.0
     other: float = 4.0
@@ -64,11 +64,11 @@ class TrackerConfig:
         gates_m: the largest distance of a match, by class.
     """
 
-    birth_score: float = 0.1
-    keep_score: float = 0.05
+    birth_score: float = 0.2
+    keep_score: float = 0.1
     confirm_frames: int = 2
     coast_s: float = 1.5
-    duplicate_widths: float = 0.8
+    duplicate_widths: float = 1.0
     use_velocity: bool = True
     gates_m: Gates = field(default_factory=Gates)
 
