@@ -67,6 +67,12 @@ def run(
         bool,
         typer.Option("--temporal/--no-temporal", help="Use the BEV map of the previous frame.", rich_help_panel=MODEL),
     ] = True,
+    track: Annotated[
+        bool,
+        typer.Option(
+            "--track/--no-track", help="Give boxes identities over time, and write tracks.csv.", rich_help_panel=MODEL
+        ),
+    ] = True,
     camera: Annotated[
         list[str] | None,
         typer.Option(
@@ -152,7 +158,7 @@ def run(
     """Run BEVFormer on SEQUENCE, frame by frame, and write boxes and a recording.
 
     The output folder gets recording.rrd (open it with `bevcli viz`), predictions.json (all boxes of all frames),
-    summary.json and, for models with a segmentation head, segmentation/.
+    tracks.csv (one row a box with its track), summary.json and, for models with a segmentation head, segmentation/.
     """
     from bevcli.cli.progress import Progress
     from bevcli.cli.run_input import FrameChoice, choose_frames, ego_motion_use
@@ -167,7 +173,7 @@ def run(
     inputs = InputOptions(motion, strict, scene, version, split, sweeps, intrinsics, extrinsics)
     drive = choose_frames(sequence, inputs, FrameChoice(frames, rate, every), loaded.config)
     out = Path("runs") / f"{drive.name}-{loaded.name}" if out is None else out
-    options = RunOptions(temporal, dict(map(parse_camera, camera or ())), recording, save_bev)
+    options = RunOptions(temporal, track, dict(map(parse_camera, camera or ())), recording, save_bev)
 
     def show(frame: Frame, prediction: Prediction) -> None:
         for warning in warnings(frame, prediction):

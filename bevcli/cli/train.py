@@ -53,13 +53,13 @@ def train(
 
     from bevcli.checkpoints import load_weights
     from bevcli.cli.progress import Progress
-    from bevcli.config import load_config, load_training
+    from bevcli.config import TRAINING, load_config, load_table
     from bevcli.model.bevformer import BEVFormer
     from bevcli.pipeline.model_loading import choose_device
     from bevcli.training.team import join_team, leave_team
     from bevcli.training.trainer import Trainer, TrainingConfig, TrainingJob
 
-    model_config, settings = load_config(config), load_training(config, TrainingConfig)
+    model_config, settings = load_config(config), load_table(config, TRAINING, TrainingConfig)
     settings = settings if steps is None else replace(settings, steps=steps)
     out = Path("runs") / f"train-{model_config.name}" if out is None else out
     drives, held_out = choose_drives(data or [], rendered, out, model_config, settings.held_out)

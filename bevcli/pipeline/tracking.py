@@ -7,13 +7,14 @@ within the class's gate. Added here: two score thresholds, scores of tracks, and
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.frame import FrameStamp
+from bevcli.frame import Frame, FrameStamp, Prediction
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
 
@@ -134,6 +135,26 @@ class TrackerState:
     tracks: Tracks
     stamp: FrameStamp
     next_number: int
+
+
+def track(
+    config: TrackerConfig, predictions: Iterable[tuple[Frame, Prediction]], state: TrackerState | None = None
+) -> Iterator[tuple[Frame, Prediction, TrackerState | None]]:
+    """Gives the boxes of a run's predictions their identities, and yields the state after each frame.
+
+    A frame without any image has no boxes and leaves the state as it is.
+    """
+    for frame, prediction in predictions:
+        if not prediction.skipped:
+            state, tracked = step(config, state, prediction.boxes_world, prediction.stamp)
+            boxes = replace(
+                prediction.boxes,
+                instances=tracked.instances,
+                track_scores=tracked.track_scores,
+                duplicates=tracked.duplicates,
+            )
+            prediction = replace(prediction, boxes=boxes)
+        yield frame, prediction, state
 
 
 def step(

@@ -211,5 +211,5 @@ def test_a_frame_without_boxes_has_the_columns_too():
 def test_parameters_that_make_no_sense_are_errors(wrong):
     with pytest.raises(ValueError):
         TrackerConfig(**wrong)
-    with pytest.raises(ValueError, match="gates_m.car must be above 0 m"):
+    with pytest.raises(ValueError, match=r"gates_m\.car must be above 0 m"):
         Gates(car=0.0)

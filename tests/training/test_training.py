@@ -11,7 +11,7 @@ from painted_drives import CONFIG, PaintedDrives
 
 from bevcli.checkpoints import load_weights
 from bevcli.cli.train import choose_drives, parse_seeds, prepare_folder
-from bevcli.config import load_config, load_training
+from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import BevcliError, ConfigError, InputError, OutputError, WeightsError
 from bevcli.model.bevformer import BEVFormer
 from bevcli.training.augmentation import AugmentationConfig
@@ -185,11 +185,11 @@ def test_the_training_table_is_read_and_the_model_does_not_mind_it(tmp_path: Pat
     file = tmp_path / "mine.toml"
     file.write_text(f"{tiny}\n[training]\nsteps = 12\n[training.clips]\nframes = 4\n")
     assert load_config(file) == load_config("tiny")
-    assert load_training(file, TrainingConfig) == TrainingConfig(steps=12, clips=ClipConfig(frames=4))
-    assert load_training("tiny", TrainingConfig) == TrainingConfig()
+    assert load_table(file, TRAINING, TrainingConfig) == TrainingConfig(steps=12, clips=ClipConfig(frames=4))
+    assert load_table("tiny", TRAINING, TrainingConfig) == TrainingConfig()
     file.write_text(f"{tiny}\n[training]\nstep = 12\n")
     with pytest.raises(ConfigError, match=r'unknown key "training.step"; did you mean "steps"'):
-        load_training(file, TrainingConfig)
+        load_table(file, TRAINING, TrainingConfig)
 
 
 def test_drives_are_asked_for_held_out_and_kept_apart(tmp_path: Path) -> None:

@@ -35,6 +35,12 @@ class ClassTracking:
     metrics: Mapping[str, float]
     levels: Mapping[str, Array]
 
+    @property
+    def best_threshold(self) -> float:
+        """The score threshold with the highest MOTA; NaN where no recall level is reached."""
+        mota = self.levels["mota"]
+        return np.nan if np.isnan(mota).all() else float(self.levels["confidence"][np.nanargmax(mota)])
+
 
 def score_class(truth: TrackedBoxes, predictions: TrackedBoxes, config: TrackingConfig) -> ClassTracking:
     """Scores the boxes of one class. Without ground truth every number is NaN."""
