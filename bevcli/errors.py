@@ -1,25 +1,25 @@
-"""The mistakes of a user that bevcli explains in one line; the command line prints it and exits 1.
+"""Errors caused by a user's mistake. The command line prints the message on one line and exits with code 1.
 
-A message names what, where, expected, found and the next step:
+A message states what is wrong and where, what was expected and found, and what to do:
 ``calibration.json: camera CAM_BACK: "intrinsics" is missing (expected 3x3)``.
 """
 
 
 class BevcliError(Exception):
-    """A mistake in what the user gave us. The message is one line, complete without a traceback."""
+    """A mistake in the user's input. The message is one line and is understandable without a traceback."""
 
 
 class InputError(BevcliError):
-    """A sequence, calibration, ego-motion or ground-truth file is missing or wrong."""
+    """A sequence, calibration, ego-motion or ground-truth file is missing or invalid, or an option does not fit it."""
 
 
 class ConfigError(BevcliError):
-    """A model's TOML file is missing or wrong."""
+    """A model's TOML file is missing or invalid."""
 
 
 class WeightsError(BevcliError):
-    """A file of weights is missing, is none, or belongs to another model."""
+    """A weights file is missing, invalid, or belongs to another model."""
 
 
 class OutputError(BevcliError):
-    """Something cannot be written where the user asked for it."""
+    """An output cannot be written to the given path."""

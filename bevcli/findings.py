@@ -1,4 +1,4 @@
-"""What a check of a calibration found: one mistake or oddity, with its numbers and what to do about it."""
+"""A finding: one mistake or oddity in a calibration or sequence, with numbers and advice."""
 
 from __future__ import annotations
 
@@ -12,11 +12,16 @@ SEVERITIES: tuple[Severity, ...] = ("error", "warning", "info")
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing to say about a calibration.
+    """One finding about a calibration or sequence.
 
-    code: stable name of the kind, listed in docs/calibration.md. camera: which one, None for the whole rig.
-    message: what is wrong. found, expected: the numbers with their units, "" where there is none.
-    advice: what to do.
+    Attributes:
+        code: stable name of the kind of finding, listed in docs/calibration.md.
+        severity: "error", "warning" or "info".
+        camera: name of the camera, None for the whole rig.
+        message: what is wrong.
+        found: the value found, with its unit; "" if there is none.
+        expected: the value expected, with its unit; "" if there is none.
+        advice: what to do; "" if there is none.
     """
 
     code: str
@@ -29,7 +34,7 @@ class Finding:
 
     @property
     def line(self) -> str:
-        """All of it on one line: `camera CAM_BACK: "intrinsics" is missing (expected 3x3)`."""
+        """The finding on one line: `camera CAM_BACK: "intrinsics" is missing (expected 3x3)`."""
         where = f"camera {self.camera}: " if self.camera else ""
         numbers = [f"{word} {value}" for word, value in (("expected", self.expected), ("found", self.found)) if value]
         brackets = f" ({', '.join(numbers)})" if numbers else ""
@@ -37,5 +42,5 @@ class Finding:
 
 
 def errors_of(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Those of severity error, in their order."""
+    """The findings of severity "error", in their order."""
     return tuple(finding for finding in findings if finding.severity == "error")

@@ -1,24 +1,34 @@
-"""A short drive in memory with boxes of known places, and a recording of it."""
+"""Known predictions and ground truth for a sequence in memory, and a recording of them."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from memory_drive import MemorySequence
 
+from bevcli.config import load_config
 from bevcli.frame import AttentionView, CameraSamples, Frame, Prediction, Probe
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.geometry.boxes import CLASSES, Boxes3D
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import inverse
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.writer import Recording
 
 GRID = BevGrid(20, 20)
+TINY = load_config("tiny")
+
+
+@dataclass(frozen=True)
+class NamedModel:
+    """What a recording takes from a model, without a network."""
+
+    untrained: bool = False
+    config = TINY
 
 
 def boxes_ahead() -> Boxes3D:
-    """A car 12 m ahead, a pedestrian to the right and a doubtful bus, in the bev frame (x right, y forward)."""
+    """A car 12 m ahead, a pedestrian to the right and a bus with score 0.1, in the bev frame (x right, y forward)."""
     return Boxes3D(
         centers=np.array([[0.0, 12, -1], [6, 9, -1], [-9, 20, -0.5]]),
         sizes_lwh=np.array([[4.5, 1.9, 1.6], [0.7, 0.7, 1.8], [11, 2.9, 3.4]]),
@@ -30,7 +40,7 @@ def boxes_ahead() -> Boxes3D:
 
 
 def predict(frame: Frame) -> Prediction:
-    """The boxes above, the same in every frame's bev frame, and features that an image can be made of."""
+    """The boxes above in every frame's bev frame, random BEV features, and one probe."""
     random = np.random.default_rng(frame.stamp.index)
     return Prediction(
         stamp=frame.stamp,
@@ -39,7 +49,7 @@ def predict(frame: Frame) -> Prediction:
         world_from_ego=frame.world_from_ego,
         grid=GRID,
         bev=torch.tensor(random.normal(size=(GRID.rows * GRID.columns, 16)), dtype=torch.float32),
-        started_anew=frame.stamp.index == 0,
+        started_anew="" if frame.stamp.index else "first frame",
         stage_seconds={"backbone": 0.2, "encoder": 0.1},
         attention=AttentionView(
             np.full((GRID.rows, GRID.columns), 0.5),
@@ -49,7 +59,7 @@ def predict(frame: Frame) -> Prediction:
 
 
 def with_truth(frame: Frame) -> Frame:
-    """Ground truth where the car is, and a cyclist that nobody predicts."""
+    """The frame with ground truth: the car, and a bicycle that is not predicted."""
     world_from_bev = frame.world_from_ego.matrix @ frame.rig.ego_from_bev
     truth = boxes_ahead()[[0, 0]]
     truth = replace(
@@ -58,11 +68,12 @@ def with_truth(frame: Frame) -> Frame:
     return replace(frame, ground_truth=truth.transformed(world_from_bev))
 
 
-def record(path: Path, drive: MemorySequence, options: RecordingOptions | None = None, **settings) -> list[Frame]:
-    """Writes the whole drive; returns its frames."""
-    frames = [with_truth(drive.load(place)) for place in range(len(drive.stamps))]
-    settings = {"class_names": CLASSES, "title": "test drive", "untrained": False, **settings}
-    with Recording(path, rig=drive.rig, options=options, **settings) as recording:
+def record(
+    path: Path, sequence: MemorySequence, options: RecordingOptions | None = None, *, untrained: bool = False
+) -> list[Frame]:
+    """Writes a recording of the whole sequence; returns its frames."""
+    frames = [with_truth(sequence.load(place)) for place in range(len(sequence.stamps))]
+    with Recording(path, sequence, NamedModel(untrained), options) as recording:
         for frame in frames:
             recording.log(frame, predict(frame))
     return frames

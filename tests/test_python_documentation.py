@@ -33,5 +33,6 @@ def test_every_public_name_can_be_imported():
 
 
 def test_importing_bevcli_loads_nothing_heavy():
-    code = "import sys, bevcli; print([m for m in ('torch', 'numpy', 'cv2', 'rerun', 'scipy', 'numba') if m in sys.modules])"
+    heavy = ("torch", "numpy", "cv2", "rerun", "scipy", "numba")
+    code = f"import sys, bevcli; print([module for module in {heavy} if module in sys.modules])"
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"

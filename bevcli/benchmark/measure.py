@@ -27,6 +27,7 @@ from bevcli.benchmark.version import Version
 from bevcli.model.bevformer import BEVFormer, BEVFormerConfig
 from bevcli.model.pillar_projection import find_hits, project_pillars
 from bevcli.model.prepared import Precision, prepare_for_inference
+from bevcli.pipeline.model_loading import Model
 from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
 from bevcli.recording.writer import Recording
 
@@ -128,11 +129,13 @@ def _time_run(fast: Version, drive: MadeUpDrive, frames: int) -> float:
 
 @contextlib.contextmanager
 def _recording(drive: MadeUpDrive, fast: Version) -> Iterator[Recording]:
-    """A recording of the standard kind in a folder that vanishes."""
-    with tempfile.TemporaryDirectory(prefix="bevcli-bench-") as folder:
-        path, classes = Path(folder) / "recording.rrd", fast.runner.config.classes
-        with Recording(path, rig=drive.rig, class_names=classes, title="benchmark", untrained=True) as recording:
-            yield recording
+    """A recording with the default options in a temporary folder."""
+    untrained = Model(fast.runner.model)
+    with (
+        tempfile.TemporaryDirectory(prefix="bevcli-bench-") as folder,
+        Recording(Path(folder) / "recording.rrd", drive, untrained) as recording,
+    ):
+        yield recording
 
 
 def _write_profile(fast: Version, prepared: PreparedFrame, path: Path) -> None:

@@ -1,4 +1,4 @@
-"""`bevcli convert`: any input, written as a native sequence folder."""
+"""`bevcli convert`: writes any input as a native sequence folder."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from bevcli.cli.input_options import (
 
 def convert(
     source: Annotated[
-        Path, typer.Argument(metavar="INPUT", help="A sequence folder, a folder with videos, or a nuScenes root.")
+        Path, typer.Argument(metavar="INPUT", help="A sequence folder (with images or videos) or a nuScenes root.")
     ],
     out: Annotated[Path, typer.Argument(metavar="OUT_SEQUENCE", help="The native sequence folder to write.")],
     strict: StrictOption = False,
@@ -30,21 +30,30 @@ def convert(
     sweeps: SweepsOption = False,
     intrinsics: IntrinsicsOption = None,
     extrinsics: ExtrinsicsOption = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace a sequence in OUT_SEQUENCE.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite an existing sequence in OUT_SEQUENCE.")] = False,
 ) -> None:
     """Write any input as a native sequence folder.
 
-    Images are copied byte for byte; those of a video become PNG. Ego-motion, ground truth and maps come along.
+    Image files are copied byte for byte; images of a video become PNG. Ego-motion and ground truth are kept.
     """
     from bevcli.cli.progress import Progress
     from bevcli.errors import OutputError
     from bevcli.sequences.native.writer import NativeWriter
-    from bevcli.sequences.open import InputOptions, open_sequence
+    from bevcli.sequences.open import open_sequence
 
     if out.resolve() == source.resolve() or out.resolve() in source.resolve().parents:
-        raise OutputError(f"{out}: holds the input itself: name another folder")
-    options = InputOptions("none", strict, scene, version, split, sweeps, intrinsics, extrinsics)
-    sequence = open_sequence(source, options)
+        raise OutputError(f"{out}: contains the input: choose another folder")
+    sequence = open_sequence(
+        source,
+        ego_motion="optional",
+        strict=strict,
+        scene=scene,
+        version=version,
+        split=split,
+        sweeps=sweeps,
+        intrinsics=intrinsics,
+        extrinsics=extrinsics,
+    )
     for note in sequence.notes:
         typer.echo(f"note: {note}", err=True)
     count = len(sequence.stamps)

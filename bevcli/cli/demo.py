@@ -1,4 +1,4 @@
-"""`bevcli demo`: the whole chain with nothing at hand: render a drive, run the model on it, open the viewer."""
+"""`bevcli demo`: render a short drive, run the model on it and open the viewer; needs no other data."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ RESOLUTION = "800x450"
 
 
 def demo(
-    out: Annotated[Path, typer.Option(help="The folder for the drive and the results.")] = Path("runs/demo"),
+    out: Annotated[Path, typer.Option(help="Folder for the drive and the results.")] = Path("runs/demo"),
     seed: Annotated[
-        int, typer.Option(min=0, help="Which street; the model was taught none from 1000000 on.")
+        int, typer.Option(min=0, help="Seed of the drive. The model was trained on seeds below 1000000 only.")
     ] = 1_000_001,
-    frames: Annotated[int, typer.Option(min=1, help="How many frames, two a second.")] = 8,
+    frames: Annotated[int, typer.Option(min=1, help="Number of frames, two per second.")] = 8,
     view: Annotated[bool, typer.Option("--view/--no-view", help="Open the viewer at the end.")] = True,
     force: Annotated[bool, typer.Option("--force", help="Replace an earlier demo in OUT.")] = False,
 ) -> None:
     """Render a short drive, run BEVFormer on it and open the recording.
 
-    The model has seen nothing but rendered streets, and knows no others.
+    The demo model was trained on rendered drives only.
     """
     from bevcli.cli.render import render
     from bevcli.cli.run import run

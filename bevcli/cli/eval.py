@@ -45,7 +45,7 @@ def evaluate(
     from bevcli.evaluation.scores_json import scores_to_json
     from bevcli.evaluation.scores_table import scores_table
     from bevcli.evaluation.scoring import score
-    from bevcli.sequences.nuscenes.scenes import NuScenesChoice
+    from bevcli.sequences.nuscenes.choice import NuScenesChoice
 
     truth = open_ground_truth(ground_truth, NuScenesChoice(version, scene, split))
     scores = score(open_predictions(predictions), truth, max_range, count_missing=count_missing)

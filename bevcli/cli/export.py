@@ -58,7 +58,7 @@ def export(
 def _calibrated(calibration: Path | None, name: str | None) -> tuple[Camera, Array]:
     """The camera whose view is exported, and ego_from_bev."""
     from bevcli.errors import InputError
-    from bevcli.sequences.native.calibration import read_calibration
+    from bevcli.sequences.files.calibration_file import read_calibration
 
     if calibration is None:
         raise InputError("--format kitti needs --calibration: KITTI labels are in a camera's frame")

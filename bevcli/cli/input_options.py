@@ -1,22 +1,26 @@
-"""The options that say what an input is, the same for every command that reads one."""
+"""The options that select an input and its frames, the same for every command that reads one."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 PANEL = "Input"
 
-SceneOption = Annotated[str | None, typer.Option(help="Only this scene, as scene-0103.", rich_help_panel=PANEL)]
+SceneOption = Annotated[str | None, typer.Option(help="Only this scene, such as scene-0103.", rich_help_panel=PANEL)]
 StrictOption = Annotated[
     bool,
-    typer.Option("--strict", help="A missing or unreadable image is an error, not a gap.", rich_help_panel=PANEL),
+    typer.Option("--strict", help="Treat a missing or unreadable image as an error.", rich_help_panel=PANEL),
 ]
 VersionOption = Annotated[
     str | None,
-    typer.Option(help="nuScenes: the version, as v1.0-mini. Default: the only one there.", rich_help_panel=PANEL),
+    typer.Option(
+        help="nuScenes: dataset version, such as v1.0-mini. Default: the only one present.",
+        rich_help_panel=PANEL,
+        show_default=False,
+    ),
 ]
 SplitOption = Annotated[
     str | None,
@@ -27,17 +31,76 @@ SplitOption = Annotated[
 SweepsOption = Annotated[
     bool,
     typer.Option(
-        "--sweeps", help="nuScenes: the images between the keyframes too (12 a second).", rich_help_panel=PANEL
+        "--sweeps",
+        help="nuScenes: also read the images between keyframes (12 frames per second).",
+        rich_help_panel=PANEL,
     ),
 ]
 IntrinsicsOption = Annotated[
     Path | None,
     typer.Option(
-        help="Kalibr camchain or ROS camera_info YAML (or a folder of these), in place of calibration.json.",
+        help="Kalibr camchain or ROS camera_info YAML, or a folder of these; replaces calibration.json.",
         rich_help_panel=PANEL,
     ),
 ]
 ExtrinsicsOption = Annotated[
     Path | None,
-    typer.Option(help='JSON with each camera\'s "ego_from_camera", to go with --intrinsics.', rich_help_panel=PANEL),
+    typer.Option(
+        help='JSON with the "ego_from_camera" of each camera; required with --intrinsics.', rich_help_panel=PANEL
+    ),
 ]
+FramesOption = Annotated[
+    str | None,
+    typer.Option(metavar="A:B", help="Frame range A:B after thinning; B is excluded.", rich_help_panel=PANEL),
+]
+RateOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="HZ|all",
+        help="Thin to this many frames per second. Default: the model's rate; all with --sweeps.",
+        rich_help_panel=PANEL,
+    ),
+]
+EveryOption = Annotated[
+    int | None, typer.Option(min=1, help="Use every N-th frame instead of a frame rate.", rich_help_panel=PANEL)
+]
+StaticOption = Annotated[
+    bool,
+    typer.Option("--static", help="The vehicle stands still; ego_motion.csv is not needed.", rich_help_panel=PANEL),
+]
+
+
+def parse_frames(text: str | None) -> slice | None:
+    """The value of --frames, "A:B" with optional ends, as a slice. Raises click's usage error."""
+    if text is None:
+        return None
+    ends = text.split(":")
+    if len(ends) != 2 or not all(end == "" or end.isdecimal() for end in ends):
+        raise typer.BadParameter(f'"{text}" (expected A:B with integers, such as 0:10 or 5:)', param_hint="--frames")
+    start, stop = (int(end) if end else None for end in ends)
+    return slice(start, stop)
+
+
+def parse_rate(text: str | None, *, default_hz: float | None) -> float | None:
+    """The value of --rate in Hz; None for "all". Raises click's usage error.
+
+    default_hz: the result if the option is not given.
+    """
+    if text is None:
+        return default_hz
+    if text == "all":
+        return None
+    try:
+        rate_hz = float(text)
+    except ValueError:
+        rate_hz = 0.0
+    if not 0 < rate_hz < float("inf"):
+        raise typer.BadParameter(f'"{text}" (expected frames per second, such as 2, or all)', param_hint="--rate")
+    return rate_hz
+
+
+def ego_motion_use(*, static: bool, temporal: bool) -> Literal["required", "optional", "static"]:
+    """How ego_motion.csv is used with --static and --no-temporal; the type is `EgoMotionUse` of the library."""
+    if static:
+        return "static"
+    return "required" if temporal else "optional"

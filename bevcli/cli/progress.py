@@ -1,18 +1,21 @@
-"""A progress bar on a terminal, plain lines on a pipe; both say what is done, how fast, and the time left."""
+"""Progress of a command on stderr: a bar on a terminal, about ten plain lines on a pipe."""
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from types import TracebackType
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
 
-LINES_ON_A_PIPE = 10  # about how many plain lines a whole run prints
-BAR_WIDTH = 24
+if TYPE_CHECKING:
+    import rich.progress
+
+LINES_ON_A_PIPE = 10  # about this many progress lines for a whole run
 
 
 def duration(seconds: float) -> str:
-    """Seconds as a person says them: "8 s", "2 min 05 s", "1 h 12 min"."""
+    """Seconds in words: "8 s", "2 min 05 s", "1 h 12 min"."""
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"
@@ -22,50 +25,71 @@ def duration(seconds: float) -> str:
 
 
 class Progress:
-    """`with Progress(total, "frames") as progress: ... progress.advance()`, to stderr."""
+    """Shows the work done, the rate and the time left.
+
+    Use it as `with Progress(total, "frames") as progress: ... progress.advance()`.
+
+    Args:
+        total: the amount of work, in units.
+        unit: the plural of the unit, such as "frames".
+        stream: where to write; stderr if None.
+    """
 
     def __init__(self, total: int, unit: str, stream: TextIO | None = None) -> None:
         self.total, self.unit = total, unit
         self.stream = sys.stderr if stream is None else stream
         self.done = 0
         self.started = time.perf_counter()
-        self._printed_at = 0.0
-        self._bar = self.stream.isatty()
+        self._bar: rich.progress.Progress | None = None
 
     def __enter__(self) -> Progress:
+        if self.stream.isatty() and os.environ.get("TERM") not in ("dumb", "unknown"):
+            self._bar = _bar(self.stream)
+            self._bar.add_task("", total=self.total, state=self.state())
+            self._bar.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._bar and self.done:
-            self.stream.write("\n")
+        if self._bar is not None:
+            self._bar.stop()
 
     def advance(self, count: int = 1) -> None:
-        """Count work done, and show it where it is time to."""
+        """Adds units of work that are done."""
         self.done += count
-        if self._bar:
-            if self.done == self.total or time.perf_counter() - self._printed_at > 0.1:
-                self._printed_at = time.perf_counter()
-                self.stream.write("\r\x1b[K" + self.line(bar=True))
+        if self._bar is not None:
+            self._bar.update(self._bar.task_ids[0], completed=self.done, state=self.state())
         elif self._line_is_due(count):
-            self.stream.write(self.line(bar=False) + "\n")
-        self.stream.flush()
-
-    def line(self, *, bar: bool) -> str:
-        """What is shown now, as one line."""
-        elapsed = max(time.perf_counter() - self.started, 1e-9)
-        rate = self.done / elapsed
-        left = (self.total - self.done) / rate if self.done else 0.0
-        filled = BAR_WIDTH * self.done // max(self.total, 1)
-        front = f"[{'#' * filled}{'.' * (BAR_WIDTH - filled)}] " if bar else ""
-        return f"{front}{self.done}/{self.total} {self.unit}, {rate:.2f} per second, {duration(left)} left"
+            print(self.state(), file=self.stream, flush=True)
 
     def message(self, text: str) -> None:
-        """A line of its own above the bar."""
-        self.stream.write(("\r\x1b[K" if self._bar else "") + text + "\n")
-        self.stream.flush()
+        """Prints a line, above the bar if there is one."""
+        if self._bar is not None:
+            self._bar.console.print(text, markup=False, highlight=False, emoji=False, soft_wrap=True)
+        else:
+            print(text, file=self.stream, flush=True)
+
+    def state(self) -> str:
+        """The progress in words, such as "3/8 frames, 0.35 per second, 14 s left"."""
+        if not self.done:
+            return f"{self.done}/{self.total} {self.unit}"
+        rate = self.done / max(time.perf_counter() - self.started, 1e-9)
+        left = duration((self.total - self.done) / rate)
+        return f"{self.done}/{self.total} {self.unit}, {rate:.2f} per second, {left} left"
 
     def _line_is_due(self, count: int) -> bool:
         step = max(1, self.total // LINES_ON_A_PIPE)
         return self.done == self.total or self.done // step != (self.done - count) // step
+
+
+def _bar(stream: TextIO) -> rich.progress.Progress:
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    return Progress(
+        BarColumn(),
+        TextColumn("{task.fields[state]}", markup=False),
+        console=Console(file=stream),
+        redirect_stdout=False,  # a command's results may be piped
+    )

@@ -8,14 +8,20 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from bevcli.cli.input_options import (
-    PANEL,
+    EveryOption,
     ExtrinsicsOption,
+    FramesOption,
     IntrinsicsOption,
+    RateOption,
     SceneOption,
     SplitOption,
+    StaticOption,
     StrictOption,
     SweepsOption,
     VersionOption,
+    ego_motion_use,
+    parse_frames,
+    parse_rate,
 )
 
 if TYPE_CHECKING:
@@ -82,25 +88,10 @@ def run(
             rich_help_panel=MODEL,
         ),
     ] = None,
-    frames: Annotated[
-        str | None,
-        typer.Option(metavar="A:B", help="Frame range A:B; B is excluded.", rich_help_panel=PANEL),
-    ] = None,
-    rate: Annotated[
-        str | None,
-        typer.Option(
-            metavar="HZ|all",
-            help="Reduce the frame rate to this. Default: the rate that the model was trained on.",
-            rich_help_panel=PANEL,
-        ),
-    ] = None,
-    every: Annotated[
-        int | None, typer.Option(min=1, help="Use every N-th frame, whatever the rate.", rich_help_panel=PANEL)
-    ] = None,
-    static: Annotated[
-        bool,
-        typer.Option("--static", help="The vehicle stands still: ego-motion is not needed.", rich_help_panel=PANEL),
-    ] = False,
+    frames: FramesOption = None,
+    rate: RateOption = None,
+    every: EveryOption = None,
+    static: StaticOption = False,
     strict: StrictOption = False,
     scene: SceneOption = None,
     version: VersionOption = None,
@@ -154,6 +145,16 @@ def run(
             rich_help_panel=RECORDING,
         ),
     ] = None,
+    vehicle_mesh: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Draw the ego vehicle from this mesh (.glb, .ply, .obj, …; metres, origin on the ground under the "
+            "rear axle; axes in docs/recording.md). Default: a plain car.",
+            rich_help_panel=RECORDING,
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
     """Run BEVFormer on SEQUENCE, frame by frame, and write boxes and a recording.
 
@@ -161,19 +162,35 @@ def run(
     tracks.csv (one row a box with its track), summary.json and, for models with a segmentation head, segmentation/.
     """
     from bevcli.cli.progress import Progress
-    from bevcli.cli.run_input import FrameChoice, choose_frames, ego_motion_use
     from bevcli.pipeline.model_loading import load_model
     from bevcli.pipeline.run import RunOptions, run_into_folder
     from bevcli.recording.options import RecordingOptions
-    from bevcli.sequences.open import InputOptions
+    from bevcli.sequences.open import open_sequence
 
-    recording = RecordingOptions(record, bev, score, tuple(map(parse_probe, probe or ())), live)
+    recording = RecordingOptions(record, bev, score, tuple(map(parse_probe, probe or ())), vehicle_mesh)
     loaded = load_model(model, weights, device=device, precision=precision, untrained=untrained)
-    motion = ego_motion_use(static=static, temporal=temporal)
-    inputs = InputOptions(motion, strict, scene, version, split, sweeps, intrinsics, extrinsics)
-    drive = choose_frames(sequence, inputs, FrameChoice(frames, rate, every), loaded.config)
+    drive = open_sequence(
+        sequence,
+        frames=parse_frames(frames),
+        rate_hz=parse_rate(rate, default_hz=None if every or sweeps else loaded.config.rate_hz),
+        every=every,
+        ego_motion=ego_motion_use(static=static, temporal=temporal),
+        strict=strict,
+        scene=scene,
+        version=version,
+        split=split,
+        sweeps=sweeps,
+        intrinsics=intrinsics,
+        extrinsics=extrinsics,
+    )
     out = Path("runs") / f"{drive.name}-{loaded.name}" if out is None else out
     options = RunOptions(temporal, track, dict(map(parse_camera, camera or ())), recording, save_bev)
+
+    view = None
+    if live:
+        from bevcli.viewer.live import LiveView
+
+        view = LiveView()
 
     def show(frame: Frame, prediction: Prediction) -> None:
         for warning in warnings(frame, prediction):
@@ -183,7 +200,7 @@ def run(
     with Progress(len(drive.stamps), "frames") as progress:
         for note in notes(loaded, drive):
             progress.message(f"note: {note}")
-        summary = run_into_folder(loaded, drive, out, options, force=force, after_frame=show)
+        summary = run_into_folder(loaded, drive, out, options, live=view, force=force, after_frame=show)
     print(summary.table())
 
 

@@ -1,4 +1,4 @@
-"""`bevcli validate`: run a model on several drives with ground truth, and score them all together."""
+"""`bevcli validate`: run a model on several drives with ground truth and score them together."""
 
 from __future__ import annotations
 
@@ -9,46 +9,55 @@ import typer
 
 
 def validate(
-    model: Annotated[str, typer.Argument(help="A known model or a FILE.toml.")],
+    model: Annotated[str, typer.Argument(help="A model name or a FILE.toml.")],
     weights: Annotated[
         Path | None,
-        typer.Option(help="The official .pth, or a .safetensors. Default: the package's own.", show_default=False),
+        typer.Option(
+            help="Official .pth, or .safetensors. Default: the weights in the package (demo only).", show_default=False
+        ),
     ] = None,
     data: Annotated[
         list[Path] | None, typer.Option(metavar="DIR", help="A sequence with ground truth. Repeatable.")
     ] = None,
     rendered: Annotated[
-        str | None, typer.Option(metavar="SEEDS", help="Rendered drives of these seeds instead: A:B, or A,B,C.")
+        str | None,
+        typer.Option(metavar="SEEDS", help="Use rendered drives with these seeds: A:B (B excluded), or A,B,C."),
     ] = None,
-    cache: Annotated[Path, typer.Option(metavar="DIR", help="Where rendered drives are kept.")] = Path("runs/drives"),
-    temporal: Annotated[bool, typer.Option("--temporal/--no-temporal", help="Use the previous BEV map.")] = True,
+    cache: Annotated[Path, typer.Option(metavar="DIR", help="Folder that keeps rendered drives.")] = Path(
+        "runs/drives"
+    ),
+    temporal: Annotated[
+        bool, typer.Option("--temporal/--no-temporal", help="Use the BEV map of the previous frame.")
+    ] = True,
     max_range: Annotated[
         float | None,
-        typer.Option(metavar="METRES", help="Score nothing farther away. Default: as far as the BEV map reaches."),
+        typer.Option(
+            metavar="METRES", help="Ignore boxes beyond this distance. Default: the nearest side of the BEV grid."
+        ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object in place of the tables.")] = False,
-    device: Annotated[
-        Literal["auto", "cpu", "cuda"], typer.Option(help="auto takes a GPU where there is one.")
-    ] = "auto",
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")] = False,
+    device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="auto uses a GPU if there is one.")] = "auto",
 ) -> None:
-    """Run MODEL on drives with ground truth and score them together, as `bevcli run` and `bevcli eval` do for one.
+    """Score a model on drives with ground truth, all drives together.
 
-    Rendered drives from seed 1000000 on are never trained on.
+    Each drive is run as by `bevcli run` and scored as by `bevcli eval`. `bevcli train` never uses rendered drives with
+    seeds of 1000000 and above: keep them for this.
     """
     import json
 
     from bevcli.cli.progress import Progress
-    from bevcli.cli.train import open_drives
     from bevcli.evaluation.scores_json import scores_to_json
     from bevcli.evaluation.scores_table import scores_table
     from bevcli.pipeline.model_loading import load_model
     from bevcli.pipeline.runner import Runner, StepOptions
+    from bevcli.training.drives import count_frames, open_drives, parse_seeds
     from bevcli.training.validation import validate as validate_model
 
     loaded = load_model(model, weights, device=device)
-    drives = open_drives(data or [], rendered, cache, loaded.config)
+    seeds = None if rendered is None else parse_seeds(rendered)
+    drives = open_drives(data or (), seeds, cache, loaded.config)
     runner = Runner(loaded.prepared, loaded.device, StepOptions(loaded.precision, temporal))
-    with Progress(sum(len(drives.open(place).stamps) for place in range(len(drives))), "frames") as progress:
+    with Progress(count_frames(drives), "frames") as progress:
         scores = validate_model(runner, drives, max_range, progress.advance)
     if as_json:
         print(json.dumps(scores_to_json(scores.detection, scores.config, scores.segmentation), indent=1))

@@ -1,4 +1,4 @@
-"""`bevcli viz`: opens a recording, or makes an image, a video, a table or a summary of it."""
+"""`bevcli viz`: shows a recording, or writes an image, a video, its boxes or a summary of it."""
 
 from __future__ import annotations
 
@@ -9,47 +9,51 @@ import typer
 
 
 def viz(
-    recording: Annotated[Path, typer.Argument(help="A recording that `bevcli run` wrote, such as recording.rrd.")],
-    web: Annotated[bool, typer.Option("--web", help="Open it in the browser, also where there is a display.")] = False,
+    recording: Annotated[Path, typer.Argument(help="A recording (.rrd) that `bevcli run` wrote.")],
+    web: Annotated[bool, typer.Option("--web", help="Show it in the browser, even if there is a display.")] = False,
     host: Annotated[
-        str, typer.Option(help="The address that the web viewer listens on. 0.0.0.0 lets other machines in.")
+        str, typer.Option(help="Address that the web viewer listens on. 0.0.0.0 allows access from other machines.")
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="The web viewer's port; where it is in use, the next free one.")] = 9090,
+    port: Annotated[
+        int, typer.Option(help="Port of the web viewer. If it is in use, the next free one is taken.")
+    ] = 9090,
     screenshot: Annotated[
-        Path | None, typer.Option(metavar="OUT.png", help="Write an image of the viewer; needs no screen.")
+        Path | None, typer.Option(metavar="OUT.png", help="Write a screenshot of the viewer. Needs no screen.")
     ] = None,
-    frame: Annotated[int | None, typer.Option(help="The number of the frame in the image. Default: the first.")] = None,
-    summary: Annotated[bool, typer.Option("--summary", help="Print what the recording holds.")] = False,
+    frame: Annotated[int | None, typer.Option(help="Frame index for --screenshot. Default: the first frame.")] = None,
+    summary: Annotated[
+        bool, typer.Option("--summary", help="Print the frames, time span, boxes per class and sizes.")
+    ] = False,
     video: Annotated[
         Path | None,
-        typer.Option(metavar="OUT.mp4|.webm", help="Write a video (VP9) of all cameras, with boxes, and the BEV."),
+        typer.Option(metavar="OUT.mp4|.webm", help="Write a video (VP9) of all cameras and the BEV, with boxes."),
     ] = None,
     export: Annotated[
-        Path | None, typer.Option(metavar="BOXES.csv|.json", help="Write the shown boxes, in the world frame.")
+        Path | None, typer.Option(metavar="BOXES.csv|.json", help="Write the shown boxes in the world frame.")
     ] = None,
 ) -> None:
-    """Look at a recording: in the viewer, or as an image, a video, a table or a summary.
+    """Show a recording in the viewer, or write an image, a video, its boxes or a summary.
 
-    Without an option that writes something, the viewer opens: in a window where there is a display, else in the
-    browser, at an address of this machine only. Ctrl-C ends it.
+    The viewer opens if none of --summary, --screenshot, --video and --export is given: in a window if there is a
+    display, else in the browser at an address that only this machine can reach. Ctrl-C closes it.
     """
-    from bevcli.viewer.recording_file import whole_recording
+    from bevcli.viewer.recording_file import open_recording
 
     if frame is not None and screenshot is None:
-        raise typer.BadParameter("--frame goes with --screenshot", param_hint="--frame")
-    with whole_recording(recording) as whole:
-        if whole.mended:
-            typer.echo(f"note: {recording} has no end: its run was cut off or is still going. Shown is what it has.")
+        raise typer.BadParameter("is only valid with --screenshot", param_hint="--frame")
+    with open_recording(recording) as file:
+        if file.repaired:
+            typer.echo(f"note: {recording} is incomplete (its run was stopped or is still going)")
         if summary:
-            _summarise(recording, whole.path)
+            _summarise(recording, file.path)
         if screenshot is not None:
-            _screenshot(whole.path, screenshot, frame)
+            _screenshot(file.path, screenshot, frame)
         if video is not None:
-            _video(whole.path, video)
+            _video(file.path, video)
         if export is not None:
-            _export(whole.path, export)
+            _export(file.path, export)
         if not (summary or screenshot or video or export):
-            _open(whole.path, web=web, host=host, port=port)
+            _open(file.path, web=web, host=host, port=port)
 
 
 def _summarise(recording: Path, read_from: Path) -> None:
@@ -72,14 +76,14 @@ def _video(recording: Path, video: Path) -> None:
     count, rate = frame_rate(recording)
     with Progress(count, "frames") as progress:
         write_video(recording, video, progress.advance)
-    typer.echo(f"{video}: {count} frames at {rate:.3g} a second")
+    typer.echo(f"{video}: {count} frames, {rate:.3g} per second")
 
 
 def _export(recording: Path, path: Path) -> None:
     from bevcli.viewer.export import export_boxes
 
     frames, boxes = export_boxes(recording, path)
-    typer.echo(f"{path}: {boxes} boxes of {frames} frames")
+    typer.echo(f"{path}: {boxes} boxes in {frames} frames")
 
 
 def _open(recording: Path, *, web: bool, host: str, port: int) -> None:
@@ -87,15 +91,16 @@ def _open(recording: Path, *, web: bool, host: str, port: int) -> None:
     from bevcli.viewer.web import WebViewer, web_viewer_assets
 
     if display_is_there() and not web:
-        if _window_closed_well(recording):
+        if _show_window(recording):
             return
-        typer.echo("note: the viewer's window did not open; here it is for the browser")
+        typer.echo("note: the viewer's window did not open; use the browser instead")
     viewer = WebViewer(web_viewer_assets(), recording, host, port)
-    typer.echo(f"{viewer.address}  open this in a browser; Ctrl-C ends it")
+    typer.echo(f"{viewer.address}  Open this address in a browser. Ctrl-C stops the server.")
     viewer.serve()
 
 
-def _window_closed_well(recording: Path) -> bool:
+def _show_window(recording: Path) -> bool:
+    """Opens the viewer and waits until the user closes it. False if the viewer failed."""
     from bevcli.viewer.native import LOOPBACK, start_viewer, stop
 
     process = start_viewer("--bind", LOOPBACK, "--port", "auto", str(recording))

@@ -15,10 +15,10 @@ from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose, apply, rigid, rotation_about_z
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes
-from bevcli.sequences.files.map_file import MapFolder, open_maps
+from bevcli.sequences.files.map_folder import MapFolder, open_maps
 from bevcli.sequences.nuscenes.cache import open_index
+from bevcli.sequences.nuscenes.choice import NuScenesChoice, chosen_scenes, is_nuscenes_root, tables_of
 from bevcli.sequences.nuscenes.index import NuScenesIndex
-from bevcli.sequences.nuscenes.scenes import NuScenesChoice, chosen_scenes, is_nuscenes_root, tables_of
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ from bevcli.evaluation.detection_scores import DetectionScores
 from bevcli.evaluation.inputs import ScoredInput, without_cycles_in_racks
 from bevcli.evaluation.pairing import FramePairs, pair_frames
 from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmentation
-from bevcli.geometry.attributes import attributes_by_speed
-from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 
 
 @dataclass(frozen=True)

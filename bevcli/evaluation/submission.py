@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.geometry.attributes import attributes_by_speed
-from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
-from bevcli.sequences.files.growing_json import GrowingJson
+from bevcli.sequences.files.incremental_json import IncrementalJson
 
 MOST_BOXES = 500  # a sample, by the rules of the benchmark; the best by score are kept
 META = {"use_camera": True, "use_lidar": False, "use_radar": False, "use_map": False, "use_external": False}
@@ -26,7 +25,7 @@ class SubmissionWriter:
     """
 
     def __init__(self, path: Path) -> None:
-        self._file = GrowingJson(path, json.dumps({"meta": META})[:-1] + ', "results": {', "}}")
+        self._file = IncrementalJson(path, json.dumps({"meta": META})[:-1] + ', "results": {', "}}")
 
     def write(self, frame: FrameBoxes) -> None:
         """Add a frame with its boxes in the world. A frame without a sample token (no keyframe) is left out."""

@@ -1,4 +1,4 @@
-"""The BEV grid: cells <-> metres in the bev frame, and the heights of the pillars."""
+"""The BEV grid: conversion between cells and metres in the bev frame, and the pillars' heights."""
 
 from __future__ import annotations
 
@@ -12,9 +12,15 @@ from bevcli.geometry.transforms import Array
 
 @dataclass(frozen=True)
 class BevGrid:
-    """rows x columns cells over x_range_m x y_range_m. Cell (row, column) has the index row * columns + column.
+    """A regular grid in the bev frame. Cell (row, column) has the index row * columns + column.
 
-    Columns run along x, rows along y, both from the smallest to the largest.
+    Attributes:
+        rows: number of cells along y; row 0 has the smallest y.
+        columns: number of cells along x; column 0 has the smallest x.
+        x_range_m: smallest and largest x of the grid, metres.
+        y_range_m: smallest and largest y of the grid, metres.
+        z_range_m: lower and upper end of the pillars, metres.
+        pillar_points: number Z of reference points in a pillar.
     """
 
     rows: int
@@ -26,25 +32,25 @@ class BevGrid:
 
     @property
     def cell_size_m(self) -> tuple[float, float]:
-        """Extent of a cell along x and y."""
+        """Size of a cell along x and y, metres."""
         x0, x1 = self.x_range_m
         y0, y1 = self.y_range_m
         return (x1 - x0) / self.columns, (y1 - y0) / self.rows
 
     def cell_centers(self) -> Array:
-        """(rows, columns, 2) x, y of the cells' centres in metres."""
+        """(rows, columns, 2) x and y of the cells' centres, metres."""
         size_x, size_y = self.cell_size_m
         x = self.x_range_m[0] + (np.arange(self.columns) + 0.5) * size_x
         y = self.y_range_m[0] + (np.arange(self.rows) + 0.5) * size_y
         return np.stack(np.meshgrid(x, y), axis=-1)
 
     def pillar_heights(self) -> Array:
-        """(Z,) heights in metres: evenly from half a metre above the lower end to half a metre below the upper."""
+        """(Z,) heights, metres: evenly spaced from 0.5 m above the lower end to 0.5 m below the upper end."""
         z0, z1 = self.z_range_m
         return z0 + np.linspace(0.5, (z1 - z0) - 0.5, self.pillar_points)
 
     def pillars(self) -> Array:
-        """(rows, columns, Z, 3) the 3D reference points of every cell, bev frame, metres."""
+        """(rows, columns, Z, 3) the 3D reference points of every cell in the bev frame, metres."""
         centers, heights = self.cell_centers(), self.pillar_heights()
         points = np.empty((self.rows, self.columns, self.pillar_points, 3))
         points[..., :2] = centers[:, :, None, :]
@@ -52,7 +58,7 @@ class BevGrid:
         return points
 
     def cell_of(self, points_xy: ArrayLike) -> np.ndarray:
-        """Points (..., 2) in metres -> (..., 2) row, column; -1, -1 outside the grid."""
+        """Row and column (..., 2) int64 of points (..., 2) in metres; -1, -1 for a point outside the grid."""
         p = np.asarray(points_xy, dtype=np.float64)
         low = np.array([self.x_range_m[0], self.y_range_m[0]])
         cell = np.floor((p - low) / np.array(self.cell_size_m)).astype(np.int64)[..., ::-1]

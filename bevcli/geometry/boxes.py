@@ -1,4 +1,4 @@
-"""Boxes3D: oriented boxes in one frame, with what is known of each."""
+"""Oriented 3D boxes in one frame of reference, with class, score, velocity and further optional columns."""
 
 from __future__ import annotations
 
@@ -20,15 +20,23 @@ CLASSES = (
 
 @dataclass(frozen=True)
 class Boxes3D:
-    """N boxes in one frame of reference (bev, ego or world; which one is said by whoever holds them).
+    """N boxes in one frame of reference: bev, ego or world. The owner of the object states which one.
 
-    centers: (N, 3) box middles, metres. sizes_lwh: (N, 3) length, width, height, metres.
-    yaws: (N,) radians, counter-clockwise about z, 0 along x. velocities: (N, 2) m/s along x and y, NaN unknown.
-    classes: (N,) names. Optional, None where unknown for all: scores (N,) 0 to 1; attributes (N,) nuScenes
-    names, "" for none; instances (N,) identities over time, "" for none; track_scores (N,) 0 to 1, of the track that a
-    box belongs to, NaN without one; duplicates (N,) bool, whether a better box lies on the same object;
-    visibilities (N,) 0 to 1, NaN unknown;
-    num_points (N,) int, 0: not to be scored, -1 unknown.
+    An optional column is None if it is unknown for all boxes.
+
+    Attributes:
+        centers: (N, 3) box centres, metres.
+        sizes_lwh: (N, 3) length, width and height, metres.
+        yaws: (N,) radians, counter-clockwise about z, 0 along x.
+        velocities: (N, 2) m/s along x and y; NaN if unknown.
+        classes: (N,) class names.
+        scores: (N,) confidence, 0 to 1. Optional.
+        attributes: (N,) nuScenes attribute names, "" for none. Optional.
+        instances: (N,) object identities, constant over time, "" for none. Optional.
+        track_scores: (N,) score of the track that a box belongs to, 0 to 1; NaN without a track. Optional.
+        duplicates: (N,) whether a better box describes the same object. Optional.
+        visibilities: (N,) visible fraction, 0 to 1; NaN if unknown. Optional.
+        num_points: (N,) number of lidar and radar points; boxes with 0 are not scored, -1 if unknown. Optional.
     """
 
     centers: Array
@@ -54,12 +62,12 @@ class Boxes3D:
 
     @staticmethod
     def empty() -> Boxes3D:
-        """No box at all."""
+        """Zero boxes."""
         return Boxes3D(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2)), np.zeros(0, "<U1"))
 
     @staticmethod
     def concatenate(parts: Iterable[Boxes3D]) -> Boxes3D:
-        """All boxes of the parts; a column stays where every part that has boxes has it."""
+        """All boxes of the parts. An optional column is kept if every part with boxes has it."""
         filled = [part for part in parts if len(part)]
         if not filled:
             return Boxes3D.empty()
@@ -70,7 +78,10 @@ class Boxes3D:
         return Boxes3D(**columns)
 
     def transformed(self, a_from_b: ArrayLike) -> Boxes3D:
-        """The boxes, given in b, in a. Yaw and velocity turn with the rotation; boxes stay upright."""
+        """The boxes moved from frame b to frame a. Yaws and velocities rotate too; boxes stay upright.
+
+        a_from_b: (4, 4) rigid transform, metres.
+        """
         matrix = np.asarray(a_from_b, dtype=np.float64)
         headings = np.stack([np.cos(self.yaws), np.sin(self.yaws), np.zeros(len(self))], axis=-1)
         turned = headings @ matrix[:3, :3].T
@@ -83,7 +94,7 @@ class Boxes3D:
         )
 
     def corners(self) -> Array:
-        """(N, 8, 3): bottom four counter-clockwise from front left, then the top four in the same order."""
+        """(N, 8, 3) corners, metres: bottom four counter-clockwise from front left, then the top four likewise."""
         half = self.sizes_lwh[:, None, :] / 2
         signs = np.array(
             [
@@ -113,3 +124,28 @@ class Boxes3D:
 BOX_EDGES = (
     (0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7),
 )  # fmt: skip
+
+MOVING_MPS = 0.2  # a faster box counts as moving
+# Attribute of a moving and of a standing box. A standing bus is "stopped", not "parked", as in the original code.
+_MOVING_AND_STILL = {
+    "car": ("vehicle.moving", "vehicle.parked"),
+    "truck": ("vehicle.moving", "vehicle.parked"),
+    "construction_vehicle": ("vehicle.moving", "vehicle.parked"),
+    "bus": ("vehicle.moving", "vehicle.stopped"),
+    "trailer": ("vehicle.moving", "vehicle.parked"),
+    "barrier": ("", ""),
+    "motorcycle": ("cycle.with_rider", "cycle.without_rider"),
+    "bicycle": ("cycle.with_rider", "cycle.without_rider"),
+    "pedestrian": ("pedestrian.moving", "pedestrian.standing"),
+    "traffic_cone": ("", ""),
+}
+
+
+def attributes_by_speed(boxes: Boxes3D) -> NDArray[np.str_]:
+    """(N,) nuScenes attribute names from class and speed, as the original BEVFormer assigns them.
+
+    Classes without attributes get "". A box with unknown velocity counts as standing.
+    """
+    moving = np.linalg.norm(boxes.velocities, axis=1) > MOVING_MPS
+    names = [_MOVING_AND_STILL[str(name)][0 if fast else 1] for name, fast in zip(boxes.classes, moving, strict=True)]
+    return np.array(names, dtype=np.str_)

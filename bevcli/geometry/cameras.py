@@ -1,11 +1,12 @@
-"""Camera and CameraRig. The one projection of the project: encoder, overlays, rig checks and renderer use it.
+"""Camera and CameraRig: projection, lens distortion and undistortion, the only ones in the project.
 
-Camera frame: x right, y down, z forward. Pixels: the centre of the top left pixel is (0, 0), as in OpenCV.
+The camera frame has x right, y down, z forward. Pixel (0, 0) is the centre of the top left pixel, as in OpenCV.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import cv2
@@ -14,12 +15,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from bevcli.geometry.transforms import Array, apply, inverse, rigid
 
-NEAR_M = 1e-5  # points nearer than this to the camera's plane, or behind it, have no image
+NEAR_M = 1e-5  # a point with a smaller depth, or behind the camera, has no pixel
+OUTSIDE = -1e4  # pixel coordinate outside any image, in place of NaN, which cv2.remap does not accept
 
 
 @dataclass(frozen=True)
 class Distortion:
-    """A lens: Brown-Conrady (k1 k2 p1 p2 [k3 [k4 k5 k6]]) or Kannala-Brandt fisheye (k1 k2 k3 k4), as OpenCV's."""
+    """Lens distortion, with the models and coefficients of OpenCV.
+
+    Attributes:
+        model: "brown_conrady" or the fisheye model "kannala_brandt".
+        coefficients: k1 k2 p1 p2 [k3 [k4 k5 k6]] for Brown-Conrady, k1 k2 k3 k4 for Kannala-Brandt.
+    """
 
     model: Literal["brown_conrady", "kannala_brandt"]
     coefficients: tuple[float, ...]
@@ -27,9 +34,15 @@ class Distortion:
 
 @dataclass(frozen=True)
 class Camera:
-    """One pinhole camera, maybe behind a lens with distortion.
+    """A pinhole camera with optional lens distortion.
 
-    width, height: pixels. intrinsics: (3, 3) image_from_camera. ego_from_camera: (4, 4), metres.
+    Attributes:
+        name: the camera's name in its rig.
+        width: image width, pixels.
+        height: image height, pixels.
+        intrinsics: (3, 3) image_from_camera, pixels.
+        ego_from_camera: (4, 4) extrinsics, metres.
+        distortion: None for a camera without distortion.
     """
 
     name: str
@@ -41,12 +54,12 @@ class Camera:
 
     @property
     def camera_from_ego(self) -> Array:
-        """(4, 4)."""
+        """(4, 4), metres."""
         return inverse(self.ego_from_camera)
 
     @property
     def image_from_camera(self) -> Array:
-        """(4, 4) homogeneous: (u d, v d, d, 1) = image_from_camera @ (x, y, z, 1), without distortion."""
+        """(4, 4), without distortion: (u d, v d, d, 1) = image_from_camera @ (x, y, z, 1)."""
         return rigid((0, 0, 0), self.intrinsics)
 
     @property
@@ -54,19 +67,10 @@ class Camera:
         """Viewing direction in the ego frame, radians counter-clockwise from straight ahead."""
         return float(np.arctan2(self.ego_from_camera[1, 2], self.ego_from_camera[0, 2]))
 
-    @property
-    def fov_deg(self) -> tuple[float, float]:
-        """Horizontal and vertical field of view in degrees of the pinhole, without distortion."""
-        fx, fy = self.intrinsics[0, 0], self.intrinsics[1, 1]
-        return (
-            float(np.degrees(2 * np.arctan(self.width / (2 * fx)))),
-            float(np.degrees(2 * np.arctan(self.height / (2 * fy)))),
-        )
-
     def project(self, points_camera: ArrayLike) -> tuple[Array, Array]:
-        """Points (..., 3) in the camera frame -> pixels (..., 2) and depths (...,).
+        """Points (..., 3) in the camera frame, metres -> pixels (..., 2) and depths (...,), metres.
 
-        Distortion included. Pixels of points with depth <= NEAR_M are NaN.
+        Distortion is applied. Pixels are NaN for a depth of NEAR_M or less, and where the lens model is not valid.
         """
         points = np.asarray(points_camera, dtype=np.float64)
         depth = points[..., 2]
@@ -78,45 +82,60 @@ class Camera:
         return pixels, depth
 
     def project_ego(self, points_ego: ArrayLike) -> tuple[Array, Array]:
-        """Points (..., 3) in the ego frame at the camera's time -> pixels (..., 2) and depths (...,)."""
+        """Points (..., 3) in the ego frame at the camera's time -> pixels and depths as `project`."""
         return self.project(apply(self.camera_from_ego, points_ego))
 
     def contains(self, pixels: ArrayLike, depth: ArrayLike) -> NDArray[np.bool_]:
-        """Which pixels (..., 2) at these depths (...,) lie in front of the camera and inside the image."""
+        """(...,) bool: whether pixels (..., 2) with depths (...,) are in front of the camera and inside the image."""
         p = np.asarray(pixels, dtype=np.float64)
         with np.errstate(invalid="ignore"):
             inside = (p > 0).all(-1) & (p[..., 0] < self.width) & (p[..., 1] < self.height)
         return inside & (np.asarray(depth) > NEAR_M)
 
     def scaled(self, factor_x: float, factor_y: float | None = None) -> Camera:
-        """The camera whose image is this one's, resized. Pixels times the factor, without a half-pixel term."""
+        """The camera of the resized image. Pixel coordinates are multiplied by the factors, without a half-pixel shift.
+
+        factor_y: equal to `factor_x` by default.
+        """
         factors = np.diag([factor_x, factor_x if factor_y is None else factor_y, 1.0])
         width, height = round(self.width * factors[0, 0]), round(self.height * factors[1, 1])
         return replace(self, width=width, height=height, intrinsics=factors @ self.intrinsics)
 
-    def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
-        """The camera of a part of the image; a part that reaches beyond the image is padding."""
-        shift = np.array([[1.0, 0, -left], [0, 1.0, -top], [0, 0, 1.0]])
-        return replace(self, width=width, height=height, intrinsics=shift @ self.intrinsics)
+    def distorted(self, pixels: ArrayLike) -> Array:
+        """Pixels (..., 2) of the undistorted image -> the same rays' pixels (..., 2) in the camera's image.
 
-    def undistorted(self) -> Camera:
-        """The pinhole camera with the same intrinsics that `undistort_maps` resamples to."""
-        return replace(self, distortion=None)
+        NaN where the lens model is not valid.
+        """
+        p = np.asarray(pixels, dtype=np.float64)
+        rays = np.concatenate([p, np.ones((*p.shape[:-1], 1))], axis=-1) @ np.linalg.inv(self.intrinsics).T
+        return self.project(rays)[0]
 
-    def undistort_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Maps (H, W) x and y for cv2.remap: from each pixel of `undistorted()` to this camera's image."""
+    def undistort(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The image (H, W, 3) that a pinhole camera with the same intrinsics would have taken.
+
+        It is black where the lens saw nothing. An image of a camera without distortion is returned as it is.
+        """
+        if self.distortion is None:
+            return image
+        undistorted = cv2.remap(image, *self._undistortion_maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        return undistorted.astype(np.uint8, copy=False)
+
+    @cached_property
+    def _undistortion_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """(H, W) x and (H, W) y of cv2.remap. They are kept, because they cost far more than the remapping."""
         u, v = np.meshgrid(np.arange(self.width, dtype=np.float64), np.arange(self.height, dtype=np.float64))
-        pixels = np.stack([u, v, np.ones_like(u)], axis=-1)
-        rays = pixels @ np.linalg.inv(self.intrinsics).T
-        source, _ = self.project(rays)
-        return source[..., 0].astype(np.float32), source[..., 1].astype(np.float32)
+        source = np.nan_to_num(self.distorted(np.stack([u, v], axis=-1)).astype(np.float32), nan=OUTSIDE)
+        return np.ascontiguousarray(source[..., 0]), np.ascontiguousarray(source[..., 1])
 
 
 @dataclass(frozen=True)
 class CameraRig:
-    """The cameras on the vehicle, and the frame that the model predicts in.
+    """The cameras of a vehicle, and the frame in which the model predicts.
 
-    ego_from_bev: (4, 4). ego_from_bev_assumed: the calibration did not state it and the default was taken.
+    Attributes:
+        cameras: the cameras, in the calibration's order.
+        ego_from_bev: (4, 4), metres.
+        ego_from_bev_assumed: whether `ego_from_bev` is the default because the calibration does not state it.
     """
 
     cameras: tuple[Camera, ...]
@@ -133,14 +152,14 @@ class CameraRig:
 
 
 def default_ego_from_bev() -> Array:
-    """(4, 4) of a level frame like nuScenes' LIDAR_TOP: x right, y forward, at (0.94, 0, 1.84) m in ego."""
+    """(4, 4) of a level frame like nuScenes' LIDAR_TOP: x right, y forward, origin at (0.94, 0, 1.84) m in ego."""
     return rigid((0.94, 0.0, 1.84), [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def distort(rays: ArrayLike, distortion: Distortion) -> Array:
-    """Normalised pinhole coordinates (..., 2) -> where the lens puts them (..., 2); NaN stays NaN.
+    """Normalised pinhole coordinates (..., 2) -> distorted coordinates (..., 2).
 
-    Beyond the angle where the lens model folds back on itself the result is NaN.
+    The result is NaN where the input is, and beyond the angle at which the lens model stops being monotonic.
     """
     xy = np.asarray(rays, dtype=np.float64)
     if distortion.model == "kannala_brandt":
@@ -176,9 +195,3 @@ def _distort_brown_conrady(xy: Array, coefficients: tuple[float, ...]) -> Array:
     )
     with np.errstate(invalid="ignore"):
         return np.where((slope > 0)[..., None], result, np.nan)
-
-
-def undistort(image: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
-    """The image (H, W, 3) that `camera.undistorted()` would have taken; black where the lens saw nothing."""
-    map_x, map_y = (np.nan_to_num(m, nan=-1e4) for m in camera.undistort_maps())
-    return cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT).astype(np.uint8)

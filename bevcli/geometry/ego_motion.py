@@ -1,4 +1,4 @@
-"""Where the vehicle was over time: poses and kinematics, interpolated at any time that the rows cover."""
+"""The vehicle's poses and kinematics over time, with interpolation between the stored times."""
 
 from __future__ import annotations
 
@@ -8,15 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.geometry.transforms import Array, Pose, interpolate, inverse, rotation_from_quaternion
+from bevcli.geometry.transforms import Array, Pose, interpolate, rotation_from_quaternion
 
-GRAVITY = 9.81  # m/s², what an accelerometer at rest shows along z
-TOLERANCE_NS = 50_000_000  # how far outside the rows a time may lie; the nearest row is taken
+GRAVITY = 9.81  # m/s², the reading of an accelerometer at rest along z
+TOLERANCE_NS = 50_000_000  # a time this far outside the stored range is accepted and gets the nearest pose
 
 
 @dataclass(frozen=True)
 class Kinematics:
-    """What the vehicle's sensors say, each (3,) in the ego frame: m/s² with gravity, rad/s, m/s."""
+    """Motion of the vehicle at one time, in the ego frame.
+
+    Attributes:
+        acceleration: (3,) m/s², including gravity as an accelerometer measures it.
+        angular_rate: (3,) rad/s.
+        velocity: (3,) m/s.
+    """
 
     acceleration: Array
     angular_rate: Array
@@ -25,10 +31,15 @@ class Kinematics:
 
 @dataclass(frozen=True)
 class EgoMotion:
-    """Poses world_from_ego at T times.
+    """Poses world_from_ego and kinematics at T times.
 
-    timestamps_ns: (T,) int64, strictly increasing. translations: (T, 3). quaternions: (T, 4) as stored.
-    accelerations, angular_rates, velocities: (T, 3) in the ego frame.
+    Attributes:
+        timestamps_ns: (T,) int64, strictly increasing.
+        translations: (T, 3) metres, world frame.
+        quaternions: (T, 4) w, x, y, z, with the stored sign.
+        accelerations: (T, 3) m/s² with gravity, ego frame.
+        angular_rates: (T, 3) rad/s, ego frame.
+        velocities: (T, 3) m/s, ego frame.
     """
 
     timestamps_ns: NDArray[np.int64]
@@ -39,9 +50,10 @@ class EgoMotion:
     velocities: Array
 
     def pose_at(self, timestamp_ns: int) -> Pose:
-        """world_from_ego at a time: linear and slerp; an exact row is returned as stored.
+        """world_from_ego at a time. The pose of an exactly matching row is returned unchanged.
 
-        Raises InputError when the time lies more than 50 ms outside the rows.
+        Translation is interpolated linearly, rotation by slerp.
+        Raises InputError if the time is more than 50 ms outside the stored range.
         """
         row, fraction = self._locate(timestamp_ns)
         start = Pose(self.translations[row], self.quaternions[row])
@@ -50,7 +62,7 @@ class EgoMotion:
         return interpolate(start, Pose(self.translations[row + 1], self.quaternions[row + 1]), fraction)
 
     def kinematics_at(self, timestamp_ns: int) -> Kinematics:
-        """Acceleration, angular rate and velocity at a time, interpolated linearly."""
+        """Acceleration, angular rate and velocity at a time, interpolated linearly. Raises InputError as `pose_at`."""
         row, fraction = self._locate(timestamp_ns)
         later = min(row + 1, len(self.timestamps_ns) - 1)
 
@@ -65,7 +77,7 @@ class EgoMotion:
         if timestamp_ns < first - TOLERANCE_NS or timestamp_ns > last + TOLERANCE_NS:
             raise InputError(
                 f"ego-motion covers {first} to {last} ns, but an image or frame is at {timestamp_ns} ns "
-                "(at most 50 ms outside is allowed): extend it or cut the frames"
+                "(at most 50 ms outside is allowed): add ego-motion for that time, or remove the frame"
             )
         clipped = min(max(timestamp_ns, first), last)
         row = int(np.searchsorted(times, clipped, side="right")) - 1
@@ -77,9 +89,11 @@ class EgoMotion:
 def derive_kinematics(
     timestamps_ns: NDArray[np.int64], translations: Array, quaternions: Array
 ) -> tuple[Array, Array, Array]:
-    """Accelerations with gravity, angular rates and velocities, each (T, 3) in the ego frame, from T poses.
+    """Accelerations with gravity, angular rates and velocities from T poses: each (T, 3) in the ego frame.
 
-    By differences over time; zero (and gravity) where there is one row.
+    They are finite differences over time. A single pose gives no motion: gravity only.
+
+    timestamps_ns: (T,). translations: (T, 3) metres, world frame. quaternions: (T, 4) w, x, y, z.
     """
     count = len(timestamps_ns)
     rotations = np.stack([rotation_from_quaternion(q) for q in quaternions])
@@ -99,8 +113,3 @@ def derive_kinematics(
         rates / 2,
         np.einsum("tji,tj->ti", rotations, velocity),
     )
-
-
-def current_from_previous(current: Pose, previous: Pose) -> Array:
-    """(4, 4) that moves points of the earlier ego frame to the present one; both poses are world_from_ego."""
-    return inverse(current.matrix) @ previous.matrix

@@ -1,11 +1,10 @@
-"""Rigid transforms as 4x4 float64 matrices `a_from_b`, and poses that keep their stored quaternion.
+"""Rigid transforms as 4x4 float64 matrices `a_from_b`, and poses that keep the sign of their quaternion.
 
 Quaternions are (w, x, y, z). Rotations are right-handed; yaw is counter-clockwise about z, 0 along x.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,9 +15,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Pose:
-    """Where frame b stands in frame a, with the quaternion as stored (its sign is kept: w may be negative).
+    """Position and orientation of frame b in frame a.
 
-    translation: (3,) metres. quaternion: (4,) w, x, y, z, of norm 1.
+    Attributes:
+        translation: (3,) metres.
+        quaternion: (4,) w, x, y, z of norm 1, with the stored sign: w may be negative.
     """
 
     translation: Array
@@ -26,7 +27,7 @@ class Pose:
 
     @property
     def matrix(self) -> Array:
-        """(4, 4) a_from_b."""
+        """(4, 4) a_from_b, metres."""
         return rigid(self.translation, rotation_from_quaternion(self.quaternion))
 
     @property
@@ -36,7 +37,7 @@ class Pose:
 
     @staticmethod
     def from_matrix(a_from_b: ArrayLike) -> Pose:
-        """A pose from a (4, 4) rigid matrix; the quaternion gets w >= 0."""
+        """The pose of a rigid matrix (4, 4). Its quaternion has w >= 0."""
         matrix = np.asarray(a_from_b, dtype=np.float64)
         return Pose(matrix[:3, 3].copy(), quaternion_from_rotation(matrix[:3, :3]))
 
@@ -47,7 +48,7 @@ class Pose:
 
 
 def rigid(translation: ArrayLike = (0, 0, 0), rotation: ArrayLike | None = None) -> Array:
-    """(4, 4) a_from_b of a translation (3,) in metres and a rotation (3, 3), default none."""
+    """(4, 4) a_from_b of a translation (3,) in metres and a rotation (3, 3), identity by default."""
     matrix = np.eye(4)
     matrix[:3, 3] = np.asarray(translation, dtype=np.float64)
     if rotation is not None:
@@ -56,7 +57,7 @@ def rigid(translation: ArrayLike = (0, 0, 0), rotation: ArrayLike | None = None)
 
 
 def inverse(a_from_b: ArrayLike) -> Array:
-    """(..., 4, 4) b_from_a of rigid transforms, by transposition."""
+    """(..., 4, 4) b_from_a of rigid transforms a_from_b (..., 4, 4)."""
     matrix = np.asarray(a_from_b, dtype=np.float64)
     result = np.zeros_like(matrix)
     rotation = np.swapaxes(matrix[..., :3, :3], -1, -2)
@@ -67,13 +68,13 @@ def inverse(a_from_b: ArrayLike) -> Array:
 
 
 def apply(a_from_b: ArrayLike, points_b: ArrayLike) -> Array:
-    """Points (..., 3) in b, moved to a: (..., 3)."""
+    """Points (..., 3) in frame b -> the same points (..., 3) in frame a."""
     matrix = np.asarray(a_from_b, dtype=np.float64)
     return np.asarray(points_b, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def rotation_from_quaternion(quaternion: ArrayLike) -> Array:
-    """(3, 3) rotation of a quaternion (w, x, y, z), normalised first."""
+    """(3, 3) rotation of a quaternion (w, x, y, z), which is normalised first."""
     q = np.asarray(quaternion, dtype=np.float64)
     w, x, y, z = q / np.linalg.norm(q)
     return np.array(
@@ -86,7 +87,7 @@ def rotation_from_quaternion(quaternion: ArrayLike) -> Array:
 
 
 def quaternion_from_rotation(rotation: ArrayLike) -> Array:
-    """(4,) w, x, y, z with w >= 0 of a rotation (3, 3): the largest eigenvector of Bar-Itzhack's matrix."""
+    """(4,) w, x, y, z with w >= 0 of a rotation (3, 3), by Bar-Itzhack's method (the largest eigenvector)."""
     r = np.asarray(rotation, dtype=np.float64)
     k = np.array(
         [
@@ -101,7 +102,7 @@ def quaternion_from_rotation(rotation: ArrayLike) -> Array:
 
 
 def rotation_about_z(yaw: float) -> Array:
-    """(3, 3) rotation by `yaw` radians, counter-clockwise about z."""
+    """(3, 3) rotation by `yaw` radians about z, counter-clockwise."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
@@ -113,7 +114,7 @@ def yaw_of_quaternion(quaternion: ArrayLike) -> float:
 
 
 def yaw_of_rotation(rotation: ArrayLike) -> float:
-    """Yaw in radians, in (-pi, pi], of the x axis of a rotation (3, 3) seen from above."""
+    """Yaw in radians, in (-pi, pi], of the rotated x axis seen from above; rotation: (3, 3)."""
     r = np.asarray(rotation, dtype=np.float64)
     return float(np.arctan2(r[1, 0], r[0, 0]))
 
@@ -124,7 +125,7 @@ def wrap_angle(angle: ArrayLike) -> Array:
 
 
 def slerp(start: ArrayLike, end: ArrayLike, fraction: float) -> Array:
-    """Quaternion (4,) between two, along the shorter way; it takes the sign of `start`."""
+    """Spherical interpolation of two quaternions (4,) along the shorter arc. The result has the sign of `start`."""
     a, b = (np.asarray(q, dtype=np.float64) for q in (start, end))
     cosine = float(a @ b)
     if cosine < 0:
@@ -138,11 +139,6 @@ def slerp(start: ArrayLike, end: ArrayLike, fraction: float) -> Array:
 
 
 def interpolate(start: Pose, end: Pose, fraction: float) -> Pose:
-    """The pose at `fraction` (0 to 1) of the way: translation linear, rotation by slerp."""
+    """The pose at `fraction` (0 to 1) between two poses: translation linear, rotation by slerp."""
     translation = start.translation + fraction * (end.translation - start.translation)
     return Pose(translation, slerp(start.quaternion, end.quaternion, fraction))
-
-
-def stack(poses: Sequence[Pose]) -> Array:
-    """(F, 4, 4) matrices of F poses."""
-    return np.stack([pose.matrix for pose in poses])

@@ -9,8 +9,6 @@ from torch import Tensor
 from bevcli.errors import InputError
 from bevcli.frame import AttentionView, CameraSamples, Probe
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.geometry.cameras import Camera
-from bevcli.geometry.transforms import Array
 from bevcli.model.attention_probe import AttentionProbe, SpatialSamples
 from bevcli.model.bevformer import BEVFormerConfig
 from bevcli.pipeline.preprocess import PreparedFrame
@@ -53,11 +51,5 @@ def _samples(
         pixels = samples.locations[row].float().cpu().double().numpy().reshape(-1, 2) * size / prepared.scales[place]
         weights = samples.weights[row].float().cpu().double().numpy().reshape(-1)
         shares = weights / (len(chosen) * samples.weights.shape[1])  # of all heads and cameras together
-        result[camera.name] = CameraSamples(_as_read(pixels, camera), shares)
+        result[camera.name] = CameraSamples(camera.distorted(pixels), shares)
     return result
-
-
-def _as_read(pixels: Array, camera: Camera) -> Array:
-    """Pixels (K, 2) of the undistorted image -> of the image as read, NaN where the lens does not reach."""
-    rays = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=-1) @ np.linalg.inv(camera.intrinsics).T
-    return camera.project(rays)[0]

@@ -11,7 +11,7 @@ import numpy as np
 from bevcli.errors import OutputError
 from bevcli.frame import Prediction
 from bevcli.geometry.transforms import Pose
-from bevcli.sequences.files.pose_json import pose_to_json
+from bevcli.sequences.files.transform_json import pose_to_json
 
 
 def save_bev(folder: Path, prediction: Prediction, extras: Mapping[str, object]) -> None:

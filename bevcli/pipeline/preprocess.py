@@ -1,4 +1,4 @@
-"""Frame -> the network's input. Images and calibration change together, here and nowhere else."""
+"""From a frame to the network's input. Images are resized only here, together with their calibration."""
 
 from __future__ import annotations
 
@@ -20,16 +20,19 @@ from bevcli.model.bevformer import BEVFormerConfig
 from bevcli.model.image_config import ImageConfig
 from bevcli.pipeline.camera_assignment import CameraAssignment, assign_cameras
 
-LensMaps = tuple[NDArray[np.float32], NDArray[np.float32]]
-
 
 @dataclass(frozen=True)
 class PreparedFrame:
-    """A frame and what the network takes of it.
+    """A frame and the network's input made of it, for N cameras.
 
-    assignment: the cameras of the N axes below. scales: (N,) network pixels per pixel of the image.
-    images: (1, N, 3, H, W) float32, zero where an image is missing. image_from_bev: (1, N, 4, 4) float32.
-    camera_index: (N,) int64. has_image: (1, N) bool.
+    Attributes:
+        frame: the frame as it was read.
+        assignment: the N cameras and the model cameras whose embeddings they use.
+        scales: (N,) network pixels per pixel of the camera's image.
+        images: (1, N, 3, H, W) float32, normalised; zero where an image is missing.
+        image_from_bev: (1, N, 4, 4) float32, to network pixels.
+        camera_index: (N,) int64, index of each camera's embedding.
+        has_image: (1, N) bool.
     """
 
     frame: Frame
@@ -42,30 +45,29 @@ class PreparedFrame:
 
 
 class Preprocessor:
-    """Prepares the frames of a sequence for one model. Lens maps are kept while the rig stays the same.
+    """Prepares the frames of a sequence for one model.
 
-    chosen_cameras: camera -> the model's camera whose embedding it takes, where viewing direction should not decide.
+    chosen_cameras: camera -> model camera whose embedding it uses. Other cameras are assigned by viewing direction.
     """
 
     def __init__(self, config: BEVFormerConfig, chosen_cameras: Mapping[str, str] | None = None) -> None:
         self.config = config
         self._chosen_cameras = chosen_cameras
         self._rig: CameraRig | None = None
-        self._lens_maps: dict[str, LensMaps] = {}
         self._assignment = CameraAssignment((), ())
 
     def __call__(self, frame: Frame) -> PreparedFrame:
-        """Images undistorted, resized, normalised and padded; projections to match."""
+        """The frame with its images undistorted, resized, normalised and padded, and the matching projections."""
         self._use_rig(frame.rig)
         image, names = self.config.image, self._assignment.cameras
         width, height = image.padded_size
         images = torch.zeros(1, len(names), 3, height, width)
 
         def write(place: int, name: str) -> None:
-            pixels = self._undistorted(frame.images[name].pixels_bgr, frame.rig[name])
-            network_image(pixels, image, out=images[0, place].numpy())
+            pixels = frame.rig[name].undistort(frame.images[name].pixels_bgr)
+            write_network_image(pixels, image, out=images[0, place].numpy())
 
-        # Side by side: one after the other, images take longer than the model on a GPU.
+        # In parallel: in sequence, preparing the images takes longer than the model on a GPU.
         with ThreadPoolExecutor(min(len(names), os.cpu_count() or 1)) as threads:
             tasks = [threads.submit(write, i, name) for i, name in enumerate(names) if name in frame.images]
         for task in tasks:
@@ -86,33 +88,26 @@ class Preprocessor:
     def _use_rig(self, rig: CameraRig) -> None:
         if rig is self._rig:
             return
-        self._rig, self._lens_maps = rig, {}
+        self._rig = rig
         self._assignment = assign_cameras(rig, self.config.cameras, self._chosen_cameras)
-
-    def _undistorted(self, pixels: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
-        if camera.distortion is None:
-            return pixels
-        if camera.name not in self._lens_maps:
-            map_x, map_y = camera.undistort_maps()
-            self._lens_maps[camera.name] = (np.nan_to_num(map_x, nan=-1e4), np.nan_to_num(map_y, nan=-1e4))
-        maps = self._lens_maps[camera.name]
-        return cv2.remap(pixels, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT).astype(np.uint8, copy=False)
 
 
 def network_scale(camera: Camera, image: ImageConfig) -> float:
-    """Network pixels per pixel of the camera's image: the largest at which it fits into the model's size."""
+    """Network pixels per pixel of the camera's image: the largest scale at which the image fits the model's size."""
     return min(image.size[0] / camera.width, image.size[1] / camera.height)
 
 
-def network_image(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: NDArray[np.float32]) -> None:
-    """Writes an image (H, W, 3) uint8 BGR, resized and normalised, to the top left of `out` (3, H', W'), zeros before.
+def write_network_image(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: NDArray[np.float32]) -> None:
+    """Resize and normalise an image and write it to the top left corner of `out`; the rest is left unchanged.
 
-    Resized in float, which commutes with the original's order (normalise, then resize) up to rounding.
+    The image is resized as float32, which equals the original's order (normalise, then resize) up to rounding.
+
+    pixels_bgr: (H, W, 3) uint8. out: (3, H', W') float32.
     """
     height, width = pixels_bgr.shape[:2]
     scale = min(image.size[0] / width, image.size[1] / height)
     new_width, new_height = round(width * scale), round(height * scale)
-    # Larger images are interpolated either way: areas are only for what shrinks.
+    # "area" averages, which is only defined for shrinking; enlarged images are always interpolated.
     interpolation = cv2.INTER_AREA if image.resize == "area" and scale < 1 else cv2.INTER_LINEAR
     resized = cv2.resize(pixels_bgr.astype(np.float32), (new_width, new_height), interpolation=interpolation)
     if image.color_order == "rgb":
@@ -125,9 +120,9 @@ def network_image(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: NDArra
 
 
 def image_from_bev(frame: Frame, camera_name: str) -> Array:
-    """(4, 4) float64: from the bev frame at the frame's time to pixels of the undistorted image at the camera's time.
+    """(4, 4) float64 from the bev frame at the frame's time to the undistorted image at the camera's time.
 
-    A point (x, y, z, 1) becomes (u d, v d, d, 1).
+    A point (x, y, z, 1) in metres becomes (u d, v d, d, 1) with pixel (u, v) and depth d in metres.
     """
     camera = frame.rig[camera_name]
     camera_ego_from_world = inverse(frame.world_from_ego_at[camera_name].matrix)

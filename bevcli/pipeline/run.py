@@ -15,6 +15,7 @@ from bevcli.pipeline.run_summary import RunSummary
 from bevcli.pipeline.runner import Runner, StepOptions
 from bevcli.pipeline.tracking import track as track_boxes
 from bevcli.recording.options import RecordingOptions
+from bevcli.recording.writer import LiveSink
 
 
 def run(
@@ -82,6 +83,7 @@ def run_into_folder(
     out: Path,
     options: RunOptions | None = None,
     *,
+    live: LiveSink | None = None,
     force: bool = False,
     after_frame: Callable[[Frame, Prediction], None] = lambda frame, prediction: None,
 ) -> RunSummary:
@@ -94,6 +96,7 @@ def run_into_folder(
         sequence: of `open_sequence`.
         out: the output folder, made where it is missing.
         options: default `RunOptions()`.
+        live: a viewer that shows the recording while it is written.
         force: replace the files of an earlier run in `out`.
         after_frame: called after each frame has been written.
 
@@ -103,14 +106,14 @@ def run_into_folder(
     """
     options = RunOptions() if options is None else options
     prepare_folder(out, force=force)
-    files = RunFiles(out, sequence, model, options.recording, options.save_bev, track=options.track)
+    files = RunFiles(out, sequence, model, options.recording, options.save_bev, live, track=options.track)
     summary = RunSummary(model, sequence, options.recording.score, temporal=options.temporal)
     predictions = run(
         model,
         sequence,
         temporal=options.temporal,
         track=options.track,
-        attention=options.recording.shows_insides,
+        attention=options.recording.shows_internals,
         probes=options.recording.probes,
         cameras=options.cameras,
     )

@@ -11,14 +11,14 @@ from bevcli.errors import OutputError
 from bevcli.evaluation.export_csv import CsvWriter
 from bevcli.evaluation.submission import SubmissionWriter
 from bevcli.frame import Frame, Prediction, Sequence
-from bevcli.geometry.attributes import attributes_by_speed
+from bevcli.geometry.boxes import attributes_by_speed
 from bevcli.pipeline.bev_files import save_bev
 from bevcli.pipeline.model_loading import Model
 from bevcli.pipeline.run_summary import SUMMARY
 from bevcli.recording.options import RecordingOptions
-from bevcli.recording.writer import Recording
+from bevcli.recording.writer import LiveSink, Recording
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
-from bevcli.sequences.files.map_file import write_map
+from bevcli.sequences.files.map_folder import write_map
 
 RECORDING, PREDICTIONS, SUBMISSION = "recording.rrd", "predictions.json", "results_nusc.json"
 TRACKS, SEGMENTATION = "tracks.csv", "segmentation"
@@ -49,11 +49,12 @@ class RunFiles:
         model: Model,
         recording: RecordingOptions,
         bev_folder: Path | None = None,
+        live: LiveSink | None = None,
         *,
         track: bool = True,
     ) -> None:
         self._out, self._sequence, self._model, self._bev_folder = out, sequence, model, bev_folder
-        self._options, self._track = recording, track
+        self._options, self._live, self._track = recording, live, track
         self._stack = contextlib.ExitStack()
         self._submission: SubmissionWriter | None = None
         self._tracks: CsvWriter | None = None
@@ -61,14 +62,7 @@ class RunFiles:
 
     def __enter__(self) -> RunFiles:
         out, sequence, model = self._out, self._sequence, self._model
-        recording = Recording(
-            out / RECORDING,
-            rig=sequence.rig,
-            class_names=model.config.classes,
-            title=f"{sequence.name} · {model.name}",
-            untrained=model.untrained,
-            options=self._options,
-        )
+        recording = Recording(out / RECORDING, sequence, model, self._options, self._live)
         extras = {"model": model.name, "untrained": model.untrained, "classes": list(model.config.classes)}
         boxes = BoxesWriter(out / PREDICTIONS, self._reference, extras)
         with self._stack:  # closes what is open if the next one cannot be opened

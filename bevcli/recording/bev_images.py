@@ -1,7 +1,7 @@
 """BEV features as images: their norm, one channel, or three principal components as colours.
 
-The components and the range of the colours are fitted on the first two frames and then kept, so that a colour means
-the same in every frame. The first frame's image is therefore ready only when the second frame has come.
+The components and the colour range are fitted on the first two frames and then kept, so that a colour means the same
+in every frame. Therefore the image of the first frame is ready only when the second frame was pushed.
 """
 
 from __future__ import annotations
@@ -19,15 +19,19 @@ from bevcli.recording.colors import colormap
 Stamp = TypeVar("Stamp")
 Features = NDArray[np.float32]
 FITTED_ON = 2  # frames
-CELLS_FOR_FIT = 4000  # of each frame, evenly chosen
-PERCENTILES = (1.0, 99.0)  # what is darkest and what is brightest
+CELLS_FOR_FIT = 4000  # of each frame, evenly spaced
+PERCENTILES = (1.0, 99.0)  # become the darkest and the brightest colour
 
 
 @dataclass(frozen=True)
 class BevColors:
-    """A fixed way from features to colours. mean: (C,). basis: (C, K), K 1 or 3; None: the norm of the features.
+    """A fixed mapping from features to colours.
 
-    low, high: (K,) the values that become 0 and 1.
+    Attributes:
+        mean: (C,) subtracted from the features.
+        basis: (C, K) projection, K 1 or 3; None takes the norm of the features (K 1).
+        low: (K,) values that become 0.
+        high: (K,) values that become 1.
     """
 
     mean: Features
@@ -45,9 +49,9 @@ class BevColors:
 
 
 def fit_colors(kind: str, features: Features) -> BevColors:
-    """The colours of `kind` ("norm", "pca", "channel:K") for features (cells, C).
+    """Fits colours to features (cells, C). kind: "norm", "pca" or "channel:K".
 
-    Raises InputError when there is no channel K.
+    Raises InputError when the features have no channel K.
     """
     channels = features.shape[-1]
     mean: Features = np.zeros(channels, np.float32)
@@ -65,7 +69,7 @@ def fit_colors(kind: str, features: Features) -> BevColors:
 
 
 class BevImages(Generic[Stamp]):
-    """Takes each frame's features, gives back the images that are ready, each with its frame's stamp."""
+    """Takes the features of each frame; returns the images that are ready, each with the stamp of its frame."""
 
     def __init__(self, kind: str) -> None:
         self.kind = kind
@@ -73,14 +77,18 @@ class BevImages(Generic[Stamp]):
         self._waiting: list[tuple[Stamp, Features]] = []
 
     def push(self, stamp: Stamp, features: Features) -> list[tuple[Stamp, NDArray[np.uint8]]]:
-        """features: (rows, columns, C), rows from the smallest y. Images: (rows, columns, 3), largest y on top."""
+        """Adds a frame; returns the images that are ready.
+
+        features: (rows, columns, C); the first row has the smallest y. The images are (rows, columns, 3) uint8 RGB;
+        their first row has the largest y.
+        """
         self._waiting.append((stamp, features))
         if self._colors is None and len(self._waiting) < FITTED_ON:
             return []
         return self.finish()
 
     def finish(self) -> list[tuple[Stamp, NDArray[np.uint8]]]:
-        """The images that still wait: of the only frame, when no second one came."""
+        """The images that are not returned yet: that of the first frame, where there was no second one."""
         if not self._waiting:
             return []
         if self._colors is None:
@@ -106,6 +114,5 @@ def _principal_components(centered: Features) -> Features:
     _, vectors = np.linalg.eigh(centered.T @ centered)
     basis = vectors[:, :-4:-1]  # the three largest, largest first
     signs = np.sign(basis[np.abs(basis).argmax(0), np.arange(basis.shape[1])])
-    return basis * np.where(signs == 0, 1, signs).astype(
-        np.float32
-    )  # eigenvectors have no sign of their own: the largest entry is up
+    # The sign of an eigenvector is arbitrary: make its largest entry positive.
+    return basis * np.where(signs == 0, 1, signs).astype(np.float32)

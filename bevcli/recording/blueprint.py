@@ -1,4 +1,4 @@
-"""The layout of a recording in the viewer: the cameras around, scene, BEV, curves and events in the middle."""
+"""The layout of a recording in the viewer: cameras above and below; scene, BEV, curves and events in the middle."""
 
 from __future__ import annotations
 
@@ -10,13 +10,16 @@ from bevcli.recording import entities
 from bevcli.recording.camera_layout import camera_rows
 
 HIDDEN = rrb.EntityBehavior(visible=False)
-EYE_M, LOOK_AT_M = (-15.0, 0.0, 10.0), (8.0, 0.0, 0.0)  # in ego: behind and above, looking ahead
+EYE_M, LOOK_AT_M = (-15.0, 0.0, 10.0), (8.0, 0.0, 0.0)  # in the ego frame: behind and above, looking ahead
 BACKGROUND = [18, 20, 25]
-VIEW_MARGIN_M = 36.0  # what the BEV view shows around the vehicle at first
+VIEW_MARGIN_M = 36.0  # the BEV view first shows this much around the vehicle
 
 
 def recording_blueprint(rig: CameraRig, note: str = "", probes: bool = False) -> rrb.Blueprint:
-    """The layout for a rig. `note` ("untrained weights") stands in the main views' titles."""
+    """The layout for a rig.
+
+    note: is added to the titles of the main views ("untrained weights"). probes: whether probes are shown at first.
+    """
     titled = f" ({note})" if note else ""
     middle = rrb.Horizontal(_scene(rig, titled), _bev_tabs(titled), _curves(), column_shares=[5, 4, 3])
     rows = [
@@ -39,19 +42,19 @@ def recording_blueprint(rig: CameraRig, note: str = "", probes: bool = False) ->
 def _scene(rig: CameraRig, titled: str) -> rrb.Spatial3DView:
     drawn_in_images = ("boxes", "ground_truth", "pillars", "probes")
     excluded = [f"- /{entities.overlay(name, kind)}/**" for name in rig.names for kind in drawn_in_images]
-    since_start = [
+    from_start = [
         rr.VisibleTimeRange(timeline, start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative())
         for timeline in (entities.TIME_TIMELINE, entities.FRAME_TIMELINE)
     ]
     return rrb.Spatial3DView(
-        origin=entities.EGO,  # the scene follows the vehicle because it is drawn in its frame
+        origin=entities.EGO,  # drawn in the ego frame, so the view follows the vehicle
         contents=[f"/{entities.WORLD}/**", *excluded],
         name=f"3D scene{titled}",
         background=BACKGROUND,
         line_grid=False,
         eye_controls=rrb.EyeControls3D(position=EYE_M, look_target=LOOK_AT_M, eye_up=(0, 0, 1)),
         overrides={
-            entities.TRAJECTORY: [rrb.VisibleTimeRanges(since_start)],
+            entities.TRAJECTORY: [rrb.VisibleTimeRanges(from_start)],
             entities.PILLARS: [HIDDEN],
         },
     )
@@ -70,7 +73,7 @@ def _bev_tabs(titled: str) -> rrb.Tabs:
     return rrb.Tabs(
         view(f"BEV{titled}", features, history),
         view("BEV features", history, segmentation),
-        view("From history", features, segmentation),
+        view("History weight", features, segmentation),
         active_tab=0,
     )
 

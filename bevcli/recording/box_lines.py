@@ -1,4 +1,4 @@
-"""The lines of 3D boxes in a camera's image, with the lens, clipped at the camera and at the image's edge."""
+"""Projects the edges of 3D boxes into a camera's image, with lens distortion; clips them at the image's border."""
 
 from __future__ import annotations
 
@@ -11,24 +11,29 @@ from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, apply
 
-NEAR_CLIP_M = 0.2  # lines end this far before the camera; nearer, they would shoot across the image
-PIECES_BEHIND_A_LENS = 8  # a straight edge is bent by distortion: this many short lines follow it
-FRONT_EDGES = ((0, 7), (3, 4))  # the diagonals of the front face show where the box is heading
+NEAR_CLIP_M = 0.2  # lines are cut at this depth; nearer points would project far outside of the image
+PIECES_PER_EDGE = 8  # distortion bends edges; they are drawn as this many short lines
+FRONT_EDGES = ((0, 7), (3, 4))  # the diagonals of the front face show the heading
 _EDGES = np.array((*BOX_EDGES, *FRONT_EDGES))
 
 
 @dataclass(frozen=True)
 class ImageLines:
-    """Lines in an image. segments: (M, 2, 2) pixels, inside the image. owners: (M,) the box of each."""
+    """Lines in an image.
+
+    Attributes:
+        segments: (M, 2, 2) start and end of each line, pixels, inside the image.
+        owners: (M,) the index of the box that each line belongs to.
+    """
 
     segments: Array
     owners: NDArray[np.int64]
 
 
 def lines_in_image(boxes: Boxes3D, camera: Camera, camera_from_boxes: Array) -> ImageLines:
-    """The visible edges, and the front face's diagonals, of boxes in a camera's image as it was taken.
+    """The edges and the front diagonals of boxes in a camera's image, cut to the part inside the image.
 
-    camera_from_boxes: (4, 4) from the boxes' frame to the camera's at the image's time.
+    camera_from_boxes: (4, 4) from the boxes' frame to the camera frame at the image's time.
     """
     corners = apply(camera_from_boxes, boxes.corners())  # (N, 8, 3)
     edges = corners[:, _EDGES]  # (N, 14, 2, 3)
@@ -36,14 +41,14 @@ def lines_in_image(boxes: Boxes3D, camera: Camera, camera_from_boxes: Array) -> 
     ends, kept = clip_near(edges.reshape(-1, 2, 3))
     ends, owners = ends[kept], owners[kept]
     if camera.distortion is not None:
-        ends, owners = _cut(ends, PIECES_BEHIND_A_LENS), np.repeat(owners, PIECES_BEHIND_A_LENS)
+        ends, owners = _cut(ends, PIECES_PER_EDGE), np.repeat(owners, PIECES_PER_EDGE)
     pixels, _ = camera.project(ends)
     segments, inside = clip_to_image(pixels, camera.width, camera.height)
     return ImageLines(segments[inside], owners[inside])
 
 
 def clip_near(ends: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Lines (M, 2, 3) in the camera frame, cut at NEAR_CLIP_M, and which of them (M,) are before it at all."""
+    """Lines (M, 2, 3) in the camera frame, cut at depth NEAR_CLIP_M, and which of them (M,) reach beyond it."""
     depth = ends[..., 2]
     before = depth >= NEAR_CLIP_M
     span = depth[:, 1] - depth[:, 0]
@@ -53,9 +58,9 @@ def clip_near(ends: Array) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def clip_to_image(segments: Array, width: int, height: int) -> tuple[Array, NDArray[np.bool_]]:
-    """Lines (M, 2, 2) in pixels, cut at the image's border, and which of them (M,) lie in it (Liang and Barsky).
+    """Lines (M, 2, 2) in pixels, cut at the image's border, and which of them (M,) are inside (Liang and Barsky).
 
-    A line with an end that is NaN is none.
+    A line whose start or end is NaN counts as outside.
     """
     start, step = segments[:, 0], segments[:, 1] - segments[:, 0]
     slope = np.concatenate([-step, step], axis=-1)  # (M, 4): against left, top, right, bottom

@@ -1,4 +1,4 @@
-"""The colours of classes, ground truth and heights. Colours are RGB, 0 to 255."""
+"""The colours of classes, ground truth, misses and curves, and colour maps. Colours are RGB, 0 to 255."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Color = tuple[int, int, int]
 
-# None is red: red means missed or false.
+# No class is red: red means a miss or a false positive.
 CLASS_COLORS: dict[str, Color] = {
     "car": (255, 158, 44),
     "truck": (186, 222, 92),
@@ -39,18 +39,18 @@ MAP_COLORS: dict[str, Color] = {
 }
 
 
-def class_color(name: str, place: int) -> Color:
-    """A class's colour; a class that is not nuScenes' gets one by its place among the model's classes."""
+def class_color(name: str, index: int) -> Color:
+    """The colour of a class. A class that is not in CLASS_COLORS gets one by its index among the model's classes."""
     if name in CLASS_COLORS:
         return CLASS_COLORS[name]
-    red, green, blue = colorsys.hsv_to_rgb((0.11 + place * 0.618034) % 1.0, 0.65, 1.0)
+    red, green, blue = colorsys.hsv_to_rgb((0.11 + index * 0.618034) % 1.0, 0.65, 1.0)
     return round(red * 255), round(green * 255), round(blue * 255)
 
 
 def colormap(values: ArrayLike, name: str = "viridis") -> NDArray[np.uint8]:
-    """Values 0 to 1, of any shape (...,) -> (..., 3) uint8 RGB of one of OpenCV's colour maps."""
+    """Values 0 to 1 of any shape (...,) -> colours (..., 3) uint8 RGB. name: one of OpenCV's colour maps."""
     table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], getattr(cv2, f"COLORMAP_{name.upper()}"))[
         :, 0, ::-1
     ]
-    places = np.clip(np.asarray(values, dtype=np.float64) * 255, 0, 255).astype(np.uint8)
-    return np.ascontiguousarray(table[places]).astype(np.uint8)
+    indices = np.clip(np.asarray(values, dtype=np.float64) * 255, 0, 255).astype(np.uint8)
+    return np.ascontiguousarray(table[indices]).astype(np.uint8)

@@ -1,7 +1,7 @@
-"""Where things lie in a recording: the entity paths, which writers, readers and the blueprint share.
+"""The entity paths of a recording. Writer, reader and blueprint share them.
 
-`world` is the drive's world frame, moved so that it starts at the first frame's ego position (the viewer computes in
-float32). `bev` is a flat image of the bev frame in metres: to the right x, downwards -y.
+`world` is the sequence's world frame, moved so that the first frame's ego position is its origin (the viewer computes
+in float32). `bev` is a flat image of the bev frame in metres: x to the right, -y down.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ TIME_TIMELINE = "time"
 
 
 def camera(name: str) -> str:
-    """The entity of a camera: its pose, pinhole and all that is drawn in its image."""
+    """The entity of a camera: its pose and its pinhole; image and overlays are below it."""
     return f"world/cameras/{name}"
 
 
@@ -53,5 +53,5 @@ def image(name: str) -> str:
 
 
 def overlay(name: str, kind: str) -> str:
-    """The entity of what is drawn into a camera's image: boxes, labels, ground_truth, pillars, probes."""
+    """The entity of an image overlay. kind: "boxes", "boxes/labels", "ground_truth", "pillars" or "probes"."""
     return f"{camera(name)}/{kind}"

@@ -1,4 +1,4 @@
-"""Labels of boxes: what they say, and which of them are shown so that they do not cover each other."""
+"""Labels of boxes: their text, and a choice of them that does not overlap."""
 
 from __future__ import annotations
 
@@ -9,13 +9,16 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
 from bevcli.recording.box_lines import ImageLines
 
-LABELS_IN_SCENE = 10  # the nearest boxes; the others show their colour
-LOWEST_LABELLED = 0.05  # of the image's height: smaller boxes show their colour only
-LETTER_WIDTH, LETTER_HEIGHT = 0.019, 0.085  # of the image's width and height, where the view is a third of the screen
+LABELS_IN_SCENE = 10  # only the nearest boxes are labelled
+LOWEST_LABELLED = 0.05  # of the image's height: smaller boxes are not labelled
+LETTER_WIDTH, LETTER_HEIGHT = (
+    0.019,
+    0.085,
+)  # of the image's width and height, for a view that is a third of the screen wide
 
 
 def box_labels(boxes: Boxes3D) -> list[str]:
-    """ "car 0.83" for each, without the score where there is none."""
+    """The text of each label: "car 0.83", or "car" where boxes have no scores."""
     names = [str(name).replace("_", " ") for name in boxes.classes]
     if boxes.scores is None:
         return names
@@ -23,16 +26,21 @@ def box_labels(boxes: Boxes3D) -> list[str]:
 
 
 def labels_in_scene(boxes: Boxes3D, ego_xy: Array) -> list[str]:
-    """A label for the boxes nearest to ego_xy (2,), "" for the others."""
+    """Labels for the boxes nearest to ego_xy (2,), "" for the others. boxes: in the same frame, metres."""
     away = np.linalg.norm(boxes.centers[:, :2] - ego_xy, axis=-1)
     near = set(np.argsort(away)[:LABELS_IN_SCENE].tolist())
     return [text if i in near else "" for i, text in enumerate(box_labels(boxes))]
 
 
 def labels_in_image(lines: ImageLines, texts: list[str], width: int, height: int) -> tuple[Array, NDArray[np.int64]]:
-    """Where labels stand, (L, 2) pixels, over the boxes (L,) they belong to: the largest first, none over another."""
+    """Positions of labels above their boxes. The largest boxes are labelled first; no label covers another.
+
+    lines: the boxes' lines in an image of this width and height. texts: the label of each box.
+
+    Returns the centres of the labels (L, 2), pixels, and the boxes (L,) that they belong to.
+    """
     taken: list[tuple[float, float, float, float]] = []
-    places, owners = [], []
+    centers, owners = [], []
     for owner, low, high in _by_height(lines):
         if high[1] - low[1] < LOWEST_LABELLED * height:
             break
@@ -41,13 +49,13 @@ def labels_in_image(lines: ImageLines, texts: list[str], width: int, height: int
         area = (middle - half, low[1] - LETTER_HEIGHT * height, middle + half, low[1])
         if not any(_overlap(area, other) for other in taken):
             taken.append(area)
-            places.append((middle, low[1] - LETTER_HEIGHT * height / 2))
+            centers.append((middle, low[1] - LETTER_HEIGHT * height / 2))
             owners.append(owner)
-    return np.array(places).reshape(-1, 2), np.array(owners, dtype=np.int64)
+    return np.array(centers).reshape(-1, 2), np.array(owners, dtype=np.int64)
 
 
 def _by_height(lines: ImageLines) -> list[tuple[int, Array, Array]]:
-    """Each box in the image with the corners of the rectangle around it, the highest first."""
+    """Each box in the image with its bounding rectangle's corners (2,), (2,), the highest rectangle first."""
     around = []
     for owner in np.unique(lines.owners):
         points = lines.segments[lines.owners == owner].reshape(-1, 2)

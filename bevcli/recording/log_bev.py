@@ -1,4 +1,4 @@
-"""BEV maps into a recording: features on the ground and seen from above, segmentation, history, probed cells."""
+"""Writes BEV maps into a recording: features, segmentation, history weights, probed cells."""
 
 from __future__ import annotations
 
@@ -13,11 +13,14 @@ from bevcli.recording import entities
 from bevcli.recording.colors import MAP_COLORS, colormap
 
 GROUND_OPACITY = 110  # of 255: boxes, rings and the trajectory stay readable on the map
-BELOW_GROUND_M = 0.06  # so that the map does not flicker with what lies on the ground
+BELOW_GROUND_M = 0.06  # the map is drawn below the ground, so that it does not flicker with the range rings
 
 
 def log_features(stream: rr.RecordingStream, image: NDArray[np.uint8], grid: BevGrid, ego_from_bev: Array) -> None:
-    """Writes an image (rows, columns, 3) of the BEV features, the largest y on top, on the ground and from above."""
+    """Writes an image of the BEV features into the BEV view, and onto the ground of the scene.
+
+    image: (rows, columns, 3) RGB; the first row has the largest y.
+    """
     stream.log(entities.BEV_FEATURES, rr.Image(image, draw_order=-10), _placed(image, grid.x_range_m, grid.y_range_m))
     quad = rr.Mesh3D(
         vertex_positions=_ground_corners(grid, ego_from_bev),
@@ -30,16 +33,19 @@ def log_features(stream: rr.RecordingStream, image: NDArray[np.uint8], grid: Bev
 
 
 def log_segmentation(stream: rr.RecordingStream, segmentation: BevMap) -> None:
-    """Writes what lies on the ground, in the classes' colours."""
+    """Writes a segmentation into the BEV view, in the colours of the map classes."""
     colors = np.zeros((*segmentation.cells.shape, 3), dtype=np.uint8)
-    for name, bit in MAP_CLASSES.items():  # later classes lie on top of earlier ones
+    for name, bit in MAP_CLASSES.items():  # where a cell has several classes, the last one is shown
         colors[(segmentation.cells & bit) > 0] = MAP_COLORS[name]
     image = rr.Image(colors, draw_order=-5)
     stream.log(entities.BEV_SEGMENTATION, image, _placed(colors, segmentation.x_range_m, segmentation.y_range_m))
 
 
 def log_history(stream: rr.RecordingStream, weight: Array | None, grid: BevGrid) -> None:
-    """Writes how much each cell (rows, columns) took from history, 0 to 1; without history the map is taken away."""
+    """Writes the attention weight of the previous BEV map in each cell.
+
+    weight: (rows, columns) 0 to 1; None (no history was used) clears the map of the frame before.
+    """
     if weight is None:
         stream.log(entities.BEV_HISTORY, rr.Clear(recursive=False))
         return
@@ -48,7 +54,7 @@ def log_history(stream: rr.RecordingStream, weight: Array | None, grid: BevGrid)
 
 
 def log_probes(stream: rr.RecordingStream, probes: tuple[Probe, ...], ego_from_bev: Array, grid: BevGrid) -> None:
-    """Marks the probed cells: a dot from above, a pillar in the scene."""
+    """Marks the probed cells: with a dot in the BEV view, and with a pillar in the scene."""
     if not probes:
         return
     centers = np.array([probe.cell_center for probe in probes])

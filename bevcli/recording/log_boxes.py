@@ -1,4 +1,4 @@
-"""Boxes into a recording: in the 3D scene and in the BEV view; ground truth apart from predictions."""
+"""Writes boxes into a recording: predictions and ground truth, in the 3D scene and in the BEV view."""
 
 from __future__ import annotations
 
@@ -15,21 +15,25 @@ from bevcli.recording import entities
 from bevcli.recording.colors import FALSE_COLOR, GROUND_TRUTH_COLOR, MISSED_COLOR, class_color
 from bevcli.recording.labels import labels_in_scene
 
-MOVING_M_S = 0.5  # slower things get no velocity arrow
+MOVING_M_S = 0.5  # slower objects get no velocity arrow
 THIN, THICK = rr.Radius.ui_points(0.8), rr.Radius.ui_points(1.6)
 
 
 def box_colors(boxes: Boxes3D, class_names: Sequence[str]) -> np.ndarray:
-    """(N, 3) uint8, the colours of the boxes' classes."""
-    places = {name: place for place, name in enumerate(class_names)}
-    colors = {name: class_color(name, places.get(name, len(places))) for name in np.unique(boxes.classes)}
+    """(N, 3) uint8 RGB: the colour of each box's class."""
+    indices = {name: index for index, name in enumerate(class_names)}
+    colors = {name: class_color(name, indices.get(name, len(indices))) for name in np.unique(boxes.classes)}
     return np.array([colors[name] for name in boxes.classes], dtype=np.uint8).reshape(-1, 3)
 
 
 def log_boxes_3d(
     stream: rr.RecordingStream, boxes: Boxes3D, false: np.ndarray, class_names: Sequence[str], ego_xy: Array
 ) -> None:
-    """Writes predicted boxes of the recording's world; `false` (N,) crosses out those that no ground truth has."""
+    """Writes predicted boxes into the scene: boxes, velocity arrows, crosses on false positives.
+
+    boxes: in the recording's world. false: (N,) bool, the false positives. ego_xy: (2,) the vehicle's position; the
+    boxes nearest to it get labels.
+    """
     ids = [1 + list(class_names).index(name) if name in class_names else 0 for name in boxes.classes]
     labels = labels_in_scene(boxes, ego_xy)
     archetype = rr.Boxes3D(**_shape(boxes), class_ids=ids, labels=labels, show_labels=True, radii=THICK)
@@ -55,7 +59,7 @@ def log_boxes_3d(
 
 
 def log_ground_truth_3d(stream: rr.RecordingStream, truth: Boxes3D, found: np.ndarray) -> None:
-    """Writes ground-truth boxes of the recording's world: pale where found (M,), red where missed."""
+    """Writes ground-truth boxes (in the recording's world) into the scene: pale where found (M,), red where missed."""
     pale = rr.Boxes3D(**_shape(truth[found]), colors=[*GROUND_TRUTH_COLOR, 150], radii=THIN)
     stream.log(entities.GROUND_TRUTH, pale, rr.AnyValues(name=_names(truth[found])))
     missed = truth[~found]
@@ -64,7 +68,7 @@ def log_ground_truth_3d(stream: rr.RecordingStream, truth: Boxes3D, found: np.nd
 
 
 def log_boxes_bev(stream: rr.RecordingStream, boxes: Boxes3D, false: np.ndarray, class_names: Sequence[str]) -> None:
-    """Writes predicted boxes of the bev frame, seen from above."""
+    """Writes predicted boxes (in the bev frame) into the BEV view. false: (N,) bool, the false positives."""
     colors = box_colors(boxes, class_names)
     outlines, headings = footprints(boxes)
     strips = [*outlines, *headings]
@@ -84,7 +88,7 @@ def log_boxes_bev(stream: rr.RecordingStream, boxes: Boxes3D, false: np.ndarray,
 
 
 def log_ground_truth_bev(stream: rr.RecordingStream, truth: Boxes3D, found: np.ndarray) -> None:
-    """Writes ground-truth boxes of the bev frame, seen from above."""
+    """Writes ground-truth boxes (in the bev frame) into the BEV view: pale where found (M,), red where missed."""
     for entity, part, color in (
         (entities.BEV_GROUND_TRUTH, truth[found], GROUND_TRUTH_COLOR),
         (entities.BEV_MISSED, truth[~found], MISSED_COLOR),
@@ -95,7 +99,10 @@ def log_ground_truth_bev(stream: rr.RecordingStream, truth: Boxes3D, found: np.n
 
 
 def footprints(boxes: Boxes3D) -> tuple[Array, Array]:
-    """Boxes seen from above in the flat bev image: closed outlines (N, 5, 2), and lines to the front (N, 2, 2)."""
+    """Boxes of the bev frame in the flat BEV image (x to the right, -y down, metres).
+
+    Returns closed outlines (N, 5, 2), and lines from the centre to the front (N, 2, 2).
+    """
     ground = boxes.corners()[:, :4, :2] * (1, -1)
     outlines = np.concatenate([ground, ground[:, :1]], axis=1)
     front = (ground[:, 0] + ground[:, 3]) / 2
@@ -115,10 +122,10 @@ def _shape(boxes: Boxes3D) -> dict[str, Any]:
 
 
 def _names(boxes: Boxes3D) -> pa.Array:
-    return pa.array([str(name) for name in boxes.classes], pa.utf8())  # typed, so that no boxes are a value, too
+    return pa.array([str(name) for name in boxes.classes], pa.utf8())  # typed, so that an empty list is a value too
 
 
 def _crosses(boxes: Boxes3D) -> Array:
-    """(2 N, 2, 3) the diagonals of the boxes' tops."""
+    """(2 N, 2, 3): the two diagonals of each box's top face."""
     tops = boxes.corners()[:, 4:]
     return tops[:, [[0, 2], [1, 3]]].reshape(-1, 2, 3)

@@ -1,4 +1,4 @@
-"""One camera's frame into a recording: its pose, its image, and what is drawn into it."""
+"""Writes one camera of a frame into a recording: pose, image, and the overlays of the image."""
 
 from __future__ import annotations
 
@@ -19,41 +19,51 @@ from bevcli.recording.colors import GROUND_TRUTH_COLOR, MISSED_COLOR, colormap
 from bevcli.recording.labels import box_labels, labels_in_image
 from bevcli.recording.log_boxes import box_colors
 
-JPEG_QUALITY = 85  # of images that come without bytes of their own, as a video's do
+JPEG_QUALITY = 85  # for images that have no encoded bytes, such as those of a video
 POINT = rr.Radius.ui_points(2.0)
 
 
 @dataclass(frozen=True)
-class CameraShot:
-    """One camera at its image's time. world_from_camera: (4, 4), of the recording's world."""
+class PosedCamera:
+    """A camera with its pose at the time of its image.
+
+    Attributes:
+        camera: name, intrinsics and distortion.
+        world_from_camera: (4, 4) into the recording's world.
+    """
 
     camera: Camera
     world_from_camera: Array
 
     @property
+    def name(self) -> str:
+        """The camera's name."""
+        return self.camera.name
+
+    @property
     def camera_from_world(self) -> Array:
-        """(4, 4)."""
+        """(4, 4) from the recording's world."""
         return inverse(self.world_from_camera)
 
 
-def log_image(stream: rr.RecordingStream, shot: CameraShot, image: CameraImage | None) -> None:
-    """Writes the pose and the image's own bytes; where there is no image, the last one is taken away."""
-    entity = entities.camera(shot.camera.name)
-    pose = shot.world_from_camera
+def log_image(stream: rr.RecordingStream, posed: PosedCamera, image: CameraImage | None) -> None:
+    """Writes the pose and the encoded image. Without an image, the one of the frame before is cleared."""
+    entity = entities.camera(posed.name)
+    pose = posed.world_from_camera
     stream.log(entity, rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
     if image is None:
-        stream.log(entities.image(shot.camera.name), rr.Clear(recursive=False))
+        stream.log(entities.image(posed.name), rr.Clear(recursive=False))
         return
     contents, media_type = _encoded(image)
-    stream.log(entities.image(shot.camera.name), rr.EncodedImage(contents=contents, media_type=media_type))
+    stream.log(entities.image(posed.name), rr.EncodedImage(contents=contents, media_type=media_type))
 
 
 def log_boxes_in_image(
-    stream: rr.RecordingStream, shot: CameraShot, boxes: Boxes3D, class_names: Sequence[str]
+    stream: rr.RecordingStream, posed: PosedCamera, boxes: Boxes3D, class_names: Sequence[str]
 ) -> None:
-    """Writes the lines and labels of predicted boxes, given in the recording's world."""
-    name = shot.camera.name
-    lines = lines_in_image(boxes, shot.camera, shot.camera_from_world)
+    """Draws predicted boxes (in the recording's world) into the image: lines and labels."""
+    name = posed.name
+    lines = lines_in_image(boxes, posed.camera, posed.camera_from_world)
     colors = box_colors(boxes, class_names)
     stream.log(
         entities.overlay(name, "boxes"),
@@ -65,7 +75,7 @@ def log_boxes_in_image(
         ),
     )
     texts = box_labels(boxes)
-    places, owners = labels_in_image(lines, texts, shot.camera.width, shot.camera.height)
+    places, owners = labels_in_image(lines, texts, posed.camera.width, posed.camera.height)
     labels = rr.Points2D(
         places,
         labels=[texts[owner] for owner in owners],
@@ -77,12 +87,14 @@ def log_boxes_in_image(
     stream.log(entities.overlay(name, "boxes/labels"), labels)
 
 
-def log_ground_truth_in_image(stream: rr.RecordingStream, shot: CameraShot, truth: Boxes3D, found: np.ndarray) -> None:
-    """Writes the lines of ground-truth boxes, given in the recording's world: pale where found, red where missed."""
-    lines = lines_in_image(truth, shot.camera, shot.camera_from_world)
+def log_ground_truth_in_image(
+    stream: rr.RecordingStream, posed: PosedCamera, truth: Boxes3D, found: np.ndarray
+) -> None:
+    """Draws ground-truth boxes (in the recording's world) into the image: pale where found (M,), red where missed."""
+    lines = lines_in_image(truth, posed.camera, posed.camera_from_world)
     colors = np.where(found[:, None], GROUND_TRUTH_COLOR, MISSED_COLOR).astype(np.uint8).reshape(-1, 3)
     stream.log(
-        entities.overlay(shot.camera.name, "ground_truth"),
+        entities.overlay(posed.name, "ground_truth"),
         rr.LineStrips2D(
             lines.segments.astype(np.float32),
             colors=colors[lines.owners],
@@ -92,19 +104,22 @@ def log_ground_truth_in_image(stream: rr.RecordingStream, shot: CameraShot, trut
     )
 
 
-def log_pillar_hits(stream: rr.RecordingStream, shot: CameraShot, points_world: Array, colors: np.ndarray) -> None:
-    """Writes where 3D reference points (K, 3) of the recording's world land in the image. colors: (K, 3) uint8."""
-    pixels, depth = shot.camera.project(apply(shot.camera_from_world, points_world))
-    hits = shot.camera.contains(pixels, depth)
+def log_pillar_hits(stream: rr.RecordingStream, posed: PosedCamera, points_world: Array, colors: np.ndarray) -> None:
+    """Draws the projections of 3D reference points into the image, where they are inside of it.
+
+    points_world: (K, 3) in the recording's world, metres. colors: (K, 3) uint8 RGB.
+    """
+    pixels, depth = posed.camera.project(apply(posed.camera_from_world, points_world))
+    hits = posed.camera.contains(pixels, depth)
     points = rr.Points2D(pixels[hits], colors=colors[hits], radii=POINT, draw_order=10)
-    stream.log(entities.overlay(shot.camera.name, "pillars"), points)
+    stream.log(entities.overlay(posed.name, "pillars"), points)
 
 
-def log_samples(stream: rr.RecordingStream, shot: CameraShot, samples: Sequence[CameraSamples]) -> None:
-    """Writes the points that spatial cross-attention sampled in this image: larger and brighter by weight."""
+def log_samples(stream: rr.RecordingStream, posed: PosedCamera, samples: Sequence[CameraSamples]) -> None:
+    """Draws the sampling points of spatial cross-attention in this image: larger and brighter with their weight."""
     pixels = np.concatenate([np.zeros((0, 2)), *(s.pixels for s in samples)])
     weights = np.concatenate([np.zeros(0), *(s.weights for s in samples)])
-    inside = shot.camera.contains(pixels, np.ones(len(pixels)))
+    inside = posed.camera.contains(pixels, np.ones(len(pixels)))
     shares = weights[inside] / max(float(weights.max(initial=0.0)), 1e-9)
     points = rr.Points2D(
         pixels[inside],
@@ -112,7 +127,7 @@ def log_samples(stream: rr.RecordingStream, shot: CameraShot, samples: Sequence[
         radii=rr.Radius.ui_points(1.5 + 5.0 * np.sqrt(shares)),
         draw_order=40,
     )
-    stream.log(entities.overlay(shot.camera.name, "probes"), points)
+    stream.log(entities.overlay(posed.name, "probes"), points)
 
 
 def _encoded(image: CameraImage) -> tuple[bytes, str]:

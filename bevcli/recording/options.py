@@ -1,8 +1,9 @@
-"""RecordingOptions: how much a recording holds, and which of the model's insides it shows."""
+"""RecordingOptions: how much a recording holds, and how it is drawn."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from bevcli.errors import InputError
@@ -13,27 +14,33 @@ LEVELS: tuple[Level, ...] = ("minimal", "standard", "full")
 
 @dataclass(frozen=True)
 class RecordingOptions:
-    """What `bevcli run` writes into a recording.
+    """What goes into a recording.
 
-    level: "minimal" images, boxes, ego and curves; "standard" adds the BEV map, the pillars and the history map;
-    "full" thins nothing. bev: "norm", "pca", "channel:K" or "none", how BEV features become an image. score: boxes
-    below it are not shown. probes: x, y in metres in the bev frame, the cells whose attention is drawn.
-    live: a viewer shows the recording while it is written.
+    Attributes:
+        level: "minimal": images, boxes, ego pose, curves and events. "standard": also the BEV features, the
+            segmentation, the history map, probes and pillars (at most 25 by 25). "full": all pillars of the grid.
+        bev: how BEV features become an image: "norm", "pca", "channel:K" or "none".
+        score: boxes with a lower score are not shown.
+        probes: x, y in the bev frame, metres, of the cells whose attention is drawn.
+        vehicle_mesh: a mesh file of the ego vehicle (`vehicle.load_vehicle` says which axes it must have);
+            None draws the default car.
 
-    Raises InputError for an unknown level or kind of BEV image.
+    Raises InputError for an unknown level or kind of BEV image, and for a mesh file that does not exist.
     """
 
     level: Level = "standard"
     bev: str = "pca"
     score: float = 0.25
     probes: tuple[tuple[float, float], ...] = ()
-    live: bool = False
+    vehicle_mesh: Path | None = None
 
     def __post_init__(self) -> None:
         if self.level not in LEVELS:
             raise InputError(f'--record: unknown level "{self.level}" (expected {", ".join(LEVELS)})')
         if self.bev not in ("norm", "pca", "none") and self.channel is None:
             raise InputError(f'--bev: unknown image "{self.bev}" (expected norm, pca, channel:K or none)')
+        if self.vehicle_mesh is not None and not self.vehicle_mesh.is_file():
+            raise InputError(f"--vehicle-mesh {self.vehicle_mesh}: there is no such file")
 
     @property
     def channel(self) -> int | None:
@@ -42,6 +49,6 @@ class RecordingOptions:
         return int(number) if kind == "channel" and number.isdecimal() else None
 
     @property
-    def shows_insides(self) -> bool:
-        """Whether the BEV map, pillars and attention are written."""
+    def shows_internals(self) -> bool:
+        """Whether BEV features, segmentation, history, pillars and probes are written."""
         return self.level != "minimal"

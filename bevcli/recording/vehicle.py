@@ -1,53 +1,145 @@
-"""The ego vehicle as a mesh: a plain car, so that front and size are seen at a glance."""
+"""The ego vehicle as a mesh: a plain car by default, or any mesh file that trimesh reads."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array
 from bevcli.recording.colors import EGO_COLOR, Color
+
+if TYPE_CHECKING:
+    import trimesh
 
 BODY_LWH = (4.6, 1.86, 0.75)
 REAR_AXLE_TO_MIDDLE = 1.35  # metres ahead; the ego frame's origin is on the ground under the rear axle
 WHEELBASE, TRACK = 2.75, 1.64
 GLASS: Color = (32, 40, 52)
 RUBBER: Color = (20, 22, 26)
-OUTLINE = np.array([[3.65, -0.93], [3.65, 0.93], [-0.95, 0.93], [-0.95, -0.93]])  # (4, 2) in ego, seen from above
+OUTLINE = np.array([[3.65, -0.93], [3.65, 0.93], [-0.95, 0.93], [-0.95, -0.93], [3.65, -0.93]])  # in ego, from above
+FRONT_ARROW = np.array([[2.2, -0.8], [3.3, 0.0], [2.2, 0.8]])
+SMOOTH_BELOW_RAD = np.radians(40.0)  # faces that meet at a smaller angle are shaded as one curved surface
+LONGEST_M = 50.0  # a longer mesh is not in metres
+GLTF_FILES = (".glb", ".gltf")
+EGO_FROM_GLTF = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # glTF: y up, z forward, x left
 
 
 @dataclass(frozen=True)
-class ColoredMesh:
-    """vertices: (V, 3) metres. normals: (V, 3). faces: (F, 3) vertex indices. colors: (V, 3) uint8 RGB."""
+class VehicleMesh:
+    """The ego vehicle in the ego frame.
+
+    Attributes:
+        vertices: (V, 3) metres.
+        normals: (V, 3) unit vectors.
+        faces: (F, 3) vertex indices.
+        colors: (V, 3) uint8 RGB.
+        top_view: line strips (K, 2), metres: the vehicle from above, its outline and an arrow at its front.
+    """
 
     vertices: Array
     normals: Array
     faces: NDArray[np.int64]
     colors: NDArray[np.uint8]
+    top_view: tuple[Array, ...]
 
 
-def vehicle_mesh() -> ColoredMesh:
-    """A car with a cabin and four wheels in the ego frame."""
+def load_vehicle(path: Path) -> VehicleMesh:
+    """The vehicle from a mesh file of any format that trimesh reads (.glb, .gltf, .ply, .obj, .stl, …).
+
+    The file must be in metres, with its origin on the ground under the middle of the rear axle. Files in glTF format
+    (.glb, .gltf) have glTF's axes: x left, y up, z forward. All other files have the ego frame's axes: x forward,
+    y left, z up. Parts without a colour get the default car's blue.
+
+    Raises InputError where trimesh cannot read the file, and where it has no triangles or is longer than 50 m.
+    """
+    parts = [_part(mesh) for mesh in _read_meshes(path)]
+    counts = [len(vertices) for vertices, *_ in parts]
+    starts = np.cumsum([0, *counts[:-1]])
+    vertices = np.concatenate([vertices for vertices, *_ in parts])
+    low, high = vertices.min(0), vertices.max(0)
+    if not np.isfinite(vertices).all() or (high - low).max() > LONGEST_M:
+        size = " x ".join(f"{length:.4g}" for length in high - low)
+        raise InputError(
+            f"{path}: the vehicle's size is {size} m (expected at most {LONGEST_M:g} m; scale it to metres)"
+        )
+    return VehicleMesh(
+        vertices=vertices,
+        normals=np.concatenate([normals for _, normals, _, _ in parts]),
+        faces=np.concatenate([faces + start for (_, _, faces, _), start in zip(parts, starts, strict=True)]),
+        colors=np.concatenate([colors for *_, colors in parts]),
+        top_view=_top_view(low, high),
+    )
+
+
+def _read_meshes(path: Path) -> list[trimesh.Trimesh]:
+    """The triangle meshes of a file in the ego frame."""
+    import trimesh  # only here: it takes half a second to load
+
+    try:
+        scene = trimesh.load_scene(path)
+        if path.suffix.lower() in GLTF_FILES:
+            scene.apply_transform(EGO_FROM_GLTF)
+        meshes = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    except Exception as error:  # each of trimesh's many readers raises errors of its own
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(
+            f"{path}: trimesh cannot read this mesh file ({reason}); try .glb, .ply, .obj or .stl"
+        ) from error
+    if not meshes:
+        raise InputError(f"{path}: the file has no triangles (expected a triangle mesh of the vehicle)")
+    return meshes
+
+
+def _part(mesh: trimesh.Trimesh) -> tuple[Array, Array, NDArray[np.int64], NDArray[np.uint8]]:
+    """Vertices, normals, faces and colours of one mesh, with sharp edges."""
+    import trimesh
+
+    visual: Any = mesh.visual
+    if visual.kind == "face":
+        mesh.unmerge_vertices()  # no vertex may be shared by faces of different colours
+        visual = mesh.visual
+    if visual.kind == "texture":
+        visual = visual.to_color()  # of each vertex; one colour for all of them where there is no texture image
+    colors = visual.vertex_colors if visual.defined else (*EGO_COLOR, 255)
+    mesh.visual = trimesh.visual.ColorVisuals(vertex_colors=np.broadcast_to(colors, (len(mesh.vertices), 4)))
+    mesh = trimesh.graph.smooth_shade(mesh, angle=SMOOTH_BELOW_RAD, facet_minarea=None)
+    shaded: Any = mesh.visual
+    return (
+        np.array(mesh.vertices),
+        np.array(mesh.vertex_normals),
+        np.array(mesh.faces),
+        np.array(shaded.vertex_colors, dtype=np.uint8)[:, :3],
+    )
+
+
+def _top_view(low: Array, high: Array) -> tuple[Array, ...]:
+    """The rectangle around a mesh from above, and an arrow at its front. low, high: (3,) corners in the ego frame."""
+    (x0, y0), (x1, y1) = low[:2], high[:2]
+    middle, half, length = (y0 + y1) / 2, (y1 - y0) / 2, x1 - x0
+    outline = np.array([[x1, y0], [x1, y1], [x0, y1], [x0, y0], [x1, y0]])
+    arrow = np.array([[-0.32 * length, -0.86 * half], [-0.08 * length, 0], [-0.32 * length, 0.86 * half]])
+    return outline, arrow + (x1, middle)
+
+
+def default_vehicle() -> VehicleMesh:
+    """A plain car with a cabin and four wheels."""
     body = _box(*BODY_LWH) + (REAR_AXLE_TO_MIDDLE, 0, 0.62)
     wheels = [_wheel() + (x, y, 0.34) for x in (0.0, WHEELBASE) for y in (-TRACK / 2, TRACK / 2)]
     return _joined([(body, EGO_COLOR), (_cabin(), GLASS), *((wheel, RUBBER) for wheel in wheels)])
 
 
-def outline_and_heading() -> list[Array]:
-    """The vehicle seen from above as line strips in the ego frame: its outline, and an arrow's head at the front."""
-    front = np.array([[2.2, -0.8], [3.3, 0.0], [2.2, 0.8]])
-    return [np.concatenate([OUTLINE, OUTLINE[:1]]), front]
-
-
-# Parts are triangles, (T, 3, 3): corners in metres, counter-clockwise seen from outside. They are this plain because
-# trimesh takes half a second to load, at the start of every run.
+# The parts of the default car are triangles (T, 3, 3): corners in metres, counter-clockwise seen from outside. They
+# are made with NumPy, because trimesh would take half a second to load at the start of every run.
 
 
 def _cabin() -> Array:
     cabin = _box(2.5, 1.66, 0.6)
-    cabin[cabin[..., 2] > 0] *= (0.68, 0.86, 1)  # windscreens lean
+    cabin[cabin[..., 2] > 0] *= (0.68, 0.86, 1)  # the windscreens are inclined
     return cabin + (1.0, 0, 1.28)
 
 
@@ -63,27 +155,29 @@ def _box(length: float, width: float, height: float) -> Array:
 
 
 def _prism(outline: Array, height: float) -> Array:
-    """A convex outline (N, 2), counter-clockwise, from z = -height / 2 to height / 2."""
+    """A convex outline (N, 2), counter-clockwise, extruded from z = -height / 2 to height / 2."""
     low, high = (np.insert(outline, 2, z, axis=1) for z in (-height / 2, height / 2))
     low_next, high_next = np.roll(low, -1, axis=0), np.roll(high, -1, axis=0)
     sides = [(low, low_next, high_next), (low, high_next, high)]
     caps = [(low[:1].repeat(len(low), 0), low_next, low), (high[:1].repeat(len(high), 0), high, high_next)]
     triangles = np.concatenate([np.stack(corners, axis=1) for corners in (*sides, *caps)])
-    return triangles[np.linalg.norm(_normals(triangles), axis=-1) > 0]  # a cap's fan begins and ends in a line
+    # The first and the last triangle of each cap's fan have no area.
+    return triangles[np.linalg.norm(_normals(triangles), axis=-1) > 0]
 
 
 def _normals(triangles: Array) -> Array:
     return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
 
 
-def _joined(parts: list[tuple[Array, Color]]) -> ColoredMesh:
-    """Flat shading: a vertex for each corner of each triangle."""
+def _joined(parts: list[tuple[Array, Color]]) -> VehicleMesh:
+    """Flat shading: each corner of each triangle is a vertex of its own."""
     triangles = np.concatenate([part for part, _ in parts])
     normals = _normals(triangles)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return ColoredMesh(
+    return VehicleMesh(
         vertices=triangles.reshape(-1, 3),
         normals=normals.repeat(3, axis=0),
         faces=np.arange(3 * len(triangles)).reshape(-1, 3),
         colors=np.concatenate([np.tile(color, (3 * len(part), 1)) for part, color in parts]).astype(np.uint8),
+        top_view=(OUTLINE, FRONT_ARROW),
     )

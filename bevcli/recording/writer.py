@@ -1,77 +1,121 @@
-"""Recording: writes what the model saw and said, frame by frame, into a file that survives a crash."""
+"""Recording: writes frames and predictions into an .rrd file, frame by frame."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import rerun as rr
+from rerun.sinks import LogSinkLike
 
 from bevcli.errors import OutputError
-from bevcli.frame import Frame, FrameStamp, Prediction
+from bevcli.frame import Frame, FrameStamp, Prediction, Sequence
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array, inverse, rigid
-from bevcli.recording import entities, log_bev, log_boxes, log_cameras, static_scene
-from bevcli.recording.about import about_text
+from bevcli.recording import entities, log_bev, log_boxes, log_cameras, log_static
 from bevcli.recording.bev_images import BevImages
 from bevcli.recording.blueprint import recording_blueprint
-from bevcli.recording.colors import EGO_COLOR, STAGE_COLORS, class_color
+from bevcli.recording.colors import EGO_COLOR
+from bevcli.recording.log_cameras import PosedCamera
 from bevcli.recording.matching import counted, match
 from bevcli.recording.options import RecordingOptions
-from bevcli.recording.pillars import drawn_pillars
-from bevcli.viewer.live import LiveView
+from bevcli.recording.vehicle import load_vehicle
+
+if TYPE_CHECKING:
+    from bevcli.model.bevformer import BEVFormerConfig
 
 APPLICATION = "bevcli"
 FLUSH_TIMEOUT_S = 20.0
 UNTRAINED = "untrained weights"
+PosedCameras = tuple[PosedCamera, ...]
+
+
+class RecordedModel(Protocol):
+    """What a recording needs to know about a model."""
+
+    @property
+    def config(self) -> BEVFormerConfig:
+        """The model's configuration; its name and its classes are written."""
+        ...
+
+    @property
+    def untrained(self) -> bool:
+        """Whether the weights are random. Then titles, events and the page "About" say so."""
+        ...
+
+
+class LiveSink(Protocol):
+    """A viewer that follows a recording while it is written, such as `bevcli.viewer.live.LiveView`."""
+
+    @property
+    def sink(self) -> LogSinkLike:
+        """Receives everything that goes into the file."""
+        ...
+
+    def open(self) -> None:
+        """Called once, when the recording starts."""
+        ...
+
+    def close(self) -> None:
+        """Called once, when the recording ends."""
+        ...
 
 
 class Recording:
-    """`with Recording(...) as recording: recording.log(frame, prediction)`, once a frame, in order.
+    """Writes a recording: `with Recording(...) as recording: recording.log(frame, prediction)`, frames in order.
 
-    Each frame is on the disk when `log` returns. Raises OutputError when the file cannot be written.
+    Each frame is on the disk when `log` returns, so a killed run keeps all frames up to then.
+
+    Args:
+        path: the .rrd file to write; an existing one is replaced.
+        sequence: the rig and the name are taken from it.
+        model: the class names, the name and whether it is trained are taken from it.
+        options: how much is written; the defaults of RecordingOptions if None.
+        live: a viewer that follows the recording; None for no viewer.
+
+    Raises OutputError when the file cannot be written, and InputError when the vehicle's mesh cannot be read.
     """
 
     def __init__(
         self,
-        path: Path,
-        *,
-        rig: CameraRig,
-        class_names: Sequence[str],
-        title: str,
-        untrained: bool,
+        path: str | Path,
+        sequence: Sequence,
+        model: RecordedModel,
         options: RecordingOptions | None = None,
+        live: LiveSink | None = None,
     ) -> None:
-        self.path, self.rig, self.title, self.untrained = Path(path), rig, title, untrained
-        self.class_names = tuple(class_names)
+        self.path, self.rig, self.untrained = Path(path), sequence.rig, model.untrained
+        self.title = f"{sequence.name} · {model.config.name}"
+        self.class_names = tuple(model.config.classes)
         self.options = RecordingOptions() if options is None else options
         self._stream = rr.RecordingStream(APPLICATION)
-        self._live = LiveView() if self.options.live else None
-        self._origin: Array | None = None
+        self._live = live
+        self._origin: Array | None = None  # (3,) position of the first frame's ego vehicle in the world
         self._last: Frame | None = None
-        self._early_events: list[tuple[str, str]] = []  # said before there was a frame to say it at
+        self._early_events: list[tuple[str, str]] = []  # logged before the first frame
         self._pillars: Array | None = None
-        wanted = self.options.bev != "none" and self.options.shows_insides
         self._bev_images: BevImages[tuple[FrameStamp, Prediction]] | None = None
-        if wanted:
+        if self.options.bev != "none" and self.options.shows_internals:
             self._bev_images = BevImages(self.options.bev)
 
     def __enter__(self) -> Recording:
+        mesh = self.options.vehicle_mesh
+        vehicle = None if mesh is None else load_vehicle(mesh)
         note = UNTRAINED if self.untrained else ""
         blueprint = recording_blueprint(self.rig, note, probes=bool(self.options.probes))
-        self._stream.__enter__()
         sinks = [] if self._live is None else [self._live.sink]
         try:
             self._stream.set_sinks(rr.FileSink(self.path), *sinks, default_blueprint=blueprint)
         except RuntimeError as error:
             raise OutputError(f"{self.path}: the recording cannot be written ({error})") from error
+        self._stream.__enter__()
         if self._live is not None:
             self._live.open()
-        static_scene.log_static(self._stream, self.rig, self.class_names)
-        self._log_about()
+        names, untrained = self.class_names, self.untrained
+        log_static.log_scene(self._stream, self.rig, names, vehicle)
+        log_static.log_about(self._stream, self.title, self.rig, names, self.options, untrained=untrained)
         return self
 
     def __exit__(
@@ -84,35 +128,26 @@ class Recording:
             self._live.close()
 
     def log(self, frame: Frame, prediction: Prediction) -> None:
-        """Writes one frame: what was seen, the boxes at or above the score, and what the attention did."""
-        self._start_or_follow(frame)
-        self._at(frame.stamp)
-        shots = self._log_cameras(frame)
-        self._log_boxes(frame, prediction, shots)
+        """Writes one frame: images, shown boxes, ground truth, curves, events and the model's internals."""
+        self._log_ego(frame)
+        cameras = self._log_cameras(frame)
+        self._log_boxes(frame, prediction, cameras)
         self._log_curves(prediction)
         self._log_frame_events(frame, prediction)
-        if self.options.shows_insides:
-            self._log_insides(frame, prediction, shots)
+        if self.options.shows_internals:
+            self._log_internals(frame, prediction, cameras)
         self._last = frame
         self._flush()
 
     def event(self, text: str, level: str = "INFO") -> None:
-        """Writes a line into the log of events, at the newest frame, or the first. level: "INFO", "WARN" or "ERROR"."""
+        """Writes a line into the event log, at the newest frame; before the first frame, at the first one.
+
+        level: "INFO", "WARN" or "ERROR".
+        """
         if self._origin is None:
             self._early_events.append((text, level))
         else:
             self._stream.log(entities.EVENTS, rr.TextLog(text, level=level))
-
-    def _log_about(self) -> None:
-        text = about_text(self.title, self.rig, self.options, untrained=self.untrained)
-        facts = rr.AnyValues(
-            title=self.title,
-            untrained=self.untrained,
-            score=self.options.score,
-            class_names=list(self.class_names),
-            camera_names=list(self.rig.names),
-        )
-        self._stream.log(entities.RUN, rr.TextDocument(text, media_type="text/markdown"), facts, static=True)
 
     def _at(self, stamp: FrameStamp) -> None:
         self._stream.set_time(entities.FRAME_TIMELINE, sequence=stamp.index)
@@ -124,13 +159,13 @@ class Recording:
         except (RuntimeError, ValueError, TimeoutError) as error:
             raise OutputError(f"{self.path}: the recording cannot be written ({error})") from error
 
-    def _start_or_follow(self, frame: Frame) -> None:
-        """Places the frame: the recording's world is the drive's, moved to where the first frame's vehicle stands."""
+    def _log_ego(self, frame: Frame) -> None:
+        """Writes the ego pose. The recording's world frame has its origin at the first frame's ego position."""
         if self._origin is None:
             self._origin = frame.world_from_ego.matrix[:3, 3].copy()
             self._stream.log(entities.WORLD, rr.AnyValues(origin=self._origin), static=True)
         self._at(frame.stamp)
-        pose = self._in_recording(frame.world_from_ego.matrix)
+        pose = self._moved_to_origin(frame.world_from_ego.matrix)
         self._stream.log(
             entities.EGO,
             rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]),
@@ -138,129 +173,112 @@ class Recording:
         )
         before = self._last
         if before is not None and before.stamp.scene == frame.stamp.scene:
-            way = [self._in_recording(f.world_from_ego.matrix)[:3, 3] for f in (before, frame)]
-            self._stream.log(entities.TRAJECTORY, rr.LineStrips3D([way], colors=EGO_COLOR, radii=0.06))
+            piece = [self._moved_to_origin(f.world_from_ego.matrix)[:3, 3] for f in (before, frame)]
+            self._stream.log(entities.TRAJECTORY, rr.LineStrips3D([piece], colors=EGO_COLOR, radii=0.06))
 
-    def _in_recording(self, world_from_a: Array) -> Array:
-        return rigid(-(self._origin if self._origin is not None else np.zeros(3))) @ world_from_a
+    def _moved_to_origin(self, world_from_a: Array) -> Array:
+        """world_from_a (4, 4) of the sequence's world -> of the recording's world."""
+        assert self._origin is not None
+        return rigid(-self._origin) @ world_from_a
 
-    def _log_cameras(self, frame: Frame) -> tuple[log_cameras.CameraShot, ...]:
-        shots = tuple(
-            log_cameras.CameraShot(c, self._in_recording(frame.world_from_ego_at[c.name].matrix) @ c.ego_from_camera)
+    def _log_cameras(self, frame: Frame) -> PosedCameras:
+        cameras = tuple(
+            PosedCamera(c, self._moved_to_origin(frame.world_from_ego_at[c.name].matrix) @ c.ego_from_camera)
             for c in frame.rig.cameras
         )
-        for shot in shots:
-            log_cameras.log_image(self._stream, shot, frame.images.get(shot.camera.name))
-        return shots
+        for posed in cameras:
+            log_cameras.log_image(self._stream, posed, frame.images.get(posed.name))
+        return cameras
 
-    def _log_boxes(self, frame: Frame, prediction: Prediction, shots: tuple[log_cameras.CameraShot, ...]) -> None:
+    def _log_boxes(self, frame: Frame, prediction: Prediction, cameras: PosedCameras) -> None:
         shown = shown_boxes(prediction.boxes, self.options.score)
-        world_from_bev = self._in_recording(prediction.world_from_ego.matrix) @ prediction.ego_from_bev
+        world_from_bev = self._moved_to_origin(prediction.world_from_ego.matrix) @ prediction.ego_from_bev
         in_world = shown.transformed(world_from_bev)
         true = np.ones(len(shown), dtype=bool)
         if frame.ground_truth is not None:
-            in_recording = frame.ground_truth.transformed(self._in_recording(np.eye(4)))
+            in_recording = frame.ground_truth.transformed(self._moved_to_origin(np.eye(4)))
             truth = counted(in_recording.transformed(inverse(world_from_bev)), prediction.grid)
-            if self.untrained:  # nothing can be found or missed: a scene all in red would say nothing
+            if self.untrained:  # random boxes match nothing: a scene all in red would be useless
                 found = np.ones(len(truth), dtype=bool)
             else:
                 true, found = match(shown, truth)
-            self._log_ground_truth(truth, found, world_from_bev, shots)
+            self._log_ground_truth(truth, found, world_from_bev, cameras)
         stream, names = self._stream, self.class_names
-        ego_xy = self._in_recording(prediction.world_from_ego.matrix)[:2, 3]
+        ego_xy = self._moved_to_origin(prediction.world_from_ego.matrix)[:2, 3]
         log_boxes.log_boxes_3d(stream, in_world, ~true, names, ego_xy)
         log_boxes.log_boxes_bev(stream, shown, ~true, names)
-        for shot in shots:
-            log_cameras.log_boxes_in_image(stream, shot, in_world, names)
+        for posed in cameras:
+            log_cameras.log_boxes_in_image(stream, posed, in_world, names)
         counts = [float((shown.classes == name).sum()) for name in names]
         stream.log(entities.BOX_CURVES, rr.Scalars(counts))
 
     def _log_ground_truth(
-        self, truth: Boxes3D, found: np.ndarray, world_from_bev: Array, shots: tuple[log_cameras.CameraShot, ...]
+        self, truth: Boxes3D, found: np.ndarray, world_from_bev: Array, cameras: PosedCameras
     ) -> None:
         in_world = truth.transformed(world_from_bev)
         log_boxes.log_ground_truth_3d(self._stream, in_world, found)
         log_boxes.log_ground_truth_bev(self._stream, truth, found)
-        for shot in shots:
-            log_cameras.log_ground_truth_in_image(self._stream, shot, in_world, found)
+        for posed in cameras:
+            log_cameras.log_ground_truth_in_image(self._stream, posed, in_world, found)
 
     def _log_curves(self, prediction: Prediction) -> None:
         stages = prediction.stage_seconds
         if self._last is None:
-            self._name_curves(stages)
+            log_static.log_curve_names(self._stream, stages, self.class_names)
         self._stream.log(entities.STAGE_CURVES, rr.Scalars(list(stages.values())))
-
-    def _name_curves(self, stages: Mapping[str, float]) -> None:
-        stage_colors = [STAGE_COLORS[place % len(STAGE_COLORS)] for place in range(len(stages))]
-        self._stream.log(entities.STAGE_CURVES, rr.SeriesLines(names=list(stages), colors=stage_colors), static=True)
-        colors = [class_color(name, place) for place, name in enumerate(self.class_names)]
-        lines = rr.SeriesLines(names=list(self.class_names), colors=colors)
-        self._stream.log(entities.BOX_CURVES, lines, static=True)
 
     def _log_frame_events(self, frame: Frame, prediction: Prediction) -> None:
         if self._last is None and self.untrained:
-            self.event("The weights are UNTRAINED: boxes and maps mean nothing.", "WARN")
+            self.event("The weights are UNTRAINED: boxes and maps are meaningless.", "WARN")
+        where = f"frame {frame.stamp.index}"
         while self._early_events:
             self.event(*self._early_events.pop(0))
         if prediction.started_anew:
-            self.event(f"frame {frame.stamp.index}: {self._why_anew(frame.stamp)}; the model starts without history")
+            scene = f', scene "{frame.stamp.scene}"' if frame.stamp.scene else ""
+            self.event(f"{where}: no history: {prediction.started_anew}{scene}")
         for camera, reason in frame.dropped.items():
-            self.event(f"frame {frame.stamp.index}: camera {camera} is missing: {reason}", "WARN")
+            self.event(f"{where}: camera {camera} has no image: {reason}", "WARN")
         if prediction.skipped:
-            self.event(f"frame {frame.stamp.index}: no image at all, the model was not asked", "WARN")
+            self.event(f"{where}: no camera has an image; the model was not run", "WARN")
 
-    def _why_anew(self, stamp: FrameStamp) -> str:
-        before = None if self._last is None else self._last.stamp
-        if before is None:
-            return f'scene "{stamp.scene}" begins' if stamp.scene else "the drive begins"
-        if before.scene != stamp.scene:
-            return f'scene change from "{before.scene}" to "{stamp.scene}"'
-        return f"{(stamp.timestamp_ns - before.timestamp_ns) / 1e9:.1f} s since the last frame"
-
-    def _log_insides(
-        self,
-        frame: Frame,
-        prediction: Prediction,
-        shots: tuple[log_cameras.CameraShot, ...],
-    ) -> None:
-        self._log_pillars(frame, prediction, shots)
+    def _log_internals(self, frame: Frame, prediction: Prediction, cameras: PosedCameras) -> None:
+        self._log_pillars(frame, prediction, cameras)
         if prediction.segmentation is not None:
             log_bev.log_segmentation(self._stream, prediction.segmentation)
         if self._bev_images is not None and prediction.bev is not None:
             grid = prediction.grid
             features = prediction.bev.detach().float().cpu().numpy().reshape(grid.rows, grid.columns, -1)
-            placed = (frame.stamp, prediction)
-            self._log_bev_images(self._bev_images.push(placed, features))
+            self._log_bev_images(self._bev_images.push((frame.stamp, prediction), features))
             self._at(frame.stamp)
-        self._log_attention(prediction, shots)
+        self._log_attention(prediction, cameras)
 
     def _log_bev_images(self, ready: list[tuple[tuple[FrameStamp, Prediction], np.ndarray]]) -> None:
         for (stamp, prediction), image in ready:
             self._at(stamp)
             log_bev.log_features(self._stream, image, prediction.grid, prediction.ego_from_bev)
 
-    def _log_pillars(self, frame: Frame, prediction: Prediction, shots: tuple[log_cameras.CameraShot, ...]) -> None:
+    def _log_pillars(self, frame: Frame, prediction: Prediction, cameras: PosedCameras) -> None:
         if self._pillars is None:
-            self._pillars = drawn_pillars(prediction.grid, everything=self.options.level == "full")
-            static_scene.log_pillars(self._stream, prediction.grid, prediction.ego_from_bev, self._pillars)
-        colors = static_scene.pillar_colors(prediction.grid, len(self._pillars))
-        world_from_bev = self._in_recording(prediction.world_from_ego.matrix) @ prediction.ego_from_bev
+            self._pillars = log_static.drawn_pillars(prediction.grid, all_cells=self.options.level == "full")
+            log_static.log_pillars(self._stream, prediction.grid, prediction.ego_from_bev, self._pillars)
+        colors = log_static.pillar_colors(prediction.grid, len(self._pillars))
+        world_from_bev = self._moved_to_origin(prediction.world_from_ego.matrix) @ prediction.ego_from_bev
         points = self._pillars.reshape(-1, 3) @ world_from_bev[:3, :3].T + world_from_bev[:3, 3]
-        for shot in shots:
-            if shot.camera.name in frame.images:
-                log_cameras.log_pillar_hits(self._stream, shot, points, colors)
+        for posed in cameras:
+            if posed.name in frame.images:
+                log_cameras.log_pillar_hits(self._stream, posed, points, colors)
 
-    def _log_attention(self, prediction: Prediction, shots: tuple[log_cameras.CameraShot, ...]) -> None:
+    def _log_attention(self, prediction: Prediction, cameras: PosedCameras) -> None:
         attention = prediction.attention
         if attention is None:
             return
         log_bev.log_history(self._stream, attention.history_weight, prediction.grid)
         log_bev.log_probes(self._stream, attention.probes, prediction.ego_from_bev, prediction.grid)
-        for shot in shots if attention.probes else ():
-            samples = [p.cameras[shot.camera.name] for p in attention.probes if shot.camera.name in p.cameras]
-            log_cameras.log_samples(self._stream, shot, samples)
+        for posed in cameras if attention.probes else ():
+            samples = [p.cameras[posed.name] for p in attention.probes if posed.name in p.cameras]
+            log_cameras.log_samples(self._stream, posed, samples)
 
 
 def shown_boxes(boxes: Boxes3D, score: float) -> Boxes3D:
-    """The boxes at or above a score; all where there are no scores."""
+    """The boxes with this score or more; all boxes where they have no scores."""
     return boxes if boxes.scores is None else boxes[boxes.scores >= score]

@@ -17,7 +17,7 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.rig.motion_checks import check_ego_motion
 from bevcli.rig.time_checks import check_camera_times
-from bevcli.sequences.native.calibration import draft_calibration
+from bevcli.sequences.files.calibration_file import draft_calibration
 from bevcli.sequences.native.folder import FolderSequence
 from bevcli.sequences.native.frames_table import read_frames_table
 from bevcli.sequences.open import open_sequence
@@ -63,7 +63,7 @@ def _foreign(path: Path, frame: int) -> DebugInput:
 def _look_into(folder: Path, rig: CameraRig, frame: int) -> tuple[tuple[Finding, ...], Mapping[str, NDArray[np.uint8]]]:
     findings: list[Finding] = []
     try:
-        sequence = FolderSequence(folder, rig=rig, ego_motion="none")
+        sequence = FolderSequence(folder, rig=rig, ego_motion="optional")
     except InputError as error:
         findings.append(_refused(error))
         try:

@@ -14,7 +14,7 @@ from matplotlib.colors import to_rgb
 from bevcli.errors import OutputError
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Array, apply
-from bevcli.recording import entities, static_scene
+from bevcli.recording import entities, log_static
 from bevcli.recording.camera_layout import camera_rows
 from bevcli.rig.checks import RigReport
 from bevcli.rig.coverage import Coverage
@@ -45,7 +45,7 @@ def write_calibration_recording(path: Path, rig: CameraRig, report: RigReport, i
             stream.save(path, default_blueprint=_blueprint(rig))
         except RuntimeError as error:
             raise OutputError(f"{path}: the recording cannot be written ({error})") from error
-        static_scene.log_static(stream, rig, ())
+        log_static.log_scene(stream, rig, ())
         _log_scene(stream, rig, report.coverage)
         for camera in rig.cameras:
             _log_camera(stream, camera, rig.ego_from_bev, images.get(camera.name))

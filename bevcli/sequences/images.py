@@ -1,4 +1,4 @@
-"""The images of one frame, decoded side by side: from files, or from videos read front to back."""
+"""Reads the images of a frame from files or videos and decodes them in parallel."""
 
 from __future__ import annotations
 
@@ -19,13 +19,19 @@ from bevcli.sequences.video import VideoReader
 DECODING_THREADS = 6
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".webm", ".mov", ".m4v")
-# An image is shown and calibrated as its pixels are stored: an EXIF orientation would turn it away from both.
+# The calibration refers to the pixels as they are stored, so an EXIF orientation must not rotate them.
 DECODE_FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
 
 @dataclass(frozen=True)
 class ImageSource:
-    """Where one image is, and when it was taken. `video_index`: its number in the video `path`, from 0."""
+    """Where one image is, and when it was taken.
+
+    Attributes:
+        path: an image file or a video.
+        timestamp_ns: time of the image.
+        video_index: index of the image in the video, from 0. None for an image file.
+    """
 
     path: Path
     timestamp_ns: int
@@ -36,27 +42,31 @@ class ImageSource:
 
 
 class UnreadableImage(Exception):
-    """An image is missing or broken; the message is the reason."""
+    """An image is missing or broken. The message is the reason."""
 
 
 class ImageReader:
-    """Reads the images of frames in order. With `strict`, one that is missing or broken is an InputError."""
+    """Reads the images of frames, which should be asked for in order.
+
+    strict: a missing or broken image raises InputError.
+    """
 
     def __init__(self, *, strict: bool = False) -> None:
         self._strict = strict
-        self._videos: dict[str, VideoReader] = {}  # by camera: each reader serves one thread at a time
+        self._videos: dict[str, VideoReader] = {}  # by camera, so that only one thread at a time uses a reader
         self._threads = ThreadPoolExecutor(DECODING_THREADS, thread_name_prefix="decode")
 
     def read(
         self, sources: Mapping[str, ImageSource], rig: CameraRig, dropped: Mapping[str, str]
     ) -> tuple[dict[str, CameraImage], dict[str, str]]:
-        """The images by camera, and why others are missing: `dropped` (known before) and what turned up.
+        """The images by camera, and the reasons for missing images by camera.
 
-        Raises InputError for an image of another size than the calibration's.
+        dropped: cameras already known to have no image, with the reasons.
+        Raises InputError for an image whose size differs from the calibration and, with `strict`, a missing image.
         """
         if self._strict and dropped:
             camera, reason = next(iter(dropped.items()))
-            raise InputError(f"camera {camera}: {reason}: add the image, or run without --strict")
+            raise InputError(f"camera {camera}: {reason}: add the image, or remove --strict")
         tasks = {name: self._threads.submit(self._read_one, source, rig[name]) for name, source in sources.items()}
         images: dict[str, CameraImage] = {}
         reasons = dict(dropped)
@@ -65,7 +75,7 @@ class ImageReader:
                 images[name] = task.result()
             except UnreadableImage as unreadable:
                 if self._strict:
-                    hint = "mend the image, or run without --strict"
+                    hint = "replace the image, or remove --strict"
                     raise InputError(f"camera {name}: {unreadable}: {hint}") from None
                 reasons[name] = str(unreadable)
         return images, reasons
@@ -79,7 +89,7 @@ class ImageReader:
         if (width, height) != (camera.width, camera.height):
             raise InputError(
                 f"{source}: camera {camera.name}: the image is {width}x{height} (expected {camera.width}x"
-                f"{camera.height}, as the calibration says): give images and calibration of the same size"
+                f"{camera.height}, as in the calibration): use the calibration of this image size"
             )
         return image
 
@@ -104,12 +114,12 @@ def _read_file(source: ImageSource) -> CameraImage:
     media_type = media_type_of(encoded)
     pixels = decode(encoded)
     if pixels is None:
-        raise UnreadableImage(f"{source.path} is not a whole image")
+        raise UnreadableImage(f"{source.path} is not a complete image")
     return CameraImage(source.timestamp_ns, pixels, encoded if media_type else None, media_type)
 
 
 def decode(encoded: bytes) -> NDArray[np.uint8] | None:
-    """(H, W, 3) BGR of an image's bytes, or None where they are no image or one cut short."""
+    """(H, W, 3) uint8 BGR of an encoded image; None if it is not an image or incomplete."""
     if not encoded or _is_cut_short(encoded):
         return None
     pixels = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), DECODE_FLAGS)
@@ -117,15 +127,15 @@ def decode(encoded: bytes) -> NDArray[np.uint8] | None:
 
 
 def media_type_of(encoded: bytes) -> str | None:
-    """What a viewer needs to know of the bytes: "image/jpeg", "image/png", or None for another format."""
+    """The media type of an encoded image: "image/jpeg", "image/png", or None for another format."""
     if encoded.startswith(b"\xff\xd8\xff"):
         return "image/jpeg"
     return "image/png" if encoded.startswith(b"\x89PNG\r\n") else None
 
 
 def _is_cut_short(encoded: bytes) -> bool:
-    """Whether a JPEG or PNG lacks its end; OpenCV decodes the rest to grey without a word."""
+    """Whether the end of a JPEG or PNG is missing. OpenCV fills the missing part with grey, without an error."""
     kind = media_type_of(encoded)
     if kind == "image/jpeg":
-        return encoded.rfind(b"\xff\xd9") < encoded.rfind(b"\xff\xda")  # end of image before the last scan's start
+        return encoded.rfind(b"\xff\xd9") < encoded.rfind(b"\xff\xda")  # the end marker comes before the last scan
     return kind == "image/png" and b"IEND" not in encoded[-64:]

@@ -1,18 +1,26 @@
-"""A part of a sequence as a sequence: some scenes, a range of frames, or every so many."""
+"""A part of a sequence as a sequence: one scene, a range of frames, or a lower frame rate."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence as Places
+from collections.abc import Iterator
+from collections.abc import Sequence as Indices
 
+import numpy as np
+
+from bevcli.errors import InputError
 from bevcli.frame import Frame, FrameStamp, Sequence
+
+# A scene counts as having the wanted rate if the ratio of its rate to it is in this range: keyframe times jitter.
+SLOWEST_RATIO, FASTEST_RATIO = 0.75, 1.5
+LONGEST_GAP_PERIODS = 1.5  # a longer gap between two frames, in periods of the wanted rate, is a hole in the recording
 
 
 class Selection:
-    """The frames of another sequence at some places, in their order."""
+    """The frames of another sequence at some of its indices, as a `Sequence`."""
 
-    def __init__(self, sequence: Sequence, places: Places[int], notes: tuple[str, ...] = ()) -> None:
+    def __init__(self, sequence: Sequence, indices: Indices[int], notes: tuple[str, ...] = ()) -> None:
         self._sequence = sequence
-        self._places = tuple(places)
+        self._indices = tuple(indices)
         self.name = sequence.name
         self.rig = sequence.rig
         self.has_ego_motion = sequence.has_ego_motion
@@ -20,17 +28,109 @@ class Selection:
 
     @property
     def stamps(self) -> tuple[FrameStamp, ...]:
-        """When each frame is, in order."""
+        """Index, scene and time of each frame, in order."""
         stamps = self._sequence.stamps
-        return tuple(stamps[place] for place in self._places)
+        return tuple(stamps[index] for index in self._indices)
 
     def load(self, place: int) -> Frame:
-        """The frame at a place of the selection, its images decoded."""
-        return self._sequence.load(self._places[place])
+        """The frame at position `place` of the selection, with decoded images."""
+        return self._sequence.load(self._indices[place])
 
 
-def select(sequence: Sequence, places: Places[int], notes: tuple[str, ...] = ()) -> Sequence:
-    """The sequence of the frames at `places`; further notes are added to its own. All places: itself."""
-    if not notes and list(places) == list(range(len(sequence.stamps))):
+def select(sequence: Sequence, indices: Indices[int], notes: tuple[str, ...] = ()) -> Sequence:
+    """The frames of a sequence at `indices`. If these are all and `notes` is empty, the sequence itself.
+
+    indices: positions in the sequence, from 0. notes: added to the sequence's own.
+    """
+    if not notes and list(indices) == list(range(len(sequence.stamps))):
         return sequence
-    return Selection(sequence, places, notes)
+    return Selection(sequence, indices, notes)
+
+
+def select_scene(sequence: Sequence, scene: str) -> Sequence:
+    """The frames of one scene. Raises InputError if the sequence does not have it."""
+    indices = [index for index, stamp in enumerate(sequence.stamps) if stamp.scene == scene]
+    if not indices:
+        names = sorted({stamp.scene for stamp in sequence.stamps} - {""})
+        found = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "") if names else "no scenes"
+        raise InputError(f'{sequence.name}: has no scene "{scene}" (found {found})')
+    return select(sequence, indices)
+
+
+def select_range(sequence: Sequence, frames: slice) -> Sequence:
+    """The frames in a range of positions, as Python slices a list. Raises InputError if there are none."""
+    indices = range(len(sequence.stamps))[frames]
+    if not indices:
+        start, stop = ("" if end is None else end for end in (frames.start, frames.stop))
+        count = len(sequence.stamps)
+        raise InputError(f"--frames {start}:{stop}: the range has no frame (the sequence has {count}: 0:{count})")
+    return select(sequence, indices)
+
+
+def select_every(sequence: Sequence, step: int) -> Sequence:
+    """Every `step`-th frame of each scene, from the scene's first frame on."""
+    return select(sequence, [index for scene in scenes_of(sequence.stamps) for index in scene[::step]])
+
+
+def select_rate(sequence: Sequence, rate_hz: float) -> Sequence:
+    """The sequence thinned to about `rate_hz` frames per second, scene by scene.
+
+    A model expects the frame rate that it was trained with: its velocities and its history depend on it. In each
+    scene, the frames nearest to a regular clock that starts at the scene's first frame are kept. A scene that has
+    about this rate, or a lower one, is kept whole. `notes` tell the user what was done.
+    """
+    stamps = sequence.stamps
+    kept: list[int] = []
+    slowest = np.inf
+    for indices in scenes_of(stamps):
+        times = np.array([stamps[index].timestamp_ns for index in indices], dtype=np.int64)
+        ratio = _median_rate_hz(times) / rate_hz
+        slowest = min(slowest, ratio)
+        chosen = _nearest_to_clock(times, rate_hz) if ratio > FASTEST_RATIO else range(len(indices))
+        kept += [indices[position] for position in chosen]
+    return select(sequence, kept, tuple(_rate_notes(len(stamps), len(kept), slowest, rate_hz)))
+
+
+def scenes_of(stamps: Indices[FrameStamp]) -> Iterator[list[int]]:
+    """The indices of each scene: a run of consecutive frames with the same scene name."""
+    start = 0
+    for index in range(1, len(stamps) + 1):
+        if index == len(stamps) or stamps[index].scene != stamps[start].scene:
+            yield list(range(start, index))
+            start = index
+
+
+def _median_rate_hz(times_ns: np.ndarray) -> float:
+    """Frames per second from the median gap of times (T,) int64 ns; infinite for a single frame."""
+    return float(1e9 / np.median(np.diff(times_ns))) if len(times_ns) > 1 else np.inf
+
+
+def _nearest_to_clock(times_ns: np.ndarray, rate_hz: float) -> list[int]:
+    """Indices of the frames nearest to the ticks of the clock, which restarts after a hole in the recording."""
+    seconds = (times_ns - times_ns[0]) / 1e9
+    holes = np.flatnonzero(np.diff(seconds) > LONGEST_GAP_PERIODS / rate_hz) + 1
+    kept: list[int] = []
+    for piece in np.split(np.arange(len(seconds)), holes):
+        kept += (piece[0] + _nearest_in_piece(seconds[piece] - seconds[piece[0]], rate_hz)).tolist()
+    return kept
+
+
+def _nearest_in_piece(seconds: np.ndarray, rate_hz: float) -> np.ndarray:
+    if len(seconds) == 1:
+        return np.zeros(1, dtype=np.int64)
+    # A tick later than half a frame period after the last frame has no frame of its own.
+    end = seconds[-1] + 0.5 * np.median(np.diff(seconds))
+    ticks = np.arange(0, end, 1 / rate_hz)
+    later = np.clip(np.searchsorted(seconds, ticks), 1, len(seconds) - 1)
+    earlier = later - 1
+    return np.unique(np.where(ticks - seconds[earlier] <= seconds[later] - ticks, earlier, later))
+
+
+def _rate_notes(total: int, kept: int, slowest_ratio: float, rate_hz: float) -> Iterator[str]:
+    if kept < total:
+        yield f"{kept} of {total} frames are used, at about {rate_hz:g} frames per second (--rate all uses every frame)"
+    if slowest_ratio < SLOWEST_RATIO:
+        yield (
+            f"the input has {slowest_ratio * rate_hz:.2g} frames per second, fewer than the model's {rate_hz:g}: "
+            "velocities will be less accurate and history less useful"
+        )

@@ -1,4 +1,4 @@
-"""Drive: one seed's drive through the rendered world, frame by frame, without touching the disk."""
+"""A rendered drive: its frames, ground truth and ego-motion, made in memory when they are asked for."""
 
 from __future__ import annotations
 
@@ -14,89 +14,105 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid, rotation_about_z
-from bevcli.synth.assets.catalog import Catalog
-from bevcli.synth.bev_truth import MapWindow, draw_map
+from bevcli.synth.assets.catalog import Assets, Body
+from bevcli.synth.assets.triangles import MeshTemplate, PlacedMesh, TriangleSoup
+from bevcli.synth.render.bev_map import MapWindow, draw_map
 from bevcli.synth.render.ground_texture import GroundTexture, paint_ground
-from bevcli.synth.render.renderer import Exposure, Moment, expose
-from bevcli.synth.render.shading import ShadowMap
-from bevcli.synth.render.shadows import shadow_map, with_more
-from bevcli.synth.render.triangles import Run, Shape, Soup, gather, joined_soup, place
+from bevcli.synth.render.renderer import RenderedView, WorldSnapshot, render_view
+from bevcli.synth.render.shadow_map import ShadowMap
 from bevcli.synth.rig import nuscenes_like_rig
-from bevcli.synth.world.actors import Actor, Body, State
+from bevcli.synth.world.actors import ActorState
 from bevcli.synth.world.city import CityPlan
 from bevcli.synth.world.ground_plan import GroundPlan
-from bevcli.synth.world.scenery import Furnishings, Scenery
+from bevcli.synth.world.scenery import Scenery, signal_meshes
 from bevcli.synth.world.simulation import Simulation
-from bevcli.synth.world.street_signals import signal_runs
-from bevcli.synth.world.weather import WEATHER_NAMES, Weather, make_weather
+from bevcli.synth.world.weather import WEATHER_NAMES, make_weather
 
-ANNOTATED_M = 60.0  # boxes are kept within this distance of the bev frame's origin
-SEEN_M = 66.0  # actors are drawn within this distance
-SCENERY_M = 135.0
-SNAP_M = 24.0  # scenery and ground are gathered anew when the vehicle has moved this far
+ANNOTATED_M = 60.0  # boxes are kept within this distance of the origin of the bev frame
+ACTORS_M = 66.0  # actors are drawn within this distance
+SCENERY_M = 135.0  # scenery is drawn within this distance
+SNAP_M = 24.0  # scenery, ground and shadows are made again when the vehicle has moved about this far
 FIRST_TIMESTAMP_NS = 1_700_000_000_000_000_000
 
 
 @dataclass(frozen=True)
-class Stock:
-    """Meshes that all drives share; make it once and hand it to every Drive."""
+class TextureDetail:
+    """How fine the ground texture and the shadow map are.
 
-    catalog: Catalog
-    furnishings: Furnishings
-
-    @staticmethod
-    def make() -> Stock:
-        """Build every mesh, which takes about half a second."""
-        return Stock(Catalog(), Furnishings())
-
-
-@dataclass(frozen=True)
-class Detail:
-    """How finely ground and shadows are drawn, metres a texel."""
+    Attributes:
+        ground_m: size of a texel of the ground, metres.
+        shadow_m: size of a texel of the shadow map, metres.
+        extent_m: side of the square that both cover at least, metres.
+    """
 
     ground_m: float
     shadow_m: float
     extent_m: float
 
     @staticmethod
-    def for_width(width: int) -> Detail:
-        """Detail that suits images of a width in pixels."""
+    def for_width(width: int) -> TextureDetail:
+        """The detail that suits images of a width in pixels."""
         if width <= 500:
-            return Detail(0.125, 0.16, 112.0)
-        return Detail(0.06, 0.08, 112.0) if width <= 1000 else Detail(0.04, 0.06, 112.0)
+            return TextureDetail(0.125, 0.16, 112.0)
+        return TextureDetail(0.06, 0.08, 112.0) if width <= 1000 else TextureDetail(0.04, 0.06, 112.0)
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What does not move, around a world point: its triangles, the ground's paint, and its shadows."""
+    """Everything around a point that does not move.
 
-    middle: tuple[float, float]
-    scenery: Soup
+    Attributes:
+        center: the point, world, metres.
+        scenery: triangles of the scenery.
+        ground: texture of the ground.
+        shadows: shadow map of the scenery.
+    """
+
+    center: tuple[float, float]
+    scenery: TriangleSoup
     ground: GroundTexture
     shadows: ShadowMap
 
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """One moment of a drive. exposures: by camera. boxes: in the world frame, with all ground truth columns."""
+    """One frame of a rendered drive.
+
+    Attributes:
+        stamp: index, scene and timestamp.
+        views: camera name to image; all cameras see the world at the same time.
+        world_from_ego: pose of the ego vehicle.
+        boxes: ground truth boxes in the world frame, with attributes, instances, visibilities and numbers of pixels.
+        bev_map: ground truth map.
+    """
 
     stamp: FrameStamp
-    exposures: Mapping[str, Exposure]
+    views: Mapping[str, RenderedView]
     world_from_ego: Pose
     boxes: Boxes3D
     bev_map: BevMap
 
     @property
     def images(self) -> dict[str, NDArray[np.uint8]]:
-        """camera -> (H, W, 3) uint8 BGR."""
-        return {name: exposure.pixels_bgr for name, exposure in self.exposures.items()}
+        """Camera name to image (H, W, 3) uint8 BGR."""
+        return {name: view.pixels_bgr for name, view in self.views.items()}
 
 
-class Drive:
-    """A drive of `frames` frames at `rate_hz`; `frame(k)` renders any of them, in any order, always the same.
+class RenderedDrive:
+    """A drive through the city of one seed.
 
-    rig: default six cameras like nuScenes' at 400x225. weather: one of WEATHER_NAMES, drawn from the seed by default.
-    supersampling: samples a pixel and side, against jagged edges. threads: cameras rendered side by side.
+    `frame(k)` renders any frame, in any order; the same seed and options always give the same frames.
+
+    Args:
+        seed: the drive; 0 or greater.
+        frames: number of frames.
+        rate_hz: frames per second.
+        rig: the cameras; default: `nuscenes_like_rig` at 400x225.
+        weather: one of WEATHER_NAMES; default: drawn from the seed. Raises InputError for another name.
+        assets: the meshes, if they are built already.
+        supersampling: samples per pixel along each axis (anti-aliasing).
+        threads: number of cameras rendered in parallel.
+        map_window: extent and cell size of the ground truth maps.
     """
 
     def __init__(
@@ -106,44 +122,44 @@ class Drive:
         rate_hz: float = 2.0,
         rig: CameraRig | None = None,
         weather: str | None = None,
-        stock: Stock | None = None,
+        assets: Assets | None = None,
         supersampling: int = 1,
         threads: int = 1,
         map_window: MapWindow = MapWindow(),
     ) -> None:
         self.seed, self.frames, self.rate_hz = seed, frames, rate_hz
         self.rig = rig or nuscenes_like_rig(400, 225)
-        self.scene = f"rendered-{seed}"
         self.map_window = map_window
         self._supersampling, self._threads = supersampling, threads
-        self._stock = stock or Stock.make()
-        self.city = CityPlan(seed)
-        names = self.city.stream("weather-name")
+        self._assets = assets or Assets.build()
+        self._city = CityPlan(seed)
+        names = self._city.stream("weather-name")
         name = weather or WEATHER_NAMES[int(names.choice(3, p=[0.45, 0.25, 0.3]))]
-        self.weather: Weather = make_weather(name, self.city.stream("weather"))
-        self.simulation = Simulation(self.city, self._stock.catalog, frames / rate_hz)
-        self.ground = GroundPlan(self.city)
-        self._detail = Detail.for_width(max(camera.width for camera in self.rig.cameras) * supersampling)
-        self._scenery = Scenery(self.city, self._stock.furnishings)
+        self.weather = make_weather(name, self._city.stream("weather"))
+        self.simulation = Simulation(self._city, self._assets.catalog, frames / rate_hz)
+        self._ground = GroundPlan(self._city)
+        self._detail = TextureDetail.for_width(max(camera.width for camera in self.rig.cameras) * supersampling)
+        self._scenery = Scenery(self._city, self._assets.furniture)
         self._around: Surroundings | None = None
-        self._shapes: dict[tuple[str, int], Shape] = {}
-        self._placed: dict[tuple[str, int], tuple[Run, tuple[float, ...]]] = {}
+        self._templates: dict[tuple[str, int], MeshTemplate] = {}
+        self._placed: dict[tuple[str, int], tuple[PlacedMesh, tuple[float, ...]]] = {}
 
     def time_s(self, index: int) -> float:
-        """Seconds since the drive's start."""
+        """Time of a frame, seconds since the start of the drive."""
         return index / self.rate_hz
 
     def stamp(self, index: int) -> FrameStamp:
-        """When a frame is."""
-        return FrameStamp(index, self.scene, FIRST_TIMESTAMP_NS + round(index * 1e9 / self.rate_hz))
+        """Index, scene and timestamp of a frame."""
+        timestamp_ns = FIRST_TIMESTAMP_NS + round(index * 1e9 / self.rate_hz)
+        return FrameStamp(index, f"rendered-{self.seed}", timestamp_ns)
 
     def world_from_ego(self, time_s: float) -> Pose:
-        """Where the ego vehicle is, seconds after the start."""
+        """Pose of the ego vehicle, seconds after the start of the drive."""
         (x, y), yaw = self.simulation.ego.pose(time_s)
         return Pose.from_matrix(rigid((x, y, 0.0), rotation_about_z(yaw)))
 
     def ego_motion(self, rate_hz: float = 50.0) -> EgoMotion:
-        """Poses and kinematics over the whole drive."""
+        """Poses and kinematics over the whole drive, `rate_hz` per second."""
         count = int(np.ceil((self.frames - 1) / self.rate_hz * rate_hz)) + 1
         times = np.arange(count) / rate_hz
         poses = [self.world_from_ego(float(t)) for t in times]
@@ -154,91 +170,90 @@ class Drive:
             *(np.stack([m[k] for m in motions]) for k in range(3)),
         )  # fmt: skip
 
-    def states(self, index: int) -> list[State]:
-        """What is annotated around the vehicle at a frame, in the order of the objects in its exposures."""
+    def states(self, index: int) -> list[ActorState]:
+        """The annotated objects around the vehicle at a frame, in the order of the object indices in its views."""
         origin = self.world_from_ego(self.time_s(index)).translation[:2]
         found = []
-        for actor in self._actors(origin):
+        for actor in self.simulation.actors_near(origin, ACTORS_M):
             state = actor.state(self.time_s(index))
-            if state is not None and np.hypot(*(state.position[:2] - origin)) < SEEN_M:
+            if state is not None and np.hypot(*(state.position[:2] - origin)) < ACTORS_M:
                 found.append(state)
         return found
 
     def frame(self, index: int) -> RenderedFrame:
-        """Render one frame, 0 to frames - 1."""
+        """Render a frame. index: 0 to frames - 1."""
         states = self.states(index)
         pose = self.world_from_ego(self.time_s(index))
-        exposures = self.expose(states, pose, self.time_s(index))
-        boxes = self._boxes(states, exposures, pose)
+        views = self._render_views(states, pose, self.time_s(index))
+        boxes = self._boxes(states, views, pose)
         bev_from_world = inverse(pose.matrix @ self.rig.ego_from_bev)
-        pieces = self.ground.pieces_around(pose.translation[:2], self.map_window.half_extent_m * 1.5)
+        pieces = self._ground.pieces_around(pose.translation[:2], self.map_window.half_extent_m * 1.5)
         bev_map = draw_map(pieces, boxes, bev_from_world, self.map_window)
-        return RenderedFrame(self.stamp(index), exposures, pose, boxes, bev_map)
+        return RenderedFrame(self.stamp(index), views, pose, boxes, bev_map)
 
-    def expose(self, states: list[State], world_from_ego: Pose, time_s: float) -> dict[str, Exposure]:
-        """The images of all cameras when the annotated world is in these states."""
-        around = self._surroundings(world_from_ego.translation[:2])
+    def _render_views(self, states: list[ActorState], world_from_ego: Pose, time_s: float) -> dict[str, RenderedView]:
+        """The images of all cameras. The object indices in them are positions in `states`."""
         here = world_from_ego.translation[:2]
+        around = self._surroundings(here)
         near_first = np.argsort([np.hypot(*(state.position[:2] - here)) for state in states], kind="stable")
-        runs = [self._place(states[k]) for k in near_first]
-        signals = signal_runs(self.city, self.simulation.signals, self._stock.furnishings, here, time_s)
-        moving = gather([*runs, *signals], [*near_first.tolist(), *[-1] * len(signals)])
-        soup = joined_soup(around.scenery, moving)
-        shadows = with_more(around.shadows, [moving.surfaces.corners, self._ego_shape(world_from_ego)])
-        moment = Moment(soup, len(runs), around.ground, shadows, self.weather)
+        actors = [self._place(states[k]) for k in near_first]
+        signals = signal_meshes(self._city, self.simulation.signals, self._assets.furniture, here, time_s)
+        moving = TriangleSoup.gather([*actors, *signals], [*near_first.tolist(), *[-1] * len(signals)])
+        soup = around.scenery.joined(moving)
+        shadows = around.shadows.with_shadows_of([moving.triangles.corners, self._ego_corners(world_from_ego)])
+        snapshot = WorldSnapshot(soup, len(actors), around.ground, shadows, self.weather)
 
-        def one(name: str) -> Exposure:
-            return expose(moment, self.rig[name], world_from_ego.matrix, self._supersampling)
+        def render_one(name: str) -> RenderedView:
+            return render_view(snapshot, self.rig[name], world_from_ego.matrix, self._supersampling)
 
         if self._threads == 1:
-            return {name: one(name) for name in self.rig.names}
+            return {name: render_one(name) for name in self.rig.names}
         with ThreadPoolExecutor(self._threads) as pool:
-            return dict(zip(self.rig.names, pool.map(one, self.rig.names), strict=True))
-
-    def _actors(self, origin: Array) -> list[Actor]:
-        return self.simulation.actors_near(origin, SEEN_M)
+            return dict(zip(self.rig.names, pool.map(render_one, self.rig.names), strict=True))
 
     def _surroundings(self, here: Array) -> Surroundings:
-        """Scenery and ground around a point, gathered for the middle of the grid cell that it lies in."""
-        middle = (float(np.round(here[0] / SNAP_M) * SNAP_M), float(np.round(here[1] / SNAP_M) * SNAP_M))
-        if self._around is None or self._around.middle != middle:
+        """The surroundings of the nearest point of a grid with SNAP_M spacing, so that they are rarely made again."""
+        center = (float(np.round(here[0] / SNAP_M) * SNAP_M), float(np.round(here[1] / SNAP_M) * SNAP_M))
+        if self._around is None or self._around.center != center:
             extent = self._detail.extent_m + SNAP_M
-            pieces = self.ground.pieces_around(middle, extent * 0.71)
-            texture = paint_ground(pieces, middle, extent, self._detail.ground_m)
-            scenery = self._scenery.around(middle, SCENERY_M)
-            corners = [scenery.surfaces.corners]
-            shadows = shadow_map(corners, self.weather.to_sun, middle, extent, self._detail.shadow_m)
-            self._around = Surroundings(middle, scenery, texture, shadows)
+            pieces = self._ground.pieces_around(center, extent * 0.71)
+            texture = paint_ground(pieces, center, extent, self._detail.ground_m)
+            scenery = self._scenery.around(center, SCENERY_M)
+            shadows = ShadowMap.of(
+                scenery.triangles.corners, self.weather.to_sun, center, extent, self._detail.shadow_m
+            )
+            self._around = Surroundings(center, scenery, texture, shadows)
         return self._around
 
-    def _place(self, state: State) -> Run:
-        """The actor's triangles; those of one that stands still are kept."""
+    def _place(self, state: ActorState) -> PlacedMesh:
+        """The mesh of an actor in the world; kept while the actor stands still."""
         key = (state.body.instance, state.pose)
         x, y, z = (float(c) for c in state.position)
         here = (x, y, z, state.yaw)
         if key not in self._placed or self._placed[key][1] != here:
-            self._placed[key] = (place(self._shape(state.body, state.pose), (x, y, z), state.yaw), here)
+            self._placed[key] = (self._template(state.body, state.pose).placed((x, y, z), state.yaw), here)
         return self._placed[key][0]
 
-    def _shape(self, body: Body, pose: int) -> Shape:
-        """The body's mesh in its size and colours."""
+    def _template(self, body: Body, pose: int) -> MeshTemplate:
+        """The mesh of a body in its size and colours."""
         key = (body.instance, pose)
-        if key not in self._shapes:
+        if key not in self._templates:
             mesh = body.variant.poses[pose % len(body.variant.poses)].fitted(body.size_lwh)
-            self._shapes[key] = Shape.of(mesh).painted(body.paint, body.dye)
-        return self._shapes[key]
+            self._templates[key] = MeshTemplate.of(mesh).painted(body.paint, body.dye)
+        return self._templates[key]
 
-    def _ego_shape(self, world_from_ego: Pose) -> NDArray[np.float32]:
-        """The ego vehicle's own triangles, for its shadow; its frame's origin is behind its middle."""
+    def _ego_corners(self, world_from_ego: Pose) -> NDArray[np.float32]:
+        """(T, 3, 3) triangles of the ego vehicle, for its shadow. Its middle is 1.4 m in front of the rear axle."""
         x, y, _ = apply(world_from_ego.matrix, (1.4, 0.0, 0.0))
-        return place(self._shape(self.simulation.ego_body, 0), (x, y, 0.0), world_from_ego.yaw).corners
+        template = self._template(self.simulation.ego_body, 0)
+        return template.placed((x, y, 0.0), world_from_ego.yaw).triangles.corners
 
-    def _boxes(self, states: list[State], exposures: Mapping[str, Exposure], pose: Pose) -> Boxes3D:
-        """Ground truth boxes in the world frame, within ANNOTATED_M of the bev frame's origin."""
+    def _boxes(self, states: list[ActorState], views: Mapping[str, RenderedView], pose: Pose) -> Boxes3D:
+        """Ground truth boxes in the world frame, within ANNOTATED_M of the origin of the bev frame."""
         if not states:
             return Boxes3D.empty()
-        visible = sum(exposure.visible for exposure in exposures.values())
-        unoccluded = sum(exposure.unoccluded for exposure in exposures.values())
+        visible = sum(view.visible for view in views.values())
+        unoccluded = sum(view.unoccluded for view in views.values())
         sizes = np.stack([s.body.size_lwh for s in states])
         centers = np.stack([s.position for s in states]) + np.column_stack(
             [np.zeros((len(states), 2)), sizes[:, 2] / 2]

@@ -1,4 +1,4 @@
-"""The default rig: six cameras as nuScenes' vehicles carry them, with rounded numbers."""
+"""The rigs that are rendered: the default one, six cameras like those of nuScenes, or one from a file."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.transforms import Array, rigid, rotation_about_z
-from bevcli.sequences.native.calibration import read_calibration
+from bevcli.sequences.files.calibration_file import read_calibration
 from bevcli.synth.render.lens import distortion_maps
 
-# name: x, y, z in ego (m), yaw (degrees), focal length (px at 1600 x 900)
+# name: x, y, z in the ego frame (metres), yaw (degrees), focal length (pixels at 1600 x 900)
 _MOUNTS = {
     "CAM_FRONT": (1.72, 0.0, 1.50, 0.0, 1266.0),
     "CAM_FRONT_RIGHT": (1.58, -0.50, 1.51, -56.0, 1260.0),
@@ -25,7 +25,7 @@ _EGO_AXES_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0,
 
 
 def nuscenes_like_rig(width: int = 1600, height: int = 900) -> CameraRig:
-    """Six level cameras around the vehicle, for images of this size; a wider image sees no more."""
+    """Six horizontal cameras around the vehicle. width, height: of the images, pixels; the fields of view stay."""
     cameras = []
     for name, (x, y, z, yaw_deg, focal) in _MOUNTS.items():
         intrinsics: Array = np.array([[focal, 0, 800.0], [0, focal, 450.0], [0, 0, 1.0]])
@@ -35,19 +35,26 @@ def nuscenes_like_rig(width: int = 1600, height: int = 900) -> CameraRig:
     return CameraRig(tuple(cameras), default_ego_from_bev())
 
 
-def rig_for_rendering(path: Path | None, size: tuple[int, int] | None) -> CameraRig:
-    """The rig of a calibration.json, or the default one, with images of `size` (width, height) where it is given.
+def rig_for_rendering(rig: str | Path | CameraRig | None, size: tuple[int, int] | None) -> CameraRig:
+    """The cameras to render.
 
-    Raises InputError where the file is wrong, or a camera's image is too wide to be rendered through a pinhole.
+    rig: a rig, or the path of a calibration.json; default: `nuscenes_like_rig`. size: width and height of the images,
+    pixels; default: that of the rig.
+    Raises InputError where the file is wrong, or a camera with distortion has too wide a field of view.
     """
-    rig = nuscenes_like_rig() if path is None else read_calibration(path)
+    if rig is None:
+        where, found = "", nuscenes_like_rig()
+    elif isinstance(rig, CameraRig):
+        where, found = "rig: ", rig
+    else:
+        where, found = f"{rig}: ", read_calibration(Path(rig))
     if size is not None:
-        cameras = tuple(c.scaled(size[0] / c.width, size[1] / c.height) for c in rig.cameras)
-        rig = CameraRig(cameras, rig.ego_from_bev, rig.ego_from_bev_assumed)
-    for camera in rig.cameras:
+        cameras = tuple(c.scaled(size[0] / c.width, size[1] / c.height) for c in found.cameras)
+        found = CameraRig(cameras, found.ego_from_bev, found.ego_from_bev_assumed)
+    for camera in found.cameras:
         if camera.distortion is not None:
             try:
                 distortion_maps(camera)
             except InputError as error:
-                raise InputError(f"{path}: camera {camera.name}: {error}") from None
-    return rig
+                raise InputError(f"{where}camera {camera.name}: {error}") from None
+    return found

@@ -1,4 +1,4 @@
-"""Photometric distortion and grid mask: images change in training, the world in them does not."""
+"""Image augmentation: photometric distortion and grid mask. Boxes, maps and calibration stay as they are."""
 
 from __future__ import annotations
 
@@ -13,16 +13,18 @@ from torch import Tensor
 
 from bevcli.frame import CameraImage, Frame
 
-BRIGHTNESS = 32.0  # added, at most
-CONTRAST = SATURATION = (0.5, 1.5)  # multiplied
-HUE_DEG = 18.0
+MAX_BRIGHTNESS = 32.0  # added to pixel values of 0 to 255
+CONTRAST_RANGE = SATURATION_RANGE = (0.5, 1.5)  # factors
+MAX_HUE_DEG = 18.0
 
 
 @dataclass(frozen=True)
 class AugmentationConfig:
-    """photometric: the chance of each distortion (brightness, contrast, saturation, hue) of an image.
+    """The [training.augmentation] table.
 
-    grid_mask: the chance that a grid of grey squares covers an image.
+    Attributes:
+        photometric: probability (0 to 1) of each distortion of an image: brightness, contrast, saturation, hue.
+        grid_mask: probability (0 to 1) that a grid of grey squares covers an image.
     """
 
     photometric: float = 0.5
@@ -30,26 +32,26 @@ class AugmentationConfig:
 
     def __post_init__(self) -> None:
         if not (0 <= self.photometric <= 1 and 0 <= self.grid_mask <= 1):
-            raise ValueError("photometric and grid_mask are chances, from 0 to 1")
+            raise ValueError("photometric and grid_mask are probabilities, from 0 to 1")
 
 
-def distort_images(frame: Frame, chance: float, random: np.random.Generator) -> Frame:
-    """The frame with each image's light and colours changed."""
-    if chance == 0:
+def distort_images(frame: Frame, probability: float, random: np.random.Generator) -> Frame:
+    """A copy of the frame with `distort` applied to each image."""
+    if probability == 0:
         return frame
     images: Mapping[str, CameraImage] = {
-        name: replace(image, pixels_bgr=distort(image.pixels_bgr, chance, random))
+        name: replace(image, pixels_bgr=distort(image.pixels_bgr, probability, random))
         for name, image in frame.images.items()
     }
     return replace(frame, images=images)
 
 
-def distort(pixels_bgr: NDArray[np.uint8], chance: float, random: np.random.Generator) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 with another brightness, contrast, saturation and hue, each by chance."""
-    applied = random.random(4) < chance
-    brightness = random.uniform(-BRIGHTNESS, BRIGHTNESS) * applied[0]
-    contrast, saturation = random.uniform(*CONTRAST), random.uniform(*SATURATION)
-    hue_deg = random.uniform(-HUE_DEG, HUE_DEG) * applied[3]
+def distort(pixels_bgr: NDArray[np.uint8], probability: float, random: np.random.Generator) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 with brightness, contrast, saturation and hue changed, each with the given probability."""
+    applied = random.random(4) < probability
+    brightness = random.uniform(-MAX_BRIGHTNESS, MAX_BRIGHTNESS) * applied[0]
+    contrast, saturation = random.uniform(*CONTRAST_RANGE), random.uniform(*SATURATION_RANGE)
+    hue_deg = random.uniform(-MAX_HUE_DEG, MAX_HUE_DEG) * applied[3]
     pixels = (pixels_bgr.astype(np.float32) + np.float32(brightness)) * np.float32(contrast if applied[1] else 1)
     if applied[2] or applied[3]:
         hsv = cv2.cvtColor(pixels.clip(0, 255) / np.float32(255), cv2.COLOR_BGR2HSV)
@@ -59,10 +61,10 @@ def distort(pixels_bgr: NDArray[np.uint8], chance: float, random: np.random.Gene
     return pixels.clip(0, 255).astype(np.uint8)
 
 
-def mask_images(images: Tensor, chance: float, random: np.random.Generator) -> None:
-    """Greys a grid of squares in each of the normalised images (..., 3, H, W), in place."""
+def mask_images(images: Tensor, probability: float, random: np.random.Generator) -> None:
+    """Covers normalised images (..., 3, H, W) with a grid of grey squares in place, each with the given probability."""
     for image in images.flatten(0, -4):
-        if random.random() < chance:
+        if random.random() < probability:
             height, width = image.shape[-2:]
             period = int(random.integers(2, max(3, min(height, width))))
             rows, columns = (_stripes(extent, period, random) for extent in (height, width))
@@ -70,5 +72,5 @@ def mask_images(images: Tensor, chance: float, random: np.random.Generator) -> N
 
 
 def _stripes(extent: int, period: int, random: np.random.Generator) -> NDArray[np.bool_]:
-    """(extent,) bool: the first half of each period, from a random start."""
+    """(extent,) bool: true in the first half of each period, with a random phase."""
     return (np.arange(extent) + random.integers(period)) % period < period / 2

@@ -1,4 +1,4 @@
-"""Clips: short parts of drives. As in the paper, one frame to learn from and some before it, for the history."""
+"""Training clips: short parts of drives. As in the paper, the last frame is trained on, the others are its history."""
 
 from __future__ import annotations
 
@@ -9,19 +9,22 @@ import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.frame import Sequence
-from bevcli.sequences.rate import scenes_of
+from bevcli.sequences.selection import scenes_of
 from bevcli.training.drives import Drives
 
 
 @dataclass(frozen=True)
 class ClipConfig:
-    """frames: of a clip; the paper's base model trains on 4, tiny and small on 3; 1 is without history.
+    """The [training.clips] table.
 
-    batch: clips a step. short_share: of the batches, whose clips are shorter, as at the start of a scene.
-    learn: "last" learns from the last frame of a clip, as published. "all" goes through longer clips and learns from
-    every frame, one update each, the first of them without history: no image is looked at in vain.
-    in_turn: with "all", batches a step that are gone through side by side, a frame of each in turn, so that updates
-    that follow each other do not learn from the same few streets.
+    Attributes:
+        frames: frames of a clip. The paper's base model uses 4, tiny and small use 3; 1 trains without history.
+        batch: clips of a batch.
+        short_share: share of the batches with shorter clips (0 to 1), because each scene starts without history.
+        learn: "last" trains on the last frame of a clip, as published. "all" trains on every frame of successive
+            frames, with one update each; a clip's first frame has no history.
+        in_turn: with "all", the number of batches a step. The updates alternate between them, so that successive
+            updates do not see the same few streets.
     """
 
     frames: int = 3
@@ -39,14 +42,19 @@ class ClipConfig:
 
 @dataclass(frozen=True)
 class Clip:
-    """drive: its place among the drives. places: of the frames in it, in order."""
+    """Some frames of one drive.
+
+    Attributes:
+        drive: index of the drive.
+        frames: indices of the frames in the drive, ascending.
+    """
 
     drive: int
-    places: tuple[int, ...]
+    frames: tuple[int, ...]
 
 
 def draw_clips(drives: Drives, config: ClipConfig, random: np.random.Generator) -> list[Clip]:
-    """The clips of a batch, all of one length. Raises InputError where a drive is too short for it."""
+    """The clips of one batch, all of the same length. Raises InputError if a drive is too short."""
     frames = config.frames
     if frames > 1 and random.random() < config.short_share:
         frames = int(random.integers(1, frames))
@@ -54,23 +62,24 @@ def draw_clips(drives: Drives, config: ClipConfig, random: np.random.Generator) 
     for _ in range(config.batch):
         drive = int(random.integers(len(drives)))
         with_gap = config.learn == "last"
-        clips.append(Clip(drive, draw_places(drives.open(drive), frames, random, with_gap=with_gap)))
+        clips.append(Clip(drive, draw_frames(drives.open(drive), frames, random, with_gap=with_gap)))
     return clips
 
 
-def draw_places(
-    sequence: Sequence, frames: int, random: np.random.Generator, *, with_gap: bool = True
+def draw_frames(
+    sequence: Sequence, count: int, random: np.random.Generator, *, with_gap: bool = True
 ) -> tuple[int, ...]:
-    """A frame drawn at random and frames - 1 of those before it in its scene.
+    """Indices of a random frame and of `count` - 1 frames before it in its scene. Raises InputError if there are none.
 
-    with_gap: they are chosen from `frames` of them, one left out at random, as published.
+    Args:
+        with_gap: as published, take the `count` frames before it and leave out a random one.
     """
     scenes = list(scenes_of(sequence.stamps))
-    ends = [(scene, end) for scene in scenes for end in range(frames - 1, len(scene))]
-    if not ends:
-        raise InputError(f"{sequence.name}: no scene of it has the {frames} frames of a clip")
-    scene, end = ends[int(random.integers(len(ends)))]
-    before = scene[max(0, end - frames if with_gap else end - frames + 1) : end]
-    if len(before) == frames:
+    candidates = [(scene, end) for scene in scenes for end in range(count - 1, len(scene))]
+    if not candidates:
+        raise InputError(f"{sequence.name}: no scene has {count} frames or more, as many as a clip needs")
+    scene, end = candidates[int(random.integers(len(candidates)))]
+    before = scene[max(0, end - count if with_gap else end - count + 1) : end]
+    if len(before) == count:
         del before[int(random.integers(len(before)))]
     return (*before, scene[end])

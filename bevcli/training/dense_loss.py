@@ -1,7 +1,7 @@
-"""A dense loss beside those of the heads: every BEV cell near an object says its class and its box itself.
+"""Auxiliary loss on the BEV map: every BEV cell near an object predicts its class and its box.
 
-The heads teach the BEV map through the few queries that are matched; here every object teaches the cells where it
-stands, which makes a short training learn much sooner. The layer that reads the cells serves training only.
+The detection head trains the BEV map only through the few matched queries. Here each object trains all cells around
+its centre directly, so that a short training converges much sooner. The auxiliary head exists in training only.
 """
 
 from __future__ import annotations
@@ -22,7 +22,12 @@ from bevcli.training.focal_loss import focal_loss
 
 @dataclass(frozen=True)
 class DenseLossConfig:
-    """weight: of the whole loss; 0 leaves it out, as published. reach_m: how far from its centre an object teaches."""
+    """The [training.dense_loss] table.
+
+    Attributes:
+        weight: of the whole loss; 0 disables it, as published.
+        reach_m: cells up to this distance from an object's centre are positives, metres.
+    """
 
     weight: float = 0.0
     reach_m: float = 1.5
@@ -32,11 +37,8 @@ class DenseLossConfig:
             raise ValueError("weight must not be negative, reach_m must be positive")
 
 
-class DenseReader(nn.Module):
-    """(B, Y·X, C) BEV map -> class logits (B, Y·X, classes) and box codes (B, Y·X, 10), by one linear layer.
-
-    A code's centre is that of the cell moved by what the layer says, in metres.
-    """
+class DenseHead(nn.Module):
+    """One linear layer that predicts classes and a box from each BEV cell."""
 
     centers: Tensor
 
@@ -49,37 +51,51 @@ class DenseReader(nn.Module):
         self.register_buffer("centers", centers, persistent=False)
 
     def forward(self, bev: Tensor) -> tuple[Tensor, Tensor]:
-        """bev: (B, Y·X, C)."""
+        """bev: (B, Y·X, C) -> class logits (B, Y·X, classes) and box codes (B, Y·X, 10).
+
+        The layer predicts a box centre as an offset from the cell's centre, metres.
+        """
         codes = self.boxes(bev)
         return self.classes(bev), torch.cat([codes[..., :2] + self.centers, codes[..., 2:]], dim=-1)
 
 
 def dense_loss(
-    reader: DenseReader,
+    head: DenseHead,
     bev: Tensor,
     targets: Sequence[DetectionTargets],
     config: DenseLossConfig,
-    of_boxes: DetectionLossConfig,
+    detection: DetectionLossConfig,
 ) -> DetectionLoss:
-    """bev: (B, Y·X, C). targets: B. Focal and L1 loss as of the detection head, over the number of taught cells."""
-    logits, codes = reader(bev)
-    wanted = torch.zeros_like(logits)
-    found, truths = [], []
+    """Focal loss of all cells and L1 loss of the positive ones, divided by the number of positive cells.
+
+    Args:
+        bev: (B, Y·X, C).
+        targets: B.
+        detection: the weights of classes and boxes, as in the detection loss.
+    """
+    logits, codes = head(bev)
+    class_targets = torch.zeros_like(logits)
+    predicted, truths = [], []
     for element, truth in enumerate(targets):
-        cells, owners = _taught_cells(reader.centers, truth.codes[:, :2], config.reach_m)
-        wanted[element, cells, truth.labels[owners]] = 1
-        found.append(codes[element, cells])
-        truths.append(truth.codes[owners])
-    count = max(sum(map(len, found)), 1)
-    classes = of_boxes.class_weight * focal_loss(logits, wanted).sum() / count
-    boxes = of_boxes.box_weight * box_loss(torch.cat(found), torch.cat(truths), of_boxes) / count
+        cells, objects = _positive_cells(head.centers, truth.codes[:, :2], config.reach_m)
+        class_targets[element, cells, truth.labels[objects]] = 1
+        predicted.append(codes[element, cells])
+        truths.append(truth.codes[objects])
+    count = max(sum(map(len, predicted)), 1)
+    classes = detection.class_weight * focal_loss(logits, class_targets).sum() / count
+    boxes = detection.box_weight * box_loss(torch.cat(predicted), torch.cat(truths), detection) / count
     return DetectionLoss(config.weight * classes, config.weight * boxes)
 
 
-def _taught_cells(cells: Tensor, objects: Tensor, reach_m: float) -> tuple[Tensor, Tensor]:
-    """The cells with an object in reach, (K,), and the nearest one of theirs, (K,); cells (S, 2), objects (G, 2)."""
+def _positive_cells(cells: Tensor, objects: Tensor, reach_m: float) -> tuple[Tensor, Tensor]:
+    """Indices (K,) of the cells within reach of an object, and (K,) of the nearest object of each.
+
+    Args:
+        cells: (Y·X, 2) cell centres, metres.
+        objects: (G, 2) object centres, metres.
+    """
     if not len(objects):
         return (torch.zeros(0, dtype=torch.int64, device=cells.device),) * 2
     distance, nearest = torch.cdist(cells, objects).min(dim=1)
-    taught = (distance <= reach_m).nonzero()[:, 0]
-    return taught, nearest[taught]
+    positive = (distance <= reach_m).nonzero()[:, 0]
+    return positive, nearest[positive]

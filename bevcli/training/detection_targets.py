@@ -1,4 +1,4 @@
-"""What the detection head should say of a frame."""
+"""Ground truth boxes as targets of the detection head."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from bevcli.geometry.boxes import Boxes3D
@@ -15,30 +16,39 @@ from bevcli.model.box_coding import encode
 
 @dataclass(frozen=True)
 class DetectionTargets:
-    """labels: (G,) int64, places in the model's classes. codes: (G, 10) float32, NaN velocities where unknown."""
+    """The G ground truth boxes of one frame.
+
+    Attributes:
+        labels: (G,) int64, indices into the model's classes.
+        codes: (G, 10) float32 box codes (see `bevcli.model.box_coding`); unknown velocities are NaN.
+    """
 
     labels: Tensor
     codes: Tensor
 
     def to(self, device: torch.device) -> DetectionTargets:
-        """The same on a device."""
+        """A copy on a device."""
         return DetectionTargets(self.labels.to(device), self.codes.to(device))
 
 
 def detection_targets(boxes: Boxes3D, config: BEVFormerConfig) -> DetectionTargets:
-    """Ground truth (bev frame) that the model can learn: of its classes, centre in range, seen at all."""
-    chosen = boxes[np.isin(boxes.classes, config.classes) & in_range(boxes, config) & seen(boxes)]
-    labels = [config.classes.index(name) for name in chosen.classes]
-    return DetectionTargets(torch.tensor(labels, dtype=torch.int64), torch.from_numpy(encode(chosen)).float())
+    """Targets from the boxes that have one of the model's classes, a centre inside the BEV grid, and visible points.
+
+    Args:
+        boxes: ground truth in the bev frame.
+    """
+    kept = boxes[np.isin(boxes.classes, config.classes) & in_range(boxes, config) & has_points(boxes)]
+    labels = [config.classes.index(name) for name in kept.classes]
+    return DetectionTargets(torch.tensor(labels, dtype=torch.int64), torch.from_numpy(encode(kept)).float())
 
 
-def seen(boxes: Boxes3D) -> np.ndarray:
-    """(N,) bool: not stated to be without a single point."""
+def has_points(boxes: Boxes3D) -> NDArray[np.bool_]:
+    """(N,) bool, false where the ground truth counts 0 points; boxes without a count are kept."""
     return np.ones(len(boxes), dtype=bool) if boxes.num_points is None else boxes.num_points != 0
 
 
-def in_range(boxes: Boxes3D, config: BEVFormerConfig) -> np.ndarray:
-    """(N,) bool: the centre lies in the model's range; boxes in the bev frame."""
+def in_range(boxes: Boxes3D, config: BEVFormerConfig) -> NDArray[np.bool_]:
+    """(N,) bool: whether the centre (bev frame) lies in the model's x, y and z range."""
     grid = config.bev_grid
     low, high = np.array([grid.x_range_m, grid.y_range_m, grid.z_range_m]).T
     return ((boxes.centers >= low) & (boxes.centers <= high)).all(-1)

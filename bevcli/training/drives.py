@@ -1,4 +1,4 @@
-"""Where training finds its drives: folders with ground truth, or drives rendered from seeds when they are needed."""
+"""The drives of a training: sequence folders with ground truth, or drives rendered from seeds on demand."""
 
 from __future__ import annotations
 
@@ -9,52 +9,51 @@ from collections.abc import Sequence as Items
 from pathlib import Path
 from typing import Protocol
 
+from bevcli.errors import InputError
 from bevcli.frame import Sequence
 from bevcli.model.bevformer import BEVFormerConfig
 from bevcli.sequences.open import open_sequence
-from bevcli.sequences.rate import thin
-from bevcli.sequences.selection import select
-from bevcli.synth.bev_truth import MapWindow
-from bevcli.synth.drive import Drive, Stock
+from bevcli.synth.assets.catalog import Assets
+from bevcli.synth.drive import RenderedDrive
 from bevcli.synth.export import export_drive
+from bevcli.synth.render.bev_map import MapWindow
 from bevcli.synth.rig import nuscenes_like_rig
 
-FIRST_HELD_OUT_SEED = 1_000_000  # drives from here on are for evaluation only
-FRAMES_A_DRIVE = 20
+FIRST_HELD_OUT_SEED = 1_000_000  # drives from this seed on are for evaluation only
+FRAMES_PER_DRIVE = 20
 
 
 class Drives(Protocol):
-    """Some drives; threads may open them side by side."""
+    """A list of drives. Several threads may open them at the same time."""
 
     def __len__(self) -> int: ...
 
-    def open(self, place: int) -> Sequence:
-        """The drive at a place, 0 to len - 1, at the model's rate. Raises InputError."""
+    def open(self, index: int) -> Sequence:
+        """The drive at an index (0 to len - 1), at the model's frame rate. Raises InputError."""
         ...
 
 
 class FolderDrives:
-    """Sequence folders (or nuScenes roots), opened when they are first asked for and kept open by each thread."""
+    """Sequence folders (or nuScenes roots). Each thread opens a drive once and keeps it open."""
 
     def __init__(self, folders: Items[Path], rate_hz: float) -> None:
         self._folders = tuple(folders)
         self._rate_hz = rate_hz
-        self._of_thread = threading.local()  # a sequence is read by one thread
+        self._of_thread = threading.local()  # a Sequence must be read from one thread
 
     def __len__(self) -> int:
         return len(self._folders)
 
-    def open(self, place: int) -> Sequence:
-        """The drive at a place, thinned to the model's rate."""
+    def open(self, index: int) -> Sequence:
+        """The drive at an index, thinned to the model's frame rate. Raises InputError."""
         opened: dict[int, Sequence] = vars(self._of_thread).setdefault("opened", {})
-        if place not in opened:
-            sequence = open_sequence(self._folders[place])
-            opened[place] = select(sequence, thin(sequence.stamps, self._rate_hz).places)
-        return opened[place]
+        if index not in opened:
+            opened[index] = open_sequence(self._folders[index], rate_hz=self._rate_hz)
+        return opened[index]
 
 
 class RenderedDrives:
-    """Rendered drives of some seeds, in the model's image size, kept as sequence folders under `cache`/WxH."""
+    """Rendered drives in the model's image size, kept as sequence folders `cache/WIDTHxHEIGHT/SEED`."""
 
     def __init__(self, seeds: Items[int], cache: Path, config: BEVFormerConfig) -> None:
         width, height = config.image.size
@@ -62,33 +61,33 @@ class RenderedDrives:
         self._seeds = tuple(seeds)
         self._config = config
         self._rendering = threading.Lock()
-        self._stock: Stock | None = None
+        self._assets: Assets | None = None
         self._drives = FolderDrives(self._folders, config.rate_hz)
 
     def __len__(self) -> int:
         return len(self._seeds)
 
-    def open(self, place: int) -> Sequence:
-        """The drive at a place; rendered (some seconds) when it is not in the cache."""
-        folder = self._folders[place]
+    def open(self, index: int) -> Sequence:
+        """The drive at an index. It is rendered first, which takes seconds, if the cache does not hold it."""
+        folder = self._folders[index]
         with self._rendering:
             if not folder.exists():
-                self._render(self._seeds[place], folder)
-        return self._drives.open(place)
+                self._render(self._seeds[index], folder)
+        return self._drives.open(index)
 
     def _render(self, seed: int, folder: Path) -> None:
-        """Under another name until it is whole, so that a kill leaves no half drive behind."""
-        self._stock = self._stock or Stock.make()
+        """Writes to a temporary folder and renames it, so that an interrupted process leaves no partial drive."""
+        self._assets = self._assets or Assets.build()
         width, height = self._config.image.size
         grid = self._config.bev_grid
-        reach = max(abs(end) for end in (*grid.x_range_m, *grid.y_range_m))
-        drive = Drive(
+        half_extent = max(abs(end) for end in (*grid.x_range_m, *grid.y_range_m))
+        drive = RenderedDrive(
             seed,
-            FRAMES_A_DRIVE,
+            FRAMES_PER_DRIVE,
             self._config.rate_hz,
             nuscenes_like_rig(width, height),
-            stock=self._stock,
-            map_window=MapWindow(half_extent_m=reach),
+            assets=self._assets,
+            map_window=MapWindow(half_extent_m=half_extent),
         )
         unfinished = folder.with_suffix(f".unfinished-{os.getpid()}")
         shutil.rmtree(unfinished, ignore_errors=True)
@@ -98,20 +97,73 @@ class RenderedDrives:
         except OSError:
             if not folder.exists():
                 raise
-            shutil.rmtree(unfinished)  # another process was faster
+            shutil.rmtree(unfinished)  # another process has rendered the same drive meanwhile
 
 
-def part_of(drives: Drives, start: int, end: int) -> Drives:
-    """The drives from place `start` to before `end`."""
-    return _Part(drives, start, end)
-
-
-class _Part:
-    def __init__(self, drives: Drives, start: int, end: int) -> None:
-        self._drives, self._places = drives, range(start, end)
+class _Subset:
+    def __init__(self, drives: Drives, indices: range) -> None:
+        self._drives, self._indices = drives, indices
 
     def __len__(self) -> int:
-        return len(self._places)
+        return len(self._indices)
 
-    def open(self, place: int) -> Sequence:
-        return self._drives.open(self._places[place])
+    def open(self, index: int) -> Sequence:
+        return self._drives.open(self._indices[index])
+
+
+def open_drives(folders: Items[Path], seeds: Items[int] | None, cache: Path, config: BEVFormerConfig) -> Drives:
+    """The drives in folders, or those rendered from seeds.
+
+    Args:
+        folders: sequence folders with ground truth; empty if seeds are given.
+        seeds: of rendered drives; None if folders are given.
+        cache: the folder that keeps rendered drives.
+
+    Raises:
+        InputError: both or neither are given.
+    """
+    if bool(folders) == (seeds is not None):
+        raise InputError("choose the drives: give either --data DIR (repeatable) or --rendered SEEDS, not both")
+    return FolderDrives(folders, config.rate_hz) if seeds is None else RenderedDrives(seeds, cache, config)
+
+
+def check_training_seeds(seeds: Items[int]) -> None:
+    """Raises InputError if a seed is reserved for evaluation."""
+    if max(seeds, default=0) >= FIRST_HELD_OUT_SEED:
+        raise InputError(
+            f"--rendered: seed {max(seeds)} is reserved for evaluation; train on seeds below {FIRST_HELD_OUT_SEED}"
+        )
+
+
+def split_drives(drives: Drives, held_out: int) -> tuple[Drives, Drives]:
+    """The drives to train on, and those to evaluate on: the last `held_out`, or all of them if that is 0.
+
+    Raises:
+        InputError: no drive is left to train on.
+    """
+    count = len(drives)
+    if count <= held_out:
+        raise InputError(
+            f"{count} drives are too few with {held_out} of them held out for evaluation: give more, "
+            "or set held_out = 0 in [training] to evaluate on the training drives"
+        )
+    first_held_out = count - held_out
+    evaluated = range(first_held_out if held_out else 0, count)
+    return _Subset(drives, range(first_held_out)), _Subset(drives, evaluated)
+
+
+def count_frames(drives: Drives) -> int:
+    """The number of frames of all drives. Opens each of them."""
+    return sum(len(drives.open(index).stamps) for index in range(len(drives)))
+
+
+def parse_seeds(text: str) -> list[int]:
+    """Seeds from "A:B" (B excluded) or "A,B,C". Raises InputError."""
+    try:
+        start, colon, end = text.partition(":")
+        seeds = list(range(int(start), int(end))) if colon else [int(part) for part in text.split(",")]
+    except ValueError:
+        seeds = []
+    if not seeds or min(seeds) < 0:
+        raise InputError(f'--rendered "{text}": expected seeds as A:B (B excluded) or A,B,C, none of them negative')
+    return seeds

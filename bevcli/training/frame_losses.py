@@ -1,24 +1,32 @@
-"""All that a frame's outputs cost, and the layers that read the model in training only."""
+"""All losses of a frame, and the auxiliary heads that exist in training only."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from torch import Tensor, nn
 
 from bevcli.model.bevformer import BEVFormer, BEVFormerInputs, BEVFormerOutputs
-from bevcli.training.dense_loss import DenseLossConfig, DenseReader, dense_loss
+from bevcli.training.dense_loss import DenseHead, DenseLossConfig, dense_loss
 from bevcli.training.detection_loss import DetectionLossConfig, detection_loss
-from bevcli.training.image_loss import ImageFeatureReader, ImageLossConfig, image_loss
+from bevcli.training.image_loss import ImageHead, ImageLossConfig, image_loss
 from bevcli.training.samples import Targets
 from bevcli.training.segmentation_loss import SegmentationLossConfig, segmentation_loss
 
 
 @dataclass(frozen=True)
 class LossConfigs:
-    """Those tables of [training] that end in _loss."""
+    """The tables of [training] whose names end in _loss.
+
+    Attributes:
+        detection_loss: the detection head's.
+        segmentation_loss: the segmentation head's, where the model has one.
+        dense_loss: auxiliary, on the BEV map.
+        picture_loss: auxiliary, on the image features (the key in the file keeps this name).
+    """
 
     detection_loss: DetectionLossConfig = field(default_factory=DetectionLossConfig)
     segmentation_loss: SegmentationLossConfig = field(default_factory=SegmentationLossConfig)
@@ -27,44 +35,63 @@ class LossConfigs:
 
 
 class FrameLosses:
-    """`losses(inputs, outputs, targets)`, called right after the model's forward that it judges.
+    """Computes the losses of one forward pass by name.
 
-    readers: the layers of the dense and the image loss, which learn along with the model.
+    Attributes:
+        auxiliary_heads: the heads of the dense and the image loss, which train along with the model. Their names are
+            part of the checkpoint format.
     """
 
     def __init__(self, model: BEVFormer, configs: LossConfigs) -> None:
-        of_model, classes = model.config, len(model.config.classes)
+        classes = len(model.config.classes)
         self.configs = configs
-        self.groups = of_model.decoder.training_groups
-        self.dense_reader: DenseReader | None = None
-        self.image_reader: ImageFeatureReader | None = None
-        self.readers = nn.ModuleDict()
+        self._query_groups = model.config.decoder.training_groups
+        self._dense_head: DenseHead | None = None
+        self._image_head: ImageHead | None = None
+        self.auxiliary_heads = nn.ModuleDict()
         if configs.dense_loss.weight > 0:
-            self.dense_reader = DenseReader(of_model.channels, classes, of_model.bev_grid)
-            self.readers["dense_reader"] = self.dense_reader
+            self._dense_head = DenseHead(model.config.channels, classes, model.config.bev_grid)
+            self.auxiliary_heads["dense_reader"] = self._dense_head
         if configs.picture_loss.weight > 0:
-            self.image_reader = ImageFeatureReader(of_model.channels, classes)
-            self.readers["image_reader"] = self.image_reader
-            model.neck.register_forward_hook(self._keep_features)
+            self._image_head = ImageHead(model.config.channels, classes)
+            self.auxiliary_heads["picture_reader"] = self._image_head
+
+    @contextlib.contextmanager
+    def watching(self, model: BEVFormer) -> Iterator[None]:
+        """Inside, each forward pass of the model keeps its image features for the image loss. Leaves no hook behind."""
+        if self._image_head is None:
+            yield
+            return
+
+        def keep(neck: nn.Module, inputs: tuple[Any, ...], maps: Sequence[Tensor]) -> None:
+            self._image_features = maps[0]  # the finest level
+
+        hook = model.neck.register_forward_hook(keep)
+        try:
+            yield
+        finally:
+            hook.remove()
 
     def __call__(self, inputs: BEVFormerInputs, outputs: BEVFormerOutputs, targets: Targets) -> dict[str, Tensor]:
-        """The weighted losses by name; their sum is what a step makes smaller."""
-        of_boxes = self.configs.detection_loss
-        detection = detection_loss(outputs.class_logits, outputs.box_codes, targets.detection, of_boxes, self.groups)
+        """The weighted scalar losses by name; their sum is minimised.
+
+        Call it inside `watching`, right after the forward pass that made the outputs.
+        """
+        weights = self.configs.detection_loss
+        detection = detection_loss(
+            outputs.class_logits, outputs.box_codes, targets.detection, weights, self._query_groups
+        )
         losses = {"classes": detection.classes, "boxes": detection.boxes}
-        if self.dense_reader is not None:
+        if self._dense_head is not None:
             bev, config = outputs.bev.float(), self.configs.dense_loss
-            dense = dense_loss(self.dense_reader, bev, targets.detection, config, of_boxes)
+            dense = dense_loss(self._dense_head, bev, targets.detection, config, weights)
             losses |= {"cell classes": dense.classes, "cell boxes": dense.boxes}
-        if self.image_reader is not None:
-            features, of_pixels = self._features.float(), self.configs.picture_loss
-            pixels = image_loss(self.image_reader, features, inputs, targets.detection, of_pixels, of_boxes)
-            losses |= {"pixel classes": pixels.classes, "pixel places": pixels.places}
+        if self._image_head is not None:
+            features = self._image_features.float()
+            image_config = self.configs.picture_loss
+            image = image_loss(self._image_head, features, inputs, targets.detection, image_config, weights)
+            losses |= {"pixel classes": image.classes, "pixel places": image.places}
         if outputs.segmentation is not None:
             maps = segmentation_loss(outputs.segmentation, targets.segmentation, self.configs.segmentation_loss)
             losses |= {"map classes": maps.classes, "masks": maps.masks, "locations": maps.locations}
         return losses
-
-    def _keep_features(self, neck: nn.Module, inputs: tuple[Any, ...], maps: Sequence[Tensor]) -> None:
-        """The finest of the neck's maps, which the image loss reads."""
-        self._features = maps[0]

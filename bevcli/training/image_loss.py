@@ -1,8 +1,8 @@
-"""A loss on the image features beside those of the heads: every pixel on an object says its class and how far it is.
+"""Auxiliary loss on the image features: every pixel on an object predicts its class, depth and projected centre.
 
-The heads teach the backbone through the few places at which the BEV queries look; here every object teaches the pixels
-in which it appears, directly. (The idea is BEVFormer v2's perspective supervision, arXiv 2211.10439; this is a linear
-layer, not a second detector.) The layer that reads the features serves training only.
+The detection head trains the backbone only through the sampling points of the BEV queries. Here each object trains the
+pixels that show it directly. The idea is the perspective supervision of BEVFormer v2 (arXiv 2211.10439), with a linear
+layer in place of a second detector. The auxiliary head exists in training only.
 """
 
 from __future__ import annotations
@@ -21,10 +21,17 @@ from bevcli.training.detection_loss import DetectionLossConfig
 from bevcli.training.detection_targets import DetectionTargets
 from bevcli.training.focal_loss import focal_loss
 
+MIN_HALF_EXTENT = 0.6  # feature pixels; a smaller object still covers the centre of at least one pixel
+
 
 @dataclass(frozen=True)
 class ImageLossConfig:
-    """weight: of the whole loss; 0 leaves it out, as published. place_weight: of depth and centre in it."""
+    """The [training.picture_loss] table.
+
+    Attributes:
+        weight: of the whole loss; 0 disables it, as published.
+        place_weight: of depth and projected centre within the loss.
+    """
 
     weight: float = 0.0
     place_weight: float = 1.0
@@ -36,17 +43,19 @@ class ImageLossConfig:
 
 @dataclass(frozen=True)
 class ImageLoss:
-    """Weighted. classes: focal. places: L1 of log depth and of the way to the projected centre."""
+    """Weighted scalar losses.
+
+    Attributes:
+        classes: () focal loss of the classes.
+        places: () L1 loss of log depth and of the offset to the projected centre.
+    """
 
     classes: Tensor
     places: Tensor
 
 
-class ImageFeatureReader(nn.Module):
-    """(P, C, h, w) features of P images -> class logits (P, h, w, classes) and places (P, h, w, 3).
-
-    A place is (log of the depth in metres, way to the centre's projection in x, in y, in pixels of the feature map).
-    """
+class ImageHead(nn.Module):
+    """One linear layer that predicts classes and the place of an object from each pixel of the image features."""
 
     def __init__(self, channels: int, classes: int) -> None:
         super().__init__()
@@ -55,74 +64,95 @@ class ImageFeatureReader(nn.Module):
         nn.init.constant_(self.classes.bias, -math.log(99))  # focal prior, as in the detection head
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """features: (P, C, h, w)."""
+        """features: (P, C, h, w) of P images -> class logits (P, h, w, classes) and places (P, h, w, 3).
+
+        A place is the log of the depth in metres, and the offset from the pixel to the projection of the object's
+        centre in x and y, in pixels of the feature map.
+        """
         pixels = features.movedim(1, -1)
         return self.classes(pixels), self.places(pixels)
 
 
 def image_loss(
-    reader: ImageFeatureReader,
+    head: ImageHead,
     features: Tensor,
     inputs: BEVFormerInputs,
     targets: Sequence[DetectionTargets],
     config: ImageLossConfig,
-    of_boxes: DetectionLossConfig,
+    detection: DetectionLossConfig,
 ) -> ImageLoss:
-    """features: (B·N, C, h, w), the finest of the neck's for these inputs. targets: B.
+    """Focal loss of all pixels and L1 loss of the positive ones, divided by the number of positive pixels.
 
-    Both losses are divided by the number of taught pixels; the classes weigh as those of boxes.
+    Args:
+        features: (B·N, C, h, w) the neck's finest feature map for these inputs.
+        targets: B.
+        detection: its class weight applies here too.
     """
-    logits, places = reader(features)
-    wanted = torch.zeros_like(logits)
-    found, truths = [], []
+    logits, places = head(features)
+    class_targets = torch.zeros_like(logits)
+    predicted, truths = [], []
     image_size = (inputs.images.shape[-2], inputs.images.shape[-1])
     cameras = inputs.image_from_bev.shape[1]
     for image, matrix in enumerate(inputs.image_from_bev.flatten(0, 1)):
         truth = targets[image // cameras]
-        taught = _taught_pixels(matrix, truth.codes, (features.shape[-2], features.shape[-1]), image_size)
-        wanted[image, taught.rows, taught.columns, truth.labels[taught.owners]] = 1
-        found.append(places[image, taught.rows, taught.columns])
-        truths.append(taught.places)
-    count = max(sum(map(len, found)), 1)
-    classes = of_boxes.class_weight * focal_loss(logits, wanted).sum() / count
-    errors = F.l1_loss(torch.cat(found), torch.cat(truths), reduction="sum") / count
+        positive = _positive_pixels(matrix, truth.codes, (features.shape[-2], features.shape[-1]), image_size)
+        class_targets[image, positive.rows, positive.columns, truth.labels[positive.objects]] = 1
+        predicted.append(places[image, positive.rows, positive.columns])
+        truths.append(positive.places)
+    count = max(sum(map(len, predicted)), 1)
+    classes = detection.class_weight * focal_loss(logits, class_targets).sum() / count
+    errors = F.l1_loss(torch.cat(predicted), torch.cat(truths), reduction="sum") / count
     return ImageLoss(config.weight * classes, config.weight * config.place_weight * errors)
 
 
 @dataclass(frozen=True)
-class _TaughtPixels:
-    """K pixels of a feature map. owners: places of their objects. places: (K, 3), what they should say."""
+class _PositivePixels:
+    """K pixels of a feature map that show an object.
+
+    Attributes:
+        rows: (K,) int64.
+        columns: (K,) int64.
+        objects: (K,) int64, indices of the objects that they show.
+        places: (K, 3) targets, as `ImageHead` predicts them.
+    """
 
     rows: Tensor
     columns: Tensor
-    owners: Tensor
+    objects: Tensor
     places: Tensor
 
 
-def _taught_pixels(
+def _positive_pixels(
     image_from_bev: Tensor, codes: Tensor, shape: tuple[int, int], image_size: tuple[int, int]
-) -> _TaughtPixels:
-    """The pixels in the inner half of an object's outline; of objects behind each other, the nearest one's."""
+) -> _PositivePixels:
+    """The pixels in the inner half of an object's outline. Where objects overlap, a pixel shows the nearest.
+
+    Args:
+        image_from_bev: (4, 4).
+        codes: (G, 10) box codes.
+        shape: rows and columns of the feature map.
+        image_size: height and width of the network's input image, pixels.
+    """
     if not len(codes):
         none = torch.zeros(0, dtype=torch.int64, device=codes.device)
-        return _TaughtPixels(none, none, none, codes.new_zeros(0, 3))
+        return _PositivePixels(none, none, none, codes.new_zeros(0, 3))
     rows, columns = shape
     scale = codes.new_tensor([columns / image_size[1], rows / image_size[0]])
     centers = codes[:, [0, 1, 4]]
     pixels, depth = project_points(image_from_bev, centers)
-    ahead = depth > MIN_DEPTH
-    middle = pixels * scale  # (G, 2), x and y
-    toward = image_from_bev[2, :3]  # the viewing direction
-    focal = (image_from_bev[:2, :3].square().sum(1) - (image_from_bev[:2, :3] @ toward).square()).sqrt() * scale
-    width = codes[:, [2, 3]].exp().mean(1)
-    reach = torch.stack([width, codes[:, 5].exp()], 1) / 4 * focal / depth.clamp(min=MIN_DEPTH)[:, None]
+    in_front = depth > MIN_DEPTH
+    projected = pixels * scale  # (G, 2), x and y
+    viewing_direction = image_from_bev[2, :3]
+    focal = (image_from_bev[:2, :3].square().sum(1) - (image_from_bev[:2, :3] @ viewing_direction).square()).sqrt()
+    width, height = codes[:, [2, 3]].exp().mean(1), codes[:, 5].exp()
+    half_extent = torch.stack([width, height], 1) / 4 * (focal * scale) / depth.clamp(min=MIN_DEPTH)[:, None]
     y, x = torch.meshgrid(
         torch.arange(rows, device=codes.device) + 0.5, torch.arange(columns, device=codes.device) + 0.5, indexing="ij"
     )
-    way = middle - torch.stack([x, y], -1)[:, :, None]  # (h, w, G, 2)
-    inside = (way.abs() <= reach.clamp(min=0.6)).all(-1) & ahead
+    offset = projected - torch.stack([x, y], -1)[:, :, None]  # (h, w, G, 2)
+    inside = (offset.abs() <= half_extent.clamp(min=MIN_HALF_EXTENT)).all(-1) & in_front
     nearest = torch.where(inside, depth, torch.inf).argmin(-1)  # (h, w)
     row, column = inside.any(-1).nonzero(as_tuple=True)
-    owners = nearest[row, column]
-    places = torch.cat([depth[owners].log()[:, None], way[row, column, owners]], -1)
-    return _TaughtPixels(row, column, owners, places)
+    objects = nearest[row, column]
+    places = torch.cat([depth[objects].log()[:, None], offset[row, column, objects]], -1)
+    return _PositivePixels(row, column, objects, places)

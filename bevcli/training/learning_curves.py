@@ -1,14 +1,13 @@
-"""The curves of a training: rows in CSV files, and an image of them."""
+"""Learning curves: losses and scores by step, as CSV files and as a plot."""
 
 from __future__ import annotations
 
 import csv
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bevcli.errors import OutputError
+from bevcli.training.checkpoint import replace_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -16,28 +15,33 @@ if TYPE_CHECKING:
 Row = Mapping[str, float]
 
 
-class Curve:
-    """A CSV file with a column `step`, one row a step. Rows beyond `done` steps, of a killed run, are dropped."""
+class LearningCurve:
+    """A CSV file with a column `step` and one row a step.
+
+    Attributes:
+        path: the file.
+        rows: what is in it.
+    """
 
     def __init__(self, path: Path, done: int = 0) -> None:
+        """Opens the file of a resumed training, or starts a new one. Raises OutputError.
+
+        Args:
+            done: steps done. Rows after them, of an interrupted run, are dropped; 0 starts a new file.
+        """
         self.path = path
         self.rows: list[Row] = [row for row in _read(path) if row["step"] <= done] if done else []
-        aside = path.with_name(f"{path.name}.unfinished")
-        try:
-            _write(aside, self.rows, "w")
-            os.replace(aside, path)
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
+        replace_file(path, lambda unfinished: _write(unfinished, self.rows, "w"))
 
     def add(self, step: int, numbers: Row) -> None:
-        """One more row, in the file at once."""
+        """Appends a row and writes it to the file at once."""
         row = {"step": step, **numbers}
         _write(self.path, [row], "a", header=not self.rows)
         self.rows.append(row)
 
 
-def draw(loss: Curve, validation: Curve, path: Path) -> None:
-    """Losses (smoothed) beside scores, as a PNG."""
+def draw_learning_curves(loss: LearningCurve, validation: LearningCurve, path: Path) -> None:
+    """Writes a PNG: smoothed losses on the left, scores on the right."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -61,15 +65,15 @@ def _draw_rows(axes: Axes, rows: list[Row], skipped: tuple[str, ...], marker: st
 
 
 def _scores(row: Row) -> Row:
-    """What lies between 0 and 1: no error, and not every class."""
+    """The step and the scores from 0 to 1 over all classes: mAP, NDS and IoU."""
     return {name: row[name] for name in row if name in ("step", "mAP", "NDS") or name.startswith("IoU")}
 
 
 def _smoothed(rows: list[Row], points: int = 200) -> list[Row]:
-    """Means of equal stretches, at most `points`."""
+    """Means over blocks of equal length, at least `points` blocks if there are so many rows."""
     size = max(1, len(rows) // points)
-    parts = [rows[start : start + size] for start in range(0, len(rows) - size + 1, size)]
-    return [{name: sum(row[name] for row in part) / size for name in part[0]} for part in parts]
+    blocks = [rows[start : start + size] for start in range(0, len(rows) - size + 1, size)]
+    return [{name: sum(row[name] for row in block) / size for name in block[0]} for block in blocks]
 
 
 def _read(path: Path) -> list[Row]:

@@ -1,4 +1,4 @@
-"""AdamW with a linear warm-up and a cosine decay, as published."""
+"""AdamW with a linear warm-up and a cosine decay of the learning rate, as published."""
 
 from __future__ import annotations
 
@@ -11,10 +11,16 @@ from torch import nn
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """learning_rate: at its highest. backbone_share: of it, for the image backbone (1 for one that is untrained).
+    """The [training.optimizer] table.
 
-    warm_up_steps: in which the rate rises from warm_up_start of itself. final_share: of the rate, at the end.
-    max_gradient_norm: longer gradients are shortened to it.
+    Attributes:
+        learning_rate: the peak learning rate.
+        backbone_share: learning rate of the image backbone relative to the rest; 1 for an untrained backbone.
+        weight_decay: of AdamW.
+        warm_up_steps: steps in which the rate rises linearly.
+        warm_up_start: relative rate at step 0.
+        final_share: relative rate at the end of the cosine decay.
+        max_gradient_norm: gradients are clipped to this L2 norm.
     """
 
     learning_rate: float = 2e-4
@@ -29,29 +35,29 @@ class OptimizerConfig:
         if min(self.learning_rate, self.max_gradient_norm) <= 0 or self.warm_up_steps < 0:
             raise ValueError("learning_rate and max_gradient_norm must be positive, warm_up_steps not negative")
 
-    def share(self, step: int, steps: int) -> float:
-        """The share of the learning rate at a step, 0 to steps - 1."""
+    def learning_rate_at(self, step: int, steps: int) -> float:
+        """The learning rate of a step (0 to steps - 1)."""
         cosine = (1 + math.cos(math.pi * step / steps)) / 2
-        decayed = self.final_share + (1 - self.final_share) * cosine
-        if step >= self.warm_up_steps:
-            return decayed
-        return decayed * (self.warm_up_start + (1 - self.warm_up_start) * step / self.warm_up_steps)
+        share = self.final_share + (1 - self.final_share) * cosine
+        if step < self.warm_up_steps:
+            share *= self.warm_up_start + (1 - self.warm_up_start) * step / self.warm_up_steps
+        return self.learning_rate * share
 
 
-def make_optimizer(learning: nn.Module, backbone: nn.Module, config: OptimizerConfig) -> torch.optim.AdamW:
-    """AdamW over two groups: all that learns but the backbone, and the backbone."""
-    known = {id(parameter) for parameter in backbone.parameters()}
-    others = [parameter for parameter in learning.parameters() if id(parameter) not in known]
+def make_optimizer(trained: nn.Module, backbone: nn.Module, config: OptimizerConfig) -> torch.optim.AdamW:
+    """AdamW with two parameter groups: everything in `trained` except the backbone, and the backbone."""
+    in_backbone = {id(parameter) for parameter in backbone.parameters()}
+    others = [parameter for parameter in trained.parameters() if id(parameter) not in in_backbone]
     groups = [{"params": others, "share": 1.0}, {"params": list(backbone.parameters()), "share": config.backbone_share}]
     return torch.optim.AdamW(groups, lr=config.learning_rate, weight_decay=config.weight_decay)
 
 
-def set_rate(optimizer: torch.optim.AdamW, rate: float) -> None:
-    """The learning rate of the next step; each group takes its share of it."""
+def set_learning_rate(optimizer: torch.optim.AdamW, rate: float) -> None:
+    """Sets the learning rate of the next step; each parameter group takes its share of it."""
     for group in optimizer.param_groups:
         group["lr"] = rate * group["share"]
 
 
-def clip_gradients(model: nn.Module, max_norm: float) -> float:
-    """Shortens the gradient where it is longer than max_norm; returns how long it was."""
-    return float(nn.utils.clip_grad_norm_(model.parameters(), max_norm))
+def clip_gradients(module: nn.Module, max_norm: float) -> float:
+    """Clips the gradient to an L2 norm of at most max_norm; returns its norm before."""
+    return float(nn.utils.clip_grad_norm_(module.parameters(), max_norm))

@@ -1,4 +1,4 @@
-"""Samples: the frames of a batch of clips as the model's inputs, with what it should say of the last ones."""
+"""Training samples: the frames of a batch of clips as network inputs, with the targets of the frames to train on."""
 
 from __future__ import annotations
 
@@ -24,16 +24,18 @@ from bevcli.training.segmentation_targets import SegmentationTargets, segmentati
 
 @dataclass(frozen=True)
 class Targets:
-    """What a model should say of B frames: B detection and B segmentation targets.
+    """The targets of B frames, one of each clip.
 
-    segmentation is empty where the model has no such head.
+    Attributes:
+        detection: B.
+        segmentation: B, or empty if the model has no segmentation head.
     """
 
     detection: tuple[DetectionTargets, ...]
     segmentation: tuple[SegmentationTargets, ...]
 
     def to(self, device: torch.device) -> Targets:
-        """The same on a device."""
+        """A copy on a device."""
         return Targets(
             tuple(targets.to(device) for targets in self.detection),
             tuple(targets.to(device) for targets in self.segmentation),
@@ -42,18 +44,20 @@ class Targets:
 
 @dataclass(frozen=True)
 class Batch:
-    """B clips of one length. steps: the model's inputs, one a frame. targets: of the last frames of the clips.
+    """B clips of the same length.
 
-    There are fewer targets than steps where the first frames of clips only make history.
+    Attributes:
+        inputs: the network inputs, one a frame of the clips, each for B clips.
+        targets: of the last frames of the clips. There are fewer than inputs if the first frames are history only.
     """
 
-    steps: tuple[BEVFormerInputs, ...]
+    inputs: tuple[BEVFormerInputs, ...]
     targets: tuple[Targets, ...]
 
     def to(self, device: torch.device) -> Batch:
-        """The same on a device."""
-        steps = tuple(step.to(device) for step in self.steps)
-        return Batch(steps, tuple(targets.to(device) for targets in self.targets))
+        """A copy on a device."""
+        inputs = tuple(one.to(device) for one in self.inputs)
+        return Batch(inputs, tuple(targets.to(device) for targets in self.targets))
 
 
 def load_batch(
@@ -65,40 +69,48 @@ def load_batch(
     *,
     learn_all: bool = False,
 ) -> Batch:
-    """Reads, changes and prepares the frames of clips of one length. Raises InputError without ground truth.
+    """Reads, augments and preprocesses the frames of clips of the same length.
 
-    learn_all: give the targets of every frame, not of the last one only.
+    Args:
+        learn_all: give targets for every frame, not for the last one only.
+
+    Raises:
+        InputError: a frame to train on has no ground truth.
     """
     loaded = [_load_clip(drives, clip, config, augmentation, random) for clip in clips]
-    steps = []
-    for number, frames in enumerate(zip(*loaded, strict=True)):
-        before = [clip[number - 1].frame.world_from_ego if number else None for clip in loaded]
-        inputs = model_inputs(frames, before, config)
-        mask_images(inputs.images, augmentation.grid_mask, random)
-        steps.append(inputs)
-    learned = list(zip(*loaded, strict=True))[0 if learn_all else -1 :]
-    return Batch(tuple(steps), tuple(_targets([prepared.frame for prepared in frames], config) for frames in learned))
+    frames = list(zip(*loaded, strict=True))
+    inputs = []
+    for index, prepared in enumerate(frames):
+        previous_poses = [one.frame.world_from_ego for one in frames[index - 1]] if index else [None] * len(clips)
+        step = model_inputs(prepared, previous_poses, config)
+        mask_images(step.images, augmentation.grid_mask, random)
+        inputs.append(step)
+    learned = frames if learn_all else frames[-1:]
+    return Batch(tuple(inputs), tuple(_targets([one.frame for one in prepared], config) for prepared in learned))
 
 
-def _targets(frames: Sequence[Frame], config: BEVFormerConfig) -> Targets:
-    truths = [(frame, ground_truth(frame)) for frame in frames]
-    segments = "segmentation" in config.heads
-    return Targets(
-        tuple(detection_targets(boxes, config) for _, boxes in truths),
-        tuple(
-            segmentation_targets(boxes, frame.ground_truth_map, config.bev_grid) for frame, boxes in truths if segments
-        ),
-    )
-
-
-def ground_truth(frame: Frame) -> Boxes3D:
-    """The true boxes in the bev frame. Raises InputError where the frame has none."""
+def ground_truth_boxes(frame: Frame) -> Boxes3D:
+    """The ground truth boxes in the bev frame. Raises InputError if the frame has none."""
     if frame.ground_truth is None:
         raise InputError(
             f"frame {frame.stamp.index} of {frame.stamp.scene or 'the drive'} has no ground truth boxes: "
             "training needs ground_truth.json (bevcli convert writes it)"
         )
     return frame.ground_truth.transformed(inverse(frame.world_from_ego.matrix @ frame.rig.ego_from_bev))
+
+
+def _targets(frames: Sequence[Frame], config: BEVFormerConfig) -> Targets:
+    boxes = [ground_truth_boxes(frame) for frame in frames]
+    detection = tuple(detection_targets(of_frame, config) for of_frame in boxes)
+    if "segmentation" not in config.heads:
+        return Targets(detection, ())
+    return Targets(
+        detection,
+        tuple(
+            segmentation_targets(of_frame, frame.ground_truth_map, config.bev_grid)
+            for frame, of_frame in zip(frames, boxes, strict=True)
+        ),
+    )
 
 
 def _load_clip(
@@ -108,6 +120,6 @@ def _load_clip(
     augmentation: AugmentationConfig,
     random: np.random.Generator,
 ) -> list[PreparedFrame]:
-    sequence, prepare = drives.open(clip.drive), Preprocessor(config)
-    frames = (sequence.load(place) for place in clip.places)
-    return [prepare(distort_images(frame, augmentation.photometric, random)) for frame in frames]
+    sequence, preprocess = drives.open(clip.drive), Preprocessor(config)
+    frames = (sequence.load(index) for index in clip.frames)
+    return [preprocess(distort_images(frame, augmentation.photometric, random)) for frame in frames]

@@ -1,4 +1,4 @@
-"""What the segmentation head should say of a frame: stuff from its map, things from its vehicles' footprints."""
+"""Ground truth maps and boxes as targets of the segmentation head: stuff from the map, things from vehicle boxes."""
 
 from __future__ import annotations
 
@@ -14,19 +14,22 @@ from bevcli.frame import MAP_CLASSES, BevMap
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.segmentation_head import STUFF_CLASSES
-from bevcli.synth.bev_truth import VEHICLE_CLASSES
-from bevcli.training.detection_targets import seen
+from bevcli.synth.render.bev_map import VEHICLE_CLASSES
+from bevcli.training.detection_targets import has_points
 
-# How much of a BEV cell a class covers for the cell to count as it: least for lines, which are thinner than a cell.
+# A cell belongs to a class that covers at least this share of it. Lines are thinner than a cell: their share is lower.
 MIN_SHARES = {"drivable_road": 0.4, "lane_boundary": 0.2, "pedestrian_crossing": 0.4}
-SAMPLES = 8  # looked up along each side of a BEV cell
+SAMPLES = 8  # sampling points along each side of a BEV cell
 
 
 @dataclass(frozen=True)
 class SegmentationTargets:
-    """stuff: (S, Y·X) float32 of 0 and 1 in the order of STUFF_CLASSES, None where no map is known.
+    """The masks of one frame: S stuff classes and G vehicles.
 
-    things: (G, Y·X) float32. locations: (G, 4) float32: centre x, y, extent x, y, 0 to 1 over the map.
+    Attributes:
+        stuff: (S, Y·X) float32 masks of 0 and 1 in the order of STUFF_CLASSES; None if the frame has no map.
+        things: (G, Y·X) float32 masks of 0 and 1.
+        locations: (G, 4) float32 centre x, y and extent x, y of each vehicle, as fractions (0 to 1) of the grid.
     """
 
     stuff: Tensor | None
@@ -34,14 +37,18 @@ class SegmentationTargets:
     locations: Tensor
 
     def to(self, device: torch.device) -> SegmentationTargets:
-        """The same on a device."""
+        """A copy on a device."""
         stuff = None if self.stuff is None else self.stuff.to(device)
         return SegmentationTargets(stuff, self.things.to(device), self.locations.to(device))
 
 
 def segmentation_targets(boxes: Boxes3D, bev_map: BevMap | None, grid: BevGrid) -> SegmentationTargets:
-    """boxes: of the frame, bev frame. Raises InputError where the map does not reach as far as the grid."""
-    vehicles = boxes[np.isin(boxes.classes, VEHICLE_CLASSES) & seen(boxes)]
+    """Masks on the BEV grid. Raises InputError if the map does not cover the grid.
+
+    Args:
+        boxes: the frame's ground truth boxes, bev frame.
+    """
+    vehicles = boxes[np.isin(boxes.classes, VEHICLE_CLASSES) & has_points(boxes)]
     vehicles = vehicles[(grid.cell_of(vehicles.centers[:, :2]) >= 0).all(-1)]
     stuff = None if bev_map is None else torch.from_numpy(_stuff(bev_map, grid)).float()
     return SegmentationTargets(
@@ -52,30 +59,30 @@ def segmentation_targets(boxes: Boxes3D, bev_map: BevMap | None, grid: BevGrid) 
 
 
 def _stuff(bev_map: BevMap, grid: BevGrid) -> NDArray[np.bool_]:
-    """(S, Y·X): whether enough of a cell is of a class."""
-    _check_reach(bev_map, grid)
+    """(S, Y·X): whether a class covers enough of a cell."""
+    _check_coverage(bev_map, grid)
     fine = BevGrid(grid.rows * SAMPLES, grid.columns * SAMPLES, grid.x_range_m, grid.y_range_m)
     rows, columns = bev_map.cells.shape
     map_grid = BevGrid(rows, columns, bev_map.x_range_m, bev_map.y_range_m)
-    places = map_grid.cell_of(fine.cell_centers())  # (Y · 8, X · 8, 2)
-    bits = bev_map.cells[::-1][places[..., 0], places[..., 1]]  # the map's rows run from the largest y
+    map_cells = map_grid.cell_of(fine.cell_centers())  # (Y · SAMPLES, X · SAMPLES, 2)
+    bits = bev_map.cells[::-1][map_cells[..., 0], map_cells[..., 1]]  # the map's rows start at the largest y
     layers = np.stack([(bits & MAP_CLASSES[name]) > 0 for name in STUFF_CLASSES])
     shares = layers.reshape(len(layers), grid.rows, SAMPLES, grid.columns, SAMPLES).mean((2, 4))
-    enough = np.array([MIN_SHARES[name] for name in STUFF_CLASSES])
-    return (shares >= enough[:, None, None]).reshape(len(layers), -1)
+    min_shares = np.array([MIN_SHARES[name] for name in STUFF_CLASSES])
+    return (shares >= min_shares[:, None, None]).reshape(len(layers), -1)
 
 
-def _check_reach(bev_map: BevMap, grid: BevGrid) -> None:
-    for axis, reach, wanted in (("x", bev_map.x_range_m, grid.x_range_m), ("y", bev_map.y_range_m, grid.y_range_m)):
-        if reach[0] > wanted[0] or reach[1] < wanted[1]:
+def _check_coverage(bev_map: BevMap, grid: BevGrid) -> None:
+    for axis, found, needed in (("x", bev_map.x_range_m, grid.x_range_m), ("y", bev_map.y_range_m, grid.y_range_m)):
+        if found[0] > needed[0] or found[1] < needed[1]:
             raise InputError(
-                f"a ground truth map covers {axis} {reach[0]:g} to {reach[1]:g} m, but the model's BEV grid "
-                f"{wanted[0]:g} to {wanted[1]:g} m: write larger maps, or train without the segmentation head"
+                f"a ground truth map covers {axis} {found[0]:g} to {found[1]:g} m, but the model's BEV grid "
+                f"{needed[0]:g} to {needed[1]:g} m: write larger maps, or train without the segmentation head"
             )
 
 
 def _footprints(vehicles: Boxes3D, grid: BevGrid) -> NDArray[np.bool_]:
-    """(G, Y·X): the cells whose centre a vehicle covers, and always the cell of its own centre."""
+    """(G, Y·X): the cells whose centre lies under the vehicle, and in any case the cell of the vehicle's centre."""
     cells = grid.cell_centers().reshape(-1, 2)
     from_center = cells - vehicles.centers[:, None, :2]  # (G, Y·X, 2)
     cos, sin = np.cos(vehicles.yaws)[:, None], np.sin(vehicles.yaws)[:, None]
@@ -88,7 +95,7 @@ def _footprints(vehicles: Boxes3D, grid: BevGrid) -> NDArray[np.bool_]:
 
 
 def _locations(vehicles: Boxes3D, grid: BevGrid) -> NDArray[np.float64]:
-    """(G, 4) centre and extent of the footprints' bounding rectangles over the map."""
+    """(G, 4) centre and extent of the footprints' axis-aligned bounding rectangles, as fractions of the grid."""
     start, end = np.array([grid.x_range_m, grid.y_range_m]).T
     corners = vehicles.corners()[:, :4, :2]
     extent = corners.max(1) - corners.min(1) if len(vehicles) else np.zeros((0, 2))

@@ -1,158 +1,134 @@
-"""The training loop: clips in, a step of the optimizer, checkpoints and curves out."""
+"""The training loop: clips in; updates of the weights, checkpoints and learning curves out."""
 
 from __future__ import annotations
 
+import copy
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Literal, TypeVar
+from collections.abc import Callable, Iterator, Sequence
+from typing import TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from bevcli.errors import BevcliError
-from bevcli.model.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer, BEVFormerInputs, BEVFormerOutputs
 from bevcli.model.prepared import choose_kernels
 from bevcli.pipeline.model_loading import choose_precision
 from bevcli.pipeline.read_ahead import read_ahead
 from bevcli.pipeline.runner import Runner, StepOptions
-from bevcli.training.augmentation import AugmentationConfig
 from bevcli.training.checkpoint import load_checkpoint, save_checkpoint, save_weights
-from bevcli.training.clips import ClipConfig, draw_clips
-from bevcli.training.drives import Drives
-from bevcli.training.frame_losses import FrameLosses, LossConfigs
-from bevcli.training.learning_curves import Curve, draw
-from bevcli.training.optimizer import OptimizerConfig, clip_gradients, make_optimizer, set_rate
-from bevcli.training.recurrent_clip import forward_clip
+from bevcli.training.clips import draw_clips
+from bevcli.training.frame_losses import FrameLosses
+from bevcli.training.job import CHECKPOINT, TrainingJob
+from bevcli.training.learning_curves import LearningCurve, draw_learning_curves
+from bevcli.training.optimizer import clip_gradients, make_optimizer, set_learning_rate
 from bevcli.training.samples import Batch, load_batch
-from bevcli.training.team import Team
 from bevcli.training.validation import Validation, validate
 
 T = TypeVar("T")
 
 
-@dataclass(frozen=True)
-class TrainingConfig(LossConfigs):
-    """The [training] table of a model's file.
-
-    steps: batches of clips. held_out: how many of the drives, the last ones, are for evaluation only.
-    evaluate_every, checkpoint_every: steps. freeze_batch_norm: for fine-tuning, keep the running statistics.
-    loaders: threads that each read one step's batches ahead; more than one where a GPU waits for them.
-    weights_dtype: of weights.safetensors.
-    """
-
-    steps: int = 10_000
-    held_out: int = 2
-    evaluate_every: int = 1000
-    checkpoint_every: int = 250
-    freeze_batch_norm: bool = False
-    loaders: int = 1
-    weights_dtype: Literal["float32", "float16"] = "float32"
-    clips: ClipConfig = field(default_factory=ClipConfig)
-    augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
-    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
-
-    def __post_init__(self) -> None:
-        if min(self.steps, self.evaluate_every, self.checkpoint_every, self.loaders) < 1 or self.held_out < 0:
-            raise ValueError(
-                "steps, evaluate_every, checkpoint_every and loaders must be positive, held_out not negative"
-            )
-
-
-@dataclass(frozen=True)
-class TrainingJob:
-    """drives: to learn from. held_out: to evaluate on; empty to evaluate on `drives`. out: a folder that exists.
-
-    seed: decides everything that is drawn, together with the number of the step and the place in the team.
-    """
-
-    model: BEVFormer
-    config: TrainingConfig
-    drives: Drives
-    held_out: Drives
-    out: Path
-    device: torch.device
-    seed: int = 0
-    team: Team = field(default_factory=Team)
-
-
 class Trainer:
-    """A training that can be stopped at any time and resumed at its last checkpoint.
+    """A training that can be interrupted at any time and resumed from its last checkpoint.
 
-    Writes checkpoint.pt, weights.safetensors, loss.csv, validation.csv and curves.png.
+    Writes checkpoint.pt, weights.safetensors, loss.csv, validation.csv and curves.png into the output folder.
+
+    Attributes:
+        job: what is trained, on what.
+        trained: all modules that are trained: the model and the auxiliary heads.
+        optimizer: of their parameters.
+        done: the number of steps done.
     """
 
     def __init__(self, job: TrainingJob, *, resume: bool = False) -> None:
+        """Prepares model and optimizer. Raises WeightsError if the checkpoint to resume from is missing or wrong."""
         self.job = job
-        options = StepOptions(choose_precision(None, job.device), temporal=job.config.clips.frames > 1)
-        self.runner = Runner(job.model, job.device, options)
-        self.losses = FrameLosses(job.model, job.config)
-        # All that learns: the model, and what reads it in training only.
-        self.learning = nn.ModuleDict({"model": job.model, **self.losses.readers}).to(job.device)
-        self.optimizer = make_optimizer(self.learning, job.model.backbone, job.config.optimizer)
-        checkpoint = job.out / "checkpoint.pt"
-        self.done = load_checkpoint(checkpoint, self.learning, self.optimizer) if resume else 0
+        self._losses = FrameLosses(job.model, job.config)
+        self.trained = nn.ModuleDict({"model": job.model, **self._losses.auxiliary_heads}).to(job.device)
+        self.optimizer = make_optimizer(self.trained, job.model.backbone, job.config.optimizer)
+        self.done = load_checkpoint(job.out / CHECKPOINT, self.trained, self.optimizer) if resume else 0
         choose_kernels(job.model, job.device, gradients=True)
-        if job.team.leads:
-            self.loss_curve = Curve(job.out / "loss.csv", self.done)
-            self.validation_curve = Curve(job.out / "validation.csv", self.done)
+        if job.group.leads:
+            self._loss_curve = LearningCurve(job.out / "loss.csv", self.done)
+            self._validation_curve = LearningCurve(job.out / "validation.csv", self.done)
 
     def run(
         self,
         after_step: Callable[[], None] = lambda: None,
         after_validation: Callable[[int, Validation], None] = lambda step, scores: None,
     ) -> None:
-        """All steps that are left. Raises BevcliError where the loss is no number any more."""
+        """Runs the remaining steps and leaves the model in evaluation mode. Raises BevcliError if a loss is not finite.
+
+        Args:
+            after_step: called by the leader after each step.
+            after_validation: called by the leader with the number of steps done and the scores.
+        """
         config = self.job.config
-        left = range(self.done, config.steps)
-        for batches in read_ahead(self._load, left, depth=config.loaders, threads=config.loaders):
+        remaining = range(self.done, config.steps)
+        for batches in read_ahead(self._load, remaining, depth=config.loaders, threads=config.loaders):
             row = self._step(batches)
             self.done += 1
-            if not self.job.team.leads:
+            if not self.job.group.leads:
                 continue
-            self.loss_curve.add(self.done, row)
+            self._loss_curve.add(self.done, row)
             last = self.done == config.steps
             if self.done % config.evaluate_every == 0 or last:
                 after_validation(self.done, self._validate())
             if self.done % config.checkpoint_every == 0 or last:
-                save_checkpoint(self.job.out / "checkpoint.pt", self.done, self.learning, self.optimizer)
+                save_checkpoint(self.job.out / CHECKPOINT, self.done, self.trained, self.optimizer)
             after_step()
+        self.job.model.eval()
+
+    @property
+    def _learn_all(self) -> bool:
+        return self.job.config.clips.learn == "all"
+
+    def _seeds(self, step: int) -> list[int]:
+        """The seeds of a step's random draws; different for each process of a group."""
+        rank = self.job.group.rank
+        return [self.job.seed, step, rank] if rank else [self.job.seed, step]
 
     def _load(self, step: int) -> list[Batch]:
-        """The batches that a step goes through side by side."""
+        """The batches of a step: `clips.in_turn` of them."""
         job, config = self.job, self.job.config
         random = np.random.default_rng(self._seeds(step))
         batches = []
         for _ in range(config.clips.in_turn):
             clips = draw_clips(job.drives, config.clips, random)
             batches.append(
-                load_batch(
-                    job.drives, clips, job.model.config, config.augmentation, random, learn_all=self._learns_all()
-                )
+                load_batch(job.drives, clips, job.model.config, config.augmentation, random, learn_all=self._learn_all)
             )
         return batches
 
     def _step(self, batches: list[Batch]) -> dict[str, float]:
-        """One step, an update of the weights for each frame that is learned from; returns the mean row."""
+        """One step, with an update of the weights for each frame trained on. Returns the means for loss.csv."""
         job, config = self.job, self.job.config
-        torch.manual_seed(int(np.random.SeedSequence(self._seeds(self.done)).generate_state(1)[0]))  # for dropout
-        rate = config.optimizer.learning_rate * config.optimizer.share(self.done, config.steps)
-        set_rate(self.optimizer, rate)
-        clips = [self._losses(batch.to(job.device)) for batch in batches]
-        rows = [self._update(losses) for losses in _in_turn(clips)]
-        job.team.average_statistics(self.learning)
+        rate = config.optimizer.learning_rate_at(self.done, config.steps)
+        set_learning_rate(self.optimizer, rate)
+        gpus = [job.device] if job.device.type == "cuda" else []
+        with torch.random.fork_rng(gpus), self._losses.watching(job.model):
+            torch.manual_seed(int(np.random.SeedSequence(self._seeds(self.done)).generate_state(1)[0]))  # for dropout
+            clips = [self._clip_losses(batch.to(job.device)) for batch in batches]
+            rows = [self._update(losses) for losses in alternated(clips)]
+        job.group.average_statistics(self.trained)
         means = {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
         norm = means.pop("gradient norm")
         return means | {"learning rate": rate, "gradient norm": norm}
 
-    def _seeds(self, step: int) -> list[int]:
-        """What decides chance in a step: another one for each process of a team."""
-        place = self.job.team.place
-        return [self.job.seed, step, place] if place else [self.job.seed, step]
+    def _clip_losses(self, batch: Batch) -> Iterator[dict[str, Tensor]]:
+        """The losses of each frame to train on, lazily: the model may be updated in between."""
+        job, config = self.job, self.job.config
+        outputs = forward_clip(
+            job.model, batch.inputs, learn_all=self._learn_all, freeze_batch_norm=config.freeze_batch_norm
+        )
+        for inputs, targets in zip(batch.inputs[-len(batch.targets) :], batch.targets, strict=True):
+            with torch.autocast(job.device.type, torch.bfloat16, enabled=computes_in_bfloat16(job.device)):
+                output = next(outputs)
+            yield self._losses(inputs, output, targets)
 
     def _update(self, losses: dict[str, Tensor]) -> dict[str, float]:
+        """One update of the weights."""
         total = torch.stack(list(losses.values())).sum()
         if not math.isfinite(total.item()):
             raise BevcliError(
@@ -161,48 +137,65 @@ class Trainer:
             )
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
-        self.job.team.average_gradients(self.learning)
-        norm = clip_gradients(self.learning, self.job.config.optimizer.max_gradient_norm)
+        self.job.group.average_gradients(self.trained)
+        norm = clip_gradients(self.trained, self.job.config.optimizer.max_gradient_norm)
         self.optimizer.step()
         return {"loss": total.item(), **{name: loss.item() for name, loss in losses.items()}, "gradient norm": norm}
 
-    def _losses(self, batch: Batch) -> Iterator[dict[str, Tensor]]:
-        """The losses of one frame after another; the model may be updated in between."""
-        job, config = self.job, self.job.config
-        frames = forward_clip(
-            job.model, batch.steps, learn_all=self._learns_all(), freeze_batch_norm=config.freeze_batch_norm
-        )
-        learned = batch.steps[-len(batch.targets) :]
-        for inputs, targets in zip(learned, batch.targets, strict=True):
-            with torch.autocast(job.device.type, torch.bfloat16, enabled=computes_in_bfloat16(job.device)):
-                outputs = next(frames)
-            yield self.losses(inputs, outputs, targets)
-
-    def _learns_all(self) -> bool:
-        return self.job.config.clips.learn == "all"
-
     def _validate(self) -> Validation:
+        """Scores the model, writes its weights and the learning curves."""
         job = self.job
-        job.model.eval()
-        scores = validate(self.runner, job.held_out if len(job.held_out) else job.drives)
-        self.validation_curve.add(self.done, scores.row())
+        options = StepOptions(choose_precision(None, job.device), temporal=job.config.clips.frames > 1)
+        # A copy, because a Runner puts timing hooks on its model and switches it to evaluation mode.
+        runner = Runner(copy.deepcopy(job.model), job.device, options)
+        scores = validate(runner, job.held_out if len(job.held_out) else job.drives)
+        self._validation_curve.add(self.done, scores.row())
         dtype = torch.float16 if job.config.weights_dtype == "float16" else torch.float32
         save_weights(job.out / "weights.safetensors", job.model, dtype)
-        draw(self.loss_curve, self.validation_curve, job.out / "curves.png")
+        draw_learning_curves(self._loss_curve, self._validation_curve, job.out / "curves.png")
         return scores
 
 
-def _in_turn(iterators: list[Iterator[T]]) -> Iterator[T]:
-    """The first of each, then the second of each, and so on."""
-    left = list(iterators)
-    while left:
-        for iterator in tuple(left):
+def forward_clip(
+    model: BEVFormer, clip: Sequence[BEVFormerInputs], *, learn_all: bool = False, freeze_batch_norm: bool = False
+) -> Iterator[BEVFormerOutputs]:
+    """The outputs, in training mode, for the last frame of a batch of clips.
+
+    The frames before it only build its history, in evaluation mode and without gradient, as in the paper.
+
+    Args:
+        clip: the inputs of successive frames.
+        learn_all: yield the outputs for every frame. The model may be updated in between: history has no gradient.
+        freeze_batch_norm: keep batch norms in evaluation mode, for fine-tuning.
+    """
+    history: Tensor | None = None
+    history_only = () if learn_all else clip[:-1]
+    model.eval()
+    with torch.no_grad():
+        for inputs in history_only:
+            history = model.bev_map(inputs, history)
+    model.train()
+    if freeze_batch_norm:
+        for module in model.modules():
+            if isinstance(module, nn.BatchNorm2d):
+                module.eval()
+    for inputs in clip[len(history_only) :]:
+        outputs = model(inputs, history)
+        history = outputs.bev.detach()
+        yield outputs
+
+
+def alternated(iterators: Sequence[Iterator[T]]) -> Iterator[T]:
+    """The first item of each iterator, then the second of each, and so on until all are exhausted."""
+    remaining = list(iterators)
+    while remaining:
+        for iterator in tuple(remaining):
             try:
                 yield next(iterator)
             except StopIteration:
-                left.remove(iterator)
+                remaining.remove(iterator)
 
 
 def computes_in_bfloat16(device: torch.device) -> bool:
-    """Whether the device has instructions for it, so that mixed precision is the faster one."""
+    """Whether the device has bfloat16 instructions, so that mixed precision is faster."""
     return device.type == "cuda" or torch.cpu._is_avx512_bf16_supported()

@@ -1,4 +1,4 @@
-"""How good a model is on several drives together: each run as `bevcli run` does, scored as `bevcli eval` does."""
+"""Scores of a model over several drives: each is run as by `bevcli run`, and all are scored as by `bevcli eval`."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from bevcli.evaluation.detection import evaluate
 from bevcli.evaluation.detection_scores import DetectionScores
 from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmentation
 from bevcli.frame import MAP_CLASSES, Frame, Prediction
-from bevcli.geometry.attributes import attributes_by_speed
-from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.transforms import inverse
 from bevcli.model.bevformer import BEVFormerConfig
 from bevcli.pipeline.preprocess import Preprocessor
@@ -22,24 +21,34 @@ from bevcli.training.drives import Drives
 
 @dataclass(frozen=True)
 class Validation:
-    """config: how detections were scored. segmentation: None where model or drives have no maps."""
+    """Scores over all frames of several drives.
+
+    Attributes:
+        config: the settings of the detection metrics.
+        detection: AP, errors and NDS.
+        segmentation: IoU by class; None if the model or the drives have no maps.
+    """
 
     config: DetectionConfig
     detection: DetectionScores
     segmentation: SegmentationScores | None
 
     def summary(self) -> dict[str, float]:
-        """The numbers that are looked at first: of the classes with ground truth, NaN where nothing measures them."""
+        """mAP, NDS and mAVE (m/s) over the classes that have ground truth, and IoU by class; NaN if not measured."""
         table = self.detection.overall.of_classes_with_ground_truth()
         iou = {} if self.segmentation is None else self.segmentation.iou
-        first = {"mAP": table.mean_ap, "NDS": table.nd_score, "mAVE": table.errors["vel_err"]}
-        return first | {f"IoU {name}": iou.get(name, math.nan) for name in MAP_CLASSES}
+        detection = {"mAP": table.mean_ap, "NDS": table.nd_score, "mAVE": table.errors["vel_err"]}
+        return detection | {f"IoU {name}": iou.get(name, math.nan) for name in MAP_CLASSES}
 
     def row(self) -> dict[str, float]:
-        """The numbers by the names of the curve's columns; AP is 0 for a class without ground truth."""
+        """The columns of validation.csv: the summary, mATE (metres), and AP by class, 0 without ground truth."""
         table = self.detection.overall
         aps = {f"AP {name}": scores.mean_ap for name, scores in table.classes.items()}
         return {**self.summary(), "mATE": table.of_classes_with_ground_truth().errors["trans_err"], **aps}
+
+    def __str__(self) -> str:
+        """The summary on one line."""
+        return ", ".join(f"{name} {value:.3f}" for name, value in self.summary().items())
 
 
 def validate(
@@ -48,15 +57,20 @@ def validate(
     max_range_m: float | None = None,
     after_frame: Callable[[], None] = lambda: None,
 ) -> Validation:
-    """Runs every frame of the drives. max_range_m: nothing farther is scored; default what the model can reach."""
-    config = DetectionConfig().cut_at(reach_m(runner.config) if max_range_m is None else max_range_m)
+    """Runs every frame of the drives and scores the frames that have ground truth.
+
+    Args:
+        max_range_m: ignore boxes beyond this distance, metres; by default beyond the nearest side of the BEV grid.
+        after_frame: called after each frame.
+    """
+    config = DetectionConfig().cut_at(nearest_side_m(runner.config) if max_range_m is None else max_range_m)
     predictions, truths, maps = [], [], []
-    for place in range(len(drives)):
-        sequence = drives.open(place)
+    for index in range(len(drives)):
+        sequence = drives.open(index)
         for frame, prediction, _ in runner.run(sequence, range(len(sequence.stamps)), Preprocessor(runner.config)):
             if frame.ground_truth is not None:
-                found, truth = _boxes_ego(frame, frame.ground_truth, prediction)
-                predictions.append(found)
+                predicted, truth = _boxes_ego(frame, frame.ground_truth, prediction)
+                predictions.append(predicted)
                 truths.append(truth)
             if prediction.segmentation is not None and frame.ground_truth_map is not None:
                 maps.append((prediction.segmentation, frame.ground_truth_map))
@@ -64,14 +78,14 @@ def validate(
     return Validation(config, evaluate(predictions, truths, config), evaluate_segmentation(maps) if maps else None)
 
 
-def reach_m(config: BEVFormerConfig) -> float:
-    """How far the model's BEV grid reaches to its nearest side, metres."""
+def nearest_side_m(config: BEVFormerConfig) -> float:
+    """Distance from the origin to the nearest side of the BEV grid, metres."""
     grid = config.bev_grid
     return min(abs(end) for end in (*grid.x_range_m, *grid.y_range_m))
 
 
 def _boxes_ego(frame: Frame, ground_truth: Boxes3D, prediction: Prediction) -> tuple[Boxes3D, Boxes3D]:
-    """Found and true boxes in the ego frame; the model names no attribute, so its boxes get them by speed."""
-    found = prediction.boxes_ego
-    found = replace(found, attributes=attributes_by_speed(found))
-    return found, ground_truth.transformed(inverse(frame.world_from_ego.matrix))
+    """Predicted and ground truth boxes in the ego frame. The model has no attributes: they follow from the speed."""
+    predicted = prediction.boxes_ego
+    predicted = replace(predicted, attributes=attributes_by_speed(predicted))
+    return predicted, ground_truth.transformed(inverse(frame.world_from_ego.matrix))

@@ -1,15 +1,21 @@
-"""The boxes of a recording as a file: a table (.csv) or boxes that `bevcli eval` reads (.json)."""
+"""Exports the boxes of a recording: as a table (.csv), or as a boxes file that `bevcli eval` reads (.json)."""
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from bevcli.errors import InputError, OutputError
+from bevcli.frame import FrameStamp
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.transforms import Array, Pose
+from bevcli.recording import entities
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
-from bevcli.viewer.recorded_boxes import RecordedBoxes, recorded_boxes
-from bevcli.viewer.recording_reader import RecordingReader
+from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
 
 COLUMNS = (
     "frame", "scene", "timestamp_ns", "class", "score", "x", "y", "z", "length", "width", "height", "yaw",
@@ -17,10 +23,25 @@ COLUMNS = (
 )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class RecordedBoxes:
+    """The shown boxes of one frame.
+
+    Attributes:
+        stamp: index, scene and timestamp of the frame.
+        world_from_ego: the ego pose at the frame's time.
+        boxes: in the world frame, highest score first.
+    """
+
+    stamp: FrameStamp
+    world_from_ego: Pose
+    boxes: Boxes3D
+
+
 def export_boxes(recording: Path, path: Path) -> tuple[int, int]:
     """Writes the shown boxes, in the world frame, metres and radians; returns the number of frames and of boxes.
 
-    Raises InputError for another ending than .csv or .json, OutputError where the file cannot be written.
+    Raises InputError if the path does not end in .csv or .json, OutputError if the file cannot be written.
     """
     writers = {".csv": _write_csv, ".json": _write_json}
     if path.suffix.lower() not in writers:
@@ -33,6 +54,36 @@ def export_boxes(recording: Path, path: Path) -> tuple[int, int]:
     return len(frames), sum(len(frame.boxes) for frame in frames)
 
 
+def recorded_boxes(frame: RecordedFrame) -> RecordedBoxes:
+    """The shown boxes of a frame, in the sequence's world frame (the recording stores them as float32)."""
+    entity = entities.BOXES
+    origin = frame.array(entities.WORLD, "origin", 3).reshape(-1)[:3]
+    origin = origin if len(origin) == 3 else np.zeros(3)
+    quaternions = frame.array(entity, "Boxes3D:quaternions", 4)  # x, y, z, w
+    boxes = Boxes3D(
+        centers=frame.array(entity, "Boxes3D:centers", 3) + origin,
+        sizes_lwh=2 * frame.array(entity, "Boxes3D:half_sizes", 3),
+        yaws=2 * np.arctan2(quaternions[:, 2], quaternions[:, 3]),
+        velocities=np.column_stack([frame.array(entity, f"velocity_{axis}", 1)[:, 0] for axis in "xy"]),
+        classes=np.array(frame.values(entity, "name"), dtype=np.str_),
+        scores=frame.array(entity, "score", 1)[:, 0],
+    )
+    return RecordedBoxes(_stamp(frame), _world_from_ego(frame, origin), boxes)
+
+
+def _stamp(frame: RecordedFrame) -> FrameStamp:
+    scene = frame.values(entities.EGO, "scene")
+    time = frame.values(entities.EGO, "timestamp_ns")
+    return FrameStamp(frame.index, scene[0] if scene else "", int(time[0]) if time else 0)
+
+
+def _world_from_ego(frame: RecordedFrame, origin: Array) -> Pose:
+    numbers = frame.array(entities.EGO, "pose", 16)
+    matrix = numbers[0].reshape(4, 4).copy() if len(numbers) else np.eye(4)
+    matrix[:3, 3] += origin
+    return Pose.from_matrix(matrix)
+
+
 def _write_csv(path: Path, frames: list[RecordedBoxes]) -> None:
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
@@ -43,8 +94,8 @@ def _write_csv(path: Path, frames: list[RecordedBoxes]) -> None:
 
 def _rows(frame: RecordedBoxes) -> Iterator[list[object]]:
     stamp, boxes = frame.stamp, frame.boxes
-    scores = boxes.scores if boxes.scores is not None else [None] * len(boxes)
-    for i, score in enumerate(scores):
+    assert boxes.scores is not None
+    for i, score in enumerate(boxes.scores):
         numbers = (*boxes.centers[i], *boxes.sizes_lwh[i], boxes.yaws[i], *boxes.velocities[i])
         rounded = [f"{number:.4f}" for number in numbers]
         yield [stamp.index, stamp.scene, stamp.timestamp_ns, boxes.classes[i], f"{score:.4f}", *rounded]

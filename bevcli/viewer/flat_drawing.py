@@ -1,4 +1,4 @@
-"""Draws the flat parts of a recording, lines, arrows and labels, with OpenCV: no viewer, GPU or screen."""
+"""Draws the 2D entities of a recording (lines, arrows, labels) with OpenCV, without viewer, GPU or screen."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from bevcli.geometry.transforms import Array
 from bevcli.viewer.recording_reader import RecordedFrame
 
 Canvas = NDArray[np.uint8]
-ToCanvas = Callable[[Array], Array]  # (K, 2) of an entity's space -> (K, 2) pixels of a canvas
+ToCanvas = Callable[[Array], Array]  # points (K, 2) in the space of an entity -> (K, 2) pixels of a canvas
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 SUBPIXEL_BITS = 3
 
 
 def draw_strips(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: ToCanvas, thickness: int = 1) -> None:
-    """Draws an entity's line strips."""
+    """Draws the line strips of an entity."""
     strips = frame.values(entity, "LineStrips2D:strips")
     colors = entity_colors(frame, entity, "LineStrips2D:colors", len(strips))
     for strip, color in zip(strips, colors, strict=True):
@@ -27,7 +27,7 @@ def draw_strips(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: To
 
 
 def draw_arrows(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: ToCanvas) -> None:
-    """Draws an entity's 2D arrows."""
+    """Draws the 2D arrows of an entity."""
     starts = frame.array(entity, "Arrows2D:origins", 2)
     ends = starts + frame.array(entity, "Arrows2D:vectors", 2)
     colors = entity_colors(frame, entity, "Arrows2D:colors", len(starts))
@@ -36,40 +36,43 @@ def draw_arrows(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: To
 
 
 def draw_labels(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: ToCanvas, size: float = 0.4) -> None:
-    """Draws an entity's labelled points as text on a dark ground."""
-    places = to_canvas(frame.array(entity, "Points2D:positions", 2))
-    colors = entity_colors(frame, entity, "Points2D:colors", len(places))
-    for text, place, color in zip(frame.values(entity, "Points2D:labels"), places, colors, strict=False):
-        draw_text(canvas, text, (int(place[0]), int(place[1])), color, size, centered=True)
+    """Draws the labels of an entity as text on a dark background, centred on the labelled points."""
+    positions = to_canvas(frame.array(entity, "Points2D:positions", 2))
+    colors = entity_colors(frame, entity, "Points2D:colors", len(positions))
+    for text, (x, y), color in zip(frame.values(entity, "Points2D:labels"), positions, colors, strict=False):
+        draw_text(canvas, text, (int(x), int(y)), color, size, centered=True)
 
 
 def draw_text(
     canvas: Canvas,
     text: str,
-    place: tuple[int, int],
+    position: tuple[int, int],
     color: tuple[int, int, int],
     size: float = 0.45,
     *,
     centered: bool = False,
 ) -> None:
-    """Writes text, its middle left (or its middle) at `place`, BGR."""
+    """Draws a line of text.
+
+    position: x, y, pixels, of the middle of its left edge, or of its centre if `centered`. color: BGR.
+    """
     (width, height), _ = cv2.getTextSize(text, FONT, size, 1)
-    left = place[0] - width // 2 if centered else place[0]
-    bottom = place[1] + height // 2
+    left = position[0] - width // 2 if centered else position[0]
+    bottom = position[1] + height // 2
     if centered:
         cv2.rectangle(canvas, (left - 2, bottom - height - 3), (left + width + 2, bottom + 3), (24, 20, 18), -1)
     cv2.putText(canvas, text, (left, bottom), FONT, size, color, 1, cv2.LINE_AA)
 
 
 def entity_colors(frame: RecordedFrame, entity: str, component: str, count: int) -> list[tuple[int, int, int]]:
-    """`count` colours as BGR; one recorded colour holds for all, none means white."""
+    """`count` colours, BGR. One recorded colour is repeated; without a recorded colour all are white."""
     packed = frame.values(entity, component) or [0xFFFFFFFF]
     colors = [((c >> 8) & 255, (c >> 16) & 255, (c >> 24) & 255) for c in packed]
     return colors if len(colors) == count else colors[:1] * count
 
 
 def recorded_image(frame: RecordedFrame, entity: str) -> Canvas | None:
-    """An entity's raw RGB image as (H, W, 3) BGR; None where there is none."""
+    """The uncompressed image of an entity, (H, W, 3) uint8 BGR; None if it has none."""
     formats = frame.values(entity, "Image:format")
     if not formats:
         return None

@@ -1,7 +1,7 @@
 """LiveView: a viewer that follows a recording while it is written.
 
-The run serves the stream on loopback and never waits for who watches: a viewer that is closed, killed or hangs costs
-it nothing, and the file is written beside the stream, not through it.
+The recording goes into its file and, independently, to a stream on this machine's loopback address. Writing never waits
+for the viewer: a viewer that is closed, killed or hangs does not slow the run down.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import rerun as rr
 from bevcli.viewer.native import LOOPBACK, display_is_there, free_port, start_viewer
 from bevcli.viewer.web import WebViewer, web_viewer_assets
 
-KEPT_FOR_LATE_VIEWERS = "256MB"  # of memory; beyond it the oldest frames are forgotten by the stream, not by the file
+KEPT_FOR_LATE_VIEWERS = "256MB"  # of memory; beyond it the stream drops its oldest frames (the file keeps all)
 
 
 class LiveView:
-    """Opens the viewer: a window where there is a display, else a page whose address is printed to stderr."""
+    """A viewer in a window; without a display in the browser, at an address that is printed to stderr."""
 
     def __init__(self) -> None:
         port = free_port(9876)
@@ -27,7 +27,7 @@ class LiveView:
         self._web: WebViewer | None = None
 
     def open(self) -> None:
-        """Starts the viewer. The window stays after the run, until the user closes it."""
+        """Starts the viewer. A window stays open after the run until the user closes it."""
         if display_is_there():
             start_viewer("--bind", LOOPBACK, "--port", "auto", "--connect", self.stream_address)
             return
@@ -36,6 +36,6 @@ class LiveView:
         print(f"live view: {self._web.address}", file=sys.stderr)
 
     def close(self) -> None:
-        """Ends the page's server, where there is one."""
+        """Stops the web viewer's server. A window stays open."""
         if self._web is not None:
             self._web.close()

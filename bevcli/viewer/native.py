@@ -1,4 +1,4 @@
-"""Rerun's viewer as a process of ours: found in the installed package, on loopback only, telling nobody."""
+"""Starts and stops rerun's viewer as a child process, on loopback and without telemetry."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ PORTS_TRIED = 20
 
 
 def viewer_binary() -> Path:
-    """The viewer itself. The console script is a wrapper in Python: ending it would leave the viewer running."""
+    """The viewer's executable. The `rerun` command is a wrapper: stopping it would leave the viewer running."""
     name = "rerun.exe" if sys.platform == "win32" else "rerun"
     return Path(rerun_cli.__file__).with_name(name)
 
 
 def viewer_environment() -> dict[str, str]:
-    """This process's environment, with the viewer's telemetry off (it sends none under CI)."""
+    """The environment for the viewer: ours, and CI=1, which turns the viewer's telemetry off."""
     return {**os.environ, "CI": "1"}
 
 
 def display_is_there() -> bool:
-    """Whether a window could open."""
+    """Whether a window can be opened here."""
     if sys.platform in ("darwin", "win32"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def start_viewer(*arguments: str, quiet: bool = True) -> subprocess.Popen[bytes]:
-    """Starts the viewer with command-line arguments, in the background. The caller ends it (`stop`)."""
+    """Starts the viewer in the background with command-line arguments. The caller stops it with `stop`."""
     output = subprocess.DEVNULL if quiet else None
     command = [str(viewer_binary()), *arguments]
     return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, env=viewer_environment())
 
 
 def stop(process: subprocess.Popen[bytes]) -> None:
-    """Ends a viewer as Ctrl-C would, so that it removes its temporary folder; at once if it does not listen."""
+    """Stops a viewer like Ctrl-C, so that it removes its temporary folder; kills it if it runs on for 3 s."""
     if process.poll() is None:
         process.send_signal(signal.SIGINT)
         try:
@@ -52,7 +52,7 @@ def stop(process: subprocess.Popen[bytes]) -> None:
 
 
 def free_port(preferred: int | None = None, host: str = LOOPBACK) -> int:
-    """A port that nobody uses: the preferred one or one of those after it, else any."""
+    """A free port: the preferred one, or one of the 19 after it, or any other."""
     wanted = [] if preferred is None else range(preferred, preferred + PORTS_TRIED)
     for port in (*wanted, 0):
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
@@ -62,4 +62,4 @@ def free_port(preferred: int | None = None, host: str = LOOPBACK) -> int:
             except OSError:
                 continue
             return int(probe.getsockname()[1])
-    raise AssertionError("the system gave no port at all")
+    raise AssertionError("the system has no free port")

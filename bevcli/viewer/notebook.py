@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import rerun as rr
 
 from bevcli.errors import BevcliError
-from bevcli.viewer.recording_file import whole_recording
+from bevcli.viewer.recording_file import open_recording
 
 if TYPE_CHECKING:
     from rerun.notebook import Viewer
@@ -37,9 +37,9 @@ def show(
     if not HAS_NOTEBOOK:
         raise BevcliError("the notebook viewer is not installed: pip install 'bevcli[notebook]'")
     viewer = Viewer(width=width, height=height, use_global_recording=False, theme="dark")
-    with whole_recording(Path(recording)) as whole:
+    with open_recording(Path(recording)) as opened:
         stream = rr.RecordingStream("bevcli")
         viewer.add_recording(stream)
-        stream.log_file_from_path(whole.path)
+        stream.log_file_from_path(opened.path)
         stream.flush(timeout_sec=60.0)
     return viewer

@@ -1,4 +1,4 @@
-"""Reads a recording back, frame by frame, in the order in which it was written; one frame at a time in memory."""
+"""Reads a recording frame by frame, in the order of writing, with one frame at a time in memory."""
 
 from __future__ import annotations
 
@@ -21,21 +21,26 @@ Row = dict[str, pa.Scalar]
 
 @dataclass(frozen=True)
 class RecordedFrame:
-    """What holds at one frame: the newest row of every entity, static ones included, by component."""
+    """The state of all entities at one frame.
+
+    Attributes:
+        index: the frame's index.
+        rows: by entity, then by component: the newest value, static ones included.
+    """
 
     index: int
     rows: Mapping[str, Row]
 
     def has(self, entity: str, component: str) -> bool:
-        """Whether the entity has a value."""
+        """Whether the entity has a value for this component."""
         return component in self.rows.get(entity, {}) and self.rows[entity][component].is_valid
 
     def values(self, entity: str, component: str) -> list[Any]:
-        """The values as Python objects, empty where there are none."""
+        """The values of a component as Python objects; [] if there are none."""
         return self.rows[entity][component].as_py() if self.has(entity, component) else []
 
     def array(self, entity: str, component: str, width: int) -> Array:
-        """(N, width) numbers of a component whose values have `width` each; (0, width) where there are none."""
+        """The values of a component as (N, width) float64, `width` numbers each; (0, width) if there are none."""
         if not self.has(entity, component):
             return np.zeros((0, width))
         values = self.rows[entity][component].values
@@ -44,7 +49,7 @@ class RecordedFrame:
         return np.asarray(values, dtype=np.float64).reshape(-1, width)
 
     def blob(self, entity: str, component: str) -> bytes:
-        """The bytes of a component that holds one blob, such as a JPEG."""
+        """The bytes of a component that is one blob, such as a JPEG; empty if there is none."""
         if not self.has(entity, component):
             return b""
         values = self.rows[entity][component].values
@@ -55,30 +60,30 @@ class RecordedFrame:
 
 @dataclass(frozen=True)
 class RecordingReader:
-    """A recording that was written by `Recording`. Raises InputError where the file is none of ours."""
+    """A recording that `Recording` wrote. Raises InputError if the file cannot be read."""
 
     path: Path
     _reader: RrdReader = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a file without its end is read part by part, and that is what we do
+            warnings.simplefilter("ignore")  # rerun warns that a file without its end is read in parts; all are
             try:
                 object.__setattr__(self, "_reader", RrdReader(self.path))
             except RuntimeError as error:
-                raise InputError(f"{self.path}: this is no readable recording ({error})") from error
+                raise InputError(f"{self.path}: the recording cannot be read ({error})") from error
 
     def chunks(self) -> Iterator[Chunk]:
-        """All parts of the recording, in the file's order."""
+        """All chunks of the recording, in the order of the file."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             try:
                 yield from self._reader.stream()
             except (RuntimeError, ValueError) as error:
-                raise InputError(f"{self.path}: this is no readable recording ({error})") from error
+                raise InputError(f"{self.path}: the recording cannot be read ({error})") from error
 
     def frames(self) -> Iterator[RecordedFrame]:
-        """Each frame with all that holds at it."""
+        """The frames in order, each with the state of all entities."""
         state: dict[str, Row] = {}
         current: int | None = None
         for entity, frame, row in self._rows():
@@ -86,7 +91,9 @@ class RecordingReader:
                 yield RecordedFrame(current, dict(state))
             if frame is not None and (current is None or frame > current):
                 current = frame
-            if frame is None or frame == current:  # an earlier frame's late BEV image holds no more
+            if (
+                frame is None or frame == current
+            ):  # a BEV image that was written late for an earlier frame is not current
                 _apply(state, entity, row)
         if current is not None:
             yield RecordedFrame(current, dict(state))
@@ -96,9 +103,9 @@ class RecordingReader:
             batch = chunk.to_record_batch()
             names = [name for name in batch.schema.names if ":" in name or name in OWN_COMPONENTS]
             timed = entities.FRAME_TIMELINE in batch.schema.names
-            for place in range(batch.num_rows):
-                frame = batch.column(entities.FRAME_TIMELINE)[place].as_py() if timed else None
-                yield chunk.entity_path.strip("/"), frame, {n: batch.column(n)[place] for n in names}
+            for i in range(batch.num_rows):
+                frame = batch.column(entities.FRAME_TIMELINE)[i].as_py() if timed else None
+                yield chunk.entity_path.strip("/"), frame, {n: batch.column(n)[i] for n in names}
 
 
 OWN_COMPONENTS = frozenset(

@@ -1,4 +1,4 @@
-"""An image of a recording in the viewer, without a screen: the viewer runs headless and draws with Vulkan."""
+"""Screenshots of a recording in the viewer, which runs without a screen and draws with Vulkan."""
 
 from __future__ import annotations
 
@@ -17,22 +17,24 @@ from bevcli.viewer.native import LOOPBACK, free_port, start_viewer, stop
 
 Answer = TypeVar("Answer")
 START_TIMEOUT_S = 40.0
-SETTLE_S = 2.5  # images are decoded after the views have opened, and nothing says when they are there
+SETTLE_S = 2.5  # the viewer decodes images after it opened the views, and does not report when it is done
 NO_DRIVER = "the viewer cannot draw here: it needs a Vulkan driver (Debian: apt-get install mesa-vulkan-drivers)"
 
 
 def take_screenshot(recording: Path, image: Path, frame: int | None = None) -> tuple[str, ...]:
-    """Writes a PNG of the whole viewer at a frame (its number; default the first), and returns the views' names.
+    """Writes a PNG of the whole viewer at a frame; returns the names of the views. Takes about 6 s.
 
-    Takes about 6 s. Raises OutputError where the viewer cannot draw (no Vulkan driver) or the file cannot be written,
-    InputError for a frame that the recording does not have.
+    frame: the frame's index; None takes the first one.
+
+    Raises OutputError if the viewer cannot draw (no Vulkan driver) or the file cannot be written, InputError if the
+    recording does not have the frame.
     """
     port = free_port()
     process = start_viewer("--headless", "--bind", LOOPBACK, "--port", str(port))
     try:
         client = _connect(process, port)
         client.open(str(recording))
-        state = _wait(process, lambda: _opened(client), "the recording does not open in the viewer")
+        state = _wait(process, lambda: _opened(client), "the viewer cannot open the recording")
         _go_to(client, state, frame)
         time.sleep(SETTLE_S)
         _write(image, client.take_screenshot())
@@ -65,18 +67,18 @@ def _go_to(client: ViewerClient, state: ViewerState, frame: int | None) -> None:
         raise InputError("the recording has no frames (expected one that `bevcli run` wrote)")
     wanted = timeline.start if frame is None else frame
     if not timeline.start <= wanted <= timeline.end:
-        raise InputError(f"--frame {wanted}: the recording has the frames {timeline.start} to {timeline.end}")
+        raise InputError(f"--frame {wanted}: the recording has frames {timeline.start} to {timeline.end}")
     client.set_time(entities.FRAME_TIMELINE, sequence=wanted, play_state="paused")
 
 
-def _wait(process: subprocess.Popen[bytes], attempt: Callable[[], Answer | None], complaint: str) -> Answer:
+def _wait(process: subprocess.Popen[bytes], attempt: Callable[[], Answer | None], failure: str) -> Answer:
     deadline = time.monotonic() + START_TIMEOUT_S
     while time.monotonic() < deadline and process.poll() is None:
         result = attempt()
         if result is not None:
             return result
         time.sleep(0.1)
-    raise OutputError(complaint)
+    raise OutputError(failure)
 
 
 def _write(image: Path, png: bytes) -> None:

@@ -1,4 +1,4 @@
-"""What a recording holds, in numbers: frames, time span, boxes per class, size by entity."""
+"""The summary of a recording: frames, time span, boxes per class, bytes per entity."""
 
 from __future__ import annotations
 
@@ -16,7 +16,18 @@ SHOWN_ENTITIES = 15
 
 @dataclass(frozen=True)
 class RecordingSummary:
-    """timestamps_ns: of the frames, in order. boxes: shown boxes by class. bytes_by_entity: in memory, by size."""
+    """The summary of a recording.
+
+    Attributes:
+        path: the recording's file.
+        file_bytes: its size.
+        title: name of the sequence and of the model.
+        untrained: whether the model's weights were random.
+        frames: the number of frames.
+        timestamps_ns: of the frames, in order.
+        boxes: the number of shown boxes by class, largest first.
+        bytes_by_entity: size in memory by entity, largest first.
+    """
 
     path: Path
     file_bytes: int
@@ -28,7 +39,7 @@ class RecordingSummary:
     bytes_by_entity: Mapping[str, int]
 
     def text(self) -> str:
-        """The summary as lines for a terminal."""
+        """The summary as text for a terminal."""
         lines = [f"{self.path}: {self.title}" + (" (UNTRAINED weights)" if self.untrained else "")]
         lines += [f"  frames    {self.frames}{self._span()}", f"  size      {_size(self.file_bytes)}"]
         lines += [f"  boxes     {sum(self.boxes.values())}"]
@@ -49,7 +60,7 @@ class RecordingSummary:
 
 
 def summarise(path: Path, read_from: Path | None = None) -> RecordingSummary:
-    """The summary of the recording at `path`, read from a mended copy where there is one."""
+    """Summarises the recording at `path`. read_from: its repaired copy, if there is one."""
     reader = RecordingReader(path if read_from is None else read_from)
     sizes: Counter[str] = Counter()
     for chunk in reader.chunks():

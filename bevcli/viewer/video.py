@@ -1,4 +1,4 @@
-"""A recording as a video file, made from what it holds: VP9, which Chromium and Firefox play."""
+"""Writes a video of a recording in VP9, which Chromium and Firefox play."""
 
 from __future__ import annotations
 
@@ -13,16 +13,15 @@ from bevcli.recording import entities
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
 from bevcli.viewer.video_frame import HEIGHT, WIDTH, Tile, camera_rows_of, draw_frame, tiles
 
-# OpenCV's wheels write VP9 but not H.264.
-FOURCC = {".mp4": "vp09", ".webm": "VP90"}
+FOURCC = {".mp4": "vp09", ".webm": "VP90"}  # VP9: OpenCV's wheels cannot write H.264
 SLOWEST, FASTEST = 1.0, 30.0  # frames a second
 
 
 def write_video(recording: Path, video: Path, on_frame: Callable[[], None] = lambda: None) -> int:
-    """Writes the video and returns the number of frames; `on_frame` is called after each.
+    """Writes the video; returns the number of frames. on_frame: called after each frame.
 
-    Raises InputError for another ending than .mp4 or .webm, or a recording without frames; OutputError where the
-    video cannot be written.
+    Raises InputError if the path does not end in .mp4 or .webm or the recording has no frames, OutputError if the video
+    cannot be written.
     """
     if video.suffix.lower() not in FOURCC:
         raise InputError(f"--video {video}: the file must end in .mp4 or .webm")
@@ -31,7 +30,7 @@ def write_video(recording: Path, video: Path, on_frame: Callable[[], None] = lam
         raise InputError(f"{recording}: the recording has no frames")
     writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*FOURCC[video.suffix.lower()]), rate, (WIDTH, HEIGHT))
     if not writer.isOpened():
-        raise OutputError(f"{video}: the video cannot be written (is the folder there, and may you write in it?)")
+        raise OutputError(f"{video}: the video cannot be written (does the folder exist, and is it writable?)")
     try:
         for image in _images(recording):
             writer.write(image)
@@ -42,7 +41,7 @@ def write_video(recording: Path, video: Path, on_frame: Callable[[], None] = lam
 
 
 def frame_rate(recording: Path) -> tuple[int, float]:
-    """How many frames a recording has, and how many of them a second, by the median of the times between them."""
+    """The number of frames, and the frames per second: 1 / the median time between frames, limited to 1 to 30."""
     times = frame_times_ns(recording)
     steps = np.diff(times)
     seconds = float(np.median(steps[steps > 0])) / 1e9 if (steps > 0).any() else 1.0
@@ -50,7 +49,7 @@ def frame_rate(recording: Path) -> tuple[int, float]:
 
 
 def frame_times_ns(recording: Path) -> np.ndarray:
-    """The frames' times, read without their images."""
+    """The timestamps of the frames, (N,) int64, in order; images are not decoded."""
     times: dict[int, int] = {}
     for chunk in RecordingReader(recording).chunks():
         if chunk.entity_path.strip("/") == entities.EGO:
@@ -63,15 +62,15 @@ def frame_times_ns(recording: Path) -> np.ndarray:
 
 
 def _images(recording: Path) -> Iterator[np.ndarray]:
-    placed: tuple[Tile, ...] | None = None
+    layout: tuple[Tile, ...] | None = None
     for frame in RecordingReader(recording).frames():
-        if placed is None:
-            placed = tiles(camera_rows_of(frame), image_sizes(frame))
-        yield draw_frame(frame, placed)
+        if layout is None:
+            layout = tiles(camera_rows_of(frame), image_sizes(frame))
+        yield draw_frame(frame, layout)
 
 
 def image_sizes(frame: RecordedFrame) -> dict[str, tuple[int, int]]:
-    """(width, height) of each camera's images, pixels."""
+    """(width, height) of the images by camera, pixels."""
     sizes = {}
     for name in frame.values(entities.RUN, "camera_names"):
         width, height = frame.array(entities.camera(name), "Pinhole:resolution", 2)[0]

@@ -1,4 +1,4 @@
-"""One image of a recording for a video: all cameras with their boxes, the BEV beside them, and a legend below."""
+"""Draws one frame of a video: all cameras with their boxes, the BEV to the right, a legend below."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ WIDTH, HEIGHT = 1920, 640
 BEV_SIDE = 640
 CAMERAS_WIDTH = WIDTH - BEV_SIDE
 CAMERAS_HEIGHT = 500
-BEV_REACH_M = 50.0
-BACKGROUND = (25, 20, 18)  # BGR, as all colours of canvases
+BEV_RANGE_M = 50.0  # from the vehicle to each edge of the BEV view
+BACKGROUND = (25, 20, 18)  # BGR, as all colours of the video
 TEXT, WARNING = (225, 220, 215), (85, 70, 255)
 
 
 @dataclass(frozen=True)
 class Tile:
-    """Where a camera's image goes, in pixels of the canvas."""
+    """The rectangle of a camera's image in the video frame, pixels."""
 
     camera: str
     left: int
@@ -44,9 +44,9 @@ class Tile:
 
 
 def tiles(rows: tuple[tuple[str, ...], ...], sizes: dict[str, tuple[int, int]]) -> tuple[Tile, ...]:
-    """The places of cameras, by rows, that have these (width, height); each fits its cell of an even grid."""
+    """The rectangles of the cameras, by rows. sizes: (width, height) of the images by camera, pixels."""
     cell = CAMERAS_WIDTH // max(len(row) for row in rows), CAMERAS_HEIGHT // len(rows)
-    placed = []
+    layout = []
     for r, row in enumerate(rows):
         indent = (CAMERAS_WIDTH - len(row) * cell[0]) // 2
         for c, name in enumerate(row):
@@ -54,12 +54,12 @@ def tiles(rows: tuple[tuple[str, ...], ...], sizes: dict[str, tuple[int, int]]) 
             scale = min(cell[0] / width, cell[1] / height)
             w, h = round(width * scale), round(height * scale)
             left, top = indent + c * cell[0] + (cell[0] - w) // 2, r * cell[1] + (cell[1] - h) // 2
-            placed.append(Tile(name, left, top, w, h))
-    return tuple(placed)
+            layout.append(Tile(name, left, top, w, h))
+    return tuple(layout)
 
 
 def camera_rows_of(frame: RecordedFrame) -> tuple[tuple[str, ...], ...]:
-    """The cameras of a recording in rows as they stand around the vehicle."""
+    """The cameras of a recording in rows, in the same order as in the viewer."""
     from_world = _rotation(frame, entities.EGO).T
     yaws = {}
     for name in frame.values(entities.RUN, "camera_names"):
@@ -68,10 +68,10 @@ def camera_rows_of(frame: RecordedFrame) -> tuple[tuple[str, ...], ...]:
     return rows_by_yaw(yaws)
 
 
-def draw_frame(frame: RecordedFrame, placed: tuple[Tile, ...]) -> Canvas:
-    """(HEIGHT, WIDTH, 3) BGR uint8."""
+def draw_frame(frame: RecordedFrame, layout: tuple[Tile, ...]) -> Canvas:
+    """The video frame, (HEIGHT, WIDTH, 3) uint8 BGR. layout: where each camera's image goes."""
     canvas = np.full((HEIGHT, WIDTH, 3), BACKGROUND, dtype=np.uint8)
-    for tile in placed:
+    for tile in layout:
         _draw_camera(canvas[tile.top : tile.top + tile.height, tile.left : tile.left + tile.width], frame, tile)
     _draw_bev(canvas[:, CAMERAS_WIDTH:], frame)
     _draw_legend(canvas[CAMERAS_HEIGHT:, :CAMERAS_WIDTH], frame)
@@ -105,7 +105,7 @@ def _draw_camera(canvas: Canvas, frame: RecordedFrame, tile: Tile) -> None:
 
 def _draw_bev(canvas: Canvas, frame: RecordedFrame) -> None:
     def to_canvas(points: Array) -> Array:
-        return (points / BEV_REACH_M + 1) * BEV_SIDE / 2
+        return (points / BEV_RANGE_M + 1) * BEV_SIDE / 2
 
     segmentation = recorded_image(frame, entities.BEV_SEGMENTATION)
     if segmentation is not None:
@@ -134,16 +134,16 @@ def _draw_legend(canvas: Canvas, frame: RecordedFrame) -> None:
     scene = "".join(frame.values(entities.EGO, "scene"))
     draw_text(canvas, f"{title}   {scene}   frame {frame.index}", (16, 24), TEXT, 0.6)
     if any(frame.values(entities.RUN, "untrained")):
-        draw_text(canvas, "UNTRAINED WEIGHTS: boxes mean nothing", (CAMERAS_WIDTH - 480, 24), WARNING, 0.6)
+        draw_text(canvas, "UNTRAINED WEIGHTS: boxes are meaningless", (CAMERAS_WIDTH - 480, 24), WARNING, 0.6)
     names = frame.values(entities.RUN, "class_names")
     counts = Counter(frame.values(entities.BOXES, "name"))
-    for place, name in enumerate(names):
-        red, green, blue = class_color(name, place)
-        x, y = 16 + 250 * (place % 5), 60 + 32 * (place // 5)
+    for index, name in enumerate(names):
+        red, green, blue = class_color(name, index)
+        x, y = 16 + 250 * (index % 5), 60 + 32 * (index // 5)
         cv2.rectangle(canvas, (x, y - 7), (x + 14, y + 7), (blue, green, red), -1)
         draw_text(canvas, f"{name.replace('_', ' ')} {counts[name]}", (x + 24, y), TEXT)
 
 
 def _rotation(frame: RecordedFrame, entity: str) -> Array:
     columns = frame.array(entity, "Transform3D:mat3x3", 9)
-    return columns[0].reshape(3, 3).T if len(columns) else np.eye(3)  # rerun stores columns
+    return columns[0].reshape(3, 3).T if len(columns) else np.eye(3)  # rerun stores matrices by columns

@@ -1,8 +1,8 @@
-"""The web viewer and a recording behind one address: a small server of ours, so that nothing else keeps running.
+"""Serves the web viewer and a recording from one address.
 
-Rerun's own web server binds all interfaces and keeps a core busy. Ours takes the viewer's files out of the installed
-binary once, and serves them and the recording from one origin. The pages may connect to that origin only, which also
-keeps the viewer in the browser from sending telemetry.
+Rerun's own web server listens on all network interfaces and keeps a core busy. This server takes the files of the web
+viewer from the installed viewer once, and serves them and the recording from one origin. A content security policy
+lets the pages connect to that origin only; so the viewer in the browser cannot send telemetry.
 """
 
 from __future__ import annotations
@@ -28,27 +28,30 @@ ASSETS = {
 }
 RECORDING = "/recording.rrd"
 START_TIMEOUT_S = 15.0
-OUTSIDE = re.compile(rb"<link[^>]*https://fonts[^>]*>", re.DOTALL)  # the page asks Google for a font: not ours
+FONT_LINKS = re.compile(rb"<link[^>]*https://fonts[^>]*>", re.DOTALL)  # links to Google's fonts; removed
 
 
 def web_viewer_assets() -> dict[str, bytes]:
-    """The files of the web viewer by path, as the installed viewer serves them (43 MB, about a second)."""
+    """The files of the web viewer by path, fetched from the installed viewer (43 MB, takes about a second)."""
     port = free_port()
     address = f"http://{LOOPBACK}:{port}"
-    # With a recording's address given, the viewer starts no other server; nobody asks for that recording.
+    # With the address of a recording the viewer starts no second server. That recording is never requested.
     process = start_viewer("--serve-web", "--bind", LOOPBACK, "--web-viewer-port", str(port), f"{address}/none.rrd")
     try:
         files = {path: _fetch(address + path) for path in ASSETS}
     finally:
         stop(process)
-    return {**files, "/": OUTSIDE.sub(b"", files["/"])}
+    return {**files, "/": FONT_LINKS.sub(b"", files["/"])}
 
 
 class WebViewer:
-    """`with WebViewer(assets, recording) as viewer: print(viewer.address); viewer.serve()`.
+    """A web server for the viewer and a recording.
 
-    source: a recording's file, or the address of a live stream (rerun+http://…). Port: the preferred one or, where it
-    is in use, another.
+    Args:
+        assets: the web viewer's files by path (`web_viewer_assets`).
+        source: the file of a recording, or the address of a live stream (rerun+http://…).
+        host: the address to listen on.
+        port: the preferred port; if it is in use, the next free one is taken.
     """
 
     def __init__(
@@ -61,15 +64,15 @@ class WebViewer:
 
     @property
     def address(self) -> str:
-        """What to open in a browser."""
+        """The address to open in a browser."""
         return f"http://{self.host}:{self.port}"
 
     def serve(self) -> None:
-        """Answers until `close`, from this thread."""
+        """Serves until `close` is called from another thread."""
         self._server.serve_forever(poll_interval=1.0)
 
     def close(self) -> None:
-        """Ends `serve`, and frees the port."""
+        """Stops `serve`, and frees the port."""
         self._server.shutdown()
         self._server.server_close()
 
@@ -82,7 +85,7 @@ class _Handler(BaseHTTPRequestHandler):
         super().__init__(*request)  # type: ignore[arg-type]
 
     def do_GET(self) -> None:
-        """Serves the viewer's files and the recording; the bare address leads to the viewer with the recording."""
+        """Serves the viewer's files and the recording; "/" redirects to the viewer with the recording."""
         parts = urlsplit(self.path)
         if parts.path == RECORDING and isinstance(self.source, Path):
             self._send_recording(self.source)
@@ -95,7 +98,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._send_head(404, "text/plain", 0)
 
     def log_message(self, format: str, *arguments: object) -> None:
-        """Says nothing: the terminal is for the user."""
+        """Logs nothing, so that the terminal stays readable."""
 
     def _redirect(self, query: str) -> None:
         host = self.headers.get("Host", "")
@@ -127,5 +130,5 @@ def _fetch(address: str) -> bytes:
                 return answer.read()
         except (urllib.error.URLError, ConnectionError) as error:
             if time.monotonic() > deadline:
-                raise OutputError(f"the web viewer does not start: {address}: {error}") from error
+                raise OutputError(f"the web viewer does not start ({address}: {error})") from error
             time.sleep(0.05)

@@ -10,7 +10,7 @@ from bevcli.model.bevformer import BEVFormer
 from bevcli.pipeline.model_loading import Model
 from bevcli.pipeline.run import RunOptions, run_into_folder
 from bevcli.recording.options import RecordingOptions
-from bevcli.sequences.files.map_file import open_maps
+from bevcli.sequences.files.map_folder import open_maps
 
 
 def run(config, out, frames, *, force=False):

@@ -21,8 +21,8 @@ from bevcli.frame import BevMap, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
 from bevcli.sequences.files.boxes_file import BoxesFile, BoxesWriter, FrameBoxes, read_boxes
-from bevcli.sequences.files.map_file import write_map
-from bevcli.sequences.nuscenes.scenes import NuScenesChoice
+from bevcli.sequences.files.map_folder import write_map
+from bevcli.sequences.nuscenes.choice import NuScenesChoice
 
 
 def write_frames(path: Path, frames: list[Boxes3D], reference: str = "ego", pose: Pose | None = None) -> Path:

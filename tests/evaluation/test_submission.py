@@ -14,8 +14,7 @@ from bevcli.errors import InputError
 from bevcli.evaluation.read_submission import is_submission, read_submission
 from bevcli.evaluation.submission import SubmissionWriter, write_submission
 from bevcli.frame import FrameStamp
-from bevcli.geometry.attributes import attributes_by_speed
-from bevcli.geometry.boxes import CLASSES, Boxes3D
+from bevcli.geometry.boxes import CLASSES, Boxes3D, attributes_by_speed
 from bevcli.geometry.transforms import Pose, yaw_of_quaternion
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 

@@ -35,7 +35,7 @@ def test_edges_have_the_lengths_of_the_sizes():
     )
 
 
-def test_transforming_moves_corners_like_points_and_comes_back():
+def test_transforming_moves_corners_like_points_and_can_be_inverted():
     a_from_b = rigid((3, -1, 0.5), rotation_about_z(0.7))
     boxes = some_boxes()
     moved = boxes.transformed(a_from_b)
@@ -45,7 +45,7 @@ def test_transforming_moves_corners_like_points_and_comes_back():
     assert np.cos(back.yaws - boxes.yaws) == pytest.approx(1)
 
 
-def test_selecting_and_joining_keep_every_column_in_step():
+def test_selecting_and_concatenating_keep_columns_aligned():
     boxes = some_boxes()
     joined = Boxes3D.concatenate([boxes[[3, 1]], Boxes3D.empty(), boxes[boxes.scores > 2]])
     assert joined.centers == pytest.approx(boxes.centers[[3, 1]])

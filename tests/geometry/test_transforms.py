@@ -44,7 +44,7 @@ def test_yaw_counts_counter_clockwise_from_x():
     assert yaw_of_quaternion((-np.cos(half), 0, 0, -np.sin(half))) == pytest.approx(np.radians(30))
 
 
-def test_interpolation_takes_the_shorter_way_and_the_earlier_sign():
+def test_interpolation_takes_the_shorter_arc_and_the_first_sign():
     start = Pose(np.zeros(3), np.array([-np.cos(0.1), 0, 0, -np.sin(0.1)]))  # yaw 0.2, stored with w < 0
     end = Pose(np.array([2.0, 0, 0]), np.array([np.cos(0.3), 0, 0, np.sin(0.3)]))  # yaw 0.6
     middle = interpolate(start, end, 0.5)

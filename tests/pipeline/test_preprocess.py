@@ -11,7 +11,7 @@ from bevcli.pipeline.preprocess import Preprocessor
 
 
 def textbook_image(pixels, image):
-    """The original's order: normalise in float, resize, pad right and bottom."""
+    """The original's order: normalise as float, resize, pad right and bottom."""
     rgb = pixels[..., ::-1] if image.color_order == "rgb" else pixels
     normalised = (rgb.astype(np.float32) - np.float32(image.mean)) / np.float32(image.std)
     resized = cv2.resize(normalised, image.size, interpolation=cv2.INTER_LINEAR)
@@ -22,7 +22,7 @@ def textbook_image(pixels, image):
 
 
 @pytest.mark.parametrize("order", ["rgb", "bgr"])
-def test_images_are_those_of_the_originals_order(mini_config, order):
+def test_images_equal_normalising_before_resizing(mini_config, order):
     config = replace(mini_config, image=replace(mini_config.image, color_order=order))
     frame = MemorySequence().load(1)
     images = Preprocessor(config)(frame).images[0].numpy()
@@ -30,13 +30,13 @@ def test_images_are_those_of_the_originals_order(mini_config, order):
     assert images == pytest.approx(np.stack(expected), abs=1e-5)
 
 
-def test_shrunk_images_may_be_averaged(mini_config):
-    """Stripes finer than the network's pixels become grey, and not stripes again."""
+def test_area_resizing_averages_pixels(mini_config):
+    """Stripes that are finer than the network's pixels become grey."""
     config = replace(mini_config, image=replace(mini_config.image, resize="area"))
     frame = MemorySequence().load(1)
     name = config.cameras[0]
     stripes = np.zeros_like(frame.images[name].pixels_bgr)
-    stripes[:, ::2] = 200  # a network's pixel is two by two of them
+    stripes[:, ::2] = 200  # a network pixel covers two by two pixels
     frame = replace(frame, images={**frame.images, name: replace(frame.images[name], pixels_bgr=stripes)})
     image = Preprocessor(config)(frame).images[0, 0].numpy()
     width, height = config.image.size
@@ -45,7 +45,7 @@ def test_shrunk_images_may_be_averaged(mini_config):
     assert image[:, :height, :width] == pytest.approx(expected, abs=1e-4)
 
 
-def test_projection_goes_through_the_world_at_each_cameras_own_time(mini_config):
+def test_projection_uses_the_pose_at_each_cameras_time(mini_config):
     frame = MemorySequence().load(1)
     late = Pose(frame.world_from_ego.translation + [1.5, 0, 0], frame.world_from_ego.quaternion)
     frame = replace(frame, world_from_ego_at={**frame.world_from_ego_at, "CAM_FRONT": late})
@@ -57,7 +57,7 @@ def test_projection_goes_through_the_world_at_each_cameras_own_time(mini_config)
     assert (d, one) == pytest.approx((float(depth), 1.0), abs=1e-4)
 
 
-def test_an_image_of_another_aspect_is_fitted_inside_and_its_calibration_follows(mini_config):
+def test_image_of_another_aspect_ratio_is_fitted_with_its_calibration(mini_config):
     camera = make_camera("CAM_FRONT", 0, width=300, height=300)
     sequence = MemorySequence(rig=CameraRig((camera,), make_rig().ego_from_bev))
     prepared = Preprocessor(mini_config)(sequence.load(0))
@@ -72,7 +72,7 @@ def test_an_image_of_another_aspect_is_fitted_inside_and_its_calibration_follows
     assert (u / d, v / d) == pytest.approx(0.3 * expected, abs=1e-3)
 
 
-def test_images_of_several_sizes_go_into_one_batch(mini_config):
+def test_images_of_different_sizes_form_one_batch(mini_config):
     cameras = (make_camera("CAM_FRONT", 0, 320, 180), make_camera("CAM_BACK", 180, 640, 400))
     sequence = MemorySequence(rig=CameraRig(cameras, make_rig().ego_from_bev))
     prepared = Preprocessor(mini_config)(sequence.load(0))
@@ -80,7 +80,7 @@ def test_images_of_several_sizes_go_into_one_batch(mini_config):
     assert prepared.scales == (0.5, 90 / 400)
 
 
-def test_a_lens_is_undone_before_anything_else(mini_config):
+def test_images_are_undistorted_before_resizing(mini_config):
     lens = Distortion("kannala_brandt", (0.05, -0.01, 0.0, 0.0))
     plain = make_camera("CAM_FRONT", 0)
     bent = replace(plain, distortion=lens)
@@ -98,7 +98,7 @@ def test_a_lens_is_undone_before_anything_else(mini_config):
     assert np.linalg.norm(seen - expected) > 2
 
 
-def test_a_missing_image_is_black_and_marked(mini_config):
+def test_missing_image_is_black_and_marked(mini_config):
     prepared = Preprocessor(mini_config)(WithoutImages({0: ["CAM_BACK"]}).load(0))
     place = prepared.assignment.cameras.index("CAM_BACK")
     assert prepared.has_image[0].tolist() == [name != "CAM_BACK" for name in prepared.assignment.cameras]

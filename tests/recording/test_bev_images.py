@@ -1,4 +1,4 @@
-"""BEV features as images: fixed colours, no flicker, ahead is up."""
+"""BEV features as images: colours are fixed after two frames, forward is up."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ def features(seed: int, rows: int = 6, columns: int = 5, channels: int = 12) -> 
 @pytest.mark.parametrize("kind", ["norm", "pca", "channel:3"])
 def test_colours_are_fitted_on_two_frames_and_then_kept(kind):
     images = BevImages(kind)
-    assert images.push(0, features(0)) == []  # the first waits for the second
+    assert images.push(0, features(0)) == []  # the first frame's image is ready with the second
     ready = images.push(1, features(1))
     assert [stamp for stamp, _ in ready] == [0, 1]
     images.push(2, 100 * features(2))  # would change any range that is not fixed
@@ -22,7 +22,7 @@ def test_colours_are_fitted_on_two_frames_and_then_kept(kind):
     np.testing.assert_array_equal(again, ready[0][1])
 
 
-def test_a_run_of_one_frame_gets_its_image_at_the_end():
+def test_the_image_of_a_single_frame_is_ready_at_the_end():
     images = BevImages("pca")
     assert images.push("only", features(0)) == []
     ((stamp, image),) = images.finish()
@@ -49,12 +49,12 @@ def test_principal_components_are_those_of_the_singular_values():
     images.push(0, cells)
     ((_, image),) = images.finish()
     red, green = image[..., 0].astype(int), image[..., 1].astype(int)
-    assert (np.diff(red[:, 7]) <= 0).all()  # the largest component, along y, is red; ahead is on top
+    assert (np.diff(red[:, 7]) <= 0).all()  # red is the largest component, along y; the largest y is on top
     assert red[0, 7] - red[-1, 7] > 200
     assert (np.diff(green[7]) >= 0).all()
 
 
-def test_a_channel_that_is_not_there_is_a_users_mistake():
+def test_a_missing_channel_is_an_input_error():
     images = BevImages("channel:12")
     images.push(0, features(0))
     with pytest.raises(InputError, match="channels 0 to 11"):

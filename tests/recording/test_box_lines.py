@@ -1,4 +1,4 @@
-"""Lines of boxes in an image: cut at the camera and at the border, bent by the lens."""
+"""Box lines in an image: clipped near the camera and at the border, curved by distortion."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, Distortion
 from bevcli.recording.box_lines import NEAR_CLIP_M, clip_near, clip_to_image, lines_in_image
 
-FINE = 256  # OpenCV clips lines of whole numbers: make its pixels small
+FINE = 256  # cv2.clipLine takes integers: subdivide the pixels
 CAMERA = Camera("front", 640, 360, np.array([[400.0, 0, 320], [0, 400, 180], [0, 0, 1]]), np.eye(4))
 
 
@@ -19,7 +19,7 @@ def one_box(center, size=(2.0, 2.0, 2.0)) -> Boxes3D:
     )  # in the camera frame: z is ahead
 
 
-def test_lines_are_cut_where_opencv_cuts_them():
+def test_lines_are_clipped_as_by_opencv():
     random = np.random.default_rng(1)
     segments = random.integers(-400, 1000, (400, 2, 2)).astype(float)
     clipped, kept = clip_to_image(segments, 640, 360)
@@ -33,7 +33,7 @@ def test_lines_are_cut_where_opencv_cuts_them():
             np.testing.assert_allclose(ours, np.array([start, end]) / FINE, atol=0.1)
 
 
-def test_a_line_through_the_camera_ends_before_it():
+def test_a_line_through_the_camera_is_cut_at_the_near_plane():
     ends, before = clip_near(np.array([[[0.0, 0, -1], [0, 0, 3]], [[0, 0, -1], [0, 0, -2]]]))
     assert before.tolist() == [True, False]
     np.testing.assert_allclose(ends[0], [[0, 0, NEAR_CLIP_M], [0, 0, 3]])
@@ -50,14 +50,14 @@ def test_a_box_around_the_camera_stays_inside_the_image():
     assert (lines.segments <= [640 + 1e-9, 360 + 1e-9]).all()
 
 
-def test_a_box_ahead_is_where_the_pinhole_says():
+def test_a_box_ahead_is_where_the_pinhole_model_projects_it():
     lines = lines_in_image(one_box((0, 0, 10)), CAMERA, np.eye(4))
     # Its nearest face is 9 m away and 2 m wide: 400 px/m at 1 m, 44.4 px at 9 m to each side.
     np.testing.assert_allclose(lines.segments.reshape(-1, 2).max(0), [320 + 400 / 9, 180 + 400 / 9])
     assert set(lines.owners) == {0}
 
 
-def test_an_edge_follows_the_lens():
+def test_a_distorted_edge_is_curved():
     lens = Distortion("brown_conrady", (-0.3, 0.05, 0.0, 0.0))
     box = one_box((0, 2.2, 8), (7.0, 0.5, 0.5))
     lines = lines_in_image(box, replace(CAMERA, distortion=lens), np.eye(4))

@@ -1,4 +1,4 @@
-"""Views stand as the cameras stand; labels do not cover each other."""
+"""Camera views are ordered by yaw; labels do not overlap."""
 
 import numpy as np
 from memory_drive import make_rig
@@ -8,14 +8,14 @@ from bevcli.recording.camera_layout import camera_rows, rows_by_yaw
 from bevcli.recording.labels import LETTER_HEIGHT, LETTER_WIDTH, labels_in_image
 
 
-def test_nuscenes_cameras_stand_around_the_vehicle():
+def test_nuscenes_cameras_are_in_two_rows():
     assert camera_rows(make_rig()) == (
         ("CAM_FRONT_LEFT", "CAM_FRONT", "CAM_FRONT_RIGHT"),
         ("CAM_BACK_LEFT", "CAM_BACK", "CAM_BACK_RIGHT"),
     )
 
 
-def test_other_rigs_stand_by_yaw():
+def test_other_rigs_are_ordered_by_yaw():
     yaws = {"left": 90, "rear": 180, "ahead": 0, "right": -90, "rear_right": -150, "rear_left": 150}
     rows = rows_by_yaw({name: np.radians(yaw) for name, yaw in yaws.items()})
     assert rows == (("left", "ahead", "right"), ("rear_left", "rear", "rear_right"))
@@ -29,8 +29,8 @@ def test_a_single_camera_has_one_row():
 def test_labels_do_not_overlap_and_the_largest_box_wins():
     boxes = np.array([[100, 100, 30], [110, 100, 90], [500, 100, 60], [600, 300, 2]])  # x, y, height
     segments = np.array([[[x, y], [x + 5, y + h]] for x, y, h in boxes], dtype=float)
-    places, owners = labels_in_image(ImageLines(segments, np.arange(4)), ["car 0.50"] * 4, 800, 450)
+    centers, owners = labels_in_image(ImageLines(segments, np.arange(4)), ["car 0.50"] * 4, 800, 450)
     assert owners.tolist() == [1, 2]  # the first is covered by the second, the last is too small
     size = np.array([8 * LETTER_WIDTH * 800, LETTER_HEIGHT * 450])
-    assert (np.abs(places[0] - places[1]) >= size - 1e-9).any()
-    assert (places - size / 2)[:, 0].min() >= -1e-9
+    assert (np.abs(centers[0] - centers[1]) >= size - 1e-9).any()
+    assert (centers - size / 2)[:, 0].min() >= -1e-9

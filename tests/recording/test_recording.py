@@ -9,16 +9,16 @@ import cv2
 import numpy as np
 import pytest
 from memory_drive import MemorySequence, WithoutImages
-from recorded_drive import bev_from_world, boxes_ahead, predict, record, with_truth
+from recorded_drive import NamedModel, bev_from_world, boxes_ahead, predict, record, with_truth
 
 from bevcli.errors import OutputError
 from bevcli.frame import CameraImage
-from bevcli.geometry.boxes import CLASSES, Boxes3D
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
 from bevcli.recording import entities
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.writer import Recording
-from bevcli.viewer.recorded_boxes import recorded_boxes
+from bevcli.viewer.export import recorded_boxes
 from bevcli.viewer.recording_reader import RecordingReader
 
 
@@ -51,19 +51,19 @@ def test_boxes_come_back_in_the_world(standard):
         np.testing.assert_allclose(back.scores, shown.scores)
 
 
-def test_far_from_the_origin_millimetres_survive(tmp_path):
-    class Utm(MemorySequence):
+def test_boxes_far_from_the_origin_keep_millimetres(tmp_path):
+    class UtmSequence(MemorySequence):
         def pose(self, place: int) -> Pose:
             near = super().pose(place)
             return Pose(near.translation + [654321.0, 5345678.0, 512.0], near.quaternion)
 
-    frames = record(tmp_path / "utm.rrd", Utm(2))
+    frames = record(tmp_path / "utm.rrd", UtmSequence(2))
     last = list(RecordingReader(tmp_path / "utm.rrd").frames())[-1]
     back = recorded_boxes(last).boxes.transformed(bev_from_world(frames[-1]))
     np.testing.assert_allclose(back.centers, boxes_ahead()[:2].centers, atol=1e-3)
 
 
-def test_ground_truth_is_found_or_missed(standard):
+def test_ground_truth_is_divided_into_found_and_missed(standard):
     _, recorded, _ = standard
     for frame in recorded:
         assert frame.values(entities.GROUND_TRUTH, "name") == ["car"]
@@ -71,7 +71,7 @@ def test_ground_truth_is_found_or_missed(standard):
         assert len(frame.values(entities.FALSE_BOXES, "LineStrips3D:strips")) == 2  # the pedestrian, crossed out
 
 
-def test_every_view_has_something_to_show(standard):
+def test_every_view_has_its_entities(standard):
     _, recorded, _ = standard
     last = recorded[-1]
     for entity, component in {
@@ -97,7 +97,7 @@ def test_every_view_has_something_to_show(standard):
         assert last.has(entity, component), f"{entity} {component}"
 
 
-def test_static_things_are_written_once(standard):
+def test_static_entities_are_written_once(standard):
     *_, path = standard
     for entity in (entities.VEHICLE, entities.RANGE_RINGS, entities.PILLARS, entities.RUN, entities.BEV_VEHICLE):
         assert entity_rows(path, entity) == [(True, 1)]
@@ -105,13 +105,13 @@ def test_static_things_are_written_once(standard):
     assert [c.is_static for c in pinholes] == [True] * 6
 
 
-def test_boxes_in_the_image_are_where_the_camera_saw_them(tmp_path):
+def test_boxes_are_projected_at_the_time_of_each_image(tmp_path):
     """Each camera has its own time: the vehicle stood 2 m farther back when CAM_FRONT took its image."""
     drive = MemorySequence(1)
     frame = drive.load(0)
     earlier = Pose(frame.world_from_ego.translation - [2.0, 0, 0], frame.world_from_ego.quaternion)
     frame = replace(frame, world_from_ego_at={**frame.world_from_ego_at, "CAM_FRONT": earlier})
-    with Recording(tmp_path / "r.rrd", rig=drive.rig, class_names=CLASSES, title="", untrained=False) as recording:
+    with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
         recording.log(frame, predict(frame))
     (read,) = RecordingReader(tmp_path / "r.rrd").frames()
     color = 0xFF9E2CFF  # the car's
@@ -124,33 +124,33 @@ def test_boxes_in_the_image_are_where_the_camera_saw_them(tmp_path):
     np.testing.assert_allclose(strips[..., 0].min(), middle - half, atol=0.1)
 
 
-def test_the_files_own_bytes_are_kept(tmp_path):
+def test_the_encoded_bytes_of_an_image_file_are_kept(tmp_path):
     drive = MemorySequence(1)
     frame = drive.load(0)
     image = frame.images["CAM_FRONT"]
     jpeg = cv2.imencode(".jpg", image.pixels_bgr)[1].tobytes()
     own = CameraImage(image.timestamp_ns, image.pixels_bgr, jpeg, "image/jpeg")
     frame = replace(frame, images={**frame.images, "CAM_FRONT": own})
-    with Recording(tmp_path / "r.rrd", rig=drive.rig, class_names=CLASSES, title="", untrained=False) as recording:
+    with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
         recording.log(frame, predict(frame))
     (read,) = RecordingReader(tmp_path / "r.rrd").frames()
     assert read.blob(entities.image("CAM_FRONT"), "EncodedImage:blob") == jpeg
 
 
-def test_a_dropped_camera_shows_no_old_image_and_is_an_event(tmp_path):
+def test_a_dropped_image_clears_the_view_and_logs_an_event(tmp_path):
     record(tmp_path / "r.rrd", WithoutImages({1: ("CAM_BACK",)}, count=3))
     recorded = list(RecordingReader(tmp_path / "r.rrd").frames())
     shown = [frame.has(entities.image("CAM_BACK"), "EncodedImage:blob") for frame in recorded]
     assert shown == [True, False, True]
-    assert recorded[1].values(entities.EVENTS, "TextLog:text") == ["frame 1: camera CAM_BACK is missing: missing"]
+    assert recorded[1].values(entities.EVENTS, "TextLog:text") == ["frame 1: camera CAM_BACK has no image: missing"]
 
 
-def test_an_untrained_run_says_so(tmp_path):
+def test_a_recording_of_an_untrained_model_is_labelled(tmp_path):
     record(tmp_path / "r.rrd", MemorySequence(1), untrained=True)
     (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
     assert frame.values(entities.RUN, "untrained") == [True]
     assert "untrained" in frame.values(entities.RUN, "TextDocument:text")[0]
-    assert frame.values(entities.MISSED, "name") == []  # it promised nothing: nothing is missed
+    assert frame.values(entities.MISSED, "name") == []  # random boxes match nothing: misses are not shown
     assert any("UNTRAINED" in text for text in events(tmp_path / "r.rrd"))
 
 
@@ -159,28 +159,29 @@ def events(path: Path) -> list[str]:
     return [text for batch in batches for (text,) in batch.column("TextLog:text").to_pylist()]
 
 
-def test_why_the_model_starts_anew_is_an_event(tmp_path):
+def test_the_reason_of_a_restart_without_history_is_an_event(tmp_path):
     drive = MemorySequence(4, scenes="aabb")
-    with Recording(tmp_path / "r.rrd", rig=drive.rig, class_names=CLASSES, title="", untrained=False) as recording:
+    reasons = ("first frame", "", "new scene", "gap of 9.0 s")
+    with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
         for place in range(4):
             frame = drive.load(place)
-            recording.log(frame, replace(predict(frame), started_anew=place != 1))
+            recording.log(frame, replace(predict(frame), started_anew=reasons[place]))
     assert events(tmp_path / "r.rrd") == [
-        'frame 0: scene "a" begins; the model starts without history',
-        'frame 2: scene change from "a" to "b"; the model starts without history',
-        "frame 3: 0.5 s since the last frame; the model starts without history",
+        'frame 0: no history: first frame, scene "a"',
+        'frame 2: no history: new scene, scene "b"',
+        'frame 3: no history: gap of 9.0 s, scene "b"',
     ]
 
 
-def test_minimal_has_no_insides(tmp_path):
+def test_a_minimal_recording_has_no_internals(tmp_path):
     record(tmp_path / "r.rrd", MemorySequence(2), RecordingOptions(level="minimal"))
     *_, last = RecordingReader(tmp_path / "r.rrd").frames()
     assert not {entities.BEV_FEATURES, entities.BEV_ON_GROUND, entities.PILLARS, entities.BEV_HISTORY} & set(last.rows)
     assert last.has(entities.BOXES, "Boxes3D:centers")
 
 
-def test_a_frame_costs_less_than_its_allowance(standard):
-    """At most 5 % of the images' bytes and 400 kB a frame; images in memory are encoded, so they count as ours."""
+def test_a_frame_adds_at_most_400_kb(standard):
+    """At most 400 kB and 5 % of the images' bytes are added to the encoded images."""
     *_, path = standard
     images = sum(
         len(frame.blob(entities.image(name), "EncodedImage:blob"))
@@ -195,7 +196,7 @@ def test_a_frame_without_boxes_shows_none(tmp_path, monkeypatch):
     monkeypatch.setenv("RERUN_STRICT", "1")
     drive = MemorySequence(2)
     first, second = (with_truth(drive.load(place)) for place in range(2))
-    with Recording(tmp_path / "r.rrd", rig=drive.rig, class_names=CLASSES, title="", untrained=False) as recording:
+    with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
         recording.log(first, predict(first))
         recording.log(replace(second, ground_truth=Boxes3D.empty()), replace(predict(second), boxes=Boxes3D.empty()))
     *_, last = RecordingReader(tmp_path / "r.rrd").frames()
@@ -208,17 +209,17 @@ def test_a_frame_without_boxes_shows_none(tmp_path, monkeypatch):
 def test_events_before_the_first_frame_are_kept(tmp_path):
     drive = MemorySequence(1)
     frame = with_truth(drive.load(0))
-    with Recording(tmp_path / "r.rrd", rig=drive.rig, class_names=CLASSES, title="", untrained=False) as recording:
+    with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
         recording.event("a note", "WARN")
         recording.log(frame, predict(frame))
     assert events(tmp_path / "r.rrd")[0] == "a note"
     (read,) = RecordingReader(tmp_path / "r.rrd").frames()
-    assert read.has(entities.EVENTS, "TextLog:text")  # it has a place in time
+    assert read.has(entities.EVENTS, "TextLog:text")  # it has a timestamp
 
 
 def test_a_file_that_cannot_be_written_is_one_line(tmp_path):
     drive = MemorySequence(1)
-    recording = Recording(tmp_path / "no" / "r.rrd", rig=drive.rig, class_names=CLASSES, title="", untrained=False)
+    recording = Recording(tmp_path / "no" / "r.rrd", drive, NamedModel())
     with pytest.raises(OutputError, match=r"r\.rrd"), recording:
         pass
 
@@ -228,10 +229,10 @@ def test_every_frame_survives_a_crash(tmp_path):
 import os, sys
 sys.path[:0] = {[str(Path(__file__).parent), str(Path(__file__).parents[1])]!r}
 from memory_drive import MemorySequence
-from recorded_drive import predict
+from recorded_drive import NamedModel, predict
 from bevcli.recording.writer import Recording
 drive = MemorySequence(4)
-with Recording({str(tmp_path / "r.rrd")!r}, rig=drive.rig, class_names=("car",), title="", untrained=False) as r:
+with Recording({str(tmp_path / "r.rrd")!r}, drive, NamedModel()) as r:
     for place in range(3):
         r.log(drive.load(place), predict(drive.load(place)))
     os._exit(9)  # as a crash does: nothing is closed

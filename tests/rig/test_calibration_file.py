@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from bevcli.errors import InputError, OutputError
 from bevcli.findings import errors_of
 from bevcli.geometry.cameras import CameraRig
-from bevcli.sequences.native.calibration import draft_calibration, read_calibration, write_calibration
+from bevcli.sequences.files.calibration_file import draft_calibration, read_calibration, write_calibration
 
 
 def written(document, folder):
@@ -115,9 +115,9 @@ MISTAKES = {
     "no format": (put(("format",), DELETE), '"format" is missing'),
     "other format": (put(("format",), "bevcli-boxes/1"), "bevcli-boxes/1"),
     "no cameras": (put(("cameras",), DELETE), '"cameras" is missing'),
-    "cameras is empty": (put(("cameras",), {}), "names no camera"),
-    "cameras is a list": (put(("cameras",), [1]), "names no camera"),
-    "camera is a number": (put(CAMERA, 3), "camera CAM_BACK: .*is no camera"),
+    "cameras is empty": (put(("cameras",), {}), "contains no camera"),
+    "cameras is a list": (put(("cameras",), [1]), "contains no camera"),
+    "camera is a number": (put(CAMERA, 3), "camera CAM_BACK: .*is not a camera"),
     "no width": (put((*CAMERA, "width"), DELETE), 'camera CAM_BACK: "width" is missing'),
     "width is text": (put((*CAMERA, "width"), "1600"), 'camera CAM_BACK: "width".*1600'),
     "width is zero": (put((*CAMERA, "width"), 0), 'camera CAM_BACK: "width"'),
@@ -127,7 +127,7 @@ MISTAKES = {
     ),
     "intrinsics 2x3": (put((*CAMERA, "intrinsics"), EYE[:2]), "CAM_BACK.*expected 3x3, found 2x3"),
     "intrinsics ragged": (put((*CAMERA, "intrinsics"), [[1, 0], [0], [1]]), "CAM_BACK.*expected 3x3"),
-    "intrinsics of text": (put((*CAMERA, "intrinsics"), [["a"] * 3] * 3), "CAM_BACK.*not all numbers"),
+    "intrinsics of text": (put((*CAMERA, "intrinsics"), [["a"] * 3] * 3), "CAM_BACK.*not an array of numbers"),
     "intrinsics NaN": (put((*CAMERA, "intrinsics"), [[float("nan")] * 3] * 3), "CAM_BACK.*NaN"),
     "intrinsics singular": (
         put((*CAMERA, "intrinsics"), [[0, 0, 800], [0, 800, 450], [0, 0, 1]]), "CAM_BACK.*singular.*fx 0",
@@ -136,19 +136,19 @@ MISTAKES = {
         put((*CAMERA, "intrinsics"), [[-800, 0, 800], [0, 800, 450], [0, 0, 1]]), "CAM_BACK.*fx > 0",
     ),
     "intrinsics transposed": (
-        put((*CAMERA, "intrinsics"), [[800, 0, 0], [0, 800, 0], [800, 450, 1]]), "CAM_BACK.*no camera matrix",
+        put((*CAMERA, "intrinsics"), [[800, 0, 0], [0, 800, 0], [800, 450, 1]]), "CAM_BACK.*not a camera matrix",
     ),
     "focal length in mm": (
-        put((*CAMERA, "intrinsics"), [[4.2, 0, 800], [0, 4.2, 450], [0, 0, 1]]), "CAM_BACK.*absurd focal length.*4.2",
+        put((*CAMERA, "intrinsics"), [[4.2, 0, 800], [0, 4.2, 450], [0, 0, 1]]), "CAM_BACK.*implausible focal.*4.2",
     ),
     "focal length too long": (
-        put((*CAMERA, "intrinsics"), [[8e5, 0, 800], [0, 8e5, 450], [0, 0, 1]]), "CAM_BACK.*absurd focal length",
+        put((*CAMERA, "intrinsics"), [[8e5, 0, 800], [0, 8e5, 450], [0, 0, 1]]), "CAM_BACK.*implausible focal length",
     ),
     "principal point absurd": (
         put((*CAMERA, "intrinsics"), [[800, 0, 8e5], [0, 800, 450], [0, 0, 1]]), "CAM_BACK.*principal point",
     ),
     "no pose": (put(POSE, DELETE), 'CAM_BACK: "ego_from_camera" is missing'),
-    "pose is a list": (put(POSE, [1, 2, 3]), 'CAM_BACK: "ego_from_camera" is no transform'),
+    "pose is a list": (put(POSE, [1, 2, 3]), 'CAM_BACK: "ego_from_camera" is not a transform'),
     "no translation": (put((*POSE, "translation"), DELETE), 'CAM_BACK: "ego_from_camera.translation" is missing'),
     "translation of two": (put((*POSE, "translation"), [1, 2]), "CAM_BACK.*translation.*expected 3 numbers, found 2"),
     "translation infinite": (put((*POSE, "translation"), [1, 2, float("inf")]), "CAM_BACK.*translation.*infinity"),
@@ -156,12 +156,12 @@ MISTAKES = {
     "quaternion of three": (put((*POSE, "rotation_wxyz"), [1, 0, 0]), "CAM_BACK.*expected 4 numbers, found 3"),
     "quaternion of norm 1.002": (put((*POSE, "rotation_wxyz"), [1.002, 0, 0, 0]), "CAM_BACK.*norm.*found 1.002"),
     "quaternion of zeros": (put((*POSE, "rotation_wxyz"), [0, 0, 0, 0]), "CAM_BACK.*norm.*found 0"),
-    "both rotations": (put((*POSE, "rotation"), EYE), "CAM_BACK.*beside"),
+    "both rotations": (put((*POSE, "rotation"), EYE), "CAM_BACK.*in addition to"),
     "not orthonormal": (as_matrix([[1, 0.01, 0], [0, 1, 0], [0, 0, 1]]), "CAM_BACK.*not orthonormal.*0.01"),
     "left-handed": (as_matrix([[1, 0, 0], [0, 1, 0], [0, 0, -1]]), "CAM_BACK.*left-handed"),
     "a row of zeros": (as_matrix([[1, 0, 0], [0, 1, 0], [0, 0, 0]]), "CAM_BACK.*not orthonormal"),
     "unknown lens": (put((*CAMERA, "distortion"), {"model": "fisheye"}), "CAM_BACK.*kannala_brandt, found fisheye"),
-    "lens is a list": (put((*CAMERA, "distortion"), [0.1, 0.2]), "CAM_BACK.*no known model"),
+    "lens is a list": (put((*CAMERA, "distortion"), [0.1, 0.2]), "CAM_BACK.*unknown model"),
     "three coefficients": (
         put((*CAMERA, "distortion"), {"model": "brown_conrady", "coefficients": [0.1, 0.2, 0.3]}),
         "CAM_BACK.*expected 4 or 5 or 8 for brown_conrady, found 3",
@@ -172,7 +172,7 @@ MISTAKES = {
     ),
     "coefficient of text": (
         put((*CAMERA, "distortion"), {"model": "kannala_brandt", "coefficients": [0.1, "b", 0, 0]}),
-        'CAM_BACK: "distortion.coefficients" is not all numbers',
+        'CAM_BACK: "distortion.coefficients" is not an array of numbers',
     ),
     "bev without translation": (put(("ego_from_bev", "translation"), DELETE), '"ego_from_bev.translation" is missing'),
     "bev is null": (put(("ego_from_bev",), None), '"ego_from_bev" is missing'),
@@ -220,8 +220,8 @@ def test_all_mistakes_are_found_at_once(tmp_path):
     [
         ('{"format": ', "line 1.*broken JSON"),
         ("", "broken JSON"),
-        ("[1, 2]", "no JSON object"),
-        ('{"cameras": {"A": {}, "A": {}}}', '"A" stands twice'),
+        ("[1, 2]", "not a JSON object"),
+        ('{"cameras": {"A": {}, "A": {}}}', '"A" appears twice'),
     ],
 )
 @pytest.mark.parametrize("read", [read_calibration, draft_calibration])

@@ -9,7 +9,7 @@ from healthy_rigs import camera, copy_of, rig
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.rig.coverage import coverage_of
 from bevcli.rig.pose import horizon, mounting_of, seen_fov_deg
-from bevcli.sequences.native.calibration import read_calibration
+from bevcli.sequences.files.calibration_file import read_calibration
 
 
 def rig_of(document, folder):

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from bevcli.findings import errors_of
 from bevcli.rig.checks import check_rig
-from bevcli.sequences.native.calibration import draft_calibration
+from bevcli.sequences.files.calibration_file import draft_calibration
 
 ALL = tuple(SIX["cameras"])
 

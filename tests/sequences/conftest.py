@@ -1,4 +1,4 @@
-"""A small drive written by hand, and the real one where it is at hand."""
+"""A small made-up drive, and real drives if the reference data is available."""
 
 import json
 import os
@@ -28,9 +28,9 @@ def _calibration() -> dict:
 
 @pytest.fixture
 def drive(tmp_path: Path) -> Path:
-    """Four frames, 2 a second from 1 s on, two cameras, driving straight along x at 10 m/s; the back camera 20 ms late.
+    """Four frames with indices 10 to 13, two per second from 1 s on, of a vehicle that drives along x at 10 m/s.
 
-    Frame numbers 10 to 13; images are PNG.
+    Two cameras with PNG images. The back camera is 20 ms late.
     """
     folder = tmp_path / "drive"
     for camera in CAMERAS:
@@ -52,7 +52,7 @@ def drive(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def edit(drive: Path) -> Callable[[str, str, str], Path]:
-    """Replace a text in one of the drive's files, which must be there, and give the drive's folder."""
+    """Replace a text in one of the drive's files. Returns the drive's folder."""
 
     def replace(file: str, old: str, new: str) -> Path:
         text = (drive / file).read_text()
@@ -66,7 +66,7 @@ def edit(drive: Path) -> Callable[[str, str, str], Path]:
 def _shared(part: str) -> Path:
     root = os.environ.get("BEVCLI_SHARED")
     if not root:
-        pytest.skip("BEVCLI_SHARED does not name the folder with the real data")
+        pytest.skip("BEVCLI_SHARED does not name the folder with the reference data")
     return Path(root) / "data" / part
 
 

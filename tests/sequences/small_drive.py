@@ -1,4 +1,4 @@
-"""What the images of the small drive in conftest.py show."""
+"""The images of the small drive in conftest.py."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ SIZE = (64, 36)
 
 
 def image_of(camera: str, number: int) -> np.ndarray:
-    """An image that tells camera and number apart from all others, with smooth and sharp parts."""
+    """An image that is different for every camera and number, with smooth and sharp parts."""
     u, v = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
     seed = CAMERAS.index(camera) * 40 + number * 7
     return np.stack([u * 3 + seed, v * 5 + seed, (u // 4 + v // 4 + number) % 2 * 200], axis=-1).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Mistakes in a native folder: one line each, with the file and the camera, line or column."""
+"""A mistake in a native folder gives a message of one line that names the file and the camera, line or column."""
 
 import json
 import shutil
@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from bevcli.errors import InputError
-from bevcli.sequences.open import InputOptions, open_sequence
+from bevcli.sequences.open import open_sequence
 
 
-def message(folder, options=InputOptions(), place=0):
-    """The one line that opening the folder, or loading a frame of it, ends with."""
+def message(folder, place=0, **options):
+    """The error message of opening the folder or loading a frame."""
     with pytest.raises(InputError) as caught:
-        open_sequence(folder, options).load(place)
+        open_sequence(folder, **options).load(place)
     line = str(caught.value)
     assert "\n" not in line
     return line
@@ -24,11 +24,11 @@ def test_missing_folder(tmp_path):
     assert str(tmp_path / "nothing") in message(tmp_path / "nothing")
 
 
-def test_a_folder_of_something_else(tmp_path):
-    assert "no sequence folder" in message(tmp_path)
+def test_folder_of_unknown_format(tmp_path):
+    assert "is not a sequence folder" in message(tmp_path)
 
 
-def test_a_file_in_place_of_a_folder(drive):
+def test_file_instead_of_a_folder(drive):
     assert "is a file" in message(drive / "frames.csv")
 
 
@@ -70,8 +70,8 @@ def test_broken_json(drive, content):
         ("frames.csv", "11,", "11,7,", ["line 3", "6 cells", "expected 5"]),
         ("frames.csv", "1500000000,images", "1.5e9,images", ["line 3", "timestamp_ns", '"1.5e9"', "integer"]),
         ("frames.csv", "1500000000,images", ",images", ["line 3", "timestamp_ns", '""', "integer"]),
-        ("frames.csv", "1500000000,images", "1000000000,images", ["line 3", "1000000000", "does not come after"]),
-        ("frames.csv", "1500000000,images", "2000000001,images", ["line 4", "2000000001", "does not come after"]),
+        ("frames.csv", "1500000000,images", "1000000000,images", ["line 3", "1000000000", "is not later than"]),
+        ("frames.csv", "1500000000,images", "2000000001,images", ["line 4", "2000000001", "is not later than"]),
         ("frames.csv", "1520000000", "nan", ["line 3", "CAM_BACK.timestamp_ns", '"nan"']),
         ("frames.csv", "\n11,", "\n10,", ["line 3", "frame", "10", "line 2"]),
         ("frames.csv", "\n11,", "\n-1,", ["line 3", "frame", "negative"]),
@@ -93,7 +93,7 @@ def test_wrong_cells_and_columns(edit, file, old, new, expected):
         assert part in line
 
 
-def test_optional_columns_come_in_groups(drive):
+def test_incomplete_group_of_optional_columns(drive):
     rows = (drive / "ego_motion.csv").read_text().splitlines()
     (drive / "ego_motion.csv").write_text("\n".join([rows[0] + ",vx", *(row + ",1" for row in rows[1:])]))
     line = message(drive)
@@ -111,21 +111,21 @@ def test_no_rows(drive, file, rows):
     assert ("no rows" if rows else "empty") in line
 
 
-def test_a_camera_without_a_column(drive):
+def test_camera_without_a_column(drive):
     rows = (drive / "frames.csv").read_text().splitlines()
     (drive / "frames.csv").write_text("\n".join(",".join(row.split(",")[:3]) for row in rows))
     line = message(drive)
     assert "frames.csv: camera CAM_BACK" in line
 
 
-def test_a_column_without_a_camera(drive):
+def test_column_without_a_camera(drive):
     calibration = json.loads((drive / "calibration.json").read_text())
     del calibration["cameras"]["CAM_BACK"]
     (drive / "calibration.json").write_text(json.dumps(calibration))
     assert 'unknown column "CAM_BACK"' in message(drive)
 
 
-def test_an_image_of_another_size(drive):
+def test_image_of_another_size(drive):
     cv2.imwrite(str(drive / "images/CAM_BACK/2.png"), np.zeros((30, 64, 3), np.uint8))
     line = message(drive, place=2)
     assert "CAM_BACK/2.png" in line
@@ -137,19 +137,19 @@ def test_an_image_of_another_size(drive):
 def test_strict_makes_a_bad_image_an_error(drive, content):
     path = drive / "images/CAM_BACK/1.png"
     path.unlink() if content is None else path.write_bytes(content)
-    line = message(drive, InputOptions(strict=True), place=1)
+    line = message(drive, strict=True, place=1)
     assert "camera CAM_BACK" in line
     assert str(path) in line
 
 
 def test_strict_makes_an_empty_cell_an_error(edit):
-    line = message(edit("frames.csv", "images/CAM_BACK/1.png", ""), InputOptions(strict=True), place=1)
+    line = message(edit("frames.csv", "images/CAM_BACK/1.png", ""), strict=True, place=1)
     assert "CAM_BACK" in line
     assert "frames.csv" in line
 
 
 def test_no_such_scene(drive):
-    assert 'no scene "x"' in message(drive, InputOptions(scene="x"))
+    assert 'no scene "x"' in message(drive, scene="x")
 
 
 def test_cameras_with_different_sets_of_names(drive):
@@ -160,7 +160,7 @@ def test_cameras_with_different_sets_of_names(drive):
     assert "first is 2" in line
 
 
-def test_names_that_are_no_numbers(drive):
+def test_image_name_that_is_not_a_number(drive):
     (drive / "frames.csv").unlink()
     (drive / "images/CAM_BACK/2.png").rename(drive / "images/CAM_BACK/two.png")
     assert "two.png" in message(drive)

@@ -1,4 +1,4 @@
-"""`bevcli convert`: what was an input of any kind is read back the same as a native folder."""
+"""`bevcli convert`: the native folder has the same frames as the input."""
 
 import json
 import shutil
@@ -12,16 +12,16 @@ from typer.testing import CliRunner
 from bevcli.cli.main import app
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import BevMap
-from bevcli.sequences.files.map_file import write_map
+from bevcli.sequences.files.map_folder import write_map
 from bevcli.sequences.native.writer import NativeWriter
-from bevcli.sequences.open import InputOptions, open_sequence
+from bevcli.sequences.open import open_sequence
 
 
 def convert(*arguments):
     return CliRunner().invoke(app, ["convert", *map(str, arguments)], catch_exceptions=True)
 
 
-def test_a_gap_and_the_order_of_cameras_are_kept(edit, tmp_path):
+def test_missing_images_and_camera_order_are_kept(edit, tmp_path):
     drive = edit("frames.csv", "images/CAM_BACK/1.png", "")
     assert convert(drive, tmp_path / "out").exit_code == 0
     one, other = open_sequence(drive), open_sequence(tmp_path / "out")
@@ -39,7 +39,7 @@ def test_a_gap_and_the_order_of_cameras_are_kept(edit, tmp_path):
         np.testing.assert_allclose(a.kinematics.velocity, b.kinematics.velocity, atol=1e-12)
 
 
-def test_maps_come_along(drive, tmp_path):
+def test_ground_truth_maps_are_converted(drive, tmp_path):
     cells = np.random.default_rng(0).integers(0, 16, (20, 20), dtype=np.uint8)
     write_map(drive / "ground_truth_map", 11, BevMap(cells, (-10.0, 10.0), (-10.0, 10.0)))
     convert(drive, tmp_path / "out")
@@ -48,7 +48,7 @@ def test_maps_come_along(drive, tmp_path):
     assert sequence.load(0).ground_truth_map is None
 
 
-def test_a_drive_without_ego_motion_stays_without(drive, tmp_path):
+def test_converted_drive_without_ego_motion_has_none(drive, tmp_path):
     (drive / "ego_motion.csv").unlink()
     assert convert(drive, tmp_path / "out").exit_code == 0
     assert not (tmp_path / "out" / "ego_motion.csv").exists()
@@ -66,7 +66,7 @@ def test_images_of_a_video_become_png(drive, edit, tmp_path):
     np.testing.assert_array_equal(cv2.imread(str(written)), image_of("CAM_BACK", 9))
 
 
-def test_an_existing_folder_is_replaced_only_by_force(drive, tmp_path):
+def test_existing_folder_is_replaced_only_with_force(drive, tmp_path):
     out = tmp_path / "out"
     assert convert(drive, out).exit_code == 0
     (out / "mine.txt").write_text("kept")
@@ -80,7 +80,7 @@ def test_an_existing_folder_is_replaced_only_by_force(drive, tmp_path):
 
 
 @pytest.mark.parametrize("target", ["drive", "."])
-def test_the_input_is_never_overwritten(drive, target):
+def test_input_is_never_overwritten(drive, target):
     answer = convert(drive, drive.parent / target, "--force")
     assert isinstance(answer.exception, OutputError)
     assert open_sequence(drive).load(3).images
@@ -92,7 +92,7 @@ def write_native(folder, frames):
             writer.write(frame)
 
 
-def test_an_interrupted_conversion_is_no_sequence(drive, tmp_path):
+def test_interrupted_conversion_is_not_a_sequence(drive, tmp_path):
     def interrupted():
         yield open_sequence(drive).load(0)
         raise KeyboardInterrupt
@@ -103,23 +103,23 @@ def test_an_interrupted_conversion_is_no_sequence(drive, tmp_path):
         open_sequence(tmp_path / "out")
 
 
-def test_scenes_with_different_rigs_do_not_mix(drive, tmp_path):
+def test_scenes_with_different_rigs_are_an_error(drive, tmp_path):
     other = tmp_path / "other"
     shutil.copytree(drive, other)
     calibration = json.loads((other / "calibration.json").read_text())
     calibration["cameras"]["CAM_BACK"]["ego_from_camera"]["translation"][0] += 0.1
     (other / "calibration.json").write_text(json.dumps(calibration))
     frames = [open_sequence(drive).load(0), open_sequence(other).load(1)]
-    with pytest.raises(InputError, match="another calibration"):
+    with pytest.raises(InputError, match="calibration differs from"):
         write_native(tmp_path / "out", frames)
 
 
-def test_one_scene_of_several(drive, tmp_path):
+def test_only_the_chosen_scene_is_converted(drive, tmp_path):
     lines = (drive / "frames.csv").read_text().splitlines()
     scenes = ["scene", "first", "first", "second", "second"]
     (drive / "frames.csv").write_text("\n".join(f"{s},{line}" for s, line in zip(scenes, lines, strict=True)))
     convert(drive, tmp_path / "out", "--scene", "second")
-    assert [stamp.index for stamp in open_sequence(tmp_path / "out", InputOptions(scene="second")).stamps] == [12, 13]
+    assert [stamp.index for stamp in open_sequence(tmp_path / "out", scene="second").stamps] == [12, 13]
 
 
 def test_intrinsics_in_yaml_make_a_calibration(drive, tmp_path):

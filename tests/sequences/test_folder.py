@@ -1,11 +1,11 @@
-"""A native folder becomes frames: times, poses and images as written."""
+"""The frames of a native folder have the times, poses and images in its files."""
 
 import cv2
 import numpy as np
 import pytest
 
 from bevcli.sequences.native.folder import FolderSequence
-from bevcli.sequences.open import InputOptions, open_sequence
+from bevcli.sequences.open import open_sequence
 
 
 def test_stamps_are_the_rows_of_frames_csv(drive):
@@ -14,6 +14,7 @@ def test_stamps_are_the_rows_of_frames_csv(drive):
     assert [stamp.timestamp_ns for stamp in sequence.stamps] == [10**9, 15 * 10**8, 2 * 10**9, 25 * 10**8]
     assert {stamp.scene for stamp in sequence.stamps} == {""}
     assert sequence.name == "drive"
+    assert open_sequence(str(drive)).stamps == sequence.stamps
 
 
 def test_poses_are_those_at_the_frame_and_at_each_camera(drive):
@@ -26,7 +27,7 @@ def test_poses_are_those_at_the_frame_and_at_each_camera(drive):
     np.testing.assert_allclose(frame.kinematics.acceleration, [0, 0, 9.81], atol=1e-6)
 
 
-def test_images_are_the_files(drive):
+def test_images_are_those_in_the_files(drive):
     frame = open_sequence(drive).load(2)
     for camera, image in frame.images.items():
         path = drive / "images" / camera / "2.png"
@@ -36,8 +37,8 @@ def test_images_are_the_files(drive):
     assert frame.images["CAM_BACK"].timestamp_ns == 2_020_000_000
 
 
-def test_times_beyond_the_precision_of_floats_are_kept(edit):
-    """2**60 + 1 is no float64."""
+def test_times_beyond_float_precision_are_exact(edit):
+    """2**60 + 1 is not a float64."""
     drive = edit("ego_motion.csv", "2600000000,", f"{2**60 + 2},")
     text = (
         (drive / "frames.csv").read_text().replace("2520000000", str(2**60 + 2)).replace("2500000000", str(2**60 + 1))
@@ -48,7 +49,7 @@ def test_times_beyond_the_precision_of_floats_are_kept(edit):
     assert sequence.load(3).images["CAM_BACK"].timestamp_ns == 2**60 + 2
 
 
-def test_an_empty_cell_is_a_dropped_image(edit):
+def test_empty_cell_is_a_dropped_image(edit):
     frame = open_sequence(edit("frames.csv", "images/CAM_BACK/1.png", "")).load(1)
     assert list(frame.images) == ["CAM_FRONT"]
     assert frame.dropped == {"CAM_BACK": "no image in frames.csv"}
@@ -56,7 +57,7 @@ def test_an_empty_cell_is_a_dropped_image(edit):
 
 
 @pytest.mark.parametrize("keep", [0, 40, -20], ids=["empty", "header", "cut short"])
-def test_a_broken_image_is_dropped_with_its_name(drive, keep):
+def test_broken_image_is_dropped_with_its_name(drive, keep):
     path = drive / "images/CAM_BACK/1.png"
     path.write_bytes(path.read_bytes()[:keep])
     frame = open_sequence(drive).load(1)
@@ -64,7 +65,7 @@ def test_a_broken_image_is_dropped_with_its_name(drive, keep):
     assert str(path) in frame.dropped["CAM_BACK"]
 
 
-def test_a_jpeg_cut_short_is_dropped(drive, edit):
+def test_truncated_jpeg_is_dropped(drive, edit):
     """OpenCV fills what is missing with grey."""
     encoded = cv2.imencode(".jpg", cv2.imread(str(drive / "images/CAM_BACK/1.png")))[1].tobytes()
     path = drive / "images/CAM_BACK/1.jpg"
@@ -72,35 +73,35 @@ def test_a_jpeg_cut_short_is_dropped(drive, edit):
     edit("frames.csv", "CAM_BACK/1.png", "CAM_BACK/1.jpg")
     assert open_sequence(drive).load(1).images["CAM_BACK"].encoded == encoded
     path.write_bytes(encoded[: len(encoded) // 2])
-    assert "not a whole image" in open_sequence(drive).load(1).dropped["CAM_BACK"]
+    assert "not a complete image" in open_sequence(drive).load(1).dropped["CAM_BACK"]
 
 
 def test_without_ego_motion_every_pose_is_the_identity(drive):
     (drive / "ego_motion.csv").unlink()
-    for use in ("static", "none"):
-        sequence = open_sequence(drive, InputOptions(ego_motion=use))
+    for use in ("static", "optional"):
+        sequence = open_sequence(drive, ego_motion=use)
         assert not sequence.has_ego_motion
         assert sequence.notes
         np.testing.assert_array_equal(sequence.load(3).world_from_ego.matrix, np.eye(4))
         np.testing.assert_array_equal(sequence.load(3).kinematics.acceleration, [0, 0, 9.81])
 
 
-def test_a_vehicle_said_to_stand_stands_whatever_the_file_says(drive):
-    sequence = open_sequence(drive, InputOptions(ego_motion="static"))
+def test_static_ignores_the_ego_motion_file(drive):
+    sequence = open_sequence(drive, ego_motion="static")
     np.testing.assert_array_equal(sequence.load(3).world_from_ego.matrix, np.eye(4))
     assert any("not read" in note for note in sequence.notes)
 
 
-def test_one_scene_can_be_picked(drive):
+def test_scene_selects_its_frames(drive):
     lines = (drive / "frames.csv").read_text().splitlines()
     scenes = ["scene", "first", "first", "second", "second"]
     (drive / "frames.csv").write_text("\n".join(f"{s},{line}" for s, line in zip(scenes, lines, strict=True)))
-    sequence = open_sequence(drive, InputOptions(scene="second"))
+    sequence = open_sequence(drive, scene="second")
     assert [stamp.index for stamp in sequence.stamps] == [12, 13]
     assert sequence.load(0).stamp.index == 12
 
 
-def test_images_named_by_their_time_need_no_table(drive):
+def test_images_named_by_timestamp_need_no_frames_csv(drive):
     table = open_sequence(drive)
     last = table.load(3).images["CAM_BACK"].pixels_bgr
     for camera in ("CAM_FRONT", "CAM_BACK"):
@@ -108,7 +109,7 @@ def test_images_named_by_their_time_need_no_table(drive):
             path = drive / "images" / camera / f"{number}.png"
             path.rename(path.with_name(f"{stamp.timestamp_ns * 10**5}.png"))
     (drive / "frames.csv").unlink()
-    sequence = open_sequence(drive, InputOptions(ego_motion="static"))
+    sequence = open_sequence(drive, ego_motion="static")
     assert [stamp.timestamp_ns for stamp in sequence.stamps] == [s.timestamp_ns * 10**5 for s in table.stamps]
     assert [stamp.index for stamp in sequence.stamps] == [0, 1, 2, 3]
     np.testing.assert_array_equal(sequence.load(3).images["CAM_BACK"].pixels_bgr, last)
@@ -127,7 +128,7 @@ def test_numbered_images_take_their_times_from_timing_toml(drive):
             np.testing.assert_array_equal(mine.images[camera].pixels_bgr, image.pixels_bgr)
 
 
-def test_a_missing_number_leaves_a_gap_in_time(drive):
+def test_missing_image_number_leaves_a_gap_in_time(drive):
     (drive / "frames.csv").unlink()
     for camera in ("CAM_FRONT", "CAM_BACK"):
         (drive / "images" / camera / "1.png").unlink()
@@ -146,11 +147,11 @@ def test_ground_truth_in_the_ego_frame_is_moved_to_the_world(drive):
     sequence = open_sequence(drive)
     np.testing.assert_allclose(sequence.load(1).ground_truth.centers, [[20, 1, 0.8]])
     assert sequence.load(0).ground_truth is None
-    standing = open_sequence(drive, InputOptions(ego_motion="static"))
+    standing = open_sequence(drive, ego_motion="static")
     np.testing.assert_allclose(standing.load(1).ground_truth.centers, [[5, 1, 0.8]])
 
 
-def test_the_real_drive_is_read_whole(real_drive):
+def test_real_drive_is_read_completely(real_drive):
     sequence = open_sequence(real_drive)
     assert len(sequence.stamps) == 4
     frame = sequence.load(0)
@@ -163,7 +164,7 @@ def test_the_real_drive_is_read_whole(real_drive):
         assert image.encoded == path.read_bytes()
 
 
-def test_an_exif_orientation_does_not_turn_the_pixels(drive, edit):
+def test_exif_orientation_is_ignored(drive, edit):
     encoded = cv2.imencode(".jpg", cv2.imread(str(drive / "images/CAM_BACK/1.png")))[1].tobytes()
     exif = (
         b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"  # orientation 6: turn by 90 degrees
@@ -175,6 +176,6 @@ def test_an_exif_orientation_does_not_turn_the_pixels(drive, edit):
     assert cv2.imdecode(np.frombuffer(turned, np.uint8), cv2.IMREAD_COLOR).shape == (64, 36, 3)
 
 
-def test_a_folder_reached_by_a_link_has_the_name_of_the_folder(drive, tmp_path):
+def test_sequence_behind_a_symlink_has_the_name_of_its_folder(drive, tmp_path):
     (tmp_path / "link").symlink_to(drive)
     assert open_sequence(tmp_path / "link").name == "drive"

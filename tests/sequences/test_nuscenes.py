@@ -1,4 +1,4 @@
-"""nuScenes tables with known contents, of any size: poses, images, annotations, splits, the cached index."""
+"""Reading nuScenes tables with known contents: poses, images, annotations, splits, and the cached index."""
 
 import json
 import os
@@ -13,9 +13,9 @@ from bevcli.errors import InputError
 from bevcli.sequences.nuscenes import cache as nuscenes_cache
 from bevcli.sequences.nuscenes import json_tables as nuscenes_json
 from bevcli.sequences.nuscenes.build import build_index
-from bevcli.sequences.nuscenes.can_bus import read_can_bus
-from bevcli.sequences.nuscenes.scenes import NuScenesChoice, NuScenesSequence
-from bevcli.sequences.nuscenes.splits import MINI_TRAIN, MINI_VAL, TEST, VAL, numbers, split_of
+from bevcli.sequences.nuscenes.choice import MINI_VAL, TEST, VAL, NuScenesChoice, numbers, split_of
+from bevcli.sequences.nuscenes.scene import read_can_bus
+from bevcli.sequences.nuscenes.sequence import NuScenesSequence
 
 SMALL = Size(scenes=3, samples=4, objects=8)
 
@@ -41,7 +41,7 @@ def test_keyframes_of_all_scenes_in_order(root):
     ]
 
 
-def test_poses_are_those_of_the_lidar_and_of_each_image(root):
+def test_poses_are_at_the_times_of_lidar_and_images(root):
     frame = NuScenesSequence(root).load(6)
     assert frame.world_from_ego.translation[0] == ego_x(1, sample_time(1, 2))
     assert frame.rig.names == CAMERAS
@@ -51,8 +51,8 @@ def test_poses_are_those_of_the_lidar_and_of_each_image(root):
     np.testing.assert_allclose(lags, [0.05, 0.08, 0.11, 0.14, 0.17, 0.2], atol=1e-9)
 
 
-def test_ground_truth_is_of_the_ten_classes(root):
-    """Objects 0 to 7 are in turn car, adult, rack, animal; the last two are none of the ten."""
+def test_ground_truth_has_the_ten_classes_only(root):
+    """Objects 0 to 7 are car, adult, rack, animal, and again; racks and animals are in none of the ten classes."""
     sequence = NuScenesSequence(root)
     truth = sequence.load(5).ground_truth
     assert truth.classes.tolist() == ["car", "pedestrian"] * 2
@@ -66,18 +66,20 @@ def test_ground_truth_is_of_the_ten_classes(root):
     assert sequence.index.bicycle_racks(5).centers[:, 0].tolist() == [1002, 1006]
 
 
-def test_velocities_are_unknown_over_long_gaps(root):
-    """Between keyframes 2 s apart nothing is known; across two gaps of 1 s it is."""
+def test_velocity_is_unknown_over_a_long_gap(root):
+    """Keyframes are 0.5 s apart. At twice the time between them velocities are known, at four times they are not."""
 
     def stretch(rows):
-        return [{**row, "timestamp": row["timestamp"] * 4 - 3 * sample_time(0, 0)} for row in rows]
+        return [{**row, "timestamp": 2 * row["timestamp"] - sample_time(0, 0)} for row in rows]
 
     edit_table(root, "sample", stretch)
-    index = build_index(root / "v1.0-trainval")
-    assert np.isnan(index.ground_truth(1).velocities).all()
+    velocities = build_index(root / "v1.0-trainval").ground_truth(1).velocities
+    np.testing.assert_allclose(velocities, [[0, 1.0]] * len(velocities))
+    edit_table(root, "sample", stretch)
+    assert np.isnan(build_index(root / "v1.0-trainval").ground_truth(1).velocities).all()
 
 
-def test_a_single_annotation_has_no_velocity(root):
+def test_single_annotation_has_no_velocity(root):
     edit_table(root, "sample_annotation", lambda rows: [{**rows[0], "prev": "", "next": ""}])
     assert np.isnan(build_index(root / "v1.0-trainval").ground_truth(0).velocities).all()
 
@@ -93,17 +95,17 @@ def test_without_annotations_there_is_no_ground_truth(tmp_path, remove):
     assert len(sequence.stamps) == 12
 
 
-def test_the_order_of_rows_does_not_matter(root, tmp_path):
+def test_order_of_rows_does_not_matter(root, tmp_path):
     plain = build_index(root / "v1.0-trainval")
     for name in ("sample", "sample_data", "ego_pose", "calibrated_sensor", "sample_annotation"):
         edit_table(root, name, lambda rows: rows[::-1])
-    turned = build_index(root / "v1.0-trainval")
-    assert plain.samples.tokens.tolist() == turned.samples.tokens.tolist()
-    assert plain.images.files.tolist() == turned.images.files.tolist()
-    np.testing.assert_array_equal(plain.images.translations, turned.images.translations)
+    reversed_rows = build_index(root / "v1.0-trainval")
+    assert plain.samples.tokens.tolist() == reversed_rows.samples.tokens.tolist()
+    assert plain.images.files.tolist() == reversed_rows.images.files.tolist()
+    np.testing.assert_array_equal(plain.images.translations, reversed_rows.images.translations)
 
 
-def test_tables_read_in_batches_are_the_tables(root, monkeypatch):
+def test_batches_contain_all_rows_of_a_table(root, monkeypatch):
     path = root / "v1.0-trainval" / "sample_data.json"
     monkeypatch.setattr(nuscenes_json, "BATCH_BYTES", 10_000)
     batches = list(nuscenes_json.read_batches(path))
@@ -116,13 +118,13 @@ def test_can_bus_is_the_first_message_after_the_time(tmp_path):
     rows = [{"utime": t, "accel": [t, 0, 9.8], "rotation_rate": [0, 0, t], "vel": [t, 0, 0]} for t in (10, 20, 30)]
     (tmp_path / "can_bus" / "scene-0001_pose.json").write_text(json.dumps(rows))
     can_bus = read_can_bus(tmp_path, "scene-0001")
-    told = {time: can_bus.kinematics_at(time).velocity[0] for time in (5, 10, 15, 20, 30, 40)}
-    assert told == {5: 10, 10: 20, 15: 20, 20: 30, 30: 30, 40: 30}
+    found = {time: can_bus.kinematics_at(time).velocity[0] for time in (5, 10, 15, 20, 30, 40)}
+    assert found == {5: 10, 10: 20, 15: 20, 20: 30, 30: 30, 40: 30}
     assert read_can_bus(tmp_path, "scene-0002") is None
 
 
-def test_sweeps_are_the_front_images_between(root):
-    """Six front images a keyframe, so twelve frames a second; keyframes keep their samples and times."""
+def test_sweeps_follow_the_front_images_between_keyframes(root):
+    """There are six front images per keyframe, so 12 frames per second. Keyframes keep their samples and times."""
     keyframes, sweeps = NuScenesSequence(root), NuScenesSequence(root, NuScenesChoice(sweeps=True))
     times = np.array([stamp.timestamp_ns for stamp in sweeps.stamps if stamp.scene == scene_name(1)])
     assert len(times) == 4 * 6
@@ -138,8 +140,8 @@ def test_sweeps_are_the_front_images_between(root):
         np.testing.assert_allclose(lags, [0.05, 0.08, 0.11, 0.14, 0.17, 0.2], atol=1e-4)
 
 
-def test_splits_are_disjoint_and_whole():
-    assert (len(numbers(VAL)), len(numbers(TEST)), len(numbers(MINI_TRAIN)), len(numbers(MINI_VAL))) == (150, 150, 8, 2)
+def test_splits_have_their_official_scenes():
+    assert (len(numbers(VAL)), len(numbers(TEST)), len(numbers(MINI_VAL))) == (150, 150, 2)
     assert not numbers(VAL) & numbers(TEST)
     assert split_of("scene-0103", mini=True) == "mini_val"
     assert split_of("scene-0103", mini=False) == "val"
@@ -147,7 +149,7 @@ def test_splits_are_disjoint_and_whole():
     assert split_of("scene-0077", mini=False) == "test"
 
 
-def test_a_split_picks_its_scenes(root):
+def test_split_selects_its_scenes(root):
     """Of scenes 1 to 3, the third is in val."""
     assert {stamp.scene for stamp in NuScenesSequence(root, NuScenesChoice(split="val")).stamps} == {"scene-0003"}
     assert {stamp.scene for stamp in NuScenesSequence(root, NuScenesChoice(split="train")).stamps} == {
@@ -166,12 +168,12 @@ def test_a_split_picks_its_scenes(root):
         (NuScenesChoice(scene="scene-0001", split="val"), "scene-0001"),
     ],
 )
-def test_wrong_choices(root, choice, expected):
+def test_choice_without_scenes_is_an_error(root, choice, expected):
     with pytest.raises(InputError, match=expected):
         NuScenesSequence(root, choice)
 
 
-def test_several_versions_ask_for_a_choice(root):
+def test_several_versions_require_a_choice(root):
     write_tables(root / "v1.0-mini", SMALL)
     with pytest.raises(InputError, match="--version"):
         NuScenesSequence(root)
@@ -196,13 +198,13 @@ def test_several_versions_ask_for_a_choice(root):
         ("scene", lambda rows: [], "no rows"),
     ],
 )
-def test_tables_that_do_not_fit(root, table, change, expected):
+def test_invalid_or_inconsistent_table_is_named(root, table, change, expected):
     edit_table(root, table, change)
     with pytest.raises(InputError, match=expected):
         NuScenesSequence(root)
 
 
-def test_a_missing_or_broken_table_is_named(root):
+def test_missing_or_broken_table_is_named(root):
     path = root / "v1.0-trainval" / "ego_pose.json"
     path.write_text(path.read_text()[:1000])
     with pytest.raises(InputError, match=r"ego_pose.json: cannot be read as JSON"):
@@ -214,13 +216,13 @@ def test_a_missing_or_broken_table_is_named(root):
 
 @pytest.fixture
 def cached(root, monkeypatch, tmp_path):
-    """The small tables, treated like large ones."""
+    """The small tables, cached like large ones."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(nuscenes_cache, "SMALLEST_BYTES", 0)
     return root
 
 
-def test_the_cached_index_is_the_index(cached, monkeypatch):
+def test_cached_index_equals_the_built_index(cached, monkeypatch):
     first, note = nuscenes_cache.open_index(cached / "v1.0-trainval")
     assert str(cached / "cache" / "bevcli") in note
     monkeypatch.delattr(nuscenes_cache, "build_index")  # the second time reads no table
@@ -231,7 +233,7 @@ def test_the_cached_index_is_the_index(cached, monkeypatch):
             np.testing.assert_array_equal(values, getattr(getattr(second, part), name))
 
 
-def test_a_changed_table_makes_the_index_anew(cached):
+def test_changed_table_rebuilds_the_index(cached):
     nuscenes_cache.open_index(cached / "v1.0-trainval")
     edit_table(cached, "scene", lambda rows: [{**row, "name": "scene-09" + row["name"][-2:]} for row in rows])
     index, _ = nuscenes_cache.open_index(cached / "v1.0-trainval")
@@ -250,7 +252,7 @@ def test_large_tables_take_little_memory(tmp_path):
     scenes = int(os.environ.get("BEVCLI_SCENES", "40"))
     write_tables(tmp_path / "v1.0-trainval", Size(scenes=scenes))
     code = (
-        "import sys; from pathlib import Path; from bevcli.sequences.nuscenes.scenes import NuScenesSequence\n"
+        "import sys; from pathlib import Path; from bevcli.sequences.nuscenes.sequence import NuScenesSequence\n"
         "sequence = NuScenesSequence(Path(sys.argv[1]))\n"
         # Not getrusage: a child's peak there begins with what its parent had.
         "peak = Path('/proc/self/status').read_text().split('VmHWM:')[1].split()[0]\n"

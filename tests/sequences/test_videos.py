@@ -1,4 +1,7 @@
-"""Videos: cells of frames.csv, and whole videos aligned by time. FFV1 is lossless, so pixels are compared exactly."""
+"""Images of videos that frames.csv lists, and whole videos aligned by time.
+
+FFV1 is lossless, so pixels are compared exactly.
+"""
 
 import cv2
 import numpy as np
@@ -6,7 +9,7 @@ import pytest
 from small_drive import CAMERAS, SIZE, image_of
 
 from bevcli.errors import InputError
-from bevcli.sequences.open import InputOptions, open_sequence
+from bevcli.sequences.open import open_sequence
 from bevcli.sequences.video import VideoReader
 
 
@@ -21,7 +24,7 @@ def write_video(path, images, rate, codec="FFV1"):
 
 @pytest.fixture
 def videos(drive):
-    """The small drive without frames.csv and images, front at 10 Hz and back at 5 Hz, ten and five images."""
+    """The small drive with videos only: ten front images at 10 Hz, five back images at 5 Hz."""
     (drive / "frames.csv").unlink()
     for path in (drive / "images").rglob("*.png"):
         path.unlink()
@@ -33,11 +36,8 @@ def videos(drive):
     return drive
 
 
-STANDING = InputOptions(ego_motion="static")
-
-
 @pytest.mark.parametrize("suffix", ["mkv", "avi"])
-def test_images_come_by_number_in_any_order(tmp_path, suffix):
+def test_images_are_read_by_index_in_any_order(tmp_path, suffix):
     images = [image_of("CAM_FRONT", number) for number in range(8)]
     write_video(tmp_path / f"v.{suffix}", images, 10)
     reader = VideoReader(tmp_path / f"v.{suffix}")
@@ -45,11 +45,11 @@ def test_images_come_by_number_in_any_order(tmp_path, suffix):
         np.testing.assert_array_equal(reader.read(number), images[number])
 
 
-def test_a_number_beyond_the_end_is_refused_again_and_again(tmp_path):
+def test_index_beyond_the_end_is_an_error_every_time(tmp_path):
     write_video(tmp_path / "v.mkv", [image_of("CAM_FRONT", number) for number in range(3)], 10)
     reader = VideoReader(tmp_path / "v.mkv")
     for _ in range(2):
-        with pytest.raises(InputError, match=r"no image 3 \(the last one is 2\)"):
+        with pytest.raises(InputError, match=r"no image 3 \(the last is 2\)"):
             reader.read(3)
     np.testing.assert_array_equal(reader.read(2), image_of("CAM_FRONT", 2))
 
@@ -66,8 +66,8 @@ def test_cells_of_frames_csv_name_images_of_a_video(drive, edit):
 
 
 def test_whole_videos_are_aligned_by_time(videos):
-    """A frame for each image of the slower camera; the faster one's nearest is twice its number."""
-    sequence = open_sequence(videos, STANDING)
+    """There is one frame per back image. The nearest front image has twice its index."""
+    sequence = open_sequence(videos, ego_motion="static")
     assert [stamp.timestamp_ns for stamp in sequence.stamps] == [n * 200_000_000 for n in range(5)]
     for place in range(5):
         frame = sequence.load(place)
@@ -77,11 +77,11 @@ def test_whole_videos_are_aligned_by_time(videos):
 
 
 def test_offsets_and_rates_come_from_timing_toml(videos):
-    """The front camera starts 0.31 s late: its image n is at 0.31 + n / 10 s; the back one's at n / 4 s."""
+    """Image n of the front camera is at 0.31 + n / 10 s, and that of the back camera at n / 4 s."""
     (videos / "timing.toml").write_text(
         "start_ns = 5000000000\n[cameras.CAM_FRONT]\noffset_ns = 310000000\n[cameras.CAM_BACK]\nrate_hz = 4\n"
     )
-    sequence = open_sequence(videos, STANDING)
+    sequence = open_sequence(videos, ego_motion="static")
     assert [stamp.timestamp_ns for stamp in sequence.stamps] == [5_000_000_000 + n * 250_000_000 for n in range(5)]
     assert "CAM_FRONT" in sequence.load(0).dropped
     assert "CAM_FRONT" in sequence.load(1).dropped  # 0.25 s is 60 ms before its first image
@@ -92,32 +92,32 @@ def test_offsets_and_rates_come_from_timing_toml(videos):
 
 
 def test_poses_are_taken_at_the_images_own_times(videos):
-    """The drive's ego-motion is at time / 0.1 s metres, from 0.9 s on."""
+    """The vehicle drives at 10 m/s from x = 0 at time 0; its poses start at 0.9 s."""
     (videos / "timing.toml").write_text("start_ns = 1000000000\n[cameras.CAM_FRONT]\noffset_ns = 30000000\n")
     frame = open_sequence(videos).load(2)
     np.testing.assert_allclose(frame.world_from_ego.translation[0], 14.0, atol=1e-9)
     np.testing.assert_allclose(frame.world_from_ego_at["CAM_FRONT"].translation[0], 14.3, atol=1e-9)
 
 
-def test_videos_that_miss_the_ego_motion_ask_for_their_start(videos):
-    """Without timing.toml they start at 0, long before the first pose."""
+def test_videos_outside_the_ego_motion_need_a_start_time(videos):
+    """Without timing.toml, videos start at time 0, before the first pose."""
     with pytest.raises(InputError, match=r"ego_motion.csv: covers .*CAM_BACK.avi#0.*timing.toml"):
         open_sequence(videos)
 
 
-def test_a_camera_without_a_video(videos):
+def test_camera_without_a_video(videos):
     (videos / "videos/CAM_BACK.avi").unlink()
     with pytest.raises(InputError, match="camera CAM_BACK: expected one video"):
-        open_sequence(videos, STANDING)
+        open_sequence(videos, ego_motion="static")
 
 
-def test_a_file_that_is_no_video(videos):
+def test_file_that_is_not_a_video(videos):
     (videos / "videos/CAM_BACK.avi").write_bytes(b"no video at all" * 100)
     with pytest.raises(InputError, match=r"CAM_BACK.avi"):
-        open_sequence(videos, STANDING)
+        open_sequence(videos, ego_motion="static")
 
 
 def test_motion_jpeg_is_read(videos):
     (videos / "videos/CAM_BACK.avi").unlink()
     write_video(videos / "videos/CAM_BACK.avi", [image_of("CAM_BACK", n) for n in range(5)], 5, "MJPG")
-    assert open_sequence(videos, STANDING).load(4).images["CAM_BACK"].pixels_bgr.shape == (36, 64, 3)
+    assert open_sequence(videos, ego_motion="static").load(4).images["CAM_BACK"].pixels_bgr.shape == (36, 64, 3)

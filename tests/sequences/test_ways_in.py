@@ -1,4 +1,4 @@
-"""The same real drive as a native folder, as six lossless videos, and as a nuScenes root: the same frames."""
+"""The same real drive as a native folder, as six lossless videos, and as a nuScenes root gives the same frames."""
 
 import shutil
 from pathlib import Path
@@ -10,7 +10,7 @@ import pytest
 from bevcli.geometry.cameras import CameraRig
 from bevcli.sequences.native.folder import FolderSequence
 from bevcli.sequences.native.writer import NativeWriter
-from bevcli.sequences.open import InputOptions, open_sequence
+from bevcli.sequences.open import open_sequence
 
 
 def assert_same_rig(one: CameraRig, other: CameraRig) -> None:
@@ -58,20 +58,20 @@ def write_videos(source: Path, target: Path, suffix: str) -> None:
         writer.release()
 
 
-def test_nuscenes_root(real_drive, nuscenes_root):
+def test_nuscenes_root_gives_the_same_frames(real_drive, nuscenes_root):
     sequence = open_sequence(nuscenes_root)
     assert sequence.has_ego_motion
     assert [stamp.scene for stamp in sequence.stamps] == ["scene-0103"] * 4
     assert_same_frames(open_sequence(real_drive), sequence, same_bytes=True)
 
 
-def test_samples_of_a_root_have_their_tokens(nuscenes_root):
+def test_keyframes_have_their_sample_tokens(nuscenes_root):
     assert open_sequence(nuscenes_root).load(0).sample_token == "3e8750f331d7499e9b5123e9eb70f2e2"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".mkv", ".avi"])
-def test_six_lossless_videos(real_drive, tmp_path, suffix):
+def test_lossless_videos_give_the_same_frames(real_drive, tmp_path, suffix):
     copy_without_images(real_drive, tmp_path / "videos_in")
     write_videos(real_drive, tmp_path / "videos_in", suffix)
     table = (real_drive / "frames.csv").read_text()
@@ -83,7 +83,7 @@ def test_six_lossless_videos(real_drive, tmp_path, suffix):
 
 
 @pytest.mark.parametrize("which", ["native", "nuscenes"])
-def test_converted(real_drive, nuscenes_root, tmp_path, which):
+def test_converted_sequence_gives_the_same_frames(real_drive, nuscenes_root, tmp_path, which):
     source = open_sequence(real_drive if which == "native" else nuscenes_root)
     with NativeWriter(tmp_path / "out", with_ego_motion=True) as writer:
         for place in range(len(source.stamps)):
@@ -91,22 +91,22 @@ def test_converted(real_drive, nuscenes_root, tmp_path, which):
     assert_same_frames(source, open_sequence(tmp_path / "out"), same_bytes=True)
 
 
-def test_a_scene_and_a_split_are_chosen(nuscenes_root):
+def test_scene_split_and_version_select_the_scene(nuscenes_root):
     for options in (
-        InputOptions(scene="scene-0103"),
-        InputOptions(split="mini_val"),
-        InputOptions(version="v1.0-mini"),
+        {"scene": "scene-0103"},
+        {"split": "mini_val"},
+        {"version": "v1.0-mini"},
     ):
-        assert len(open_sequence(nuscenes_root, options).stamps) == 4
+        assert len(open_sequence(nuscenes_root, **options).stamps) == 4
 
 
 def test_without_can_bus_kinematics_come_from_the_poses(nuscenes_root, tmp_path):
-    """The car drives at 8.4 m/s forward, as its own sensors say."""
+    """The car drives at 8.4 m/s forward, according to its sensors."""
     shutil.copytree(nuscenes_root, tmp_path / "root", ignore=shutil.ignore_patterns("can_bus"))
-    told, derived = open_sequence(nuscenes_root), open_sequence(tmp_path / "root")
+    measured, derived = open_sequence(nuscenes_root), open_sequence(tmp_path / "root")
     assert any("no CAN bus" in note for note in derived.notes)
     for place in range(4):
-        a, b = told.load(place).kinematics, derived.load(place).kinematics
+        a, b = measured.load(place).kinematics, derived.load(place).kinematics
         np.testing.assert_allclose(a.velocity, b.velocity, atol=0.3)
         np.testing.assert_allclose(a.angular_rate[2], b.angular_rate[2], atol=0.03)
         np.testing.assert_allclose(a.acceleration, b.acceleration, atol=0.8)

@@ -1,24 +1,25 @@
-"""What the tests of the rendered world share: the meshes, made once, and one small drive."""
+"""Fixtures of the rendered world: the meshes, built once, and one small drive."""
 
 import pytest
 
 pytest.importorskip("numba")
 
-from bevcli.synth.drive import Drive, RenderedFrame, Stock
+from bevcli.synth.assets.catalog import Assets
+from bevcli.synth.drive import RenderedDrive, RenderedFrame
 from bevcli.synth.rig import nuscenes_like_rig
 
 
 @pytest.fixture(scope="session")
-def stock() -> Stock:
-    return Stock.make()
+def assets() -> Assets:
+    return Assets.build()
 
 
 @pytest.fixture(scope="session")
-def drive(stock: Stock) -> Drive:
-    """Seed 113: the ego vehicle brakes and turns right at a building site."""
-    return Drive(113, frames=20, rig=nuscenes_like_rig(320, 180), stock=stock, weather="noon")
+def drive(assets: Assets) -> RenderedDrive:
+    """Seed 113: the ego vehicle brakes and turns right at a building site. Images of 320x180."""
+    return RenderedDrive(113, frames=20, rig=nuscenes_like_rig(320, 180), assets=assets, weather="noon")
 
 
 @pytest.fixture(scope="session")
-def frame(drive: Drive) -> RenderedFrame:
+def frame(drive: RenderedDrive) -> RenderedFrame:
     return drive.frame(9)

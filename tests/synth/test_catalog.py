@@ -1,16 +1,15 @@
-"""The meshes: as many as promised, of sizes that such things have, and their boxes fit."""
+"""The meshes: enough variants, plausible sizes, closed surfaces, and boxes that fit."""
 
 import cv2
 import numpy as np
 import pytest
 
 from bevcli.geometry.boxes import CLASSES
+from bevcli.synth.assets.catalog import Assets, draw_body
 from bevcli.synth.assets.paint import linear
-from bevcli.synth.drive import Stock
-from bevcli.synth.world.actors import draw_body
 
 VEHICLES = ("car", "truck", "construction_vehicle", "bus", "trailer", "motorcycle", "bicycle")
-# Shortest and longest length, width and height in metres that the class may have.
+# Smallest and largest plausible length, width and height of each class, metres.
 PLAUSIBLE = {
     "car": ((3.5, 1.5, 1.2), (5.8, 2.2, 2.4)), "truck": ((4.5, 1.8, 1.6), (12, 2.7, 4.2)),
     "construction_vehicle": ((3.5, 1.8, 2.2), (10, 3.5, 4.5)), "bus": ((6, 2.2, 2.5), (18.5, 3.1, 4.5)),
@@ -21,23 +20,23 @@ PLAUSIBLE = {
 
 
 @pytest.mark.parametrize("name", CLASSES)
-def test_there_are_enough_variants(stock: Stock, name: str):
-    looks = {v.name.removesuffix("_standing") for v in stock.catalog.by_class[name]}
+def test_there_are_enough_variants(assets: Assets, name: str):
+    looks = {v.name.removesuffix("_standing") for v in assets.catalog.by_class[name]}
     assert len(looks) >= (6 if name in VEHICLES else 4)
 
 
 @pytest.mark.parametrize("name", CLASSES)
-def test_sizes_are_those_of_such_things(stock: Stock, name: str):
+def test_sizes_are_plausible(assets: Assets, name: str):
     low, high = np.array(PLAUSIBLE[name])
-    for variant in stock.catalog.by_class[name]:
+    for variant in assets.catalog.by_class[name]:
         assert (variant.size_lwh > low).all(), variant.name
         assert (variant.size_lwh < high).all(), variant.name
 
 
 @pytest.mark.parametrize("name", CLASSES)
-def test_mesh_fills_its_box_exactly(stock: Stock, name: str):
+def test_mesh_fills_its_box_exactly(assets: Assets, name: str):
     rng = np.random.default_rng(3)
-    for variant in stock.catalog.by_class[name]:
+    for variant in assets.catalog.by_class[name]:
         body = draw_body(variant, rng, "one")
         for pose in variant.poses:
             points = pose.fitted(body.size_lwh).faces.reshape(-1, 3)
@@ -47,9 +46,9 @@ def test_mesh_fills_its_box_exactly(stock: Stock, name: str):
 
 
 @pytest.mark.parametrize("name", CLASSES)
-def test_meshes_have_no_holes_and_no_face_turned_inwards(stock: Stock, name: str):
-    """From any side the faces that look this way cover as much as all faces together."""
-    for variant in stock.catalog.by_class[name]:
+def test_meshes_have_no_holes_and_no_inverted_faces(assets: Assets, name: str):
+    """From every side, the faces that point to the viewer cover the same area as all faces."""
+    for variant in assets.catalog.by_class[name]:
         for pose in variant.poses:
             faces = pose.fitted(variant.size_lwh / variant.size_lwh.max()).faces
             for view in ((1, 0.3, 0.4), (-0.7, 1, 0.2), (0.2, -1, 1), (-1, -0.4, -0.6)):
@@ -58,7 +57,7 @@ def test_meshes_have_no_holes_and_no_face_turned_inwards(stock: Stock, name: str
 
 
 def _silhouettes(faces, view, size=400):
-    """(size, size) bool images along -view: of all faces, and of those that look towards the viewer."""
+    """(size, size) bool images seen from direction `view`: of all faces, and of those that point to the viewer."""
     view = view / np.linalg.norm(view)
     right = np.cross((0, 0, 1), view) / np.linalg.norm(np.cross((0, 0, 1), view))
     axes = np.stack([right, np.cross(view, right)], -1)
@@ -73,7 +72,7 @@ def _silhouettes(faces, view, size=400):
     return images[0] > 0, cv2.dilate(images[1], np.ones((3, 3), np.uint8)) > 0
 
 
-def test_white_stays_white_and_black_black():
+def test_linear_rgb_of_white_black_and_grey():
     np.testing.assert_allclose(linear((255, 255, 255)), 1.0)
     np.testing.assert_allclose(linear((0, 0, 0)), 0.0)
     assert 0.20 < linear((128, 128, 128))[0] < 0.23

@@ -1,4 +1,4 @@
-"""`bevcli render` writes what the sequence reader reads, and says what is wrong in one line."""
+"""`bevcli render` and its Python function: the files that they write, and their error messages."""
 
 from pathlib import Path
 
@@ -7,24 +7,27 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from bevcli.cli.render import parse_resolution, render
+from bevcli.cli.render import WeatherChoice, parse_resolution, render
 from bevcli.errors import InputError, OutputError
-from bevcli.sequences.native.calibration import write_calibration
+from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.sequences.open import open_sequence
-from bevcli.synth.drive import Drive, Stock
+from bevcli.synth.assets.catalog import Assets
+from bevcli.synth.drive import RenderedDrive
 from bevcli.synth.export import export_drive
+from bevcli.synth.export import render as render_sequence
 from bevcli.synth.rig import nuscenes_like_rig
+from bevcli.synth.world.weather import WEATHER_NAMES
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory, stock: Stock) -> tuple[Drive, Path]:
+def written(tmp_path_factory: pytest.TempPathFactory, assets: Assets) -> tuple[RenderedDrive, Path]:
     folder = tmp_path_factory.mktemp("rendered") / "drive"
-    drive = Drive(5, frames=2, rig=nuscenes_like_rig(160, 90), stock=stock)
+    drive = RenderedDrive(5, frames=2, rig=nuscenes_like_rig(160, 90), assets=assets)
     export_drive(drive, folder)
     return drive, folder
 
 
-def test_the_reader_gives_back_what_was_rendered(written: tuple[Drive, Path]):
+def test_reading_the_folder_gives_the_rendered_frames(written: tuple[RenderedDrive, Path]):
     drive, folder = written
     sequence = open_sequence(folder)
     assert [stamp.index for stamp in sequence.stamps] == [0, 1]
@@ -40,21 +43,23 @@ def test_the_reader_gives_back_what_was_rendered(written: tuple[Drive, Path]):
     np.testing.assert_allclose(read.world_from_ego.matrix, rendered.world_from_ego.matrix, atol=1e-9)
 
 
-def test_ego_motion_is_denser_than_the_frames(written: tuple[Drive, Path]):
+def test_ego_motion_has_50_hz(written: tuple[RenderedDrive, Path]):
     rows = (written[1] / "ego_motion.csv").read_text().splitlines()
     assert rows[0].endswith("ax,ay,az,wx,wy,wz,vx,vy,vz")
-    assert len(rows) - 1 == 26  # 0.5 s at 50 Hz, both ends
+    assert len(rows) - 1 == 26  # 0.5 s at 50 Hz, both ends included
 
 
-def test_a_second_export_gives_the_same_files(written: tuple[Drive, Path], tmp_path: Path, stock: Stock):
-    export_drive(Drive(5, frames=2, rig=nuscenes_like_rig(160, 90), stock=stock, threads=2), tmp_path / "again")
+def test_a_second_export_gives_the_same_files(written: tuple[RenderedDrive, Path], tmp_path: Path, assets: Assets):
+    export_drive(
+        RenderedDrive(5, frames=2, rig=nuscenes_like_rig(160, 90), assets=assets, threads=2), tmp_path / "again"
+    )
     names = sorted(p.relative_to(written[1]) for p in written[1].rglob("*") if p.is_file())
     assert names == sorted(p.relative_to(tmp_path / "again") for p in (tmp_path / "again").rglob("*") if p.is_file())
     for name in names:
         assert (written[1] / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
 
 
-def test_an_existing_sequence_is_not_overwritten(written: tuple[Drive, Path]):
+def test_an_existing_sequence_is_not_overwritten(written: tuple[RenderedDrive, Path]):
     with pytest.raises(OutputError, match="exists already"):
         export_drive(written[0], written[1])
 
@@ -73,14 +78,18 @@ def test_the_command_renders_any_rig_at_any_size(tmp_path: Path):
     np.testing.assert_allclose(frame.rig["CAM_FRONT"].intrinsics[0, 0], 1266 * 96 / 1600)
 
 
-def test_a_size_that_is_none_is_a_mistake_in_usage():
+def test_the_command_offers_every_weather():
+    assert tuple(choice.value for choice in WeatherChoice) == WEATHER_NAMES
+
+
+def test_a_wrong_resolution_is_a_usage_error():
     assert parse_resolution("800x450") == (800, 450)
     for text in ("800", "x", "0x10", "800x99999"):
         with pytest.raises(typer.BadParameter):
             parse_resolution(text)
 
 
-def test_a_lens_that_sees_behind_itself_is_refused(tmp_path: Path):
+def test_a_fisheye_lens_that_is_too_wide_is_an_error(tmp_path: Path):
     from dataclasses import replace
 
     from bevcli.geometry.cameras import Distortion
@@ -94,5 +103,37 @@ def test_a_lens_that_sees_behind_itself_is_refused(tmp_path: Path):
         distortion=Distortion("kannala_brandt", (0.0, 0.0, 0.0, 0.0)),
     )
     write_calibration(tmp_path / "rig.json", type(rig)((wide,), rig.ego_from_bev))
-    with pytest.raises(InputError, match="camera CAM_FRONT: its lens sees too far"):
+    with pytest.raises(InputError, match=r"rig\.json: camera CAM_FRONT: its field of view is too wide"):
         rig_for_rendering(tmp_path / "rig.json", None)
+
+
+def test_the_function_takes_a_rig_and_summarises_what_it_wrote(tmp_path: Path):
+    rig = nuscenes_like_rig(96, 54)
+    seen = []
+    summary = render_sequence(
+        tmp_path / "out", seed=4, frames=2, rig=type(rig)(rig.cameras[3:4], rig.ego_from_bev), progress=seen.append
+    )
+    sequence = open_sequence(summary.folder)
+    assert summary.frames == len(sequence.stamps) == len(seen) == 2
+    assert summary.cameras == sequence.load(0).rig.names == ("CAM_BACK",)
+    assert summary.weather == RenderedDrive(4, frames=2).weather.name
+    with pytest.raises(OutputError, match="exists already"):
+        render_sequence(tmp_path / "out", frames=1, resolution=(96, 54))
+
+
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    [
+        ({"frames": 0}, "frames: expected 1 or more, found 0"),
+        ({"seed": -1}, "seed: expected 0 or more, found -1"),
+        ({"rate_hz": 0.0}, r"rate_hz: expected 0\.1 to 100, found 0\.0"),
+        ({"quality": 101}, "quality: expected 1 to 100, found 101"),
+        ({"resolution": (800, 8)}, "resolution: expected 16 to 8192, found 8"),
+        ({"supersampling": 5}, "supersampling: expected 1 to 4, found 5"),
+        ({"weather": "rain"}, "weather: expected noon, evening or overcast, found 'rain'"),
+    ],
+)
+def test_an_argument_out_of_range_is_an_error_before_anything_is_written(tmp_path: Path, argument, message):
+    with pytest.raises(InputError, match=message):
+        render_sequence(tmp_path / "out", **argument)
+    assert not (tmp_path / "out").exists()

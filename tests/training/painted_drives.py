@@ -1,4 +1,4 @@
-"""Drives of two cameras in memory, in whose images boxes stand as coloured shapes on grey ground."""
+"""Drives of two cameras in memory: boxes are drawn as coloured shapes on grey ground."""
 
 from __future__ import annotations
 
@@ -43,27 +43,31 @@ CONFIG = BEVFormerConfig(
 class PaintedDrive:
     """Two frames half a second apart, with three cars and two pedestrians.
 
-    told: whether truth is told of both frames, or of the second one only.
+    all_labelled: whether both frames have ground truth, or only the second.
     """
 
     has_ego_motion = True
     notes = ()
     rig = RIG
 
-    def __init__(self, seed: int, *, told: bool) -> None:
-        self._told = told
+    def __init__(self, seed: int, *, all_labelled: bool) -> None:
+        self._all_labelled = all_labelled
         self.name = f"painted-{seed}"
         self.stamps = tuple(FrameStamp(i, self.name, 10**18 + i * 500_000_000) for i in range(2))
-        self._boxes = _boxes(np.random.default_rng(seed))  # in the world, where the bev frame is at the second frame
+        self._boxes = _boxes(
+            np.random.default_rng(seed)
+        )  # in the world frame, which is the bev frame of the second frame
 
-    def load(self, place: int) -> Frame:
-        """The frame; nothing but the ego vehicle moves, 1 m ahead."""
-        pose = Pose(np.array([float(place - 1), 0, 0]), np.array([1.0, 0, 0, 0]))
-        stamp = self.stamps[place]
+    def load(self, index: int) -> Frame:
+        """The frame at an index. Only the ego vehicle moves, 1 m forward."""
+        pose = Pose(np.array([float(index - 1), 0, 0]), np.array([1.0, 0, 0, 0]))
+        stamp = self.stamps[index]
         images = {c.name: CameraImage(stamp.timestamp_ns, self._image(c, pose)) for c in RIG.cameras}
         still = Kinematics(np.array([0, 0, GRAVITY]), np.zeros(3), np.array([2.0, 0, 0]))
         frame = Frame(stamp, RIG, images, pose, dict.fromkeys(RIG.names, pose), still)
-        return replace(frame, ground_truth=self._boxes, ground_truth_map=_map()) if place or self._told else frame
+        return (
+            replace(frame, ground_truth=self._boxes, ground_truth_map=_map()) if index or self._all_labelled else frame
+        )
 
     def _image(self, camera: Camera, pose: Pose) -> np.ndarray:
         pixels = np.full((camera.height, camera.width, 3), 120, dtype=np.uint8)
@@ -79,17 +83,17 @@ class PaintedDrive:
 
 
 class PaintedDrives:
-    """Some painted drives, from seeds."""
+    """Painted drives of the seeds 0 to count - 1."""
 
-    def __init__(self, count: int, *, told: bool = False) -> None:
-        self._drives = [PaintedDrive(seed, told=told) for seed in range(count)]
+    def __init__(self, count: int, *, all_labelled: bool = False) -> None:
+        self._drives = [PaintedDrive(seed, all_labelled=all_labelled) for seed in range(count)]
 
     def __len__(self) -> int:
         return len(self._drives)
 
-    def open(self, place: int) -> PaintedDrive:
-        """The drive at a place."""
-        return self._drives[place]
+    def open(self, index: int) -> PaintedDrive:
+        """The drive at an index."""
+        return self._drives[index]
 
 
 def _boxes(random: np.random.Generator) -> Boxes3D:
@@ -107,7 +111,7 @@ def _boxes(random: np.random.Generator) -> Boxes3D:
 
 
 def _map() -> BevMap:
-    """A straight road ahead and behind, 8 m wide."""
+    """A straight road, 8 m wide, in driving direction."""
     cells = np.zeros((64, 64), dtype=np.uint8)
     cells[:, 24:40] = 1
     return BevMap(cells, (-REACH_M, REACH_M), (-REACH_M, REACH_M))

@@ -1,4 +1,4 @@
-"""Which frames make a clip, and what may change in its images."""
+"""Drawing of clips, and image augmentation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from memory_drive import MemorySequence
 
 from bevcli.errors import InputError
 from bevcli.training.augmentation import distort, distort_images, mask_images
-from bevcli.training.clips import ClipConfig, draw_clips, draw_places
+from bevcli.training.clips import ClipConfig, draw_clips, draw_frames
 
 
 class Drives:
@@ -23,25 +23,25 @@ class Drives:
     def __len__(self) -> int:
         return self._count
 
-    def open(self, place: int) -> MemorySequence:
+    def open(self, index: int) -> MemorySequence:
         return self._sequence
 
 
 def drawn(sequence: MemorySequence, frames: int, times: int = 200) -> Counter[tuple[int, ...]]:
     random = np.random.default_rng(0)
-    return Counter(draw_places(sequence, frames, random) for _ in range(times))
+    return Counter(draw_frames(sequence, frames, random) for _ in range(times))
 
 
-def test_one_of_the_frames_before_is_left_out_and_the_order_kept() -> None:
-    expected = {(0, 1), (0, 2), (1, 2), (1, 3), (2, 3)}  # the start has one frame before it, the others two
+def test_one_earlier_frame_is_left_out_and_the_order_is_kept() -> None:
+    expected = {(0, 1), (0, 2), (1, 2), (1, 3), (2, 3)}  # frame 1 has one frame before it, the others two
     assert set(drawn(MemorySequence(4), frames=2)) == expected
     assert all(places[-1] - places[0] <= 3 for places in drawn(MemorySequence(10), frames=3))
 
 
-def test_clips_that_are_learned_from_as_a_whole_have_no_gap() -> None:
+def test_clips_trained_on_as_a_whole_have_no_gap() -> None:
     random = np.random.default_rng(0)
     config = ClipConfig(frames=3, batch=50, short_share=0.0, learn="all")
-    found = {clip.places for clip in draw_clips(Drives(MemorySequence(5)), config, random)}
+    found = {clip.frames for clip in draw_clips(Drives(MemorySequence(5)), config, random)}
     assert found == {(0, 1, 2), (1, 2, 3), (2, 3, 4)}
 
 
@@ -53,22 +53,22 @@ def test_a_clip_of_one_frame_has_no_history() -> None:
     assert set(drawn(MemorySequence(3), frames=1)) == {(0,), (1,), (2,)}
 
 
-def test_a_drive_too_short_for_a_clip_is_refused() -> None:
-    with pytest.raises(InputError, match="memory: no scene of it has the 4 frames of a clip"):
+def test_a_drive_too_short_for_a_clip_is_rejected() -> None:
+    with pytest.raises(InputError, match="memory: no scene has 4 frames or more"):
         drawn(MemorySequence(6, scenes="aaabbb"), frames=4)
 
 
-def test_the_clips_of_a_batch_are_of_one_length_and_some_batches_are_short() -> None:
+def test_the_clips_of_a_batch_have_the_same_length_and_some_batches_are_short() -> None:
     random, lengths = np.random.default_rng(0), Counter()
     for _ in range(300):
         clips = draw_clips(Drives(MemorySequence(8)), ClipConfig(frames=3, batch=4, short_share=0.3), random)
-        assert len({len(clip.places) for clip in clips}) == 1
-        lengths[len(clips[0].places)] += 1
+        assert len({len(clip.frames) for clip in clips}) == 1
+        lengths[len(clips[0].frames)] += 1
     assert set(lengths) == {1, 2, 3}
     assert lengths[3] / 300 == pytest.approx(0.7, abs=0.1)
 
 
-def test_images_are_left_alone_where_nothing_is_asked_for() -> None:
+def test_probability_zero_leaves_images_unchanged() -> None:
     frame, random = MemorySequence(1).load(0), np.random.default_rng(0)
     assert distort_images(frame, 0.0, random) is frame
     images = torch.ones(1, 2, 3, 8, 8)
@@ -76,7 +76,7 @@ def test_images_are_left_alone_where_nothing_is_asked_for() -> None:
     assert (images == 1).all()
 
 
-def test_distortion_changes_light_and_colour_and_repeats_with_its_seed() -> None:
+def test_distortion_changes_the_image_and_is_reproducible() -> None:
     pixels = np.full((4, 4, 3), (40, 90, 160), dtype=np.uint8)
     changed = distort(pixels, 1.0, np.random.default_rng(1))
     assert changed.dtype == np.uint8
@@ -84,7 +84,7 @@ def test_distortion_changes_light_and_colour_and_repeats_with_its_seed() -> None
     assert np.array_equal(changed, distort(pixels, 1.0, np.random.default_rng(1)))
 
 
-def test_half_of_the_rows_and_columns_of_the_grid_mask_cross() -> None:
+def test_the_grid_mask_covers_about_a_quarter() -> None:
     images = torch.ones(2, 6, 3, 64, 64)
     mask_images(images, 1.0, np.random.default_rng(0))
     covered = (images == 0).float().mean((-1, -2, -3))

@@ -1,4 +1,4 @@
-"""The dense loss: the cells near an object say its class and its box."""
+"""The dense loss: cells near an object are positives of its class and its box."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.training.dense_loss import DenseLossConfig, DenseReader, dense_loss
+from bevcli.training.dense_loss import DenseHead, DenseLossConfig, dense_loss
 from bevcli.training.detection_loss import DetectionLossConfig
 from bevcli.training.detection_targets import DetectionTargets
 
@@ -17,25 +17,23 @@ def code(x: float, y: float) -> list[float]:
     return [x, y, 0, 0, 0, 0, 0, 0, 0, 0]
 
 
-def reader_that_says_nothing() -> DenseReader:
-    reader = DenseReader(2, 3, GRID)
-    for parameter in reader.parameters():
+def zero_head() -> DenseHead:
+    head = DenseHead(2, 3, GRID)
+    for parameter in head.parameters():
         torch.nn.init.zeros_(parameter)
-    return reader
+    return head
 
 
-def test_the_cells_in_reach_answer_for_the_nearest_object() -> None:
+def test_cells_in_reach_are_positives_of_the_nearest_object() -> None:
     truth = DetectionTargets(torch.tensor([2, 0]), torch.tensor([code(1, 1), code(1.5, 3)]))
-    config, of_boxes = DenseLossConfig(weight=2.0, reach_m=1.0), DetectionLossConfig(box_weight=0.5)
-    loss = dense_loss(reader_that_says_nothing(), torch.zeros(1, 16, 2), [truth], config, of_boxes)
-    # Two cells are taught: that at (1, 1) without an error, that at (1, 3) half a metre off.
+    config, weights = DenseLossConfig(weight=2.0, reach_m=1.0), DetectionLossConfig(box_weight=0.5)
+    loss = dense_loss(zero_head(), torch.zeros(1, 16, 2), [truth], config, weights)
+    # Two cells are positives: (1, 1) without an error, (1, 3) with half a metre.
     assert loss.boxes.item() == pytest.approx(2.0 * 0.5 * 0.5 / 2)
 
 
-def test_a_frame_without_objects_teaches_that_there_are_none() -> None:
+def test_a_frame_without_objects_has_negatives_only() -> None:
     nothing = DetectionTargets(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 10))
-    loss = dense_loss(
-        reader_that_says_nothing(), torch.zeros(1, 16, 2), [nothing], DenseLossConfig(1.0), DetectionLossConfig()
-    )
+    loss = dense_loss(zero_head(), torch.zeros(1, 16, 2), [nothing], DenseLossConfig(1.0), DetectionLossConfig())
     assert loss.boxes.item() == 0
     assert loss.classes.item() > 0

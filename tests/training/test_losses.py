@@ -1,4 +1,4 @@
-"""Losses against numbers worked out by hand, and the matcher against every permutation."""
+"""Losses against values computed by hand, and the Hungarian matching against every permutation."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import torch
 
 from bevcli.training.detection_loss import DetectionLossConfig, detection_loss
 from bevcli.training.detection_targets import DetectionTargets
-from bevcli.training.dice_loss import dice_costs, dice_loss
 from bevcli.training.focal_loss import focal_cost, focal_loss
-from bevcli.training.matcher import match
+from bevcli.training.hungarian_matching import hungarian_matching
+from bevcli.training.segmentation_loss import dice_costs, dice_loss
 
 
 @pytest.mark.parametrize("shape", [(5, 3), (3, 5), (4, 4), (6, 1)])
 def test_no_permutation_is_cheaper_than_the_matching(shape: tuple[int, int]) -> None:
     costs = np.random.default_rng(sum(shape)).normal(size=shape)
-    pairs = match(torch.from_numpy(costs))
+    pairs = hungarian_matching(torch.from_numpy(costs))
     small, large = sorted(shape)
     wide = costs if shape[0] == small else costs.T
     cheapest = min(sum(wide[i, p] for i, p in enumerate(order)) for order in permutations(range(large), small))
@@ -28,12 +28,12 @@ def test_no_permutation_is_cheaper_than_the_matching(shape: tuple[int, int]) -> 
     assert len(set(queries)) == len(set(truths)) == small
 
 
-def test_nothing_to_match_gives_no_pair() -> None:
-    assert len(match(torch.zeros(4, 0)).queries) == 0
+def test_no_ground_truth_gives_no_pairs() -> None:
+    assert len(hungarian_matching(torch.zeros(4, 0)).queries) == 0
 
 
-def test_a_pair_of_no_finite_cost_is_the_last_choice() -> None:
-    pairs = match(torch.tensor([[float("nan"), 0.0], [1.0, 5.0]]))
+def test_a_pair_with_a_nan_cost_is_chosen_last() -> None:
+    pairs = hungarian_matching(torch.tensor([[float("nan"), 0.0], [1.0, 5.0]]))
     assert (pairs.queries.tolist(), pairs.truths.tolist()) == ([0, 1], [1, 0])
 
 
@@ -64,7 +64,7 @@ CONFIG = DetectionLossConfig()
 
 
 def test_detection_loss_by_hand() -> None:
-    """Two queries, one class, one box: the nearer query answers for it, the other is background."""
+    """Two queries, one class, one box: the nearer query is matched to it, the other is background."""
     codes = torch.tensor([[code(x=5.0), code(x=1.5, vx=3.0)]])[None]  # (1, 1, 2, 10)
     logits = torch.zeros(1, 1, 2, 1)  # p = 1/2 each
     loss = detection_loss(logits, codes, [targets(code(x=1.0))], CONFIG)
@@ -73,7 +73,7 @@ def test_detection_loss_by_hand() -> None:
     assert loss.total.item() == pytest.approx(loss.boxes.item() + loss.classes.item())
 
 
-def test_groups_of_queries_are_matched_each_for_itself() -> None:
+def test_query_groups_are_matched_independently() -> None:
     random = torch.Generator().manual_seed(0)
     logits, codes = (torch.randn(2, 1, 6, size, generator=random) for size in (3, 10))
     truth = [targets(code(x=1.0), code(x=-2.0), label=1)]
@@ -83,16 +83,16 @@ def test_groups_of_queries_are_matched_each_for_itself() -> None:
     assert together.item() == pytest.approx(sum(apart).item() / 2)
 
 
-def test_the_class_decides_between_queries_at_the_same_place() -> None:
+def test_of_two_queries_at_the_same_position_the_more_confident_is_matched() -> None:
     codes = torch.tensor([[code(0.0), code(0.0)]])[None]
     logits = torch.tensor([[[[-2.0], [2.0]]]])
-    sure = detection_loss(logits, codes, [targets(code(0.0))], CONFIG).classes.item()
+    loss = detection_loss(logits, codes, [targets(code(0.0))], CONFIG).classes.item()
     p = 1 / (1 + exp(-2))
     positive, negative = 0.25 * (1 - p) ** 2 * -log(p), 0.75 * (1 - p) ** 2 * -log(p)
-    assert sure == pytest.approx(2 * (positive + negative), rel=1e-4)
+    assert loss == pytest.approx(2 * (positive + negative), rel=1e-4)
 
 
-def test_losses_are_divided_by_the_boxes_of_the_batch() -> None:
+def test_losses_are_divided_by_the_number_of_boxes_in_the_batch() -> None:
     codes = torch.tensor([code(2.0)]).expand(1, 2, 1, 10)
     logits = torch.zeros(1, 2, 1, 1)
     one = detection_loss(logits[:, :1], codes[:, :1], [targets(code(0.0))], CONFIG)
@@ -108,7 +108,7 @@ def test_every_layer_adds_its_loss() -> None:
     assert thrice.total.item() == pytest.approx(3 * once.item())
 
 
-def test_a_box_of_unknown_velocity_counts_as_a_class_only() -> None:
+def test_a_box_of_unknown_velocity_contributes_to_the_class_loss_only() -> None:
     codes, logits = torch.tensor([[code(2.0)]])[None], torch.zeros(1, 1, 1, 1)
     loss = detection_loss(logits, codes, [targets(code(0.0, vx=float("nan")))], CONFIG)
     assert loss.boxes.item() == 0
@@ -116,14 +116,14 @@ def test_a_box_of_unknown_velocity_counts_as_a_class_only() -> None:
 
 
 @pytest.mark.parametrize(("true_speed", "weight"), [(0.4, 1.0), (4.0, 5.0)])
-def test_speeds_of_what_moves_can_count_more(true_speed: float, weight: float) -> None:
+def test_velocities_of_moving_objects_can_have_a_higher_weight(true_speed: float, weight: float) -> None:
     codes, logits = torch.tensor([[code(0.0)]])[None], torch.zeros(1, 1, 1, 1)
     config = DetectionLossConfig(velocity_weight=0.5, moving_weight=5.0)
     loss = detection_loss(logits, codes, [targets(code(0.0, vx=true_speed))], config)
     assert loss.boxes.item() == pytest.approx(0.25 * 0.5 * weight * true_speed)
 
 
-def test_a_frame_without_boxes_teaches_background() -> None:
+def test_without_boxes_every_query_is_background() -> None:
     loss = detection_loss(torch.zeros(1, 1, 3, 2), torch.zeros(1, 1, 3, 10), [targets()], CONFIG)
     assert loss.boxes.item() == 0
     assert loss.classes.item() == pytest.approx(2 * 6 * 0.75 / 4 * log(2))

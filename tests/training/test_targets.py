@@ -1,4 +1,4 @@
-"""What is taught of a frame: boxes in range, and masks laid out by hand."""
+"""Targets of a frame: boxes in range, and masks against masks made by hand."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def boxes(*rows: tuple[str, float, float, float], num_points: list[int] | None =
     )
 
 
-def test_boxes_out_of_range_unknown_or_unseen_are_not_taught(mini_config) -> None:
+def test_boxes_out_of_range_of_other_classes_or_without_points_are_no_targets(mini_config) -> None:
     config = replace(mini_config, classes=("car", "pedestrian"))
     truth = boxes(
         ("pedestrian", 1, 2, 0),
@@ -57,17 +57,18 @@ def test_a_vehicle_covers_the_cells_under_it() -> None:
     assert targets.locations.tolist() == [pytest.approx([9 / 16, 0.5, 2 / 16, 4 / 8])]
 
 
-def test_a_vehicle_smaller_than_a_cell_still_has_one() -> None:
+def test_a_vehicle_smaller_than_a_cell_covers_one() -> None:
     bicycle = replace(boxes(("bicycle", 0.2, 0.2, 0.3)), sizes_lwh=np.array([[0.5, 0.3, 1.0]]))
     targets = segmentation_targets(bicycle, None, GRID)
     assert targets.things.nonzero().tolist() == [[0, 2 * 8 + 4]]
 
 
-def test_the_map_is_looked_up_ahead_on_top() -> None:
-    cells = np.zeros((8, 16), dtype=np.uint8)  # of 1 m, rows from the largest y
-    cells[:2] = 1  # y 2 to 4: the grid's last row is road
-    cells[2, :2] = 4  # half of a cell's area would be two rows: this quarter of two cells is too little
-    cells[7, 15] = 2  # a lane boundary on a quarter of the cell at the largest x, smallest y
+def test_a_class_needs_a_minimum_share_of_a_cell() -> None:
+    cells = np.zeros((8, 16), dtype=np.uint8)  # cells of 1 m; the first row has the largest y
+    cells[:2] = 1  # y 2 to 4, the last row of the grid: all road
+    cells[2, :2] = 4  # a crossing on half of the cell at the smallest x, y 0 to 2
+    cells[4, :1] = 4  # a crossing on a quarter of the cell below: too little
+    cells[7, 15] = 2  # a lane boundary on a quarter of the cell at the largest x, smallest y; enough for lines
     stuff = segmentation_targets(Boxes3D.empty(), BevMap(cells, (-8, 8), (-4, 4)), GRID).stuff
     assert stuff is not None
     road, line, crossing = stuff.reshape(3, 4, 8)
@@ -77,6 +78,6 @@ def test_the_map_is_looked_up_ahead_on_top() -> None:
     assert crossing.nonzero().tolist() == [[2, 0]]
 
 
-def test_a_map_that_ends_within_the_grid_is_refused() -> None:
+def test_a_map_smaller_than_the_grid_is_rejected() -> None:
     with pytest.raises(InputError, match="covers x -6 to 6 m, but the model's BEV grid -8 to 8 m"):
         segmentation_targets(Boxes3D.empty(), BevMap(np.zeros((4, 4), np.uint8), (-6, 6), (-4, 4)), GRID)

@@ -1,32 +1,64 @@
-"""docs/training.md names every key of the [training] table, with its default."""
+"""docs/training.md lists every key of the [training] table with its default; links of the training pages work."""
 
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Iterator
+from fractions import Fraction
 from pathlib import Path
 
+import pytest
+
 import bevcli
-from bevcli.training.trainer import TrainingConfig
+from bevcli.training.job import TrainingConfig
 
-DOCUMENT = Path(bevcli.__file__).parents[1] / "docs" / "training.md"
+DOCS = Path(bevcli.__file__).parents[1] / "docs"
 
 
-def keys(config: object) -> Iterator[tuple[str, object]]:
+def defaults(config: object, table: str = "") -> Iterator[tuple[str, object]]:
+    """Key, with the names of its tables, and default value."""
     for field in dataclasses.fields(config):  # type: ignore[arg-type]
         value = getattr(config, field.name)
         if dataclasses.is_dataclass(value):
-            yield from keys(value)
+            yield from defaults(value, f"{table}{field.name}.")
         else:
-            yield field.name, value
+            yield f"{table}{field.name}", value
 
 
-def test_every_key_and_its_default_stand_in_the_table() -> None:
-    rows = [line for line in DOCUMENT.read_text().splitlines() if line.startswith("|")]
-    for name, value in keys(TrainingConfig()):
-        said = [row for row in rows if f"{name}`" in row]
-        assert len(said) >= 1, name
-        text = {0.001: "1e-3", 2e-4: "2e-4", 1 / 3: "1/3"}.get(
-            value, f"{value:g}" if type(value) is float else str(value)
-        )
-        assert any(text.lower() in row.lower() for row in said), (name, text)
+def documented() -> Iterator[tuple[str, object]]:
+    """Key and default value of each entry of the document's table. A key ".name" is in the table of the key before."""
+    section = (DOCS / "training.md").read_text().partition("## The `[training]` table")[2].partition("\n## ")[0]
+    for row in re.findall(r"^\| (`.*?) \| (.*?) \|", section, flags=re.MULTILINE):
+        table = ""
+        for key, value in zip(row[0].split(", "), row[1].split(", "), strict=True):
+            name = key.strip("`")
+            name = table + name if name.startswith(".") else name
+            table = name.rpartition(".")[0]
+            yield name, parsed(value)
+
+
+def parsed(value: str) -> object:
+    if value.startswith('"'):
+        return value.strip('"')
+    if value in ("true", "false"):
+        return value == "true"
+    return float(Fraction(value))
+
+
+def test_the_table_lists_every_key_with_its_default() -> None:
+    expected = {
+        key: float(value) if type(value) in (int, float) else value for key, value in defaults(TrainingConfig())
+    }
+    assert dict(documented()) == expected
+
+
+@pytest.mark.parametrize("page", ["training.md", "model-card.md", "history.md", "speed.md"])
+def test_links_lead_to_files_and_headings(page: str) -> None:
+    for target in re.findall(r"\]\((?!http)([^)]+)\)", (DOCS / page).read_text()):
+        file, _, anchor = target.partition("#")
+        path = DOCS / (file or page)
+        assert path.is_file(), target
+        headings = re.findall(r"^#+ (.*)$", path.read_text(), flags=re.MULTILINE) if path.suffix == ".md" else []
+        anchors = {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+        assert not anchor or anchor in anchors, target

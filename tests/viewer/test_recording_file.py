@@ -1,11 +1,11 @@
-"""Recordings that were cut off are mended; files that are none get one line."""
+"""A recording that was cut off is repaired; a file that is not a recording is an error of one line."""
 
 import pytest
 from memory_drive import MemorySequence
 from recorded_drive import record
 
 from bevcli.errors import InputError
-from bevcli.viewer.recording_file import whole_recording
+from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.recording_reader import RecordingReader
 
 
@@ -16,41 +16,41 @@ def recording(tmp_path_factory):
     return path
 
 
-def test_a_whole_recording_is_taken_as_it_is(recording):
-    with whole_recording(recording) as whole:
-        assert (whole.path, whole.mended) == (recording, False)
+def test_a_complete_recording_is_read_from_its_own_file(recording):
+    with open_recording(recording) as file:
+        assert (file.path, file.repaired) == (recording, False)
 
 
 @pytest.mark.parametrize("share", [0.5, 0.75, 0.98])
-def test_a_recording_cut_anywhere_opens_with_what_it_has(recording, tmp_path, share):
+def test_a_recording_cut_anywhere_keeps_its_first_frames(recording, tmp_path, share):
     content = recording.read_bytes()
     cut = tmp_path / "cut.rrd"
     cut.write_bytes(content[: int(share * len(content))])
-    with whole_recording(cut) as whole:
-        assert whole.mended
-        frames = [frame.index for frame in RecordingReader(whole.path).frames()]
-        copy = whole.path
+    with open_recording(cut) as file:
+        assert file.repaired
+        frames = [frame.index for frame in RecordingReader(file.path).frames()]
+        copy = file.path
     assert frames == list(range(len(frames)))
     assert 1 <= len(frames) <= 3
     assert not copy.exists()
-    assert len(cut.read_bytes()) == int(share * len(content))  # the user's file is left alone
+    assert len(cut.read_bytes()) == int(share * len(content))  # the user's file is unchanged
 
 
 @pytest.mark.parametrize(
-    ("content", "complaint"),
-    [(b"no recording at all", "no recording"), (b"", "empty"), (b"RRF2\0\x29\0\0", "cut off before its first frame")],
+    ("content", "message"),
+    [(b"some other file", "is not a recording"), (b"", "empty"), (b"RRF2\0\x29\0\0", "cut off before its first frame")],
 )
-def test_a_file_that_is_no_recording_gets_one_line(tmp_path, content, complaint):
+def test_a_file_that_is_not_a_recording_is_an_error_of_one_line(tmp_path, content, message):
     path = tmp_path / "x.rrd"
     path.write_bytes(content)
-    with pytest.raises(InputError, match=complaint) as caught, whole_recording(path):
+    with pytest.raises(InputError, match=message) as caught, open_recording(path):
         pass
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_file_and_a_folder_are_said(tmp_path):
-    with pytest.raises(InputError, match="missing"), whole_recording(tmp_path / "none.rrd"):
+def test_a_missing_file_and_a_folder_are_errors(tmp_path):
+    with pytest.raises(InputError, match="no such recording"), open_recording(tmp_path / "none.rrd"):
         pass
-    with pytest.raises(InputError, match="folder"), whole_recording(tmp_path):
+    with pytest.raises(InputError, match="folder"), open_recording(tmp_path):
         pass

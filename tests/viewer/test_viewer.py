@@ -1,4 +1,4 @@
-"""The native viewer, really opened without a screen; and a live view that cannot hold up a run."""
+"""The native viewer without a screen; and a live view that cannot slow a run down."""
 
 import os
 import signal
@@ -10,11 +10,9 @@ import cv2
 import numpy as np
 import pytest
 from memory_drive import MemorySequence
-from recorded_drive import predict, record
+from recorded_drive import NamedModel, predict, record
 
 from bevcli.errors import InputError, OutputError
-from bevcli.geometry.boxes import CLASSES
-from bevcli.recording.options import RecordingOptions
 from bevcli.recording.writer import Recording
 from bevcli.viewer import live
 from bevcli.viewer.native import LOOPBACK, free_port, start_viewer, stop
@@ -22,7 +20,7 @@ from bevcli.viewer.recording_reader import RecordingReader
 from bevcli.viewer.screenshot import NO_DRIVER, take_screenshot
 
 VIEWS = {
-    "3D scene", "BEV", "BEV features", "From history", "Seconds per stage", "Boxes per class", "Events", "About",
+    "3D scene", "BEV", "BEV features", "History weight", "Seconds per stage", "Boxes per class", "Events", "About",
     "CAM_FRONT", "CAM_FRONT_LEFT", "CAM_FRONT_RIGHT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT",
 }  # fmt: skip
 
@@ -55,13 +53,13 @@ def test_the_viewer_shows_every_view(screenshot):
 
 
 @pytest.mark.slow
-def test_a_frame_that_is_not_there_is_a_users_mistake(screenshot):
+def test_a_screenshot_of_a_missing_frame_is_an_error(screenshot):
     *_, folder = screenshot
     with pytest.raises(InputError, match="frames 0 to 2"):
         take_screenshot(folder / "recording.rrd", folder / "other.png", 7)
 
 
-def test_a_port_in_use_is_passed_over():
+def test_a_port_in_use_is_not_free():
     with socket.socket() as taken:
         taken.bind((LOOPBACK, 0))
         taken.listen()
@@ -71,30 +69,27 @@ def test_a_port_in_use_is_passed_over():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fate", [signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM])
-def test_a_viewer_that_dies_or_hangs_costs_the_run_nothing(tmp_path, monkeypatch, fate):
+def test_a_viewer_that_dies_or_hangs_does_not_disturb_the_run(tmp_path, monkeypatch, fate):
     viewers: list[subprocess.Popen] = []
 
-    def open_without_a_screen(view: live.LiveView) -> None:
+    def open_headless(view: live.LiveView) -> None:
         port = str(free_port())
         arguments = ("--headless", "--bind", LOOPBACK, "--port", port, "--connect", view.stream_address)
         viewers.append(start_viewer(*arguments))
-        time.sleep(3)  # until it follows
+        time.sleep(3)  # until it is connected
 
-    monkeypatch.setattr(live.LiveView, "open", open_without_a_screen)
+    monkeypatch.setattr(live.LiveView, "open", open_headless)
     drive = MemorySequence(8)
-    options = RecordingOptions(live=True)
     path = tmp_path / "recording.rrd"
     try:
-        with Recording(
-            path, rig=drive.rig, class_names=CLASSES, title="", untrained=False, options=options
-        ) as recording:
+        with Recording(path, drive, NamedModel(), live=live.LiveView()) as recording:
             for place in range(8):
                 if place == 3:
                     os.kill(viewers[0].pid, fate)
                 frame = drive.load(place)
-                recording.log(frame, predict(frame))  # would raise, or not return, if the viewer mattered
+                recording.log(frame, predict(frame))  # must return, and not raise
     finally:
         os.kill(viewers[0].pid, signal.SIGCONT) if viewers[0].poll() is None else None
         stop(viewers[0])
     assert [frame.index for frame in RecordingReader(path).frames()] == list(range(8))
-    assert path.read_bytes()[-12:-4] == b"RRF2FOOT"  # whole, to its end
+    assert path.read_bytes()[-12:-4] == b"RRF2FOOT"  # complete

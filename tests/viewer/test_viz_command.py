@@ -1,4 +1,4 @@
-"""`bevcli viz`: what it prints and writes, without a viewer."""
+"""`bevcli viz`: its output and files, without a viewer."""
 
 import csv
 import json
@@ -28,10 +28,10 @@ def viz(*arguments) -> str:
     return result.output
 
 
-def test_the_summary_counts(drive):
+def test_the_summary_counts_frames_boxes_and_bytes(drive):
     _, path = drive
     summary = summarise(path)
-    assert (summary.frames, summary.title, summary.untrained) == (3, "test drive", False)
+    assert (summary.frames, summary.title, summary.untrained) == (3, "memory · tiny", False)
     assert summary.boxes == {"car": 3, "pedestrian": 3}
     assert summary.timestamps_ns[-1] - summary.timestamps_ns[0] == 10**9
     assert summary.file_bytes == path.stat().st_size
@@ -42,7 +42,7 @@ def test_the_summary_counts(drive):
     assert "3 pedestrian" in text
 
 
-def test_the_table_has_the_boxes_in_the_world(drive, tmp_path):
+def test_the_table_has_the_shown_boxes_in_the_world_frame(drive, tmp_path):
     frames, path = drive
     viz(path, "--export", tmp_path / "boxes.csv")
     with (tmp_path / "boxes.csv").open() as file:
@@ -56,7 +56,7 @@ def test_the_table_has_the_boxes_in_the_world(drive, tmp_path):
         assert float(row["score"]) == pytest.approx(0.9)
 
 
-def test_the_boxes_file_says_the_same(drive, tmp_path):
+def test_the_boxes_file_has_the_shown_boxes(drive, tmp_path):
     frames, path = drive
     viz(path, "--export", tmp_path / "boxes.json")
     content = json.loads((tmp_path / "boxes.json").read_text())
@@ -87,7 +87,7 @@ def test_a_cut_off_recording_is_shown_with_a_note(drive, tmp_path):
     cut = tmp_path / "cut.rrd"
     cut.write_bytes(path.read_bytes()[:-5000])
     text = viz(cut, "--summary")
-    assert text.startswith(f"note: {cut} has no end")
+    assert text.startswith(f"note: {cut} is incomplete")
 
 
 def test_unknown_endings_are_refused(drive, tmp_path):
@@ -97,6 +97,6 @@ def test_unknown_endings_are_refused(drive, tmp_path):
             viz(path, option, tmp_path / "x.avi")
 
 
-def test_a_frame_without_an_image_to_draw_is_a_mistake_in_usage(drive):
+def test_a_frame_without_a_screenshot_is_a_usage_error(drive):
     result = CliRunner().invoke(app, ["viz", str(drive[1]), "--frame", "1"])
     assert result.exit_code == 2

@@ -1,4 +1,4 @@
-"""The web viewer's server: loopback, one origin, any free port; and in a real browser."""
+"""The web viewer's server: loopback only, one origin, any free port; and in a real browser."""
 
 import os
 import re
@@ -40,7 +40,7 @@ def viewer(tmp_path):
     assert not thread.is_alive()
 
 
-def test_the_bare_address_leads_to_the_viewer_with_the_recording(viewer):
+def test_the_root_redirects_to_the_viewer_with_the_recording(viewer):
     with urllib.request.urlopen(viewer.address + "/?renderer=webgl") as answer:
         query = parse_qs(urlsplit(answer.url).query)
         assert answer.read() == PAGE["/"]
@@ -49,7 +49,7 @@ def test_the_bare_address_leads_to_the_viewer_with_the_recording(viewer):
         assert answer.read() == b"RRF2 and so on"
 
 
-def test_the_page_may_talk_to_nobody_else(viewer):
+def test_the_page_may_connect_to_its_own_origin_only(viewer):
     with urllib.request.urlopen(viewer.address + "/?url=x") as answer:
         assert answer.headers["Content-Security-Policy"] == "connect-src 'self' blob: data:"
 
@@ -57,9 +57,9 @@ def test_the_page_may_talk_to_nobody_else(viewer):
 def test_only_loopback_can_reach_it(viewer):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            probe.connect(("192.0.2.1", 9))  # sends nothing: asks which address of ours would
+            probe.connect(("192.0.2.1", 9))  # sends nothing; finds the address of this machine
         except OSError:
-            pytest.skip("this machine has no address but loopback")
+            pytest.skip("this machine has no other address than loopback")
         own = probe.getsockname()[0]
     with pytest.raises(OSError), socket.create_connection((own, viewer.port), timeout=2):
         pass
@@ -70,13 +70,13 @@ def test_other_paths_are_not_served(viewer):
         urllib.request.urlopen(viewer.address + "/etc/passwd")
 
 
-def test_a_port_in_use_is_no_problem(viewer, tmp_path):
+def test_a_port_in_use_is_replaced_by_another(viewer, tmp_path):
     second = WebViewer(PAGE, tmp_path / "recording.rrd", port=viewer.port)
     assert second.port != viewer.port
     second._server.server_close()
 
 
-def test_the_assets_are_the_viewers(viewer):
+def test_the_assets_are_the_files_of_the_viewer(viewer):
     assets = web_viewer_assets()
     assert assets["/re_viewer_bg.wasm"].startswith(b"\0asm")
     assert b"the_canvas_id" in assets["/"]
@@ -103,16 +103,16 @@ def test_a_browser_shows_the_recording(tmp_path):
         with playwright.sync_playwright() as driver:
             browser = driver.chromium.launch(executable_path=CHROMIUM, args=WITHOUT_A_GPU.split())
             page = browser.new_page(viewport={"width": 1280, "height": 800})
-            asked: list[str] = []
-            page.on("request", lambda request: asked.append(request.url))
+            requested: list[str] = []
+            page.on("request", lambda request: requested.append(request.url))
             page.goto(f"{address}/?renderer=webgl")
             image = wait_for_image(page)
             browser.close()
         assert looks_like_views(image)
-        assert {urlsplit(url).netloc for url in asked if url.startswith("http")} == {urlsplit(address).netloc}
+        assert {urlsplit(url).netloc for url in requested if url.startswith("http")} == {urlsplit(address).netloc}
         before = processor_seconds(server)
         time.sleep(3)
-        assert processor_seconds(server) - before < 0.1  # nobody watches: it idles
+        assert processor_seconds(server) - before < 0.1  # no page is open: the server is idle
     finally:
         server.send_signal(signal.SIGINT)
     assert server.wait(10) == 130
@@ -130,7 +130,7 @@ def wait_for_image(page, seconds: float = 90) -> np.ndarray:
 
 
 def looks_like_views(image: np.ndarray) -> bool:
-    """The cameras' noise above and below, and the BEV view's blue vehicle between them."""
+    """Whether the image has noise (the camera images) above and below, and the BEV view's blue vehicle between them."""
     height = len(image)
     above, middle, below = image[: height // 4], image[height // 4 : 3 * height // 4], image[3 * height // 4 :]
     vehicle = (np.abs(middle.astype(int) - [250, 200, 90]).sum(-1) < 40).sum()

@@ -1,4 +1,4 @@
-"""Boxes as JSON objects, one a box, and back to columns; a frame's boxes are checked together, so it is fast."""
+"""Conversion between Boxes3D and JSON, one object per box. All boxes of a frame are checked at once, for speed."""
 
 from __future__ import annotations
 
@@ -23,9 +23,10 @@ _UNKNOWN_VELOCITY = [None, None]
 
 
 def boxes_from_json(objects: Any, where: str) -> Boxes3D:
-    """Read a list of N box objects; a velocity that is missing or null becomes NaN.
+    """N boxes from a list of N JSON objects. A missing or null velocity becomes NaN.
 
-    where: what stands before the message ("boxes.json: frame 3"). Raises InputError naming the first wrong box.
+    where: start of an error message, such as "boxes.json: frame 3".
+    Raises InputError that names the first invalid box by its index in the list.
     """
     if not isinstance(objects, list):
         raise InputError(f'{where}: "boxes" must be a list, found {objects!r:.40}')
@@ -48,14 +49,14 @@ def boxes_from_json(objects: Any, where: str) -> Boxes3D:
     )
     for key, column in (("center", boxes.centers), ("size_lwh", boxes.sizes_lwh), ("yaw", boxes.yaws)):
         _require(np.isfinite(column), column, f"{where}: box", key, "finite numbers")
-    _require(boxes.sizes_lwh > 0, boxes.sizes_lwh, f"{where}: box", "size_lwh", "lengths above 0")
+    _require(boxes.sizes_lwh > 0, boxes.sizes_lwh, f"{where}: box", "size_lwh", "numbers above 0")
     return boxes
 
 
 def boxes_to_json(boxes: Boxes3D) -> list[dict[str, Any]]:
-    """N box objects; what is unknown (NaN visibility, "" names, -1 points) is left out, NaN velocities are null.
+    """N JSON objects. Unknown values (NaN visibility, "" names, -1 points) are left out; NaN velocities become null.
 
-    "duplicate" stands only where it is true.
+    "duplicate" is written only where it is true.
     """
     velocities = [[None if math.isnan(v) else v for v in row] for row in boxes.velocities.tolist()]
     columns: dict[str, list[Any]] = {
@@ -92,7 +93,7 @@ def _check_keys(objects: Sequence[Any], where: str) -> None:
         for key in ("class", "center", "size_lwh", "yaw"):
             if key not in box:
                 raise InputError(f'{where}: box {place}: "{key}" is missing (found: {", ".join(box)})')
-        if box["class"] not in CLASSES:  # a tuple, because a list or object is found here too and has no hash
+        if box["class"] not in CLASSES:  # `in` a tuple, because an invalid class may be a list, which has no hash
             raise InputError(
                 f"{where}: box {place}: unknown class {box['class']!r:.40} (expected one of {', '.join(CLASSES)})"
             )
@@ -102,7 +103,7 @@ def _check_keys(objects: Sequence[Any], where: str) -> None:
 
 
 def _numbers(values: list[Any], width: int, where: str, key: str) -> Array:
-    """(N, width), or (N,) for width 1; where null is allowed it is NaN already."""
+    """(N, width) float64, or (N,) for width 1. The caller has replaced allowed nulls by NaN."""
     shape = (len(values),) if width == 1 else (len(values), width)
     try:
         array = np.asarray(values)
@@ -177,7 +178,7 @@ def _num_points(objects: Sequence[dict[str, Any]], where: str) -> NDArray[np.int
     values = [box.get("num_points", -1) for box in objects]
     for place, value in enumerate(values):
         if type(value) is not int or ("num_points" in objects[place] and value < 0):
-            raise InputError(f"{where}: box {place}: num_points: expected an integer from 0 up, found {value!r:.40}")
+            raise InputError(f"{where}: box {place}: num_points: expected an integer, 0 or more, found {value!r:.40}")
     return np.array(values, dtype=np.int64)
 
 
@@ -187,5 +188,5 @@ def _names(objects: Sequence[dict[str, Any]], key: str, where: str) -> NDArray[n
     values = [box.get(key) or "" for box in objects]
     for place, value in enumerate(values):
         if not isinstance(value, str):
-            raise InputError(f"{where}: box {place}: {key}: expected a text, found {value!r:.40}")
+            raise InputError(f"{where}: box {place}: {key}: expected a string, found {value!r:.40}")
     return np.array(values)

@@ -1,11 +1,12 @@
-"""ground_truth.json and predictions.json ("bevcli-boxes/1"): boxes by frame, read whole and written frame by frame."""
+"""ground_truth.json and predictions.json ("bevcli-boxes/1"): boxes by frame.
+
+A file is read as a whole and written frame by frame.
+"""
 
 from __future__ import annotations
 
-import gc
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
@@ -16,8 +17,9 @@ from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
 from bevcli.sequences.files.box_json import boxes_from_json, boxes_to_json
-from bevcli.sequences.files.growing_json import GrowingJson
-from bevcli.sequences.files.pose_json import pose_from_json, pose_to_json
+from bevcli.sequences.files.incremental_json import IncrementalJson
+from bevcli.sequences.files.transform_json import pose_from_json, pose_to_json
+from bevcli.sequences.garbage_collection import without_garbage_collection
 
 FORMAT = "bevcli-boxes/1"
 FRAMES_OF_REFERENCE = ("world", "ego", "bev")
@@ -27,10 +29,13 @@ _FRAME_KEYS = ("frame", "scene", "timestamp_ns", "world_from_ego", "boxes")
 
 @dataclass(frozen=True)
 class FrameBoxes:
-    """One frame's boxes, in the frame of reference of the file that holds it.
+    """One frame's boxes, in the frame of reference of its file.
 
-    world_from_ego: at the frame's time; None where it is not known (then the frame of reference is not world).
-    extras: whatever else is said of the frame, such as "skipped" or "sample_token".
+    Attributes:
+        stamp: index, scene and time of the frame.
+        world_from_ego: pose at the frame's time. None if unknown, which is not allowed in a file in the world frame.
+        boxes: N boxes, metres.
+        extras: further members of the frame's JSON object, such as "skipped" or "sample_token".
     """
 
     stamp: FrameStamp
@@ -43,8 +48,11 @@ class FrameBoxes:
 class BoxesFile:
     """All frames of a file, in its order.
 
-    frame_of_reference: "world", "ego" or "bev", of every centre, yaw and velocity. ego_from_bev: where it is known.
-    extras: whatever else is said of all frames, such as "model" or "untrained".
+    Attributes:
+        frame_of_reference: "world", "ego" or "bev"; all centres, yaws and velocities are in it.
+        frames: the frames.
+        ego_from_bev: pose of the bev frame, None if unknown.
+        extras: further members of the file's JSON object, such as "model" or "untrained".
     """
 
     frame_of_reference: str
@@ -56,10 +64,10 @@ class BoxesFile:
 def read_boxes(path: Path) -> BoxesFile:
     """Read a boxes file.
 
-    Raises InputError, one line that names the file, the frame and the box, where the file is missing or no JSON,
-    is of another format, lacks a key, has a number that is none, an unknown class, or one moment of a scene twice.
+    Raises InputError if the file is missing, not JSON or of another format, or has a missing key, an invalid value,
+    an unknown class, or two frames of a scene with the same time. The message names the file, the frame and the box.
     """
-    with _without_garbage_collection():
+    with without_garbage_collection():
         content = _load(path)
         frame_of_reference = content.get("frame_of_reference")
         if frame_of_reference not in FRAMES_OF_REFERENCE:
@@ -67,7 +75,7 @@ def read_boxes(path: Path) -> BoxesFile:
                 f'{path}: "frame_of_reference" must be world, ego or bev, found {frame_of_reference!r:.40}'
             )
         if not isinstance(content.get("frames"), list):
-            raise InputError(f'{path}: "frames" is missing or no list (expected one object a frame)')
+            raise InputError(f'{path}: "frames" is missing or not a list (expected one object per frame)')
         rows = content["frames"]
         frames = tuple(_frame(path, place, row, frame_of_reference) for place, row in enumerate(rows))
     _check_unique(path, frames)
@@ -81,7 +89,7 @@ def read_boxes(path: Path) -> BoxesFile:
 
 
 def above_score(boxes: BoxesFile, score: float) -> BoxesFile:
-    """The boxes with at least this score; those without any score stay."""
+    """The boxes with at least this score. Frames without scores keep all boxes."""
 
     def kept(frame: FrameBoxes) -> FrameBoxes:
         scores = frame.boxes.scores
@@ -91,10 +99,13 @@ def above_score(boxes: BoxesFile, score: float) -> BoxesFile:
 
 
 class BoxesWriter:
-    """`with BoxesWriter(path, "world", {"model": "tiny"}) as writer: writer.write(frame_boxes)`.
+    """Writes a boxes file frame by frame.
 
-    The file is whole, valid JSON after every frame: a run that is killed leaves the frames it has done.
-    Nothing is kept in memory. Raises OutputError where the file cannot be written.
+    The file is valid JSON after every frame, so an interrupted run leaves its finished frames. Boxes are not kept in
+    memory. Raises OutputError if the file cannot be written.
+
+        with BoxesWriter(path, "world", {"model": "tiny"}) as writer:
+            writer.write(frame_boxes)
     """
 
     def __init__(
@@ -108,10 +119,10 @@ class BoxesWriter:
         head: dict[str, Any] = {"format": FORMAT, "frame_of_reference": frame_of_reference, **(extras or {})}
         if ego_from_bev is not None:
             head["ego_from_bev"] = pose_to_json(ego_from_bev)
-        self._file = GrowingJson(path, json.dumps(head)[:-1] + ', "frames": [', "]}")
+        self._file = IncrementalJson(path, json.dumps(head)[:-1] + ', "frames": [', "]}")
 
     def write(self, frame: FrameBoxes) -> None:
-        """Append a frame, its boxes in the file's frame of reference."""
+        """Append a frame. Its boxes must be in the file's frame of reference."""
         row: dict[str, Any] = {
             "frame": frame.stamp.index,
             "scene": frame.stamp.scene,
@@ -132,30 +143,18 @@ class BoxesWriter:
         self._file.close()
 
 
-@contextmanager
-def _without_garbage_collection() -> Iterator[None]:
-    # Millions of small JSON objects make the collector walk them over and over: twice the time for nothing.
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
-
-
 def _load(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_bytes())
     except FileNotFoundError:
-        raise InputError(f"{path}: the file is missing (expected boxes, {FORMAT})") from None
+        raise InputError(f'{path}: the file is missing (expected a boxes file, "format": "{FORMAT}")') from None
     except json.JSONDecodeError as error:
         raise InputError(f"{path}: broken JSON at line {error.lineno}, column {error.colno}: {error.msg}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read as JSON ({error})") from None
     found = content.get("format") if isinstance(content, dict) else type(content).__name__
     if found != FORMAT:
-        raise InputError(f'{path}: not a boxes file: "format" must be "{FORMAT}", found {found!r:.40}')
+        raise InputError(f'{path}: is not a boxes file: "format" must be "{FORMAT}", found {found!r:.40}')
     return content
 
 
@@ -167,12 +166,12 @@ def _frame(path: Path, place: int, row: Any, frame_of_reference: str) -> FrameBo
     where = f"{path}: frame {index}"
     scene = row.get("scene", "")
     if not isinstance(scene, str):
-        raise InputError(f"{where}: scene: expected a text, found {scene!r:.40}")
+        raise InputError(f"{where}: scene: expected a string, found {scene!r:.40}")
     if "boxes" not in row:
-        raise InputError(f'{where}: "boxes" is missing (a frame without boxes has an empty list)')
+        raise InputError(f'{where}: "boxes" is missing (expected a list, empty for a frame without boxes)')
     stated = row.get("world_from_ego")
     if stated is None and frame_of_reference == "world":
-        raise InputError(f'{where}: "world_from_ego" is missing (expected, because frame_of_reference is world)')
+        raise InputError(f'{where}: "world_from_ego" is missing (required if "frame_of_reference" is "world")')
     return FrameBoxes(
         FrameStamp(index, scene, timestamp_ns),
         None if stated is None else pose_from_json(stated, "world_from_ego", where),
@@ -197,5 +196,7 @@ def _check_unique(path: Path, frames: tuple[FrameBoxes, ...]) -> None:
     for frame in frames:
         moment = (frame.stamp.scene, frame.stamp.timestamp_ns)
         if moment in seen:
-            raise InputError(f'{path}: frame {frame.stamp.index}: scene "{moment[0]}" has {moment[1]} ns twice')
+            raise InputError(
+                f'{path}: frame {frame.stamp.index}: scene "{moment[0]}" has two frames at {moment[1]} ns: remove one'
+            )
         seen.add(moment)

@@ -1,4 +1,4 @@
-"""Strict CSV reading: a header of known columns, rows of the same length, and errors that name line and column."""
+"""Strict CSV reading: known columns, rows of equal length, and error messages that name line and column."""
 
 from __future__ import annotations
 
@@ -13,33 +13,39 @@ from bevcli.errors import InputError
 
 @dataclass(frozen=True)
 class CsvRow:
-    """One row: where it stands, and its cells by column, stripped."""
+    """One row of a CSV file.
+
+    Attributes:
+        path: the file.
+        line: the row's line number in the file, from 1.
+        cells: text by column, without surrounding spaces.
+    """
 
     path: Path
     line: int
     cells: dict[str, str]
 
     def error(self, column: str, what: str) -> InputError:
-        """A mistake in this row's cell, to be raised."""
+        """The error to raise for a mistake in this row."""
         return InputError(f"{self.path}: line {self.line}, column {column}: {what}")
 
     def integer(self, column: str) -> int:
-        """The cell as an integer of any size. Raises InputError otherwise."""
+        """The cell as an integer of any size. Raises InputError if it is not one."""
         text = self.cells[column]
         digits = text.removeprefix("-")
         if not (digits.isascii() and digits.isdigit()):
-            raise self.error(column, f'expected an integer, found "{text}": write it without point or exponent')
+            raise self.error(column, f'expected an integer, found "{text}": remove decimal point and exponent')
         return int(text)
 
     def number(self, column: str) -> float:
-        """The cell as a finite number. Raises InputError otherwise."""
+        """The cell as a finite number. Raises InputError if it is not one."""
         text = self.cells[column]
         try:
             value = float(text)
         except ValueError:
             raise self.error(column, f'expected a number, found "{text}"') from None
         if not math.isfinite(value):
-            raise self.error(column, f'expected a finite number, found "{text}": remove or mend the row')
+            raise self.error(column, f'expected a finite number, found "{text}": correct or remove the row')
         return value
 
 
@@ -53,10 +59,10 @@ class CsvTable:
 
 
 def read_csv(path: Path, required: Iterable[str], optional: Iterable[str] = ()) -> CsvTable:
-    """Read a CSV file with a header (UTF-8, commas).
+    """Read a CSV file with a header (UTF-8, separated by commas).
 
-    Raises InputError where the file is missing or no text, a required column is missing, a column is unknown or
-    twice there, a row has another number of cells than the header, or no row follows.
+    Raises InputError if the file cannot be read, a required column is missing, a column is unknown or repeated, a row
+    has another number of cells than the header, or there are no rows.
     """
     required = tuple(required)
     lines = _lines(path)
@@ -66,7 +72,7 @@ def read_csv(path: Path, required: Iterable[str], optional: Iterable[str] = ()) 
     _check_columns(path, columns, required, tuple(optional))
     rows = tuple(_row(path, columns, line, cells) for line, cells in lines[1:])
     if not rows:
-        raise InputError(f"{path}: no rows below the header (expected at least one)")
+        raise InputError(f"{path}: the table has no rows below the header (expected at least one)")
     return CsvTable(path, columns, rows)
 
 
@@ -92,7 +98,7 @@ def _check_columns(path: Path, columns: tuple[str, ...], required: tuple[str, ..
         raise InputError(f'{path}: unknown column "{unknown[0]}" (known: {", ".join((*required, *optional))})')
     twice = [name for name in columns if columns.count(name) > 1]
     if twice:
-        raise InputError(f'{path}: column "{twice[0]}" stands twice in the header')
+        raise InputError(f'{path}: column "{twice[0]}" appears twice in the header')
 
 
 def _row(path: Path, columns: tuple[str, ...], line: int, cells: list[str]) -> CsvRow:

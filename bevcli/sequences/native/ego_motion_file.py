@@ -1,4 +1,4 @@
-"""ego_motion.csv: where the vehicle was, as rows of world_from_ego, with what its sensors said."""
+"""ego_motion.csv: rows of world_from_ego, optionally with acceleration, angular rate and velocity."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ QUATERNION = ("qw", "qx", "qy", "qz")
 ACCELERATION = ("ax", "ay", "az")
 ANGULAR_RATE = ("wx", "wy", "wz")
 VELOCITY = ("vx", "vy", "vz")
-NORM_TOLERANCE = 1e-3  # how far a quaternion's norm may be from 1 before it is taken for a mistake
+NORM_TOLERANCE = 1e-3  # largest deviation of a quaternion's norm from 1
 
 
 def read_ego_motion(path: Path) -> EgoMotion:
-    """Read world_from_ego at T times; accelerations, angular rates and velocities that are not there are derived.
+    """Read world_from_ego at T times. Missing kinematics are derived from the poses.
 
-    Raises InputError where a column or cell is wrong, times do not increase, or a quaternion is no rotation.
+    Raises InputError for an invalid column or cell, times that do not increase, or a quaternion without norm 1.
     """
     required = ("timestamp_ns", *TRANSLATION, *QUATERNION)
     table = read_csv(path, required, (*ACCELERATION, *ANGULAR_RATE, *VELOCITY))
@@ -38,7 +38,7 @@ def read_ego_motion(path: Path) -> EgoMotion:
 
 
 def write_ego_motion(path: Path, ego_motion: EgoMotion) -> None:
-    """Write all columns, so that `read_ego_motion` gives the same numbers back."""
+    """Write all columns, so that `read_ego_motion` returns the same numbers."""
     columns = (
         ego_motion.translations,
         ego_motion.quaternions,
@@ -58,7 +58,7 @@ def _times(table: CsvTable) -> NDArray[np.int64]:
     times = [row.integer("timestamp_ns") for row in table.rows]
     for row, earlier, time in zip(table.rows[1:], times, times[1:], strict=False):
         if time <= earlier:
-            raise row.error("timestamp_ns", f"{time} does not come after the row before ({earlier}): sort the rows")
+            raise row.error("timestamp_ns", f"{time} is not later than the previous row ({earlier}): sort the rows")
     return np.array(times, dtype=np.int64)
 
 
@@ -67,20 +67,20 @@ def _columns(table: CsvTable, names: tuple[str, ...]) -> Array:
 
 
 def _group(table: CsvTable, names: tuple[str, ...]) -> Array | None:
-    """Three columns that are there together or not at all."""
+    """(T, 3) of three columns, None if the table has none of them. Raises InputError if it has only some."""
     there = [name for name in names if name in table.columns]
     if there and len(there) < len(names):
         raise InputError(
-            f"{table.path}: columns {', '.join(names)} come together (found only {', '.join(there)}): "
-            "add the others, or leave all out to have them derived from the poses"
+            f"{table.path}: expected all of the columns {', '.join(names)} or none (found only {', '.join(there)}): "
+            "add the others, or remove all to derive them from the poses"
         )
     return _columns(table, names) if there else None
 
 
 def _quaternion(row: CsvRow) -> Array:
-    """(4,) as stored, its norm made exactly 1."""
+    """(4,) w, x, y, z with the stored sign, normalised to a norm of exactly 1."""
     quaternion = np.array([row.number(name) for name in QUATERNION])
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1) > NORM_TOLERANCE:
-        raise row.error("qw..qz", f"the quaternion's norm is {norm:.6g} (expected 1): it is no rotation")
+        raise row.error("qw..qz", f"the quaternion's norm is {norm:.6g} (expected 1): check its digits and their order")
     return quaternion / norm

@@ -1,4 +1,4 @@
-"""The native sequence folder: calibration.json, frames.csv, ego_motion.csv, images or videos, ground truth."""
+"""The native sequence folder as a Sequence."""
 
 from __future__ import annotations
 
@@ -12,21 +12,32 @@ from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import GRAVITY, TOLERANCE_NS, EgoMotion, Kinematics
 from bevcli.geometry.transforms import Pose
+from bevcli.sequences.files.calibration_file import read_calibration
 from bevcli.sequences.images import ImageReader
-from bevcli.sequences.native.calibration import read_calibration
 from bevcli.sequences.native.ego_motion_file import read_ego_motion
 from bevcli.sequences.native.frames_table import FrameEntry, check_times, read_frames_table
 from bevcli.sequences.native.ground_truth import FolderGroundTruth
 from bevcli.sequences.native.unlisted_frames import find_frames
 
-# required: ego_motion.csv must be there. static: the vehicle stands, the file is not read.
-# none: the file is read where it is there; without it there are no poses.
-EgoMotionUse = Literal["required", "static", "none"]
+# required: ego_motion.csv must exist. optional: without the file there are no poses.
+# static: the vehicle stands, and the file is not read.
+EgoMotionUse = Literal["required", "optional", "static"]
+# Any of these makes a folder a native sequence, so that an incomplete one gets an error that names the missing file.
+MARKERS = ("calibration.json", "frames.csv", "ego_motion.csv", "images", "videos")
 AT_REST = Kinematics(np.array([0.0, 0.0, GRAVITY]), np.zeros(3), np.zeros(3))
 
 
+def is_native_folder(path: Path) -> bool:
+    """Whether a folder contains any part of a native sequence."""
+    return any((path / part).exists() for part in MARKERS)
+
+
 class FolderSequence:
-    """A native sequence folder as a `Sequence`. `rig` replaces calibration.json's."""
+    """A native sequence folder as a `Sequence`.
+
+    rig: used in place of calibration.json, if given.
+    Raises InputError if a file of the folder is missing or invalid.
+    """
 
     def __init__(
         self,
@@ -50,11 +61,11 @@ class FolderSequence:
 
     @property
     def stamps(self) -> tuple[FrameStamp, ...]:
-        """When each frame is, in order."""
+        """Index, scene and time of each frame, in order."""
         return tuple(entry.stamp for entry in self._entries)
 
     def load(self, place: int) -> Frame:
-        """The frame at a place, its images decoded. Raises InputError for wrong sizes, or missing ones if strict."""
+        """The frame at position `place`, with decoded images. Raises InputError as `ImageReader.read`."""
         entry = self._entries[place]
         images, dropped = self._images.read(entry.sources, self.rig, entry.dropped)
         times = _camera_times(entry, self.rig)
@@ -89,7 +100,7 @@ def _read_entries(path: Path, rig: CameraRig) -> tuple[tuple[FrameEntry, ...], t
 
 
 def _camera_times(entry: FrameEntry, rig: CameraRig) -> dict[str, int]:
-    """Each camera's own time, the frame's where it has no image."""
+    """Time of each camera's image, ns; the frame's time for a camera without an image."""
     frame_ns = entry.stamp.timestamp_ns
     return {name: entry.sources[name].timestamp_ns if name in entry.sources else frame_ns for name in rig.names}
 
@@ -100,17 +111,17 @@ def _read_motion(
     file = path / "ego_motion.csv"
     if use == "static":
         unread = " (ego_motion.csv is not read)" if file.is_file() else ""
-        return None, (f"the vehicle is taken to stand still{unread}",)
+        return None, (f"the vehicle is assumed to stand still{unread}",)
     if file.is_file():
         motion = read_ego_motion(file)
         _check_coverage(file, motion, entries)
         return motion, ()
     if use == "required":
         raise InputError(
-            f"{file}: the file is missing (where the vehicle was): add it, say --static if the vehicle stands, "
-            "or --no-temporal to run without history"
+            f"{file}: the file is missing (expected the vehicle's poses): add it, pass --static if the vehicle stands, "
+            "or pass --no-temporal to run without history"
         )
-    return None, ("ego_motion.csv is missing: boxes are given in the ego frame",)
+    return None, ("ego_motion.csv is missing: boxes are in the ego frame",)
 
 
 def _check_coverage(file: Path, motion: EgoMotion, entries: tuple[FrameEntry, ...]) -> None:
@@ -120,10 +131,10 @@ def _check_coverage(file: Path, motion: EgoMotion, entries: tuple[FrameEntry, ..
         times |= {f"camera {name}": source.timestamp_ns for name, source in entry.sources.items()}
         for what, time in times.items():
             if not first - TOLERANCE_NS <= time <= last + TOLERANCE_NS:
-                listed = entry.place.startswith(str(file.with_name("frames.csv")))
-                advice = "extend the ego-motion, or cut the frames" if listed else "state the start in timing.toml"
+                listed = entry.origin.startswith(str(file.with_name("frames.csv")))
+                advice = "add ego-motion, or remove the frame" if listed else "set start_ns in timing.toml"
                 raise InputError(
-                    f"{file}: covers {first} to {last} ns, but {what} is at {time} ns ({entry.place}; at most 50 ms "
+                    f"{file}: covers {first} to {last} ns, but {what} is at {time} ns ({entry.origin}; at most 50 ms "
                     f"outside is allowed): {advice}"
                 )
 
@@ -131,4 +142,4 @@ def _check_coverage(file: Path, motion: EgoMotion, entries: tuple[FrameEntry, ..
 def _rig_notes(rig: CameraRig) -> tuple[str, ...]:
     if not rig.ego_from_bev_assumed:
         return ()
-    return ('calibration.json has no "ego_from_bev": a level frame at (0.94, 0, 1.84) m in ego is taken',)
+    return ('calibration.json has no "ego_from_bev": the default is used, a level frame at (0.94, 0, 1.84) m in ego',)

@@ -1,4 +1,4 @@
-"""frames.csv: one row a frame, with its time and where each camera's image is."""
+"""frames.csv: one row per frame, with its time and the location of each camera's image."""
 
 from __future__ import annotations
 
@@ -18,22 +18,26 @@ NO_IMAGE = "no image in frames.csv"
 
 @dataclass(frozen=True)
 class FrameEntry:
-    """One frame before its images are read.
+    """One frame before its images are read. Each camera is in `sources` or in `dropped`.
 
-    sources: by camera, where its image is. dropped: camera -> why it has none. Together they name every camera.
-    place: for messages, where the frame is described, as "frames.csv: line 3".
+    Attributes:
+        stamp: index, scene and time of the frame.
+        sources: location of the image, by camera.
+        dropped: reason why there is no image, by camera.
+        origin: where the frame is listed, such as "frames.csv: line 3", for error messages.
     """
 
     stamp: FrameStamp
     sources: Mapping[str, ImageSource]
     dropped: Mapping[str, str]
-    place: str
+    origin: str
 
 
 def read_frames_table(path: Path, cameras: Sequence[str]) -> tuple[FrameEntry, ...]:
-    """Read frames.csv; cells are paths relative to its folder, or `video#number`.
+    """Read frames.csv. A camera's cell is a path relative to the table's folder, or `video#index`.
 
-    Raises InputError for wrong columns or cells, a camera without a column, or times that do not increase in a scene.
+    Raises InputError for an invalid column or cell, a camera without a column, or times that do not increase in a
+    scene.
     """
     table = _read_columns(path, cameras)
     entries = tuple(_entry(row, cameras, path.parent) for row in table.rows)
@@ -43,14 +47,14 @@ def read_frames_table(path: Path, cameras: Sequence[str]) -> tuple[FrameEntry, .
 
 
 def check_times(entries: Iterable[FrameEntry]) -> None:
-    """Raise InputError unless times increase within each scene (a run of frames with the same scene name)."""
+    """Raise InputError unless times increase within each scene, a run of frames with the same scene name."""
     earlier: FrameEntry | None = None
     for entry in entries:
         stamp = entry.stamp
         if earlier and earlier.stamp.scene == stamp.scene and stamp.timestamp_ns <= earlier.stamp.timestamp_ns:
             raise InputError(
-                f"{entry.place}: timestamp_ns {stamp.timestamp_ns} does not come after the frame before "
-                f"({earlier.stamp.timestamp_ns}): sort the frames, or give them scenes of their own"
+                f"{entry.origin}: timestamp_ns {stamp.timestamp_ns} is not later than the previous frame's "
+                f"({earlier.stamp.timestamp_ns}): sort the frames by time, or give them different scenes"
             )
         earlier = entry
 
@@ -61,7 +65,7 @@ def _read_columns(path: Path, cameras: Sequence[str]) -> CsvTable:
     for name in cameras:
         if name not in table.columns:
             raise InputError(
-                f"{path}: camera {name}: its column is missing (calibration.json has the camera): "
+                f"{path}: camera {name}: its column is missing (expected, because the calibration has the camera): "
                 f'add a column "{name}" (cells may be empty), or remove the camera from the calibration'
             )
     return table
@@ -88,6 +92,6 @@ def _check_numbers(rows: Sequence[CsvRow], entries: Sequence[FrameEntry]) -> Non
     for row, entry in zip(rows, entries, strict=True):
         number = entry.stamp.index
         if number < 0 or number in seen:
-            found = f"stands already on line {seen[number]}" if number in seen else "is negative"
-            raise row.error("frame", f"{number} {found} (expected every frame's own number, from 0)")
+            found = f"is also on line {seen[number]}" if number in seen else "is negative"
+            raise row.error("frame", f"{number} {found} (expected a unique integer, 0 or more)")
         seen[number] = row.line

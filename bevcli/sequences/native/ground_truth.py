@@ -1,4 +1,4 @@
-"""A native folder's ground truth, by frame: boxes moved to the world, and maps."""
+"""The ground truth of a native folder: boxes in the world frame, and BEV maps."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from bevcli.frame import BevMap
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, Pose, inverse
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes
-from bevcli.sequences.files.map_file import open_maps
+from bevcli.sequences.files.map_folder import open_maps
 
 BOXES_FILE = "ground_truth.json"
 MAPS_FOLDER = "ground_truth_map"
 
 
 class FolderGroundTruth:
-    """ground_truth.json (read at once) and ground_truth_map/ (read frame by frame), where they are there."""
+    """ground_truth.json, read at once, and ground_truth_map/, read frame by frame. Either may be missing."""
 
     def __init__(self, folder: Path) -> None:
         boxes_path, maps_path = folder / BOXES_FILE, folder / MAPS_FOLDER
@@ -24,9 +24,10 @@ class FolderGroundTruth:
         self._maps = open_maps(maps_path) if maps_path.is_dir() else None
 
     def boxes(self, frame: int, world_from_ego: Pose | None, ego_from_bev: Array) -> Boxes3D | None:
-        """A frame's boxes in the world; None where nothing is known of the frame.
+        """A frame's boxes in the world frame; None if the file does not have the frame.
 
-        world_from_ego: of the sequence; None where it has no ego-motion: then the ego frame stands for the world.
+        world_from_ego: the sequence's pose at the frame's time. None without ego-motion: boxes are in the ego frame.
+        ego_from_bev: (4, 4) of the rig, for a file in the bev frame that does not state its own.
         """
         truth = self._frames.get(frame)
         if truth is None or self._boxes is None:
@@ -40,7 +41,7 @@ class FolderGroundTruth:
         return boxes.transformed(world_from_ego.matrix) if world_from_ego else boxes
 
     def bev_map(self, frame: int) -> BevMap | None:
-        """A frame's map; None where there is none."""
+        """A frame's map, None if there is none."""
         return self._maps.load(frame) if self._maps and self._maps.has(frame) else None
 
 

@@ -1,4 +1,4 @@
-"""Frames of a folder without frames.csv: from the images' names, or from one video a camera, aligned by time."""
+"""Finds the frames of a folder without frames.csv: from image names, or from one video per camera."""
 
 from __future__ import annotations
 
@@ -15,23 +15,28 @@ from bevcli.sequences.native.frames_table import FrameEntry
 from bevcli.sequences.native.timing import FILE_NAME, Timing, read_timing
 from bevcli.sequences.video import VideoFacts, video_facts
 
-# Names that are numbers are times from this on (a day after 1970 in nanoseconds), running numbers below.
+# A number in an image's name is a time in nanoseconds from this value on (hours after 1970), an index below it.
 SMALLEST_TIMESTAMP = 10**13
-ASSUMED_RATE_HZ = 2.0  # of numbered images where timing.toml is missing: the rate of the published models
+ASSUMED_RATE_HZ = 2.0  # rate of numbered images without timing.toml: the rate of the published models
 
 
 @dataclass(frozen=True)
 class UnlistedFrames:
-    """The frames that were found, and what the user should know about how."""
+    """Frames that were found without frames.csv.
+
+    Attributes:
+        entries: the frames, in order.
+        note: tells the user how they were found.
+    """
 
     entries: tuple[FrameEntry, ...]
     note: str
 
 
 def find_frames(folder: Path, cameras: tuple[str, ...]) -> UnlistedFrames:
-    """The frames of `images/CAMERA/*` or of `videos/CAMERA.*`.
+    """The frames in `images/CAMERA/*` or `videos/CAMERA.*`.
 
-    Raises InputError where there is neither, or where cameras do not have the same set of image names.
+    Raises InputError if there is neither, or if the cameras' images do not have the same names.
     """
     timing = read_timing(folder, cameras)
     if (folder / "images").is_dir():
@@ -39,7 +44,7 @@ def find_frames(folder: Path, cameras: tuple[str, ...]) -> UnlistedFrames:
     if (folder / "videos").is_dir():
         return _from_videos(folder, cameras, timing)
     raise InputError(
-        f"{folder}: frames.csv is missing, and so are images/ and videos/: give a frames.csv, "
+        f"{folder}: frames.csv, images/ and videos/ are missing: add a frames.csv, "
         "images/CAMERA/TIMESTAMP.jpg, or videos/CAMERA.mp4"
     )
 
@@ -58,48 +63,48 @@ def _from_names(folder: Path, cameras: tuple[str, ...], timing: Timing) -> Unlis
         }
         stamp = FrameStamp(place if are_times else number, "", time)
         entries.append(FrameEntry(stamp, sources, {}, f"{folder / 'images'}: image {number}"))
-    how = "their names are the timestamps" if are_times else f"numbered images, {rate:g} a second"
-    where = "" if are_times or timing.rate_hz else f" (assumed: state rate_hz in {FILE_NAME})"
-    return UnlistedFrames(tuple(entries), f"frames.csv is missing: {len(numbers)} frames, {how}{where}")
+    how = "timestamps from the image names" if are_times else f"numbered images at {rate:g} per second"
+    where = "" if are_times or timing.rate_hz else f" (assumed; set rate_hz in {FILE_NAME})"
+    return UnlistedFrames(tuple(entries), f"frames.csv is missing: found {len(numbers)} frames, {how}{where}")
 
 
 def _numbered(folder: Path) -> dict[int, Path]:
-    """The images of a folder by the number that is their name."""
+    """The images of a folder by the number in their name."""
     if not folder.is_dir():
-        raise InputError(f"{folder}: the folder is missing (calibration.json has the camera {folder.name})")
+        raise InputError(f"{folder}: the folder is missing (the calibration has the camera {folder.name})")
     found: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() not in IMAGE_SUFFIXES:
             continue
         if not (path.stem.isascii() and path.stem.isdigit()):
-            raise InputError(f"{path}: the name is no number (expected a timestamp or number): list it in frames.csv")
+            raise InputError(f"{path}: the name is not a number (expected a time or an index): list it in frames.csv")
         if int(path.stem) in found:
             raise InputError(f"{path}: {found[int(path.stem)].name} has the same number: remove one")
         found[int(path.stem)] = path
     if not found:
-        raise InputError(f"{folder}: no images (expected files that end in {', '.join(IMAGE_SUFFIXES)})")
+        raise InputError(f"{folder}: the folder has no images (expected files ending in {', '.join(IMAGE_SUFFIXES)})")
     return found
 
 
 def _common_numbers(folder: Path, images: Mapping[str, Mapping[int, Path]]) -> list[int]:
-    """The numbers in order, the same in every camera."""
+    """The sorted image numbers, which must be the same for every camera."""
     everywhere = sorted(set().union(*images.values()))
     for name, found in images.items():
         missing = [number for number in everywhere if number not in found]
         if missing:
             raise InputError(
-                f"{folder / 'images' / name}: {len(missing)} images that other cameras have are missing, the first "
-                f"is {missing[0]}: add them, or list the frames in frames.csv with empty cells"
+                f"{folder / 'images' / name}: {len(missing)} images are missing that other cameras have, the first "
+                f"is {missing[0]}: add them, or list the frames in frames.csv and leave cells empty"
             )
     return everywhere
 
 
 def _from_videos(folder: Path, cameras: tuple[str, ...], timing: Timing) -> UnlistedFrames:
-    """A frame for each image of the slowest camera, with the nearest image of every other one."""
+    """One frame for each image of the camera with the lowest rate, with the other cameras' nearest images."""
     paths = {name: _video_of(folder / "videos", name) for name in cameras}
     facts = {name: video_facts(path) for name, path in paths.items()}
     rates = {name: timing.rate_of(name) or facts[name].rate_hz for name in cameras}
-    leading = min(cameras, key=lambda name: rates[name])  # the first camera among equals
+    leading = min(cameras, key=lambda name: rates[name])  # the first of cameras with equal rates
     entries = []
     for place in range(facts[leading].count):
         time = timing.time_of(leading, place, rates[leading])
@@ -111,10 +116,9 @@ def _from_videos(folder: Path, cameras: tuple[str, ...], timing: Timing) -> Unli
             else:
                 sources[name] = source
         entries.append(FrameEntry(FrameStamp(place, "", time), sources, dropped, f"{paths[leading]}#{place}"))
-    stated = (
-        f"as {FILE_NAME} says" if (folder / FILE_NAME).is_file() else f"all from time 0 ({FILE_NAME} can change it)"
-    )
-    note = f"frames.csv is missing: {len(entries)} frames at the images of {leading}, {rates[leading]:g} a second"
+    has_timing = (folder / FILE_NAME).is_file()
+    stated = f"times from {FILE_NAME}" if has_timing else f"starting at time 0 (set start_ns in {FILE_NAME})"
+    note = f"frames.csv is missing: found {len(entries)} frames from {leading}, {rates[leading]:g} per second"
     return UnlistedFrames(tuple(entries), f"{note}, {stated}")
 
 
@@ -122,14 +126,14 @@ def _video_of(folder: Path, camera: str) -> Path:
     found = [path for path in sorted(folder.glob(f"{camera}.*")) if path.suffix.lower() in VIDEO_SUFFIXES]
     if len(found) != 1:
         names = ", ".join(path.name for path in found) or "none"
-        raise InputError(f"{folder}: camera {camera}: expected one video {camera}.mp4 (or like), found {names}")
+        raise InputError(f"{folder}: camera {camera}: expected one video, such as {camera}.mp4, found {names}")
     return found[0]
 
 
 def _nearest(
     path: Path, facts: VideoFacts, camera: str, timing: Timing, rate_hz: float, time: int
 ) -> ImageSource | None:
-    """The camera's image nearest to a time, None where it is more than half an image's time away."""
+    """The camera's image nearest to a time in ns, None if it is more than half a period away."""
     first = timing.time_of(camera, 0, rate_hz)
     number = int(np.clip(round((time - first) * rate_hz / 1e9), 0, facts.count - 1))
     taken = timing.time_of(camera, number, rate_hz)

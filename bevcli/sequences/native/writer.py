@@ -1,4 +1,4 @@
-"""Writes frames, one after the other, as a native sequence folder."""
+"""Writes frames one by one as a native sequence folder."""
 
 from __future__ import annotations
 
@@ -19,23 +19,28 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
 from bevcli.geometry.transforms import Pose
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
-from bevcli.sequences.files.map_file import write_map
-from bevcli.sequences.native.calibration import write_calibration
+from bevcli.sequences.files.calibration_file import write_calibration
+from bevcli.sequences.files.map_folder import write_map
 from bevcli.sequences.native.ego_motion_file import write_ego_motion
 from bevcli.sequences.native.ground_truth import BOXES_FILE, MAPS_FOLDER
 
-# What this writer makes, and what `force` removes; anything else in the folder stays.
+# The files that the writer creates and `force` removes. Other files in the folder are kept.
 PARTS = ("calibration.json", "frames.csv", "ego_motion.csv", "images", BOXES_FILE, MAPS_FOLDER)
 SUFFIXES = {"image/jpeg": ".jpg", "image/png": ".png"}
 
 
 class NativeWriter:
-    """`with NativeWriter(folder, with_ego_motion=True) as writer: writer.write(frame)`.
+    """Writes a native sequence folder frame by frame.
 
-    Images keep their bytes; decoded ones (of a video) become PNG. ego_motion.csv gets the pose at every frame's and
-    image's time. calibration.json is written last: a folder that was not finished is no sequence.
-    Raises OutputError where the folder exists (but with `force`) or cannot be written, InputError where a frame does
-    not go with those before it: another calibration, a number twice, or scenes that overlap in time.
+        with NativeWriter(folder, with_ego_motion=True) as writer:
+            writer.write(frame)
+
+    Image files are copied byte for byte; images of a video become PNG. ego_motion.csv gets the pose at the time of
+    every frame and image. calibration.json is written last, so an unfinished folder is not a valid sequence.
+
+    with_ego_motion: whether the frames have poses. force: replace a sequence in the folder.
+    Raises OutputError if the folder exists and `force` is false, or it cannot be written. Raises InputError for a
+    frame with another calibration than the first or a repeated index, and for scenes that overlap in time.
     """
 
     def __init__(self, folder: Path, *, with_ego_motion: bool, force: bool = False) -> None:
@@ -45,7 +50,7 @@ class NativeWriter:
         self._rig: CameraRig | None = None
         self._numbers: set[int] = set()
         self._motion: dict[int, tuple[Pose, Kinematics]] = {}
-        self._scenes: dict[str, tuple[int, int]] = {}  # the first and last time of each
+        self._scenes: dict[str, tuple[int, int]] = {}  # first and last time of each scene, ns
         self._boxes: BoxesWriter | None = None
         self._open = ExitStack()
         try:
@@ -55,12 +60,12 @@ class NativeWriter:
         self._rows = csv.writer(table, lineterminator="\n")
 
     def write(self, frame: Frame) -> None:
-        """Append a frame."""
+        """Write a frame and its images."""
         self._check(frame)
         cells = {name: self._write_image(frame.stamp.index, name, p) for name, p in frame.images.items()}
         self._write_row(frame, cells)
         if self._with_ego_motion:
-            self._note_motion(frame)
+            self._store_motion(frame)
         if frame.ground_truth is not None:
             self._write_boxes(frame)
         if frame.ground_truth_map is not None:
@@ -78,7 +83,7 @@ class NativeWriter:
 
     def _finish(self) -> None:
         if self._rig is None:
-            raise OutputError(f"{self.folder}: no frame was written")
+            raise OutputError(f"{self.folder}: no frame was written (expected at least one)")
         if self._with_ego_motion:
             self._check_scenes()
             write_ego_motion(self.folder / "ego_motion.csv", _ego_motion(self._motion))
@@ -92,17 +97,15 @@ class NativeWriter:
             self._rows.writerow(["frame", "scene", "timestamp_ns", *frame.rig.names, *times])
         elif frame.rig is not self._rig and not same_rig(frame.rig, self._rig):
             raise InputError(
-                f"frame {stamp.index} ({stamp.scene}): another calibration than the frames before, but a native "
-                "sequence has one: convert scene by scene (--scene)"
+                f"frame {stamp.index} ({stamp.scene}): its calibration differs from the first frame's, but a native "
+                "sequence has a single calibration: convert scene by scene (--scene)"
             )
         if stamp.index in self._numbers:
-            raise InputError(
-                f"frame {stamp.index} ({stamp.scene}): its number was there before: number the frames anew"
-            )
+            raise InputError(f"frame {stamp.index} ({stamp.scene}): its index occurred before: renumber the frames")
         self._numbers.add(stamp.index)
 
     def _write_image(self, number: int, camera: str, image: CameraImage) -> str:
-        """Write it, and give its cell."""
+        """Write an image; returns its path relative to the folder."""
         encoded, suffix = image.encoded, SUFFIXES.get(image.media_type or "", ".png")
         if encoded is None or image.media_type not in SUFFIXES:
             encoded = cv2.imencode(".png", image.pixels_bgr)[1].tobytes()
@@ -122,7 +125,7 @@ class NativeWriter:
         row = [stamp.index, stamp.scene, stamp.timestamp_ns, *(cells.get(name, "") for name in names), *times]
         self._rows.writerow(row)
 
-    def _note_motion(self, frame: Frame) -> None:
+    def _store_motion(self, frame: Frame) -> None:
         for name, image in frame.images.items():
             self._motion.setdefault(image.timestamp_ns, (frame.world_from_ego_at[name], frame.kinematics))
         times = [frame.stamp.timestamp_ns, *(image.timestamp_ns for image in frame.images.values())]
@@ -131,7 +134,7 @@ class NativeWriter:
         self._scenes[frame.stamp.scene] = (min(first, *times), max(last, *times))
 
     def _check_scenes(self) -> None:
-        """Scenes share one ego_motion.csv, so they must follow each other in time."""
+        """Raise InputError if scenes overlap in time: they share one ego_motion.csv."""
         spans = sorted((first, last, name) for name, (first, last) in self._scenes.items())
         for (_, end, earlier), (start, _, later) in pairwise(spans):
             if start <= end:
@@ -148,7 +151,7 @@ class NativeWriter:
 
 
 def same_rig(one: CameraRig, other: CameraRig) -> bool:
-    """Whether two rigs are equal in all their numbers."""
+    """Whether all names and numbers of two rigs are equal."""
     return (
         one.names == other.names
         and np.array_equal(one.ego_from_bev, other.ego_from_bev)
@@ -166,7 +169,7 @@ def _make_room(folder: Path, force: bool) -> None:
         raise OutputError(f"{folder}: is a file (expected a folder to write)")
     if folder.is_dir() and any(folder.iterdir()):
         if not force:
-            raise OutputError(f"{folder}: exists already: name another folder, or add --force to replace it")
+            raise OutputError(f"{folder}: exists already: choose another folder, or pass --force to replace it")
         for part in PARTS:
             path = folder / part
             if path.is_dir() and not path.is_symlink():
@@ -176,7 +179,7 @@ def _make_room(folder: Path, force: bool) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"{folder}: cannot be made ({error.strerror})") from None
+        raise OutputError(f"{folder}: cannot be created ({error.strerror})") from None
 
 
 def _ego_motion(rows: Mapping[int, tuple[Pose, Kinematics]]) -> EgoMotion:

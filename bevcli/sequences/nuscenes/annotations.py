@@ -1,4 +1,4 @@
-"""sample_annotation.json -> Annotations, with velocities by the official rule."""
+"""Reads sample_annotation.json and derives velocities as the official devkit does."""
 
 from __future__ import annotations
 
@@ -20,22 +20,24 @@ from bevcli.sequences.nuscenes.json_tables import (
     vectors,
 )
 
-MAX_GAP_S = 1.5  # between two annotations of an object, for its velocity to be known
+MAX_GAP_S = 1.5  # longest time between two annotations of an object from which a velocity is derived
 
 
 def read_annotations(
     tables: Path, sample_tokens: NDArray[np.bytes_], sample_times_us: Ints
 ) -> tuple[Annotations, Ints]:
-    """The annotations by sample, and where each sample's begin (N + 1,).
+    """The annotations ordered by sample, and the row of each sample's first annotation (N + 1,).
 
-    sample_tokens, sample_times_us: (N,). Raises InputError where the tables do not fit together. No annotations at
-    all, as in the test split, are none.
+    A version without annotations, such as the test split, gives zero rows.
+
+    sample_tokens: (N,). sample_times_us: (N,) microseconds.
+    Raises InputError if the tables are inconsistent.
     """
     path = tables / "sample_annotation.json"
     names = _Names(tables)
     parts = [_columns(batch, path, names) for batch in (read_batches(path) if path.is_file() else ()) if batch]
     if not parts:
-        return _none(), np.zeros(len(sample_tokens) + 1, dtype=np.int64)
+        return _no_annotations(), np.zeros(len(sample_tokens) + 1, dtype=np.int64)
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     samples = places_of(columns.pop("samples"), sample_tokens, tables / "sample.json")
     own, earlier, later = columns.pop("tokens"), columns.pop("prev"), columns.pop("next")
@@ -48,7 +50,7 @@ def read_annotations(
 
 
 class _Names:
-    """What the tokens in an annotation stand for."""
+    """The names behind the tokens in an annotation."""
 
     def __init__(self, tables: Path) -> None:
         categories = _texts(tables / "category.json", "name")
@@ -67,7 +69,7 @@ def _texts(path: Path, name: str) -> dict[str, str]:
 
 
 def _middle(level: str) -> float:
-    """The middle of a level such as "v40-60", 0 to 1."""
+    """The middle of a visibility level such as "v40-60", as a fraction from 0 to 1."""
     low, high = level.removeprefix("v").split("-")
     return (float(low) + float(high)) / 200
 
@@ -100,9 +102,9 @@ def _velocities(
     times_us: Ints,
     path: Path,
 ) -> Array:
-    """(A, 3) m/s in the world: between the object's annotations before and after, or from or to its own; else NaN.
+    """(A, 3) m/s in the world frame, NaN if unknown: central differences, one-sided for first and last annotations.
 
-    As the official devkit's: known over at most 1.5 s for each of the gaps that are bridged.
+    As in the official devkit, a velocity is known if each time gap is at most 1.5 s on average.
     """
     first, last = np.arange(len(own)), np.arange(len(own))
     has_earlier, has_later = earlier != b"", later != b""
@@ -115,7 +117,7 @@ def _velocities(
         return np.where(known[:, None], (centers[last] - centers[first]) / seconds[:, None], np.nan)
 
 
-def _none() -> Annotations:
+def _no_annotations() -> Annotations:
     text = np.zeros(0, dtype="S1")
     vectors = np.zeros((0, 3))
     return Annotations(

@@ -1,4 +1,4 @@
-"""nuScenes' JSON tables -> NuScenesIndex. Tokens are joined by sorting, rows are put in order of scene and time."""
+"""Builds a NuScenesIndex from nuScenes' JSON tables: joins them by token and sorts rows by scene and time."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array
+from bevcli.sequences.garbage_collection import without_garbage_collection
 from bevcli.sequences.nuscenes.annotations import read_annotations
 from bevcli.sequences.nuscenes.index import Images, Ints, NuScenesIndex, Samples, Scenes, Sensors
 from bevcli.sequences.nuscenes.json_tables import (
@@ -21,15 +22,14 @@ from bevcli.sequences.nuscenes.json_tables import (
     read_rows,
     tokens,
     vectors,
-    without_garbage_collection,
 )
 
-LIDAR = "LIDAR_TOP"  # the sensor whose frame the published models predict in
+LIDAR = "LIDAR_TOP"  # the published models predict in the frame of this sensor
 
 
 @dataclass(frozen=True)
 class _SensorData:
-    """The rows of sample_data.json that are needed: cameras, and LIDAR_TOP's keyframes."""
+    """Columns of sample_data.json for images, and for LIDAR_TOP at keyframes. Samples and sensors are rows."""
 
     samples: Ints
     sensors: Ints
@@ -44,7 +44,7 @@ class _SensorData:
 
 
 def build_index(tables: Path) -> NuScenesIndex:
-    """Read the folder of one version's tables. Raises InputError where one is missing or they do not fit together."""
+    """Read the folder with one version's tables. Raises InputError if one is missing, invalid or inconsistent."""
     with without_garbage_collection():
         sensor_tokens, sensors = _read_sensors(tables)
         names, sample_tokens, sample_times, sample_scenes = _read_samples(tables)
@@ -99,11 +99,11 @@ def _read_sensors(tables: Path) -> tuple[NDArray[np.bytes_], Sensors]:
 
 
 def _read_samples(tables: Path) -> tuple[NDArray[np.str_], NDArray[np.bytes_], Ints, Ints]:
-    """Scenes' names (S,), and samples' tokens, times in us and scenes (N,), ordered by scene and time."""
+    """Scene names (S,), and the tokens, times in us and scenes of samples (N,), ordered by scene and time."""
     scene_path, path = tables / "scene.json", tables / "sample.json"
     scenes, rows = read_rows(scene_path), read_rows(path)
     if not scenes or not rows:
-        raise InputError(f"{path if scenes else scene_path}: the table has no rows")
+        raise InputError(f"{path if scenes else scene_path}: the table has no rows (expected at least one)")
     in_scene = places_of(tokens(rows, "scene_token", path), tokens(scenes, "token", scene_path), scene_path)
     times = integers(rows, "timestamp", path)
     order = np.lexsort((times, in_scene))
@@ -128,7 +128,7 @@ def _read_sensor_data(
         if needed:
             parts.append(_sensor_data_of(needed, path, sample_tokens, sensor_tokens))
     if not parts:
-        raise InputError(f"{path}: has no row of a camera")
+        raise InputError(f"{path}: no row belongs to a camera (expected camera images)")
     return _SensorData(**{name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])})
 
 
@@ -149,7 +149,7 @@ def _sensor_data_of(
 
 
 def _read_poses(tables: Path, wanted: NDArray[np.bytes_]) -> tuple[Array, Array]:
-    """world_from_ego translations (P, 3) and quaternions (P, 4) of the poses with these tokens (P,)."""
+    """Translations (P, 3), metres, and quaternions (P, 4) of world_from_ego for the pose tokens (P,)."""
     path = tables / "ego_pose.json"
     needed = {token.decode() for token in wanted}
     found, translations, quaternions = [], [], []
@@ -167,7 +167,7 @@ def _read_poses(tables: Path, wanted: NDArray[np.bytes_]) -> tuple[Array, Array]
 def _lidar_of_samples(
     tables: Path, samples: Ints, lidar_rows: Ints, count: int, sample_tokens: NDArray[np.bytes_]
 ) -> Ints:
-    """(N,) the row of LIDAR_TOP's keyframe of each sample."""
+    """(N,) the row of each sample's LIDAR_TOP keyframe."""
     rows = np.full(count, -1, dtype=np.int64)
     rows[samples[lidar_rows]] = lidar_rows
     if (rows < 0).any():
@@ -182,5 +182,5 @@ def _by_scene_and_time(data: _SensorData, chosen: NDArray[np.bool_], sample_scen
 
 
 def _starts(sorted_owners: Ints, count: int) -> Ints:
-    """(count + 1,) where each owner's rows begin."""
+    """(count + 1,) the first row of each owner."""
     return np.searchsorted(sorted_owners, np.arange(count + 1))

@@ -1,7 +1,8 @@
-"""The index of a large nuScenes version, kept as memory-mapped arrays: opening it again reads almost nothing.
+"""Cache for the index of a large nuScenes version: memory-mapped arrays that open almost at once.
 
-It lies in $XDG_CACHE_HOME/bevcli/nuscenes (~/.cache/... by default), one folder a version and place, never in the
-dataset. It is made anew when a table's size or time of change differs. Small versions are read each time.
+The cache is in $XDG_CACHE_HOME/bevcli/nuscenes (default ~/.cache/bevcli/nuscenes), never in the dataset, with one
+folder for each version's path. The index is rebuilt if the size or modification time of a table has changed.
+Small versions are not cached.
 """
 
 from __future__ import annotations
@@ -19,13 +20,13 @@ import numpy as np
 from bevcli.sequences.nuscenes.build import build_index
 from bevcli.sequences.nuscenes.index import NuScenesIndex
 
-FORMAT = 1  # raised when the index changes
-SMALLEST_BYTES = 64 << 20  # tables below this in all are read in a second or two
+FORMAT = 1  # version of the cached arrays; increase it when the index changes
+SMALLEST_BYTES = 64 << 20  # smaller tables are not cached, because reading them takes a second or two
 FINGERPRINT = "fingerprint.json"
 
 
 def open_index(tables: Path) -> tuple[NuScenesIndex, str]:
-    """The index of a folder of tables, from the cache where it is fresh, and a note for the user ("" none)."""
+    """The index of a folder with tables, from the cache if it is up to date, and a note for the user or ""."""
     if sum(path.stat().st_size for path in tables.glob("*.json")) < SMALLEST_BYTES:
         return build_index(tables), ""
     folder = _cache_folder(tables)
@@ -36,8 +37,11 @@ def open_index(tables: Path) -> tuple[NuScenesIndex, str]:
     try:
         _save(index, folder, fingerprint)
     except OSError as error:
-        return index, f"{folder}: the index cannot be kept ({error.strerror}): opening takes as long the next time"
-    return index, f"the index of the tables is kept in {folder}"
+        return (
+            index,
+            f"{folder}: the index cannot be cached ({error.strerror}); opening it again will be slow",
+        )
+    return index, f"the index of the nuScenes tables is cached in {folder}"
 
 
 def _cache_folder(tables: Path) -> Path:
@@ -59,7 +63,7 @@ def _is_fresh(folder: Path, fingerprint: str) -> bool:
 
 
 def _save(index: NuScenesIndex, folder: Path, fingerprint: str) -> None:
-    """Written beside and moved into place, so that an interrupted run leaves no half index."""
+    """Write to a temporary folder, then rename it, so that an interrupted run leaves no incomplete index."""
     unfinished = folder.with_name(f"{folder.name}.{os.getpid()}")
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)

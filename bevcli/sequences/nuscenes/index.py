@@ -1,4 +1,4 @@
-"""What bevcli needs of nuScenes' tables, as arrays that follow each other scene by scene and sample by sample."""
+"""The contents of nuScenes' tables that bevcli needs, as arrays ordered by scene and time."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bevcli.geometry.transforms import Array, rotation_from_quaternion, yaw_of_r
 
 Ints = NDArray[np.int64]
 
-# nuScenes' categories -> the ten detection classes; others are not detected.
+# From nuScenes' categories to the ten detection classes. Other categories are not detected.
 CLASS_OF_CATEGORY = {
     "movable_object.barrier": "barrier",
     "vehicle.bicycle": "bicycle",
@@ -34,7 +34,13 @@ BICYCLE_RACK = "static_object.bicycle_rack"
 
 @dataclass(frozen=True)
 class Scenes:
-    """S scenes. names: (S,). first_sample, first_image: (S + 1,) where each scene's begin."""
+    """S scenes.
+
+    Attributes:
+        names: (S,) such as "scene-0103".
+        first_sample: (S + 1,) row of each scene's first sample.
+        first_image: (S + 1,) row of each scene's first image.
+    """
 
     names: NDArray[np.str_]
     first_sample: Ints
@@ -43,9 +49,13 @@ class Scenes:
 
 @dataclass(frozen=True)
 class Sensors:
-    """K calibrated sensors: channels (K,), ego_from_sensor translations (K, 3), quaternions (K, 4).
+    """K calibrated sensors.
 
-    intrinsics: (K, 3, 3), NaN where the sensor is no camera.
+    Attributes:
+        channels: (K,) such as "CAM_FRONT".
+        translations: (K, 3) of ego_from_sensor, metres.
+        quaternions: (K, 4) of ego_from_sensor, w, x, y, z.
+        intrinsics: (K, 3, 3) pixels; NaN for other sensors than cameras.
     """
 
     channels: NDArray[np.str_]
@@ -56,9 +66,15 @@ class Sensors:
 
 @dataclass(frozen=True)
 class Samples:
-    """N keyframes: tokens (N,), times_us (N,), world_from_ego (N, 3) and (N, 4) at LIDAR_TOP's time.
+    """N samples, nuScenes' word for keyframes.
 
-    lidars: (N,) LIDAR_TOP's place in Sensors. first_annotation: (N + 1,) where each one's annotations begin.
+    Attributes:
+        tokens: (N,) nuScenes' identifiers.
+        times_us: (N,) microseconds.
+        translations: (N, 3) of world_from_ego at the time of LIDAR_TOP, metres.
+        quaternions: (N, 4) of world_from_ego at the time of LIDAR_TOP, w, x, y, z.
+        lidars: (N,) row of the sample's LIDAR_TOP in Sensors.
+        first_annotation: (N + 1,) row of each sample's first annotation.
     """
 
     tokens: NDArray[np.bytes_]
@@ -71,10 +87,17 @@ class Samples:
 
 @dataclass(frozen=True)
 class Images:
-    """P camera images, by time in each scene; keyframes and those between.
+    """P camera images, those of keyframes and those between, by time within each scene.
 
-    samples, sensors: (P,) places. times_us: (P,). keys: (P,) bool. sizes: (P, 2) width, height.
-    translations (P, 3), quaternions (P, 4): world_from_ego at the image's time. files: (P,) below the root.
+    Attributes:
+        samples: (P,) row in Samples.
+        sensors: (P,) row in Sensors.
+        times_us: (P,) microseconds.
+        keys: (P,) bool, whether the image belongs to a keyframe.
+        sizes: (P, 2) width and height, pixels.
+        translations: (P, 3) of world_from_ego at the image's time, metres.
+        quaternions: (P, 4) of world_from_ego at the image's time, w, x, y, z.
+        files: (P,) paths relative to the dataset root.
     """
 
     samples: Ints
@@ -89,10 +112,18 @@ class Images:
 
 @dataclass(frozen=True)
 class Annotations:
-    """A boxes in the world, by sample. categories, attributes ("" none), instances: (A,) names and tokens.
+    """A annotated boxes in the world frame, ordered by sample.
 
-    centers (A, 3), sizes_wlh (A, 3), quaternions (A, 4), velocities (A, 2) NaN unknown, visibilities (A,) 0 to 1,
-    num_points (A,): lidar and radar.
+    Attributes:
+        categories: (A,) nuScenes' category names.
+        attributes: (A,) attribute names, "" for none.
+        instances: (A,) tokens of the objects.
+        centers: (A, 3) metres.
+        sizes_wlh: (A, 3) width, length, height, metres.
+        quaternions: (A, 4) w, x, y, z.
+        velocities: (A, 2) m/s along x and y; NaN if unknown.
+        visibilities: (A,) 0 to 1; NaN if unknown.
+        num_points: (A,) number of lidar and radar points.
     """
 
     categories: NDArray[np.bytes_]
@@ -108,7 +139,7 @@ class Annotations:
 
 @dataclass(frozen=True)
 class NuScenesIndex:
-    """One version of nuScenes. Without annotations (the test split) their table has no rows."""
+    """One version of nuScenes. `annotations` has no rows if the version has none, as the test split."""
 
     scenes: Scenes
     sensors: Sensors
@@ -117,7 +148,7 @@ class NuScenesIndex:
     annotations: Annotations
 
     def ground_truth(self, sample: int) -> Boxes3D | None:
-        """A keyframe's boxes of the ten classes, in the world; None in a version without annotations."""
+        """A sample's boxes of the ten classes in the world frame; None in a version without annotations."""
         if not len(self.annotations.categories):
             return None
         rows = self._annotations_of(sample)
@@ -126,9 +157,9 @@ class NuScenesIndex:
         return self._boxes(rows[kept], [name for name in classes if name])
 
     def bicycle_racks(self, sample: int) -> Boxes3D:
-        """A keyframe's bicycle racks, in the world; the official evaluation leaves out bicycles inside them.
+        """A sample's bicycle racks in the world frame. The official evaluation ignores bicycles inside them.
 
-        Their class is nuScenes' category, as they are none of the ten.
+        Their class name is nuScenes' category, because they belong to none of the ten classes.
         """
         rows = self._annotations_of(sample)
         racks = rows[self.annotations.categories[rows] == BICYCLE_RACK.encode()]

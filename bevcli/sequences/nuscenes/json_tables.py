@@ -1,12 +1,10 @@
-"""nuScenes' tables: JSON lists of objects, the large ones over a gigabyte, read in batches."""
+"""Reads nuScenes' tables: JSON lists of objects. Large tables, some over a gigabyte, are read in batches."""
 
 from __future__ import annotations
 
-import gc
 import json
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -18,18 +16,18 @@ from bevcli.geometry.transforms import Array
 
 Row: TypeAlias = dict[str, Any]
 BATCH_BYTES = 16 << 20
-# Between two rows. The large tables hold neither objects in rows nor free text, so nothing else looks like this.
+# The text between two rows. Rows of large tables contain no objects and no free text, so it occurs nowhere else.
 BETWEEN_ROWS = re.compile(rb"}\s*,\s*{")
-TAIL_BYTES = 1 << 14  # where a batch is cut: no row is longer
+TAIL_BYTES = 1 << 14  # the end of a batch in which its last complete row ends; no row is longer
 
 
 def read_rows(path: Path) -> list[Row]:
-    """All rows of a table. Raises InputError where it is missing or no list of objects."""
+    """All rows of a table. Raises InputError if it is missing or not a list."""
     return [row for batch in read_batches(path) for row in batch]
 
 
 def read_batches(path: Path) -> Iterator[list[Row]]:
-    """The rows of a table, some ten thousands at a time; raises InputError as `read_rows`."""
+    """The rows of a table, tens of thousands at a time. Raises InputError as `read_rows`."""
     if not path.is_file():
         raise InputError(f"{path}: the table is missing (expected a nuScenes table)")
     if path.stat().st_size <= BATCH_BYTES:
@@ -45,20 +43,8 @@ def read_batches(path: Path) -> Iterator[list[Row]]:
         yield _parse(path, b"[" + rest)
 
 
-@contextmanager
-def without_garbage_collection() -> Iterator[None]:
-    """Millions of rows make the collector walk them over and over: a third of the time for nothing."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
-
-
 def column(rows: list[Row], name: str, path: Path) -> list[Any]:
-    """A column of rows. Raises InputError where one lacks it."""
+    """The values of a column. Raises InputError if a row does not have it."""
     try:
         return [row[name] for row in rows]
     except (KeyError, TypeError):
@@ -66,7 +52,7 @@ def column(rows: list[Row], name: str, path: Path) -> list[Any]:
 
 
 def integers(rows: list[Row], name: str, path: Path) -> NDArray[np.int64]:
-    """A column of integers as (N,). Raises InputError where one is none."""
+    """(N,) int64 values of a column. Raises InputError for anything but integers."""
     values = np.array(column(rows, name, path))
     if len(values) and (values.ndim != 1 or values.dtype.kind not in "iub"):
         raise InputError(f'{path}: "{name}": expected an integer in every row')
@@ -74,7 +60,7 @@ def integers(rows: list[Row], name: str, path: Path) -> NDArray[np.int64]:
 
 
 def vectors(rows: list[Row], name: str, path: Path, size: int) -> Array:
-    """A column of `size` numbers as (N, size). Raises InputError where one has others, or a number is not finite."""
+    """(N, size) values of a column of number lists. Raises InputError for another length or a non-finite number."""
     try:
         values = np.array(column(rows, name, path), dtype=np.float64)
     except (ValueError, TypeError):
@@ -85,12 +71,12 @@ def vectors(rows: list[Row], name: str, path: Path, size: int) -> Array:
 
 
 def tokens(rows: list[Row], name: str, path: Path) -> NDArray[np.bytes_]:
-    """A column of tokens as (N,) bytes."""
+    """(N,) tokens of a column, as bytes."""
     return np.array(column(rows, name, path), dtype="S") if rows else np.zeros(0, dtype="S32")
 
 
 def places_of(wanted: NDArray[np.bytes_], table: NDArray[np.bytes_], path: Path) -> NDArray[np.int64]:
-    """(N,) the rows of a table by token. table: (M,) its tokens. Raises InputError where one is not in it."""
+    """(N,) rows of the wanted tokens (N,) in a table with the tokens (M,). Raises InputError if one is missing."""
     if not len(wanted):
         return np.zeros(0, dtype=np.int64)
     order = np.argsort(table)
@@ -101,7 +87,7 @@ def places_of(wanted: NDArray[np.bytes_], table: NDArray[np.bytes_], path: Path)
         places, unknown = np.zeros(len(wanted), dtype=np.int64), np.ones(len(wanted), dtype=bool)
     if unknown.any():
         token = wanted[unknown][0].decode()
-        raise InputError(f'{path}: token "{token}" is not in the table, but another table refers to it')
+        raise InputError(f'{path}: token "{token}" is missing in this table, but another table refers to it')
     return places
 
 

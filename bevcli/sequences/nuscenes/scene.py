@@ -1,4 +1,4 @@
-"""What holds for a whole scene of nuScenes: its rig, its poses, its CAN bus."""
+"""One nuScenes scene: its rig, its poses, and the data of the CAN bus expansion."""
 
 from __future__ import annotations
 
@@ -7,21 +7,51 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics, derive_kinematics
-from bevcli.geometry.transforms import Pose
-from bevcli.sequences.nuscenes.can_bus import CanBus, read_can_bus
+from bevcli.geometry.transforms import Array, Pose
 from bevcli.sequences.nuscenes.index import NuScenesIndex
+from bevcli.sequences.nuscenes.json_tables import integers, read_rows, vectors
 
-# The order in which nuScenes' cameras are told; others follow by name.
+# The order of nuScenes' cameras in a rig. Other cameras follow, sorted by name.
 CAMERAS = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT")
 
 
 @dataclass(frozen=True)
+class CanBus:
+    """The T pose messages of a scene in the CAN bus expansion.
+
+    Attributes:
+        times_us: (T,) microseconds, increasing.
+        accelerations: (T, 3) m/s² with gravity, ego frame.
+        angular_rates: (T, 3) rad/s, ego frame.
+        velocities: (T, 3) m/s, ego frame.
+    """
+
+    times_us: NDArray[np.int64]
+    accelerations: Array
+    angular_rates: Array
+    velocities: Array
+
+    def kinematics_at(self, time_us: int) -> Kinematics:
+        """The first message after a time, or the last message. The published models were trained this way."""
+        row = min(int(np.searchsorted(self.times_us, time_us, side="right")), len(self.times_us) - 1)
+        return Kinematics(self.accelerations[row], self.angular_rates[row], self.velocities[row])
+
+
+@dataclass(frozen=True)
 class SceneFacts:
-    """What holds for a whole scene. motion: all its poses. sensor_names: the camera of each calibrated sensor."""
+    """Calibration and motion of one scene.
+
+    Attributes:
+        rig: the scene's cameras.
+        sensor_names: camera name of each calibrated sensor, by its row in the index.
+        motion: all poses of the scene.
+        can_bus: None if the scene has no CAN bus data.
+    """
 
     rig: CameraRig
     sensor_names: Mapping[int, str]
@@ -29,21 +59,21 @@ class SceneFacts:
     can_bus: CanBus | None
 
     def kinematics_at(self, timestamp_ns: int) -> Kinematics:
-        """By the CAN bus where the scene has it, else from the poses."""
+        """Kinematics at a time from the CAN bus data, or from the poses if there is none."""
         if self.can_bus is None:
             return self.motion.kinematics_at(timestamp_ns)
         return self.can_bus.kinematics_at(timestamp_ns // 1000)
 
 
 def read_scene_facts(index: NuScenesIndex, root: Path, scene: int) -> SceneFacts:
-    """All of it, of the scene at a place of the index. Raises InputError."""
+    """The facts of a scene, given by its row in the index. Raises InputError."""
     rig, sensor_names = scene_rig(index, scene)
     can_bus = read_can_bus(root, str(index.scenes.names[scene]))
     return SceneFacts(rig, sensor_names, scene_motion(index, scene), can_bus)
 
 
 def scene_rig(index: NuScenesIndex, scene: int) -> tuple[CameraRig, dict[int, str]]:
-    """The rig of a scene, and the camera's name of each of its calibrated sensors."""
+    """The rig of a scene, and the camera name of each of its calibrated sensors."""
     first, last = index.scenes.first_image[scene : scene + 2]
     sensors, rows = np.unique(index.images.sensors[first:last], return_index=True)
     cameras = [_camera(index, int(sensor), first + row) for sensor, row in zip(sensors, rows, strict=True)]
@@ -56,9 +86,9 @@ def scene_rig(index: NuScenesIndex, scene: int) -> tuple[CameraRig, dict[int, st
 
 
 def scene_motion(index: NuScenesIndex, scene: int) -> EgoMotion:
-    """A scene's poses at its keyframes' and images' times; kinematics are derived from the keyframes' alone.
+    """A scene's poses at the times of its keyframes and images.
 
-    Poses a few milliseconds apart would make differences of differences of their noise.
+    Kinematics are derived from the keyframes only: differentiating poses a few milliseconds apart amplifies noise.
     """
     samples, images = index.samples, index.images
     keys = slice(*index.scenes.first_sample[scene : scene + 2])
@@ -66,7 +96,7 @@ def scene_motion(index: NuScenesIndex, scene: int) -> EgoMotion:
     key_times = samples.times_us[keys] * 1000
     keyframes = (samples.translations[keys], samples.quaternions[keys])
     rough = EgoMotion(key_times, *keyframes, *derive_kinematics(key_times, *keyframes))
-    # The first of equal times is kept: keyframes come first.
+    # Of equal times the first is kept, so that keyframes take precedence.
     times, first = np.unique(np.concatenate([key_times, images.times_us[rows] * 1000]), return_index=True)
     translations = np.concatenate([keyframes[0], images.translations[rows]])[first]
     quaternions = np.concatenate([keyframes[1], images.quaternions[rows]])[first]
@@ -80,6 +110,20 @@ def scene_motion(index: NuScenesIndex, scene: int) -> EgoMotion:
         np.stack([k.angular_rate for k in derived]),
         np.stack([k.velocity for k in derived]),
     )
+
+
+def read_can_bus(root: Path, scene: str) -> CanBus | None:
+    """A scene's messages, None if the expansion does not have them. Raises InputError for an invalid file."""
+    path = root / "can_bus" / f"{scene}_pose.json"
+    if not path.is_file():
+        return None
+    rows = read_rows(path)
+    if not rows:
+        return None
+    times = integers(rows, "utime", path)
+    quantities = [vectors(rows, name, path, 3) for name in ("accel", "rotation_rate", "vel")]
+    order = np.argsort(times, kind="stable")
+    return CanBus(times[order], *(values[order] for values in quantities))
 
 
 def _camera(index: NuScenesIndex, sensor: int, image: int) -> Camera:

@@ -1,16 +1,16 @@
-"""Buses."""
+"""Meshes of buses."""
 
 from __future__ import annotations
 
-from bevcli.synth.assets.cars import GLASS, PAINT, TRIM
 from bevcli.synth.assets.mesh import Material, Mesh, block, joined, side_profile
-from bevcli.synth.assets.trucks import CARGO, LAMP, TAIL, axles
+from bevcli.synth.assets.paint import CARGO, GLASS, HEADLAMP, PAINT, TAIL_LAMP, TRIM
+from bevcli.synth.assets.trucks import axles
 
 BUS_NAMES = ("city", "coach", "school", "mini", "double", "shuttle", "articulated")
 
 
 def bus(name: str) -> Mesh:
-    """One of BUS_NAMES."""
+    """The mesh of a bus. name: one of BUS_NAMES."""
     length, height, floor = {
         "city": (12.0, 3.1, 0.35),
         "coach": (12.4, 3.6, 0.5),
@@ -61,8 +61,8 @@ def bus(name: str) -> Mesh:
     parts.append(block((0, 0, floor + 0.35), (length * 0.92, half * 2.01, 0.22), CARGO, Material.DYE))
     for side in (-1, 1):
         parts += [
-            block((front - 0.02, side * half * 0.75, 0.75), (0.08, 0.4, 0.2), LAMP, Material.GLOW),
-            block((-front, side * half * 0.82, 1.0), (0.06, 0.22, 0.4), TAIL, Material.GLOW),
+            block((front - 0.02, side * half * 0.75, 0.75), (0.08, 0.4, 0.2), HEADLAMP, Material.GLOW),
+            block((-front, side * half * 0.82, 1.0), (0.06, 0.22, 0.4), TAIL_LAMP, Material.GLOW),
         ]
     places = (-front * 0.55, front * 0.58) if name != "articulated" else (-front * 0.6, -0.2, front * 0.65)
     return joined([*parts, *axles(places, half + 0.02, 0.46)])

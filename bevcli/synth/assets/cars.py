@@ -1,4 +1,4 @@
-"""Cars: bodies from a side profile, a glazed cabin, wheels and lamps."""
+"""Meshes of cars: a body extruded from a side profile, a cabin with windows, wheels and lamps."""
 
 from __future__ import annotations
 
@@ -6,17 +6,24 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from bevcli.synth.assets.mesh import Material, Mesh, block, joined, rod, side_profile, wheel
-
-GLASS = (38, 48, 56)
-TRIM = (34, 35, 38)
-PAINT = (200, 200, 200)
+from bevcli.synth.assets.paint import GLASS, PAINT, TRIM
 
 
 @dataclass(frozen=True)
 class CarShape:
-    """Proportions of a car, metres; x positions are fractions of the length from the tail (0) to the nose (1).
+    """Proportions of a car.
 
-    belt: height of the windows' lower edge. cabin: x of tail window's foot and head, windscreen's head and foot.
+    Attributes:
+        length: metres.
+        width: metres.
+        height: metres.
+        belt: height of the lower edge of the windows, metres.
+        nose: height of the bonnet's front edge, metres.
+        tail: height of the boot's rear edge, metres.
+        cabin: positions along the car as fractions of its length, 0 at the tail and 1 at the nose: rear window's
+            lower edge, its upper edge, windscreen's upper edge, its lower edge.
+        wheel_radius: metres.
+        clearance: height of the body's underside, metres.
     """
 
     length: float
@@ -43,7 +50,7 @@ CAR_SHAPES: dict[str, CarShape] = {
 
 
 def car(name: str) -> Mesh:
-    """One of CAR_SHAPES. Its paint is the instance's; a taxi's sign glows."""
+    """The mesh of a car. name: a key of CAR_SHAPES."""
     s = CAR_SHAPES[name]
     half, x = s.width / 2, _along(s)
     body = [
@@ -66,12 +73,12 @@ def car(name: str) -> Mesh:
 
 
 def _along(s: CarShape) -> Callable[[float], float]:
-    """Fraction of the length -> x in metres."""
+    """A function from a fraction of the length to x in metres."""
     return lambda fraction: (fraction - 0.5) * s.length
 
 
 def _pillars(s: CarShape, half: float, roof_half: float) -> list[Mesh]:
-    """Posts at the corners and behind the doors, so that the glass does not look like one block."""
+    """Posts at the cabin's corners and between the doors."""
     x = _along(s)
     posts = []
     middle = (s.cabin[1] + s.cabin[2]) / 2
@@ -85,7 +92,7 @@ def _pillars(s: CarShape, half: float, roof_half: float) -> list[Mesh]:
 
 
 def _details(s: CarShape, half: float) -> list[Mesh]:
-    """Wheels in dark arches, lamps, bumpers, plates and mirrors."""
+    """Wheels and their arches, lamps, bumpers, number plates and mirrors."""
     x = _along(s)
     lamp_z, tail_z = s.nose - 0.1, s.tail - 0.12
     parts = [

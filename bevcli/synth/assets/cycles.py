@@ -1,10 +1,9 @@
-"""Bicycles and motorcycles, with and without riders."""
+"""Meshes of bicycles and motorcycles, with and without riders."""
 
 from __future__ import annotations
 
-from bevcli.synth.assets.cars import PAINT, TRIM
 from bevcli.synth.assets.mesh import Material, Mesh, ball, block, joined, rod, side_profile
-from bevcli.synth.assets.paint import Color
+from bevcli.synth.assets.paint import PAINT, TRIM, Color
 from bevcli.synth.assets.people import rider
 
 RUBBER: Color = (24, 24, 26)
@@ -14,7 +13,7 @@ MOTORCYCLE_NAMES = ("sport", "cruiser", "scooter", "sport_rider", "cruiser_rider
 
 
 def _thin_wheel(x: float, radius: float, width: float) -> Mesh:
-    """A wheel of two discs: a dark tyre and a lighter middle."""
+    """A wheel: a dark tyre around a lighter disc."""
     return joined(
         [
             rod((x, -width / 2, radius), (x, width / 2, radius), radius, RUBBER, sections=14),
@@ -31,7 +30,7 @@ def _thin_wheel(x: float, radius: float, width: float) -> Mesh:
 
 
 def bicycle(name: str) -> Mesh:
-    """One of BICYCLE_NAMES; those that end in _rider carry a person."""
+    """The mesh of a bicycle. name: one of BICYCLE_NAMES; with the suffix "_rider" a person sits on it."""
     kind = name.removesuffix("_rider")
     reach = {"city": 1.05, "racer": 1.0, "cargo": 1.35, "mountain": 1.08}[kind]
     radius, seat_z, bar_z = 0.34, 0.92, {"city": 1.08, "racer": 0.95, "cargo": 1.05, "mountain": 1.02}[kind]
@@ -71,7 +70,7 @@ def bicycle(name: str) -> Mesh:
 
 
 def motorcycle(name: str) -> Mesh:
-    """One of MOTORCYCLE_NAMES; those that end in _rider carry a person."""
+    """The mesh of a motorcycle. name: one of MOTORCYCLE_NAMES; with the suffix "_rider" a person sits on it."""
     kind = name.removesuffix("_rider")
     radius, reach = (0.24, 1.25) if kind == "scooter" else (0.32, 1.45)
     back, front = -reach / 2, reach / 2

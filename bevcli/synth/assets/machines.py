@@ -1,18 +1,18 @@
-"""Construction vehicles."""
+"""Meshes of construction vehicles."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-from bevcli.synth.assets.cars import GLASS, PAINT, TRIM
 from bevcli.synth.assets.mesh import Material, Mesh, block, joined, rod, side_profile, wheel
+from bevcli.synth.assets.paint import GLASS, PAINT, TRIM
 
-STEEL = (96, 96, 98)
-HOSE = (30, 30, 32)
+WORN_STEEL = (96, 96, 98)
+BLACK_RUBBER = (30, 30, 32)
 
 
 def _cabin(x: float, y: float, bottom: float, size: tuple[float, float, float]) -> list[Mesh]:
-    """A glazed cabin with a roof and four posts."""
+    """A cabin with windows, a roof and four posts."""
     length, width, height = size
     parts = [
         block((x, y, bottom + height * 0.15), (length, width, height * 0.3), PAINT, Material.PAINT),
@@ -42,12 +42,12 @@ def _track(y: float, length: float, height: float, width: float) -> list[Mesh]:
             (x, y - width / 2 - 0.02, height * 0.45),
             (x, y + width / 2 + 0.02, height * 0.45),
             height * 0.3,
-            STEEL,
+            WORN_STEEL,
             sections=8,
         )
         for x in (-half * 0.7, -half * 0.25, half * 0.25, half * 0.7)
     ]
-    return [side_profile(outline, width / 2, HOSE, y=y), *rollers]
+    return [side_profile(outline, width / 2, BLACK_RUBBER, y=y), *rollers]
 
 
 def _excavator() -> Mesh:
@@ -62,7 +62,7 @@ def _excavator() -> Mesh:
             rod((0.6, -0.3, 1.5), (2.6, -0.3, 3.3), 0.2, PAINT, Material.PAINT, 6),
             rod((2.6, -0.3, 3.3), (3.9, -0.3, 1.6), 0.16, PAINT, Material.PAINT, 6),
             rod((0.9, -0.3, 2.3), (2.1, -0.3, 3.1), 0.08, (200, 200, 202)),
-            side_profile([(3.6, 1.6), (4.2, 1.5), (3.9, 0.6), (3.2, 0.5), (3.2, 0.9)], 0.5, STEEL, y=-0.3),
+            side_profile([(3.6, 1.6), (4.2, 1.5), (3.9, 0.6), (3.2, 0.5), (3.2, 0.9)], 0.5, WORN_STEEL, y=-0.3),
         ]
     )
 
@@ -76,7 +76,7 @@ def _loader() -> Mesh:
             *_cabin(-0.3, 0, 1.5, (1.3, 1.4, 1.7)),
             *[wheel(x, y, 0.75, 0.55, (220, 190, 60)) for x in (-1.7, 1.4) for y in (-1.0, 1.0)],
             *[rod((0.6, y, 1.6), (2.7, y, 0.7), 0.11, PAINT, Material.PAINT) for y in (-0.6, 0.6)],
-            side_profile([(2.6, 0.15), (3.6, 0.1), (3.5, 0.3), (2.9, 1.1), (2.6, 1.1)], 1.35, STEEL),
+            side_profile([(2.6, 0.15), (3.6, 0.1), (3.5, 0.3), (2.9, 1.1), (2.6, 1.1)], 1.35, WORN_STEEL),
         ]
     )
 
@@ -89,10 +89,10 @@ def _backhoe() -> Mesh:
             *[wheel(-1.1, y, 0.72, 0.5, (220, 190, 60)) for y in (-0.9, 0.9)],
             *[wheel(1.4, y, 0.48, 0.35, (220, 190, 60)) for y in (-0.85, 0.85)],
             *[rod((0.9, y, 1.3), (2.5, y, 0.6), 0.09, PAINT, Material.PAINT) for y in (-0.6, 0.6)],
-            side_profile([(2.4, 0.1), (3.2, 0.1), (3.1, 0.3), (2.6, 0.9), (2.4, 0.9)], 1.15, STEEL),
+            side_profile([(2.4, 0.1), (3.2, 0.1), (3.1, 0.3), (2.6, 0.9), (2.4, 0.9)], 1.15, WORN_STEEL),
             rod((-1.6, 0, 1.0), (-2.7, 0, 3.1), 0.14, PAINT, Material.PAINT),
             rod((-2.7, 0, 3.1), (-3.3, 0, 1.5), 0.11, PAINT, Material.PAINT),
-            side_profile([(-3.6, 1.0), (-3.0, 1.1), (-2.9, 1.6), (-3.4, 1.6)], 0.35, STEEL),
+            side_profile([(-3.6, 1.0), (-3.0, 1.1), (-2.9, 1.6), (-3.4, 1.6)], 0.35, WORN_STEEL),
             block((-1.7, 0, 0.7), (0.3, 2.1, 0.6), TRIM),
         ]
     )
@@ -106,8 +106,8 @@ def _bulldozer() -> Mesh:
             block((0.9, 0, 1.35), (1.9, 1.2, 0.9), PAINT, Material.PAINT),
             block((-0.7, 0, 1.2), (1.6, 1.4, 0.7), PAINT, Material.PAINT),
             *_cabin(-0.6, 0, 1.4, (1.3, 1.4, 1.6)),
-            rod((1.2, 0.35, 1.7), (1.2, 0.35, 2.5), 0.07, HOSE),
-            side_profile([(2.2, 0.05), (2.45, 0.05), (2.35, 0.7), (2.5, 1.3), (2.2, 1.25)], 1.55, STEEL),
+            rod((1.2, 0.35, 1.7), (1.2, 0.35, 2.5), 0.07, BLACK_RUBBER),
+            side_profile([(2.2, 0.05), (2.45, 0.05), (2.35, 0.7), (2.5, 1.3), (2.2, 1.25)], 1.55, WORN_STEEL),
             *[rod((0.2, y, 0.6), (2.25, y, 0.5), 0.1, PAINT, Material.PAINT) for y in (-1.35, 1.35)],
         ]
     )
@@ -116,7 +116,7 @@ def _bulldozer() -> Mesh:
 def _roller() -> Mesh:
     return joined(
         [
-            rod((1.7, -1.0, 0.72), (1.7, 1.0, 0.72), 0.72, STEEL, sections=14),
+            rod((1.7, -1.0, 0.72), (1.7, 1.0, 0.72), 0.72, WORN_STEEL, sections=14),
             *[block((1.5, y, 0.85), (1.9, 0.1, 0.25), PAINT, Material.PAINT) for y in (-1.06, 1.06)],
             block((-1.3, 0, 1.3), (2.0, 1.5, 0.8), PAINT, Material.PAINT),
             *_cabin(0.1, 0, 1.0, (1.2, 1.4, 1.9)),
@@ -134,7 +134,7 @@ def _crane() -> Mesh:
             block((-1.2, 0, 1.8), (3.0, 2.0, 1.0), PAINT, Material.PAINT),
             *_cabin(-0.4, -0.6, 1.6, (1.3, 0.9, 1.5)),
             rod((-2.2, 0.2, 2.4), (4.6, 0.2, 3.5), 0.34, PAINT, Material.PAINT, 4),
-            rod((3.8, 0.2, 3.36), (5.0, 0.2, 3.56), 0.22, STEEL, sections=4),
+            rod((3.8, 0.2, 3.36), (5.0, 0.2, 3.56), 0.22, WORN_STEEL, sections=4),
             block((-2.9, 0, 1.8), (0.7, 2.3, 1.0), TRIM),
         ]
     )
@@ -173,5 +173,5 @@ MACHINE_NAMES = tuple(_MACHINES)
 
 
 def machine(name: str) -> Mesh:
-    """One of MACHINE_NAMES."""
+    """The mesh of a construction vehicle. name: one of MACHINE_NAMES."""
     return _MACHINES[name]()

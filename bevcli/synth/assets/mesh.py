@@ -1,6 +1,6 @@
-"""Coloured low-polygon meshes and the few shapes that all of them are built from, with trimesh.
+"""Coloured low-polygon meshes, and the primitives that they are built from.
 
-Local frame as a box's: x forward, y left, z up, the origin in the middle of the bottom.
+A mesh has its own frame: x forward, y left, z up, the origin in the middle of the bottom. Lengths are in metres.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from bevcli.synth.assets.paint import Color, linear
 
 
 class Material(IntEnum):
-    """How a face answers light. PAINT takes the instance's own colour, DYE its second one."""
+    """How a face is shaded. PAINT and DYE faces take the two colours of the individual."""
 
     MATTE = 0
     PAINT = 1
@@ -32,7 +32,13 @@ class Material(IntEnum):
 
 @dataclass(frozen=True)
 class Mesh:
-    """faces: (F, 3, 3) corner points, counter-clockwise from outside. albedo: (F, 3) linear. material: (F,)."""
+    """F triangles with colours.
+
+    Attributes:
+        faces: (F, 3, 3) corner points, metres; counter-clockwise seen from outside.
+        albedo: (F, 3) linear RGB.
+        material: (F,) values of `Material`.
+    """
 
     faces: NDArray[np.float32]
     albedo: NDArray[np.float32]
@@ -40,23 +46,17 @@ class Mesh:
 
     @property
     def extents(self) -> NDArray[np.float64]:
-        """(3,) length, width and height that the mesh fills, metres."""
+        """(3,) length, width and height, metres."""
         points = self.faces.reshape(-1, 3).astype(np.float64)
         return points.max(0) - points.min(0)
 
     def fitted(self, size_lwh: ArrayLike) -> Mesh:
-        """The mesh stretched to fill a box of this size, standing on z = 0 and centred in x and y."""
+        """The mesh stretched to this size (3,), standing on z = 0 and centred in x and y."""
         points = self.faces.reshape(-1, 3).astype(np.float64)
         low, high = points.min(0), points.max(0)
         scale = np.asarray(size_lwh, dtype=np.float64) / (high - low)
         middle = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
         return replace(self, faces=((self.faces - middle) * scale).astype(np.float32))
-
-    def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: float = 0.0, pitch: float = 0.0) -> Mesh:
-        """The mesh turned about y by `pitch` (nose down positive), about z by `yaw`, then shifted."""
-        matrix = trimesh.transformations.euler_matrix(0, pitch, yaw, "sxyz")
-        faces = self.faces @ matrix[:3, :3].T + np.array([x, y, z])
-        return replace(self, faces=faces.astype(np.float32))
 
 
 def from_trimesh(shape: trimesh.Trimesh, color: Color, material: Material = Material.MATTE) -> Mesh:
@@ -66,7 +66,7 @@ def from_trimesh(shape: trimesh.Trimesh, color: Color, material: Material = Mate
 
 
 def joined(parts: Iterable[Mesh]) -> Mesh:
-    """All parts as one mesh."""
+    """One mesh of all parts."""
     meshes = list(parts)
     return Mesh(
         np.concatenate([m.faces for m in meshes]),
@@ -81,7 +81,7 @@ def block(
     color: Color,
     material: Material = Material.MATTE,
 ) -> Mesh:
-    """A cuboid, by its middle and its size."""
+    """A cuboid. center: its middle."""
     return from_trimesh(trimesh.creation.box(size_lwh, rigid(center)), color, material)
 
 
@@ -102,7 +102,7 @@ def cone(
     x: float, y: float, bottom: float, top: float, radius: float, top_radius: float, color: Color,
     material: Material = Material.MATTE, sections: int = 8,
 ) -> Mesh:  # fmt: skip
-    """A cone frustum standing upright from `bottom` to `top`."""
+    """An upright truncated cone at (x, y). bottom, top: heights; radius, top_radius: at these heights."""
     angle = np.linspace(0, 2 * np.pi, sections, endpoint=False)
     ring = np.stack([np.cos(angle), np.sin(angle)], -1)
     rings = [
@@ -118,7 +118,7 @@ def ball(
     material: Material = Material.MATTE,
     subdivisions: int = 1,
 ) -> Mesh:
-    """An ellipsoid: 20 faces, 80 after one subdivision."""
+    """An ellipsoid with 20 faces; each subdivision multiplies them by 4."""
     shape = trimesh.creation.icosphere(subdivisions=subdivisions)
     shape.apply_scale(radii)
     shape.apply_translation(center)
@@ -126,9 +126,9 @@ def ball(
 
 
 def loft(rings: Sequence[ArrayLike], color: Color, material: Material = Material.MATTE) -> Mesh:
-    """A closed body through rings of equally many points (P, 3), capped at both ends by convex polygons.
+    """A closed body through rings (P, 3) of equally many points, with a cap at each end.
 
-    Faces are turned outwards whatever the rings' sense, as long as the body is convex along its length.
+    The end rings must be convex. The faces point outwards for both orientations of the rings.
     """
     points = np.asarray(rings, dtype=np.float64)
     count, per_ring = points.shape[:2]
@@ -147,8 +147,11 @@ def loft(rings: Sequence[ArrayLike], color: Color, material: Material = Material
     return from_trimesh(trimesh.Trimesh(shape.vertices, shape.faces[sound], process=False), color, material)
 
 
-def prism(rings: ArrayLike, color: Color, material: Material = Material.MATTE) -> Mesh:
-    """`loft` for many simple bodies: rings (2, P, 3), the lower then the upper, counter-clockwise seen from above."""
+def prism(rings: ArrayLike, color: Color) -> Mesh:
+    """A faster `loft` between two horizontal rings, with the material MATTE.
+
+    rings: (2, P, 3), the lower ring first; both convex and counter-clockwise seen from above.
+    """
     lower, upper = np.asarray(rings, dtype=np.float32)
     after_lower, after_upper = np.roll(lower, -1, axis=0), np.roll(upper, -1, axis=0)
     faces = [np.stack([lower, after_lower, after_upper], 1), np.stack([lower, after_upper, upper], 1)]
@@ -158,14 +161,17 @@ def prism(rings: ArrayLike, color: Color, material: Material = Material.MATTE) -
             np.stack([upper[0], upper[i], upper[i + 1]])[None],
         ]
     joint = np.concatenate(faces)
-    return Mesh(joint, np.tile(linear(color), (len(joint), 1)), np.full(len(joint), material, np.uint8))
+    return Mesh(joint, np.tile(linear(color), (len(joint), 1)), np.full(len(joint), Material.MATTE, np.uint8))
 
 
 def side_profile(
     outline_xz: ArrayLike, half_width: float, color: Color, material: Material = Material.MATTE, y: float = 0.0,
     top_half_width: float | None = None,
 ) -> Mesh:  # fmt: skip
-    """A convex outline (P, 2) of x and z, as wide as 2 half_width at its bottom and narrower towards its top."""
+    """A convex outline (P, 2) of x and z, extruded along y around `y`.
+
+    half_width: half the width at the bottom. top_half_width: half the width at the top; default: half_width.
+    """
     outline = np.asarray(outline_xz, dtype=np.float64)
     top = half_width if top_half_width is None else top_half_width
     low, high = outline[:, 1].min(), outline[:, 1].max()
@@ -175,7 +181,7 @@ def side_profile(
 
 
 def wheel(x: float, y: float, radius: float, width: float, hub: Color = (122, 124, 128)) -> Mesh:
-    """A tyre with a hub, its axle along y."""
+    """A tyre with a hub, standing on z = 0; its axle is parallel to y."""
     tyre = rod((x, y - width / 2, radius), (x, y + width / 2, radius), radius, (22, 22, 24), sections=12)
     rim = rod((x, y - width / 2 - 0.012, radius), (x, y + width / 2 + 0.012, radius), radius * 0.52, hub, sections=8)
     return joined([tyre, rim])

@@ -1,14 +1,21 @@
-"""Colours: sRGB as people name them, linear as light adds them."""
+"""Colours: in sRGB where they are chosen, in linear RGB where light is computed."""
 
 from __future__ import annotations
-
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Color = tuple[int, int, int]  # sRGB, 0 to 255
 
+# Parts of vehicles. PAINT is a placeholder: each vehicle gets a colour of its own.
+PAINT: Color = (200, 200, 200)
+GLASS: Color = (38, 48, 56)
+TRIM: Color = (34, 35, 38)
+CARGO: Color = (224, 224, 220)
+HEADLAMP: Color = (255, 248, 226)
+TAIL_LAMP: Color = (190, 16, 18)
+
+# Colours to draw from.
 CAR_PAINTS: tuple[Color, ...] = (
     (235, 236, 238), (196, 199, 203), (120, 124, 130), (62, 66, 72), (26, 28, 32), (170, 28, 30), (120, 22, 30),
     (28, 60, 128), (52, 108, 176), (22, 40, 70), (34, 84, 62), (214, 178, 40), (204, 98, 32), (150, 132, 104),
@@ -29,23 +36,12 @@ CLOTHES: tuple[Color, ...] = (
 
 
 def linear(color: ArrayLike) -> NDArray[np.float32]:
-    """sRGB (..., 3) of 0 to 255 -> linear (..., 3) of 0 to 1."""
+    """Convert sRGB (..., 3), 0 to 255, to linear RGB (..., 3), 0 to 1."""
     c = np.asarray(color, dtype=np.float64) / 255
     return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 def darker(color: Color, factor: float) -> Color:
-    """The colour with all its components times a factor."""
+    """The colour with each component multiplied by a factor."""
     red, green, blue = (int(component * factor) for component in color)
     return red, green, blue
-
-
-@lru_cache(maxsize=4)
-def display_table(size: int = 4096, limit: float = 1.6) -> NDArray[np.uint8]:
-    """(size,) sRGB bytes of linear light from 0 to `limit`, with a soft shoulder for what is brighter than white."""
-    light = np.linspace(0, limit, size)
-    shoulder = 0.7
-    rolled = shoulder + (1 - shoulder) * (1 - np.exp(-(light - shoulder) / (1 - shoulder)))
-    mapped = np.where(light < shoulder, light, rolled)
-    encoded = np.where(mapped <= 0.0031308, 12.92 * mapped, 1.055 * mapped ** (1 / 2.4) - 0.055)
-    return np.clip(np.round(encoded * 255), 0, 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Pedestrians in two mirrored strides and a standing pose, and the riders of cycles."""
+"""Meshes of people: walking in two mirrored strides, standing, and riding a cycle."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ PERSON_NAMES = ("man", "woman", "worker", "child", "backpack", "coat")
 
 
 def person(name: str, stride: int) -> Mesh:
-    """One of PERSON_NAMES, about 1.75 m tall; stride: +1 or -1 for the leg in front, 0 standing."""
+    """The mesh of a person, about 1.75 m tall.
+
+    name: one of PERSON_NAMES. stride: +1 left leg in front, -1 right leg in front, 0 standing.
+    """
     k = PERSON_NAMES.index(name)
     skin, hair, legs = SKIN[k % 4], HAIR[(k + 1) % 4], TROUSERS[k % 4]
     swing = 0.26 * stride
@@ -84,7 +87,7 @@ def _head(x: float, z: float, skin: Color, hair: Color) -> list[Mesh]:
 
 
 def rider(seat: tuple[float, float], bars: tuple[float, float], pedal: tuple[float, float], helmet: Color) -> Mesh:
-    """A person sitting at `seat` with hands on `bars` and feet at `pedal`, each (x, z)."""
+    """A person who sits on a cycle. seat, bars, pedal: (x, z) of the seat, of the hands and of the feet, metres."""
     hip, shoulder = np.array([seat[0], 0.0, seat[1] + 0.06]), np.array([seat[0] + 0.26, 0.0, seat[1] + 0.56])
     parts = [
         rod(hip, shoulder, 0.16, SHIRT, Material.DYE, 8),

@@ -1,8 +1,8 @@
-"""Traffic cones and barriers. A barrier's long side is its width, as nuScenes annotates them."""
+"""Meshes of traffic cones and barriers. A barrier's long side is its width, as in nuScenes annotations."""
 
 from __future__ import annotations
 
-from bevcli.synth.assets.mesh import Material, Mesh, block, cone, joined, side_profile
+from bevcli.synth.assets.mesh import Mesh, block, cone, joined, side_profile
 from bevcli.synth.assets.paint import Color
 
 ORANGE: Color = (240, 92, 26)
@@ -13,7 +13,7 @@ BARRIER_NAMES = ("concrete", "plastic", "plank", "fence", "white_plastic")
 
 
 def traffic_cone(name: str) -> Mesh:
-    """One of CONE_NAMES."""
+    """The mesh of a traffic cone. name: one of CONE_NAMES."""
     if name == "drum":
         bands = [
             cone(
@@ -46,7 +46,7 @@ def traffic_cone(name: str) -> Mesh:
 
 
 def barrier(name: str) -> Mesh:
-    """One of BARRIER_NAMES: about 0.5 m long (thick), 2.5 m wide and 1 m high."""
+    """The mesh of a barrier, about 0.5 m long (its thickness), 2.5 m wide and 1 m high. name: one of BARRIER_NAMES."""
     if name == "concrete":
         return _jersey((172, 168, 160), None)
     if name in ("plastic", "white_plastic"):
@@ -66,7 +66,7 @@ def barrier(name: str) -> Mesh:
 
 
 def _jersey(color: Color, other: Color | None) -> Mesh:
-    """A wall with a sloped foot, laid along y, in one colour or in alternating pieces."""
+    """A wall along y with a sloped foot. other: the colour of every second piece; None for one colour."""
     outline = [
         (-0.28, 0.0),
         (0.28, 0.0),
@@ -80,6 +80,7 @@ def _jersey(color: Color, other: Color | None) -> Mesh:
     count = 1 if other is None else 4
     parts = []
     for k in range(count):
-        piece = side_profile(outline, 1.25 / count, color if k % 2 == 0 or other is None else other, Material.MATTE)
-        parts.append(piece.moved(y=-1.25 + (2 * k + 1) * 1.25 / count))
+        paint = color if k % 2 == 0 or other is None else other
+        y = -1.25 + (2 * k + 1) * 1.25 / count
+        parts.append(side_profile(outline, 1.25 / count, paint, y=y))
     return joined(parts)

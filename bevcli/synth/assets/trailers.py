@@ -1,16 +1,16 @@
-"""Trailers."""
+"""Meshes of trailers."""
 
 from __future__ import annotations
 
-from bevcli.synth.assets.cars import PAINT, TRIM
 from bevcli.synth.assets.mesh import Material, Mesh, block, joined, rod
-from bevcli.synth.assets.trucks import CARGO, TAIL, axles
+from bevcli.synth.assets.paint import CARGO, PAINT, TAIL_LAMP, TRIM
+from bevcli.synth.assets.trucks import axles
 
 TRAILER_NAMES = ("box", "curtain", "container", "tanker", "flatbed", "utility")
 
 
 def trailer(name: str) -> Mesh:
-    """One of TRAILER_NAMES; its drawbar or kingpin is at the front."""
+    """The mesh of a trailer. name: one of TRAILER_NAMES."""
     if name == "utility":
         return _utility_trailer()
     length, half, height = (
@@ -58,7 +58,9 @@ def trailer(name: str) -> Mesh:
                 for y in (-0.4, 0.4)
             ],
         ]
-    parts += [block((rear - 0.01, side * half * 0.8, 1.1), (0.06, 0.3, 0.16), TAIL, Material.GLOW) for side in (-1, 1)]
+    parts += [
+        block((rear - 0.01, side * half * 0.8, 1.1), (0.06, 0.3, 0.16), TAIL_LAMP, Material.GLOW) for side in (-1, 1)
+    ]
     return joined(parts)
 
 
@@ -72,6 +74,6 @@ def _utility_trailer() -> Mesh:
             rod((1.2, 0, 0.6), (2.4, 0, 0.5), 0.06, TRIM),
             block((-0.4, 0.1, 1.3), (2.2, 1.3, 0.7), (140, 110, 78)),
             *axles((-0.7,), 1.08, 0.34),
-            *[block((-2.3, y, 0.7), (0.06, 0.2, 0.12), TAIL, Material.GLOW) for y in (-0.8, 0.8)],
+            *[block((-2.3, y, 0.7), (0.06, 0.2, 0.12), TAIL_LAMP, Material.GLOW) for y in (-0.8, 0.8)],
         ]
     )

@@ -1,19 +1,15 @@
-"""Trucks."""
+"""Meshes of trucks."""
 
 from __future__ import annotations
 
-from bevcli.synth.assets.cars import GLASS, PAINT, TRIM
 from bevcli.synth.assets.mesh import Material, Mesh, block, joined, rod, side_profile, wheel
-from bevcli.synth.assets.paint import Color
+from bevcli.synth.assets.paint import CARGO, GLASS, HEADLAMP, PAINT, TAIL_LAMP, TRIM
 
-CARGO: Color = (224, 224, 220)
-LAMP: Color = (255, 248, 226)
-TAIL: Color = (190, 16, 18)
 TRUCK_NAMES = ("pickup", "delivery", "box", "flatbed", "tanker", "dumper", "garbage", "tractor")
 
 
 def truck(name: str) -> Mesh:
-    """One of TRUCK_NAMES."""
+    """The mesh of a truck. name: one of TRUCK_NAMES."""
     if name == "pickup":
         return _pickup()
     if name == "delivery":
@@ -81,7 +77,9 @@ def truck(name: str) -> Mesh:
             block((rear + 1.6, 0, 1.15), (1.2, 0.9, 0.14), (70, 70, 72)),
             rod((rear + bed - 0.2, 0.8, 1), (rear + bed - 0.2, 0.8, height), 0.08, (180, 182, 184)),
         ]
-    parts += [block((rear + 0.03, side * half * 0.8, 0.9), (0.08, 0.3, 0.16), TAIL, Material.GLOW) for side in (-1, 1)]
+    parts += [
+        block((rear + 0.03, side * half * 0.8, 0.9), (0.08, 0.3, 0.16), TAIL_LAMP, Material.GLOW) for side in (-1, 1)
+    ]
     return joined(parts)
 
 
@@ -102,8 +100,8 @@ def _pickup() -> Mesh:
     ]
     for side in (-1, 1):
         parts += [
-            block((2.74, side * 0.78, 0.88), (0.12, 0.3, 0.18), LAMP, Material.GLOW),
-            block((-2.78, side * 0.86, 0.95), (0.06, 0.18, 0.3), TAIL, Material.GLOW),
+            block((2.74, side * 0.78, 0.88), (0.12, 0.3, 0.18), HEADLAMP, Material.GLOW),
+            block((-2.78, side * 0.86, 0.95), (0.06, 0.18, 0.3), TAIL_LAMP, Material.GLOW),
             *[
                 rod((a, side * 0.89, 1.12), (b, side * 0.77, 1.82), 0.05, PAINT, Material.PAINT, 4)
                 for a, b in ((-0.6, -0.48), (0.3, 0.2), (1.3, 0.74))
@@ -126,14 +124,14 @@ def _delivery() -> Mesh:
     ]
     for side in (-1, 1):
         parts += [
-            block((3.02, side * 0.75, 0.92), (0.14, 0.34, 0.2), LAMP, Material.GLOW),
-            block((-3.1, side * 0.9, 1.3), (0.06, 0.14, 0.5), TAIL, Material.GLOW),
+            block((3.02, side * 0.75, 0.92), (0.14, 0.34, 0.2), HEADLAMP, Material.GLOW),
+            block((-3.1, side * 0.9, 1.3), (0.06, 0.14, 0.5), TAIL_LAMP, Material.GLOW),
         ]
     return joined([*parts, *axles((-1.9, 2.05), 1.0, 0.37)])
 
 
 def _cab(nose: float, half: float, height: float) -> Mesh:
-    """A cab-over driver's cab whose front is at x = nose."""
+    """A driver's cab whose front is at x = nose."""
     body = [
         (nose - 2.1, 0.6),
         (nose, 0.45),
@@ -156,12 +154,12 @@ def _cab(nose: float, half: float, height: float) -> Mesh:
     ]
     for side in (-1, 1):
         parts += [
-            block((nose, side * half * 0.78, 0.8), (0.06, 0.34, 0.18), LAMP, Material.GLOW),
+            block((nose, side * half * 0.78, 0.8), (0.06, 0.34, 0.18), HEADLAMP, Material.GLOW),
             block((nose - 0.15, side * (half - 0.05), 2.0), (0.12, 0.1, 0.5), TRIM),
         ]
     return joined(parts)
 
 
 def axles(positions: tuple[float, ...], half: float, radius: float) -> list[Mesh]:
-    """Two wheels at each position along x, flush with sides at ± half."""
+    """Two wheels at each position along x (metres). half: half the vehicle's width; radius of the wheels; metres."""
     return [wheel(x, side * (half - 0.16), radius, 0.3) for x in positions for side in (-1, 1)]

@@ -1,4 +1,4 @@
-"""The ground's texture: a window of painted ground around the vehicle, with mip levels, sampled per pixel."""
+"""The ground texture: the painted ground around the vehicle, with mip levels."""
 
 from __future__ import annotations
 
@@ -12,18 +12,22 @@ from numpy.typing import ArrayLike, NDArray
 from bevcli.synth.assets.paint import linear
 from bevcli.synth.world.ground_plan import ASPHALT, GroundPiece
 
-SUBPIXEL_BITS = 4
-LEVELS = 6
+SUBPIXEL_BITS = 4  # fractional bits of polygon corners in OpenCV
+LEVELS = 6  # mip levels; each has half the resolution of the one before
 ROUGH_SIZE = 256
 
 
 @dataclass(frozen=True)
 class GroundTexture:
-    """texels: (K, 3) uint8 of all levels, square root of linear light, coarser levels after finer ones.
-    rough: of `roughness`.
+    """A square of the ground in the world frame, rows along y.
 
-    offsets: (LEVELS,) first texel of each level. origin: (x, y) of the first texel's corner, metres, rows along y.
-    size: texels a side of the finest level, a multiple of 2^(LEVELS - 1).
+    Attributes:
+        texels: (K, 3) square root of linear RGB, 0 to 255; all levels one after another, the finest first.
+        rough: (256, 256) made by `roughness`.
+        offsets: (LEVELS,) index of the first texel of each level.
+        origin: x and y of the first texel's corner, metres.
+        texel_m: size of a texel of the finest level, metres.
+        size: texels along a side of the finest level, a multiple of 2^(LEVELS - 1).
     """
 
     texels: NDArray[np.uint8]
@@ -35,7 +39,7 @@ class GroundTexture:
 
 
 def paint_ground(pieces: list[GroundPiece], center: ArrayLike, extent_m: float, texel_m: float) -> GroundTexture:
-    """Paint a square of `extent_m` around a world point (2,)."""
+    """Paint a square of about `extent_m` metres around a world point (2,). texel_m: size of a texel, metres."""
     block = 2 ** (LEVELS - 1)
     size = round(extent_m / texel_m / block) * block
     origin = np.asarray(center, dtype=np.float64) - size * texel_m / 2
@@ -55,7 +59,7 @@ def paint_ground(pieces: list[GroundPiece], center: ArrayLike, extent_m: float, 
 
 
 def fill(canvas: NDArray[np.uint8], outline: NDArray[np.float64], color: tuple[int, ...] | int) -> None:
-    """Fill a polygon (P, 2), in pixels of x and y, into an image with sub-pixel edges, in place."""
+    """Fill a polygon (P, 2) of pixel positions (x, y) into an image, in place. Edges are exact to 1/16 of a pixel."""
     low, high = outline.min(0), outline.max(0)
     if high[0] < 0 or high[1] < 0 or low[0] > canvas.shape[1] or low[1] > canvas.shape[0]:
         return
@@ -66,11 +70,12 @@ def fill(canvas: NDArray[np.uint8], outline: NDArray[np.float64], color: tuple[i
 
 @lru_cache(maxsize=256)
 def _stored(color: tuple[int, int, int]) -> tuple[int, ...]:
+    """An sRGB colour as texels hold it."""
     return tuple(round(float(np.sqrt(c)) * 255) for c in linear(color))
 
 
 def roughness() -> NDArray[np.float32]:
-    """(256, 256) relative brightness of worn ground, repeating, in texels of shading_kernels.ROUGH_TEXEL_M."""
+    """(256, 256) relative brightness of worn ground, around 0; it repeats every 256 * ROUGH_TEXEL_M metres."""
     rng = np.random.Generator(np.random.PCG64(7))
     total = np.zeros((ROUGH_SIZE, ROUGH_SIZE))
     for cells, strength in ((8, 0.22), (64, 0.20)):

@@ -1,4 +1,4 @@
-"""Lenses: an image through a distorting lens is resampled from a wider pinhole image."""
+"""Cameras with distortion: their images are resampled from wider pinhole images."""
 
 from __future__ import annotations
 
@@ -12,13 +12,19 @@ from bevcli.errors import InputError
 from bevcli.geometry.cameras import Camera, distort
 from bevcli.geometry.transforms import Array
 
-WIDEST = 4.0  # tangent of the widest angle off the axis that a pinhole image can show with sense
-REFINEMENTS = 15  # fixed-point steps; OpenCV's own result is good to some pixels only at strong distortion
+WIDEST = 4.0  # tangent of the widest angle off the optical axis; wider pinhole images would be too large
+REFINEMENTS = 15  # fixed-point steps; OpenCV's result alone is off by some pixels at strong distortion
 
 
 @dataclass(frozen=True)
 class LensMaps:
-    """pinhole: the camera whose image is resampled. x, y: (H, W) float32 where in it each pixel looks."""
+    """How to resample a pinhole image.
+
+    Attributes:
+        pinhole: the camera of the pinhole image.
+        x: (H, W) column in the pinhole image for each pixel.
+        y: (H, W) row in the pinhole image for each pixel.
+    """
 
     pinhole: Camera
     x: NDArray[np.float32]
@@ -26,13 +32,16 @@ class LensMaps:
 
 
 def distortion_maps(camera: Camera) -> LensMaps:
-    """How to get the image of a camera with distortion. Raises InputError where its view is too wide for a plane."""
+    """The maps of a camera with distortion.
+
+    Raises InputError where the camera sees more than about 75 degrees off its optical axis.
+    """
     u, v = np.meshgrid(np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64))
     rays = _undistorted_rays(camera, np.stack([u, v], -1).reshape(-1, 2)).reshape(camera.height, camera.width, 2)
     if not np.isfinite(rays).all() or np.abs(rays).max() > WIDEST:
         raise InputError(
-            "its lens sees too far to the side to be rendered (expected at most 75 degrees off the axis): "
-            'give the rig without "distortion"'
+            "its field of view is too wide to be rendered (expected at most 75 degrees off the optical axis): "
+            'remove "distortion" from the rig or use a narrower lens'
         )
     low, high = rays.reshape(-1, 2).min(0), rays.reshape(-1, 2).max(0)
     focal = np.array([camera.intrinsics[0, 0], camera.intrinsics[1, 1]])
@@ -45,7 +54,7 @@ def distortion_maps(camera: Camera) -> LensMaps:
 
 
 def _undistorted_rays(camera: Camera, pixels: Array) -> Array:
-    """(P, 2) normalised pinhole coordinates of pixels (P, 2), refined until the lens puts them back."""
+    """(P, 2) normalised pinhole coordinates of pixels (P, 2), refined until distortion maps them to these pixels."""
     assert camera.distortion is not None
     coefficients = np.array(camera.distortion.coefficients)
     undistort = cv2.fisheye.undistortPoints if camera.distortion.model == "kannala_brandt" else cv2.undistortPoints

@@ -1,20 +1,29 @@
-"""The kernels of the rasteriser: triangles into a visibility buffer, and into a shadow map."""
+"""The numba kernels of the rasteriser: triangles into a visibility buffer, and into a shadow map."""
 
 # mypy: disable-error-code="no-untyped-def"
-# numba takes the arguments' types from the first call.
+# The functions have no type hints: numba takes the types from the first call.
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
-NEAR_M = 0.1  # triangles are cut where they come nearer to the camera's plane
+NEAR_M = 0.1  # depth of the near plane, at which triangles are clipped
 
 
 @njit(cache=True, nogil=True)
-def rasterise_runs(corners, normals, runs, run_objects, run_spheres, camera_from_world, pinhole, eye,
-                    triangles, inverse_depth, stamps, unoccluded):  # fmt: skip
-    """Draw runs of triangles, each hidden run as a whole left out; see `rasteriser.rasterise`."""
+def rasterise_meshes(world, meshes, camera_from_world, pinhole, eye,
+                     triangles, inverse_depth, last_objects, unoccluded):  # fmt: skip
+    """Draw meshes; those that are hidden or out of view are skipped as a whole.
+
+    world: corners (T, 3, 3) and normals (T, 3) of the triangles, world frame, metres.
+    meshes: triangle ranges (M, 2), objects (M,) and bounding spheres (M, 4) of the meshes, as in `TriangleSoup`.
+    camera_from_world: (3, 4). pinhole: (5,) fx, skew, cx, fy, cy. eye: (3,) camera position, world, metres.
+    Written: triangles (H, W) int32, inverse_depth (H, W) float32, unoccluded (O,) int64 as in `VisibilityBuffer`, and
+    last_objects (H, W) int32, the last object drawn at each pixel, hidden or not.
+    """
+    corners, normals = world
+    mesh_ranges, mesh_objects, mesh_spheres = meshes
     height, width = triangles.shape
     slope_x = max(pinhole[2], width - pinhole[2]) / pinhole[0] + abs(pinhole[1] / pinhole[0])
     slope_y = max(pinhole[4], height - pinhole[4]) / pinhole[3]
@@ -22,12 +31,15 @@ def rasterise_runs(corners, normals, runs, run_objects, run_spheres, camera_from
     p = np.empty((3, 3))
     cut = np.empty((4, 3))
     center = np.empty(3)
-    for run in range(runs.shape[0]):
-        radius = run_spheres[run, 3]
+    for mesh in range(mesh_ranges.shape[0]):
+        radius = mesh_spheres[mesh, 3]
         for axis in range(3):
             row = camera_from_world[axis]
             center[axis] = (
-                row[0] * run_spheres[run, 0] + row[1] * run_spheres[run, 1] + row[2] * run_spheres[run, 2] + row[3]
+                row[0] * mesh_spheres[mesh, 0]
+                + row[1] * mesh_spheres[mesh, 1]
+                + row[2] * mesh_spheres[mesh, 2]
+                + row[3]
             )
         if center[2] + radius < NEAR_M:
             continue
@@ -36,15 +48,15 @@ def rasterise_runs(corners, normals, runs, run_objects, run_spheres, camera_from
         if abs(center[1]) > slope_y * center[2] + radius * reach_y:
             continue
         if center[2] - radius > NEAR_M and _is_hidden(center, radius, pinhole, inverse_depth):
-            continue  # it shows nothing, so that its unoccluded pixels need not be counted either
-        owner = run_objects[run]
-        for t in range(runs[run, 0], runs[run, 1]):
+            continue  # hidden as a whole, so its unoccluded pixels are not counted
+        owner = mesh_objects[mesh]
+        for t in range(mesh_ranges[mesh, 0], mesh_ranges[mesh, 1]):
             facing = (
                 normals[t, 0] * (corners[t, 0, 0] - eye[0])
                 + normals[t, 1] * (corners[t, 0, 1] - eye[1])
                 + normals[t, 2] * (corners[t, 0, 2] - eye[2])
             )
-            if facing > 1e-3:  # seen from behind
+            if facing > 1e-3:  # a back face
                 continue
             for i in range(3):
                 for axis in range(3):
@@ -54,12 +66,15 @@ def rasterise_runs(corners, normals, runs, run_objects, run_spheres, camera_from
                     )
             if p[0, 2] < NEAR_M and p[1, 2] < NEAR_M and p[2, 2] < NEAR_M:
                 continue
-            _draw_triangle(p, cut, t, owner, pinhole, triangles, inverse_depth, stamps, unoccluded)
+            _draw_triangle(p, cut, t, owner, pinhole, triangles, inverse_depth, last_objects, unoccluded)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _is_hidden(center, radius, pinhole, inverse_depth):
-    """Whether everything that the sphere's image may cover is nearer than the sphere already."""
+    """Whether all pixels that a sphere may cover already see something nearer.
+
+    center: (3,) camera frame, metres. radius: metres.
+    """
     near, far = center[2] - radius, center[2] + radius
     left, right = center[0] - radius, center[0] + radius
     above, below = center[1] - radius, center[1] + radius
@@ -79,10 +94,13 @@ def _is_hidden(center, radius, pinhole, inverse_depth):
 
 
 @njit(cache=True, nogil=True)
-def _draw_triangle(p, cut, t, owner, pinhole, triangles, inverse_depth, stamps, unoccluded):
-    """One triangle p (3, 3) in the camera frame, cut at the near plane where it must be."""
+def _draw_triangle(p, cut, t, owner, pinhole, triangles, inverse_depth, last_objects, unoccluded):
+    """Draw triangle number t, with corners p (3, 3) in the camera frame, clipped at the near plane.
+
+    cut: (4, 3) working memory. owner: the triangle's object, -1 for none.
+    """
     if p[0, 2] >= NEAR_M and p[1, 2] >= NEAR_M and p[2, 2] >= NEAR_M:
-        _fill(p, p, 0, 1, 2, pinhole, t, owner, triangles, inverse_depth, stamps, unoccluded)
+        _fill(p, p, 0, 1, 2, pinhole, t, owner, triangles, inverse_depth, last_objects, unoccluded)
         return
     count = 0
     for i in range(3):  # Sutherland-Hodgman against the near plane
@@ -97,14 +115,15 @@ def _draw_triangle(p, cut, t, owner, pinhole, triangles, inverse_depth, stamps, 
                 cut[count, axis] = p[i, axis] + w * (p[j, axis] - p[i, axis])
             count += 1
     for i in range(1, count - 1):
-        _fill(p, cut, 0, i, i + 1, pinhole, t, owner, triangles, inverse_depth, stamps, unoccluded)
+        _fill(p, cut, 0, i, i + 1, pinhole, t, owner, triangles, inverse_depth, last_objects, unoccluded)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fill(p, q, a, b, c, pinhole, t, owner, triangles, inverse_depth, stamps, unoccluded):
-    """Scan the rows of the image that points a, b, c of q span; each edge bounds the columns of a row.
+def _fill(p, q, a, b, c, pinhole, t, owner, triangles, inverse_depth, last_objects, unoccluded):
+    """Fill the triangle of rows a, b, c of q, row by row; its edges bound the columns of each row.
 
-    p: (3, 3) the whole triangle in the camera frame. 1 / z is affine over the image, so its plane gives it exactly.
+    q: (3 or 4, 3) corners after clipping, camera frame, metres. p: (3, 3) corners of the whole triangle. 1 / z is an
+    affine function of the pixel, so the plane of p gives it exactly.
     """
     fx, skew, cx, fy, cy = pinhole[0], pinhole[1], pinhole[2], pinhole[3], pinhole[4]
     height, width = triangles.shape
@@ -121,7 +140,7 @@ def _fill(p, q, a, b, c, pinhole, t, owner, triangles, inverse_depth, stamps, un
     nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
     distance = nx * p[0, 0] + ny * p[0, 1] + nz * p[0, 2]
     area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)
-    if distance >= -1e-12 or area == 0.0:  # seen from behind or edge-on
+    if distance >= -1e-12 or area == 0.0:  # a back face, or seen edge-on
         return
     gu = nx / fx / distance
     gv = (ny - nx * skew / fx) / fy / distance
@@ -140,8 +159,8 @@ def _fill(p, q, a, b, c, pinhole, t, owner, triangles, inverse_depth, stamps, un
         base = gv * v + g0
         for u in range(int(np.ceil(low)), int(np.floor(high)) + 1):
             nearness = np.float32(gu * u + base)
-            if owner >= 0 and stamps[v, u] != owner:
-                stamps[v, u] = owner
+            if owner >= 0 and last_objects[v, u] != owner:
+                last_objects[v, u] = owner
                 unoccluded[owner] += 1
             if nearness > inverse_depth[v, u]:
                 inverse_depth[v, u] = nearness
@@ -150,7 +169,7 @@ def _fill(p, q, a, b, c, pinhole, t, owner, triangles, inverse_depth, stamps, un
 
 @njit(cache=True, nogil=True, inline="always")
 def _narrow(low, high, slope, needed, origin):
-    """The part of [low, high] where slope * (u - origin) >= needed."""
+    """The part of the interval [low, high] where slope * (u - origin) >= needed."""
     if slope > 0:
         return max(low, origin + needed / slope), high
     if slope < 0:
@@ -162,7 +181,10 @@ def _narrow(low, high, slope, needed, origin):
 
 @njit(cache=True, nogil=True)
 def rasterise_heights(corners, shear_x, shear_y, origin_x, origin_y, scale, heights):
-    """Draw triangles that face the light into a map of heights; see `rasteriser.heights_from_sun`."""
+    """Draw triangles that face the sun into the heights (S, S) of a `ShadowMap`, in place.
+
+    corners: (T, 3, 3) world, metres. scale: texels per metre.
+    """
     size = heights.shape[0]
     q = np.empty((3, 3))
     for t in range(corners.shape[0]):
@@ -176,7 +198,7 @@ def rasterise_heights(corners, shear_x, shear_y, origin_x, origin_y, scale, heig
         if high_u < 0 or high_v < 0 or low_u > size - 1 or low_v > size - 1:
             continue
         area = (q[1, 0] - q[0, 0]) * (q[2, 1] - q[0, 1]) - (q[2, 0] - q[0, 0]) * (q[1, 1] - q[0, 1])
-        if area <= 0:  # for a closed mesh the side towards the sun is enough
+        if area <= 0:  # faces away from the sun: the side that faces it casts the whole shadow of a closed mesh
             continue
         du = ((q[1, 2] - q[0, 2]) * (q[2, 1] - q[0, 1]) - (q[2, 2] - q[0, 2]) * (q[1, 1] - q[0, 1])) / area
         dv = ((q[2, 2] - q[0, 2]) * (q[1, 0] - q[0, 0]) - (q[1, 2] - q[0, 2]) * (q[2, 0] - q[0, 0])) / area

@@ -1,4 +1,4 @@
-"""Images of a moment: rasterise and shade every camera of a rig, and count what each object shows."""
+"""The image of one camera: rasterise and shade the world, and count the pixels of each object."""
 
 from __future__ import annotations
 
@@ -10,19 +10,28 @@ from numpy.typing import NDArray
 
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, inverse
+from bevcli.synth.assets.triangles import TriangleSoup
 from bevcli.synth.render.ground_texture import GroundTexture
 from bevcli.synth.render.lens import LensMaps, distortion_maps
 from bevcli.synth.render.rasteriser import VisibilityBuffer, rasterise
-from bevcli.synth.render.shading import ShadowMap, shade
-from bevcli.synth.render.triangles import Soup
+from bevcli.synth.render.shading import shade
+from bevcli.synth.render.shadow_map import ShadowMap
 from bevcli.synth.world.weather import Weather
 
 
 @dataclass(frozen=True)
-class Moment:
-    """Everything that cameras see at one time. object_count: objects are 0 to object_count - 1 in the soup."""
+class WorldSnapshot:
+    """The world at one time, as the renderer needs it.
 
-    soup: Soup
+    Attributes:
+        soup: all triangles around the vehicle.
+        object_count: O; the annotated objects in the soup are 0 to O - 1.
+        ground: texture of the ground.
+        shadows: shadow map.
+        weather: light, sky and haze.
+    """
+
+    soup: TriangleSoup
     object_count: int
     ground: GroundTexture
     shadows: ShadowMap
@@ -30,10 +39,14 @@ class Moment:
 
 
 @dataclass(frozen=True)
-class Exposure:
-    """One camera's image. pixels_bgr: (H, W, 3) uint8. objects: (H, W) int32 object that each pixel sees, or -1.
+class RenderedView:
+    """The image of one camera, with its ground truth.
 
-    visible, unoccluded: (O,) pixels that each object shows, and would show if nothing stood before it.
+    Attributes:
+        pixels_bgr: (H, W, 3) uint8.
+        objects: (H, W) index of the object that each pixel sees; -1 for none.
+        visible: (O,) number of pixels that show each object.
+        unoccluded: (O,) number of pixels that would show each object without occlusion.
     """
 
     pixels_bgr: NDArray[np.uint8]
@@ -42,50 +55,44 @@ class Exposure:
     unoccluded: NDArray[np.int64]
 
 
-def expose(moment: Moment, camera: Camera, world_from_ego: Array, supersampling: int = 1) -> Exposure:
-    """The image that a camera takes. world_from_ego: (4, 4) at the camera's time.
+def render_view(snapshot: WorldSnapshot, camera: Camera, world_from_ego: Array, supersampling: int = 1) -> RenderedView:
+    """Render the image of a camera.
 
-    supersampling: samples a pixel along each side, averaged for the image; pixels are counted in whole pixels.
-    A lens with distortion is served by resampling a wider pinhole image, objects by its nearest pixel.
+    world_from_ego: (4, 4) at the time of the image. supersampling: samples per pixel along each axis; the image is
+    their mean, `visible` and `unoccluded` count whole pixels. For a camera with distortion a wider pinhole image is
+    rendered and resampled: linearly for colours, by the nearest pixel for objects.
+    Raises InputError where the field of view is too wide.
     """
     if camera.distortion is not None:
         lens = distortion_maps(camera)
-        return _through(lens, expose(moment, lens.pinhole, world_from_ego, supersampling), moment.object_count)
-    fine = supersampled(camera, supersampling)
+        return _distorted(lens, render_view(snapshot, lens.pinhole, world_from_ego, supersampling))
+    soup = snapshot.soup
+    fine = _supersampled(camera, supersampling)
     world_from_camera = world_from_ego @ camera.ego_from_camera
-    buffer = rasterise(
-        moment.soup.surfaces.corners,
-        moment.soup.surfaces.normals,
-        moment.soup.runs,
-        moment.soup.objects,
-        moment.soup.spheres,
-        fine,
-        inverse(world_from_camera),
-        moment.object_count,
-    )
-    image = shade(buffer, moment.soup.surfaces, moment.ground, moment.shadows, moment.weather, fine, world_from_camera)
-    objects = seen_objects(buffer, moment.soup)
+    buffer = rasterise(soup, fine, inverse(world_from_camera), snapshot.object_count)
+    image = shade(buffer, soup.triangles, snapshot.ground, snapshot.shadows, snapshot.weather, fine, world_from_camera)
+    objects = _seen_objects(buffer, soup)
     area = supersampling**2
-    visible = np.bincount(objects[objects >= 0], minlength=moment.object_count)
+    visible = np.bincount(objects[objects >= 0], minlength=snapshot.object_count)
     if supersampling > 1:
         image = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA).astype(np.uint8)
         objects = np.ascontiguousarray(objects[::supersampling, ::supersampling])
-    return Exposure(image, objects, visible // area, -(-buffer.unoccluded // area))
+    return RenderedView(image, objects, visible // area, -(-buffer.unoccluded // area))
 
 
-def _through(lens: LensMaps, pinhole: Exposure, object_count: int) -> Exposure:
-    """What the lens makes of its pinhole image; unoccluded pixels are scaled as the visible ones."""
+def _distorted(lens: LensMaps, pinhole: RenderedView) -> RenderedView:
+    """Resample a pinhole image. The ratio of visible to unoccluded pixels of each object stays as it is."""
     image = cv2.remap(pinhole.pixels_bgr, lens.x, lens.y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     rows, columns = np.round(lens.y).astype(int), np.round(lens.x).astype(int)
     objects = pinhole.objects[rows, columns]
-    visible = np.bincount(objects[objects >= 0], minlength=object_count)
+    visible = np.bincount(objects[objects >= 0], minlength=len(pinhole.visible))
     share = np.minimum(pinhole.visible / np.maximum(pinhole.unoccluded, 1), 1.0)
     unoccluded = np.where(visible > 0, np.ceil(visible / np.maximum(share, 1e-6)), pinhole.unoccluded)
-    return Exposure(image.astype(np.uint8), objects, visible, unoccluded.astype(np.int64))
+    return RenderedView(image.astype(np.uint8), objects, visible, unoccluded.astype(np.int64))
 
 
-def supersampled(camera: Camera, factor: int) -> Camera:
-    """The camera with `factor` times as many pixels a side, each pixel cut into equal parts about its centre."""
+def _supersampled(camera: Camera, factor: int) -> Camera:
+    """The camera with each pixel divided into factor x factor equal parts."""
     if factor == 1:
         return camera
     scaled = camera.scaled(factor)
@@ -93,7 +100,7 @@ def supersampled(camera: Camera, factor: int) -> Camera:
     return replace(scaled, intrinsics=shift @ scaled.intrinsics)
 
 
-def seen_objects(buffer: VisibilityBuffer, soup: Soup) -> NDArray[np.int32]:
-    """(H, W) int32 object that each pixel sees, -1 for none."""
-    owners = np.repeat(soup.objects, soup.runs[:, 1] - soup.runs[:, 0])
+def _seen_objects(buffer: VisibilityBuffer, soup: TriangleSoup) -> NDArray[np.int32]:
+    """(H, W) index of the object that each pixel sees; -1 for none."""
+    owners = np.repeat(soup.mesh_objects, soup.mesh_ranges[:, 1] - soup.mesh_ranges[:, 0])
     return np.where(buffer.triangles >= 0, owners[buffer.triangles], -1).astype(np.int32)

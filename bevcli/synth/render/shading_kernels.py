@@ -1,10 +1,11 @@
-"""The kernels that colour an image's pixels: `shade_pixels` and all that it calls.
+"""The numba kernels of shading: `shade_pixels` and the functions that it calls.
 
-They share one file because numba's cache on the disk asks only whether a function's own file has changed.
+They are in one file because numba's cache on disk is invalidated only when the file of the called function changes.
+Positions are in the world frame in metres, colours are linear RGB.
 """
 
 # mypy: disable-error-code="no-untyped-def"
-# numba takes the arguments' types from the first call.
+# The functions have no type hints: numba takes the types from the first call.
 
 from __future__ import annotations
 
@@ -13,8 +14,8 @@ from numba import njit
 
 from bevcli.synth.assets.mesh import Material
 
-LIGHT_LIMIT = 1.6  # brightest light that the display table distinguishes
-ROUGH_TEXEL_M = 0.25  # of the ground's roughness
+LIGHT_LIMIT = 1.6  # the brightest light in the display table
+ROUGH_TEXEL_M = 0.25  # texel size of the ground's roughness
 GROUND, FACADE, GLASS, PAINT, GLOW = (
     int(m) for m in (Material.GROUND, Material.FACADE, Material.GLASS, Material.PAINT, Material.GLOW)
 )
@@ -22,16 +23,24 @@ GROUND, FACADE, GLASS, PAINT, GLOW = (
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, image):
-    """Colour every pixel of `image` (H, W, 3); the groups of arrays and numbers are those of `shading.shade`.
+    """Colour every pixel of `image` (H, W, 3) uint8 BGR, in place.
 
-    One long function: in parts it would pass a dozen numbers to and fro for every pixel.
+    buffer: triangles and inverse depths of `VisibilityBuffer`.
+    surfaces: normals, albedo, material, facade, facades of `Triangles`.
+    ground: texels, offsets, roughness, x and y of the origin, texel size and size of `GroundTexture`.
+    shadows: heights, x and y of the origin, texel size and shear of `ShadowMap`, softness in metres.
+    weather: light (7, 3) with rows sun, sky, bounce, zenith, horizon, haze, cloud; to_sun; clouds; haze_m; lamps.
+    view: world ray from pixel (3, 3), camera position (3,), angle of a pixel in radians.
+    table: sRGB bytes of light from 0 to LIGHT_LIMIT.
+
+    The function is long because its parts would exchange a dozen numbers for every pixel.
     """
     triangles, inverse_depth = buffer
     normals, albedo, material, facade, facades = surfaces
     light, to_sun, clouds, haze_m, lamps = weather
     ray_from_image, eye, pixel_angle = view
     sun, sky, bounce, haze = light[0], light[1], light[2], light[5]
-    a = np.empty(3)  # albedo, then colour
+    a = np.empty(3)  # first the albedo, then the colour
     mirror = np.empty(3)
     table_scale = (table.shape[0] - 1) / LIGHT_LIMIT
     height, width = triangles.shape
@@ -72,23 +81,23 @@ def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, image)
             else:
                 lit = nx * to_sun[0] + ny * to_sun[1] + nz * to_sun[2]
                 if lit > 0:
-                    # Look from a little outside, or surfaces shade themselves.
+                    # Look up a point a little outside; otherwise surfaces shadow themselves.
                     off = 0.02 + 1.6 * shadows[3] * (1.0 - lit)
                     lit *= 1.0 - _shadow(shadows, px + off * nx, py + off * ny, pz + off * nz)
                 else:
                     lit = 0.0
                 up = 0.5 + 0.5 * nz
                 near_ground = 1.0
-                if t >= 0 and nz < 0.5:  # less sky is seen from low down
+                if t >= 0 and nz < 0.5:  # walls get less light from the sky near the ground
                     near_ground = min(1.0, 0.62 + 0.2 * pz)
                 for c in range(3):
                     a[c] *= sun[c] * lit + near_ground * (sky[c] * up + bounce[c] * (1.0 - up))
                     a[c] *= 1.0 + grain
-                if kind == GLASS or kind == PAINT:  # noqa: SIM109  (numba is faster so)
+                if kind == GLASS or kind == PAINT:  # noqa: SIM109  (faster in numba)
                     x, y, z = rx / length, ry / length, rz / length
                     _reflect(x, y, z, nx, ny, nz, kind, light, to_sun, clouds, lit > 0.02, mirror, a)
             far = distance / haze_m
-            veil = 1.0 - 1.0 / (1.0 + far + 0.48 * far * far + 0.235 * far * far * far)  # near 1 - exp(-far)
+            veil = 1.0 - 1.0 / (1.0 + far + 0.48 * far * far + 0.235 * far * far * far)  # about 1 - exp(-far)
             veil *= veil
             for c in range(3):
                 a[c] += (haze[c] - a[c]) * veil
@@ -97,6 +106,7 @@ def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, image)
 
 @njit(cache=True, nogil=True, inline="always")
 def _put(image, v, u, color, table, scale):
+    """Write a colour (3,) to a pixel. scale: entries of the table for each unit of light."""
     for c in range(3):
         level = int(color[c] * scale)
         image[v, u, 2 - c] = table[min(max(level, 0), table.shape[0] - 1)]
@@ -104,7 +114,7 @@ def _put(image, v, u, color, table, scale):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sky(x, y, z, light, to_sun, clouds, out):
-    """Light from direction (x, y, z): horizon to zenith, clouds on a plane overhead, a glow around the sun."""
+    """Light of the sky from the unit vector (x, y, z) into out (3,): gradient, clouds, glow around the sun."""
     zenith, horizon, cloud = light[3], light[4], light[6]
     up = max(z, 0.0)
     mix = 1.0 - (1.0 - up) * (1.0 - up) * (1.0 - up)
@@ -129,7 +139,11 @@ def _sky(x, y, z, light, to_sun, clouds, out):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _reflect(x, y, z, nx, ny, nz, kind, light, to_sun, clouds, sunlit, mirror, color):
-    """Mix the sky as mirrored by glass or paint into `color`; below the horizon a street is mirrored."""
+    """Mix the reflection in glass or paint into `color` (3,): the sky, or a dark street below the horizon.
+
+    x, y, z: direction of view. nx, ny, nz: surface normal. sunlit: whether to add the highlight of the sun.
+    mirror: (3,) working memory.
+    """
     facing = -(x * nx + y * ny + z * nz)
     mx, my, mz = x + 2 * facing * nx, y + 2 * facing * ny, z + 2 * facing * nz
     grazing = 1.0 - min(max(facing, 0.0), 1.0)
@@ -158,7 +172,7 @@ def _reflect(x, y, z, nx, ny, nz, kind, light, to_sun, clouds, sunlit, mirror, c
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _shadow(shadows, x, y, z):
-    """Share of the light, 0 to 1, that the shadow map holds back from a point."""
+    """Fraction of the sunlight, 0 to 1, that is blocked at a point."""
     heights, origin_x, origin_y, texel, shear_x, shear_y, softness = shadows
     x, y = x + shear_x * z, y + shear_y * z
     size = heights.shape[0]
@@ -166,7 +180,7 @@ def _shadow(shadows, x, y, z):
     fu, fv = (x - origin_x) / texel - 0.5, (y - origin_y) / texel - 0.5
     if fu < 3 or fv < 3 or fu > size - 5 or fv > size - 5:
         return 0.0
-    if softness > 0.5:  # no sun: a wide, weak occlusion under and beside things
+    if softness > 0.5:  # overcast: a wide, weak shadow under and beside objects
         step = softness / texel * 0.35
         blocked = 0.0
         for j in range(-2, 3):
@@ -186,9 +200,10 @@ def _shadow(shadows, x, y, z):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _ground(ground, x, y, across, along, rx, ry, out):
-    """Linear albedo at (x, y) into out (3,); returns the grain, a relative brightness of the rough surface.
+    """Albedo of the ground at (x, y) into out (3,). Returns the roughness, a relative brightness around 0.
 
-    across, along: metres that the pixel spans, `along` in the direction (rx, ry): up to three samples there.
+    across: size of the pixel on the ground, metres. along: its size in the direction (rx, ry), where up to three
+    samples are averaged.
     """
     texels, offsets, rough, origin_x, origin_y, texel_m, size = ground
     flat = np.sqrt(rx * rx + ry * ry) + 1e-9
@@ -228,16 +243,17 @@ def _ground(ground, x, y, across, along, rx, ry, out):
         rough[j1, i0] * (1 - wu) + rough[j1, i1] * wu
     ) * wv
     if width < 0.05:
-        fine = _scramble(int(np.floor(x * 45)), int(np.floor(y * 45))) % 256 / 255.0 - 0.5
+        fine = _hash(int(np.floor(x * 45)), int(np.floor(y * 45))) % 256 / 255.0 - 0.5
         grain += 0.22 * fine * min(1.0, (0.05 - width) / 0.035)
     return grain
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _facade(row, x, y, z, footprint, lamps, out):
-    """Albedo of the wall `row` at a world point into out (3,); returns whether the point is glass.
+    """Albedo of a wall at a point into out (3,). Returns whether the point is glass.
 
-    footprint: metres that a pixel spans there; detail that is finer fades into its mean.
+    row: (16,) made by `facade_row`. footprint: size of the pixel on the wall, metres; finer details fade out.
+    lamps: brightness of lit windows.
     """
     u = (x - row[0]) * row[2] + (y - row[1]) * row[3]
     height, length = row[4], row[5]
@@ -264,7 +280,7 @@ def _facade(row, x, y, z, footprint, lamps, out):
     wu = u - margin - column * pitch - pitch / 2
     wv = z - shop_m - storey * floor_m - floor_m * 0.52
     if brick > 0:
-        _courses(u, z, footprint, brick, out)
+        _bricks(u, z, footprint, brick, out)
     if not inside:
         return False
     if band:
@@ -291,15 +307,18 @@ def _facade(row, x, y, z, footprint, lamps, out):
 
 
 @njit(cache=True, nogil=True)
-def _courses(u, z, footprint, brick, out):
-    """Mortar joints and bricks of uneven tone, where a pixel is fine enough to show them."""
+def _bricks(u, z, footprint, brick, out):
+    """Multiply out (3,) by a brick pattern at u along the wall and height z.
+
+    footprint: size of the pixel, metres; coarse pixels get no pattern. brick: contrast, 0 to 1.
+    """
     strength = brick * min(1.0, max(0.0, (0.09 - footprint) / 0.06))
     if strength <= 0:
         return
     course = int(np.floor(z / 0.09))
     shifted = u / 0.26 + 0.5 * (course % 2)
     along = int(np.floor(shifted))
-    tone = (_scramble(along, course) % 64) / 64.0 - 0.5
+    tone = (_hash(along, course) % 64) / 64.0 - 0.5
     joint = z / 0.09 - course < 0.16 or shifted - along < 0.06
     factor = 1.0 + strength * (0.35 * tone + (0.35 if joint else 0.0))
     for c in range(3):
@@ -308,8 +327,11 @@ def _courses(u, z, footprint, brick, out):
 
 @njit(cache=True, nogil=True)
 def _pane(seed, column, storey, up, lamps, out):
-    """What is behind a window: dark rooms, a curtain, or a lamp."""
-    chance = _scramble(seed + column * 7919, storey * 104729 + seed) % 100
+    """Albedo of a window into out (3,): a dark room, a curtain, or a lit room.
+
+    up: vertical position in the window, -0.5 to 0.5.
+    """
+    chance = _hash(seed + column * 7919, storey * 104729 + seed) % 100
     out[0], out[1], out[2] = 0.035, 0.045, 0.055
     if chance < 26 and up > -0.5 + (chance % 5) * 0.2:  # curtain or blind
         out[0], out[1], out[2] = 0.32, 0.30, 0.26
@@ -319,16 +341,19 @@ def _pane(seed, column, storey, up, lamps, out):
 
 @njit(cache=True, nogil=True)
 def _shop(u, z, length, shop_m, seed, out):
-    """The ground floor: a plinth, panes between posts, doors, and a coloured sign above."""
+    """Albedo of a shop front into out (3,): posts, windows, doors, signs. Returns whether the point is glass.
+
+    u: position along the wall, metres. length, shop_m: length and height of the shop front, metres.
+    """
     unit = 4.2
     count = max(1.0, np.floor(length / unit))
     width = length / count
     index = int(np.floor(u / width))
     wu = u - index * width
-    kind = _scramble(seed + 31 * index, seed) % 5
+    kind = _hash(seed + 31 * index, seed) % 5
     if z > shop_m - 0.75:
         if z > shop_m - 0.68 and 0.25 < wu < width - 0.25:
-            pick = _scramble(index + 5, seed) % 6
+            pick = _hash(index + 5, seed) % 6
             out[0] = 0.30 if pick in (0, 3) else 0.07
             out[1] = 0.20 if pick in (1, 3, 4) else 0.06
             out[2] = 0.22 if pick in (2, 4) else 0.07
@@ -337,7 +362,7 @@ def _shop(u, z, length, shop_m, seed, out):
         for c in range(3):
             out[c] *= 0.7
         return False
-    if kind == 4:  # a closed front
+    if kind == 4:  # closed shutters
         stripe = z * 8 - np.floor(z * 8) < 0.15
         for c in range(3):
             out[c] = (0.16 if stripe else 0.24) + 0.02 * c
@@ -346,15 +371,15 @@ def _shop(u, z, length, shop_m, seed, out):
         out[0], out[1], out[2] = 0.08, 0.08, 0.09
         return False
     out[0], out[1], out[2] = 0.06, 0.065, 0.07
-    if z < 1.3 and kind != 0:  # goods behind the glass
-        tone = _scramble(int(np.floor(u * 2.5)), seed + int(z * 3)) % 7
+    if z < 1.3 and kind != 0:  # goods in the shop window
+        tone = _hash(int(np.floor(u * 2.5)), seed + int(z * 3)) % 7
         out[0], out[1], out[2] = 0.05 + 0.03 * tone, 0.06 + 0.02 * (6 - tone), 0.10
     return True
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _scramble(a, b):
-    """A small integer hash of two integers, 0 to 2^31 - 1."""
+def _hash(a, b):
+    """Hash two integers to one from 0 to 2^31 - 1."""
     h = (a * 73856093) ^ (b * 19349663)
     h = (h ^ (h >> 13)) * 1274126177
     return (h ^ (h >> 16)) & 0x7FFFFFFF

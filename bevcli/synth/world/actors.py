@@ -1,4 +1,4 @@
-"""Actors: everything that is annotated, with its state at any time of the drive."""
+"""Actors: the annotated objects, with their state at any time of the drive."""
 
 from __future__ import annotations
 
@@ -10,28 +10,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.geometry.transforms import Array
-from bevcli.synth.assets.catalog import Variant
-from bevcli.synth.assets.paint import linear
+from bevcli.synth.assets.catalog import Body, Variant
 from bevcli.synth.world.traffic import Unit, Vehicle, points_between
 
-MOVING_M_S = 0.3  # slower counts as standing
-_DIFFERENCE_S = 0.02  # velocities are central differences over twice this
+MOVING_M_S = 0.3  # slower actors have the attribute of a standing one
+_DIFFERENCE_S = 0.02  # half the interval of the central differences that give velocities
 
 
 @dataclass(frozen=True)
-class Body:
-    """How an actor looks: its variant stretched to a size, in its colours."""
+class ActorState:
+    """An actor at one time.
 
-    variant: Variant
-    size_lwh: Array
-    paint: NDArray[np.float32]
-    dye: NDArray[np.float32]
-    instance: str
-
-
-@dataclass(frozen=True)
-class State:
-    """An actor at a time. position: (3,) world, the middle of its bottom. velocity: (2,) world, m/s."""
+    Attributes:
+        body: size and looks.
+        position: (3,) middle of the bottom, world, metres.
+        yaw: world, radians.
+        velocity: (2,) world, m/s.
+        attribute: nuScenes attribute, such as "vehicle.moving"; empty for classes without attributes.
+        pose: index of the mesh among the variant's poses; taken modulo their number.
+    """
 
     body: Body
     position: Array
@@ -42,40 +39,45 @@ class State:
 
 
 class Actor(Protocol):
-    """Something with a state over time; None while it is not there."""
+    """An annotated object over the time of a drive."""
 
-    def state(self, time_s: float) -> State | None:
-        """The state at a time in seconds since the drive's start."""
+    def state(self, time_s: float) -> ActorState | None:
+        """The state at a time in seconds since the start of the drive, or None while it is not there."""
         ...
 
 
-def draw_body(
-    variant: Variant, rng: np.random.Generator, instance: str, spread: float = 0.05, tall: float = 1.0
-) -> Body:
-    """A body of a variant: its size varied by `spread`, its colours drawn."""
-    size = variant.size_lwh * rng.uniform(1 - spread, 1 + spread, 3) * tall
-    paint = variant.paints[int(rng.integers(len(variant.paints)))]
-    dye = variant.dyes[int(rng.integers(len(variant.dyes)))]
-    return Body(variant, size, linear(paint), linear(dye), instance)
-
-
 @dataclass(frozen=True)
-class Standing:
-    """An actor that never moves."""
+class StandingActor:
+    """An actor that never moves.
+
+    Attributes:
+        body: size and looks.
+        position: (3,) middle of the bottom, world, metres.
+        yaw: world, radians.
+        attribute: nuScenes attribute.
+    """
 
     body: Body
     position: Array
     yaw: float
     attribute: str
 
-    def state(self, time_s: float) -> State:
-        """Always the same state."""
-        return State(self.body, self.position, self.yaw, np.zeros(2), self.attribute)
+    def state(self, time_s: float) -> ActorState:
+        """The same state at all times."""
+        return ActorState(self.body, self.position, self.yaw, np.zeros(2), self.attribute)
 
 
 @dataclass(frozen=True)
-class Driving:
-    """One body of a vehicle that follows its track: its axles stand on the route."""
+class DrivingActor:
+    """One unit of a driving vehicle. Its axles are on the route.
+
+    Attributes:
+        vehicle: the vehicle, after the simulation.
+        unit: the unit.
+        times: (T,) times of the simulation steps, seconds.
+        fronts: (T,) route positions of the vehicle's front, metres.
+        speeds: (T,) m/s.
+    """
 
     vehicle: Vehicle
     unit: Unit
@@ -84,26 +86,26 @@ class Driving:
     speeds: NDArray[np.float64]
 
     @staticmethod
-    def of(vehicle: Vehicle) -> list[Driving]:
-        """The bodies of a vehicle whose track is complete."""
+    def of(vehicle: Vehicle) -> list[DrivingActor]:
+        """One actor for each unit of a vehicle. Call it after the simulation."""
         times, fronts, speeds = np.array(vehicle.track).T
-        return [Driving(vehicle, unit, times, fronts, speeds) for unit in vehicle.units]
+        return [DrivingActor(vehicle, unit, times, fronts, speeds) for unit in vehicle.units]
 
-    def state(self, time_s: float) -> State | None:
-        """None before it appeared and after it left."""
+    def state(self, time_s: float) -> ActorState | None:
+        """The state, or None before the vehicle appears and after it leaves."""
         if time_s < self.times[0] or time_s > self.times[-1]:
             return None
         center, yaw = self._pose(time_s)
         early, late = max(time_s - _DIFFERENCE_S, self.times[0]), min(time_s + _DIFFERENCE_S, self.times[-1])
         velocity = (self._pose(late)[0] - self._pose(early)[0]) / max(late - early, 1e-9)
-        body = Body(self.unit.variant, self.unit.size_lwh, self.unit.paint, self.unit.dye, self.unit.instance)
+        body = self.unit.body
         position = np.array([center[0], center[1], 0.0])
         moving = float(np.hypot(*velocity)) > MOVING_M_S
-        return State(body, position, yaw, velocity, driving_attribute(body.variant, moving))
+        return ActorState(body, position, yaw, velocity, driving_attribute(body.variant, moving))
 
     def _pose(self, time_s: float) -> tuple[Array, float]:
         front = interpolated_track(self.times, self.fronts, self.speeds, time_s)
-        length = float(self.unit.size_lwh[0])
+        length = float(self.unit.body.size_lwh[0])
         middle = front - self.unit.lag - length / 2
         route = self.vehicle.route
         rear, fore = points_between(route.points, route.positions, middle - 0.3 * length, middle + 0.3 * length, 2)
@@ -111,7 +113,10 @@ class Driving:
 
 
 def interpolated_track(times: Array, fronts: Array, speeds: Array, time_s: float) -> float:
-    """Position on a track at a time: a cubic between steps that keeps positions and speeds."""
+    """Route position in metres at a time: cubic Hermite interpolation between the steps of a track.
+
+    times, fronts, speeds: (T,) seconds, metres and m/s of the steps.
+    """
     k = min(max(int(times.searchsorted(time_s, side="right")) - 1, 0), len(times) - 2)
     span = times[k + 1] - times[k]
     u = (time_s - times[k]) / span
@@ -122,7 +127,7 @@ def interpolated_track(times: Array, fronts: Array, speeds: Array, time_s: float
 
 
 def driving_attribute(variant: Variant, moving: bool) -> str:
-    """nuScenes' attribute of something on a route."""
+    """The nuScenes attribute of a vehicle or cycle in traffic."""
     if variant.class_name in ("bicycle", "motorcycle"):
         return "cycle.with_rider" if variant.name.endswith("_rider") else "cycle.without_rider"
     return "vehicle.moving" if moving else "vehicle.stopped"

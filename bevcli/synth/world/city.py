@@ -1,14 +1,16 @@
-"""The city's plan: an endless grid of streets, gently bent, in which everything else finds its place.
+"""The city's plan: an unlimited grid of streets and the blocks between them.
 
-Plan coordinates are straight: streets of axis 0 run along x, of axis 1 along y. `CityPlan.bend` moves plan points to
-the world, where streets curve and the whole is turned by a random angle. Whatever is drawn for an index is drawn
-from a stream of its own, so that the plan does not depend on the order in which it is asked.
+There are two frames. In plan coordinates (metres) streets are straight: those of axis 0 are parallel to x, those of
+axis 1 to y. `CityPlan.bend` maps plan points to the world frame, where streets are curved and the grid is rotated by
+a random angle. Every street and block has random numbers of its own, so the plan does not depend on the order of the
+calls.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,15 +19,28 @@ from bevcli.geometry.transforms import Array
 
 KERB_M = 0.15  # height of kerbs
 CORNER_M = 5.0  # radius of the kerb at a junction
-CROSSING_FROM_M, CROSSING_TO_M = 1.5, 5.0  # a pedestrian crossing, measured from the junction's box
-STOP_LINE_M = 6.2
+CROSSING_FROM_M, CROSSING_TO_M = 1.5, 5.0  # extent of a pedestrian crossing, measured from the edge of the junction
+STOP_LINE_M = 6.2  # from the edge of the junction to the stop line
+SIDE_STEP_M, LINE_STEP_M = 6.0, 4.0  # distances between the points of outlines and lines, so that they can be bent
+
+Landuse = Literal["houses", "park", "site"]
 
 
 @dataclass(frozen=True)
 class Street:
-    """Cross-section of one street, the same on both sides. Widths in metres; lanes counts one direction.
+    """Cross-section of a street, the same on both sides of its centre line.
 
-    position: of its centre line across its axis. bike_m: a strip for bicycles right of the lanes.
+    Attributes:
+        axis: 0 for a street parallel to plan x, 1 for plan y.
+        index: number of the street among those of its axis.
+        position: plan coordinate of the centre line: y for axis 0, x for axis 1, metres.
+        lanes: number of lanes in each direction.
+        lane_m: width of a lane, metres.
+        bike_m: width of the bicycle lane, right of the other lanes, metres.
+        parking_m: width of the parking lane, metres; 0 for none.
+        sidewalk_m: width of the pavement, metres.
+        trees: whether trees stand along the street.
+        painted_bike: whether the bicycle lane has a colour of its own.
     """
 
     axis: int
@@ -41,27 +56,45 @@ class Street:
 
     @property
     def half_width(self) -> float:
-        """From the centre line to the kerb."""
+        """From the centre line to the kerb, metres."""
         return self.lanes * self.lane_m + self.bike_m + self.parking_m
 
     def lane_offset(self, lane: int) -> float:
-        """From the centre line to the middle of a lane, 0 the innermost."""
+        """From the centre line to the middle of a lane, metres. Lane 0 is the innermost."""
         return self.lane_m * (lane + 0.5)
 
 
 @dataclass(frozen=True)
 class Block:
-    """The land between four streets, in plan coordinates: low and high corner of what kerbs enclose."""
+    """The land between four streets, in plan coordinates.
+
+    Attributes:
+        column: index of the street on its west side.
+        row: index of the street on its south side.
+        low: south-west corner of the kerb, metres.
+        high: north-east corner of the kerb, metres.
+        sidewalks: widths of the pavements on the south, east, north and west side, metres.
+    """
 
     column: int
     row: int
     low: tuple[float, float]
     high: tuple[float, float]
-    sidewalks: tuple[float, float, float, float]  # widths: south, east, north, west
+    sidewalks: tuple[float, float, float, float]
+
+    def side(self, side: int) -> tuple[Array, Array, Array]:
+        """Start, end and inward direction of a side, each (2,) in plan coordinates.
+
+        side: 0 south, 1 east, 2 north, 3 west.
+        """
+        (x0, y0), (x1, y1) = self.low, self.high
+        corners = [np.array(p, dtype=np.float64) for p in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))]
+        inward = np.array([(0, 1), (-1, 0), (0, -1), (1, 0)][side], dtype=np.float64)
+        return corners[side], corners[(side + 1) % 4], inward
 
 
 class CityPlan:
-    """The endless plan of one seed."""
+    """The plan of one seed. It has no limits: streets and blocks exist at every index, negative ones included."""
 
     def __init__(self, seed: int) -> None:
         self.seed = seed
@@ -75,13 +108,13 @@ class CityPlan:
         self._position = lru_cache(maxsize=None)(self._make_position)
 
     def stream(self, purpose: str, *indices: int) -> np.random.Generator:
-        """Random numbers of one purpose and place, independent of all others."""
+        """A random number generator for one purpose and one place, independent of all others."""
         name = int.from_bytes(purpose.encode()[:12].ljust(12, b"."), "big")
         entropy = [self.seed, name, *(index + 2**20 for index in indices)]
         return np.random.Generator(np.random.PCG64(np.random.SeedSequence(entropy)))
 
     def bend(self, points: ArrayLike) -> Array:
-        """Plan points (..., 2) -> world (..., 2)."""
+        """Map plan points (..., 2) to world points (..., 2)."""
         p = np.asarray(points, dtype=np.float64)
         x = p[..., 0] + self._amplitude[0] * np.sin(2 * np.pi * p[..., 1] / self._period[0] + self._phase[0])
         y = p[..., 1] + self._amplitude[1] * np.sin(2 * np.pi * p[..., 0] / self._period[1] + self._phase[1])
@@ -91,7 +124,7 @@ class CityPlan:
         return world
 
     def unbend(self, points: ArrayLike) -> Array:
-        """World (..., 2) -> plan points, by fixed-point iteration (the bend is gentle)."""
+        """Map world points (..., 2) to plan points (..., 2). The inverse of `bend`, by fixed-point iteration."""
         w = np.asarray(points, dtype=np.float64)
         c, s = self._cosine, self._sine
         target = np.stack([c * w[..., 0] + s * w[..., 1], -s * w[..., 0] + c * w[..., 1]], axis=-1)
@@ -125,7 +158,7 @@ class CityPlan:
         )  # fmt: skip
 
     def block(self, column: int, row: int) -> Block:
-        """The block east of street (1, column) and north of street (0, row)."""
+        """The block east of street `column` of axis 1 and north of street `row` of axis 0."""
         west, east = self.street(1, column), self.street(1, column + 1)
         south, north = self.street(0, row), self.street(0, row + 1)
         return Block(
@@ -135,8 +168,15 @@ class CityPlan:
             (south.sidewalk_m, east.sidewalk_m, north.sidewalk_m, west.sidewalk_m),
         )  # fmt: skip
 
+    def landuse(self, column: int, row: int) -> Landuse:
+        """What a block is used for: 70 % houses, 14 % parks, 16 % building sites."""
+        share = self.stream("landuse", column, row).random()
+        if share < 0.14:
+            return "park"
+        return "site" if share < 0.30 else "houses"
+
     def streets_between(self, axis: int, low: float, high: float) -> list[Street]:
-        """Streets of an axis whose kerbs reach into low to high across it."""
+        """The streets of an axis that overlap the interval from low to high (plan coordinates, metres), in order."""
         index = self.nearest(axis, low) - 1
         found: list[Street] = []
         while True:
@@ -148,7 +188,7 @@ class CityPlan:
             index += 1
 
     def nearest(self, axis: int, position: float) -> int:
-        """Index of the street of an axis whose centre line is nearest to a position across it."""
+        """Index of the street of an axis whose centre line is nearest to a plan coordinate in metres."""
         index = round(position / 85)
         while self._position(axis, index) > position:
             index -= 1
@@ -158,8 +198,8 @@ class CityPlan:
         return index if position - before <= after - position else index + 1
 
 
-def rounded_rectangle(low: tuple[float, float], high: tuple[float, float], radius: float, step: float = 6.0) -> Array:
-    """(P, 2) counter-clockwise outline with round corners, its sides cut into pieces of at most `step` metres."""
+def rounded_rectangle(low: tuple[float, float], high: tuple[float, float], radius: float) -> Array:
+    """(P, 2) counter-clockwise outline with round corners and with points about every SIDE_STEP_M on its sides."""
     (x0, y0), (x1, y1) = low, high
     radius = min(radius, (x1 - x0) / 2, (y1 - y0) / 2)
     centers = [(x1 - radius, y0 + radius, -np.pi / 2), (x1 - radius, y1 - radius, 0.0),
@@ -171,13 +211,13 @@ def rounded_rectangle(low: tuple[float, float], high: tuple[float, float], radiu
     pieces = []
     for this, following in zip(corners, corners[1:] + corners[:1], strict=True):
         pieces.append(this)
-        count = max(int(np.linalg.norm(following[0] - this[-1]) / step), 1)
+        count = max(int(np.linalg.norm(following[0] - this[-1]) / SIDE_STEP_M), 1)
         pieces.append(this[-1] + (following[0] - this[-1]) * (np.arange(1, count) / count)[:, None])
     return np.concatenate(pieces)
 
 
-def along(start: ArrayLike, end: ArrayLike, step: float = 4.0) -> Array:
-    """(P, 2) points from start to end, at most `step` metres apart, both ends included."""
+def along(start: ArrayLike, end: ArrayLike) -> Array:
+    """(P, 2) points from start to end, at most LINE_STEP_M apart, both ends included."""
     a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
-    count = max(int(np.ceil(np.linalg.norm(b - a) / step)), 1)
+    count = max(int(np.ceil(np.linalg.norm(b - a) / LINE_STEP_M)), 1)
     return a + (b - a) * np.linspace(0, 1, count + 1)[:, None]

@@ -1,6 +1,6 @@
-"""What is painted on the ground: roads, lane lines, crossings and pavements, as polygons in the world.
+"""What is painted on the ground: roads, lane lines, crossings and pavements, as polygons in the world frame.
 
-The ground's texture and the ground truth map are both drawn from these.
+The ground texture and the ground truth map are both drawn from these polygons.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from bevcli.synth.world.city import (
     along,
     rounded_rectangle,
 )
-from bevcli.synth.world.landuse import landuse
 
 WHITE: Color = (222, 222, 216)
 YELLOW: Color = (214, 170, 54)
@@ -34,12 +33,18 @@ PAVEMENT: Color = (158, 154, 146)
 JOINT: Color = (132, 128, 121)
 KERB: Color = (186, 184, 178)
 YARD: dict[str, Color] = {"houses": (128, 124, 116), "park": (92, 112, 62), "site": (142, 120, 92)}
-LINE_M = 0.14
+LINE_M = 0.14  # width of lane lines
 
 
 @dataclass(frozen=True)
 class GroundPaint:
-    """One colour on the ground. outline: (P, 2) world. width_m: of a line; finer textures than that show it."""
+    """A polygon of one colour.
+
+    Attributes:
+        outline: (P, 2) world, metres.
+        color: sRGB.
+        width_m: width of a line, metres; infinite for areas. Textures coarser than twice the width leave it out.
+    """
 
     outline: Array
     color: Color
@@ -48,9 +53,13 @@ class GroundPaint:
 
 @dataclass(frozen=True)
 class GroundPiece:
-    """The ground of one block or stretch of street: what is painted, in order, and what the map must show.
+    """The ground of one block, junction or stretch of street, in the world frame, metres.
 
-    lane_boundaries: polylines (P, 2). roads, crossings: polygons (P, 2). All in the world, metres.
+    Attributes:
+        paints: what is painted, in this order.
+        roads: polygons (P, 2) of the drivable road.
+        lane_boundaries: polylines (P, 2).
+        crossings: polygons (P, 2) of pedestrian crossings.
     """
 
     paints: tuple[GroundPaint, ...]
@@ -60,14 +69,14 @@ class GroundPiece:
 
 
 class GroundPlan:
-    """The painted ground of a city, piece by piece."""
+    """The painted ground of a city. Pieces are made when they are first needed, and kept."""
 
     def __init__(self, city: CityPlan) -> None:
         self.city = city
         self._pieces: dict[tuple[str, int, int], GroundPiece] = {}
 
     def pieces_around(self, center: ArrayLike, reach_m: float) -> list[GroundPiece]:
-        """Pieces within `reach_m` of a world point, in the order in which they must be painted."""
+        """Pieces within `reach_m` metres of a world point (2,), in the order in which they must be painted."""
         x, y = self.city.unbend(center)
         reach = reach_m * 1.1 + 10
         columns = self.city.streets_between(1, x - reach, x + reach)
@@ -94,7 +103,7 @@ class GroundPlan:
         return self._pieces[key]
 
     def _block(self, column: int, row: int) -> GroundPiece:
-        """Pavement with joints and a kerb; the road's fillet at the corners comes from its round outline."""
+        """The kerb, the pavement with its joints, and the land behind it."""
         city, block = self.city, self.city.block(column, row)
         outline = city.bend(rounded_rectangle(block.low, block.high, CORNER_M))
         inner = rounded_rectangle(
@@ -111,15 +120,14 @@ class GroundPlan:
         yard_low = (x0 + west, y0 + south)
         yard_high = (x1 - east, y1 - north)
         yard = city.bend(rounded_rectangle(yard_low, yard_high, 0.5))
-        paints.append(GroundPaint(yard, YARD[landuse(city, column, row)]))
+        paints.append(GroundPaint(yard, YARD[city.landuse(column, row)]))
         return GroundPiece(tuple(paints))
 
     def _junction(self, column: int, row: int) -> GroundPiece:
-        """The box where two streets meet, with its four corner fillets, crossings and stop lines."""
+        """The area where two streets meet, with its crossings and stop lines."""
         a, b = self.city.street(1, column), self.city.street(0, row)
         x, y = a.position, b.position
-        reach_x, reach_y = a.half_width + CORNER_M, b.half_width + CORNER_M
-        outline = _junction_outline(x, y, a.half_width, b.half_width, reach_x, reach_y)
+        outline = _junction_outline(x, y, a.half_width + CORNER_M, b.half_width + CORNER_M)
         paints: list[GroundPaint] = []
         crossings = []
         for street, across, sign in ((a, b, 1), (a, b, -1), (b, a, 1), (b, a, -1)):
@@ -139,7 +147,7 @@ class GroundPlan:
         return GroundPiece(tuple(paints), roads=(road,), crossings=tuple(crossings))
 
     def _stretch(self, axis: int, index: int, cross: int) -> GroundPiece:
-        """A street between two junctions: asphalt from centre to centre, its lines between the stop lines."""
+        """A street between two junctions: asphalt from centre to centre, lines between the stop lines."""
         street = self.city.street(axis, index)
         before, after = self.city.street(1 - axis, cross), self.city.street(1 - axis, cross + 1)
         start, end = before.position, after.position
@@ -160,14 +168,14 @@ class GroundPlan:
                     GroundPaint(self._band(street, low, high, side * inner, side * street.half_width), PARKING)
                 )
             for offset, color, dash in self._lines(street):
-                boundaries.append(self.city.bend(self._run(street, low, high, side * offset)))
+                boundaries.append(self.city.bend(self._line(street, low, high, side * offset)))
                 dashes = list(self._dashes(street, low, high, side * offset, dash))
                 paints += self._bars([a for a, _ in dashes], [b for _, b in dashes], LINE_M, color)
         paints += self._marks(street, low, high)
         return GroundPiece(tuple(paints), (self._band(street, start, end),), tuple(boundaries))
 
     def _lines(self, street: Street) -> Iterator[tuple[float, Color, float]]:
-        """Offset, colour and dash length (0 unbroken) of the lines right of the centre."""
+        """The lines right of the centre: offset in metres, colour, dash length in metres (0: solid)."""
         yield (0.16 if street.lanes > 1 else 0.0), YELLOW, 0.0 if street.lanes > 1 else 3.0
         for lane in range(1, street.lanes):
             yield lane * street.lane_m, WHITE, 3.0
@@ -176,7 +184,7 @@ class GroundPlan:
             yield street.lanes * street.lane_m + street.bike_m, WHITE, 0.0
 
     def _marks(self, street: Street, low: float, high: float) -> Iterator[GroundPaint]:
-        """Arrows before the stop lines, repairs and manholes."""
+        """Arrows before the stop lines, patches and manhole covers."""
         rng = self.city.stream("marks", street.axis, street.index, int(low))
         for sign, stop in ((1, low), (-1, high)):
             side = self._approach_side(street, sign)
@@ -205,27 +213,30 @@ class GroundPlan:
         yield GroundPaint(self.city.bend(head), WHITE)
 
     def _approach_side(self, street: Street, sign: int) -> int:
-        """On which side of the centre (+ or -) vehicles come towards a junction that lies before this stretch's end."""
+        """The sign of the offset of the lanes that lead to a junction.
+
+        sign: +1 where the stretch begins at the junction, -1 where it ends there, along the street's axis.
+        """
         towards = -sign  # their direction along the street
         return -towards if street.axis == 0 else towards
 
     def _at(self, street: Street, position: float, offset: float) -> tuple[float, float]:
-        """Plan point at a position along a street and an offset across it (+ is +y or +x)."""
+        """Plan point at a position along a street, `offset` metres from its centre line (towards +y or +x)."""
         if street.axis == 0:
             return position, street.position + offset
         return street.position + offset, position
 
-    def _run(self, street: Street, start: float, end: float, offset: float) -> Array:
+    def _line(self, street: Street, start: float, end: float, offset: float) -> Array:
         return along(self._at(street, start, offset), self._at(street, end, offset))
 
     def _band(
         self, street: Street, start: float, end: float, low: float | None = None, high: float | None = None
     ) -> Array:
-        """World outline of a strip of a street, over its whole width by default."""
+        """World outline (P, 2) of a strip of a street. low, high: offsets of its edges; default: the kerbs."""
         low = -street.half_width if low is None else low
         high = street.half_width if high is None else high
         return self.city.bend(
-            np.concatenate([self._run(street, start, end, low), self._run(street, start, end, high)[::-1]])
+            np.concatenate([self._line(street, start, end, low), self._line(street, start, end, high)[::-1]])
         )
 
     def _dashes(
@@ -237,11 +248,11 @@ class GroundPlan:
             yield self._at(street, start, offset), self._at(street, end, offset)
 
     def _bar(self, start: tuple[float, float], end: tuple[float, float], width: float, color: Color) -> GroundPaint:
-        """A painted line between two plan points."""
+        """A painted line between two plan points. width: metres."""
         return self._bars([start], [end], width, color)[0]
 
     def _bars(self, starts: ArrayLike, ends: ArrayLike, width: float, color: Color) -> list[GroundPaint]:
-        """Painted lines between plan points (L, 2) and (L, 2)."""
+        """Painted lines from plan points (L, 2) to plan points (L, 2). width: metres."""
         a, b = np.asarray(starts, dtype=np.float64), np.asarray(ends, dtype=np.float64)
         way = b - a
         normal = np.stack([-way[:, 1], way[:, 0]], -1) / np.linalg.norm(way, axis=1, keepdims=True) * width / 2
@@ -250,12 +261,15 @@ class GroundPlan:
 
 
 def _pairs(varying: Array, fixed: float) -> Array:
-    """(L, 2) points of varying first and fixed second coordinate."""
+    """(L, 2) points with first coordinates (L,) and one second coordinate."""
     return np.stack([varying, np.full(len(varying), fixed)], -1)
 
 
-def _junction_outline(x: float, y: float, half_x: float, half_y: float, reach_x: float, reach_y: float) -> Array:
-    """Plan outline of a junction: a cross whose inner corners are rounded by CORNER_M, counter-clockwise."""
+def _junction_outline(x: float, y: float, reach_x: float, reach_y: float) -> Array:
+    """Plan outline (24, 2) of a junction, counter-clockwise: a cross whose inner corners have the radius CORNER_M.
+
+    x, y: centre. reach_x, reach_y: from the centre to the ends of its arms, metres.
+    """
     points = []
     for sx, sy in ((1, 1), (-1, 1), (-1, -1), (1, -1)):
         sweep = np.linspace(0, np.pi / 2, 6)[:: sx * sy]

@@ -1,4 +1,4 @@
-"""Pedestrians: they stroll along pavements and cross at junctions when the signal lets them."""
+"""People who walk: along the pavements, and over the streets at junctions."""
 
 from __future__ import annotations
 
@@ -8,26 +8,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.geometry.transforms import Array
-from bevcli.synth.assets.catalog import Catalog
+from bevcli.synth.assets.catalog import Body, Catalog, draw_body
 from bevcli.synth.assets.people import PERSON_NAMES
-from bevcli.synth.world.actors import MOVING_M_S, Body, State, draw_body
+from bevcli.synth.world.actors import MOVING_M_S, ActorState
 from bevcli.synth.world.city import KERB_M, CityPlan, along, rounded_rectangle
 from bevcli.synth.world.route import DIRECTIONS, node_center, street_of
 from bevcli.synth.world.signals import Signals
 
-STRIDE_M = 0.72
-CROSSING_LINE_M = 3.2  # where people cross, measured from the junction's box
-ALONG_PAVEMENT_M = 26.0  # how far people come from, and go on to
-STROLLERS_PER_BLOCK = 4.5
-SECONDS_BETWEEN_CROSSERS = 8.0
+STRIDE_M = 0.72  # distance after which the pose changes
+CROSSING_LINE_M = 3.2  # from the edge of the junction to the line on which people cross
+ALONG_PAVEMENT_M = 26.0  # length of a crosser's path on the pavement, before and after the road
+STROLLERS_PER_BLOCK = 4.5  # mean number
+SECONDS_BETWEEN_CROSSERS = 8.0  # mean time at a junction
 
 
 @dataclass(frozen=True)
 class Walker:
-    """A person on a path. path: (P, 2) plan points; positions: (P,) metres along it.
+    """A person on a path.
 
-    times, places: (K,) knots of the walk: where on the path, in metres, the person is when.
-    road: the span of the path that lies on a road, metres.
+    Attributes:
+        city: the plan that the path belongs to.
+        body: size and looks.
+        path: (P, 2) plan points, metres.
+        positions: (P,) position of each point along the path, metres.
+        times: (K,) seconds; between them the person moves evenly.
+        places: (K,) position along the path at these times, metres.
+        road: start and end of the part of the path that is on a road, metres; negative for none.
     """
 
     city: CityPlan
@@ -39,33 +45,33 @@ class Walker:
     road: tuple[float, float]
 
     def plan_at(self, time_s: float) -> Array:
-        """Plan point (2,) at a time."""
+        """Plan point (2,) at a time in seconds."""
         place = np.interp(time_s, self.times, self.places)
         return np.array([np.interp(place, self.positions, self.path[:, k]) for k in (0, 1)])
 
     def on_road(self, time_s: float) -> bool:
-        """Whether vehicles must mind the person."""
+        """Whether the person is on the road at a time, so that vehicles must stop."""
         return self.road[0] - 0.3 < float(np.interp(time_s, self.times, self.places)) < self.road[1] + 0.3
 
-    def state(self, time_s: float) -> State | None:
-        """None before the walk begins and after it ends."""
+    def state(self, time_s: float) -> ActorState | None:
+        """The state, or None before the walk begins and after it ends."""
         if not self.times[0] <= time_s <= self.times[-1]:
             return None
-        moments = np.array([time_s - 0.02, time_s, time_s + 0.02])
-        places = np.interp(moments, self.times, self.places)
+        times = np.array([time_s - 0.02, time_s, time_s + 0.02])
+        places = np.interp(times, self.times, self.places)
         plan = np.stack([np.interp(places, self.positions, self.path[:, k]) for k in (0, 1)], -1)
         before, here, after = self.city.bend(plan)
         velocity = (after - before) / 0.04
         moving = float(np.hypot(*velocity)) > MOVING_M_S
         if moving:
             yaw = float(np.arctan2(velocity[1], velocity[0]))
-        else:  # waiting: towards the other side
+        else:  # a waiting person faces along the path
             segment = int(np.searchsorted(self.positions, places[1], side="right"))
             yaw = self.city.heading(plan[1], _unit(self.path[segment] - self.path[segment - 1]))
         inside = min(places[1] - self.road[0], self.road[1] - places[1])  # metres into the road, negative on pavements
         position = np.array([here[0], here[1], KERB_M * float(np.clip(0.5 - inside / 0.3, 0, 1))])
         attribute = "pedestrian.moving" if moving else "pedestrian.standing"
-        return State(self.body, position, yaw, velocity, attribute, int(places[1] / STRIDE_M) % 2)
+        return ActorState(self.body, position, yaw, velocity, attribute, int(places[1] / STRIDE_M) % 2)
 
 
 def _unit(way: Array) -> Array:
@@ -80,7 +86,7 @@ def _make(
 
 
 def strollers(city: CityPlan, catalog: Catalog, column: int, row: int, span_s: tuple[float, float]) -> list[Walker]:
-    """People who walk around a block on its pavement."""
+    """People who walk around a block on its pavement. span_s: start and end of the simulation, seconds."""
     rng = city.stream("strollers", column, row)
     land = city.block(column, row)
     walkers = []
@@ -103,7 +109,10 @@ def strollers(city: CityPlan, catalog: Catalog, column: int, row: int, span_s: t
 def crossers(
     city: CityPlan, catalog: Catalog, signals: Signals, node: tuple[int, int], span_s: tuple[float, float]
 ) -> list[Walker]:
-    """People who cross at a junction, one after another over the whole time."""
+    """People who cross a street at a junction, over the whole simulation.
+
+    node: column and row of the junction. span_s: start and end of the simulation, seconds.
+    """
     rng = city.stream("crossers", *node)
     walkers: list[Walker] = []
     begin = span_s[0] - 30
@@ -118,17 +127,20 @@ def _crosser(
     city: CityPlan, catalog: Catalog, signals: Signals, node: tuple[int, int], begin: float,
     rng: np.random.Generator, name: str, index: int,
 ) -> Walker:  # fmt: skip
-    """One person: along the pavement to a kerb, over the road when the signal says walk, and on."""
+    """One person who walks to the kerb, waits for the signal, crosses the road and walks on.
+
+    begin: start of the walk, seconds. index: number of the crosser at this junction; neighbours keep apart.
+    """
     arm = int(rng.integers(4))
     street, cross = street_of(city, node, arm), street_of(city, node, arm + 1)
-    side = 1 if rng.random() < 0.5 else -1  # who goes one way keeps to one side of the crossing
+    side = 1 if rng.random() < 0.5 else -1  # each direction has its side of the crossing
     sideways = DIRECTIONS[(arm + 1) % 4] * side
     spot = node_center(city, node) + DIRECTIONS[arm] * (
         cross.half_width + CROSSING_LINE_M + side * (0.25 + 0.72 * (index % 3))
     )
     reach = street.half_width + ALONG_PAVEMENT_M
     path = along(spot - sideways * reach, spot + sideways * reach)
-    speed = max(rng.uniform(1.0, 1.7), street.half_width / 6.5)  # over within 13 s
+    speed = max(rng.uniform(1.0, 1.7), street.half_width / 6.5)  # crosses within 13 s
     kerb, far = ALONG_PAVEMENT_M - 0.5 - 0.85 * (index // 3 % 3), ALONG_PAVEMENT_M + 2 * street.half_width
     arrival = begin + kerb / speed
     start = arrival

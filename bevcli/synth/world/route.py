@@ -1,4 +1,4 @@
-"""Routes: where a vehicle drives, as a smooth line in the world with the junctions that it passes."""
+"""Routes: the smooth line that a vehicle follows, with its speed limits and the junctions on it."""
 
 from __future__ import annotations
 
@@ -12,19 +12,25 @@ from scipy.ndimage import gaussian_filter1d
 from bevcli.geometry.transforms import Array
 from bevcli.synth.world.city import CROSSING_TO_M, STOP_LINE_M, CityPlan, Street
 
-STEP_M = 0.25
-SMOOTHING_M = 1.2  # corners are rounded over this, so that yaw rates rise and fall as a steering wheel turns
-LATERAL_ACCELERATION = 2.2  # m/s², how fast curves are taken
-BRAKING = 1.7  # m/s², how early drivers slow for curves
+STEP_M = 0.25  # distance between the points of a route
+SMOOTHING_M = 1.2  # standard deviation of the smoothing, so that yaw rates change gradually
+LATERAL_ACCELERATION = 2.2  # m/s², limit in curves
+BRAKING = 1.7  # m/s², deceleration before curves
 DIRECTIONS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)], dtype=np.float64)  # east, north, west, south
-BICYCLE_OFFSET_M = 0.5  # from the outermost lane's edge to the line that bicycles keep
+BICYCLE_OFFSET_M = 0.5  # from the edge of the outermost lane to the line that bicycles follow
 
 
 @dataclass(frozen=True)
 class JunctionPass:
-    """One junction on a route. stop, enter, leave: route positions of stop line, junction box and its far end, m.
+    """One junction on a route.
 
-    node: (column, row). direction: 0 to 3 on approach. turn: -1 right, 0 straight on, 1 left.
+    Attributes:
+        node: column and row of the junction.
+        direction: index into DIRECTIONS on the approach.
+        turn: -1 right, 0 straight on, 1 left.
+        stop: route position of the stop line, metres.
+        enter: route position of the near edge of the junction, metres.
+        leave: route position behind the crossing on the far side, metres.
     """
 
     node: tuple[int, int]
@@ -37,7 +43,15 @@ class JunctionPass:
 
 @dataclass(frozen=True)
 class Route:
-    """points: (P, 2) world. positions: (P,) metres along. yaws: (P,) unwrapped. speed_limits: (P,) m/s."""
+    """The path of a vehicle.
+
+    Attributes:
+        points: (P, 2) world, metres.
+        positions: (P,) distance of each point from the start, along the route, metres.
+        yaws: (P,) headings, radians, unwrapped.
+        speed_limits: (P,) m/s.
+        passes: the junctions, in order.
+    """
 
     points: Array
     positions: Array
@@ -47,7 +61,7 @@ class Route:
 
     @property
     def length(self) -> float:
-        """Metres from the first to the last point."""
+        """Length of the route, metres."""
         return float(self.positions[-1])
 
     def at(self, position: ArrayLike) -> Array:
@@ -64,7 +78,14 @@ class Route:
 
 @dataclass(frozen=True)
 class LaneStart:
-    """Where a route begins: on the way in `direction` towards the junction `node`, `before` metres from its centre."""
+    """Where a route begins.
+
+    Attributes:
+        node: column and row of the first junction ahead.
+        direction: index into DIRECTIONS of the approach to it.
+        lane: lane of the street, 0 the innermost.
+        before: distance to the centre of the junction, metres.
+    """
 
     node: tuple[int, int]
     direction: int
@@ -73,26 +94,28 @@ class LaneStart:
 
 
 def street_of(city: CityPlan, node: tuple[int, int], direction: int) -> Street:
-    """The street on which one passes a junction in a direction."""
+    """The street through a junction in a direction (index into DIRECTIONS)."""
     return city.street(0, node[1]) if direction % 2 == 0 else city.street(1, node[0])
 
 
 def node_center(city: CityPlan, node: tuple[int, int]) -> Array:
-    """Plan point (2,) in the middle of a junction."""
+    """Plan point (2,) at the centre of a junction."""
     return np.array([city.street(1, node[0]).position, city.street(0, node[1]).position])
 
 
 def right_of(direction: int) -> Array:
-    """Unit vector (2,) to the right of a direction."""
+    """Unit vector (2,) to the right of a direction (index into DIRECTIONS)."""
     return DIRECTIONS[(direction - 1) % 4]
 
 
 def draw_turns(city: CityPlan, start: LaneStart, rng: np.random.Generator, straight_on: float = 0.6) -> Iterator[int]:
-    """Endless turns that a driver may take from the lane that they are in."""
+    """Draw turns without end, each one allowed from the lane that the vehicle is in."""
     node, direction, lane = start.node, start.direction, start.lane
     while True:
         lanes = street_of(city, node, direction).lanes
-        options = [1, -1, -1] if lanes == 1 else ([1] if lane == 0 else [-1])  # left turns hold up those behind
+        options = (
+            [1, -1, -1] if lanes == 1 else ([1] if lane == 0 else [-1])
+        )  # left turns are rarer: they block the lane
         turn = 0 if rng.random() < straight_on else int(options[int(rng.integers(len(options)))])
         yield turn
         direction = (direction + turn) % 4
@@ -101,7 +124,7 @@ def draw_turns(city: CityPlan, start: LaneStart, rng: np.random.Generator, strai
 
 
 def bicycle_turns(rng: np.random.Generator) -> Iterator[int]:
-    """Endless turns of a bicycle: straight on or right, as it keeps right."""
+    """Draw turns of a bicycle without end: straight on or right."""
     while True:
         yield 0 if rng.random() < 0.7 else -1
 
@@ -114,7 +137,11 @@ def _lane_after(city: CityPlan, node: tuple[int, int], direction: int, turn: int
 def build_route(
     city: CityPlan, start: LaneStart, turns: Iterable[int], length: float, speed: float, bicycle: bool = False
 ) -> Route:
-    """A route of at least `length` metres at a preferred speed in m/s; a bicycle keeps right of the lanes."""
+    """Build a route.
+
+    turns: turn at each junction. length: least length, metres. speed: limit on straight road, m/s.
+    bicycle: whether it keeps right of the lanes.
+    """
     node, direction, lane = start.node, start.direction, start.lane
     street = street_of(city, node, direction)
     offset = lane_offset(street, lane, bicycle)
@@ -134,10 +161,10 @@ def build_route(
             corner = corner + DIRECTIONS[direction] * (right_of(after) @ DIRECTIONS[direction]) * new_offset
         radius = _radius(cross, new_offset, turn)
         begin, end = corner - DIRECTIONS[direction] * radius, corner + DIRECTIONS[after] * radius
-        stop = corner_at(center, direction, offset, -(cross.half_width + STOP_LINE_M))
-        enter = corner_at(center, direction, offset, -cross.half_width)
+        stop = _lane_point(center, direction, offset, -(cross.half_width + STOP_LINE_M))
+        enter = _lane_point(center, direction, offset, -cross.half_width)
         across = street_of(city, node, after + 1)
-        leave = corner_at(center, after, new_offset, across.half_width + CROSSING_TO_M)
+        leave = _lane_point(center, after, new_offset, across.half_width + CROSSING_TO_M)
         marks.append((node, direction, turn, stop, enter, leave))
         piece = _arc(begin, corner, end) if turn != 0 else np.stack([begin, end])
         corners.append(piece)
@@ -147,13 +174,13 @@ def build_route(
     return _finish(city, np.concatenate(corners), marks, speed)
 
 
-def corner_at(center: Array, direction: int, offset: float, ahead: float) -> Array:
-    """Plan point on the lane that passes a junction's centre at `offset` to the right, `ahead` metres beyond it."""
+def _lane_point(center: Array, direction: int, offset: float, ahead: float) -> Array:
+    """Plan point on a lane at a junction: `offset` metres right of its centre and `ahead` metres behind it."""
     return center + right_of(direction) * offset + DIRECTIONS[direction] * ahead
 
 
 def lane_offset(street: Street, lane: int, bicycle: bool) -> float:
-    """Metres right of the street's centre line on which a vehicle keeps; bicycles keep right of all lanes."""
+    """Offset of a vehicle to the right of the street's centre line, metres."""
     return street.lanes * street.lane_m + BICYCLE_OFFSET_M if bicycle else street.lane_offset(lane)
 
 
@@ -164,14 +191,17 @@ def _radius(cross: Street, new_offset: float, turn: int) -> float:
 
 
 def _arc(begin: Array, corner: Array, end: Array) -> Array:
-    """(17, 2) quarter circle from begin to end, tangent to the ways to and from the corner."""
+    """(17, 2) quarter of an ellipse from begin to end, tangent to the lines from begin and end to the corner."""
     center = begin + end - corner
     angle = np.linspace(0, np.pi / 2, 17)[:, None]
     return center + (begin - center) * np.cos(angle) + (end - center) * np.sin(angle)
 
 
 def _finish(city: CityPlan, corners: Array, marks: list, speed: float) -> Route:
-    """Sample the plan line, bend it to the world, smooth it, and find the marks on it."""
+    """Sample a plan line (C, 2), map it to the world, smooth it, and find the route positions of the marks.
+
+    marks: of each junction: node, direction, turn, and the plan points of stop, enter and leave.
+    """
     along_corners = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
     samples = np.arange(0, along_corners[-1], STEP_M)
     plan = np.stack([np.interp(samples, along_corners, corners[:, k]) for k in (0, 1)], -1)
@@ -193,7 +223,7 @@ def _finish(city: CityPlan, corners: Array, marks: list, speed: float) -> Route:
 
 
 def _speed_limits(positions: Array, yaws: Array, speed: float) -> NDArray[np.float64]:
-    """Speeds (P,) that curves allow, lowered before them so that nobody must brake harder than BRAKING."""
+    """(P,) m/s: the limits of the curves, lowered before them so that BRAKING is enough."""
     curvature = np.abs(np.gradient(yaws) / np.maximum(np.gradient(positions), 1e-6))
     squared = np.minimum(speed**2, LATERAL_ACCELERATION / np.maximum(curvature, 1e-4))
     falling = squared + 2 * BRAKING * positions

@@ -1,4 +1,4 @@
-"""The run of a drive: traffic and pedestrians over its whole time, and the ego vehicle's motion among them."""
+"""The simulation of a drive: traffic and pedestrians over its whole time, and the ego vehicle's motion."""
 
 from __future__ import annotations
 
@@ -10,27 +10,34 @@ from scipy.ndimage import gaussian_filter1d
 
 from bevcli.geometry.ego_motion import GRAVITY
 from bevcli.geometry.transforms import Array
-from bevcli.synth.assets.catalog import Catalog
-from bevcli.synth.world.actors import Actor, Driving, draw_body, interpolated_track
+from bevcli.synth.assets.catalog import Catalog, draw_body
+from bevcli.synth.world.actors import Actor, DrivingActor, interpolated_track
 from bevcli.synth.world.city import CityPlan
-from bevcli.synth.world.parked import Roadside
 from bevcli.synth.world.pedestrians import Walker, crossers, strollers
-from bevcli.synth.world.population import Population
+from bevcli.synth.world.roadside import Roadside
 from bevcli.synth.world.route import Route
 from bevcli.synth.world.signals import Signals
+from bevcli.synth.world.spawning import VehicleSpawner
 from bevcli.synth.world.traffic import STEP_S, Unit, Vehicle, step
 
-WARM_UP_S = 6.0  # the traffic runs this long before the first frame, so that queues have formed
-AFTER_S = 0.6
-VEHICLES, BICYCLES = 22, 6
-REACH_M = 75.0
-EGO_REAR_AXLE_M = 3.75  # from the ego vehicle's front to its rear axle, where its frame's origin is
-EGO_SMOOTHING_S = 0.35
+WARM_UP_S = 6.0  # simulated time before the first frame, in which queues form
+AFTER_S = 0.6  # simulated time after the last frame
+VEHICLES, BICYCLES = 22, 6  # numbers around the ego vehicle, which counts as a vehicle
+REACH_M = 75.0  # traffic is simulated within this distance of the ego vehicle
+EGO_REAR_AXLE_M = 3.75  # from the front of the ego vehicle to its rear axle, the origin of the ego frame
+EGO_SMOOTHING_S = 0.35  # standard deviation of the smoothing of the ego vehicle's speed
 
 
 @dataclass(frozen=True)
 class EgoTrack:
-    """The ego vehicle's rear axle on its route. times: (T,) s. positions: (T,) m along the route. speeds: (T,) m/s."""
+    """The motion of the ego vehicle's rear axle.
+
+    Attributes:
+        route: its route.
+        times: (T,) seconds.
+        positions: (T,) route positions, metres.
+        speeds: (T,) m/s.
+    """
 
     route: Route
     times: Array
@@ -38,12 +45,12 @@ class EgoTrack:
     speeds: Array
 
     def pose(self, time_s: float) -> tuple[Array, float]:
-        """World point (2,) of the rear axle and yaw."""
+        """World point (2,) of the rear axle in metres, and yaw in radians, at a time in seconds."""
         s = interpolated_track(self.times, self.positions, self.speeds, time_s)
         return self.route.at(s), float(self.route.yaw_at(s))
 
     def motion(self, time_s: float) -> tuple[Array, Array, Array]:
-        """Acceleration with gravity, angular rate and velocity, each (3,), in the ego frame."""
+        """Acceleration with gravity (m/s²), angular rate (rad/s) and velocity (m/s), each (3,), ego frame."""
         h = 0.05
         s = [interpolated_track(self.times, self.positions, self.speeds, time_s + d) for d in (-h, 0.0, h)]
         speed = (s[2] - s[0]) / (2 * h)
@@ -59,26 +66,26 @@ class EgoTrack:
 
 
 class Simulation:
-    """Everything that moves or stands in a drive of `duration_s` seconds, reproducible from the city's seed."""
+    """All actors of a drive of `duration_s` seconds. The same city gives the same simulation."""
 
     def __init__(self, city: CityPlan, catalog: Catalog, duration_s: float) -> None:
         self.city, self.catalog = city, catalog
         self.roadside = Roadside(city, catalog)
         self.span_s = (-WARM_UP_S, duration_s + AFTER_S)
-        self.population = Population(city, catalog, 14.0 * (self.span_s[1] - self.span_s[0]) + 60)
+        self.spawner = VehicleSpawner(city, catalog, 14.0 * (self.span_s[1] - self.span_s[0]) + 60)
         body = draw_body(catalog.by_class["car"][2], city.stream("ego-body"), "ego", 0.0)
         self.ego_body = body
-        self._ego = self.population.ego((Unit(body.variant, body.size_lwh, body.paint, body.dye, "ego", 0.0),))
+        self._ego = self.spawner.spawn_ego((Unit(body, 0.0),))
         first = self._ego.route.passes[0]
         self.signals = Signals(city, (first.node, first.direction % 2))
         self._crossers: dict[tuple[int, int], list[Walker]] = {}
         self._strollers: dict[tuple[int, int], list[Walker]] = {}
-        self._driving: list[Driving] = []
+        self._driving: list[DrivingActor] = []
         self._run()
         self.ego = _smoothed(self._ego)
 
     def actors_near(self, point: ArrayLike, reach_m: float) -> list[Actor]:
-        """Everything annotated that may be within `reach_m` of a world point (2,), in a fixed order."""
+        """Actors that may be within `reach_m` metres of a world point (2,), and some that are not, in a fixed order."""
         x, y = self.city.unbend(point)
         columns = self.city.streets_between(1, x - reach_m, x + reach_m)
         rows = self.city.streets_between(0, y - reach_m, y + reach_m)
@@ -116,10 +123,10 @@ class Simulation:
             step(vehicles, self._people_on_roads(vehicles, time_s), self.signals, time_s)
             if k % 10 == 9:
                 gone += self._renew(vehicles, time_s + STEP_S)
-        self._driving = [d for v in [*gone, *vehicles[1:]] if len(v.track) > 1 for d in Driving.of(v)]
+        self._driving = [d for v in [*gone, *vehicles[1:]] if len(v.track) > 1 for d in DrivingActor.of(v)]
 
     def _populate(self, vehicles: list[Vehicle], near_m: float) -> None:
-        """Fill the streets around the ego vehicle."""
+        """Spawn vehicles around the ego vehicle, at least `near_m` metres away, until there are enough."""
         ego = self._ego
         taken = [vehicle.body_points() for vehicle in vehicles]
         for attempt in range(6 * (VEHICLES + BICYCLES)):
@@ -130,13 +137,13 @@ class Simulation:
             if not wants_bicycle and len(vehicles) - bicycles >= VEHICLES:
                 continue
             around = ego.route.at(ego.front + 25.0)
-            new = self.population.appear(around, near_m, REACH_M, np.concatenate(taken), wants_bicycle)
+            new = self.spawner.spawn(around, near_m, REACH_M, np.concatenate(taken), wants_bicycle)
             if new is not None:
                 vehicles.append(new)
                 taken.append(new.body_points())
 
     def _renew(self, vehicles: list[Vehicle], time_s: float) -> list[Vehicle]:
-        """Let vehicles go that are far away or at their route's end, and new ones come; returns the former."""
+        """Remove vehicles that are far away or at the end of their route, and spawn others. Returns those removed."""
         here = self._ego.route.at(self._ego.front)
         gone = []
         for vehicle in vehicles[1:]:
@@ -152,7 +159,7 @@ class Simulation:
         return gone
 
     def _people_on_roads(self, vehicles: list[Vehicle], time_s: float) -> Array:
-        """(H, 2) world points of people on the road near junctions that vehicles approach."""
+        """(H, 2) world points of people on the road at the junctions that vehicles approach."""
         nodes = sorted({p.node for v in vehicles if (p := v.next_pass()) is not None})
         points = [
             w.plan_at(time_s)
@@ -180,7 +187,7 @@ def _below(city: CityPlan, axis: int, position: float) -> int:
 
 
 def _smoothed(ego: Vehicle) -> EgoTrack:
-    """The ego vehicle's track with a driver's soft pedals: its speed smoothed over EGO_SMOOTHING_S."""
+    """The track of the ego vehicle with its speed smoothed, which limits its acceleration."""
     times, fronts, speeds = np.array(ego.track).T
     soft = gaussian_filter1d(speeds, EGO_SMOOTHING_S / STEP_S, mode="nearest")
     moved = np.concatenate([[0], np.cumsum((soft[1:] + soft[:-1]) / 2 * STEP_S)])

@@ -1,4 +1,4 @@
-"""Traffic: vehicles that follow routes, keep distance, obey signals and yield, step by step and reproducibly."""
+"""The traffic simulation: vehicles follow routes, keep their distance, obey signals and give way."""
 
 from __future__ import annotations
 
@@ -10,34 +10,42 @@ from numba import njit
 from numpy.typing import NDArray
 
 from bevcli.geometry.transforms import Array
-from bevcli.synth.assets.catalog import Variant
+from bevcli.synth.assets.catalog import Body
 from bevcli.synth.world.route import JunctionPass, Route
 from bevcli.synth.world.signals import Light, Signals
 
-STEP_S = 0.1
-LOOK_AHEAD_M, LOOK_STEPS = 42.0, 54
-CORRIDOR_M = 1.55  # something this near to the middle of a vehicle's way is in its way
-COMFORT = 2.0  # m/s², usual braking
-HARDEST = -3.4  # m/s², what the traffic ever brakes with
+STEP_S = 0.1  # time step of the simulation
+LOOK_AHEAD_M, LOOK_STEPS = 42.0, 54  # range of the search for obstacles, and its number of samples
+CORRIDOR_M = 1.55  # obstacles nearer than this to the centre of a vehicle's lane block it
+COMFORT = 2.0  # m/s², comfortable deceleration
+HARDEST = -3.4  # m/s², strongest deceleration
 
 
 @dataclass(frozen=True)
 class Unit:
-    """One body of a road train. lag: metres from the train's foremost point to this body's front."""
+    """One part of a vehicle: the vehicle itself, its tractor or its trailer.
 
-    variant: Variant
-    size_lwh: Array
-    paint: NDArray[np.float32]
-    dye: NDArray[np.float32]
-    instance: str
+    Attributes:
+        body: size and looks.
+        lag: distance from the vehicle's front to the front of this unit, metres.
+    """
+
+    body: Body
     lag: float
 
 
 @dataclass(eq=False)
 class Vehicle:
-    """A vehicle, or a road train, on its route. front: route position of its foremost point, metres.
+    """A vehicle on its route.
 
-    track: (time, front, speed) of every step since it appeared.
+    Attributes:
+        route: the route.
+        units: the vehicle, or tractor and trailer, from front to rear.
+        front: route position of the vehicle's front, metres.
+        speed: m/s.
+        liveliness: factor on the acceleration, about 1.
+        bicycle: whether it is a bicycle.
+        track: (time, front, speed) of every step since it appeared; seconds, metres, m/s.
     """
 
     route: Route
@@ -50,21 +58,21 @@ class Vehicle:
 
     @cached_property
     def length(self) -> float:
-        """Metres from the foremost to the last point."""
-        return self.units[-1].lag + float(self.units[-1].size_lwh[0])
+        """From the front to the rear, metres."""
+        return self.units[-1].lag + float(self.units[-1].body.size_lwh[0])
 
     def next_pass(self) -> JunctionPass | None:
-        """The junction that is not yet left behind."""
+        """The first junction that the vehicle has not left yet; None where the route has no more."""
         return next((p for p in self.route.passes if self.front < p.leave + self.length), None)
 
     def body_points(self) -> Array:
-        """(B, 2) points along the vehicle, at most 2.5 m apart, its ends included."""
+        """(B, 2) world points along the vehicle, at most 2.5 m apart, both ends included."""
         count = max(int(np.ceil(self.length / 2.5)) + 1, 2)
         return points_between(self.route.points, self.route.positions, self.front - self.length, self.front, count)
 
 
 def step(vehicles: list[Vehicle], people: Array, signals: Signals, time_s: float) -> None:
-    """Move all vehicles on by STEP_S. people: (H, 2) world points of persons who may stand in the way."""
+    """Advance all vehicles by STEP_S. people: (H, 2) world points of people on the road."""
     bodies = [vehicle.body_points() for vehicle in vehicles]
     owners = np.repeat(np.arange(len(bodies)), [len(b) for b in bodies])
     obstacles = np.concatenate([*bodies, people.reshape(-1, 2)])
@@ -85,7 +93,7 @@ def _acceleration(
     index: int, vehicle: Vehicle, vehicles: list[Vehicle], obstacles: Array, owners: NDArray, speeds: Array,
     signals: Signals, time_s: float,
 ) -> float:  # fmt: skip
-    """The Intelligent Driver Model towards whatever limits the vehicle most."""
+    """Acceleration in m/s² by the Intelligent Driver Model (IDM): the smallest of free road, obstacle and signal."""
     route = vehicle.route
     limit = float(np.interp(vehicle.front, route.positions, route.speed_limits))
     speed, strongest = vehicle.speed, 1.6 * vehicle.liveliness
@@ -107,13 +115,13 @@ def _acceleration(
 
 
 def _follow(speed: float, limit: float, strongest: float, gap: float, lead_speed: float) -> float:
-    """IDM: keep 2 m and 1.2 s from what drives at `lead_speed`, `gap` metres ahead."""
+    """Acceleration (IDM) behind a vehicle at `lead_speed`, `gap` metres ahead: keep a distance of 2 m plus 1.2 s."""
     desired = 2.0 + max(0.0, speed * 1.2 + speed * (speed - lead_speed) / (2 * np.sqrt(strongest * COMFORT)))
     return strongest * (1 - (speed / max(limit, 0.3)) ** 4 - (desired / max(gap, 0.1)) ** 2)
 
 
 def _same_way(vehicle: Vehicle, vehicles: list[Vehicle], other: int) -> bool:
-    """Whether the other one drives roughly in the vehicle's direction; what crosses counts as standing."""
+    """Whether the other vehicle drives in about the same direction (within 60 degrees)."""
     if other < 0:
         return False
     mine = vehicle.route.yaw_at(vehicle.front)
@@ -124,7 +132,7 @@ def _same_way(vehicle: Vehicle, vehicles: list[Vehicle], other: int) -> bool:
 def _may_enter(
     vehicle: Vehicle, crossing: JunctionPass, vehicles: list[Vehicle], signals: Signals, time_s: float
 ) -> bool:
-    """Green, and nobody there to whom the vehicle must give way. Left turns may use the yellow, too."""
+    """Whether the light is green and nobody has priority. Left turns may also start on yellow."""
     light = signals.light(crossing.node, crossing.direction % 2, time_s)
     if light != "green" and (light == "red" or crossing.turn <= 0):
         return False
@@ -136,7 +144,7 @@ def _may_enter(
 
 
 def _has_priority(other: Vehicle, theirs: JunctionPass, vehicle: Vehicle, crossing: JunctionPass, light: Light) -> bool:
-    """Oncoming traffic before left turns; bicycles before right turns beside them, until these have begun."""
+    """Whether the other vehicle has priority: oncoming over left turns, bicycles over right turns not yet begun."""
     if theirs.direction == (crossing.direction + 2) % 4 and crossing.turn == 1 and theirs.turn != 1:
         near = theirs.stop - 15 < other.front < theirs.leave - 5
         waits = other.speed < 0.5 and (light == "yellow" or other.front < theirs.stop - 6)
@@ -150,7 +158,10 @@ def _has_priority(other: Vehicle, theirs: JunctionPass, vehicle: Vehicle, crossi
 
 @njit(cache=True, nogil=True)
 def points_between(points: Array, positions: Array, start: float, end: float, count: int) -> Array:
-    """(count, 2) points at even positions from start to end along a route."""
+    """(count, 2) evenly spaced points of a route from position start to end.
+
+    points: (P, 2) of the route. positions: (P,) along it, metres.
+    """
     found = np.empty((count, 2))
     for i in range(count):
         place = start + (end - start) * i / (count - 1)
@@ -165,7 +176,13 @@ def points_between(points: Array, positions: Array, start: float, end: float, co
 def _nearest_in_way(
     points: Array, positions: Array, front: float, obstacles: Array, owners: NDArray, own: int, corridor: float
 ) -> tuple[float, int]:
-    """Distance along a route from `front` to the first obstacle in its corridor, and its owner; inf, -1 for none."""
+    """Find the first obstacle ahead on a route.
+
+    points: (P, 2) of the route. positions: (P,) along it, metres. front: start of the search, metres.
+    obstacles: (O, 2). owners: (O,) index of the vehicle that an obstacle point belongs to, -1 for people.
+    own: index whose points are ignored. corridor: half the width of the search, metres.
+    Returns the distance in metres and the owner; infinity and -1 where the road is free.
+    """
     squared = corridor * corridor
     way = points_between(points, positions, front + 0.3, front + LOOK_AHEAD_M, LOOK_STEPS)
     reach = (LOOK_AHEAD_M + 5.0) ** 2

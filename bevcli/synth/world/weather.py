@@ -1,27 +1,37 @@
-"""Weather and hour: sun, sky and haze of one drive."""
+"""Weather: the light of the sun and the sky, the clouds and the haze of one drive."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bevcli.errors import InputError
 from bevcli.synth.assets.paint import linear
 
-WeatherName = Literal["noon", "evening", "overcast"]
-WEATHER_NAMES: tuple[str, ...] = get_args(WeatherName)
+WEATHER_NAMES = ("noon", "evening", "overcast")
 
 
 @dataclass(frozen=True)
 class Weather:
-    """Light in linear units, where 1 is a white surface's brightness in full sun at noon.
+    """The light of a drive. Colours are linear RGB; 1 is about the brightness of a white surface in full sun.
 
-    to_sun: (3,) unit vector in the world. sun, sky, bounce: (3,) light from the sun, from above and from below.
-    zenith, horizon, haze: (3,) colours. clouds: (512, 512) cover 0 to 1 on a plane overhead, repeating.
-    haze_m: distance after which 63 % of the light is haze. lamps: how strongly lamps and windows glow.
+    Attributes:
+        name: one of WEATHER_NAMES.
+        to_sun: (3,) unit vector towards the sun, world.
+        sun: (3,) light from the sun.
+        sky: (3,) light from above.
+        bounce: (3,) light from below, reflected by the ground.
+        zenith: (3,) colour of the sky overhead.
+        horizon: (3,) colour of the sky at the horizon.
+        haze: (3,) colour of the haze.
+        cloud_color: (3,) colour of the clouds.
+        clouds: (512, 512) cloud cover, 0 to 1, on a horizontal plane; it repeats in both directions.
+        haze_m: distance after which about 63 % of the light comes from the haze, metres.
+        lamps: brightness of lamps and lit windows, relative.
+        shadow_softness_m: width of the edge of shadows, metres.
     """
 
     name: str
@@ -40,7 +50,9 @@ class Weather:
 
 
 def make_weather(name: str, rng: np.random.Generator) -> Weather:
-    """Weather of this name, with sun and clouds drawn from `rng`."""
+    """The weather of a name, with sun and clouds drawn from `rng`. Raises InputError where the name is not known."""
+    if name not in WEATHER_NAMES:
+        raise InputError(f"weather: expected {', '.join(WEATHER_NAMES[:-1])} or {WEATHER_NAMES[-1]}, found {name!r}")
     azimuth = rng.uniform(0, 2 * np.pi)
     if name == "noon":
         elevation = rng.uniform(0.65, 1.05)
@@ -131,7 +143,7 @@ def _weather(
 
 
 def _clouds(rng: np.random.Generator, threshold: float) -> NDArray[np.float32]:
-    """(512, 512) cloud cover on a plane overhead that repeats in both directions: octaves of noise."""
+    """(512, 512) cloud cover, 0 to 1, repeating in both directions: five octaves of noise above a threshold."""
     size = 512
     total = np.zeros((size, size))
     for octave in range(5):

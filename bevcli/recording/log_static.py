@@ -1,0 +1,159 @@
+"""What a recording holds once: rig, vehicle, range rings, pillars, colours, curve names, the page "About"."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import rerun as rr
+
+from bevcli import __version__
+from bevcli.geometry.bev_grid import BevGrid
+from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.geometry.transforms import Array, apply, inverse
+from bevcli.recording import entities
+from bevcli.recording.colors import EGO_COLOR, RING_COLOR, STAGE_COLORS, class_color, colormap
+from bevcli.recording.options import RecordingOptions
+from bevcli.recording.vehicle import VehicleMesh, default_vehicle
+
+RING_DISTANCES_M = (10, 20, 30, 40, 50)
+FRUSTUM_LENGTH_M = 0.55  # longer frusta would hide the vehicle from the eye behind it
+PILLARS_PER_SIDE = 25  # more pillars than this along one side of the grid would hide the image
+HOW_TO_READ = """\
+- **Predicted boxes** have the colour of their class. The front face is crossed; from above, a line points to the front.
+- **Ground truth** is pale where a prediction matches it, and red where it was missed.
+- **False positives** are crossed out in red: no ground truth of their class is within 2 m.
+- **Pillars** are the 3D reference points of the BEV cells, coloured by height from blue to red. They are hidden at
+  first: click the eye next to `pillars` in the left panel.
+"""
+
+
+def log_scene(
+    stream: rr.RecordingStream, rig: CameraRig, class_names: Sequence[str], vehicle: VehicleMesh | None = None
+) -> None:
+    """Writes the class colours, the pinholes, the vehicle and the range rings.
+
+    vehicle: in the ego frame; None draws the default car.
+    """
+    stream.log(entities.WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    infos = [rr.AnnotationInfo(id=i + 1, label=n, color=class_color(n, i)) for i, n in enumerate(class_names)]
+    stream.log("/", rr.AnnotationContext([rr.AnnotationInfo(id=0, label="other"), *infos]), static=True)
+    for camera in rig.cameras:
+        _log_pinhole(stream, camera)
+    _log_vehicle(stream, rig, default_vehicle() if vehicle is None else vehicle)
+    _log_rings(stream, rig)
+
+
+def log_about(
+    stream: rr.RecordingStream,
+    title: str,
+    rig: CameraRig,
+    class_names: Sequence[str],
+    options: RecordingOptions,
+    *,
+    untrained: bool,
+) -> None:
+    """Writes the page "About", and the facts of the run that readers of the file need."""
+    facts = rr.AnyValues(
+        title=title,
+        untrained=untrained,
+        score=options.score,
+        class_names=list(class_names),
+        camera_names=list(rig.names),
+    )
+    text = about_text(title, rig, options, untrained=untrained)
+    stream.log(entities.RUN, rr.TextDocument(text, media_type="text/markdown"), facts, static=True)
+
+
+def about_text(title: str, rig: CameraRig, options: RecordingOptions, *, untrained: bool) -> str:
+    """The page "About" in Markdown: what was run, and how to read the views."""
+    warning = "**The weights are untrained: boxes and maps are meaningless.**\n\n" if untrained else ""
+    facts = (
+        f"bevcli {__version__}; {len(rig.cameras)} cameras: {', '.join(rig.names)}. "
+        f"Boxes with a score of {options.score:g} or more are shown.\n"
+    )
+    return f"# {title}\n\n{warning}{facts}\n{HOW_TO_READ}"
+
+
+def log_curve_names(stream: rr.RecordingStream, stages: Iterable[str], class_names: Sequence[str]) -> None:
+    """Writes names and colours of the curves: seconds per stage, boxes per class."""
+    stages = list(stages)
+    colors = [STAGE_COLORS[i % len(STAGE_COLORS)] for i in range(len(stages))]
+    stream.log(entities.STAGE_CURVES, rr.SeriesLines(names=stages, colors=colors), static=True)
+    colors = [class_color(name, i) for i, name in enumerate(class_names)]
+    stream.log(entities.BOX_CURVES, rr.SeriesLines(names=list(class_names), colors=colors), static=True)
+
+
+def drawn_pillars(grid: BevGrid, *, all_cells: bool = False) -> Array:
+    """The pillars to draw: (cells, Z, 3) 3D reference points in the bev frame, metres.
+
+    At most PILLARS_PER_SIDE along each side of the grid, evenly spaced, unless `all_cells`.
+    """
+    steps = [1 if all_cells else max(1, -(-side // PILLARS_PER_SIDE)) for side in (grid.rows, grid.columns)]
+    pillars = grid.pillars()[steps[0] // 2 :: steps[0], steps[1] // 2 :: steps[1]]
+    return pillars.reshape(-1, grid.pillar_points, 3)
+
+
+def log_pillars(stream: rr.RecordingStream, grid: BevGrid, ego_from_bev: Array, pillars: Array) -> None:
+    """Writes pillars (cells, Z, 3), in the bev frame, into the scene, coloured by height."""
+    points = apply(ego_from_bev, pillars).reshape(-1, 3)
+    colors = pillar_colors(grid, len(pillars))
+    stream.log(entities.PILLARS, rr.Points3D(points, colors=colors, radii=rr.Radius.ui_points(1.5)), static=True)
+
+
+def pillar_colors(grid: BevGrid, cells: int) -> np.ndarray:
+    """(cells * Z, 3) uint8 RGB: the lowest point of each pillar is blue, the highest red."""
+    heights = np.linspace(0.1, 0.95, grid.pillar_points)
+    return np.tile(colormap(heights, "turbo"), (cells, 1))
+
+
+def _log_pinhole(stream: rr.RecordingStream, camera: Camera) -> None:
+    pinhole = rr.Pinhole(
+        image_from_camera=camera.intrinsics,
+        resolution=[camera.width, camera.height],
+        camera_xyz=rr.ViewCoordinates.RDF,
+        image_plane_distance=FRUSTUM_LENGTH_M,
+        color=[*EGO_COLOR, 160],
+        line_width=0.01,
+    )
+    stream.log(entities.camera(camera.name), pinhole, static=True)
+
+
+def _log_vehicle(stream: rr.RecordingStream, rig: CameraRig, vehicle: VehicleMesh) -> None:
+    mesh = rr.Mesh3D(
+        vertex_positions=vehicle.vertices,
+        triangle_indices=vehicle.faces,
+        vertex_normals=vehicle.normals,
+        vertex_colors=vehicle.colors,
+    )
+    stream.log(entities.VEHICLE, mesh, static=True)
+    strips = [_bev_image_points(rig, strip) for strip in vehicle.top_view]
+    stream.log(entities.BEV_VEHICLE, rr.LineStrips2D(strips, colors=EGO_COLOR, draw_order=40), static=True)
+
+
+def _log_rings(stream: rr.RecordingStream, rig: CameraRig) -> None:
+    angles = np.linspace(0, 2 * np.pi, 121)
+    circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    rings = [circle * distance for distance in RING_DISTANCES_M]
+    width = rr.Radius.ui_points(0.6)
+    in_space = [np.column_stack([ring, np.zeros(len(ring))]) for ring in rings]
+    stream.log(entities.RANGE_RINGS, rr.LineStrips3D(in_space, colors=[*RING_COLOR, 140], radii=width), static=True)
+    flat = [_bev_image_points(rig, ring) for ring in rings]
+    stream.log(entities.BEV_RINGS, rr.LineStrips2D(flat, colors=RING_COLOR, radii=width, draw_order=5), static=True)
+    # The labels are on the circles, ahead to the right, where they cover little.
+    positions = [_bev_image_points(rig, ring[[105]])[0] for ring in rings]
+    labels = rr.Points2D(
+        positions,
+        labels=[f"{distance} m" for distance in RING_DISTANCES_M],
+        colors=[150, 156, 170],
+        radii=rr.Radius.ui_points(0.01),
+        show_labels=True,
+        draw_order=6,
+    )
+    stream.log(f"{entities.BEV_RINGS}/labels", labels, static=True)
+
+
+def _bev_image_points(rig: CameraRig, points_ego: Array) -> Array:
+    """Points (K, 2) on the ground in the ego frame -> (K, 2) in the flat BEV image: x to the right, -y down, metres."""
+    points = apply(inverse(rig.ego_from_bev), np.column_stack([points_ego, np.zeros(len(points_ego))]))
+    return points[:, :2] * (1, -1)

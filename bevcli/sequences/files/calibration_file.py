@@ -1,0 +1,129 @@
+"""calibration.json: the cameras of the rig, and the bev frame in which the model predicts."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bevcli.errors import InputError, OutputError
+from bevcli.findings import Finding, errors_of
+from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
+from bevcli.sequences.files.camera_fields import parse_camera
+from bevcli.sequences.files.json_fields import Report
+from bevcli.sequences.files.transform_json import parse_transform, transform_to_json
+
+FORMAT = "bevcli-calibration/1"
+
+
+@dataclass(frozen=True)
+class RigDraft:
+    """A calibration with mistakes.
+
+    Attributes:
+        rig: the cameras with usable fields, possibly none. Invalid rotations are replaced by the nearest valid ones.
+        findings: what is wrong with the file. Whether its numbers are plausible is checked in `bevcli.rig`.
+    """
+
+    rig: CameraRig
+    findings: tuple[Finding, ...]
+
+
+def read_calibration(path: Path) -> CameraRig:
+    """The rig in calibration.json. Raises InputError with the first mistake in the file."""
+    draft = draft_calibration(path)
+    for error in errors_of(draft.findings):
+        raise InputError(f"{path}: {error.line}")
+    return draft.rig
+
+
+def draft_calibration(path: Path) -> RigDraft:
+    """The rig in calibration.json and all mistakes in the file. Raises InputError only if it is not a JSON object."""
+    document = _load_object(path)
+    report = Report()
+    if "format" not in document:
+        report.missing("format", FORMAT)
+    elif document["format"] != FORMAT:
+        report.error("wrong-format", "format", "is not supported", expected=FORMAT, found=document["format"])
+    cameras = _parse_cameras(document, report)
+    given = "ego_from_bev" in document
+    ego_from_bev = parse_transform(document, "ego_from_bev", report) if given else None
+    if ego_from_bev is None:
+        ego_from_bev = default_ego_from_bev()
+    return RigDraft(CameraRig(cameras, ego_from_bev, ego_from_bev_assumed=not given), tuple(report.findings))
+
+
+def write_calibration(path: Path, rig: CameraRig) -> None:
+    """Write the rig so that `read_calibration` returns exactly the same numbers. Raises OutputError.
+
+    A default `ego_from_bev` is left out, so that a reader also knows it as the default.
+    """
+    document: dict[str, Any] = {"format": FORMAT}
+    if not rig.ego_from_bev_assumed:
+        document["ego_from_bev"] = transform_to_json(rig.ego_from_bev)
+    document["cameras"] = {camera.name: _camera_to_json(camera) for camera in rig.cameras}
+    try:
+        path.write_text(_lines(document) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+def _load_object(path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: the file is missing (expected a calibration)") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as text ({error})") from error
+    try:
+        document = json.loads(text, object_pairs_hook=lambda pairs: _unique(pairs, path))
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}: line {error.lineno}, column {error.colno}: broken JSON: {error.msg}") from error
+    if not isinstance(document, dict):
+        raise InputError(f'{path}: is not a JSON object (expected {{"format": "{FORMAT}", "cameras": {{...}}}})')
+    return document
+
+
+def _unique(pairs: list[tuple[str, Any]], path: Path) -> dict[str, Any]:
+    keys = [key for key, _ in pairs]
+    for key in keys:
+        if keys.count(key) > 1:
+            raise InputError(f'{path}: "{key}" appears twice in the same object: remove or rename one')
+    return dict(pairs)
+
+
+def _parse_cameras(document: Mapping[str, Any], report: Report) -> tuple[Camera, ...]:
+    value = document.get("cameras")
+    if value is None:
+        report.missing("cameras", "an object with one entry per camera")
+        return ()
+    if not isinstance(value, dict) or not value:
+        message = "contains no camera"
+        report.error("wrong-shape", "cameras", message, expected="an object with one entry per camera", found=value)
+        return ()
+    parsed = (parse_camera(name, entry, report.about(name)) for name, entry in value.items())
+    return tuple(camera for camera in parsed if camera is not None)
+
+
+def _camera_to_json(camera: Camera) -> dict[str, Any]:
+    entry: dict[str, Any] = {
+        "width": camera.width,
+        "height": camera.height,
+        "intrinsics": camera.intrinsics.tolist(),
+        "ego_from_camera": transform_to_json(camera.ego_from_camera),
+    }
+    if camera.distortion is not None:
+        lens = camera.distortion
+        entry["distortion"] = {"model": lens.model, "coefficients": list(lens.coefficients)}
+    return entry
+
+
+def _lines(value: Any, indent: str = "") -> str:
+    """JSON with one line per object member, and each list on one line."""
+    if not isinstance(value, dict):
+        return json.dumps(value)
+    inner = indent + "  "
+    entries = (f"{inner}{json.dumps(key)}: {_lines(entry, inner)}" for key, entry in value.items())
+    return "{\n" + ",\n".join(entries) + f"\n{indent}}}"

@@ -1,0 +1,199 @@
+"""A rig from intrinsics in YAML (Kalibr camchain or ROS camera_info) and extrinsics in JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from bevcli.errors import InputError
+from bevcli.findings import errors_of
+from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
+from bevcli.geometry.transforms import Array, inverse
+from bevcli.sequences.files.camera_fields import parse_camera
+from bevcli.sequences.files.json_fields import Report, parse_numbers
+from bevcli.sequences.files.transform_json import parse_transform, transform_to_json
+
+Fields = dict[str, Any]  # the fields of one camera, as in calibration.json
+YAML_SUFFIXES = (".yaml", ".yml")
+KALIBR_LENSES = {"radtan": "brown_conrady", "equidistant": "kannala_brandt", "none": "none"}
+ROS_LENSES = {"plumb_bob": "brown_conrady", "rational_polynomial": "brown_conrady", "equidistant": "kannala_brandt"}
+CHAIN = "camera_from_previous"  # key of Kalibr's T_cn_cnm1 in Fields, until all poses are known
+
+
+def read_rig(intrinsics: Path | None, extrinsics: Path | None) -> CameraRig | None:
+    """The rig of an intrinsics and an extrinsics file; None if neither is given.
+
+    intrinsics: a Kalibr camchain, a ROS camera_info, or a folder of these.
+    extrinsics: JSON with each camera's pose and, optionally, the bev frame:
+        {"ego_from_bev": {...}, "cameras": {"cam0": {"ego_from_camera": {"translation": ..., "rotation_wxyz": ...}}}}
+        A camera that is missing there gets its pose from its neighbour and T_cn_cnm1 of the camchain.
+    Raises InputError if one file is given without the other, or one is missing or invalid.
+    """
+    if intrinsics is None and extrinsics is None:
+        return None
+    if intrinsics is None or extrinsics is None:
+        raise InputError("--intrinsics and --extrinsics must be given together: pass both, or write a calibration.json")
+    cameras = dict(_read_intrinsics(intrinsics))
+    document = _read_extrinsics(extrinsics)
+    poses = _poses(document.get("cameras", {}), cameras, extrinsics)
+    rig_cameras = tuple(_camera(name, fields, poses.get(name), extrinsics) for name, fields in cameras.items())
+    if "ego_from_bev" not in document:
+        return CameraRig(rig_cameras, default_ego_from_bev(), ego_from_bev_assumed=True)
+    report = Report()
+    ego_from_bev = parse_transform(document, "ego_from_bev", report)
+    _raise_first(report, extrinsics)
+    assert ego_from_bev is not None
+    return CameraRig(rig_cameras, ego_from_bev)
+
+
+def _read_intrinsics(path: Path) -> Iterator[tuple[str, Fields]]:
+    """Name and fields of every camera in a file or in the files of a folder."""
+    files = [path]
+    if path.is_dir():
+        files = [file for file in sorted(path.iterdir()) if file.suffix.lower() in YAML_SUFFIXES]
+        if not files:
+            raise InputError(f"{path}: the folder has no .yaml file (expected Kalibr or ROS intrinsics)")
+    seen: set[str] = set()
+    for file in files:
+        for name, fields in _cameras_in(file):
+            if name in seen:
+                raise InputError(f"{file}: camera {name} is in another file too: keep one")
+            seen.add(name)
+            yield name, fields
+
+
+def _cameras_in(path: Path) -> Iterator[tuple[str, Fields]]:
+    document = _load_yaml(path)
+    if "image_width" in document or "width" in document:
+        yield str(document.get("camera_name") or path.stem), _ros_fields(document, path)
+    elif any(isinstance(entry, dict) and "intrinsics" in entry for entry in document.values()):
+        for name, entry in document.items():
+            yield str(name), _kalibr_fields(entry, f"{path}: camera {name}")
+    else:
+        raise InputError(f"{path}: expected a Kalibr camchain (cam0: intrinsics: ...) or a ROS camera_info")
+
+
+def _load_yaml(path: Path) -> Mapping[str, Any]:
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: the file is missing") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read ({error})") from None
+    except yaml.YAMLError as error:
+        raise InputError(f"{path}: broken YAML ({' '.join(str(error).split())})") from None
+    if not isinstance(document, dict):
+        raise InputError(f"{path}: expected a mapping (Kalibr camchain or ROS camera_info)")
+    return document
+
+
+def _kalibr_fields(entry: Any, where: str) -> Fields:
+    if not isinstance(entry, dict):
+        raise InputError(f"{where}: expected a mapping with intrinsics and resolution")
+    if entry.get("camera_model", "pinhole") != "pinhole":
+        raise InputError(f"{where}: camera_model {entry['camera_model']} is not supported (expected pinhole)")
+    fx, fy, cx, cy = _numbers(entry, "intrinsics", 4, where)
+    width, height = _numbers(entry, "resolution", 2, where)
+    fields: Fields = {
+        "width": int(width),
+        "height": int(height),
+        "intrinsics": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]],
+        "distortion": _lens(
+            entry.get("distortion_model", "none"), entry.get("distortion_coeffs") or [], KALIBR_LENSES, where
+        ),
+    }
+    if "T_cn_cnm1" in entry:
+        matrix = np.array(entry["T_cn_cnm1"], dtype=object)
+        if matrix.shape != (4, 4):
+            raise InputError(f"{where}: T_cn_cnm1: expected a 4x4 matrix, found {entry['T_cn_cnm1']!r:.60}")
+        fields[CHAIN] = matrix.astype(np.float64)
+    return fields
+
+
+def _ros_fields(document: Mapping[str, Any], path: Path) -> Fields:
+    """Fields of a ROS calibration file (camera_matrix: {data: ...}) or printed message (k: [...] or K: [...])."""
+    where = str(path)
+    matrix = document.get("camera_matrix", {}).get("data") or document.get("k") or document.get("K")
+    coefficients = document.get("distortion_coefficients", {}).get("data") or document.get("d") or document.get("D")
+    numbers = _numbers({"camera_matrix": matrix}, "camera_matrix", 9, where)
+    return {
+        "width": document.get("image_width", document.get("width")),
+        "height": document.get("image_height", document.get("height")),
+        "intrinsics": [numbers[0:3], numbers[3:6], numbers[6:9]],
+        "distortion": _lens(document.get("distortion_model") or "plumb_bob", coefficients or [], ROS_LENSES, where),
+    }
+
+
+def _numbers(owner: Mapping[str, Any], name: str, count: int, where: str) -> list[float]:
+    report = Report()
+    numbers = parse_numbers(owner, name, (count,), report)
+    for error in errors_of(report.findings):
+        raise InputError(f"{where}: {error.line}")
+    assert numbers is not None
+    return [float(number) for number in numbers]
+
+
+def _lens(model: str, coefficients: list[float], known: Mapping[str, str], where: str) -> Fields:
+    if model not in known:
+        raise InputError(f"{where}: distortion_model {model} is not supported (expected {', '.join(known)})")
+    if not any(coefficients):
+        return {"model": "none"}
+    return {"model": known[model], "coefficients": coefficients}
+
+
+def _read_extrinsics(path: Path) -> Mapping[str, Any]:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: the file is missing") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read as JSON ({error})") from None
+    if not isinstance(document, dict) or not isinstance(document.get("cameras"), dict):
+        raise InputError(
+            f'{path}: "cameras" is missing (expected {{"cameras": {{"cam0": {{"ego_from_camera": ...}}}}}})'
+        )
+    return document
+
+
+def _poses(stated: Mapping[str, Any], cameras: Mapping[str, Fields], path: Path) -> dict[str, Array]:
+    """ego_from_camera (4, 4) by camera: as stated, otherwise along Kalibr's chain in the file's order."""
+    for name in stated:
+        if name not in cameras:
+            raise InputError(f"{path}: camera {name}: has no intrinsics (found those of {', '.join(cameras)})")
+    poses: dict[str, Array] = {}
+    for name, entry in stated.items():
+        report = Report(camera=name)
+        pose = parse_transform(entry if isinstance(entry, dict) else {}, "ego_from_camera", report)
+        _raise_first(report, path)
+        assert pose is not None
+        poses[name] = pose
+    order = list(cameras)
+    for earlier, name in pairwise(order):  # along the chain
+        if name not in poses and earlier in poses and CHAIN in cameras[name]:
+            poses[name] = poses[earlier] @ inverse(cameras[name][CHAIN])
+    for earlier, name in zip(order[-2::-1], order[:0:-1], strict=False):  # and back
+        if earlier not in poses and name in poses and CHAIN in cameras[name]:
+            poses[earlier] = poses[name] @ cameras[name][CHAIN]
+    return poses
+
+
+def _camera(name: str, fields: Fields, ego_from_camera: Array | None, path: Path) -> Camera:
+    if ego_from_camera is None:
+        raise InputError(f'{path}: camera {name}: "ego_from_camera" is missing: add the camera\'s pose')
+    report = Report(camera=name)
+    own = {key: value for key, value in fields.items() if key != CHAIN}
+    camera = parse_camera(name, {**own, "ego_from_camera": transform_to_json(ego_from_camera)}, report)
+    _raise_first(report, path)
+    assert camera is not None
+    return camera
+
+
+def _raise_first(report: Report, path: Path) -> None:
+    for error in errors_of(report.findings):
+        raise InputError(f"{path}: {error.line}")

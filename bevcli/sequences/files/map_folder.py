@@ -1,0 +1,122 @@
+"""BEV maps in ground_truth_map/ and segmentation/: one PNG per frame, and map.json ("bevcli-map/1")."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from bevcli.errors import InputError, OutputError
+from bevcli.frame import MAP_CLASSES, BevMap
+
+FORMAT = "bevcli-map/1"
+LEGEND = "map.json"
+
+
+@dataclass(frozen=True)
+class MapFolder:
+    """A folder of maps with one extent in the bev frame.
+
+    Attributes:
+        path: the folder.
+        x_range_m: smallest and largest x, metres.
+        y_range_m: smallest and largest y, metres.
+        classes: names of the classes that the maps may contain.
+    """
+
+    path: Path
+    x_range_m: tuple[float, float]
+    y_range_m: tuple[float, float]
+    classes: tuple[str, ...]
+
+    def has(self, frame: int) -> bool:
+        """Whether the folder has a map of this frame."""
+        return _image(self.path, frame).is_file()
+
+    def load(self, frame: int) -> BevMap:
+        """The map of a frame. Raises InputError if it is missing, unreadable or has an unknown bit."""
+        path = _image(self.path, frame)
+        if not path.is_file():
+            raise InputError(f"{path}: the map of frame {frame} is missing")
+        cells = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if cells is None or cells.ndim != 2 or cells.dtype != np.uint8:
+            found = "an unreadable image" if cells is None else f"{cells.dtype} of shape {cells.shape}"
+            raise InputError(f"{path}: expected an 8-bit image with one channel, found {found}")
+        unknown = int(np.bitwise_or.reduce(cells, axis=None)) & ~sum(MAP_CLASSES[name] for name in self.classes)
+        if unknown:
+            raise InputError(f"{path}: bits {unknown:#x} belong to no class in {LEGEND} ({', '.join(self.classes)})")
+        return BevMap(cells.astype(np.uint8), self.x_range_m, self.y_range_m)
+
+
+def open_maps(path: Path) -> MapFolder:
+    """Open a folder of maps. Only map.json is read here. Raises InputError if it is missing or invalid."""
+    legend_path = path / LEGEND
+    try:
+        legend = json.loads(legend_path.read_bytes())
+    except FileNotFoundError:
+        raise InputError(
+            f"{legend_path}: the file is missing (expected the extent and classes of the maps in this folder)"
+        ) from None
+    except (ValueError, OSError) as error:
+        raise InputError(f"{legend_path}: cannot be read as JSON ({error})") from None
+    found = legend.get("format") if isinstance(legend, dict) else type(legend).__name__
+    if found != FORMAT:
+        raise InputError(f'{legend_path}: "format" must be "{FORMAT}", found {found!r:.40}')
+    ranges = (_range(legend, "x_range_m", legend_path), _range(legend, "y_range_m", legend_path))
+    return MapFolder(path, *ranges, _classes(legend, legend_path))
+
+
+def write_map(folder: Path, frame: int, bev_map: BevMap) -> None:
+    """Write a frame's map as NNNNNN.png. The folder and map.json are created if they are missing.
+
+    Raises OutputError if the map cannot be written, and InputError if the folder's maps have another extent.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not (folder / LEGEND).exists():
+            (folder / LEGEND).write_text(json.dumps(_legend(bev_map), indent=1) + "\n")
+        _check_extent(open_maps(folder), bev_map)
+        _image(folder, frame).write_bytes(cv2.imencode(".png", bev_map.cells)[1].tobytes())
+    except OSError as error:
+        raise OutputError(f"{folder}: the map cannot be written ({error.strerror})") from None
+
+
+def _check_extent(folder: MapFolder, bev_map: BevMap) -> None:
+    if (folder.x_range_m, folder.y_range_m) != (tuple(bev_map.x_range_m), tuple(bev_map.y_range_m)):
+        raise InputError(
+            f"{folder.path / LEGEND}: states x {folder.x_range_m}, y {folder.y_range_m}, but the new map has "
+            f"x {bev_map.x_range_m}, y {bev_map.y_range_m}: write it to another folder"
+        )
+
+
+def _image(folder: Path, frame: int) -> Path:
+    return folder / f"{frame:06d}.png"
+
+
+def _legend(bev_map: BevMap) -> dict[str, Any]:
+    return {
+        "format": FORMAT,
+        "x_range_m": list(bev_map.x_range_m),
+        "y_range_m": list(bev_map.y_range_m),
+        "classes": {str(bit): name for name, bit in MAP_CLASSES.items()},
+    }
+
+
+def _range(legend: dict[str, Any], key: str, path: Path) -> tuple[float, float]:
+    value = legend.get(key)
+    numbers = value if isinstance(value, list) and all(type(v) in (int, float) for v in value) else []
+    if len(numbers) != 2 or not numbers[0] < numbers[1]:
+        raise InputError(f'{path}: "{key}" must be two numbers, smaller first, in metres; found {value!r:.60}')
+    return float(numbers[0]), float(numbers[1])
+
+
+def _classes(legend: dict[str, Any], path: Path) -> tuple[str, ...]:
+    value = legend.get("classes")
+    known = {str(bit): name for name, bit in MAP_CLASSES.items()}
+    if not isinstance(value, dict) or not value or not value.items() <= known.items():
+        raise InputError(f'{path}: "classes" must name bits as in {json.dumps(known)}; found {value!r:.80}')
+    return tuple(value.values())

@@ -1,0 +1,143 @@
+"""The ego vehicle's mesh: from files of several formats, and the default car."""
+
+import subprocess
+import sys
+
+import numpy as np
+import PIL.Image
+import pytest
+import trimesh
+from memory_drive import MemorySequence
+from recorded_drive import record
+
+from bevcli.errors import InputError
+from bevcli.recording import entities
+from bevcli.recording.colors import EGO_COLOR
+from bevcli.recording.options import RecordingOptions
+from bevcli.recording.vehicle import default_vehicle, load_vehicle
+from bevcli.viewer.recording_reader import RecordingReader
+
+RED = (200, 10, 20)
+
+
+def van() -> trimesh.Trimesh:
+    """A red box in the ego frame: x -1 to 4 m, y -1 to 1 m, z 0.3 to 2.3 m."""
+    mesh = trimesh.creation.box(bounds=[(-1, -1, 0.3), (4, 1, 2.3)])
+    mesh.visual.vertex_colors = (*RED, 255)
+    return mesh
+
+
+def assert_is_the_van(vehicle) -> None:
+    np.testing.assert_allclose(vehicle.vertices.min(0), (-1, -1, 0.3), atol=1e-6)
+    np.testing.assert_allclose(vehicle.vertices.max(0), (4, 1, 2.3), atol=1e-6)
+    triangles = vehicle.vertices[vehicle.faces]
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    outward = triangles.mean(1) - (1.5, 0, 1.3)
+    assert ((normals * outward).sum(-1) > 0).all()
+    np.testing.assert_allclose(np.abs(vehicle.normals).max(-1), 1)  # the edges of a box are sharp
+    assert (vehicle.colors == RED).all()
+    outline, arrow = vehicle.top_view
+    np.testing.assert_allclose((outline.min(0), outline.max(0)), [(-1, -1), (4, 1)], atol=1e-6)
+    assert 3 < arrow[1, 0] < 4  # its tip is at the front
+    assert arrow[1, 1] == pytest.approx(0)
+
+
+def test_a_ply_file_has_the_axes_of_the_ego_frame(tmp_path):
+    van().export(tmp_path / "van.ply")
+    assert_is_the_van(load_vehicle(tmp_path / "van.ply"))
+
+
+def test_a_glb_file_has_the_axes_of_gltf(tmp_path):
+    """y up, z forward, x left."""
+    mesh = van()
+    x, y, z = mesh.vertices.T
+    turned = trimesh.Trimesh(np.column_stack([y, z, x]), mesh.faces, process=False)
+    turned.visual.vertex_colors = (*RED, 255)
+    turned.export(tmp_path / "van.glb")
+    assert_is_the_van(load_vehicle(tmp_path / "van.glb"))
+
+
+def test_the_parts_of_a_scene_keep_their_positions_and_colours(tmp_path):
+    """One part has a material, one has no colour."""
+    material = trimesh.visual.material.PBRMaterial(baseColorFactor=(0, 255, 0, 255))
+    painted, plain = (trimesh.creation.box((1, 1, 1)) for _ in range(2))
+    painted.visual = trimesh.visual.TextureVisuals(material=material)
+    scene = trimesh.Scene()
+    for x, part in enumerate((painted, plain)):
+        scene.add_geometry(part, transform=trimesh.transformations.translation_matrix((0, 0, 3 * x)))
+    scene.export(tmp_path / "parts.glb")
+    vehicle = load_vehicle(tmp_path / "parts.glb")
+    part = np.round(vehicle.vertices[:, 0] / 3).astype(int)  # z of glTF is x of the ego frame
+    assert set(part) == {0, 1}
+    assert (vehicle.colors[part == 0] == (0, 255, 0)).all()
+    assert (vehicle.colors[part == 1] == EGO_COLOR).all()
+
+
+def test_colours_of_faces_do_not_mix(tmp_path):
+    mesh = van()
+    mesh.visual.face_colors = [(*RED, 255)] * 6 + [(0, 0, 255, 255)] * 6
+    mesh.export(tmp_path / "van.ply")
+    vehicle = load_vehicle(tmp_path / "van.ply")
+    assert {tuple(color) for color in vehicle.colors.tolist()} == {RED, (0, 0, 255)}
+
+
+def test_colours_are_taken_from_a_texture(tmp_path):
+    """The left half of the texture is red, the right half blue; all vertices lie in the left half."""
+    image = PIL.Image.fromarray(np.repeat([[RED] * 8 + [(0, 0, 255)] * 8], 16, axis=0).astype(np.uint8))
+    mesh = van()
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=image)
+    mesh.visual = trimesh.visual.TextureVisuals(uv=np.full((len(mesh.vertices), 2), 0.2), material=material)
+    mesh.export(tmp_path / "van.glb")
+    assert (load_vehicle(tmp_path / "van.glb").colors == RED).all()
+
+
+def test_a_recording_has_the_mesh_of_the_file(tmp_path):
+    van().export(tmp_path / "van.ply")
+    record(tmp_path / "r.rrd", MemorySequence(1), RecordingOptions(vehicle_mesh=tmp_path / "van.ply"))
+    (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
+    vertices = frame.array(entities.VEHICLE, "Mesh3D:vertex_positions", 3)
+    np.testing.assert_allclose((vertices.min(0), vertices.max(0)), [(-1, -1, 0.3), (4, 1, 2.3)], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("broken.glb", b"glTF and then something else", "trimesh cannot read"),
+        ("notes.txt", b"a car", "trimesh cannot read"),
+        ("empty.ply", b"", "trimesh cannot read"),
+        ("points.xyz", b"0 0 0\n1 0 0\n0 1 0\n", "no triangles"),
+    ],
+)
+def test_a_file_without_a_mesh_is_an_error_of_one_line(tmp_path, capfd, name, content, message):
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=message) as caught:
+        load_vehicle(path)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+    assert capfd.readouterr().err == ""  # trimesh does not print its own message
+
+
+def test_a_mesh_in_millimetres_is_an_error(tmp_path):
+    van().apply_scale(1000).export(tmp_path / "van.stl")
+    with pytest.raises(InputError, match="5000 x 2000 x 2000 m"):
+        load_vehicle(tmp_path / "van.stl")
+
+
+def test_the_default_car_is_drawn_without_trimesh(tmp_path):
+    code = (
+        "import sys, bevcli.recording.writer\n"
+        "from bevcli.recording.vehicle import default_vehicle\n"
+        "default_vehicle(); print('trimesh' in sys.modules)"
+    )
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "False"
+
+
+def test_the_default_car_stands_on_the_ground_and_faces_forward():
+    car = default_vehicle()
+    low, high = car.vertices.min(0), car.vertices.max(0)
+    assert low[2] == pytest.approx(0, abs=0.01)
+    assert high[0] > -low[0]  # the origin is under the rear axle
+    np.testing.assert_allclose(np.linalg.norm(car.normals, axis=-1), 1)
+    outline, _ = car.top_view
+    np.testing.assert_allclose(outline.max(0), high[:2], atol=0.01)

@@ -1,0 +1,23 @@
+"""The parts of the rendered world import in one direction: assets < world < render < rig < drive < export."""
+
+import ast
+from pathlib import Path
+
+import bevcli.synth
+
+ROOT = Path(bevcli.synth.__file__).parent
+LAYERS = ("assets", "world", "render", "rig", "drive", "export")
+
+
+def test_parts_import_only_from_lower_parts():
+    checked = 0
+    for path in ROOT.rglob("*.py"):
+        part = path.relative_to(ROOT).parts[0].removesuffix(".py")
+        if part == "__init__":
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("bevcli.synth."):
+                other = node.module.split(".")[2]
+                assert LAYERS.index(other) <= LAYERS.index(part), f"{path.relative_to(ROOT)} imports {node.module}"
+                checked += 1
+    assert checked > 50
