@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bevcli.errors import InputError
 from bevcli.evaluation.tracking.class_metrics import METRICS, ClassTracking, score_class
 from bevcli.evaluation.tracking.config import TrackingConfig
 from bevcli.evaluation.tracking.tracked_boxes import scored_tracks
@@ -59,8 +60,9 @@ def evaluate_tracking(
         ego_xy: (F, 2) position of the ego vehicle in the frame of reference, metres. Default: the origin.
 
     Raises:
-        InputError: a frame has one identity twice.
+        InputError: a ground-truth box or all predictions have no identity, or a frame has one identity twice.
     """
+    _require_identities(predictions, ground_truth, stamps)
     config = TrackingConfig() if config is None else config
     ego_xy = np.zeros((len(stamps), 2)) if ego_xy is None else ego_xy
     found = scored_tracks(predictions, stamps, ego_xy, config.class_ranges_m, "predictions")
@@ -70,6 +72,24 @@ def evaluate_tracking(
         for name in config.class_ranges_m
     }
     return TrackingScores(classes, config, len({stamp.scene for stamp in stamps}), len(stamps))
+
+
+def _require_identities(
+    predictions: Sequence[Boxes3D], ground_truth: Sequence[Boxes3D], stamps: Sequence[FrameStamp]
+) -> None:
+    for boxes, stamp in zip(ground_truth, stamps, strict=True):
+        without = len(boxes) if boxes.instances is None else int((boxes.instances == "").sum())
+        if without:
+            raise InputError(
+                f'ground truth: scene "{stamp.scene}" frame {stamp.index}: {without} of {len(boxes)} boxes have no '
+                '"instance" (tracking metrics need the identity of every object)'
+            )
+    if any(map(len, predictions)) and not any(
+        boxes.instances is not None and (boxes.instances != "").any() for boxes in predictions
+    ):
+        raise InputError(
+            'predictions: no box has an "instance" (tracking metrics need identities): run bevcli run with --track'
+        )
 
 
 def _over_classes(name: str, values: Array) -> float:
