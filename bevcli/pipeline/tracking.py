@@ -210,13 +210,17 @@ def find_duplicates(boxes: Boxes3D, order: NDArray[np.int64], widths: float) -> 
         order: (N,) their indices, highest score first.
         widths: distance of the centres on the ground, in widths of the better box.
     """
+    ranked = boxes[order]
+    offsets = ranked.centers[:, None, :2] - ranked.centers[None, :, :2]
+    near = (offsets**2).sum(axis=-1) < (widths * ranked.sizes_lwh[:, 1, None]) ** 2
+    near &= ranked.classes[:, None] == ranked.classes
+    near = np.triu(near, k=1)  # (N, N): row i says which worse boxes lie on the object of box i
+    worse = np.zeros(len(boxes), dtype=bool)
+    for rank, row in enumerate(near):
+        if not worse[rank]:
+            worse |= row
     duplicates = np.zeros(len(boxes), dtype=bool)
-    xy = boxes.centers[:, :2]
-    for place, better in enumerate(order):
-        if not duplicates[better]:
-            rest = order[place + 1 :]
-            near = np.linalg.norm(xy[rest] - xy[better], axis=1) < widths * boxes.sizes_lwh[better, 1]
-            duplicates[rest[near & (boxes.classes[rest] == boxes.classes[better])]] = True
+    duplicates[order] = worse
     return duplicates
 
 
