@@ -211,9 +211,10 @@ def find_duplicates(boxes: Boxes3D, order: NDArray[np.int64], widths: float) -> 
         widths: distance of the centres on the ground, in widths of the better box.
     """
     ranked = boxes[order]
-    offsets = ranked.centers[:, None, :2] - ranked.centers[None, :, :2]
-    near = (offsets**2).sum(axis=-1) < (widths * ranked.sizes_lwh[:, 1, None]) ** 2
-    near &= ranked.classes[:, None] == ranked.classes
+    x, y = ranked.centers[:, :2].T
+    near = np.hypot(x[:, None] - x, y[:, None] - y) < widths * ranked.sizes_lwh[:, 1, None]
+    _, classes = np.unique(ranked.classes, return_inverse=True)
+    near &= classes[:, None] == classes
     near = np.triu(near, k=1)  # (N, N): row i says which worse boxes lie on the object of box i
     worse = np.zeros(len(boxes), dtype=bool)
     for rank, row in enumerate(near):
