@@ -49,8 +49,7 @@ def validate(
     import json
 
     from bevcli.cli.progress import Progress
-    from bevcli.evaluation.scores_json import scores_to_json
-    from bevcli.evaluation.scores_table import scores_table
+    from bevcli.evaluation.scores_report import scores_table, scores_to_dict
     from bevcli.evaluation.tracking.report import tracking_table, tracking_to_dict
     from bevcli.pipeline.model_loading import load_model
     from bevcli.pipeline.runner import Runner, StepOptions
@@ -66,7 +65,7 @@ def validate(
             runner, drives, max_range, loaded.tracker if tracking else None, after_frame=progress.advance
         )
     if as_json:
-        content = scores_to_json(scores.detection, scores.config, scores.segmentation)
+        content = scores_to_dict(scores.detection, scores.config, scores.segmentation)
         content |= {} if scores.tracking is None else {"tracking": tracking_to_dict(scores.tracking)}
         print(json.dumps(content, indent=1))
     else:

@@ -1,4 +1,4 @@
-"""Boxes as one CSV table, a row a box."""
+"""Boxes as a CSV table with one row a box."""
 
 from __future__ import annotations
 

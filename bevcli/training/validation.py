@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bevcli.evaluation.config import DetectionConfig
-from bevcli.evaluation.detection import evaluate
+from bevcli.evaluation.detection import evaluate_detections
 from bevcli.evaluation.detection_scores import DetectionScores
 from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmentation
 from bevcli.evaluation.tracking.config import TrackingConfig
@@ -94,7 +94,7 @@ def validate(
             after_frame()
     return Validation(
         config,
-        evaluate(predictions, truths, config),
+        evaluate_detections(predictions, truths, config),
         evaluate_segmentation(maps) if maps else None,
         None if tracker is None else _score_tracks(tracks, TrackingConfig().cut_at(range_m)),
     )
