@@ -221,3 +221,10 @@ def test_without_predictions_a_class_gets_the_worst_values():
 def test_one_identity_twice_in_a_frame_is_an_error():
     with pytest.raises(InputError, match='predictions: scene "a" frame 1: two boxes have the instance "s"'):
         car_scores([[("s", 0, 0)], [("s", 0, 0), ("s", 9, 0)]], [[("A", 0, 0)]] * 2)
+
+
+def test_boxes_without_an_identity_cannot_be_scored():
+    with pytest.raises(InputError, match='ground truth: scene "a" frame 1: 1 of 2 boxes have no "instance"'):
+        car_scores([[("s", 0, 0)]] * 2, [[("A", 0, 0)], [("A", 0, 0), ("", 9, 0)]])
+    with pytest.raises(InputError, match='predictions: no box has an "instance"'):
+        car_scores([[("", 0, 0)]], [[("A", 0, 0)]])

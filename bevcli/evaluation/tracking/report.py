@@ -28,7 +28,7 @@ def tracking_table(scores: TrackingScores) -> str:
     switches = overall["ids"] / scores.scenes if scores.scenes else math.nan
     heading = (
         f"AMOTA {_number(overall['amota'], 3)}   AMOTP {_number(overall['amotp'], 3)} m   "
-        f"identity switches {_number(switches, 1)} per scene ({scores.scenes} scenes, {scores.frames} frames)"
+        f"identity switches {_number(switches, 1)} per scene (scenes: {scores.scenes}, frames: {scores.frames})"
     )
     return "\n\n".join([*tables, heading])
 

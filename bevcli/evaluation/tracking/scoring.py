@@ -62,8 +62,8 @@ def evaluate_tracking(
     Raises:
         InputError: a ground-truth box or all predictions have no identity, or a frame has one identity twice.
     """
-    _require_identities(predictions, ground_truth, stamps)
     config = TrackingConfig() if config is None else config
+    _require_identities(predictions, ground_truth, stamps, tuple(config.class_ranges_m))
     ego_xy = np.zeros((len(stamps), 2)) if ego_xy is None else ego_xy
     found = scored_tracks(predictions, stamps, ego_xy, config.class_ranges_m, "predictions")
     true = scored_tracks(ground_truth, stamps, ego_xy, config.class_ranges_m, "ground truth")
@@ -75,13 +75,17 @@ def evaluate_tracking(
 
 
 def _require_identities(
-    predictions: Sequence[Boxes3D], ground_truth: Sequence[Boxes3D], stamps: Sequence[FrameStamp]
+    predictions: Sequence[Boxes3D],
+    ground_truth: Sequence[Boxes3D],
+    stamps: Sequence[FrameStamp],
+    classes: tuple[str, ...],
 ) -> None:
     for boxes, stamp in zip(ground_truth, stamps, strict=True):
-        without = len(boxes) if boxes.instances is None else int((boxes.instances == "").sum())
+        scored = boxes[np.isin(boxes.classes, classes)]
+        without = len(scored) if scored.instances is None else int((scored.instances == "").sum())
         if without:
             raise InputError(
-                f'ground truth: scene "{stamp.scene}" frame {stamp.index}: {without} of {len(boxes)} boxes have no '
+                f'ground truth: scene "{stamp.scene}" frame {stamp.index}: {without} of {len(scored)} boxes have no '
                 '"instance" (tracking metrics need the identity of every object)'
             )
     if any(map(len, predictions)) and not any(
