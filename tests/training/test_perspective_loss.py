@@ -10,7 +10,7 @@ import pytest
 import torch
 from painted_drives import CONFIG, PaintedDrives
 
-from bevcli.config import load_training
+from bevcli.config import TRAINING, load_table
 from bevcli.errors import ConfigError
 from bevcli.model.bevformer import BEVFormer
 from bevcli.model.fpn import FPNConfig
@@ -214,7 +214,7 @@ def test_the_table_of_earlier_versions_is_rejected_with_the_new_name(tmp_path: P
     (tmp_path / "old.toml").write_text("[training.picture_loss]\nweight = 1.0\n")
     expected = r'unknown key "training.picture_loss"; \[training.perspective_loss\] replaces it'
     with pytest.raises(ConfigError, match=expected):
-        load_training(tmp_path / "old.toml", TrainingConfig)
+        load_table(tmp_path / "old.toml", TRAINING, TrainingConfig)
 
 
 def test_a_negative_weight_is_rejected(tmp_path: Path) -> None:
@@ -222,4 +222,4 @@ def test_a_negative_weight_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(
         ConfigError, match=r"\[training.perspective_loss\]: layers and the weights must not be negative"
     ):
-        load_training(tmp_path / "wrong.toml", TrainingConfig)
+        load_table(tmp_path / "wrong.toml", TRAINING, TrainingConfig)
