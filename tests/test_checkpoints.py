@@ -80,7 +80,7 @@ def official_v2(model: str, tmp_path: Path, **changes: tuple[int, ...]) -> Path:
     """An official BEVFormerV2 file of zeros that takes no space. changes: other shapes, by the last part of the key."""
     path = tmp_path / f"{model}.pth"
     shapes = {key: changes.get(key.rpartition(".")[2], tuple(shape)) for key, shape in v2_keys(model).items()}
-    torch.save({"state_dict": {key: torch.zeros(1).expand(shape) for key, shape in shapes.items()}}, path)
+    torch.save({"state_dict": {key: torch.zeros(()).expand(shape) for key, shape in shapes.items()}}, path)
     return path
 
 
