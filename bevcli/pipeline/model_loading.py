@@ -9,11 +9,12 @@ from pathlib import Path
 import torch
 
 from bevcli.checkpoints import bundled_weights, inspect, load_weights
-from bevcli.config import known_models, load_config
+from bevcli.config import TRACKING, known_models, load_config, load_table
 from bevcli.errors import BevcliError, WeightsError
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
 from bevcli.model.bevformer_v2 import build_model
 from bevcli.model.prepared import Precision, prepare_for_inference
+from bevcli.pipeline.tracking import TrackerConfig
 
 DEFAULT_MODEL = "demo"
 UNTRAINED_SEED = 0  # two untrained runs of one drive agree
@@ -30,6 +31,7 @@ class Model:
         weights: the file that the weights came from, None for random weights.
         bundled: whether that file is part of the package.
         left_out: what of that file is for training only and was left out; "" for nothing.
+        tracker: the parameters of the tracker, the table [tracking] of the model's TOML file.
     """
 
     network: BEVFormerBase
@@ -38,6 +40,7 @@ class Model:
     weights: Path | None = None
     bundled: bool = False
     left_out: str = ""
+    tracker: TrackerConfig = field(default_factory=TrackerConfig)
 
     @property
     def config(self) -> BEVFormerConfig:
@@ -91,7 +94,7 @@ def load_model(
         raise WeightsError(f"--weights {weights} and --untrained exclude each other: give one of them")
     if name is None:
         name = DEFAULT_MODEL if weights is None else _model_of(weights)
-    config = load_config(name)
+    config, tracker = load_config(name), load_table(name, TRACKING, TrackerConfig)
     bundled = bundled_weights(str(name)) if weights is None and not untrained else None
     file = weights or bundled
     if file is None and not untrained:
@@ -111,6 +114,7 @@ def load_model(
         file,
         bundled=bundled is not None,
         left_out=left_out,
+        tracker=tracker,
     )
 
 

@@ -29,7 +29,7 @@ _AUTOCAST = {"bf16": torch.bfloat16, "fp16": torch.float16}
 
 @dataclass(frozen=True)
 class BevState:
-    """All that a run remembers from one frame to the next.
+    """The state of a run between two frames.
 
     Attributes:
         memory: of the model; the runner only passes it on.
@@ -42,9 +42,13 @@ class BevState:
 
 @dataclass(frozen=True)
 class StepOptions:
-    """precision: of the network's arithmetic. temporal: whether history is used.
+    """How a step is computed.
 
-    ask_attention: whether predictions carry an AttentionView. probes: x, y in metres, bev frame, the cells asked.
+    Attributes:
+        precision: of a plain model, by autocast; a prepared model has its own.
+        temporal: whether history is used.
+        ask_attention: whether predictions carry an AttentionView.
+        probes: x, y in metres, bev frame: the cells whose sampling points the AttentionView shows.
     """
 
     precision: Precision = "fp32"
@@ -54,7 +58,7 @@ class StepOptions:
 
 
 class Runner:
-    """A model on a device, and how it is to be run. It keeps nothing between frames: `BevState` goes in and out."""
+    """Runs a model on a device, step by step. The state is an argument and a result; the runner keeps none."""
 
     def __init__(self, model: BEVFormerBase, device: torch.device, options: StepOptions | None = None) -> None:
         self.model = model.to(device).eval()
@@ -68,13 +72,17 @@ class Runner:
     def step(
         self, state: BevState | None, prepared: PreparedFrame, upcoming: Items[PreparedFrame] = ()
     ) -> tuple[BevState | None, Prediction]:
-        """One frame. A frame without any image passes the state on: the next frame's history is older then.
+        """Runs the model on one frame.
 
         Args:
-            state: what the step before returned; None at the start.
-            prepared: the frame.
+            state: the result of the step before; None at the start.
+            prepared: the frame, preprocessed.
             upcoming: the frames after it, for a model that looks ahead. Those after the end of the scene, after a gap
                 or without images are not used.
+
+        Returns:
+            the new state and the prediction. A frame without any image returns the state unchanged, so that the next
+            alignment by ego-motion spans both frames.
         """
         frame = prepared.frame
         started_anew = self._reason_to_start_anew(None if state is None else state.stamp, frame.stamp)
@@ -97,10 +105,9 @@ class Runner:
     def run(
         self, sequence: Sequence, places: Items[int], preprocessor: Preprocessor, state: BevState | None = None
     ) -> Iterator[tuple[Frame, Prediction, BevState | None]]:
-        """The frames at these places, read and prepared ahead.
+        """Yields frame, prediction and state at these places of a sequence. Frames are read and prepared in advance.
 
-        Nothing is kept of a frame once it is yielded, but what the state holds. A model that looks ahead sees the
-        later ones of these places.
+        A model that looks ahead sees the later ones of these places.
         """
 
         def prepare(place: int) -> PreparedFrame:

@@ -203,7 +203,8 @@ def other_bev_from_bev(world_from_ego: Pose, other_world_from_ego: Pose, ego_fro
     """
     now, other = world_from_ego.matrix, other_world_from_ego.matrix
     far = max(np.abs(now[:3, 3]).max(), np.abs(other[:3, 3]).max()) > FLOAT32_RANGE_M
-    now, other, offset = (matrix.astype(np.float64 if far else np.float32) for matrix in (now, other, ego_from_bev))
-    bev_from_other_bev = np.linalg.inv(offset) @ np.linalg.inv(now) @ other @ offset
+    dtype: type[np.floating] = np.float64 if far else np.float32
+    offset = ego_from_bev.astype(dtype)
+    bev_from_other_bev = np.linalg.inv(offset) @ np.linalg.inv(now.astype(dtype)) @ other.astype(dtype) @ offset
     moved: Array = np.linalg.inv(bev_from_other_bev).astype(np.float64)
     return moved
