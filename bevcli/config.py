@@ -15,8 +15,13 @@ from typing import Any, Literal, TypeVar
 
 from bevcli.errors import ConfigError
 from bevcli.model.bevformer import BEVFormerConfig
+from bevcli.model.bevformer_v2 import BEVFormerV2Config
 
 T = TypeVar("T")
+
+# The key that says which model a file configures, and its values. A file without it configures a BEVFormer.
+ARCHITECTURE = "architecture"
+ARCHITECTURES: dict[str, type[BEVFormerConfig]] = {"BEVFormer": BEVFormerConfig, "BEVFormerV2": BEVFormerV2Config}
 
 TRAINING = "training"  # the table of a model's file with the settings of its training, which the model does not need
 
@@ -34,7 +39,12 @@ def load_config(name_or_path: str | Path) -> BEVFormerConfig:
     """
     text, file = _read_model(str(name_or_path))
     table = _parse(text, file)
-    return _dataclass({key: table[key] for key in table if key != TRAINING}, BEVFormerConfig, file, "")
+    architecture = table.get(ARCHITECTURE, "BEVFormer")
+    if architecture not in list(ARCHITECTURES):
+        expected = " or ".join(f'"{name}"' for name in ARCHITECTURES)
+        raise ConfigError(f'{file}: "{ARCHITECTURE}" must be {expected}, but is {architecture!r}')
+    settings = {key: table[key] for key in table if key not in (TRAINING, ARCHITECTURE)}
+    return _dataclass(settings, ARCHITECTURES[architecture], file, "")
 
 
 def load_training(name_or_path: str | Path, kind: type[T]) -> T:
