@@ -26,7 +26,7 @@ from bevcli.cli.main import app
 from bevcli.config import known_models, load_config
 from bevcli.errors import WeightsError
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.bevformer import BEVFormer
+from bevcli.model.bevformer_v2 import build_model
 from bevcli.model.official_keys import from_official
 from bevcli.model.parts import model_parts
 
@@ -220,7 +220,7 @@ def test_every_parameter_of_a_model_belongs_to_one_part() -> None:
     for name in known_models():
         config = load_config(name)
         with torch.device("meta"):
-            expected = sum(parameter.numel() for parameter in BEVFormer(config).parameters())
+            expected = sum(parameter.numel() for parameter in build_model(config).parameters())
         assert sum(part.parameters for part in model_parts(config)) == expected
 
 

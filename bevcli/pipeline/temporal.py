@@ -9,16 +9,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from bevcli.frame import FrameStamp
-from bevcli.geometry.transforms import Array, Pose, inverse
+from bevcli.geometry.transforms import Array, Pose
 from bevcli.model.bevformer import BEVFormer, BEVFormerBase, BEVFormerOutputs
 from bevcli.model.bevformer_v2 import BEVFormerV2, WindowFrame
 from bevcli.model.deformable_attention import FeatureMaps, LevelShapes
 from bevcli.pipeline.model_inputs import model_inputs
 from bevcli.pipeline.preprocess import PreparedFrame
+
+
+# Metres. Where poses are nearer to the world's origin, float32 holds them to a millimetre. nuScenes' maps reach 3 km.
+FLOAT32_RANGE_M = 10_000
 
 
 @dataclass(frozen=True)
@@ -174,8 +179,8 @@ class Window:
         """The frame, seen from the bev frame of the current one."""
         image_from_bev = frame.image_from_bev
         if frame.stamp != current.frame.stamp:
-            moved = bev_from_bev(current.frame.world_from_ego, frame.pose, current.frame.rig.ego_from_bev)
-            image_from_bev = image_from_bev @ torch.from_numpy(inverse(moved))
+            moved = other_bev_from_bev(current.frame.world_from_ego, frame.pose, current.frame.rig.ego_from_bev)
+            image_from_bev = image_from_bev @ torch.from_numpy(moved)
         width, height = self.model.config.image.padded_size
         return WindowFrame(
             image_features=FeatureMaps(frame.tokens, frame.level_shapes),
@@ -185,16 +190,21 @@ class Window:
         )
 
 
-def bev_from_bev(world_from_ego: Pose, other_world_from_ego: Pose, ego_from_bev: Array) -> Array:
-    """(4, 4) float64 from the bev frame at another time to the bev frame now.
+def other_bev_from_bev(world_from_ego: Pose, other_world_from_ego: Pose, ego_from_bev: Array) -> Array:
+    """(4, 4) float64 from the bev frame now to the bev frame at another time.
 
-    As in the released code, both times take the current pose of the bev frame in the vehicle.
+    As in the released code, both times take the current pose of the bev frame in the vehicle, and the arithmetic is
+    float32, so that the same cells are seen at the edges of images. Far from the world's origin float32 is too coarse;
+    there it is float64.
 
     Args:
         world_from_ego: the vehicle's pose now.
         other_world_from_ego: the vehicle's pose at the other time.
         ego_from_bev: (4, 4), the current pose of the bev frame in the vehicle.
     """
-    world_from_bev = world_from_ego.matrix @ ego_from_bev
-    moved: Array = inverse(world_from_bev) @ other_world_from_ego.matrix @ ego_from_bev
+    now, other = world_from_ego.matrix, other_world_from_ego.matrix
+    far = max(np.abs(now[:3, 3]).max(), np.abs(other[:3, 3]).max()) > FLOAT32_RANGE_M
+    now, other, offset = (matrix.astype(np.float64 if far else np.float32) for matrix in (now, other, ego_from_bev))
+    bev_from_other_bev = np.linalg.inv(offset) @ np.linalg.inv(now) @ other @ offset
+    moved: Array = np.linalg.inv(bev_from_other_bev).astype(np.float64)
     return moved
