@@ -78,7 +78,7 @@ def _window_frame(batch: Batch, features: FeatureMaps, place: int, current: int)
     image_from_bev = inputs.image_from_bev
     if place != current:
         moved = torch.linalg.solve(batch.world_from_bev[place], batch.world_from_bev[current])
-        image_from_bev = (image_from_bev.double() @ moved).float()
+        image_from_bev = (image_from_bev.double() @ moved[:, None]).float()
     return WindowFrame(features, image_from_bev, inputs.has_image, inputs.image_size)
 
 

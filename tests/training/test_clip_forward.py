@@ -37,9 +37,9 @@ CPU = torch.device("cpu")
 
 
 def batch_of(config: BEVFormerV2Config, frames: int = 2) -> Batch:
-    """Clips of both painted drives."""
-    clips = [Clip(drive, tuple(range(2 - frames, 2))) for drive in range(2)]
-    drives = PaintedDrives(2, all_labelled=True)
+    """Clips of three drives, which is not the number of cameras."""
+    clips = [Clip(drive, tuple(range(2 - frames, 2))) for drive in range(3)]
+    drives = PaintedDrives(3, all_labelled=True)
     return load_batch(drives, clips, config, AugmentationConfig(0, 0), np.random.default_rng(0), learn_all=True)
 
 
@@ -52,8 +52,8 @@ def test_a_clip_gives_the_outputs_of_inference(config: BEVFormerV2Config, *, lea
     outputs = list(forward_clip(model, batch_of(config), learn_all=learn_all, freeze_batch_norm=True))
     assert len(outputs) == (2 if learn_all else 1)
     model.eval()
-    drives = PaintedDrives(2, all_labelled=True)
-    for drive in range(2):
+    drives = PaintedDrives(3, all_labelled=True)
+    for drive in range(3):
         running, memory = temporal_model(model, CPU), None
         for index in range(2):
             prepared = Preprocessor(config)(drives.open(drive).load(index))
