@@ -21,7 +21,6 @@ from bevcli.model.deformable_attention import FeatureMaps, LevelShapes
 from bevcli.pipeline.model_inputs import model_inputs
 from bevcli.pipeline.preprocess import PreparedFrame
 
-
 # Metres. Where poses are nearer to the world's origin, float32 holds them to a millimetre. nuScenes' maps reach 3 km.
 FLOAT32_RANGE_M = 10_000
 
