@@ -91,7 +91,8 @@ def trained(out: Path, settings: TrainingConfig, *, resume: bool = False) -> Tra
     """A training of a BEVFormerV2."""
     out.mkdir(exist_ok=True)
     torch.manual_seed(0)
-    drives = PaintedDrives(settings.clips.batch, all_labelled=True)
+    # With "last", only the second frame of a drive is trained on, so that only it may be scored.
+    drives = PaintedDrives(settings.clips.batch, all_labelled=settings.clips.learn == "all")
     return Trainer(TrainingJob(BEVFormerV2(WINDOW), settings, drives, drives, out, CPU), resume=resume)
 
 
