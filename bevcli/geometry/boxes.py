@@ -32,7 +32,9 @@ class Boxes3D:
         classes: (N,) class names.
         scores: (N,) confidence, 0 to 1. Optional.
         attributes: (N,) nuScenes attribute names, "" for none. Optional.
-        instances: (N,) object identities, constant over time. Optional.
+        instances: (N,) object identities, constant over time, "" for none. Optional.
+        track_scores: (N,) score of the track that a box belongs to, 0 to 1; NaN without a track. Optional.
+        duplicates: (N,) whether a better box describes the same object. Optional.
         visibilities: (N,) visible fraction, 0 to 1; NaN if unknown. Optional.
         num_points: (N,) number of lidar and radar points; boxes with 0 are not scored, -1 if unknown. Optional.
     """
@@ -45,6 +47,8 @@ class Boxes3D:
     scores: Array | None = None
     attributes: NDArray[np.str_] | None = None
     instances: NDArray[np.str_] | None = None
+    track_scores: Array | None = None
+    duplicates: NDArray[np.bool_] | None = None
     visibilities: Array | None = None
     num_points: NDArray[np.int64] | None = None
 

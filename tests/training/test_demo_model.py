@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from bevcli.checkpoints import bundled_weights
-from bevcli.config import load_config, load_training
+from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import WeightsError
 from bevcli.model.bevformer import BEVFormer
 from bevcli.model.prepared import prepare_for_inference
@@ -35,7 +35,7 @@ def test_the_demo_model_has_every_part() -> None:
 
 
 def test_the_demo_model_is_trained_with_history() -> None:
-    settings = load_training("demo", TrainingConfig)
+    settings = load_table("demo", TRAINING, TrainingConfig)
     assert settings.clips.frames >= 2
     assert settings.held_out > 0
     assert settings.weights_dtype == "float16"
