@@ -60,9 +60,7 @@ def convert(
     count = len(sequence.stamps)
     gaps = 0
     with (
-        NativeWriter(
-            out, with_ego_motion=sequence.has_ego_motion, force=force, facts=facts_of(sequence)
-        ) as writer,
+        NativeWriter(out, with_ego_motion=sequence.has_ego_motion, force=force, facts=facts_of(sequence)) as writer,
         Progress(count, "frames") as progress,
     ):
         for place in range(count):

@@ -34,7 +34,7 @@ DUPLICATE_COLOR: Color = (150, 156, 170)
 RING_COLOR: Color = (92, 98, 112)
 # Dark and hardly coloured, so that nothing on a map looks like a box.
 MAP_COLORS: dict[str, Color] = {
-    "drivable_road": (46, 51, 60),
+    "drivable_road": (58, 64, 75),
     "lane_boundary": (112, 112, 100),
     "pedestrian_crossing": (86, 76, 104),
     "vehicle": (44, 84, 112),

@@ -1,7 +1,8 @@
 """The entity paths of a recording. Writer, reader and blueprint share them.
 
 `world` is the sequence's world frame, moved so that the first frame's ego position is its origin (the viewer computes
-in float32). `bev` is a flat image of the bev frame in metres: x to the right, -y down. `map` holds latitudes and longitudes, where the drive states them.
+in float32). `bev` is a flat image of the bev frame in metres: x to the right, -y down. `map` holds latitudes and
+longitudes, where the drive states its place on Earth.
 """
 
 from __future__ import annotations

@@ -19,6 +19,7 @@ AHEAD_S = 1.0  # how far ahead a trail shows where the object will be at its pre
 LOST_S = 3.0  # the trail of a track that had no box for so long is forgotten
 PAST_OPACITY, AHEAD_OPACITY = 220, 110  # of 255
 ABOVE_GROUND_M = 0.05
+WIDTH = rr.Radius.ui_points(1.2)
 
 
 @dataclass
@@ -69,30 +70,28 @@ class TrackLog:
         self._stream, self._class_names = stream, class_names
         self._history = TrackHistory()
         self._shown: set[str] = set()
+        self._known: set[str] = set()
 
     def log(self, boxes: Boxes3D, stamp: FrameStamp, bev_from_world: Array) -> None:
         """Writes the tracks of boxes in the recording's world. bev_from_world: (4, 4). Without tracks: nothing."""
         if boxes.instances is None:
             return
         self._history.add(boxes, stamp)
-        names, ahead, outlines = track_names(boxes), _ahead(boxes), _footprints(boxes)
-        colors = box_colors(boxes, self._class_names)
+        ahead, outlines, colors = _ahead(boxes), _footprints(boxes), box_colors(boxes, self._class_names)
         shown: set[str] = set()
         flat, flat_colors = [], []
-        for i, name in enumerate(names):
+        for i, name in enumerate(track_names(boxes)):
             if not name:
                 continue
-            past, own_colors = self._history.past(name), []
-            strips = [ahead[i], outlines[i]] + ([past] if len(past) > 1 else [])
-            own_colors = [(*colors[i], opacity) for opacity in (AHEAD_OPACITY, PAST_OPACITY, PAST_OPACITY)]
             entity = entities.track(str(boxes.classes[i]), name)
-            trail = rr.LineStrips3D(strips, colors=own_colors[: len(strips)], radii=THIN)
-            facts = rr.AnyValues(track=name, seconds=self._seconds(name))
-            self._stream.log(entity, trail, facts)
+            past = self._history.past(name)
+            trail = [past] if len(past) > 1 else []
+            own_colors = [(*colors[i], opacity) for opacity in (AHEAD_OPACITY, PAST_OPACITY, PAST_OPACITY)]
+            self._log_style(entity, name, own_colors)
+            self._stream.log(entity, rr.LineStrips3D.from_fields(strips=[ahead[i], outlines[i], *trail]))
             shown.add(entity)
-            for strip, color in zip((strips[0], *strips[2:]), own_colors[::2], strict=False):
-                flat.append(apply(bev_from_world, strip)[:, :2] * (1, -1))
-                flat_colors.append(color)
+            flat += [apply(bev_from_world, strip)[:, :2] * (1, -1) for strip in (ahead[i], *trail)]
+            flat_colors += own_colors[:: 2 if trail else 3]
         self._stream.log(
             entities.BEV_TRACKS, rr.LineStrips2D(flat, colors=flat_colors or None, radii=THIN, draw_order=25)
         )
@@ -100,9 +99,12 @@ class TrackLog:
             self._stream.log(entity, rr.Clear(recursive=False))
         self._shown = shown
 
-    def _seconds(self, name: str) -> float:
-        times = self._history.times_ns[name]
-        return (times[-1] - times[0]) / 1e9
+    def _log_style(self, entity: str, name: str, colors: list[tuple[int, int, int, int]]) -> None:
+        """Writes what does not change, once for each track: a message costs more bytes than its numbers."""
+        if entity not in self._known:
+            self._known.add(entity)
+            style = rr.LineStrips3D.from_fields(colors=colors, radii=WIDTH)
+            self._stream.log(entity, style, rr.AnyValues(track=name), static=True)
 
 
 def _feet(boxes: Boxes3D) -> Array:

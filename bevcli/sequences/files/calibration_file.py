@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ class RigDraft:
 
     rig: CameraRig
     findings: tuple[Finding, ...]
-    facts: DriveFacts = DriveFacts()
+    facts: DriveFacts = field(default_factory=DriveFacts)
 
 
 def read_calibration(path: Path) -> CameraRig:
