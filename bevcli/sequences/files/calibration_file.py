@@ -144,7 +144,7 @@ def _parse_geo_origin(document: Mapping[str, Any], report: Report) -> GeoOrigin 
         number = parse_numbers(given, name, (1,), within)
         if number is not None and abs(number[0]) > limit:
             wanted = f"degrees, -{limit:g} to {limit:g}"
-            within.error("out-of-range", name, "is out of range", expected=wanted, found=value[name])
+            within.error("wrong-size", name, "is out of range", expected=wanted, found=value[name])
             number = None
         numbers.append(number)
     if any(number is None for number in numbers):
