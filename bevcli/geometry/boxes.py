@@ -121,8 +121,8 @@ class Boxes3D:
     def to_dict(self) -> dict[str, list[Any]]:
         """The boxes as a table: column name -> N values. `pandas.DataFrame` and `polars.DataFrame` take it.
 
-        The columns are class, score, x, y, z, length, width, height, yaw, vx, vy, attribute, instance, visibility and
-        num_points, without the optional ones that are None.
+        The columns are class, score, x, y, z, length, width, height, yaw, vx, vy, attribute, instance, track_score,
+        duplicate, visibility and num_points, without the optional ones that are None.
         """
         numbers = ("x", "y", "z", "length", "width", "height", "yaw", "vx", "vy")
         columns = {
@@ -131,6 +131,8 @@ class Boxes3D:
             **dict(zip(numbers, self.to_numpy().T, strict=True)),
             "attribute": self.attributes,
             "instance": self.instances,
+            "track_score": self.track_scores,
+            "duplicate": self.duplicates,
             "visibility": self.visibilities,
             "num_points": self.num_points,
         }

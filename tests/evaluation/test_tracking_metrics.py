@@ -73,9 +73,9 @@ def test_every_number_equals_the_devkits(golden: dict[str, Any], without: dict[s
     for metric, classes in expected["label_metrics"].items():
         for name, value in classes.items():
             found = scores.classes[name].metrics[metric]
-            assert found == pytest.approx(number(value), abs=1e-8, nan_ok=True), (metric, name)
+            assert found == pytest.approx(number(value), abs=1e-9, nan_ok=True), (metric, name)
     for metric, value in expected["mean_metrics"].items():
-        assert scores.overall[metric] == pytest.approx(number(value), abs=1e-8, nan_ok=True), metric
+        assert scores.overall[metric] == pytest.approx(number(value), abs=1e-9, nan_ok=True), metric
 
 
 def test_the_metrics_at_every_recall_level_equal_the_devkits(golden: dict[str, Any]) -> None:
@@ -84,7 +84,7 @@ def test_the_metrics_at_every_recall_level_equal_the_devkits(golden: dict[str, A
         for metric, values in metrics.items():
             expected = np.array([number(value) for value in values])
             np.testing.assert_allclose(
-                scores.classes[name].levels[metric], expected, atol=1e-8, rtol=0, err_msg=f"{metric} of {name}"
+                scores.classes[name].levels[metric], expected, atol=1e-9, rtol=0, err_msg=f"{metric} of {name}"
             )
 
 
