@@ -28,7 +28,8 @@ WIDTH, HEIGHT = 1920, 640
 BEV_SIDE = 640
 CAMERAS_WIDTH = WIDTH - BEV_SIDE
 CAMERAS_HEIGHT = 500
-BEV_RANGE_M = 50.0  # from the vehicle to each edge of the BEV view
+BEV_RANGE_M = 50.0  # from the vehicle to each edge of the BEV view, in recordings without range rings
+BEV_MARGIN = 1.02  # of the range rings and the border of the grid
 BACKGROUND = (25, 20, 18)  # BGR, as all colours of the video
 BELOW_BOXES = (
     entities.BEV_GROUND_TRUTH, entities.BEV_MISSED, entities.BEV_TRACKS, entities.BEV_FALSE, entities.BEV_DUPLICATES
@@ -110,8 +111,11 @@ def _draw_camera(canvas: Canvas, frame: RecordedFrame, tile: Tile, image: Canvas
 
 
 def _draw_bev(canvas: Canvas, frame: RecordedFrame) -> None:
+    rings = [np.abs(strip).max() for strip in frame.values(entities.BEV_RINGS, "LineStrips2D:strips")]
+    reach = BEV_MARGIN * max(rings) if rings else BEV_RANGE_M
+
     def to_canvas(points: Array) -> Array:
-        return (points / BEV_RANGE_M + 1) * BEV_SIDE / 2
+        return (points / reach + 1) * BEV_SIDE / 2
 
     segmentation = recorded_image(frame, entities.BEV_SEGMENTATION)
     if segmentation is not None:
