@@ -185,8 +185,8 @@ def test_a_batch_has_the_mean_loss_of_its_frames_by_positive_pixel() -> None:
             len(perspective_targets(matrix, truth, locations, inputs.image_size).locations)
             for matrix in inputs.image_from_bev[frame]
         )
-        total, count = total + positives * float(part.classes + part.boxes), count + positives
-    assert float(whole.classes + whole.boxes) == pytest.approx(total / count, rel=1e-4)
+        total, count = total + positives * (part.classes + part.boxes).item(), count + positives
+    assert (whole.classes + whole.boxes).item() == pytest.approx(total / count, rel=1e-4)
 
 
 def test_each_weight_scales_its_part() -> None:
