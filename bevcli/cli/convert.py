@@ -38,6 +38,7 @@ def convert(
     """
     from bevcli.cli.progress import Progress
     from bevcli.errors import OutputError
+    from bevcli.frame import facts_of
     from bevcli.sequences.native.writer import NativeWriter
     from bevcli.sequences.open import open_sequence
 
@@ -59,7 +60,7 @@ def convert(
     count = len(sequence.stamps)
     gaps = 0
     with (
-        NativeWriter(out, with_ego_motion=sequence.has_ego_motion, force=force) as writer,
+        NativeWriter(out, with_ego_motion=sequence.has_ego_motion, force=force, facts=facts_of(sequence)) as writer,
         Progress(count, "frames") as progress,
     ):
         for place in range(count):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -134,6 +135,13 @@ def run(
         Literal["minimal", "standard", "full"],
         typer.Option(help="How much the recording contains.", rich_help_panel=RECORDING),
     ] = "standard",
+    images: Annotated[
+        Literal["jpeg", "av1"],
+        typer.Option(
+            help="jpeg keeps the bytes of the image files; av1 makes the recording smaller and needs bevcli[video].",
+            rich_help_panel=RECORDING,
+        ),
+    ] = "jpeg",
     bev: Annotated[
         str,
         typer.Option(help="How the BEV features are drawn: norm, pca, channel:K or none.", rich_help_panel=RECORDING),
@@ -168,7 +176,7 @@ def run(
     from bevcli.recording.options import RecordingOptions
     from bevcli.sequences.open import open_sequence
 
-    recording = RecordingOptions(record, bev, score, tuple(map(parse_probe, probe or ())), vehicle_mesh)
+    recording = RecordingOptions(record, bev, score, tuple(map(parse_probe, probe or ())), vehicle_mesh, images)
     loaded = load_model(model, weights, device=device, precision=precision, untrained=untrained)
     drive = open_sequence(
         sequence,
@@ -203,6 +211,7 @@ def run(
             progress.message(f"note: {note}")
         summary = run_into_folder(loaded, drive, out, options, live=view, force=force, after_frame=show)
     print(summary.table())
+    print(f"next     bevcli viz {shlex.quote(str(out))}")
 
 
 def notes(model: Model, drive: Sequence, *, live: bool = False) -> list[str]:

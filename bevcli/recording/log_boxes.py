@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import rerun as rr
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
 from bevcli.recording import entities
-from bevcli.recording.colors import FALSE_COLOR, GROUND_TRUTH_COLOR, MISSED_COLOR, class_color
+from bevcli.recording.colors import DUPLICATE_COLOR, FALSE_COLOR, GROUND_TRUTH_COLOR, MISSED_COLOR, class_color
 from bevcli.recording.labels import labels_in_scene
 
 MOVING_M_S = 0.5  # slower objects get no velocity arrow
@@ -26,13 +27,25 @@ def box_colors(boxes: Boxes3D, class_names: Sequence[str]) -> np.ndarray:
     return np.array([colors[name] for name in boxes.classes], dtype=np.uint8).reshape(-1, 3)
 
 
-def log_boxes_3d(
-    stream: rr.RecordingStream, boxes: Boxes3D, false: np.ndarray, class_names: Sequence[str], ego_xy: Array
-) -> None:
-    """Writes predicted boxes into the scene: boxes, velocity arrows, crosses on false positives.
+@dataclass(frozen=True)
+class Marks:
+    """Which of N predicted boxes are marked as wrong.
 
-    boxes: in the recording's world. false: (N,) bool, the false positives. ego_xy: (2,) the vehicle's position; the
-    boxes nearest to it get labels.
+    Attributes:
+        false: (N,) bool, the false positives: crossed out in red.
+        duplicate: (N,) bool, a second box on an object: one grey diagonal.
+    """
+
+    false: np.ndarray
+    duplicate: np.ndarray
+
+
+def log_boxes_3d(
+    stream: rr.RecordingStream, boxes: Boxes3D, marks: Marks, class_names: Sequence[str], ego_xy: Array
+) -> None:
+    """Writes predicted boxes into the scene: boxes, velocity arrows, marks of false positives and duplicates.
+
+    boxes: in the recording's world. ego_xy: (2,) the vehicle's position; the boxes nearest to it get labels.
     """
     ids = [1 + list(class_names).index(name) if name in class_names else 0 for name in boxes.classes]
     labels = labels_in_scene(boxes, ego_xy)
@@ -42,6 +55,7 @@ def log_boxes_3d(
         velocity_x=boxes.velocities[:, 0],
         velocity_y=boxes.velocities[:, 1],
         name=_names(boxes),
+        **({} if boxes.instances is None else {"track": pa.array(boxes.instances.tolist(), pa.utf8())}),
     )
     stream.log(entities.BOXES, archetype, facts)
     moving = np.linalg.norm(boxes.velocities, axis=-1) > MOVING_M_S
@@ -54,8 +68,10 @@ def log_boxes_3d(
     stream.log(entities.VELOCITY, arrows)
     stream.log(
         entities.FALSE_BOXES,
-        rr.LineStrips3D(_crosses(boxes[false]).astype(np.float32), colors=FALSE_COLOR, radii=THICK),
+        rr.LineStrips3D(_crosses(boxes[marks.false]).astype(np.float32), colors=FALSE_COLOR, radii=THICK),
     )
+    diagonals = _crosses(boxes[marks.duplicate])[::2].astype(np.float32)
+    stream.log(entities.DUPLICATES, rr.LineStrips3D(diagonals, colors=DUPLICATE_COLOR, radii=THICK))
 
 
 def log_ground_truth_3d(stream: rr.RecordingStream, truth: Boxes3D, found: np.ndarray) -> None:
@@ -67,8 +83,8 @@ def log_ground_truth_3d(stream: rr.RecordingStream, truth: Boxes3D, found: np.nd
     stream.log(entities.MISSED, red, rr.AnyValues(name=_names(missed)))
 
 
-def log_boxes_bev(stream: rr.RecordingStream, boxes: Boxes3D, false: np.ndarray, class_names: Sequence[str]) -> None:
-    """Writes predicted boxes (in the bev frame) into the BEV view. false: (N,) bool, the false positives."""
+def log_boxes_bev(stream: rr.RecordingStream, boxes: Boxes3D, marks: Marks, class_names: Sequence[str]) -> None:
+    """Writes predicted boxes (in the bev frame) into the BEV view."""
     colors = box_colors(boxes, class_names)
     outlines, headings = footprints(boxes)
     strips = [*outlines, *headings]
@@ -83,8 +99,10 @@ def log_boxes_bev(stream: rr.RecordingStream, boxes: Boxes3D, false: np.ndarray,
         draw_order=31,
     )
     stream.log(entities.BEV_VELOCITY, arrows)
-    crosses = (_crosses(boxes[false])[..., :2] * (1, -1)).astype(np.float32)
+    crosses = (_crosses(boxes[marks.false])[..., :2] * (1, -1)).astype(np.float32)
     stream.log(entities.BEV_FALSE, rr.LineStrips2D(crosses, colors=FALSE_COLOR, radii=THIN, draw_order=32))
+    diagonals = (_crosses(boxes[marks.duplicate])[::2, :, :2] * (1, -1)).astype(np.float32)
+    stream.log(entities.BEV_DUPLICATES, rr.LineStrips2D(diagonals, colors=DUPLICATE_COLOR, radii=THIN, draw_order=32))
 
 
 def log_ground_truth_bev(stream: rr.RecordingStream, truth: Boxes3D, found: np.ndarray) -> None:

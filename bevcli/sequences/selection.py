@@ -8,7 +8,7 @@ from collections.abc import Sequence as Indices
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.frame import Frame, FrameStamp, Sequence
+from bevcli.frame import Frame, FrameStamp, Sequence, facts_of
 
 # A scene counts as having the wanted rate if the ratio of its rate to it is in this range: keyframe times jitter.
 SLOWEST_RATIO, FASTEST_RATIO = 0.75, 1.5
@@ -24,6 +24,7 @@ class Selection:
         self.name = sequence.name
         self.rig = sequence.rig
         self.has_ego_motion = sequence.has_ego_motion
+        self.facts = facts_of(sequence)
         self.notes = (*sequence.notes, *notes)
 
     @property

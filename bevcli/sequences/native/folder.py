@@ -8,11 +8,11 @@ from typing import Literal
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.frame import Frame, FrameStamp
+from bevcli.frame import DriveFacts, Frame, FrameStamp
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import GRAVITY, TOLERANCE_NS, EgoMotion, Kinematics
 from bevcli.geometry.transforms import Pose
-from bevcli.sequences.files.calibration_file import read_calibration
+from bevcli.sequences.files.calibration_file import read_calibration, read_facts
 from bevcli.sequences.images import ImageReader
 from bevcli.sequences.native.ego_motion_file import read_ego_motion
 from bevcli.sequences.native.frames_table import FrameEntry, check_times, read_frames_table
@@ -51,7 +51,9 @@ class FolderSequence:
             raise InputError(f"{path}: the sequence folder is missing")
         self.path = path
         self.name = path.resolve().name
-        self.rig = read_calibration(path / "calibration.json") if rig is None else rig
+        calibration = path / "calibration.json"
+        self.rig = read_calibration(calibration) if rig is None else rig
+        self.facts = read_facts(calibration) if calibration.is_file() and rig is None else DriveFacts()
         self._entries, notes = _read_entries(path, self.rig)
         self.ego_motion, motion_notes = _read_motion(path, ego_motion, self._entries)
         self.has_ego_motion = self.ego_motion is not None
