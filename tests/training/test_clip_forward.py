@@ -10,7 +10,7 @@ import pytest
 import torch
 from painted_drives import CONFIG, PaintedDrives
 
-from bevcli.config import known_models, load_config
+from bevcli.config import TRAINING, known_models, load_config, load_table
 from bevcli.errors import ConfigError
 from bevcli.model.bev_fusion import BevFusionConfig
 from bevcli.model.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config, build_model
