@@ -8,9 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from bevcli.cli.input_options import (
+    CalibrationOption,
+    ClassMapOption,
+    EgoMotionOption,
     EveryOption,
     ExtrinsicsOption,
     FramesOption,
+    GroundTruthOption,
     IntrinsicsOption,
     RateOption,
     SceneOption,
@@ -18,10 +22,15 @@ from bevcli.cli.input_options import (
     StaticOption,
     StrictOption,
     SweepsOption,
+    TopicOption,
+    TopicsOption,
     VersionOption,
     ego_motion_use,
+    parse_class_map,
     parse_frames,
+    parse_pairs,
     parse_rate,
+    parse_topics,
 )
 
 if TYPE_CHECKING:
@@ -34,7 +43,7 @@ MODEL, OUTPUT, RECORDING = "Model", "Output", "Recording"
 def run(
     sequence: Annotated[
         Path,
-        typer.Argument(help="A sequence folder, a folder with one video per camera, or a nuScenes root."),
+        typer.Argument(help="A sequence folder (images or videos), a nuScenes root, an .mcap file or a rosbag2 folder."),
     ],
     model: Annotated[
         str | None,
@@ -93,6 +102,12 @@ def run(
     sweeps: SweepsOption = False,
     intrinsics: IntrinsicsOption = None,
     extrinsics: ExtrinsicsOption = None,
+    calibration: CalibrationOption = None,
+    ego_motion: EgoMotionOption = None,
+    topic: TopicOption = None,
+    topics: TopicsOption = None,
+    ground_truth: GroundTruthOption = True,
+    class_map: ClassMapOption = None,
     out: Annotated[
         Path | None, typer.Option(help="Default: runs/SEQUENCE-MODEL.", rich_help_panel=OUTPUT, show_default=False)
     ] = None,
@@ -176,9 +191,15 @@ def run(
         sweeps=sweeps,
         intrinsics=intrinsics,
         extrinsics=extrinsics,
+        calibration=calibration,
+        ego_motion_file=ego_motion,
+        topics=parse_topics(topic),
+        topics_file=topics,
+        ground_truth=ground_truth,
+        class_map=parse_class_map(class_map),
     )
     out = Path("runs") / f"{drive.name}-{loaded.name}" if out is None else out
-    options = RunOptions(temporal, dict(map(parse_camera, camera or ())), recording, save_bev)
+    options = RunOptions(temporal, parse_pairs(camera, "--camera", "NAME=MODEL_CAMERA"), recording, save_bev)
 
     view = None
     if live:
@@ -228,11 +249,3 @@ def parse_probe(text: str) -> tuple[float, float]:
             f'"{text}" is not a position (expected X,Y in metres, such as 10,-2.5)', param_hint="--probe"
         ) from None
     return x, y
-
-
-def parse_camera(text: str) -> tuple[str, str]:
-    """ "NAME=MODEL_CAMERA" -> both names. Raises click's usage error."""
-    name, equals, embedding = text.partition("=")
-    if not (name and equals and embedding):
-        raise typer.BadParameter(f'"{text}" is not an assignment (expected NAME=MODEL_CAMERA)', param_hint="--camera")
-    return name, embedding

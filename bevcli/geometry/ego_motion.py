@@ -49,6 +49,16 @@ class EgoMotion:
     angular_rates: Array
     velocities: Array
 
+    @property
+    def first_ns(self) -> int:
+        """Time of the first pose."""
+        return int(self.timestamps_ns[0])
+
+    @property
+    def last_ns(self) -> int:
+        """Time of the last pose."""
+        return int(self.timestamps_ns[-1])
+
     def pose_at(self, timestamp_ns: int) -> Pose:
         """world_from_ego at a time. The pose of an exactly matching row is returned unchanged.
 

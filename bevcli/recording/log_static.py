@@ -21,7 +21,8 @@ FRUSTUM_LENGTH_M = 0.55  # longer frusta would hide the vehicle from the eye beh
 PILLARS_PER_SIDE = 25  # more pillars than this along one side of the grid would hide the image
 HOW_TO_READ = """\
 - **Predicted boxes** have the colour of their class. The front face is crossed; from above, a line points to the front.
-- **Ground truth** is pale where a prediction matches it, and red where it was missed.
+- **Ground truth** is pale where a prediction matches it, and red where it was missed. Classes that are not scored are
+  grey.
 - **False positives** are crossed out in red: no ground truth of their class is within 2 m.
 - **Pillars** are the 3D reference points of the BEV cells, coloured by height from blue to red. They are hidden at
   first: click the eye next to `pillars` in the left panel.
