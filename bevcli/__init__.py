@@ -20,7 +20,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from bevcli.errors import BevcliError
-    from bevcli.evaluation.scoring import evaluate
+    from bevcli.evaluation.evaluate import evaluate
     from bevcli.frame import MAP_CLASSES, BevMap, CameraImage, Frame, FrameStamp, Prediction, Sequence
     from bevcli.geometry.boxes import Boxes3D
     from bevcli.geometry.cameras import Camera, CameraRig
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from bevcli.pipeline.run import RunOptions, run, run_into_folder
     from bevcli.recording.options import RecordingOptions
     from bevcli.recording.writer import Recording
-    from bevcli.rig.inspection import check_calibration
+    from bevcli.rig.check_calibration import check_calibration
     from bevcli.sequences.open import open_sequence
     from bevcli.synth.export import render
     from bevcli.viewer.notebook import show
@@ -52,8 +52,8 @@ _MODULES = {
     "RecordingOptions": "bevcli.recording.options",
     "RunOptions": "bevcli.pipeline.run",
     "Sequence": "bevcli.frame",
-    "check_calibration": "bevcli.rig.inspection",
-    "evaluate": "bevcli.evaluation.scoring",
+    "check_calibration": "bevcli.rig.check_calibration",
+    "evaluate": "bevcli.evaluation.evaluate",
     "load_model": "bevcli.pipeline.model_loading",
     "open_sequence": "bevcli.sequences.open",
     "render": "bevcli.synth.export",

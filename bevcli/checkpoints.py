@@ -1,4 +1,4 @@
-"""Files of weights: the official .pth and our .safetensors, to the state dict of our model."""
+"""Weights files: reads the official .pth and our .safetensors into the state dict of our model."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from bevcli.errors import WeightsError
 from bevcli.model.bevformer import BEVFormer, BEVFormerConfig
 from bevcli.model.official_keys import from_official, is_official
 
-# What torch's restricted unpickler raises on bytes that are no pickle, depending on where they go wrong.
+# The exceptions of torch's restricted unpickler for a file that is not a valid pickle.
 _BROKEN_PICKLE = (
     pickle.UnpicklingError, RuntimeError, OSError, EOFError, ValueError, LookupError, TypeError, AttributeError,
     struct.error,
@@ -28,9 +28,12 @@ _BROKEN_PICKLE = (
 
 @dataclass(frozen=True)
 class KeyReport:
-    """How a state dict differs from what a model needs; all empty when it fits.
+    """The differences between a state dict and the one that a model needs.
 
-    misshapen: lines "key: expected (…), found (…)".
+    Attributes:
+        missing: keys that the state dict lacks.
+        unexpected: keys that the model does not have.
+        misshapen: lines "key: expected (…), found (…)" for tensors of a wrong shape.
     """
 
     missing: tuple[str, ...]
@@ -39,20 +42,24 @@ class KeyReport:
 
     @property
     def fits(self) -> bool:
-        """Whether nothing differs."""
+        """Whether there are no differences."""
         return not (self.missing or self.unexpected or self.misshapen)
 
     def describe(self) -> str:
-        """Every differing key, on one line."""
+        """All differing keys, on one line."""
         parts = [("missing", self.missing), ("unexpected", self.unexpected), ("misshapen", self.misshapen)]
         return "; ".join(f"{len(keys)} {name}: {', '.join(keys)}" for name, keys in parts if keys)
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A file of weights, read. state: under our names. official: whether the file uses the original's names.
+    """The contents of a weights file.
 
-    facts: what the file says about itself, such as its epoch.
+    Attributes:
+        path: the file.
+        state: state dict with our key names.
+        official: whether the file uses the key names of the released code.
+        facts: metadata in the file, such as its epoch.
     """
 
     path: Path
@@ -63,9 +70,16 @@ class Checkpoint:
 
 @dataclass(frozen=True)
 class CheckpointSummary:
-    """What a file of weights is.
+    """What a weights file contains.
 
-    models: those of ours that it fits. parameters: how many numbers it holds, running statistics included.
+    Attributes:
+        path: the file.
+        models: names of the known models that it fits.
+        official: whether the file uses the key names of the released code.
+        tensors: number of tensors.
+        parameters: number of values in all tensors, running statistics of batch norms included.
+        file_bytes: size of the file.
+        facts: metadata in the file, such as its epoch.
     """
 
     path: Path
@@ -78,40 +92,60 @@ class CheckpointSummary:
 
 
 def load_weights(path: Path, model: BEVFormer, *, resample: bool = False) -> Checkpoint:
-    """Loads a file of weights into a model, in place; every key must be there, none more, all of the right shape.
+    """Loads a weights file into a model, in place. Keys and shapes must be exactly those of the model.
 
-    resample: weights of a BEV grid with another number of cells are interpolated, to be fine-tuned.
+    Args:
+        path: an official .pth or a .safetensors.
+        model: unchanged where the file does not fit.
+        resample: whether BEV queries of a grid with another number of cells are interpolated, for fine-tuning.
 
-    Raises WeightsError that says which known model the file is for, or else lists every key that differs.
+    Raises WeightsError that names the known model that the file fits, or else every key that differs.
     """
     checkpoint = read_checkpoint(path)
     if resample:
         checkpoint = replace(checkpoint, state=model.bev_queries.resampled(checkpoint.state, "bev_queries."))
-    report = compare(checkpoint.state, model.state_dict())
-    if not report.fits:
-        name, others = model.config.name, fitting_models(checkpoint.state)
-        if others:
-            raise WeightsError(f"{path}: expected weights of model {name}, found those of {' or '.join(others)}")
-        raise WeightsError(f"{path}: does not fit model {name} nor any known one; {report.describe()}")
+    require_fit(checkpoint, model.config.name, model.state_dict())
     model.load_state_dict(dict(checkpoint.state))
     return checkpoint
 
 
+def require_fit(checkpoint: Checkpoint, model: str, expected: Mapping[str, Tensor]) -> None:
+    """Raises WeightsError where a weights file does not fit a model.
+
+    Args:
+        checkpoint: the contents of the weights file.
+        model: the model's name.
+        expected: the model's state dict.
+    """
+    report = compare(checkpoint.state, expected)
+    if report.fits:
+        return
+    others = fitting_models(checkpoint.state)
+    if others:
+        raise WeightsError(
+            f"{checkpoint.path}: expected weights of model {model}, found those of {' or '.join(others)}"
+        )
+    raise WeightsError(f"{checkpoint.path}: does not fit model {model} nor any known one; {report.describe()}")
+
+
 def convert(source: Path, destination: Path) -> CheckpointSummary:
-    """Writes a file of weights as .safetensors under our names, once it fits one of the known models."""
+    """Writes a weights file as .safetensors with our key names.
+
+    Raises WeightsError where the file fits none of the known models.
+    """
     checkpoint = read_checkpoint(source)
     models = fitting_models(checkpoint.state)
     if not models:
         raise WeightsError(f"{source}: fits none of the known models ({', '.join(known_models())})")
     if destination.suffix != ".safetensors":
-        raise WeightsError(f"{destination}: expected a name that ends in .safetensors")
+        raise WeightsError(f"{destination}: expected a file name that ends in .safetensors")
     tensors = {key: tensor.contiguous() for key, tensor in checkpoint.state.items()}
     safetensors.torch.save_file(tensors, destination, {**checkpoint.facts, "model": models[0]})
     return inspect(destination)
 
 
 def inspect(path: Path) -> CheckpointSummary:
-    """What a file of weights is."""
+    """What a weights file contains."""
     checkpoint = read_checkpoint(path)
     return CheckpointSummary(
         path=path,
@@ -125,22 +159,22 @@ def inspect(path: Path) -> CheckpointSummary:
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
-    """Reads an official .pth or a .safetensors, official keys or ours. Nothing but tensors is unpickled."""
+    """Reads an official .pth or a .safetensors, with official key names or ours. Code in the file never runs."""
     if not path.is_file():
-        raise WeightsError(f"{path}: no such file of weights")
+        raise WeightsError(f"{path}: weights file not found")
     state, facts = _read_safetensors(path) if path.suffix == ".safetensors" else _read_pth(path)
     official = is_official(state)
     return Checkpoint(path, from_official(state) if official else state, official, facts)
 
 
 def bundled_weights(model: str) -> Path | None:
-    """The file of weights that comes with the package for a known model; None where there is none."""
+    """The weights file that comes with the package for a known model; None where there is none."""
     file = Path(str(resources.files("bevcli").joinpath("weights", f"{model}.safetensors")))
     return file if model in known_models() and file.is_file() else None
 
 
 def compare(state: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> KeyReport:
-    """Which keys of a state dict are missing, unexpected or misshapen against a model's."""
+    """The differences between a state dict and the state dict of a model."""
     shapes = {key: tuple(tensor.shape) for key, tensor in expected.items()}
     found = {key: tuple(tensor.shape) for key, tensor in state.items()}
     return KeyReport(
@@ -155,12 +189,12 @@ def compare(state: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> KeyR
 
 
 def fitting_models(state: Mapping[str, Tensor]) -> tuple[str, ...]:
-    """The known models that a state dict fits."""
+    """Names of the known models that a state dict fits."""
     return tuple(name for name in known_models() if compare(state, expected_state(load_config(name))).fits)
 
 
 def expected_state(config: BEVFormerConfig) -> dict[str, Tensor]:
-    """The state dict that a model needs, as tensors without contents."""
+    """The state dict that a model needs, with tensors that have a shape but no contents."""
     with torch.device("meta"):
         return BEVFormer(config).state_dict()
 
@@ -171,7 +205,7 @@ def _read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
             state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
             return state, dict(file.metadata() or {})
     except safetensors.SafetensorError as error:
-        raise WeightsError(f"{path}: is no safetensors file: {error}") from error
+        raise WeightsError(f"{path}: not a valid safetensors file: {error}") from error
 
 
 def _read_pth(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -179,12 +213,14 @@ def _read_pth(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         contents = torch.load(path, map_location="cpu", weights_only=True)
     except _BROKEN_PICKLE as error:
         raise WeightsError(
-            f"{path}: is no file of weights that is safe to read (expected a PyTorch file of tensors and plain values, "
-            "or .safetensors): it is damaged, something else, or holds objects that could run code"
+            f"{path}: not a weights file that is safe to read (expected .safetensors, or a PyTorch file of tensors and "
+            "plain values): it is damaged, is another kind of file, or holds objects that could run code"
         ) from error
     state = contents.get("state_dict", contents) if isinstance(contents, dict) else None
     if not isinstance(state, dict) or not state or not all(isinstance(v, Tensor) for v in state.values()):
-        raise WeightsError(f"{path}: holds no state dict; expected tensors by name, at the top or as state_dict")
+        raise WeightsError(
+            f"{path}: contains no state dict (expected tensors by name, at the top level or under state_dict)"
+        )
     meta = contents.get("meta")
     facts = {} if not isinstance(meta, dict) else {k: str(meta[k]) for k in ("epoch", "iter", "time") if k in meta}
     return state, facts

@@ -1,4 +1,4 @@
-"""A TOML file to frozen dataclasses; an unknown key or a wrong type is an error that names file and key."""
+"""Reads TOML files into frozen dataclasses. An unknown key or a wrong type is an error that names file and key."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bevcli.model.bevformer import BEVFormerConfig
 
 T = TypeVar("T")
 
-TRAINING = "training"  # the table of a model's file that says how it is trained, of which the model knows nothing
+TRAINING = "training"  # the table of a model's file with the settings of its training, which the model does not need
 
 
 def known_models() -> tuple[str, ...]:
@@ -27,9 +27,9 @@ def known_models() -> tuple[str, ...]:
 
 
 def load_config(name_or_path: str | Path) -> BEVFormerConfig:
-    """The model of a known name ("tiny"), or of a file whose name ends in .toml.
+    """The configuration of a known model ("tiny"), or of a file whose name ends in .toml.
 
-    Raises ConfigError when there is none, or when its contents are wrong.
+    Raises ConfigError where there is none, or where its contents are wrong.
     """
     text, file = _read_model(str(name_or_path))
     table = _parse(text, file)
@@ -37,33 +37,28 @@ def load_config(name_or_path: str | Path) -> BEVFormerConfig:
 
 
 def load_training(name_or_path: str | Path, kind: type[T]) -> T:
-    """The [training] table of a model's file as a dataclass; its defaults where the file has none."""
+    """The [training] table of a model's file as a dataclass of type `kind`; its defaults where the file has none."""
     text, file = _read_model(str(name_or_path))
     return _dataclass(_parse(text, file).get(TRAINING, {}), kind, file, f"{TRAINING}.")
-
-
-def parse_config(text: str, file: str, kind: type[T]) -> T:
-    """TOML text to a dataclass of that kind, nested dataclasses as tables; `file` is named in errors."""
-    return _dataclass(_parse(text, file), kind, file, "")
 
 
 def _parse(text: str, file: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{file}: is no valid TOML: {error}") from error
+        raise ConfigError(f"{file}: invalid TOML: {error}") from error
 
 
 def _read_model(name: str) -> tuple[str, str]:
-    """Text and file name of a known model, or of a file whose name ends in .toml."""
+    """Text and name of the TOML file of a known model, or of a file whose name ends in .toml."""
     if name.endswith(".toml"):
         path = Path(name)
         if not path.is_file():
-            raise ConfigError(f"{path}: no such model file; known models are {', '.join(known_models())}")
+            raise ConfigError(f"{path}: file not found; known models are {', '.join(known_models())}")
         return _read(path), name
     if name not in known_models():
         known = ", ".join(known_models())
-        raise ConfigError(f'model "{name}" is unknown; expected one of {known}, or a file FILE.toml')
+        raise ConfigError(f'unknown model "{name}"; expected one of {known}, or a FILE.toml')
     file = f"{name}.toml"
     return resources.files("bevcli").joinpath("configs", file).read_text(encoding="utf-8"), file
 
@@ -84,7 +79,7 @@ def _dataclass(table: dict[str, Any], kind: type[T], file: str, prefix: str) -> 
     for name, field in fields.items():
         optional = field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
         if name not in values and not optional:
-            raise ConfigError(f'{file}: "{prefix}{name}" is missing; expected {_say(hints[name])}')
+            raise ConfigError(f'{file}: "{prefix}{name}" is missing; expected {_describe(hints[name])}')
     try:
         return kind(**values)
     except ValueError as error:
@@ -96,12 +91,12 @@ def _value(value: Any, kind: Any, file: str, key: str) -> Any:
     if dataclasses.is_dataclass(kind) and isinstance(value, dict):
         return _dataclass(value, typing.cast(type, kind), file, f"{key}.")
     if not _fits(value, kind):
-        raise ConfigError(f'{file}: "{key}" must be {_say(kind)}, but is {value!r}')
+        raise ConfigError(f'{file}: "{key}" must be {_describe(kind)}, but is {value!r}')
     return _converted(value, kind)
 
 
 def _fits(value: Any, kind: Any) -> bool:
-    """Whether a TOML value can stand for a type: a scalar, Literal, tuple, or a union of these."""
+    """Whether a TOML value fits a type: a scalar, Literal, tuple, or a union of these."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is Literal:
         return value in arguments and not isinstance(value, bool)
@@ -118,7 +113,7 @@ def _fits(value: Any, kind: Any) -> bool:
 
 
 def _converted(value: Any, kind: Any) -> Any:
-    """A value that fits, as that type: lists become tuples, whole numbers floats where floats are asked."""
+    """A fitting value converted to a type: lists to tuples, integers to floats."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
         return _converted(value, next(argument for argument in arguments if _fits(value, argument)))
@@ -128,22 +123,22 @@ def _converted(value: Any, kind: Any) -> Any:
 
 
 def _element_kinds(arguments: tuple[Any, ...], length: int) -> tuple[Any, ...]:
-    """The types of a tuple's elements: tuple[int, ...] takes any length."""
+    """The types of a tuple's elements; tuple[int, ...] has any length."""
     return (arguments[0],) * length if arguments[-1] is Ellipsis else arguments
 
 
-def _say(kind: Any) -> str:
-    """A type in words for an error message."""
+def _describe(kind: Any) -> str:
+    """A type in words, for an error message."""
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is Literal:
         return " or ".join(f'"{argument}"' for argument in arguments)
     if origin in (typing.Union, types.UnionType):
-        return " or ".join(_say(argument) for argument in arguments if argument is not type(None))
+        return " or ".join(_describe(argument) for argument in arguments if argument is not type(None))
     if origin is tuple:
         if arguments[-1] is Ellipsis:
-            return f"a list, each element {_say(arguments[0])}"
-        return f"a list of {len(arguments)}, each element {_say(arguments[0])}"
-    names = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
+            return f"a list, each element {_describe(arguments[0])}"
+        return f"a list of {len(arguments)}, each element {_describe(arguments[0])}"
+    names = {bool: "true or false", int: "an integer", float: "a number", str: "a string"}
     return names.get(kind, "a table")
 
 

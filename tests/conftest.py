@@ -1,4 +1,4 @@
-"""What several tests need: a tiny model, a drive in memory, and where the shared reference data lie."""
+"""Fixtures of several tests: a tiny model, and the folder of the reference data."""
 
 import os
 from pathlib import Path
@@ -8,17 +8,16 @@ import torch
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import CLASSES
-from bevcli.model.bevformer import BEVFormer, BEVFormerConfig
+from bevcli.model.bevformer import BEVFormer, BEVFormerConfig, ImageConfig
 from bevcli.model.decoder import DecoderConfig
 from bevcli.model.encoder import EncoderConfig
-from bevcli.model.image_config import ImageConfig
 from bevcli.model.resnet import ResNetConfig
 from bevcli.pipeline.camera_assignment import NUSCENES_YAWS_DEG
 
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The folder of real frames and reference numbers; skips where there is none."""
+    """The folder of real frames and reference numbers; skips the test where there is none."""
     folder = os.environ.get("BEVCLI_SHARED")
     if not folder:
         pytest.skip("BEVCLI_SHARED is not set: no real frames and reference numbers here")
@@ -27,7 +26,7 @@ def shared() -> Path:
 
 @pytest.fixture(scope="session")
 def mini_config() -> BEVFormerConfig:
-    """BEVFormer with all parts, so small that a step takes milliseconds."""
+    """A BEVFormer with all its parts, so small that a step takes milliseconds."""
     return BEVFormerConfig(
         name="mini",
         classes=CLASSES,
@@ -43,7 +42,7 @@ def mini_config() -> BEVFormerConfig:
 
 @pytest.fixture(scope="session")
 def mini_model(mini_config) -> BEVFormer:
-    """Untrained, always the same, and awake: attention weights and residual branches are not zero."""
+    """Random weights, the same in every test; attention weights and residual branches are not zero."""
     torch.manual_seed(0)
     model = BEVFormer(mini_config).eval()
     with torch.no_grad():

@@ -1,8 +1,9 @@
-"""Files of weights: read, checked, converted, and refused with one clear line."""
+"""Weights files: reading, checking, converting, and one-line errors for files that cannot be used."""
 
 from __future__ import annotations
 
 import json
+import math
 import pickle
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 import safetensors.torch
 import torch
+from typer.testing import CliRunner
 
 from bevcli.checkpoints import (
     compare,
@@ -20,10 +22,13 @@ from bevcli.checkpoints import (
     load_weights,
     read_checkpoint,
 )
-from bevcli.config import load_config
+from bevcli.cli.main import app
+from bevcli.config import known_models, load_config
 from bevcli.errors import WeightsError
 from bevcli.geometry.bev_grid import BevGrid
+from bevcli.model.bevformer import BEVFormer
 from bevcli.model.official_keys import from_official
+from bevcli.model.parts import model_parts
 
 sys.path.insert(0, str(Path(__file__).parent / "model"))
 
@@ -33,7 +38,7 @@ KEYS = json.loads((Path(__file__).parent / "data" / "golden_keys.json").read_tex
 
 
 def official_state(model: str) -> dict[str, torch.Tensor]:
-    """A state dict with the official keys and shapes that takes no room: every tensor is one number, expanded."""
+    """A state dict with the official keys and shapes that takes no memory: every tensor is one expanded number."""
     return {key: torch.zeros(()).expand(shape) for key, shape in KEYS[model].items()}
 
 
@@ -55,7 +60,7 @@ def saved(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("model", ["tiny", "small", "base"])
-def test_every_official_key_has_its_place_in_our_model_and_no_place_stays_empty(model: str) -> None:
+def test_official_keys_map_one_to_one_to_the_keys_of_our_model(model: str) -> None:
     state = {key: torch.empty(shape, device="meta") for key, shape in KEYS[model].items()}
     report = compare(from_official(state), expected_state(load_config(model)))
     assert report.fits, report.describe()
@@ -65,11 +70,11 @@ def test_a_state_dict_fits_its_own_model_alone() -> None:
     assert fitting_models(from_official(official_state("small"))) == ("small",)
 
 
-def test_no_two_official_keys_become_one() -> None:
-    assert len(from_official(official_state("base"))) == len(official_state("base")) - 1  # but code_weights
+def test_different_official_keys_stay_different() -> None:
+    assert len(from_official(official_state("base"))) == len(official_state("base")) - 1  # without code_weights
 
 
-def test_an_official_file_says_what_it_is(official_tiny: Path) -> None:
+def test_the_summary_of_an_official_file_holds_model_and_metadata(official_tiny: Path) -> None:
     summary = inspect(official_tiny)
     assert summary.models == ("tiny",)
     assert summary.official
@@ -101,7 +106,7 @@ def test_half_precision_weights_are_loaded_as_float32(tmp_path: Path) -> None:
     torch.testing.assert_close(model.bev_queries.embedding.data, state["bev_queries.embedding"], atol=1e-2, rtol=1e-2)
 
 
-def test_weights_of_another_grid_are_resampled_where_they_are_to_be_fine_tuned(tmp_path: Path) -> None:
+def test_weights_of_another_grid_are_resampled_on_request(tmp_path: Path) -> None:
     path, model = tmp_path / "coarse.safetensors", small_model(seed=1)
     rows, columns = 6, 8
     y, x = torch.meshgrid(torch.arange(rows) + 0.5, torch.arange(columns) + 0.5, indexing="ij")
@@ -115,7 +120,7 @@ def test_weights_of_another_grid_are_resampled_where_they_are_to_be_fine_tuned(t
         load_weights(path, finer)
     load_weights(path, finer, resample=True)
     cells = finer.bev_queries.embedding.data.reshape(12, 16, -1)
-    # What grows evenly over the ground does so still, but for the outermost half cells.
+    # A linear gradient over the grid stays linear, except in the outermost half cells.
     torch.testing.assert_close(cells[1:-1, 3, 0], ((torch.arange(12) + 0.5) / 12)[1:-1])
     torch.testing.assert_close(cells[5, 1:-1, 1], ((torch.arange(16) + 0.5) / 16)[1:-1])
     torch.testing.assert_close(finer.bev_queries.row_embedding.data[1:-1, 0], ((torch.arange(12) + 0.5) / 12)[1:-1])
@@ -149,12 +154,12 @@ def test_every_missing_unexpected_and_misshapen_key_is_listed(tmp_path: Path) ->
     assert "\n" not in message
 
 
-def test_weights_of_another_model_are_named(official_tiny: Path) -> None:
+def test_the_error_for_weights_of_another_model_names_that_model(official_tiny: Path) -> None:
     with pytest.raises(WeightsError, match="expected weights of model small-for-tests, found those of tiny"):
         load_weights(official_tiny, small_model())
 
 
-def test_a_refused_file_leaves_the_model_as_it_was(official_tiny: Path) -> None:
+def test_a_file_that_does_not_fit_leaves_the_model_unchanged(official_tiny: Path) -> None:
     model, untouched = small_model(), small_model().state_dict()
     with pytest.raises(WeightsError):
         load_weights(official_tiny, model)
@@ -168,12 +173,12 @@ def test_weights_that_fit_no_model_are_not_converted(saved: Path, tmp_path: Path
 
 
 def test_a_conversion_goes_to_a_safetensors_file(official_tiny: Path, tmp_path: Path) -> None:
-    with pytest.raises(WeightsError, match=r"expected a name that ends in \.safetensors"):
+    with pytest.raises(WeightsError, match=r"expected a file name that ends in \.safetensors"):
         convert(official_tiny, tmp_path / "out.pth")
 
 
 class Evil:
-    """Unpickling it would run code."""
+    """An object that runs code when it is unpickled."""
 
     def __reduce__(self) -> tuple[object, tuple[str]]:
         return print, ("ran",)
@@ -181,7 +186,7 @@ class Evil:
 
 @pytest.mark.parametrize("suffix", [".pth", ".safetensors"])
 @pytest.mark.parametrize("contents", [b"", b"hello, I am a text\n", b"\x00" * 100, b"PK\x03\x04broken", b"\x80\x02."])
-def test_a_file_that_is_no_weights_is_refused(tmp_path: Path, suffix: str, contents: bytes) -> None:
+def test_a_file_that_does_not_contain_weights_is_an_error(tmp_path: Path, suffix: str, contents: bytes) -> None:
     path = tmp_path / f"file{suffix}"
     path.write_bytes(contents)
     with pytest.raises(WeightsError) as caught:
@@ -190,7 +195,7 @@ def test_a_file_that_is_no_weights_is_refused(tmp_path: Path, suffix: str, conte
     assert "\n" not in str(caught.value)
 
 
-def test_a_file_with_code_in_it_is_refused_and_not_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_code_in_a_file_is_an_error_and_does_not_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for path, save in ((tmp_path / "a.pth", torch.save), (tmp_path / "b.pth", _pickle)):
         save({"state_dict": {"weight": Evil()}}, path)
         with pytest.raises(WeightsError, match="safe to read"):
@@ -199,16 +204,64 @@ def test_a_file_with_code_in_it_is_refused_and_not_run(tmp_path: Path, capsys: p
 
 
 @pytest.mark.parametrize("contents", [3, [1, 2], {}, {"state_dict": {}}, {"state_dict": {"a": 1}}])
-def test_a_file_without_a_state_dict_is_refused(tmp_path: Path, contents: object) -> None:
+def test_a_file_without_a_state_dict_is_an_error(tmp_path: Path, contents: object) -> None:
     path = tmp_path / "other.pth"
     torch.save(contents, path)
-    with pytest.raises(WeightsError, match="holds no state dict"):
+    with pytest.raises(WeightsError, match="contains no state dict"):
         inspect(path)
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(WeightsError, match=r"nothing\.pth: no such file"):
+def test_the_error_for_a_missing_file_names_it(tmp_path: Path) -> None:
+    with pytest.raises(WeightsError, match=r"nothing\.pth: weights file not found"):
         inspect(tmp_path / "nothing.pth")
+
+
+def test_every_parameter_of_a_model_belongs_to_one_part() -> None:
+    for name in known_models():
+        config = load_config(name)
+        with torch.device("meta"):
+            expected = sum(parameter.numel() for parameter in BEVFormer(config).parameters())
+        assert sum(part.parameters for part in model_parts(config)) == expected
+
+
+def test_the_parts_of_base_have_the_published_sizes() -> None:
+    parts = {part.name: part for part in model_parts(load_config("base"))}
+    assert parts["BEV queries"].shapes == ((200 * 200, 256),)
+    assert parts["camera embeddings"].parameters == 6 * 256
+    # 8 heads, 4 levels, 8 points: offsets (x, y) and weights; then value and output projection; all with biases.
+    samples = 8 * 4 * 8
+    expected = (2 * samples + samples) * (256 + 1) + 2 * 256 * (256 + 1)
+    assert parts["encoder layer 5: spatial cross-attention"].parameters == expected
+    not_learned = ("running_mean", "running_var", "num_batches_tracked", "code_weights")
+    published = sum(math.prod(shape) for key, shape in KEYS["base"].items() if not key.endswith(not_learned))
+    assert sum(part.parameters for part in parts.values()) == published
+
+
+def test_weights_inspect_lists_the_parts_of_a_model() -> None:
+    answer = CliRunner().invoke(app, ["weights", "inspect", "--model", "tiny"], catch_exceptions=False)
+    lines = answer.stdout.splitlines()
+    assert any(line.startswith("BEV queries ") and "640,000  2500 × 256" in line for line in lines)
+    end = lines[0].index("  shapes")  # of the column "parameters", which is aligned to the right
+    total = sum(int(line[:end].split()[-1].replace(",", "")) for line in lines[1:-1])
+    assert lines[-1].split() == ["total", f"{total:,}"]
+
+
+def test_weights_inspect_gives_file_and_parts_as_json(official_tiny: Path) -> None:
+    command = ["weights", "inspect", str(official_tiny), "--model", "tiny", "--json"]
+    data = json.loads(CliRunner().invoke(app, command, catch_exceptions=False).stdout)
+    assert (data["models"], data["model"]) == (["tiny"], "tiny")
+    assert data["model_parameters"] == sum(part["parameters"] for part in data["parts"]) < data["parameters"]
+    queries = next(part for part in data["parts"] if part["name"] == "BEV queries")
+    assert queries == {
+        "name": "BEV queries", "modules": ["bev_queries.embedding"], "parameters": 640_000, "shapes": [[2500, 256]],
+    }  # fmt: skip
+
+
+def test_weights_inspect_needs_a_file_that_fits_the_model(official_tiny: Path) -> None:
+    answer = CliRunner().invoke(app, ["weights", "inspect", str(official_tiny), "--model", "base"])
+    assert isinstance(answer.exception, WeightsError)
+    assert "expected weights of model base, found those of tiny" in str(answer.exception)
+    assert CliRunner().invoke(app, ["weights", "inspect"]).exit_code == 2
 
 
 def _pickle(contents: object, path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Model files: what they say, and one clear line for each mistake in them."""
+"""Model files: how their values are read, and the error message for each kind of mistake."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Literal
 
 import pytest
 
-from bevcli.config import known_models, load_config, parse_config
+from bevcli.config import known_models, load_config, load_training
 from bevcli.errors import ConfigError
 
 
@@ -35,11 +35,14 @@ class Car:
             raise ValueError("seats must be positive")
 
 
-def parse(text: str) -> Car:
-    return parse_config(text, "car.toml", Car)
+def load(folder: Path, text: str) -> Car:
+    """The training table of a file car.toml, read as a Car."""
+    path = folder / "car.toml"
+    path.write_text(f"[training]\n{text}")
+    return load_training(path, Car)
 
 
-MINIMAL = 'name = "a"\n{}\n[wheel]\nwidth = 1'
+MINIMAL = 'name = "a"\n{}\n[training.wheel]\nwidth = 1'
 
 
 def test_the_published_models_come_with_the_package() -> None:
@@ -50,7 +53,7 @@ def test_the_published_models_come_with_the_package() -> None:
     ("name", "cells", "layers", "levels", "padded"),
     [("tiny", 50, 3, 1, (800, 480)), ("small", 150, 3, 1, (1280, 736)), ("base", 200, 6, 4, (1600, 928))],
 )
-def test_the_published_models_are_as_published(
+def test_the_published_models_have_the_published_sizes(
     name: str, cells: int, layers: int, levels: int, padded: tuple[int, int]
 ) -> None:
     config = load_config(name)
@@ -67,8 +70,9 @@ def test_a_path_to_a_copy_gives_the_same_model(tmp_path: Path) -> None:
     assert load_config(copy) == load_config("tiny")
 
 
-def test_values_take_the_dataclasss_types() -> None:
-    car = parse('name = "a"\ndoors = [2, 3]\nsize = [4, 2.5]\nroof = [1, 2]\ntowed = [1, 1]\nwheel = { width = 3 }')
+def test_values_are_converted_to_the_types_of_the_dataclass(tmp_path: Path) -> None:
+    text = 'name = "a"\ndoors = [2, 3]\nsize = [4, 2.5]\nroof = [1, 2]\ntowed = [1, 1]\nwheel = { width = 3 }'
+    car = load(tmp_path, text)
     assert car == Car("a", Wheel(3.0), doors=(2, 3), size=(4.0, 2.5), roof=(1.0, 2.0), towed=(1, 1))
     assert isinstance(car.wheel.width, float)
 
@@ -76,26 +80,32 @@ def test_values_take_the_dataclasss_types() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (MINIMAL.format("seets = 3"), 'car.toml: unknown key "seets"; did you mean "seats"?'),
-        (MINIMAL.format("") + "\nwidht = 2", 'car.toml: unknown key "wheel.widht"; did you mean "width"?'),
-        ('name = "a"', 'car.toml: "wheel" is missing; expected a table'),
-        (MINIMAL.format("seats = 2.5"), 'car.toml: "seats" must be a whole number, but is 2.5'),
-        (MINIMAL.format("seats = true"), 'car.toml: "seats" must be a whole number, but is True'),
-        (MINIMAL.format("electric = 1"), 'car.toml: "electric" must be true or false, but is 1'),
-        (MINIMAL.format("size = [1.0]"), 'car.toml: "size" must be a list of 2, each element a number, but is [1.0]'),
-        (MINIMAL.format("size = [1, nan]"), '"size" must be a list of 2, each element a number, but is [1, nan]'),
-        (MINIMAL.format('doors = ["x"]'), "\"doors\" must be a list, each element a whole number, but is ['x']"),
-        (MINIMAL.format('roof = "shut"'), '"roof" must be "open" or a list of 2, each element a number'),
-        (MINIMAL.format("wheel2 = 1"), 'unknown key "wheel2"; did you mean "wheel"?'),
-        ('name = "a"\nwheel = 3', 'car.toml: "wheel" must be a table, but is 3'),
-        (MINIMAL.format("") + '\nkind = "all"', '"wheel.kind" must be "summer" or "winter", but is \'all\''),
-        (MINIMAL.format("seats = 0"), "car.toml: seats must be positive"),
-        ("name = ", "car.toml: is no valid TOML"),
+        (MINIMAL.format("seets = 3"), 'car.toml: unknown key "training.seets"; did you mean "seats"?'),
+        (MINIMAL.format("") + "\nwidht = 2", 'car.toml: unknown key "training.wheel.widht"; did you mean "width"?'),
+        ('name = "a"', 'car.toml: "training.wheel" is missing; expected a table'),
+        (MINIMAL.format("seats = 2.5"), 'car.toml: "training.seats" must be an integer, but is 2.5'),
+        (MINIMAL.format("seats = true"), 'car.toml: "training.seats" must be an integer, but is True'),
+        (MINIMAL.format("electric = 1"), 'car.toml: "training.electric" must be true or false, but is 1'),
+        (
+            MINIMAL.format("size = [1.0]"),
+            '"training.size" must be a list of 2, each element a number, but is [1.0]',
+        ),
+        (
+            MINIMAL.format("size = [1, nan]"),
+            "each element a number, but is [1, nan]",
+        ),
+        (MINIMAL.format('doors = ["x"]'), "\"training.doors\" must be a list, each element an integer, but is ['x']"),
+        (MINIMAL.format('roof = "shut"'), '"training.roof" must be "open" or a list of 2, each element a number'),
+        (MINIMAL.format("wheel2 = 1"), 'unknown key "training.wheel2"; did you mean "wheel"?'),
+        ('name = "a"\nwheel = 3', 'car.toml: "training.wheel" must be a table, but is 3'),
+        (MINIMAL.format("") + '\nkind = "all"', '"training.wheel.kind" must be "summer" or "winter", but is \'all\''),
+        (MINIMAL.format("seats = 0"), "car.toml: [training]: seats must be positive"),
+        ("name = ", "car.toml: invalid TOML"),
     ],
 )
-def test_a_mistake_gets_one_line_that_names_file_and_key(text: str, message: str) -> None:
+def test_the_error_for_a_mistake_is_one_line_with_file_and_key(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        parse(text)
+        load(tmp_path, text)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -117,9 +127,7 @@ def test_a_mistake_gets_one_line_that_names_file_and_key(text: str, message: str
         ("queries = 900", "querys = 900", 'unknown key "decoder.querys"; did you mean "queries"?'),
     ],
 )
-def test_parts_of_a_model_that_do_not_fit_each_other_are_named(
-    tmp_path: Path, old: str, new: str, message: str
-) -> None:
+def test_values_that_do_not_fit_each_other_are_an_error(tmp_path: Path, old: str, new: str, message: str) -> None:
     text = (Path(__file__).parents[1] / "bevcli" / "configs" / "tiny.toml").read_text()
     assert old in text
     path = tmp_path / "mine.toml"
@@ -131,12 +139,12 @@ def test_parts_of_a_model_that_do_not_fit_each_other_are_named(
 
 
 @pytest.mark.parametrize("name", ["huge", "nowhere/x.toml"])
-def test_an_unknown_model_names_the_known_ones(name: str) -> None:
+def test_the_error_for_an_unknown_model_names_the_known_ones(name: str) -> None:
     with pytest.raises(ConfigError, match=r"base.*small.*tiny"):
         load_config(name)
 
 
-def test_a_file_that_is_no_text_is_named(tmp_path: Path) -> None:
+def test_the_error_for_a_file_that_is_not_text_names_the_file(tmp_path: Path) -> None:
     path = tmp_path / "bytes.toml"
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ConfigError, match=r"bytes\.toml: cannot be read"):

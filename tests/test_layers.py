@@ -20,7 +20,7 @@ LAYERS = (
     {"viewer"},
     {"pipeline"},
     {"rig", "synth"},
-    {"training", "benchmark"},
+    {"training", "benchmark", "explain"},
     {"cli"},
     {"__main__"},
 )

@@ -1,1 +1,1 @@
-"""How fast a model runs here, stage by stage, beside what the machine could do at most."""
+"""The speed of a model on this machine, stage by stage, next to the machine's peak throughput."""

@@ -1,13 +1,20 @@
-"""What the machine can do at most, measured: the rate of matrix products and the rate of copying memory."""
+"""The machine's peak throughput, measured, and the number of operations of a frame, counted."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
+from torch import Tensor
+from torch.utils.flop_counter import FlopCounterMode
 
+from bevcli.model.bevformer import BEVFormer, BEVFormerConfig
+from bevcli.model.deformable_attention import FeatureMaps
+from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.prepared import DTYPES, Precision
 
 # Edge of the square matrices and floats of the copied block: large enough for full speed, small enough to be quick.
@@ -15,21 +22,29 @@ CPU_EDGE, GPU_EDGE = 2048, 8192
 COPIED_FLOATS = 1 << 26
 REPEATS = 8
 
+# Bilinear sampling: a product and a sum for each of four neighbours, then a product and a sum with the weight.
+OPERATIONS_PER_SAMPLE = 4 * 2 + 2
+
 
 @dataclass(frozen=True)
 class MachineLimits:
-    """gemm_gflops: of matrix products, 10^9 operations a second. copy_gbs: 10^9 bytes a second, read plus written."""
+    """Peak throughput.
+
+    Attributes:
+        gemm_gflops: rate of matrix products, 10^9 operations a second.
+        copy_gbs: rate of copying memory, 10^9 bytes a second, read plus written.
+    """
 
     gemm_gflops: float
     copy_gbs: float
 
     def fastest(self, other: MachineLimits) -> MachineLimits:
-        """The higher of two measurements: disturbances only slow down."""
+        """The higher of two measurements; disturbances only make a measurement lower."""
         return MachineLimits(max(self.gemm_gflops, other.gemm_gflops), max(self.copy_gbs, other.copy_gbs))
 
 
 def measure_limits(device: torch.device, precision: Precision) -> MachineLimits:
-    """Best of some matrix products at that precision, and of some copies, on a device."""
+    """The best of several matrix products in a precision, and of several copies, on a device."""
     edge = GPU_EDGE if device.type == "cuda" else CPU_EDGE
     matrix = torch.randn(edge, edge, device=device).to(DTYPES[precision])
     product = torch.empty_like(matrix)
@@ -37,6 +52,33 @@ def measure_limits(device: torch.device, precision: Precision) -> MachineLimits:
     gemm_s = _best_seconds(lambda: torch.mm(matrix, matrix, out=product), device)
     copy_s = _best_seconds(lambda: target.copy_(source), device)
     return MachineLimits(2 * edge**3 / gemm_s / 1e9, 2 * 4 * COPIED_FLOATS / copy_s / 1e9)
+
+
+def wait_for(device: torch.device) -> None:
+    """Returns when a GPU has finished all queued work; at once on a CPU."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def count_operations(config: BEVFormerConfig, hits_per_camera: tuple[int, ...]) -> float:
+    """Arithmetic operations of one frame with history; a multiplication and an addition are two.
+
+    Counts matrix products, convolutions, attention and sampling of the plain model. The shapes are enough for this:
+    nothing is computed.
+
+    Args:
+        config: the model.
+        hits_per_camera: number of BEV cells that each camera sees.
+    """
+    counter = FlopCounterMode(display=False, custom_mapping={torch.ops.aten.grid_sampler_2d: _sampling_operations})
+    with torch.device("meta"), counter:
+        model = BEVFormer(config).eval().requires_grad_(False)
+        width, height = config.image.padded_size
+        maps = model.neck(model.backbone(torch.empty(len(hits_per_camera), 3, height, width)))
+        tokens = model.image_tokens(maps, torch.zeros(len(hits_per_camera), dtype=torch.int64))
+        bev = _encode(model, tokens, hits_per_camera)
+        model.decoder(bev, model.detection_head)
+    return float(counter.get_total_flops())
 
 
 def _best_seconds(work: Callable[[], object], device: torch.device) -> float:
@@ -51,7 +93,20 @@ def _best_seconds(work: Callable[[], object], device: torch.device) -> float:
     return best
 
 
-def wait_for(device: torch.device) -> None:
-    """Returns once a GPU has done all that it was given."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
+def _encode(model: BEVFormer, tokens: FeatureMaps, hits_per_camera: tuple[int, ...]) -> Tensor:
+    """The encoder on tensors of the right shapes."""
+    grid, total = model.config.bev_grid, sum(hits_per_camera)
+    hits = PillarHits(
+        cell=torch.zeros(total, dtype=torch.int64),
+        reference_points=torch.empty(total, grid.pillar_points, 2),
+        hits_per_camera=hits_per_camera,
+        cameras_per_cell=torch.ones(grid.rows * grid.columns, dtype=torch.int64),
+    )
+    query = model.bev_queries(torch.empty(1, 18))
+    history = torch.empty(1, grid.rows * grid.columns, model.config.channels)
+    return model.encoder(query, model.bev_queries.position(), tokens, hits, history, torch.empty(1, 2))
+
+
+def _sampling_operations(*_shapes: Any, out_val: Any = None, out_shape: Any = None, **_options: Any) -> int:
+    shape = out_val.shape if out_val is not None else out_shape
+    return OPERATIONS_PER_SAMPLE * math.prod(shape)

@@ -1,4 +1,4 @@
-"""The benchmark itself: warm up, time every stage, compare with the plain version and with the machine's limits."""
+"""The benchmark: times every stage, and compares with the plain version and with the machine's peak throughput."""
 
 from __future__ import annotations
 
@@ -18,28 +18,31 @@ from statistics import median
 import torch
 
 from bevcli.benchmark.comparison import compare_with_plain
-from bevcli.benchmark.limits import measure_limits
-from bevcli.benchmark.made_up_drive import MadeUpDrive
-from bevcli.benchmark.made_up_model import made_up_model
-from bevcli.benchmark.operations import count_operations
+from bevcli.benchmark.limits import count_operations, measure_limits
+from bevcli.benchmark.made_up import MadeUpDrive, made_up_model
 from bevcli.benchmark.result import BenchmarkResult
 from bevcli.benchmark.version import Version
 from bevcli.model.bevformer import BEVFormer, BEVFormerConfig
-from bevcli.model.pillar_projection import find_hits, project_pillars
 from bevcli.model.prepared import Precision, prepare_for_inference
 from bevcli.pipeline.model_loading import Model
 from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
 from bevcli.recording.writer import Recording
 
-WARM_UP_FRAMES = 2  # the second is the first with history
-MIN_RUN_FRAMES = 3  # of the run with reading and recording; its first frame does not count
+WARM_UP_FRAMES = 2  # one without and one with history
+MIN_RUN_FRAMES = 3  # of the run with reading and recording, whose first frame is not timed
 
 
 @dataclass(frozen=True)
 class BenchmarkSettings:
-    """frames: that are timed, after the warm-up. against_plain: whether the plain version runs beside the fast one.
+    """What is measured.
 
-    profile: where PyTorch's profile of one frame is written (Chrome's trace format).
+    Attributes:
+        config: the model.
+        device: where it runs.
+        precision: of the prepared model.
+        frames: number of timed frames, after the warm-up.
+        against_plain: whether the plain version is timed too, and the results compared.
+        profile: where to write PyTorch's profile of one frame (Chrome's trace format), None for no profile.
     """
 
     config: BEVFormerConfig
@@ -51,7 +54,7 @@ class BenchmarkSettings:
 
 
 def run_benchmark(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Everything, one after the other; nothing else should run on the machine."""
+    """Runs all measurements one after another. Nothing else should run on the machine."""
     config, device = settings.config, settings.device
     limits = measure_limits(device, settings.precision)
     model = made_up_model(config)
@@ -82,7 +85,7 @@ def run_benchmark(settings: BenchmarkSettings) -> BenchmarkResult:
 
 
 def describe_machine(device: torch.device) -> str:
-    """Processor or GPU, threads and PyTorch's version, in words."""
+    """Name of the processor or GPU, number of threads and PyTorch's version."""
     if device.type == "cuda":
         return f"{torch.cuda.get_device_name(device)}, PyTorch {torch.__version__}"
     cpu = Path("/proc/cpuinfo")
@@ -94,7 +97,7 @@ def describe_machine(device: torch.device) -> str:
 
 
 def _time_stages(fast: Version, drive: MadeUpDrive, frames: int) -> dict[str, tuple[float, ...]]:
-    """Seconds of each stage of each frame, the warm-up left out; one stage at a time."""
+    """Seconds of each stage of each frame after the warm-up; no two stages run at the same time."""
     preprocessor = Preprocessor(fast.runner.config)
     times: dict[str, list[float]] = defaultdict(list)
     with _recording(drive, fast) as recording:
@@ -118,7 +121,7 @@ def _time_stages(fast: Version, drive: MadeUpDrive, frames: int) -> dict[str, tu
 
 
 def _time_run(fast: Version, drive: MadeUpDrive, frames: int) -> float:
-    """The median seconds of a frame where reading and recording go on beside the model, as in `bevcli run`."""
+    """Median seconds of a frame while other threads read and record, as in `bevcli run`."""
     done = []
     with _recording(drive, fast) as recording:
         for frame, prediction, _ in fast.runner.run(drive, range(frames), Preprocessor(fast.runner.config)):
@@ -150,12 +153,11 @@ def _prepared(drive: MadeUpDrive, config: BEVFormerConfig, place: int) -> Prepar
 
 def _hits(model: BEVFormer, prepared: PreparedFrame) -> tuple[int, ...]:
     size = (prepared.images.shape[-2], prepared.images.shape[-1])
-    projection = project_pillars(prepared.image_from_bev, model.pillars.cpu(), size, prepared.has_image)
-    return find_hits(projection).hits_per_camera
+    return model.pillars(prepared.image_from_bev, size, prepared.has_image).hits_per_camera
 
 
 def _peak_memory(device: torch.device) -> int:
-    """Bytes: of the whole process on the CPU, of tensors on a GPU."""
+    """Peak memory in bytes: of the whole process on a CPU, of tensors on a GPU."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

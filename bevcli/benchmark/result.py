@@ -1,4 +1,4 @@
-"""What a benchmark found out: one frozen value, as JSON and as lines to read."""
+"""The result of a benchmark, as JSON and as text."""
 
 from __future__ import annotations
 
@@ -11,10 +11,13 @@ from bevcli.benchmark.limits import MachineLimits
 
 @dataclass(frozen=True)
 class Comparison:
-    """The fast version beside the plain one, on the same frames.
+    """The fast version compared with the plain one, over all object queries of all frames.
 
-    plain_frame_s: of each frame. Over all object queries of all frames: how far apart the centres of the boxes are
-    (m), the share of them that are within 0.1 m, and how far apart the scores are.
+    Attributes:
+        plain_frame_s: seconds of each frame of the plain version.
+        max_box_difference_m: largest distance between the two versions' box centres.
+        share_within_tenth_m: share of the box centres that are within 0.1 m of each other.
+        max_score_difference: largest difference of scores.
     """
 
     plain_frame_s: tuple[float, ...]
@@ -25,10 +28,20 @@ class Comparison:
 
 @dataclass(frozen=True)
 class BenchmarkResult:
-    """machine: in words. stages_s: stage -> seconds of each frame, each stage alone on the machine.
+    """All measurements of one model.
 
-    frame_s: the model's step of each frame, from network input to boxes. run_frame_s: seconds a frame of a whole run,
-    where decoding, preprocessing and recording go on beside the model. operations: of one frame.
+    Attributes:
+        model: its name.
+        device: "cpu" or "cuda".
+        precision: of the prepared model.
+        machine: description of processor or GPU, threads and PyTorch's version.
+        stages_s: stage -> seconds of each frame; no two stages ran at the same time.
+        frame_s: seconds of the model's step for each frame, from network inputs to boxes.
+        run_frame_s: median seconds of a frame in a whole run, where other threads decode, preprocess and record.
+        peak_memory_bytes: of the process on a CPU, of tensors on a GPU.
+        operations: arithmetic operations of one frame.
+        limits: the machine's peak throughput.
+        comparison: with the plain version, None where that was not run.
     """
 
     model: str
@@ -45,16 +58,16 @@ class BenchmarkResult:
 
     @property
     def times_limit(self) -> float:
-        """The frame's time over that of its operations at the rate of matrix products."""
+        """The frame's time divided by the time of its operations at the peak rate of matrix products."""
         return median(self.frame_s) / (self.operations / (self.limits.gemm_gflops * 1e9))
 
     @property
     def speedup(self) -> float | None:
-        """The plain version's median frame time over the fast one's."""
+        """The plain version's median frame time divided by the fast version's."""
         return median(self.comparison.plain_frame_s) / median(self.frame_s) if self.comparison else None
 
     def as_data(self) -> dict[str, object]:
-        """What --json prints."""
+        """The object that --json prints."""
         frame_s = median(self.frame_s)
         data: dict[str, object] = {
             "model": self.model,
@@ -85,21 +98,23 @@ class BenchmarkResult:
         return data
 
     def text(self) -> str:
-        """The same for a person, stage by stage."""
+        """A table of the stages, then one line for each other measurement."""
         lines = [f"{self.model}, {self.precision}, {self.machine}", ""]
         lines.append(f"{'stage':<22}{'median ms':>10}  fastest to slowest")
         for stage, times in {**self.stages_s, "whole frame": self.frame_s}.items():
             low, middle, high = (1000 * seconds for seconds in (min(times), median(times), max(times)))
             lines.append(f"{stage:<22}{middle:>10.1f}  {low:.1f} to {high:.1f}")
         frame_s, gemm = median(self.frame_s), self.limits.gemm_gflops
-        run_ms, memory = 1000 * self.run_frame_s, self.peak_memory_bytes / 1e6
+        run_ms, run_ratio, memory = 1000 * self.run_frame_s, self.run_frame_s / frame_s, self.peak_memory_bytes / 1e6
         lines += [
             "",
-            f"{1 / frame_s:.3g} frames a second by the model alone",
-            f"{run_ms:.0f} ms a frame with reading and recording, {self.run_frame_s / frame_s:.2f} times the model's",
-            f"{self.operations / 1e9:.0f} G operations a frame; matrix products run at {gemm:.0f} G a second: "
-            f"the frame takes {self.times_limit:.2f} times as long as that",
-            f"memory is copied at {self.limits.copy_gbs:.1f} GB/s; at most {memory:.0f} MB were in use",
+            f"model alone                {1 / frame_s:.3g} frames per second",
+            f"with reading, recording    {run_ms:.0f} ms per frame, {run_ratio:.2f} times the model alone",
+            f"operations                 {self.operations / 1e9:.0f} G per frame; "
+            f"the frame takes {self.times_limit:.2f} times their time at the peak rate",
+            f"peak rate                  {gemm:.0f} G operations per second (matrix products), "
+            f"{self.limits.copy_gbs:.1f} GB/s (copying)",
+            f"peak memory                {memory:.0f} MB",
         ]
         return "\n".join(lines + self._comparison_lines())
 
@@ -108,7 +123,9 @@ class BenchmarkResult:
             return []
         found = self.comparison
         return [
-            f"the plain version takes {1000 * median(found.plain_frame_s):.0f} ms, {self.speedup:.2f} times as long",
-            f"boxes are at most {found.max_box_difference_m:.2g} m apart, {found.share_within_tenth_m:.1%} of them "
-            f"within 0.1 m; scores at most {found.max_score_difference:.2g}",
+            f"plain version              {1000 * median(found.plain_frame_s):.0f} ms per frame, "
+            f"{self.speedup:.2f} times the prepared model's",
+            f"largest difference to it   {found.max_box_difference_m:.2g} m "
+            f"({found.share_within_tenth_m:.1%} of the boxes within 0.1 m), "
+            f"{found.max_score_difference:.2g} in the scores",
         ]

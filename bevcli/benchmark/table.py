@@ -1,4 +1,4 @@
-"""The table of docs/speed.md: every model at every precision, each in a process of its own."""
+"""The table of docs/speed.md: every model in every precision, each measured in a separate process."""
 
 from __future__ import annotations
 
@@ -34,12 +34,15 @@ COLUMNS: Mapping[str, Callable[[dict[str, Any]], str]] = {
 
 
 def write_table(path: Path, device: torch.device, frames: int) -> None:
-    """Measures and writes the table between its two marks in a Markdown file. Raises BevcliError without marks."""
+    """Measures, and writes the table between the lines BEGIN and END of a Markdown file.
+
+    Raises BevcliError where an existing file lacks these lines.
+    """
     text = path.read_text() if path.is_file() else f"{BEGIN}\n{END}\n"
     before, begin, rest = text.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not (begin and end):
-        raise BevcliError(f"{path}: has no place for the table (expected the lines {BEGIN} and {END})")
+        raise BevcliError(f"{path}: cannot find where to write the table (expected the lines {BEGIN} and {END})")
     precisions = ("bf16", "fp16") if device.type == "cuda" else ("fp32", "bf16")
     results = [_measure(model, precision, device, frames) for model in known_models() for precision in precisions]
     path.write_text(f"{before}{begin}\n{_table(results)}\n{end}{after}")
@@ -49,7 +52,7 @@ def _measure(model: str, precision: str, device: torch.device, frames: int) -> d
     print(f"measuring {model}, {precision} …", file=sys.stderr)
     options = ["--model", model, "--precision", precision, "--device", device.type, "--frames", str(frames)]
     command = [sys.executable, "-m", "bevcli", "bench", *options, "--against", "plain", "--json"]
-    # A process of its own: its peak of memory is the model's.
+    # In a separate process, so that its peak memory is that of this model.
     answer = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
     return json.loads(answer.stdout)
 

@@ -1,4 +1,4 @@
-"""One version of a model under test: its runner, its history, its times and its last answers."""
+"""One version of a model under test, with its history and its times."""
 
 from __future__ import annotations
 
@@ -16,9 +16,13 @@ from bevcli.pipeline.stage_clock import StageClock
 
 
 class Version:
-    """Steps through frames and keeps the state in between.
+    """A version of the model that runs frame after frame.
 
-    seconds: of each step. centers: (Q, 3) metres, and scores: (Q, classes), of the last step's object queries.
+    Attributes:
+        runner: runs the model.
+        seconds: of each timed step.
+        centers: (Q, 3) metres, bev frame, box centres of the last timed step's object queries.
+        scores: (Q, classes) of the same queries.
     """
 
     def __init__(self, model: BEVFormer, device: torch.device) -> None:
@@ -27,27 +31,27 @@ class Version:
         self.seconds: list[float] = []
         self.centers = self.scores = torch.empty(0)
         self._state: BevState | None = None
-        model.register_forward_hook(self._keep)
 
     def step(self, prepared: PreparedFrame) -> Prediction:
-        """One frame, timed until its boxes are there."""
-        wait_for(self.runner.device)
-        began = time.perf_counter()
-        self._state, prediction = self.runner.step(self._state, prepared)
-        wait_for(self.runner.device)
-        self.seconds.append(time.perf_counter() - began)
+        """Runs and times one frame, from its network inputs to its boxes."""
+        with self.runner.model.register_forward_hook(self._keep):
+            wait_for(self.runner.device)
+            began = time.perf_counter()
+            self._state, prediction = self.runner.step(self._state, prepared)
+            wait_for(self.runner.device)
+            self.seconds.append(time.perf_counter() - began)
         return prediction
 
     def warm_up(self, prepared: PreparedFrame) -> None:
-        """One frame, neither timed nor remembered."""
+        """Runs one frame; keeps neither its time nor its BEV map."""
         self.runner.step(self._state, prepared)
 
     def forget_times(self) -> None:
-        """The steps so far were for warming up."""
+        """Drops the times so far."""
         self.seconds = []
 
     def start_anew(self) -> None:
-        """No history and no times."""
+        """Drops the history and the times."""
         self._state = None
         self.forget_times()
 
@@ -57,7 +61,7 @@ class Version:
 
 
 def fine_stages(model: BEVFormer) -> tuple[dict[str, str], dict[str, str]]:
-    """What a StageClock takes to tell the parts of the encoder apart: stages by module, and before modules."""
+    """The `stages` and `starts` of a StageClock that tells the parts of the encoder apart."""
     stages = {"backbone": "backbone", "neck": "neck", "decoder": "decoder and head"}
     parts = {
         "temporal_self_attention": "temporal attention",
@@ -66,6 +70,6 @@ def fine_stages(model: BEVFormer) -> tuple[dict[str, str], dict[str, str]]:
     }
     for layer in range(model.config.encoder.layers):
         stages |= {f"encoder.layers.{layer}.{part}": stage for part, stage in parts.items()}
-    # The last norm belongs to the last feed-forward network; pillars and history are worked out before the encoder.
+    # The last norm of the encoder counts as FFN; pillars and history are computed just before the encoder.
     stages |= {"encoder": "FFN", "segmentation_head": "segmentation head"}
     return stages, {"backbone": "input", "encoder": "projection"}

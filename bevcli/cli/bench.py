@@ -1,4 +1,4 @@
-"""`bevcli bench`: how fast is a model here, and how fast could it be?"""
+"""`bevcli bench`: the speed of a model on this machine."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ def bench(
         Literal["fp32", "bf16", "fp16"] | None,
         typer.Option(help="Default: fp32 on the CPU, bf16 on a GPU.", show_default=False),
     ] = None,
-    frames: Annotated[int, typer.Option(min=1, help="How many frames are timed, after the warm-up.")] = 5,
+    frames: Annotated[int, typer.Option(min=1, help="Number of timed frames, after the warm-up.")] = 5,
     against: Annotated[
         Literal["plain"] | None,
-        typer.Option(help="Also run the plain version, in turn, and compare times and results.", show_default=False),
+        typer.Option(help="Also run the plain version; compare times and results.", show_default=False),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object in place of the lines.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
     profile: Annotated[
         Path | None,
         typer.Option(metavar="OUT", help="Write PyTorch's profile of one frame (open it at chrome://tracing)."),
     ] = None,
     table: Annotated[
         Path | None,
-        typer.Option(metavar="OUT", help="Run all models and precisions, and write the table of docs/speed.md."),
+        typer.Option(metavar="OUT", help="Measure all models in all precisions, and write the table of docs/speed.md."),
     ] = None,
 ) -> None:
-    """Time every stage of a model on made-up images and weights, beside what this machine can do at most.
+    """Time every stage of a model on made-up images and weights, next to this machine's peak throughput.
 
-    The limits are the rates of matrix products and of copying memory, measured in the same run. Nothing else should
-    run on the machine meanwhile.
+    The peak throughput is the rate of matrix products and of copying memory, measured in the same run. Nothing else
+    should run on the machine at the same time.
     """
     import json
 

@@ -17,6 +17,7 @@ from bevcli.cli.bench import bench
 from bevcli.cli.convert import convert
 from bevcli.cli.demo import demo
 from bevcli.cli.eval import evaluate
+from bevcli.cli.explain import explain
 from bevcli.cli.export import export
 from bevcli.cli.project_debug import project_debug
 from bevcli.cli.render import render
@@ -26,6 +27,7 @@ from bevcli.cli.validate import validate
 from bevcli.cli.viz import viz
 from bevcli.cli.weights import weights_app
 from bevcli.errors import BevcliError
+from bevcli.pipeline.cpu_memory import keep_freed_memory
 
 app = typer.Typer(
     help="Run BEVFormer on sequences from any camera rig, and look at the results.",
@@ -54,6 +56,7 @@ app.command()(bench)
 app.command()(convert)
 app.command()(demo)
 app.command("eval")(evaluate)
+app.command()(explain)
 app.command()(export)
 app.command()(project_debug)
 app.command()(render)
@@ -69,6 +72,7 @@ def run_app() -> None:
     # Read when PyTorch is loaded: its threads sleep while they wait, so that a frame on a busy machine is not held up
     # by spinning.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    keep_freed_memory()
     try:
         app()
     except BevcliError as error:

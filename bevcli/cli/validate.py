@@ -46,8 +46,7 @@ def validate(
     import json
 
     from bevcli.cli.progress import Progress
-    from bevcli.evaluation.scores_json import scores_to_json
-    from bevcli.evaluation.scores_table import scores_table
+    from bevcli.evaluation.scores_report import scores_table, scores_to_dict
     from bevcli.pipeline.model_loading import load_model
     from bevcli.pipeline.runner import Runner, StepOptions
     from bevcli.training.drives import count_frames, open_drives, parse_seeds
@@ -60,6 +59,6 @@ def validate(
     with Progress(count_frames(drives), "frames") as progress:
         scores = validate_model(runner, drives, max_range, progress.advance)
     if as_json:
-        print(json.dumps(scores_to_json(scores.detection, scores.config, scores.segmentation), indent=1))
+        print(json.dumps(scores_to_dict(scores.detection, scores.config, scores.segmentation), indent=1))
     else:
         print(f"drives  {len(drives)}\n\n{scores_table(scores.detection, scores.segmentation)}")

@@ -1,4 +1,4 @@
-"""`bevcli weights`: what a file of weights is, and its conversion."""
+"""`bevcli weights`: inspects and converts weights files, and lists the parts of a model."""
 
 from __future__ import annotations
 
@@ -10,34 +10,64 @@ import typer
 
 if TYPE_CHECKING:
     from bevcli.checkpoints import CheckpointSummary
+    from bevcli.model.parts import ModelPart
 
-weights_app = typer.Typer(help="Look at files of weights, and convert them.", no_args_is_help=True)
+weights_app = typer.Typer(help="Inspect and convert weights files.", no_args_is_help=True)
 
 
 @weights_app.command()
 def inspect(
-    file: Annotated[Path, typer.Argument(help="An official .pth as published, or a .safetensors.")],
+    file: Annotated[
+        Path | None, typer.Argument(help="An official .pth as published, or a .safetensors.", show_default=False)
+    ] = None,
+    model: Annotated[
+        str | None,
+        typer.Option(
+            help="List the parts of this model, tiny, small, base or a FILE.toml; FILE must fit it.", show_default=False
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Say what FILE is: which of our models it fits, tensors, size, and what it states of its training."""
-    from bevcli.checkpoints import inspect as inspect_file
+    """Print what FILE contains: the models that it fits, tensors, size and metadata.
 
-    summary = inspect_file(file)
-    print(json.dumps(_as_data(summary), indent=1) if as_json else _as_text(summary))
+    With --model, with or without FILE, print the model's parts in the paper's terms (backbone, BEV queries, attentions,
+    detection head, …) with the shapes of their weights and the number of their parameters.
+    """
+    from bevcli.checkpoints import expected_state, read_checkpoint, require_fit
+    from bevcli.checkpoints import inspect as inspect_file
+    from bevcli.config import load_config
+    from bevcli.model.parts import model_parts
+
+    if file is None and model is None:
+        raise typer.BadParameter("give FILE, or --model NAME, or both")
+    data: dict[str, object] = {}
+    texts = []
+    if file is not None:
+        summary = inspect_file(file)
+        data |= _as_data(summary)
+        texts.append(_as_text(summary))
+    if model is not None:
+        config = load_config(model)
+        if file is not None:
+            require_fit(read_checkpoint(file), config.name, expected_state(config))
+        parts = model_parts(config)
+        data |= _parts_as_data(config.name, parts)
+        texts.append(_parts_as_text(config.name, parts))
+    print(json.dumps(data, indent=1) if as_json else "\n\n".join(texts))
 
 
 @weights_app.command()
 def convert(
     source: Annotated[Path, typer.Argument(help="An official .pth as published, or a .safetensors.")],
     destination: Annotated[Path, typer.Argument(help="The .safetensors to write.")],
-    force: Annotated[bool, typer.Option("--force", help="Overwrite DESTINATION where it exists.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite DESTINATION if it exists.")] = False,
 ) -> None:
-    """Write SOURCE as .safetensors under our names; it must fit one of our models."""
+    """Write SOURCE as .safetensors with our key names; it must fit one of our models."""
     from bevcli.checkpoints import convert as convert_file
     from bevcli.errors import OutputError
 
     if destination.exists() and not force:
-        raise OutputError(f"{destination}: exists already; give another name, or --force to overwrite it")
+        raise OutputError(f"{destination}: already exists; choose another name, or pass --force to overwrite it")
     print(_as_text(convert_file(source, destination)))
 
 
@@ -56,9 +86,37 @@ def _as_data(summary: CheckpointSummary) -> dict[str, object]:
 def _as_text(summary: CheckpointSummary) -> str:
     lines = [
         f"{summary.path}: {summary.file_bytes / 1e6:.1f} MB, {summary.tensors} tensors, "
-        f"{summary.parameters / 1e6:.1f} M numbers",
-        f"  names of keys   {'the original BEVFormer' if summary.official else 'bevcli'}",
+        f"{summary.parameters / 1e6:.1f} M values",
+        f"  key names       {'the original BEVFormer' if summary.official else 'bevcli'}",
         f"  fits            {', '.join(summary.models) or 'none of our models'}",
     ]
     lines += [f"  {name:<15} {value}" for name, value in summary.facts.items()]
+    return "\n".join(lines)
+
+
+def _parts_as_data(model: str, parts: tuple[ModelPart, ...]) -> dict[str, object]:
+    return {
+        "model": model,
+        "model_parameters": sum(part.parameters for part in parts),
+        "parts": [
+            {
+                "name": part.name,
+                "modules": list(part.modules),
+                "parameters": part.parameters,
+                "shapes": [list(shape) for shape in part.shapes],
+            }
+            for part in parts
+        ],
+    }
+
+
+def _parts_as_text(model: str, parts: tuple[ModelPart, ...]) -> str:
+    from bevcli.model.parts import describe_shapes
+
+    width = max(len(part.name) for part in parts)
+    lines = [f"{f'model {model}':<{width}}  {'parameters':>12}  shapes of the weights"]
+    lines += [
+        f"{part.name:<{width}}  {part.parameters:>12,}  {describe_shapes(part.shapes)}".rstrip() for part in parts
+    ]
+    lines.append(f"{'total':<{width}}  {sum(part.parameters for part in parts):>12,}")
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""Detection scores: boxes in, nuScenes' AP, mAP, true-positive errors and NDS out. No files."""
+"""The nuScenes detection score: AP, mAP, true-positive errors and NDS of boxes. Reads no files."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bevcli.evaluation.class_matches import ClassMatches, match_class
-from bevcli.evaluation.config import MEANINGLESS_ERRORS, DetectionConfig
+from bevcli.evaluation.config import ERRORS, UNDEFINED_ERRORS, DetectionConfig
 from bevcli.evaluation.detection_scores import (
     ClassScores,
     DetectionScores,
@@ -16,27 +15,33 @@ from bevcli.evaluation.detection_scores import (
     ScoreTable,
     VisibilityRecall,
 )
+from bevcli.evaluation.matching import ClassMatches, match_class
 from bevcli.evaluation.precision_recall import recall_curve
 from bevcli.evaluation.scored_boxes import ScoredBoxes, gather
-from bevcli.evaluation.true_positives import true_positive_errors
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.transforms import Array
+from bevcli.geometry.transforms import Array, wrap_angle
 
 
-def evaluate(
+def evaluate_detections(
     predictions: Sequence[Boxes3D],
     ground_truth: Sequence[Boxes3D],
     config: DetectionConfig | None = None,
     ego_xy: ArrayLike | None = None,
 ) -> DetectionScores:
-    """Score F frames.
+    """Score the boxes of F frames.
 
-    predictions: each frame's boxes, with scores. ground_truth: the same frames', in the same frame of reference
-    (another one for every frame, if you like); boxes with num_points 0 are left out. config: default the devkit's.
-    ego_xy: (F, 2) where the ego vehicle stands, metres, for the class ranges; default the origin: ego boxes.
+    Args:
+        predictions: F sets of boxes with scores.
+        ground_truth: F sets of boxes, each in the frame of reference of the predictions of that frame; it may differ
+            from frame to frame. Boxes with num_points 0 are left out.
+        config: parameters of the score. Default: the devkit's.
+        ego_xy: (F, 2), position of the ego vehicle in the frame of reference, metres; class ranges start there.
+            Default: the origin, for boxes in the ego frame.
 
-    Equal to nuScenes devkit 1.2.0 (detection_cvpr_2019): a class without ground truth counts with AP 0 and errors
-    of 1. One thing differs: an error that ground truth states for no box at all is NaN, and left out of NDS.
+    Returns:
+        The scores, equal to those of nuScenes devkit 1.2.0 (detection_cvpr_2019). As there, a class without ground
+        truth has AP 0 and errors of 1. One difference: if no ground truth has a velocity, or none has an attribute,
+        that error is NaN and left out of NDS.
     """
     assert len(predictions) == len(ground_truth)
     config = config or DetectionConfig()
@@ -65,7 +70,7 @@ def evaluate(
 
 
 def _with_points(boxes: ScoredBoxes) -> ScoredBoxes:
-    # On both sides, as the devkit: ground truth that is given as predictions is then perfect.
+    # On both sides, as in the devkit: then ground truth used as predictions has a perfect score.
     assert boxes.boxes.num_points is not None
     return boxes[boxes.boxes.num_points != 0]
 
@@ -81,9 +86,9 @@ def _score_class(part: ClassMatches, config: DetectionConfig, unmeasured: tuple[
     row = config.distances_m.index(config.error_distance_m)
     hits = np.flatnonzero(part.counts[row] & (part.matched[row] >= 0))
     truths = part.ground_truth.boxes[part.matched[row][hits]]
-    errors = true_positive_errors(part.name, truths, part.predictions.boxes[hits])
+    errors = _true_positive_errors(part.name, truths, part.predictions.boxes[hits])
     curve = curves[config.error_distance_m]
-    undefined = {*MEANINGLESS_ERRORS.get(part.name, ()), *unmeasured}
+    undefined = {*UNDEFINED_ERRORS.get(part.name, ()), *unmeasured}
     return ClassScores(
         ground_truth_count=truth_count,
         prediction_count=int(part.counts[row].sum()),
@@ -97,8 +102,35 @@ def _score_class(part: ClassMatches, config: DetectionConfig, unmeasured: tuple[
     )
 
 
+def _true_positive_errors(class_name: str, truth: Boxes3D, found: Boxes3D) -> dict[str, Array]:
+    """The five errors of M matched pairs of one class, each (M,), by the devkit's names.
+
+    trans_err: distance of the centres on the ground, metres.
+    scale_err: 1 - IoU of the boxes with the same centre and heading.
+    orient_err: angle between the headings, radians; front and back of a barrier are the same.
+    vel_err: m/s; NaN where ground truth has no velocity.
+    attr_err: 0 for the right attribute, 1 for a wrong one; NaN where ground truth has none.
+    """
+    offsets = found.centers[:, :2] - truth.centers[:, :2]
+    intersection = np.minimum(truth.sizes_lwh, found.sizes_lwh).prod(axis=1)
+    union = truth.sizes_lwh.prod(axis=1) + found.sizes_lwh.prod(axis=1) - intersection
+    half_turns = 2 if class_name == "barrier" else 1
+    turn = wrap_angle(half_turns * (truth.yaws - found.yaws)) / half_turns
+    assert truth.attributes is not None
+    assert found.attributes is not None
+    wrong = (truth.attributes != found.attributes).astype(np.float64)
+    errors = (
+        np.hypot(offsets[:, 0], offsets[:, 1]),
+        1 - intersection / union,
+        np.abs(turn),
+        np.linalg.norm(found.velocities - truth.velocities, axis=1),
+        np.where(truth.attributes == "", np.nan, wrong),
+    )
+    return dict(zip(ERRORS, errors, strict=True))
+
+
 def _unmeasured(truth: Boxes3D) -> tuple[str, ...]:
-    """The errors for which no box of the ground truth states anything."""
+    """The errors whose quantity no ground truth has."""
     if not len(truth):
         return ()
     assert truth.attributes is not None
@@ -110,7 +142,7 @@ def _unmeasured(truth: Boxes3D) -> tuple[str, ...]:
 
 
 def _recall_by_visibility(matches: Sequence[ClassMatches], config: DetectionConfig) -> tuple[VisibilityRecall, ...]:
-    """The bins' recalls; none where ground truth states no visibility."""
+    """Recall in each bin; empty where ground truth has no visibilities."""
     stated = [part for part in matches if not np.isnan(_visibilities(part)).all()]
     row = config.distances_m.index(config.error_distance_m)
     return tuple(_visibility_recall(stated, row, *ends) for ends in config.visibility_bins if stated)

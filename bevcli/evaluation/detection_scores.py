@@ -1,4 +1,4 @@
-"""What the scoring of detections yields."""
+"""The result of scoring detections."""
 
 from __future__ import annotations
 
@@ -6,17 +6,22 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from bevcli.evaluation.class_matches import ClassMatches
 from bevcli.evaluation.config import ERRORS
+from bevcli.evaluation.matching import ClassMatches
 from bevcli.evaluation.precision_recall import RecallCurve
 
 
 @dataclass(frozen=True)
 class ClassScores:
-    """One class.
+    """The scores of one class.
 
-    recall: the share of ground truth found at the error distance, NaN without ground truth. aps: by matching
-    distance, 0 to 1. errors: by the devkit's names, NaN where undefined. curves: by matching distance.
+    Attributes:
+        ground_truth_count: number of ground truths.
+        prediction_count: number of predictions.
+        recall: share of ground truth that is found at the error distance, 0 to 1; NaN without ground truth.
+        aps: by matching distance in metres, average precision, 0 to 1.
+        errors: by the devkit's names, mean true-positive errors; NaN where undefined.
+        curves: by matching distance in metres.
     """
 
     ground_truth_count: int
@@ -34,7 +39,12 @@ class ClassScores:
 
 @dataclass(frozen=True)
 class ScoreTable:
-    """Classes, and what follows from them together; NaN without any class."""
+    """The scores of several classes and their means; the means are NaN without any class.
+
+    Attributes:
+        classes: by name.
+        mean_ap_weight: weight of mAP in NDS.
+    """
 
     classes: Mapping[str, ClassScores]
     mean_ap_weight: float
@@ -46,29 +56,35 @@ class ScoreTable:
 
     @property
     def errors(self) -> dict[str, float]:
-        """Each error's mean over the classes for which it is defined; NaN where there is none."""
+        """The mean of each error over the classes for which it is defined; NaN without any."""
         return {name: _mean(scores.errors[name] for scores in self.classes.values()) for name in ERRORS}
 
     @property
     def error_scores(self) -> dict[str, float]:
-        """Each error turned into a score: 1 - error, not below 0."""
+        """Each error as a score: 1 - error, at least 0."""
         return {name: value if math.isnan(value) else max(0.0, 1 - value) for name, value in self.errors.items()}
 
     @property
     def nd_score(self) -> float:
-        """NDS, the nuScenes detection score: the weighted mean of mAP and the error scores that are defined."""
+        """NDS, the nuScenes detection score: the weighted mean of mAP and of all defined error scores."""
         known = [score for score in self.error_scores.values() if not math.isnan(score)]
         return (self.mean_ap_weight * self.mean_ap + sum(known)) / (self.mean_ap_weight + len(known))
 
     def of_classes_with_ground_truth(self) -> ScoreTable:
-        """The same without the classes of which there is no ground truth."""
+        """The table of only those classes that have ground truth."""
         kept = {name: scores for name, scores in self.classes.items() if scores.ground_truth_count}
         return ScoreTable(kept, self.mean_ap_weight)
 
 
 @dataclass(frozen=True)
 class RangeScores:
-    """The classes with ground truth from low_m to below high_m from the ego vehicle."""
+    """Scores in a ring around the ego vehicle.
+
+    Attributes:
+        low_m: inner radius, included, metres.
+        high_m: outer radius, excluded, metres.
+        table: the classes that have ground truth in the ring.
+    """
 
     low_m: float
     high_m: float
@@ -77,9 +93,14 @@ class RangeScores:
 
 @dataclass(frozen=True)
 class VisibilityRecall:
-    """Recall at the error distance of ground truth with a visibility from low to below high (the last bin: with it).
+    """Recall at the error distance of ground truth in a range of visibility.
 
-    recalls: by class, of those that have such ground truth.
+    Attributes:
+        low: lower end, included, 0 to 1.
+        high: upper end, excluded unless it is 1.
+        ground_truth_count: number of ground truths in the range.
+        found_count: number of those that are found.
+        recalls: by class, recall of the classes with such ground truth, 0 to 1.
     """
 
     low: float
@@ -90,16 +111,21 @@ class VisibilityRecall:
 
     @property
     def mean_recall(self) -> float:
-        """The mean over the classes, NaN without any."""
+        """The mean recall over the classes; NaN without any."""
         return _mean(self.recalls.values())
 
 
 @dataclass(frozen=True)
 class DetectionScores:
-    """A score of detections.
+    """The scores of detections.
 
-    overall: all classes, as the devkit counts. by_range: nearest first. by_visibility: empty where ground truth
-    states none. unmeasured: the errors that ground truth states for no box. matches: for plots.
+    Attributes:
+        frame_count: number of frames.
+        overall: all classes, as in the devkit.
+        by_range: rings around the ego vehicle, nearest first.
+        by_visibility: ranges of visibility; empty where ground truth has no visibilities.
+        unmeasured: names of errors that cannot be measured, because no ground truth has the quantity.
+        matches: by class, the matching, for plots.
     """
 
     frame_count: int
@@ -111,12 +137,12 @@ class DetectionScores:
 
     @property
     def prediction_count(self) -> int:
-        """Predictions within their classes' ranges."""
+        """Number of predictions inside the ranges of their classes."""
         return sum(scores.prediction_count for scores in self.overall.classes.values())
 
     @property
     def ground_truth_count(self) -> int:
-        """Ground truths within their classes' ranges."""
+        """Number of ground truths inside the ranges of their classes."""
         return sum(scores.ground_truth_count for scores in self.overall.classes.values())
 
 

@@ -1,4 +1,4 @@
-"""Boxes as one CSV table, a row a box."""
+"""Boxes as a CSV table with one row a box."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ COLUMNS = (
 
 
 def write_csv(boxes: BoxesFile, path: Path) -> int:
-    """Write all boxes as they stand, metres and radians, a cell empty where something is unknown.
+    """Write all boxes in their frame of reference, in metres and radians; a cell is empty where a value is unknown.
 
-    Returns the number of rows. Raises OutputError.
+    Returns the number of boxes. Raises OutputError.
     """
     count = 0
     try:

@@ -1,4 +1,4 @@
-"""Boxes as KITTI object labels: one text file a frame, of what one camera sees, in that camera's frame."""
+"""Boxes as KITTI object labels: one text file a frame with the boxes that one camera sees, in the camera frame."""
 
 from __future__ import annotations
 
@@ -11,27 +11,28 @@ from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, apply, inverse, wrap_angle
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
+from bevcli.sequences.files.calibration_file import read_calibration
 
-# KITTI's own types where it has them; names in its style for the others.
+# KITTI's types where it has the class; names in its style for the others.
 KITTI_TYPES = {
     "car": "Car", "truck": "Truck", "construction_vehicle": "ConstructionVehicle", "bus": "Bus",
     "trailer": "Trailer", "barrier": "Barrier", "motorcycle": "Motorcycle", "bicycle": "Cyclist",
     "pedestrian": "Pedestrian", "traffic_cone": "TrafficCone",
 }  # fmt: skip
 OCCLUSION_UNKNOWN = 3
-NEAR_M = 0.1  # edges are cut this far before the camera
+NEAR_M = 0.1  # box edges are clipped at this depth
 
 
 def write_kitti(boxes: BoxesFile, camera: Camera, ego_from_bev: Array, folder: Path) -> int:
-    """Write label_2/NNNNNN.txt and calib/NNNNNN.txt for every frame; NNNNNN is the frame's number.
+    """Write label_2/NNNNNN.txt and calib/NNNNNN.txt for every frame; NNNNNN is the frame's index.
 
-    A box is written where the camera sees a part of it, lens distortion undone. ego_from_bev: (4, 4), of boxes in
-    the bev frame, and for the calibration's lidar. Returns the number of labels. Raises InputError where boxes in
-    the world have no ego pose, or frame numbers repeat, and OutputError.
+    A label is written for each box that is at least partly inside the image without lens distortion. ego_from_bev:
+    (4, 4), for boxes in the bev frame, and as the lidar frame of the calibration. Returns the number of labels. Raises
+    InputError where frame indices repeat, and OutputError.
     """
     numbers = [frame.stamp.index for frame in boxes.frames]
     if len(set(numbers)) < len(numbers):
-        raise InputError("frame numbers repeat, and KITTI's files are named by them: export each scene on its own")
+        raise InputError("frame indices repeat (KITTI's files are named by them): export each scene separately")
     count = 0
     try:
         for name in ("label_2", "calib"):
@@ -48,10 +49,11 @@ def write_kitti(boxes: BoxesFile, camera: Camera, ego_from_bev: Array, folder: P
 
 
 def kitti_labels(boxes_ego: Boxes3D, camera: Camera) -> list[str]:
-    """One line a box that the camera sees, in the boxes' order.
+    """One line for each box that the camera sees, in the order of the boxes.
 
-    type, truncated 0 to 1, occluded (3: unknown), alpha, the 2D box left, top, right, bottom in pixels, height,
-    width, length in metres, the middle of the bottom face in the camera's frame, rotation_y, and the score if any.
+    The fields: type, truncated 0 to 1, occluded (3: unknown), alpha, 2D box (left, top, right, bottom) in pixels,
+    height, width and length in metres, centre of the bottom face in the camera frame, rotation_y, and the score if
+    there is one.
     """
     camera_from_ego = camera.camera_from_ego
     bottoms = boxes_ego.centers - np.stack([np.zeros(len(boxes_ego))] * 2 + [boxes_ego.sizes_lwh[:, 2] / 2], axis=-1)
@@ -75,8 +77,8 @@ def kitti_labels(boxes_ego: Boxes3D, camera: Camera) -> list[str]:
 
 
 def _image_box(corners: Array, camera: Camera) -> tuple[Array, float] | None:
-    """The rectangle around a box's visible part, cut at the image's border, and the share that is cut off."""
-    points = _before_the_camera(corners)
+    """The rectangle around a box's projection, clipped to the image, and the share of its area that is clipped."""
+    points = _in_front_of_camera(corners)
     if not len(points):
         return None
     pixels = (points @ camera.intrinsics.T)[:, :2] / points[:, 2:]
@@ -87,8 +89,8 @@ def _image_box(corners: Array, camera: Camera) -> tuple[Array, float] | None:
     return (cut, float(1 - area / whole_area)) if area > 0 else None
 
 
-def _before_the_camera(corners: Array) -> Array:
-    """The corners (8, 3) before the camera, and where edges pass the plane just before it."""
+def _in_front_of_camera(corners: Array) -> Array:
+    """The corners (8, 3) in front of the camera, and the points where box edges intersect the plane at NEAR_M."""
     points = [corner for corner in corners if corner[2] >= NEAR_M]
     for start, end in BOX_EDGES:
         a, b = corners[start], corners[end]
@@ -97,17 +99,32 @@ def _before_the_camera(corners: Array) -> Array:
     return np.array(points)
 
 
+def read_kitti_camera(calibration: Path, name: str | None) -> tuple[Camera, Array]:
+    """The camera for the labels, and ego_from_bev (4, 4).
+
+    calibration: calibration.json, or a folder that contains it. name: default CAM_FRONT, or else the camera that looks
+    most directly ahead. Raises InputError where there is no such file or camera.
+    """
+    path = calibration / "calibration.json" if calibration.is_dir() else calibration
+    rig = read_calibration(path)
+    if name is None:
+        name = "CAM_FRONT" if "CAM_FRONT" in rig.names else min(rig.cameras, key=lambda camera: abs(camera.yaw)).name
+    if name not in rig.names:
+        raise InputError(f'{path}: has no camera "{name}" (expected one of {", ".join(rig.names)})')
+    return rig[name], rig.ego_from_bev
+
+
 def _in_ego(frame: FrameBoxes, frame_of_reference: str, ego_from_bev: Array) -> Boxes3D:
     if frame_of_reference == "bev":
         return frame.boxes.transformed(ego_from_bev)
     if frame_of_reference == "ego":
         return frame.boxes
-    assert frame.world_from_ego is not None  # read_boxes asks for it
+    assert frame.world_from_ego is not None  # read_boxes requires it
     return frame.boxes.transformed(inverse(frame.world_from_ego.matrix))
 
 
 def _calibration(camera: Camera, ego_from_bev: Array) -> str:
-    """P0 to P3 all this camera's, R0_rect the identity, and the bev frame in the lidar's place."""
+    """KITTI's calibration: P0 to P3 are this camera's, R0_rect is the identity, the lidar frame is the bev frame."""
     projection = np.concatenate([camera.intrinsics, np.zeros((3, 1))], axis=1)
     rows = {f"P{number}": projection for number in range(4)}
     rows["R0_rect"] = np.eye(3)

@@ -1,4 +1,4 @@
-"""What `bevcli eval` is given: predictions and ground truth, from files, folders or a nuScenes root."""
+"""Reads predictions and ground truth from files, folders or a nuScenes root."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.evaluation.pairing import FramePairs
-from bevcli.evaluation.read_submission import is_submission, read_submission
+from bevcli.evaluation.submission import is_submission, read_submission
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose, apply, rigid, rotation_about_z
@@ -23,7 +23,13 @@ from bevcli.sequences.nuscenes.index import NuScenesIndex
 
 @dataclass(frozen=True)
 class ScoredInput:
-    """One side. maps: where there is a folder of them. bicycle_racks: in the world, by sample token."""
+    """Predictions or ground truth.
+
+    Attributes:
+        boxes: by frame.
+        maps: None where there is no folder of maps.
+        bicycle_racks: by sample token, in the world frame; only of a nuScenes root.
+    """
 
     boxes: BoxesFile
     maps: MapFolder | None = None
@@ -31,9 +37,9 @@ class ScoredInput:
 
 
 def open_predictions(path: Path) -> ScoredInput:
-    """A boxes file with scores, the folder of a run that holds predictions.json, or a nuScenes submission.
+    """Read a boxes file with scores, the predictions.json in the folder of a run, or a nuScenes submission.
 
-    Maps are in segmentation/ beside it. Raises InputError where it is missing or wrong, or boxes have no scores.
+    Maps are in segmentation/ next to the file. Raises InputError where it is missing or wrong, or boxes have no scores.
     """
     file = path / "predictions.json" if path.is_dir() else path
     boxes = read_submission(file) if is_submission(file) else read_boxes(file)
@@ -41,15 +47,16 @@ def open_predictions(path: Path) -> ScoredInput:
         if len(frame.boxes) and frame.boxes.scores is None:
             raise InputError(
                 f'{file}: frame {frame.stamp.index}: boxes have no "score" (expected in predictions): '
-                "is this a ground truth?"
+                "is this a ground truth file?"
             )
-    return ScoredInput(boxes, _maps_beside(file, "segmentation"))
+    return ScoredInput(boxes, _maps_next_to(file, "segmentation"))
 
 
 def open_ground_truth(path: Path, choice: NuScenesChoice = NuScenesChoice()) -> ScoredInput:
-    """A boxes file, a native sequence folder with ground_truth.json, or a nuScenes root; maps beside the file.
+    """Read a boxes file, the ground_truth.json in a sequence folder, or a nuScenes root.
 
-    choice: which part of a nuScenes root. Raises InputError where there is no ground truth, or it is wrong.
+    Maps are in ground_truth_map/ next to the file. choice: the part of a nuScenes root; its scene also
+    selects frames of a boxes file. Raises InputError where the ground truth is missing or wrong.
     """
     if path.is_dir() and is_nuscenes_root(path):
         return _open_nuscenes(path, choice)
@@ -60,13 +67,13 @@ def open_ground_truth(path: Path, choice: NuScenesChoice = NuScenesChoice()) -> 
         if not kept:
             raise InputError(f'{file}: has no scene "{choice.scene}"')
         boxes = replace(boxes, frames=kept)
-    return ScoredInput(boxes, _maps_beside(file, "ground_truth_map"))
+    return ScoredInput(boxes, _maps_next_to(file, "ground_truth_map"))
 
 
 def without_cycles_in_racks(pairs: FramePairs, bicycle_racks: Mapping[str, Boxes3D]) -> FramePairs:
-    """Leave out bicycles and motorcycles, found and true, whose middle is in a bicycle rack, as the devkit does.
+    """Leave out bicycles and motorcycles, of both sides, whose centre is in a bicycle rack, as the devkit does.
 
-    bicycle_racks: in the world, as the pairs.
+    bicycle_racks: by sample token, in the world frame, as the pairs.
     """
     if not bicycle_racks:
         return pairs
@@ -90,7 +97,7 @@ def _outside(boxes: Boxes3D, racks: Boxes3D) -> Boxes3D:
     return boxes[~(cycles & inside)]
 
 
-def _maps_beside(file: Path, name: str) -> MapFolder | None:
+def _maps_next_to(file: Path, name: str) -> MapFolder | None:
     folder = file.parent / name
     return open_maps(folder) if folder.is_dir() else None
 
@@ -110,7 +117,7 @@ def _open_nuscenes(root: Path, choice: NuScenesChoice) -> ScoredInput:
 def _nuscenes_frame(index: NuScenesIndex, scene: int, sample: int, number: int, tables: Path) -> FrameBoxes:
     boxes = index.ground_truth(sample)
     if boxes is None:
-        raise InputError(f"{tables}: has no annotations (the test split?): nothing to score against")
+        raise InputError(f"{tables}: has no annotations (expected for scoring): choose another split than test")
     samples = index.samples
     return FrameBoxes(
         FrameStamp(number, str(index.scenes.names[scene]), int(samples.times_us[sample]) * 1000),

@@ -1,54 +1,118 @@
-"""Which prediction finds which ground truth: greedily by score within each frame, as the nuScenes devkit does."""
+"""Greedy matching of predictions and ground truth: the rule of the nuScenes devkit."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.scored_boxes import ScoredBoxes
 from bevcli.geometry.transforms import Array
 
 
-def by_falling_score(scores: Array) -> NDArray[np.int64]:
-    """(P,) the order in which predictions choose; among equal scores the later one comes first, as in the devkit."""
+@dataclass(frozen=True)
+class ClassMatches:
+    """The matching of one class: G ground truths and P predictions at D matching distances.
+
+    Attributes:
+        name: of the class.
+        ground_truth: G boxes.
+        predictions: P boxes, sorted by descending score.
+        matched: (D, P), the index of the ground truth that each prediction matches, -1 for a false positive.
+        truth_counts: (G,), bool, the ground truths that are scored.
+        counts: (D, P), bool, the predictions that are scored.
+    """
+
+    name: str
+    ground_truth: ScoredBoxes
+    predictions: ScoredBoxes
+    matched: NDArray[np.int64]
+    truth_counts: NDArray[np.bool_]
+    counts: NDArray[np.bool_]
+
+    def within(self, low_m: float, high_m: float) -> ClassMatches:
+        """The same matching, scored only from low_m to below high_m from the ego vehicle.
+
+        A true positive counts where its ground truth is, a false positive where it is itself, so that no pair is split.
+        """
+        truth_inside = _inside(self.ground_truth.ranges_m, low_m, high_m)
+        prediction_inside = _inside(self.predictions.ranges_m, low_m, high_m)
+        counts = np.broadcast_to(prediction_inside, self.matched.shape).copy()
+        is_match = self.matched >= 0
+        counts[is_match] = truth_inside[self.matched[is_match]]
+        return replace(self, truth_counts=truth_inside, counts=counts)
+
+    def found(self, row: int) -> NDArray[np.bool_]:
+        """(G,), which ground truths are matched. row: index of the matching distance."""
+        found = np.zeros(len(self.ground_truth), dtype=bool)
+        found[self.matched[row][self.matched[row] >= 0]] = True
+        return found
+
+
+def match_class(
+    name: str, ground_truth: ScoredBoxes, predictions: ScoredBoxes, config: DetectionConfig
+) -> ClassMatches:
+    """Match the boxes of one class that are inside the range of the class."""
+    limit = config.class_ranges_m[name]
+    truth = ground_truth[(ground_truth.boxes.classes == name) & (ground_truth.ranges_m < limit)]
+    found = predictions[(predictions.boxes.classes == name) & (predictions.ranges_m < limit)]
+    assert found.boxes.scores is not None
+    found = found[descending_scores(found.boxes.scores)]
+    matched = match_greedily(truth, found, config.distances_m)
+    return ClassMatches(name, truth, found, matched, np.ones(len(truth), bool), np.ones(matched.shape, bool))
+
+
+def descending_scores(scores: Array) -> NDArray[np.int64]:
+    """(P,), indices that sort by descending score; of equal scores the later one is first, as in the devkit."""
     return np.argsort(scores, kind="stable")[::-1]
 
 
-def match(ground_truth: ScoredBoxes, predictions: ScoredBoxes, distances_m: tuple[float, ...]) -> NDArray[np.int64]:
-    """Match one class's boxes by the horizontal distance of their centres, for each of D limits on its own.
+def match_greedily(
+    ground_truth: ScoredBoxes, predictions: ScoredBoxes, distances_m: tuple[float, ...]
+) -> NDArray[np.int64]:
+    """Match boxes of one class by the distance of their centres on the ground.
 
-    predictions: P boxes in the order of `by_falling_score`. Each takes the nearest ground truth of its frame that
-    is still free, if that is closer than the limit. Returns (D, P) indices into `ground_truth`, -1 for no match.
+    ground_truth: G boxes. predictions: P boxes in the order of `descending_scores`. distances_m: D matching distances,
+    each matched independently.
 
-    All frames take one step at a time: the best prediction of every frame, then the second best, and so on.
+    Each prediction in turn takes the nearest free ground truth of its frame, if that is closer than the matching
+    distance. Returns (D, P) indices into `ground_truth`, -1 without a match.
+
+    All frames are processed together: first the best prediction of every frame, then the second best, and so on.
     """
     matched = np.full((len(distances_m), len(predictions)), -1)
     if not len(ground_truth) or not len(predictions):
         return matched
     frame_count = int(max(ground_truth.frames.max(), predictions.frames.max())) + 1
-    slots = _slots(ground_truth.frames, frame_count)  # (F, K) indices into ground_truth, -1: empty
-    rounds = _slots(predictions.frames, frame_count)  # (F, R) indices into predictions, best first
+    truths_of = _indices_by_frame(ground_truth.frames, frame_count)  # (F, K)
+    predictions_of = _indices_by_frame(predictions.frames, frame_count)  # (F, R), best first
     centers = ground_truth.boxes.centers[:, :2]
-    free = np.broadcast_to(slots >= 0, (len(distances_m), *slots.shape)).copy()  # (D, F, K)
-    for turn in range(rounds.shape[1]):
-        frames = np.flatnonzero((rounds[:, turn] >= 0) & (slots[:, 0] >= 0))
-        chosen = rounds[frames, turn]
-        offsets = centers[slots[frames]] - predictions.boxes.centers[chosen, None, :2]
+    free = np.broadcast_to(truths_of >= 0, (len(distances_m), *truths_of.shape)).copy()  # (D, F, K)
+    for turn in range(predictions_of.shape[1]):
+        frames = np.flatnonzero((predictions_of[:, turn] >= 0) & (truths_of[:, 0] >= 0))  # (A,)
+        chosen = predictions_of[frames, turn]
+        offsets = centers[truths_of[frames]] - predictions.boxes.centers[chosen, None, :2]
         distance = np.hypot(offsets[..., 0], offsets[..., 1])  # (A, K)
         for row, limit in enumerate(distances_m):
-            reachable = np.where(free[row, frames], distance, np.inf)
-            nearest = reachable.argmin(axis=1)
-            hit = reachable[np.arange(len(frames)), nearest] < limit
-            free[row, frames[hit], nearest[hit]] = False
-            matched[row, chosen[hit]] = slots[frames[hit], nearest[hit]]
+            candidates = np.where(free[row, frames], distance, np.inf)
+            nearest = candidates.argmin(axis=1)
+            is_match = candidates[np.arange(len(frames)), nearest] < limit
+            free[row, frames[is_match], nearest[is_match]] = False
+            matched[row, chosen[is_match]] = truths_of[frames[is_match], nearest[is_match]]
     return matched
 
 
-def _slots(frames: NDArray[np.int64], frame_count: int) -> NDArray[np.int64]:
-    """(F, K) the indices of each frame's members in their order, filled up with -1."""
+def _indices_by_frame(frames: NDArray[np.int64], frame_count: int) -> NDArray[np.int64]:
+    """(F, K), the indices of each frame's boxes in their order, padded with -1."""
     counts = np.bincount(frames, minlength=frame_count)
     order = np.argsort(frames, kind="stable")
     starts = np.cumsum(counts) - counts
     table = np.full((frame_count, int(counts.max())), -1)
     table[frames[order], np.arange(len(frames)) - starts[frames[order]]] = order
     return table
+
+
+def _inside(values: Array, low: float, high: float) -> NDArray[np.bool_]:
+    return (values >= low) & (values < high)

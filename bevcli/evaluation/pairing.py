@@ -1,4 +1,4 @@
-"""Which frame of the predictions belongs to which frame of the ground truth, and both in one frame of reference."""
+"""Pairs the frames of predictions and ground truth, and moves their boxes into one frame of reference."""
 
 from __future__ import annotations
 
@@ -18,12 +18,19 @@ from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 
 @dataclass(frozen=True)
 class FramePairs:
-    """F frames that are scored, in the predictions' order.
+    """F frames that are scored, in the order of the predictions.
 
-    frame_of_reference: "world", "ego" or "bev", of all boxes here. predictions, ground_truth: boxes by frame.
-    reference_from_ego: (F, 4, 4) where the ego vehicle stands in it. ego_pose_known: one side at least states poses.
-    prediction_stamps, ground_truth_stamps: when, by each side's own count. sample_tokens: of the ground truth.
-    matched_by: what the frames agree in. notes: what the user should know of it, one line each.
+    Attributes:
+        frame_of_reference: of all boxes, "world", "ego" or "bev".
+        predictions: F sets of boxes.
+        ground_truth: F sets of boxes.
+        reference_from_ego: (F, 4, 4), pose of the ego vehicle in the frame of reference.
+        ego_pose_known: whether each frame has an ego pose on at least one side.
+        prediction_stamps: F stamps of the predictions' frames.
+        ground_truth_stamps: F stamps of the ground truth's frames.
+        sample_tokens: F tokens of the ground truth's frames, None where unknown.
+        matched_by: the key by which frames were paired.
+        notes: messages for the user, one line each.
     """
 
     frame_of_reference: str
@@ -39,27 +46,28 @@ class FramePairs:
 
     @property
     def ego_xy(self) -> Array:
-        """(F, 2) the ego vehicle's place in the frame of reference, metres."""
+        """(F, 2), position of the ego vehicle in the frame of reference, metres."""
         return self.reference_from_ego[:, :2, 3]
 
 
-# What may identify a frame, the surest first; the first one that both sides have in common is taken.
+# Keys that identify a frame, the most reliable first; the first one with common values is used.
 _KEYS: tuple[tuple[str, Callable[[FrameBoxes], Hashable]], ...] = (
     ("sample_token", lambda frame: frame.extras.get("sample_token")),
     ("scene and timestamp_ns", lambda frame: (frame.stamp.scene, frame.stamp.timestamp_ns)),
     ("timestamp_ns", lambda frame: frame.stamp.timestamp_ns),
-    ("scene and frame number", lambda frame: (frame.stamp.scene, frame.stamp.index)),
-    ("frame number", lambda frame: frame.stamp.index),
+    ("scene and frame index", lambda frame: (frame.stamp.scene, frame.stamp.index)),
+    ("frame index", lambda frame: frame.stamp.index),
 )
-_SURE = ("sample_token", "scene and timestamp_ns")
+_RELIABLE = ("sample_token", "scene and timestamp_ns")
 
 
 def pair_frames(predictions: BoxesFile, ground_truth: BoxesFile, *, count_missing: bool = False) -> FramePairs:
-    """Bring two files together.
+    """Pair the frames of two files.
 
-    Frames on one side only are left out, and counted in the notes; with count_missing, those of the ground truth
-    stay as frames without any prediction. Where one file is in the world and the other in the ego or bev frame,
-    all boxes move to the world. Raises InputError where no frame is common, or a pose for the move is missing.
+    Frames of only one file are left out, which a note reports; with count_missing, those of the ground truth are kept
+    as frames without predictions. Where one file is in the world frame and the other in the ego or bev frame, all boxes
+    are transformed to the world frame. Raises InputError where the files have no frame in common, or a pose for the
+    transformation is missing.
     """
     matched_by, pairs = _common_frames(predictions.frames, ground_truth.frames)
     notes = _notes(matched_by, len(pairs), len(predictions.frames), len(ground_truth.frames), count_missing)
@@ -73,11 +81,11 @@ def pair_frames(predictions: BoxesFile, ground_truth: BoxesFile, *, count_missin
     return FramePairs(
         frame_of_reference=reference,
         predictions=tuple(
-            _moved(prediction, predictions, reference, prediction.world_from_ego or pose)
+            _transformed(prediction, predictions, reference, prediction.world_from_ego or pose)
             for (prediction, _), pose in zip(pairs, poses, strict=True)
         ),
         ground_truth=tuple(
-            _moved(true, ground_truth, reference, pose) for (_, true), pose in zip(pairs, poses, strict=True)
+            _transformed(true, ground_truth, reference, pose) for (_, true), pose in zip(pairs, poses, strict=True)
         ),
         reference_from_ego=np.stack([_reference_from_ego(reference, pose, ego_from_bev) for pose in poses]),
         ego_pose_known=all(pose is not None for pose in poses),
@@ -94,7 +102,7 @@ def _common_frames(
 ) -> tuple[str, list[tuple[FrameBoxes, FrameBoxes]]]:
     for name, side in (("predictions", predictions), ("ground truth", ground_truth)):
         if not side:
-            raise InputError(f"the {name} hold no frame at all: nothing to score")
+            raise InputError(f"the {name} contain no frame (expected at least one)")
     for matched_by, key in _KEYS:
         of_truth, of_predictions = ([key(frame) for frame in side] for side in (ground_truth, predictions))
         if _ambiguous(of_truth) or _ambiguous(of_predictions):
@@ -105,7 +113,7 @@ def _common_frames(
             return matched_by, pairs
     raise InputError(
         f"predictions and ground truth have no frame in common: predictions start with {_described(predictions[0])}, "
-        f"ground truth with {_described(ground_truth[0])}: are both of the same drive?"
+        f"ground truth with {_described(ground_truth[0])}: check that both belong to the same drive"
     )
 
 
@@ -126,30 +134,30 @@ def _common_frame_of_reference(one: BoxesFile, other: BoxesFile) -> str:
     return "bev" if references == {"bev"} and not (one.ego_from_bev and other.ego_from_bev) else "ego"
 
 
-def _moved(frame: FrameBoxes, file: BoxesFile, reference: str, world_from_ego: Pose | None) -> Boxes3D:
+def _transformed(frame: FrameBoxes, file: BoxesFile, reference: str, world_from_ego: Pose | None) -> Boxes3D:
     if file.frame_of_reference == reference:
         return frame.boxes
     ego_from_boxes = np.eye(4)
     if file.frame_of_reference == "bev":
         if file.ego_from_bev is None:
             raise InputError(
-                f"frame {frame.stamp.index}: boxes in the bev frame cannot be moved to the {reference} frame: state "
-                '"ego_from_bev" in the boxes file'
+                f"frame {frame.stamp.index}: boxes in the bev frame cannot be transformed to the {reference} frame: "
+                'add "ego_from_bev" to the boxes file'
             )
         ego_from_boxes = file.ego_from_bev.matrix
     if reference == "ego":
         return frame.boxes.transformed(ego_from_boxes)
     if world_from_ego is None:
         raise InputError(
-            f"frame {frame.stamp.index}: boxes in the {file.frame_of_reference} frame cannot be moved to the world: "
-            '"world_from_ego" is missing on both sides'
+            f"frame {frame.stamp.index}: boxes in the {file.frame_of_reference} frame cannot be transformed to the "
+            'world frame: "world_from_ego" is missing in predictions and ground truth'
         )
     return frame.boxes.transformed(world_from_ego.matrix @ ego_from_boxes)
 
 
 def _reference_from_ego(reference: str, world_from_ego: Pose | None, ego_from_bev: Pose | None) -> Array:
     if reference == "world":
-        assert world_from_ego is not None  # boxes could not have been moved without
+        assert world_from_ego is not None  # otherwise the boxes could not have been transformed
         return world_from_ego.matrix
     if reference == "bev":
         return inverse(ego_from_bev.matrix if ego_from_bev else default_ego_from_bev())
@@ -158,11 +166,11 @@ def _reference_from_ego(reference: str, world_from_ego: Pose | None, ego_from_be
 
 def _notes(matched_by: str, pairs: int, predictions: int, ground_truth: int, count_missing: bool) -> tuple[str, ...]:
     notes = []
-    if matched_by not in _SURE:
-        notes.append(f"times or scenes differ between the files: frames are matched by {matched_by}")
+    if matched_by not in _RELIABLE:
+        notes.append(f"timestamps or scenes differ between the files: frames are matched by {matched_by}")
     if pairs < ground_truth:
-        fate = "all their boxes count as missed" if count_missing else "left out (--count-missing counts them)"
-        notes.append(f"{ground_truth - pairs} of {ground_truth} ground-truth frames have no prediction: {fate}")
+        treatment = "all their boxes count as missed" if count_missing else "left out (--count-missing counts them)"
+        notes.append(f"{ground_truth - pairs} of {ground_truth} ground-truth frames have no prediction: {treatment}")
     if pairs < predictions:
         notes.append(f"{predictions - pairs} of {predictions} predicted frames have no ground truth: left out")
     return tuple(notes)

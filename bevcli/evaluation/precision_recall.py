@@ -1,4 +1,4 @@
-"""Precision, score and errors along the recall, and what is read from them (nuScenes devkit 1.2.0, its formulas)."""
+"""Precision and true-positive errors as functions of recall, and their means: formulas of nuScenes devkit 1.2.0."""
 
 from __future__ import annotations
 
@@ -15,20 +15,25 @@ RECALLS = np.linspace(0, 1, 101)
 
 @dataclass(frozen=True)
 class RecallCurve:
-    """One class at one matching distance. precision, score: (101,) at RECALLS; both 0 beyond the recall reached."""
+    """One class at one matching distance.
+
+    Attributes:
+        precision: (101,), at RECALLS; 0 beyond the largest recall reached.
+        score: (101,), the score threshold at RECALLS; 0 beyond the largest recall reached.
+    """
 
     precision: Array
     score: Array
 
     def average_precision(self, config: DetectionConfig) -> float:
-        """The mean of the precision above min_precision, over recalls above min_recall, scaled to 0 to 1."""
+        """AP: the mean precision in excess of min_precision over recalls above min_recall, scaled to 0 to 1."""
         above = self.precision[round(100 * config.min_recall) + 1 :] - config.min_precision
         return float(np.mean(np.maximum(above, 0))) / (1 - config.min_precision)
 
     def mean_error(self, config: DetectionConfig, scores: Array, errors: Array) -> float:
-        """The error's running mean, averaged over the recalls from min_recall to the largest reached; 1 if none.
+        """The running mean of an error, averaged over recalls from min_recall to the largest reached; 1 if none.
 
-        scores, errors: (M,) of the M true positives by falling score; NaN errors do not count.
+        scores: (M,), of the M true positives, descending. errors: (M,), their errors; NaN is ignored.
         """
         first, last = round(100 * config.min_recall) + 1, int(np.flatnonzero(self.score).max(initial=0))
         if last < first:
@@ -39,7 +44,10 @@ class RecallCurve:
 
 
 def recall_curve(found: NDArray[np.bool_], scores: Array, ground_truth_count: int) -> RecallCurve:
-    """The curve of P predictions by falling score, `found` those that match one of the ground truths."""
+    """The curve of P predictions.
+
+    found: (P,), bool, whether the prediction is a true positive. scores: (P,), descending.
+    """
     if not found.any():
         return RecallCurve(np.zeros_like(RECALLS), np.zeros_like(RECALLS))
     true_positives = np.cumsum(found).astype(np.float64)
@@ -54,6 +62,6 @@ def recall_curve(found: NDArray[np.bool_], scores: Array, ground_truth_count: in
 def _running_mean(values: Array) -> Array:
     known = ~np.isnan(values)
     if not known.any():
-        return np.ones(len(values))  # the devkit's choice where nothing is known
+        return np.ones(len(values))  # as in the devkit
     counts = np.cumsum(known)
     return np.divide(np.nancumsum(values), counts, out=np.zeros(len(values)), where=counts > 0)

@@ -1,4 +1,4 @@
-"""The boxes of many frames after one another, as the scoring wants them."""
+"""The boxes of many frames as one array."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
 
-# What stands where a frame does not state an optional column.
+# Value of an optional column in frames that do not have it.
 _UNKNOWN = {
     "scores": np.float64(np.nan),
     "attributes": np.str_(""),
@@ -26,8 +26,10 @@ _UNKNOWN = {
 class ScoredBoxes:
     """N boxes of many frames.
 
-    boxes: with every optional column filled. frames: (N,) the place of each box's frame.
-    ranges_m: (N,) horizontal distance from the ego vehicle.
+    Attributes:
+        boxes: with all optional columns.
+        frames: (N,), index of each box's frame.
+        ranges_m: (N,), distance from the ego vehicle on the ground, metres.
     """
 
     boxes: Boxes3D
@@ -38,23 +40,23 @@ class ScoredBoxes:
         return len(self.frames)
 
     def __getitem__(self, selection: NDArray[Any]) -> ScoredBoxes:
-        """The boxes of a mask (N,) bool or of indices."""
+        """The boxes selected by a mask (N,) bool or by indices."""
         return ScoredBoxes(self.boxes[selection], self.frames[selection], self.ranges_m[selection])
 
 
 def gather(frames: Sequence[Boxes3D], ego_xy: Array) -> ScoredBoxes:
-    """All boxes of F frames.
+    """The boxes of F frames as one array.
 
-    ego_xy: (F, 2) where the ego vehicle stands in each frame's frame of reference, metres.
+    ego_xy: (F, 2), the ego vehicle's position in the frame of reference of each frame's boxes, metres.
     """
-    places = np.repeat(np.arange(len(frames)), [len(boxes) for boxes in frames])
+    indices = np.repeat(np.arange(len(frames)), [len(boxes) for boxes in frames])
     filled = [boxes for boxes in frames if len(boxes)] or [Boxes3D.empty()]
     columns: dict[str, Any] = {
         column.name: np.concatenate([_column(boxes, column.name) for boxes in filled]) for column in fields(Boxes3D)
     }
     boxes = Boxes3D(**columns)
-    ranges = np.linalg.norm(boxes.centers[:, :2] - ego_xy[places], axis=1)
-    return ScoredBoxes(boxes, places, ranges)
+    ranges = np.linalg.norm(boxes.centers[:, :2] - ego_xy[indices], axis=1)
+    return ScoredBoxes(boxes, indices, ranges)
 
 
 def _column(boxes: Boxes3D, name: str) -> NDArray[Any]:

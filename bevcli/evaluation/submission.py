@@ -1,4 +1,4 @@
-"""results_nusc.json: predictions in the form of a nuScenes detection submission."""
+"""results_nusc.json: predictions as a nuScenes detection submission, read and written."""
 
 from __future__ import annotations
 
@@ -10,16 +10,20 @@ from typing import Any
 import numpy as np
 
 from bevcli.errors import InputError
+from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
+from bevcli.geometry.transforms import rotation_from_quaternion, yaw_of_rotation
+from bevcli.sequences.files.box_json import boxes_from_json
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 from bevcli.sequences.files.incremental_json import IncrementalJson
 
-MOST_BOXES = 500  # a sample, by the rules of the benchmark; the best by score are kept
+MAX_BOXES = 500  # per sample, by the rules of the benchmark; the best by score are kept
 META = {"use_camera": True, "use_lidar": False, "use_radar": False, "use_map": False, "use_external": False}
+_PEEK_BYTES = 2048  # the kind of a file can be read from its beginning
 
 
 class SubmissionWriter:
-    """`with SubmissionWriter(path) as writer: writer.write(frame)`; the file is whole after every frame.
+    """`with SubmissionWriter(path) as writer: writer.write(frame)`; the file is valid after every frame.
 
     Raises OutputError where the file cannot be written.
     """
@@ -28,7 +32,7 @@ class SubmissionWriter:
         self._file = IncrementalJson(path, json.dumps({"meta": META})[:-1] + ', "results": {', "}}")
 
     def write(self, frame: FrameBoxes) -> None:
-        """Add a frame with its boxes in the world. A frame without a sample token (no keyframe) is left out."""
+        """Add a frame, its boxes in the world frame. A frame without a sample token (no keyframe) is left out."""
         token = frame.extras.get("sample_token")
         if token is not None:
             self._file.append(submission_boxes(frame.boxes, token), f"frame {frame.stamp.index}", key=token)
@@ -43,12 +47,13 @@ class SubmissionWriter:
 
 
 def submission_boxes(boxes: Boxes3D, sample_token: str) -> list[dict[str, Any]]:
-    """Boxes in the world, with scores, as a submission's objects: the best 500, best first.
+    """The best 500 boxes as objects of a submission, by descending score.
 
-    Where boxes have no attributes, these follow from class and speed. An unknown velocity is given as 0.
+    boxes: in the world frame, with scores. Missing attributes follow from class and speed. An unknown velocity is
+    written as 0.
     """
     assert boxes.scores is not None or not len(boxes)
-    best = boxes if boxes.scores is None else boxes[np.argsort(-boxes.scores, kind="stable")[:MOST_BOXES]]
+    best = boxes if boxes.scores is None else boxes[np.argsort(-boxes.scores, kind="stable")[:MAX_BOXES]]
     attributes = attributes_by_speed(best) if best.attributes is None else best.attributes
     scores = np.zeros(0) if best.scores is None else best.scores
     half_yaws = best.yaws / 2
@@ -79,14 +84,75 @@ def submission_boxes(boxes: Boxes3D, sample_token: str) -> list[dict[str, Any]]:
 
 
 def write_submission(boxes: BoxesFile, path: Path) -> None:
-    """Write a whole file of predictions. Raises InputError where they are not of nuScenes, or not in the world."""
+    """Write a submission. Raises InputError if boxes are not in the world frame or frames have no sample token."""
     if boxes.frame_of_reference != "world":
         raise InputError(
-            f"a nuScenes submission needs boxes in the world, but these are in the {boxes.frame_of_reference} frame: "
-            "run with ego-motion"
+            "a nuScenes submission needs boxes in the world frame, but these are in the "
+            f"{boxes.frame_of_reference} frame: run with ego-motion"
         )
     if not any("sample_token" in frame.extras for frame in boxes.frames):
         raise InputError('a nuScenes submission needs a "sample_token" in every frame: run on a nuScenes root')
     with SubmissionWriter(path) as writer:
         for frame in boxes.frames:
             writer.write(frame)
+
+
+def is_submission(path: Path) -> bool:
+    """Whether the beginning of a file is that of a submission; False where it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(_PEEK_BYTES)
+    except OSError:
+        return False
+    return b'"bevcli-boxes' not in head and (b'"meta"' in head or b'"results"' in head)
+
+
+def read_submission(path: Path) -> BoxesFile:
+    """Read boxes in the world frame with their sample tokens. Raises InputError.
+
+    A submission has no scenes, timestamps and ego poses.
+    """
+    try:
+        content = json.loads(path.read_bytes())
+    except (ValueError, OSError) as error:
+        raise InputError(f"{path}: cannot be read as JSON ({error})") from None
+    results = content.get("results") if isinstance(content, dict) else None
+    if not isinstance(results, dict):
+        raise InputError(f'{path}: "results" must be an object of sample tokens, as in a nuScenes submission')
+    frames = [_frame_from_json(index, token, rows, path) for index, (token, rows) in enumerate(results.items())]
+    # The frames have no ego pose: after pairing by sample token, the ground truth's is used.
+    return BoxesFile("world", tuple(frames))
+
+
+def _frame_from_json(index: int, token: str, rows: Any, path: Path) -> FrameBoxes:
+    where = f"{path}: sample {token}"
+    if not isinstance(rows, list):
+        raise InputError(f"{where}: expected a list of boxes, found {rows!r:.40}")
+    objects = [_box_object(row, f"{where}: box {number}") for number, row in enumerate(rows)]
+    stamp = FrameStamp(-1 - index, "", -1 - index)  # unknown, and equal to no stamp of another file
+    return FrameBoxes(stamp, None, boxes_from_json(objects, where), {"sample_token": token})
+
+
+def _box_object(row: Any, where: str) -> dict[str, Any]:
+    """A box of a submission with the keys of a boxes file, whose reader checks the values."""
+    needed = ("translation", "size", "rotation", "velocity", "detection_name", "detection_score", "attribute_name")
+    missing = [key for key in needed if not isinstance(row, dict) or key not in row]
+    if missing:
+        raise InputError(f'{where}: "{missing[0]}" is missing')
+    size = row["size"]
+    return {
+        "class": row["detection_name"],
+        "center": row["translation"],
+        "size_lwh": [size[1], size[0], size[2]] if isinstance(size, list) and len(size) == 3 else size,
+        "yaw": _yaw(row["rotation"], where),
+        "velocity": row["velocity"],
+        "score": row["detection_score"],
+        "attribute": row["attribute_name"],
+    }
+
+
+def _yaw(rotation: Any, where: str) -> float:
+    numbers = isinstance(rotation, list) and len(rotation) == 4 and all(type(v) in (int, float) for v in rotation)
+    if not numbers or not abs(np.linalg.norm(rotation) - 1) < 1e-2:
+        raise InputError(f"{where}: rotation: expected 4 numbers of norm 1 (w, x, y, z), found {rotation!r:.60}")
+    return yaw_of_rotation(rotation_from_quaternion(rotation))

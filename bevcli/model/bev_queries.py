@@ -1,4 +1,4 @@
-"""BEV queries: one learned vector a BEV cell, its position code, and what the can-bus says."""
+"""BEV queries (paper, section 3.2): one learned vector a BEV cell, its position embedding, and the can-bus MLP."""
 
 from __future__ import annotations
 
@@ -8,23 +8,18 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.ego_motion_inputs import CAN_BUS_SIZE
+from bevcli.model.ego_motion import CAN_BUS_SIZE
 
 
 class BevQueries(nn.Module):
-    """The queries that enter the encoder; the same at every step but for the can-bus embedding.
-
-    kept_position: the position code, where a prepared model keeps it.
-    """
-
-    kept_position: Tensor | None = None
+    """The queries that enter the encoder. Only the can-bus embedding, which is added to all of them, changes."""
 
     def __init__(self, grid: BevGrid, channels: int, can_bus: bool) -> None:
         super().__init__()
         self.embedding = nn.Parameter(torch.randn(grid.rows * grid.columns, channels))
         self.row_embedding = nn.Parameter(torch.rand(grid.rows, channels // 2))
         self.column_embedding = nn.Parameter(torch.rand(grid.columns, channels // 2))
-        self.can_bus_embedding = can_bus_embedding(channels) if can_bus else None
+        self.can_bus_embedding = can_bus_mlp(channels) if can_bus else None
 
     def forward(self, can_bus: Tensor) -> Tensor:
         """can_bus: (B, 18) -> BEV queries (B, Y·X, C)."""
@@ -33,18 +28,21 @@ class BevQueries(nn.Module):
         return self.embedding + self.can_bus_embedding(can_bus)[:, None]
 
     def position(self) -> Tensor:
-        """The position code (Y·X, C) of the cells: the column's (x) half, then the row's (y)."""
-        if self.kept_position is not None:
-            return self.kept_position
+        """The position embedding (Y·X, C) of the cells: first that of the column (x), then that of the row (y)."""
         rows, columns = len(self.row_embedding), len(self.column_embedding)
         x = self.column_embedding.expand(rows, -1, -1)
         y = self.row_embedding[:, None].expand(-1, columns, -1)
         return torch.cat([x, y], dim=-1).flatten(0, 1)
 
     def resampled(self, state: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-        """A model's state dict in which the queries, whose keys begin with prefix, fit the grid of these.
+        """A state dict whose BEV queries are interpolated to this grid, which covers the same area.
 
-        Bilinear, cell centre to cell centre: both grids cover the same ground.
+        Args:
+            state: state dict of a model, unchanged.
+            prefix: what the keys of the BEV queries begin with, such as "bev_queries.".
+
+        Returns:
+            The state dict; as it was where it holds no BEV queries or where these fit already.
         """
         row_key, column_key, key = (f"{prefix}{name}" for name in ("row_embedding", "column_embedding", "embedding"))
         if not {row_key, column_key, key} <= set(state):
@@ -53,21 +51,21 @@ class BevQueries(nn.Module):
         found = len(state[row_key]), len(state[column_key])
         if found == sizes or len(state[key]) != found[0] * found[1]:
             return dict(state)
-        cells = state[key].float().unflatten(0, found).permute(2, 0, 1)[None]
+        cells = state[key].float().unflatten(0, found).permute(2, 0, 1)[None]  # (1, C, rows, columns)
         return {
             **state,
             key: nn.functional.interpolate(cells, sizes, mode="bilinear")[0].flatten(1).T,
-            row_key: _stretched(state[row_key], sizes[0]),
-            column_key: _stretched(state[column_key], sizes[1]),
+            row_key: _interpolated(state[row_key], sizes[0]),
+            column_key: _interpolated(state[column_key], sizes[1]),
         }
 
 
-def _stretched(rows: Tensor, count: int) -> Tensor:
+def _interpolated(rows: Tensor, count: int) -> Tensor:
     """(N, C) -> (count, C), linearly."""
     return nn.functional.interpolate(rows.float().T[None], count, mode="linear")[0].T
 
 
-def can_bus_embedding(channels: int) -> nn.Sequential:
+def can_bus_mlp(channels: int) -> nn.Sequential:
     """(B, 18) can-bus numbers -> (B, C)."""
     layers = nn.Sequential(
         nn.Linear(CAN_BUS_SIZE, channels // 2),

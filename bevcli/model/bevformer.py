@@ -1,4 +1,4 @@
-"""BEVFormer (Li et al. 2022): cameras and ego-motion in, a BEV map and objects out."""
+"""BEVFormer (Li et al. 2022): camera images and ego-motion in, a BEV map and objects out."""
 
 from __future__ import annotations
 
@@ -9,32 +9,70 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.attention_probe import AttentionProbe
 from bevcli.model.bev_queries import BevQueries
-from bevcli.model.decoder import Decoder, DecoderConfig
-from bevcli.model.detection_head import DetectionHead
-from bevcli.model.ego_motion_inputs import EgoMotionConfig
+from bevcli.model.decoder import Decoder, DecoderConfig, DetectionHead
+from bevcli.model.ego_motion import EgoMotionConfig, rotate_history
 from bevcli.model.encoder import Encoder, EncoderConfig
 from bevcli.model.fpn import FPN, FPNConfig
-from bevcli.model.history_alignment import rotate_history
-from bevcli.model.image_config import ImageConfig
 from bevcli.model.image_tokens import ImageTokens, ImageTokensConfig
-from bevcli.model.kept_result import KeptResult
-from bevcli.model.pillar_projection import PillarHits, PillarProjection, find_hits, project_pillars
+from bevcli.model.pillar_projection import Pillars
 from bevcli.model.resnet import ResNet, ResNetConfig
-from bevcli.model.segmentation_head import SegmentationConfig, SegmentationHead, SegmentationOutputs
+from bevcli.model.segmentation import SegmentationConfig, SegmentationHead, SegmentationOutputs
+
+
+@dataclass(frozen=True)
+class ImageConfig:
+    """How an image becomes the network's input: resized, normalised in float, padded at the right and the bottom.
+
+    Attributes:
+        size: (width, height) in pixels, before padding. Images of another aspect ratio are scaled to fit inside.
+        mean: of each channel, subtracted, on the scale 0 to 255 and in color_order.
+        std: of each channel, the divisor, on the same scale.
+        color_order: order of the channels, "rgb" or "bgr".
+        pad_divisor: width and height are padded with zeros to a multiple of it.
+        resize: "linear", as the published weights were trained, aliases where images shrink to less than half;
+            "area" averages the pixels that fall into one.
+    """
+
+    size: tuple[int, int]
+    mean: tuple[float, float, float]
+    std: tuple[float, float, float]
+    color_order: Literal["rgb", "bgr"]
+    pad_divisor: int = 32
+    resize: Literal["linear", "area"] = "linear"
+
+    def __post_init__(self) -> None:
+        if min(self.size) < 1 or min(self.std) <= 0 or self.pad_divisor < 1:
+            raise ValueError("size, std and pad_divisor must be positive")
+
+    @property
+    def padded_size(self) -> tuple[int, int]:
+        """(width, height) of the network's input, pixels."""
+        width, height = (-(-extent // self.pad_divisor) * self.pad_divisor for extent in self.size)
+        return width, height
 
 
 @dataclass(frozen=True)
 class BEVFormerConfig:
-    """A whole model. One TOML file says it; `bevcli.config.load_config` reads it.
+    """A whole model. `bevcli.config.load_config` reads it from a TOML file.
 
-    classes: of the objects, in the order of the scores.
-    cameras: the names that the camera embeddings belong to, in their order.
-    rate_hz: frames a second that the model was trained on.
-    max_gap_s: a longer time between two frames starts the history anew.
-    channels: of every token and query, C.
-    heads: what the BEV map is read by; "segmentation" adds the head that `segmentation` configures.
+    Attributes:
+        name: of the model.
+        classes: of the objects, in the order of the class logits.
+        cameras: names of the camera embeddings, in their order.
+        image: how images become the network's input.
+        bev_grid: the cells of the BEV map and their pillars.
+        rate_hz: frame rate of the training data.
+        max_gap_s: after a longer time between two frames the history is dropped.
+        channels: C, of all tokens and queries.
+        heads: what is computed from the BEV map; "segmentation" adds the head that `segmentation` configures.
+        backbone: the ResNet.
+        neck: the feature pyramid network.
+        image_tokens: camera and level embeddings.
+        ego_motion: can-bus numbers and alignment of the history.
+        encoder: the BEV encoder.
+        decoder: the object decoder.
+        segmentation: the segmentation head.
     """
 
     name: str
@@ -82,13 +120,14 @@ class BEVFormerConfig:
 class BEVFormerInputs:
     """One step of B sequences with N cameras.
 
-    images: (B, N, 3, H, W) normalised, padded.
-    image_from_bev: (B, N, 4, 4) float32, bev metres -> network-input pixels (rows u·d, v·d, d, 1).
-    camera_index: (N,) int64, which camera embedding each image takes.
-    has_image: (B, N) bool; a camera without an image is seen by no BEV cell.
-    can_bus: (B, 18) float32, after the differencing.
-    shift: (B, 2) float32, history shift (x, y) in normalised BEV coordinates; zero without history.
-    rotation_deg: (B,) float32, rotation of the history map.
+    Attributes:
+        images: (B, N, 3, H, W), normalised and padded.
+        image_from_bev: (B, N, 4, 4) float32, bev metres to pixels of the network's input (rows u·d, v·d, d, 1).
+        camera_index: (N,) int64, the camera embedding of each image.
+        has_image: (B, N) bool; a camera without an image sees no BEV cell.
+        can_bus: (B, 18) float32, the translation and the change of heading since the previous frame included.
+        shift: (B, 2) float32, translation of the history (x, y) in normalised BEV coordinates; zero without history.
+        rotation_deg: (B,) float32, rotation of the history map.
     """
 
     images: Tensor
@@ -99,19 +138,26 @@ class BEVFormerInputs:
     shift: Tensor
     rotation_deg: Tensor
 
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(height, width) of the network's input, pixels."""
+        return self.images.shape[-2], self.images.shape[-1]
+
     def to(self, device: torch.device) -> BEVFormerInputs:
-        """The same on a device."""
+        """The same inputs on a device."""
         tensors = (getattr(self, part.name) for part in fields(self))
         return BEVFormerInputs(*(tensor.to(device, non_blocking=True) for tensor in tensors))
 
 
 @dataclass(frozen=True)
 class BEVFormerOutputs:
-    """bev: (B, Y·X, C) the BEV map, the next frame's history.
+    """What one step computes.
 
-    class_logits: (L, B, Q, classes), one a decoder layer.
-    box_codes: (L, B, Q, 10) cx, cy, log w, log l, cz, log h, sin, cos, vx, vy; centres in metres, bev frame.
-    segmentation: of the segmentation head, None without one.
+    Attributes:
+        bev: (B, Y·X, C), the BEV map, which is the next frame's history.
+        class_logits: (L, B, Q, classes) of the L decoder layers.
+        box_codes: (L, B, Q, 10): cx, cy, log w, log l, cz, log h, sin, cos, vx, vy; centres in metres, bev frame.
+        segmentation: outputs of the segmentation head, None without one.
     """
 
     bev: Tensor
@@ -121,13 +167,7 @@ class BEVFormerOutputs:
 
 
 class BEVFormer(nn.Module):
-    """The whole model; its parts in the order of the paper's figure 2.
-
-    prepared: whether this is `prepare_for_inference`'s, which says itself what is computed in which precision.
-    """
-
-    pillars: Tensor
-    prepared: bool = False
+    """The whole model, its parts in the order of the paper's figure 2."""
 
     def __init__(self, config: BEVFormerConfig) -> None:
         super().__init__()
@@ -138,24 +178,17 @@ class BEVFormer(nn.Module):
         self.neck = FPN(config.backbone.output_channels(), channels, config.neck)
         self.image_tokens = ImageTokens(len(config.cameras), channels, config.image_tokens)
         self.bev_queries = BevQueries(grid, channels, config.ego_motion.can_bus)
+        self.pillars = Pillars(grid)
         self.encoder = Encoder(config.encoder, channels, levels, grid, config.ego_motion.history_shift)
         self.decoder = Decoder(config.decoder, channels, bev_shape)
         self.detection_head = DetectionHead(config.decoder.layers, channels, len(config.classes), grid)
-        wanted = "segmentation" in config.heads
-        self.segmentation_head = SegmentationHead(config.segmentation, channels, bev_shape) if wanted else None
-        pillars = torch.as_tensor(grid.pillars(), dtype=torch.float32).flatten(0, 1)  # (Y·X, Z, 3)
-        self.register_buffer("pillars", pillars, persistent=False)
-        self._kept_hits = KeptResult[PillarHits]()
+        segments = "segmentation" in config.heads
+        self.segmentation_head = SegmentationHead(config.segmentation, channels, bev_shape) if segments else None
 
-    def forward(
-        self, inputs: BEVFormerInputs, history: Tensor | None = None, probe: AttentionProbe | None = None
-    ) -> BEVFormerOutputs:
-        """One step. history: (B, Y·X, C), the BEV map of the previous frame, or None at the start of a scene.
-
-        probe: filled with what one encoder layer looked at.
-        """
-        bev = self.bev_map(inputs, history, probe)
-        # Boxes are refined in steps finer than half precision can tell.
+    def forward(self, inputs: BEVFormerInputs, history: Tensor | None = None) -> BEVFormerOutputs:
+        """One step. history: (B, Y·X, C), the BEV map of the previous frame, or None for a scene's first frame."""
+        bev = self.bev_map(inputs, history)
+        # In float32: half precision is too coarse for the refinement of boxes.
         with torch.autocast(bev.device.type, enabled=False):
             class_logits, box_codes = self.decoder(bev.float(), self.detection_head)
             segmentation = None
@@ -163,33 +196,19 @@ class BEVFormer(nn.Module):
                 segmentation = self.segmentation_head(bev.float(), self.bev_queries.position())
         return BEVFormerOutputs(bev, class_logits, box_codes, segmentation)
 
-    def bev_map(self, inputs: BEVFormerInputs, history: Tensor | None, probe: AttentionProbe | None = None) -> Tensor:
-        """The first half of `forward`: the BEV map (B, Y·X, C), before any head reads it."""
-        maps = self.neck(self.backbone(inputs.images.flatten(0, 1)))
+    def bev_map(self, inputs: BEVFormerInputs, history: Tensor | None) -> Tensor:
+        """The BEV map (B, Y·X, C): the part of `forward` before the decoder and the heads."""
+        feature_maps = self.neck(self.backbone(inputs.images.flatten(0, 1)))
         return self.encoder(
-            self.bev_queries(inputs.can_bus),
-            self.bev_queries.position(),
-            self.image_tokens(maps, inputs.camera_index),
-            self._hits(inputs),
-            None if history is None else self.align_history(history, inputs.rotation_deg),
-            inputs.shift,
-            probe,
+            bev_query=self.bev_queries(inputs.can_bus),
+            position=self.bev_queries.position(),
+            image_features=self.image_tokens(feature_maps, inputs.camera_index),
+            hits=self.pillars(inputs.image_from_bev, inputs.image_size, inputs.has_image),
+            history=None if history is None else self.align_history(history, inputs.rotation_deg),
+            shift=inputs.shift,
         )
 
-    def _hits(self, inputs: BEVFormerInputs) -> PillarHits:
-        """Which cells attend in which cameras; a prepared model keeps it while calibration and poses stay."""
-        if not self.prepared:
-            return find_hits(self.project_pillars(inputs))
-        size = torch.tensor(inputs.images.shape[-2:])
-        seen_from = (inputs.image_from_bev, inputs.has_image, size)
-        return self._kept_hits(lambda: find_hits(self.project_pillars(inputs)), *seen_from)
-
-    def project_pillars(self, inputs: BEVFormerInputs) -> PillarProjection:
-        """Where the pillars appear in the cameras of these inputs, and where they are visible."""
-        image_size = (inputs.images.shape[-2], inputs.images.shape[-1])
-        return project_pillars(inputs.image_from_bev, self.pillars, image_size, inputs.has_image)
-
     def align_history(self, history: Tensor, rotation_deg: Tensor) -> Tensor:
-        """The history map (B, Y·X, C), turned by rotation_deg (B,)."""
+        """The history map (B, Y·X, C), rotated by rotation_deg (B,) to the current heading."""
         center = self.config.ego_motion.history_rotation_center
         return rotate_history(history, rotation_deg, self.config.bev_grid, center)

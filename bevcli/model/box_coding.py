@@ -1,7 +1,7 @@
-"""Box codes of the detection head <-> Boxes3D in the bev frame, both directions.
+"""Converts box codes of the detection head to Boxes3D in the bev frame, and back.
 
-A code is (cx, cy, log w, log l, cz, log h, sin, cos, vx, vy). Its angle runs clockwise from -y, as in the
-original: yaw = -angle - pi/2, with yaw counter-clockwise from +x.
+A code is (cx, cy, log w, log l, cz, log h, sin, cos, vx, vy). As in the released code, its angle is measured clockwise
+from -y: yaw = -angle - pi/2, with yaw counter-clockwise from +x.
 """
 
 from __future__ import annotations
@@ -14,10 +14,13 @@ from bevcli.model.bevformer import BEVFormerConfig, BEVFormerOutputs
 
 
 def decode(outputs: BEVFormerOutputs, config: BEVFormerConfig) -> list[Boxes3D]:
-    """The best boxes of the last decoder layer, one Boxes3D a batch element, by falling score, bev frame.
+    """The boxes with the best scores of the last decoder layer, by falling score, bev frame.
 
-    At most config.decoder.max_boxes, without suppression of overlaps: the model learned not to repeat itself.
-    A query appears once for each of its classes that is among the best scores.
+    There is no non-maximum suppression: training matches each object to one query. A query gives one box for each of
+    its classes that is among the best scores.
+
+    Returns:
+        One Boxes3D for each batch element, with at most config.decoder.max_boxes boxes.
     """
     classes = np.asarray(config.classes)
     scores = outputs.class_logits[-1].detach().float().sigmoid().flatten(1)  # (B, Q · classes)
@@ -32,7 +35,7 @@ def decode(outputs: BEVFormerOutputs, config: BEVFormerConfig) -> list[Boxes3D]:
 
 
 def encode(boxes: Boxes3D) -> Array:
-    """Boxes in the bev frame -> codes (N, 10), the targets of training; unknown velocities stay NaN."""
+    """Boxes in the bev frame -> codes (N, 10), the targets of training; unknown velocities are NaN."""
     length, width, height = boxes.sizes_lwh.T
     angle = -boxes.yaws - np.pi / 2
     x, y, z = boxes.centers.T

@@ -1,23 +1,34 @@
-"""The object decoder: queries refined layer by layer on the BEV map, after Deformable DETR."""
+"""The object decoder and its detection head, after Deformable DETR: queries that attend to the BEV map find objects."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
+from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.deformable_attention import DeformableAttention, sampling_locations
-from bevcli.model.detection_head import DetectionHead
 from bevcli.model.feed_forward import FeedForward
+
+BOX_CODE_SIZE = 10
 
 
 @dataclass(frozen=True)
 class DecoderConfig:
-    """queries: object queries. points: sampling points a head of the cross-attention into the BEV map.
+    """The object decoder.
 
-    max_boxes: how many of the best-scored boxes are decoded. training_groups: so many sets of queries learn side by
-    side, each to find every object (Group DETR, Chen et al. 2023); only the first is used afterwards.
+    Attributes:
+        layers: number of decoder layers.
+        attention_heads: heads of self-attention and of cross-attention.
+        points: sampling points of a head of the cross-attention to the BEV map.
+        queries: number of object queries.
+        feed_forward_width: channels between the two linear layers of the feed-forward network.
+        dropout: probability, 0 to below 1.
+        max_boxes: number of boxes that are decoded, those with the best scores.
+        training_groups: number of sets of queries that are trained side by side, each to find every object
+            (Group DETR, Chen et al. 2023). Inference uses the first set only.
     """
 
     layers: int = 6
@@ -38,17 +49,12 @@ class DecoderConfig:
 
 
 class Decoder(nn.Module):
-    """Object queries that look at the BEV map and move their reference points to the objects.
-
-    kept_first_queries: what the queries have made of each other before they look, where a prepared model keeps it.
-    """
-
-    kept_first_queries: Tensor | None = None
+    """Object queries that attend to the BEV map and move their reference points to the objects."""
 
     def __init__(self, config: DecoderConfig, channels: int, bev_shape: tuple[int, int]) -> None:
         super().__init__()
         self.training_groups = config.training_groups
-        # Of each object query the position half, then the content half.
+        # The first half of the channels is the position of a query, the second half its content.
         self.query_embedding = nn.Parameter(torch.randn(config.training_groups * config.queries, 2 * channels))
         self.reference_points = nn.Linear(channels, 3)
         self.layers = nn.ModuleList(DecoderLayer(config, channels, bev_shape) for _ in range(config.layers))
@@ -56,37 +62,31 @@ class Decoder(nn.Module):
         nn.init.zeros_(self.reference_points.bias)
 
     def forward(self, bev: Tensor, head: DetectionHead) -> tuple[Tensor, Tensor]:
-        """bev: (B, Y·X, C). Returns class logits (L, B, Q, classes) and box codes (L, B, Q, 10), one a layer.
+        """bev: (B, Y·X, C) -> class logits (L, B, Q, classes) and box codes (L, B, Q, 10) of all L layers.
 
-        In training mode Q are the queries of all groups, one group after another.
+        In training mode the Q queries are those of all groups, one group after another.
         """
         groups = self.training_groups if self.training else 1
-        position, query = self._queries(groups).expand(len(bev), -1, -1).chunk(2, dim=-1)  # (B, Q, C) each
+        position, query = self.object_queries(len(bev), groups)
         reference_points = self.reference_points(position).float().sigmoid()  # (B, Q, 3)
         class_logits, box_codes = [], []
         for index, layer in enumerate(self.layers):
-            attended = self.kept_first_queries if index == 0 else None
-            query = layer(query, position, reference_points[..., :2], bev, attended, groups)
+            query = layer(query, position, reference_points[..., :2], bev, groups)
             logits, codes, refined = head(index, query, reference_points)
             class_logits.append(logits)
             box_codes.append(codes)
             reference_points = refined.detach()
         return torch.stack(class_logits), torch.stack(box_codes)
 
-    def first_queries(self) -> Tensor:
-        """(1, Q, C), the queries after the first layer's self-attention: the same in every frame."""
-        position, query = self._queries(groups=1)[None].chunk(2, dim=-1)
-        first = self.layers[0]
-        assert isinstance(first, DecoderLayer)
-        return first.attend(query, position)
-
-    def _queries(self, groups: int) -> Tensor:
-        """(groups · Q, 2 C), those of the first groups."""
-        return self.query_embedding[: len(self.query_embedding) // self.training_groups * groups]
+    def object_queries(self, batch: int, groups: int = 1) -> tuple[Tensor, Tensor]:
+        """Position and content, each (batch, Q, C), of the learned queries of the first groups."""
+        count = len(self.query_embedding) // self.training_groups * groups
+        position, content = self.query_embedding[:count].expand(batch, -1, -1).chunk(2, dim=-1)
+        return position, content
 
 
 class DecoderLayer(nn.Module):
-    """Self-attention among the objects, deformable cross-attention into the BEV map, feed-forward network."""
+    """Self-attention among the object queries, deformable cross-attention to the BEV map, feed-forward network."""
 
     def __init__(self, config: DecoderConfig, channels: int, bev_shape: tuple[int, int]) -> None:
         super().__init__()
@@ -100,36 +100,101 @@ class DecoderLayer(nn.Module):
         nn.init.xavier_uniform_(self.self_attention.out_proj.weight)
 
     def forward(
-        self,
-        query: Tensor,
-        position: Tensor,
-        reference_points: Tensor,
-        bev: Tensor,
-        attended: Tensor | None = None,
-        groups: int = 1,
+        self, query: Tensor, position: Tensor, reference_points: Tensor, bev: Tensor, groups: int = 1
     ) -> Tensor:
-        """query, position: (B, Q, C). reference_points: (B, Q, 2). bev: (B, Y·X, C). Returns (B, Q, C).
+        """The refined queries.
 
-        attended: (B or 1, Q, C), the result of `attend` where it is known already.
-        groups: queries of different groups do not attend to each other.
+        Args:
+            query: (B, Q, C), contents of the queries.
+            position: (B, Q, C), positions of the queries.
+            reference_points: (B, Q, 2) x, y, 0 to 1 over the map.
+            bev: (B, Y·X, C).
+            groups: number of groups of queries; queries of different groups do not attend to each other.
+
+        Returns:
+            (B, Q, C).
         """
-        query = self.attend(query, position, groups) if attended is None else attended.expand_as(query)
-        looked = self._look_at_bev(query + position, reference_points, bev)
-        query = self.norms[1](query + self.dropout(looked))
+        query = self.norms[0](query + self.dropout(self._attend_to_queries(query, position, groups)))
+        query = self.norms[1](query + self.dropout(self._attend_to_bev(query + position, reference_points, bev)))
         return self.norms[2](query + self.feed_forward(query))
 
-    def attend(self, query: Tensor, position: Tensor, groups: int = 1) -> Tensor:
-        """query, position: (B, Q, C). The queries (B, Q, C) after the self-attention of each group, and its norm."""
-        apart = query.unflatten(1, (groups, -1)).flatten(0, 1)  # (B · groups, Q / groups, C)
-        placed = apart + position.unflatten(1, (groups, -1)).flatten(0, 1)
-        attended, _ = self.self_attention(placed, placed, apart, need_weights=False)
-        return self.norms[0](query + self.dropout(attended.reshape(query.shape)))
+    def _attend_to_queries(self, query: Tensor, position: Tensor, groups: int) -> Tensor:
+        value = query.unflatten(1, (groups, -1)).flatten(0, 1)  # (B · groups, Q / groups, C)
+        key = value + position.unflatten(1, (groups, -1)).flatten(0, 1)
+        attended, _ = self.self_attention(key, key, value, need_weights=False)
+        return attended.reshape(query.shape)
 
-    def _look_at_bev(self, query: Tensor, reference_points: Tensor, bev: Tensor) -> Tensor:
+    def _attend_to_bev(self, query: Tensor, reference_points: Tensor, bev: Tensor) -> Tensor:
         batch, queries, _ = query.shape
-        offsets, weights = self.cross_attention.look(query)  # (B, Q, heads, 1, 1, P, 2)
+        offsets, weights = self.cross_attention.predict(query)  # (B, Q, heads, 1, 1, P, 2)
         locations = sampling_locations(reference_points[:, :, None, None, None], offsets[:, :, :, 0], self.level_shapes)
         sampled = self.cross_attention.sample(
             bev, self.level_shapes, locations.flatten(0, 1), weights[:, :, :, 0].flatten(0, 1), [queries] * batch
         )
         return self.cross_attention.output_projection(sampled.unflatten(0, (batch, queries)))
+
+
+class DetectionHead(nn.Module):
+    """A class branch and a box branch for each decoder layer, with iterative box refinement."""
+
+    range_start: Tensor
+    range_extent: Tensor
+
+    def __init__(self, layers: int, channels: int, classes: int, grid: BevGrid) -> None:
+        super().__init__()
+        self.class_branches = nn.ModuleList(_class_branch(channels, classes) for _ in range(layers))
+        self.box_branches = nn.ModuleList(_box_branch(channels) for _ in range(layers))
+        ranges = torch.tensor([grid.x_range_m, grid.y_range_m, grid.z_range_m])
+        self.register_buffer("range_start", ranges[:, 0], persistent=False)
+        self.register_buffer("range_extent", ranges[:, 1] - ranges[:, 0], persistent=False)
+
+    def forward(self, layer: int, query: Tensor, reference_points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Classes and boxes of a decoder layer's queries.
+
+        Args:
+            layer: index of the decoder layer.
+            query: (B, Q, C), output of that layer.
+            reference_points: (B, Q, 3), input of that layer, 0 to 1 over the range.
+
+        Returns:
+            Class logits (B, Q, classes); box codes (B, Q, 10) with the centre in metres; the refined reference points
+            (B, Q, 3), which are that centre, 0 to 1 over the range.
+        """
+        logits = self.class_branches[layer](query)
+        code = self.box_branches[layer](query).float()
+        moved = code[..., [0, 1, 4]] + inverse_sigmoid(reference_points)
+        refined = moved.sigmoid()
+        center = refined * self.range_extent + self.range_start
+        box_codes = torch.cat([center[..., :2], code[..., 2:4], center[..., 2:], code[..., 5:]], dim=-1)
+        return logits, box_codes, refined
+
+
+def inverse_sigmoid(x: Tensor) -> Tensor:
+    """The logit of x, which lies in 0 to 1; finite at both ends."""
+    x = x.clamp(0, 1)
+    return torch.log(x.clamp(min=1e-5) / (1 - x).clamp(min=1e-5))
+
+
+def _class_branch(channels: int, classes: int) -> nn.Sequential:
+    branch = nn.Sequential(
+        nn.Linear(channels, channels),
+        nn.LayerNorm(channels),
+        nn.ReLU(),
+        nn.Linear(channels, channels),
+        nn.LayerNorm(channels),
+        nn.ReLU(),
+        nn.Linear(channels, classes),
+    )
+    # Prior of the focal loss: untrained, every class scores 0.01.
+    nn.init.constant_(branch[-1].bias, -math.log(99))  # type: ignore[arg-type]
+    return branch
+
+
+def _box_branch(channels: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Linear(channels, channels),
+        nn.ReLU(),
+        nn.Linear(channels, channels),
+        nn.ReLU(),
+        nn.Linear(channels, BOX_CODE_SIZE),
+    )

@@ -9,19 +9,22 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.attention_probe import AttentionProbe
-from bevcli.model.deformable_attention import FeatureMaps
+from bevcli.model.deformable_attention import DeformableAttention, FeatureMaps, LevelShapes, sampling_locations
 from bevcli.model.feed_forward import FeedForward
 from bevcli.model.pillar_projection import PillarHits
-from bevcli.model.spatial_cross_attention import SpatialCrossAttention
-from bevcli.model.temporal_self_attention import TemporalSelfAttention
 
 
 @dataclass(frozen=True)
 class EncoderConfig:
-    """temporal_points: sampling points a head and BEV map.
+    """The encoder.
 
-    spatial_points: sampling points a head and feature level, a multiple of the grid's pillar points.
+    Attributes:
+        layers: number of encoder layers.
+        attention_heads: heads of both attentions.
+        temporal_points: sampling points of a head in each of the two BEV maps.
+        spatial_points: sampling points of a head in each feature level, a multiple of the grid's pillar points.
+        feed_forward_width: channels between the two linear layers of the feed-forward network.
+        dropout: probability, 0 to below 1.
     """
 
     layers: int = 6
@@ -38,7 +41,11 @@ class EncoderConfig:
 
 
 class Encoder(nn.Module):
-    """BEV queries, image features and history to the BEV map."""
+    """BEV queries, image features and history to the BEV map.
+
+    Attributes:
+        cell_centers: (Y·X, 2) float32, x and y of the cells' centres, 0 to 1 over the map.
+    """
 
     cell_centers: Tensor
 
@@ -64,32 +71,30 @@ class Encoder(nn.Module):
         hits: PillarHits,
         history: Tensor | None,
         shift: Tensor,
-        probe: AttentionProbe | None = None,
     ) -> Tensor:
-        """bev_query: (B, Y·X, C). position: (Y·X, C). image_features: B·N maps.
+        """The BEV map.
 
-        history: (B, Y·X, C) rotated, or None. shift: (B, 2). Returns the BEV map (B, Y·X, C).
+        Args:
+            bev_query: (B, Y·X, C).
+            position: (Y·X, C), position embedding of the cells.
+            image_features: tokens of B·N images.
+            hits: the cells that each camera sees.
+            history: (B, Y·X, C), the previous BEV map, rotated to the current heading; None without history.
+            shift: (B, 2), translation of the history (x, y) in normalised BEV coordinates.
+
+        Returns:
+            (B, Y·X, C).
         """
-        # With history, every layer looks at the same two maps; without it, at its own queries twice.
+        # With history, all layers attend to the same two maps; without it, to their own queries twice.
         bev_maps = None if history is None else torch.stack([history, bev_query], dim=1)
         reference_points = self._reference_points(None if history is None else shift)
         bev = bev_query
-        for index, layer in enumerate(self.layers):
-            bev = layer(
-                bev,
-                position,
-                bev_maps,
-                reference_points,
-                image_features,
-                hits,
-                probe if probe is not None and probe.layer == index else None,
-            )
-        if probe is not None and history is None:
-            probe.history_share = None
+        for layer in self.layers:
+            bev = layer(bev, position, bev_maps, reference_points, image_features, hits)
         return bev
 
     def _reference_points(self, shift: Tensor | None) -> Tensor:
-        """(B or 1, 2, Y·X, 2) float32: the cells' centres in the history map and in the current one."""
+        """(B or 1, 2, Y·X, 2) float32: where the cells' centres lie in the history map and in the current one."""
         centers = self.cell_centers.float()
         if shift is None:
             return centers.expand(1, 2, -1, -1)
@@ -99,7 +104,7 @@ class Encoder(nn.Module):
 
 
 class EncoderLayer(nn.Module):
-    """One of the encoder's layers; a norm after each residual."""
+    """Temporal self-attention, spatial cross-attention and feed-forward network, each with a residual and a norm."""
 
     def __init__(self, config: EncoderConfig, channels: int, levels: int, bev_shape: tuple[int, int]) -> None:
         super().__init__()
@@ -119,13 +124,107 @@ class EncoderLayer(nn.Module):
         reference_points: Tensor,
         image_features: FeatureMaps,
         hits: PillarHits,
-        probe: AttentionProbe | None = None,
     ) -> Tensor:
-        """query: (B, Y·X, C) -> (B, Y·X, C). bev_maps: (B, 2, Y·X, C), or None without history."""
+        """The refined queries.
+
+        Args:
+            query: (B, Y·X, C).
+            position: (Y·X, C).
+            bev_maps: (B, 2, Y·X, C), history and current BEV queries; None without history.
+            reference_points: (B or 1, 2, Y·X, 2) x, y, 0 to 1, in each of the two maps.
+            image_features: tokens of B·N images.
+            hits: the cells that each camera sees.
+
+        Returns:
+            (B, Y·X, C).
+        """
         maps = torch.stack([query, query], dim=1) if bev_maps is None else bev_maps
-        query = self.norms[0](query + self.temporal_self_attention(query, position, maps, reference_points, probe))
-        query = self.norms[1](query + self.spatial_cross_attention(query, image_features, hits, probe))
+        query = self.norms[0](query + self.temporal_self_attention(query, position, maps, reference_points))
+        query = self.norms[1](query + self.spatial_cross_attention(query, image_features, hits))
         return self.norms[2](query + self.feed_forward(query))
+
+
+class TemporalSelfAttention(nn.Module):
+    """Deformable attention of BEV queries to the history and the current BEV map (paper, section 3.4).
+
+    The results of the two maps are averaged.
+    """
+
+    def __init__(self, channels: int, heads: int, points: int, bev_shape: tuple[int, int], dropout: float) -> None:
+        super().__init__()
+        self.level_shapes: LevelShapes = (bev_shape,)
+        # Offsets and weights are predicted from the history and the query together.
+        self.attention = DeformableAttention(channels, 2 * channels, heads, points, maps=2)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, query: Tensor, position: Tensor, bev_maps: Tensor, reference_points: Tensor) -> Tensor:
+        """The attended values, without the residual.
+
+        Args:
+            query: (B, Y·X, C).
+            position: (Y·X, C).
+            bev_maps: (B, 2, Y·X, C), history first.
+            reference_points: (B or 1, 2, Y·X, 2) x, y, 0 to 1, in each of the two maps.
+
+        Returns:
+            (B, Y·X, C).
+        """
+        batch, cells, _ = query.shape
+        offsets, weights = self.attention.predict(torch.cat([bev_maps[:, 0], query + position], dim=-1))
+        reference = reference_points.transpose(1, 2)[:, :, None, :, None, None]  # (B, Y·X, 1, 2, 1, 1, 2)
+        locations = sampling_locations(reference, offsets, self.level_shapes)  # (B, Y·X, heads, 2, 1, P, 2)
+        sampled = self.attention.sample(
+            bev_maps.flatten(0, 1),
+            self.level_shapes,
+            locations.movedim(3, 1).flatten(0, 2),
+            weights.movedim(3, 1).flatten(0, 2),
+            [cells] * (2 * batch),
+        )  # (B·2·Y·X, C)
+        mean = sampled.unflatten(0, (batch, 2, cells)).mean(1)
+        return self.dropout(self.attention.output_projection(mean))
+
+
+class SpatialCrossAttention(nn.Module):
+    """Deformable attention of BEV queries to the cameras that see their pillars (paper, section 3.3).
+
+    Samples lie around the projected points of a pillar. The results of the cameras that see a cell are averaged.
+    """
+
+    def __init__(self, channels: int, heads: int, points: int, levels: int, dropout: float) -> None:
+        super().__init__()
+        self.points = points
+        self.attention = DeformableAttention(channels, channels, heads, points, levels)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, query: Tensor, image_features: FeatureMaps, hits: PillarHits) -> Tensor:
+        """The attended values, without the residual; a cell that no camera sees gets the output projection's bias.
+
+        Args:
+            query: (B, Y·X, C).
+            image_features: tokens of B·N images.
+            hits: the M pairs of a camera and a cell that it sees.
+
+        Returns:
+            (B, Y·X, C).
+        """
+        locations, weights = self._sampling_points(query, image_features.level_shapes, hits)
+        sampled = self.attention.sample(
+            image_features.tokens, image_features.level_shapes, locations, weights, hits.hits_per_camera
+        )  # (M, C)
+        summed = sampled.new_zeros(query.shape).flatten(0, 1).index_add(0, hits.cell, sampled)
+        mean = summed / hits.cameras_per_cell.clamp(min=1)[:, None]
+        return self.dropout(self.attention.output_projection(mean.view_as(query)))
+
+    def _sampling_points(self, query: Tensor, level_shapes: LevelShapes, hits: PillarHits) -> tuple[Tensor, Tensor]:
+        """Sampling locations (M, heads, L, P, 2) and weights (M, heads, L, P) of the hits.
+
+        A cell has the same offsets and weights in every camera, so they are predicted once for each cell.
+        """
+        offsets, weights = self.attention.predict(query.flatten(0, 1))  # (B·Y·X, heads, 1, L, P, 2)
+        pillar_points = hits.reference_points.shape[1]
+        reference = hits.reference_points.repeat(1, self.points // pillar_points, 1)  # point p: height p mod Z
+        offsets, weights = offsets[:, :, 0].index_select(0, hits.cell), weights[:, :, 0].index_select(0, hits.cell)
+        return sampling_locations(reference[:, None, None], offsets, level_shapes), weights
 
 
 def _normalized_centers(grid: BevGrid) -> Tensor:

@@ -11,13 +11,17 @@ from torch import Tensor, nn
 
 @dataclass(frozen=True)
 class FPNConfig:
-    """levels: maps that the neck puts out. Those beyond the backbone's come from stride-2 convolutions."""
+    """The neck.
+
+    Attributes:
+        levels: number of output maps. Those beyond the backbone's maps come from stride-2 convolutions.
+    """
 
     levels: int = 1
 
 
 class FPN(nn.Module):
-    """Backbone maps to maps of one width, coarse context added top-down; no norm and no activation."""
+    """Brings the backbone's maps to C channels and adds coarse context to the finer maps; no norm, no activation."""
 
     def __init__(self, in_channels: Sequence[int], channels: int, config: FPNConfig) -> None:
         super().__init__()

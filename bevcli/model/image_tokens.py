@@ -1,4 +1,4 @@
-"""Image features as tokens, told which camera and which feature level they come from."""
+"""Image features as tokens, with the embeddings of their camera and feature level."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from bevcli.model.deformable_attention import FeatureMaps
 
 @dataclass(frozen=True)
 class ImageTokensConfig:
-    """camera_embedding: whether a learned vector of its camera is added to every image feature.
+    """The embeddings that are added to image features.
 
-    level_embeddings: learned vectors of feature levels, at least as many as the neck has levels
-    (the published files of weights always hold four).
+    Attributes:
+        camera_embedding: whether every image feature gets the learned embedding of its camera.
+        level_embeddings: number of learned level embeddings, at least the neck's levels (published weights hold four).
     """
 
     camera_embedding: bool = True
@@ -24,7 +25,7 @@ class ImageTokensConfig:
 
 
 class ImageTokens(nn.Module):
-    """Adds the camera embedding and the level embedding to the neck's maps and lays them out as tokens."""
+    """Adds the camera embedding and the level embedding to the neck's maps and flattens the maps to tokens."""
 
     def __init__(self, cameras: int, channels: int, config: ImageTokensConfig) -> None:
         super().__init__()
@@ -34,15 +35,21 @@ class ImageTokens(nn.Module):
             self.camera_embedding = nn.Parameter(torch.randn(cameras, channels))
 
     def forward(self, maps: Sequence[Tensor], camera_index: Tensor) -> FeatureMaps:
-        """maps: (B·N, C, H_l, W_l), one a level. camera_index: (N,) int64.
+        """Flattens the levels of B·N images.
 
-        Returns the tokens (B·N, S, C) of B·N maps with L levels, in the maps' dtype: rounded once where that is half.
+        Args:
+            maps: (B·N, C, H_l, W_l), one a level.
+            camera_index: (N,) int64, the camera embedding of each image.
+
+        Returns:
+            Tokens (B·N, S, C) in the maps' dtype, S the cells of all levels.
         """
         level_shapes = tuple((x.shape[-2], x.shape[-1]) for x in maps)
         levels = [x.flatten(2).transpose(1, 2) + self.level_embedding[i] for i, x in enumerate(maps)]
         tokens = torch.cat(levels, dim=1)  # (B·N, S, C)
-        if self.camera_embedding is None:
-            return FeatureMaps(tokens.to(maps[0].dtype), level_shapes)
-        embedding = self.camera_embedding[camera_index]  # (N, C)
-        by_camera = tokens.unflatten(0, (-1, len(camera_index))) + embedding[:, None]
-        return FeatureMaps(by_camera.flatten(0, 1).to(maps[0].dtype), level_shapes)
+        if self.camera_embedding is not None:
+            embedding = self.camera_embedding[camera_index]  # (N, C)
+            by_camera = tokens.unflatten(0, (-1, len(camera_index))) + embedding[:, None]  # (B, N, S, C)
+            tokens = by_camera.flatten(0, 1)  # (B·N, S, C)
+        # Where the maps are in half precision, the sums with the embeddings are rounded once, here.
+        return FeatureMaps(tokens.to(maps[0].dtype), level_shapes)

@@ -1,4 +1,4 @@
-"""The key names of the original's files of weights, and ours."""
+"""Translates the key names of the official weights files to ours."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 _PREFIXES = ("img_backbone.", "img_neck.", "pts_bbox_head.")
 
-# The official names' patterns and ours. One rule after the other is applied to every key.
+# Pattern of the official name, and ours. All rules are applied to every key, in this order.
 _RENAMES = (
     (r"^img_backbone\.layer(\d)\.", lambda m: f"backbone.stages.{int(m[1]) - 1}."),
     (r"^img_backbone\.", "backbone."),
@@ -39,17 +39,17 @@ _RENAMES = (
     (r"\.ffns\.0\.layers\.1\.", ".feed_forward.reduce."),
 )
 
-# Held by the official files, used in training only.
+# In the official files, but used in training only.
 _TRAINING_ONLY = ("pts_bbox_head.code_weights",)
 
 
 def is_official(state: Mapping[str, Tensor]) -> bool:
-    """Whether a state dict uses the original's key names."""
+    """Whether a state dict uses the official key names."""
     return any(key.startswith(_PREFIXES) for key in state)
 
 
 def from_official(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The original's state dict under our names. Keys that no rule knows stay as they are, and so are unexpected."""
+    """An official state dict with our key names. A key that no rule matches stays unchanged."""
     first_extra = sum(key.startswith("img_neck.lateral_convs.") and key.endswith(".weight") for key in state)
     return {_our_name(key, first_extra): tensor for key, tensor in state.items() if key not in _TRAINING_ONLY}
 

@@ -1,21 +1,25 @@
-"""Where the pillars of the BEV cells appear in the cameras, and which cameras see a cell (paper, section 3.3)."""
+"""Pillars of the BEV cells in the cameras: where they appear, and which cameras see a cell (paper, section 3.3)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
-# Metres. Points nearer or behind the camera are not visible, and are projected as if they lay at this depth.
+from bevcli.geometry.bev_grid import BevGrid
+
+# Metres. A point nearer than this, or behind the camera, is not visible and is projected as if it lay at this depth.
 MIN_DEPTH = 1e-5
 
 
 @dataclass(frozen=True)
 class PillarProjection:
-    """The pillars of every BEV cell in every camera.
+    """The pillar points of every BEV cell in every camera.
 
-    reference_points: (B, N, Y·X, Z, 2) float32, x and y, 0 to 1 over the padded image; up to 1e7 behind a camera.
-    visible: (B, N, Y·X, Z) bool.
+    Attributes:
+        reference_points: (B, N, Y·X, Z, 2) float32, x and y, 0 to 1 over the padded image; up to 1e7 behind a camera.
+        visible: (B, N, Y·X, Z) bool, whether a point lies inside the image and in front of the camera.
     """
 
     reference_points: Tensor
@@ -23,16 +27,19 @@ class PillarProjection:
 
     @property
     def hit(self) -> Tensor:
-        """(B, N, Y·X) bool: the cells that attend in a camera: any point of their pillar is visible there."""
+        """(B, N, Y·X) bool: whether a camera sees a cell, which is when any point of its pillar is visible."""
         return self.visible.any(-1)
 
 
 @dataclass(frozen=True)
 class PillarHits:
-    """The ragged list of M hits, a (camera, cell) pair each, ordered by batch, camera, cell.
+    """The list of all M pairs of a camera and a cell that it sees, ordered by batch element, camera, cell.
 
-    cell: (M,) int64, index in B·Y·X. reference_points: (M, Z, 2). hits_per_camera: B·N counts, of sum M.
-    cameras_per_cell: (B·Y·X,) int64, how many cameras see a cell.
+    Attributes:
+        cell: (M,) int64, index of the cell in B·Y·X.
+        reference_points: (M, Z, 2) float32, x and y of the pillar's points, 0 to 1 over the padded image.
+        hits_per_camera: B·N counts, of sum M.
+        cameras_per_cell: (B·Y·X,) int64, the number of cameras that see a cell.
     """
 
     cell: Tensor
@@ -41,8 +48,39 @@ class PillarHits:
     cameras_per_cell: Tensor
 
 
+class Pillars(nn.Module):
+    """The pillars of a BEV grid. It has no parameters.
+
+    Attributes:
+        points: (Y·X, Z, 3) float32, metres, bev frame.
+    """
+
+    points: Tensor
+
+    def __init__(self, grid: BevGrid) -> None:
+        super().__init__()
+        points = torch.as_tensor(grid.pillars(), dtype=torch.float32).flatten(0, 1)
+        self.register_buffer("points", points, persistent=False)
+
+    def forward(self, image_from_bev: Tensor, image_size: tuple[int, int], has_image: Tensor) -> PillarHits:
+        """The pairs of a camera and a cell that it sees; arguments as for `project_pillars`."""
+        return find_hits(self.project(image_from_bev, image_size, has_image))
+
+    def project(self, image_from_bev: Tensor, image_size: tuple[int, int], has_image: Tensor) -> PillarProjection:
+        """The pillars in every camera; arguments as for `project_pillars`."""
+        return project_pillars(image_from_bev, self.points, image_size, has_image)
+
+
 def project_points(image_from_bev: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
-    """(..., 4, 4) and (..., 3) metres, bev frame -> pixels (..., 2) and depths in metres (...)."""
+    """Projects points into images.
+
+    Args:
+        image_from_bev: (..., 4, 4).
+        points: (..., 3) metres, bev frame.
+
+    Returns:
+        Pixels (..., 2), and depths (...) in metres.
+    """
     # Sums of products, not matmul: lower-precision matrix units would move the points by pixels.
     projected = (image_from_bev[..., :3, :3] * points[..., None, :]).sum(-1) + image_from_bev[..., :3, 3]
     depth = projected[..., 2:]
@@ -52,10 +90,13 @@ def project_points(image_from_bev: Tensor, points: Tensor) -> tuple[Tensor, Tens
 def project_pillars(
     image_from_bev: Tensor, pillars: Tensor, image_size: tuple[int, int], has_image: Tensor
 ) -> PillarProjection:
-    """Projects 3D reference points into the cameras.
+    """Projects the pillars' points into every camera.
 
-    image_from_bev: (B, N, 4, 4) float32. pillars: (Y·X, Z, 3) metres, bev frame. has_image: (B, N) bool.
-    image_size: (height, width) of the network's input, padding included, pixels.
+    Args:
+        image_from_bev: (B, N, 4, 4) float32, bev metres to pixels of the network's input.
+        pillars: (Y·X, Z, 3) metres, bev frame.
+        image_size: (height, width) of the network's input, padding included, pixels.
+        has_image: (B, N) bool; a camera without an image sees nothing.
     """
     pixels, depth = project_points(image_from_bev.float()[:, :, None, None], pillars.float())
     height, width = image_size
@@ -65,7 +106,7 @@ def project_pillars(
 
 
 def find_hits(projection: PillarProjection) -> PillarHits:
-    """Keeps only the pairs of a camera and a cell that it sees; the other pairs cost nothing from here on."""
+    """The pairs of a camera and a cell that it sees; attention is computed for these only."""
     hit = projection.hit
     batch, camera, cell = hit.nonzero(as_tuple=True)
     return PillarHits(

@@ -1,105 +1,181 @@
-"""A trained model made ready to be run: the same answers, sooner."""
+"""A trained model prepared for inference: the same results, faster.
+
+The plain model knows nothing of this. A prepared model is a copy whose parts are replaced by faster ones.
+"""
 
 from __future__ import annotations
 
 import copy
 import threading
+from dataclasses import replace
+from importlib.util import find_spec
 from typing import Literal
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_weights
 
-from bevcli.model.bevformer import BEVFormer
-from bevcli.model.deformable_attention import DeformableAttention, fastest_backend
+from bevcli.model.bevformer import BEVFormer, BEVFormerInputs, BEVFormerOutputs
+from bevcli.model.decoder import Decoder, DecoderLayer
+from bevcli.model.deformable_attention import DeformableAttention, GridSampling
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
-from bevcli.model.kernels.compiled_attention import load_compiled
+from bevcli.model.encoder import SpatialCrossAttention
+from bevcli.model.kernels.compiled import CompiledDeformableConvolution, CompiledSampling, load_compiled
 from bevcli.model.kernels.onednn import use_onednn
+from bevcli.model.pillar_projection import PillarHits, Pillars
 from bevcli.model.resnet import Bottleneck, ResNet
-from bevcli.model.spatial_cross_attention import SpatialCrossAttention
 
 Precision = Literal["fp32", "bf16", "fp16"]
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 
 
-def prepare_for_inference(model: BEVFormer, device: torch.device, precision: Precision = "fp32") -> BEVFormer:
-    """A copy of the model on the device, for inference only; the model itself stays as it is.
-
-    What is the same in every frame is worked out here, what hangs on calibration and poses when these change.
-    Batch norms are folded into their convolutions, images are convolved channels-last, deformable operations take
-    the device's fastest backends, and on a CPU oneDNN runs convolutions and linear layers. At half precision the
-    whole way of the images computes in it: backbone, neck, image tokens and their values. What follows moves boxes
-    by decimetres when it is rounded, and is a small part of the work: BEV queries, sampling locations, decoder and
-    heads stay in float32.
-    """
-    prepared = copy.deepcopy(model).to(device).eval().requires_grad_(False)
-    prepared.prepared = True
-    _fold_batch_norms(prepared.backbone)
-    choose_kernels(prepared, device)
-    with torch.no_grad():
-        prepared.bev_queries.kept_position = prepared.bev_queries.position()
-        prepared.decoder.kept_first_queries = prepared.decoder.first_queries()
-    _lower_precision(prepared, DTYPES[precision])
+def prepare_for_inference(model: BEVFormer, device: torch.device, precision: Precision = "fp32") -> PreparedBEVFormer:
+    """A copy of the model on the device, for inference only; the model itself stays unchanged."""
+    prepared = PreparedBEVFormer(model, device, precision)
     if device.type == "cpu":
-        use_onednn(prepared)
-        # Beside the first frame's backbone, which needs no Python: the start is half a second sooner. Not before,
-        # because copying the model would wait for it at every tensor.
+        # Runs beside the first frame's backbone, which needs no Python. Started any earlier, it would slow down the
+        # copying of the model.
         threading.Thread(target=load_compiled, args=(DTYPES[precision],), name="load-compiled").start()
     return prepared
 
 
-def choose_kernels(model: BEVFormer, device: torch.device, *, gradients: bool = False) -> None:
-    """Gives a model, in place, the layouts and backends that compute the same soonest on a device.
+class PreparedBEVFormer(BEVFormer):
+    """A BEVFormer for inference on one device.
 
-    gradients: whether they are asked for.
+    Batch norms are folded into their convolutions, which run in channels-last layout. Deformable attention and
+    deformable convolution use the device's fastest kernels, and on a CPU oneDNN runs convolutions and linear layers.
+    Results that do not change from frame to frame are computed once (`ConstantSelfAttention`, `CachedPillars`).
+
+    The precision applies to the path of the images: backbone, neck, image tokens and their values. BEV queries,
+    sampling locations, decoder and heads stay in float32: they are a small part of the work, and rounding them would
+    move boxes by decimetres. Autocast around a prepared model has no effect.
+    """
+
+    def __init__(self, model: BEVFormer, device: torch.device, precision: Precision) -> None:
+        nn.Module.__init__(self)  # not BEVFormer's, which would make new weights
+        self.__dict__.update(copy.deepcopy(model).__dict__)
+        self.to(device).eval().requires_grad_(False)
+        self.images_dtype = DTYPES[precision]
+        fold_batch_norms(self.backbone, device)
+        choose_kernels(self, device)
+        self.pillars = CachedPillars(self.config.bev_grid).to(device)
+        self.decoder.layers[0].self_attention = ConstantSelfAttention(self.decoder)
+        for part in (self.backbone, self.neck):
+            part.to(self.images_dtype)
+        for module in self.encoder.modules():
+            if isinstance(module, SpatialCrossAttention):
+                module.attention.value_projection.to(self.images_dtype)
+        if device.type == "cpu":
+            use_onednn(self)
+
+    def forward(self, inputs: BEVFormerInputs, history: Tensor | None = None) -> BEVFormerOutputs:
+        """As `BEVFormer.forward`."""
+        with torch.autocast(inputs.images.device.type, enabled=False):
+            return super().forward(replace(inputs, images=inputs.images.to(self.images_dtype)), history)
+
+
+class CachedPillars(Pillars):
+    """Projects the pillars again only when calibration, poses or images are not those of the last call."""
+
+    _inputs: tuple[Tensor, Tensor, tuple[int, int]] | None = None
+    _hits: PillarHits
+
+    def forward(self, image_from_bev: Tensor, image_size: tuple[int, int], has_image: Tensor) -> PillarHits:
+        """As `Pillars.forward`."""
+        if self._inputs is None or not (
+            image_size == self._inputs[2]
+            and _equal(image_from_bev, self._inputs[0])
+            and _equal(has_image, self._inputs[1])
+        ):
+            self._inputs = image_from_bev.clone(), has_image.clone(), image_size
+            self._hits = super().forward(image_from_bev, image_size, has_image)
+        return self._hits
+
+
+class ConstantSelfAttention(nn.Module):
+    """Takes the place of the self-attention in the first decoder layer, whose input is the same in every frame."""
+
+    attended: Tensor
+
+    def __init__(self, decoder: Decoder) -> None:
+        super().__init__()
+        first = decoder.layers[0]
+        assert isinstance(first, DecoderLayer)
+        with torch.no_grad():
+            position, query = decoder.object_queries(batch=1)
+            key = query + position
+            attended, _ = first.self_attention(key, key, query, need_weights=False)
+        self.register_buffer("attended", attended, persistent=False)  # (1, Q, C)
+
+    def forward(self, query: Tensor, key: Tensor, value: Tensor, *, need_weights: bool) -> tuple[Tensor, None]:
+        """query, key, value: (B, Q, C), of which only B is read -> (B, Q, C), None."""
+        return self.attended.expand_as(value), None
+
+
+class BiasedDeformableConvolution(nn.Module):
+    """A deformable convolution with the bias that is left of a batch norm folded into it."""
+
+    def __init__(self, convolution: ModulatedDeformableConvolution, bias: Tensor) -> None:
+        super().__init__()
+        self.convolution = convolution
+        self.bias = nn.Parameter(bias.detach(), requires_grad=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """x: (B, C, H, W) -> (B, O, H', W')."""
+        return self.convolution(x) + self.bias[:, None, None]
+
+
+def choose_kernels(model: BEVFormer, device: torch.device, *, gradients: bool = False) -> None:
+    """Gives a model, in place, the memory layout and the deformable attention that are fastest on a device.
+
+    gradients: whether the model is trained; then only kernels with gradients are used.
     """
     for part in (model.backbone, model.neck):
         part.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     for module in model.modules():
         if isinstance(module, DeformableAttention):
-            module.backend = fastest_backend(device, gradients=gradients)
-        elif isinstance(module, ModulatedDeformableConvolution) and device.type == "cpu" and not gradients:
-            module.backend = "compiled"
+            module.sampling = fastest_sampling(device, gradients=gradients)
 
 
-def textbook_version(model: BEVFormer, device: torch.device) -> BEVFormer:
-    """A copy of the model that computes as the textbooks say: the yardstick and the oracle of the prepared one.
+def fastest_sampling(device: torch.device, *, gradients: bool = False) -> nn.Module:
+    """The fastest module for `DeformableAttention.sampling` on a device. gradients: whether it needs them."""
+    if device.type == "cpu":
+        return CompiledSampling()
+    if device.type == "cuda" and find_spec("triton") and not gradients:
+        from bevcli.model.kernels.triton_attention import TritonSampling  # only where Triton is installed
 
-    Batch norms apart, channels-first float32, `grid_sample` with all queries padded to the longest camera.
-    """
-    textbook = copy.deepcopy(model).to(device).eval().requires_grad_(False)
-    for module in textbook.modules():
-        if isinstance(module, DeformableAttention):
-            module.backend = "padded"
-    return textbook
+        return TritonSampling()
+    return GridSampling()
 
 
-def _fold_batch_norms(backbone: ResNet) -> None:
-    _fold(backbone, "conv1", "bn1")
+def fold_batch_norms(backbone: ResNet, device: torch.device) -> None:
+    """Folds every batch norm into the convolution before it, in place, for inference on a device."""
+    _fold(backbone, "conv1", "bn1", device)
     for block in backbone.modules():
         if isinstance(block, Bottleneck):
             for number in (1, 2, 3):
-                _fold(block, f"conv{number}", f"bn{number}")
+                _fold(block, f"conv{number}", f"bn{number}", device)
             if isinstance(block.downsample, nn.Sequential):
-                _fold(block.downsample, "0", "1")
+                _fold(block.downsample, "0", "1", device)
 
 
-def _fold(parent: nn.Module, convolution_name: str, norm_name: str) -> None:
-    """Folds a batch norm into the convolution before it; an identity takes its place."""
+def _fold(parent: nn.Module, convolution_name: str, norm_name: str, device: torch.device) -> None:
     convolution, norm = parent.get_submodule(convolution_name), parent.get_submodule(norm_name)
     assert isinstance(convolution, nn.Conv2d | ModulatedDeformableConvolution)
     assert isinstance(norm, nn.BatchNorm2d)
     assert norm.running_mean is not None
     assert norm.running_var is not None
-    convolution.weight, convolution.bias = fuse_conv_bn_weights(
-        convolution.weight, convolution.bias, norm.running_mean, norm.running_var, norm.eps, norm.weight, norm.bias
+    convolution.weight, bias = fuse_conv_bn_weights(
+        convolution.weight, None, norm.running_mean, norm.running_var, norm.eps, norm.weight, norm.bias
     )
     parent.set_submodule(norm_name, nn.Identity())
+    if isinstance(convolution, nn.Conv2d):
+        convolution.bias = bias
+    elif device.type == "cpu":
+        parent.set_submodule(convolution_name, CompiledDeformableConvolution(convolution, bias))
+    else:
+        parent.set_submodule(convolution_name, BiasedDeformableConvolution(convolution, bias))
 
 
-def _lower_precision(model: BEVFormer, dtype: torch.dtype) -> None:
-    for part in (model.backbone, model.neck):
-        part.to(dtype)
-    for module in model.encoder.modules():
-        if isinstance(module, SpatialCrossAttention):
-            module.attention.value_projection.to(dtype)
+def _equal(one: Tensor, other: Tensor) -> bool:
+    return one.shape == other.shape and one.device == other.device and torch.equal(one, other)

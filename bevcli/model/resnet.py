@@ -13,12 +13,14 @@ from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 
 @dataclass(frozen=True)
 class ResNetConfig:
-    """blocks: bottlenecks of the four stages; (3, 4, 6, 3) is ResNet-50, (3, 4, 23, 3) ResNet-101.
+    """The backbone.
 
-    style: where a stage's stride sits: "pytorch" in the 3x3, "caffe" in the first 1x1.
-    output_stages: the stages (1 to 4) whose maps go on to the neck.
-    deformable_stages: the stages whose 3x3 are modulated deformable convolutions (DCNv2).
-    width: channels of the stem; stage s puts out 4 · width · 2^(s - 1).
+    Attributes:
+        blocks: number of bottlenecks in each of the four stages; (3, 4, 6, 3) is ResNet-50, (3, 4, 23, 3) ResNet-101.
+        style: which convolution of a stage's first bottleneck has the stride: "pytorch" the 3x3, "caffe" the first 1x1.
+        output_stages: the stages (1 to 4) whose maps go to the neck.
+        deformable_stages: the stages whose 3x3 convolutions are modulated deformable convolutions (DCNv2).
+        width: channels of the stem; stage s has 4 · width · 2^(s - 1) output channels.
     """
 
     blocks: tuple[int, int, int, int] = (3, 4, 6, 3)
@@ -30,7 +32,7 @@ class ResNetConfig:
     def __post_init__(self) -> None:
         stages = self.output_stages + self.deformable_stages
         if not self.output_stages or not set(stages) <= {1, 2, 3, 4}:
-            raise ValueError("output_stages and deformable_stages name stages 1 to 4, output_stages at least one")
+            raise ValueError("output_stages and deformable_stages must hold stages 1 to 4, output_stages at least one")
         if min(*self.blocks, self.width) < 1:
             raise ValueError("blocks and width must be positive")
 
@@ -40,7 +42,7 @@ class ResNetConfig:
 
 
 class ResNet(nn.Module):
-    """Images to feature maps at strides 4, 8, 16 and 32; only the configured stages' maps are returned."""
+    """Images to feature maps of the configured output stages; the four stages have the strides 4, 8, 16 and 32."""
 
     def __init__(self, config: ResNetConfig) -> None:
         super().__init__()
@@ -59,9 +61,9 @@ class ResNet(nn.Module):
         nn.init.kaiming_normal_(self.conv1.weight, mode="fan_out", nonlinearity="relu")
 
     def forward(self, images: Tensor) -> list[Tensor]:
-        """images: (B, 3, H, W), H and W multiples of 32 -> a map (B, C_s, H / 2^(s+1), W / 2^(s+1)) a stage s."""
-        x = images.to(self.conv1.weight.dtype)
-        x = F.relu(self.pool(self.bn1(self.conv1(x))))  # the same as the published order, at a quarter of the cost
+        """images: (B, 3, H, W), H and W multiples of 32 -> (B, C_s, H / 2^(s+1), W / 2^(s+1)) for each output stage."""
+        # ReLU and max-pooling commute; the published order applies ReLU before pooling, to four times as many cells.
+        x = F.relu(self.pool(self.bn1(self.conv1(images))))
         maps = []
         for stage, blocks in enumerate(self.stages, start=1):
             x = blocks(x)
@@ -71,7 +73,7 @@ class ResNet(nn.Module):
 
 
 class Bottleneck(nn.Module):
-    """1x1, 3x3, 1x1, each with batch norm, beside a shortcut."""
+    """1x1, 3x3 and 1x1 convolution, each with batch norm, and a shortcut around them."""
 
     def __init__(
         self, in_channels: int, channels: int, stride: int, style: Literal["pytorch", "caffe"], deformable: bool
@@ -104,7 +106,7 @@ class Bottleneck(nn.Module):
         for module in self.modules():
             if isinstance(module, nn.Conv2d) and module.bias is None:
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
-        # A fresh block is the identity, which lets deep stacks start to train.
+        # An untrained block is the identity, so that deep networks train.
         nn.init.zeros_(self.bn3.weight)
 
 

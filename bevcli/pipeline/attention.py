@@ -1,21 +1,109 @@
-"""From the model's attention samples to what can be drawn: metres in the BEV, pixels in the images as read."""
+"""What an encoder layer attended to: observed in the model, then converted to BEV cells and pixels for display."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils.hooks import RemovableHandle
 
 from bevcli.errors import InputError
 from bevcli.frame import AttentionView, CameraSamples, Probe
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.attention_probe import AttentionProbe, SpatialSamples
-from bevcli.model.bevformer import BEVFormerConfig
+from bevcli.model.bevformer import BEVFormer, BEVFormerConfig
+from bevcli.model.encoder import EncoderLayer
+from bevcli.model.pillar_projection import PillarHits
 from bevcli.pipeline.preprocess import PreparedFrame
 
 
+@dataclass(frozen=True)
+class SpatialSamples:
+    """The samples of K' pairs of a camera and a cell in spatial cross-attention.
+
+    Attributes:
+        camera: (K',) index in B·N.
+        cell: (K',) index in B·Y·X.
+        locations: (K', heads, L, P, 2) x, y, 0 to 1 over the padded image.
+        weights: (K', heads, L, P), whose sum is 1 for each head.
+    """
+
+    camera: Tensor
+    cell: Tensor
+    locations: Tensor
+    weights: Tensor
+
+
+class AttentionProbe:
+    """Observes the attentions of one encoder layer, in a plain or a prepared model.
+
+    Forward hooks read the inputs and outputs of the layer's parts. They exist inside the `with` block only:
+
+        with AttentionProbe(model, layer=5, cells=torch.tensor([20_100])) as probe:
+            model(inputs, history)
+        probe.spatial, probe.history_share
+
+    Attributes:
+        cells: (K,) int64, the cells (index in B·Y·X) whose samples are kept.
+        spatial: samples of spatial cross-attention, None before the model has run.
+        history_share: (B, Y·X), 0 to 1, the share of the history map in what temporal self-attention sampled, by the
+            norms of the two sampled vectors; None without history. The attention weights cannot tell, because each
+            map has a softmax of its own and the two results are averaged.
+    """
+
+    def __init__(self, model: BEVFormer, layer: int, cells: Tensor) -> None:
+        self.cells = cells
+        self.spatial: SpatialSamples | None = None
+        self.history_share: Tensor | None = None
+        observed = model.encoder.layers[layer]
+        assert isinstance(observed, EncoderLayer)
+        self._layer = observed
+        self._hooks: list[RemovableHandle] = []
+
+    def __enter__(self) -> AttentionProbe:
+        temporal, spatial = self._layer.temporal_self_attention, self._layer.spatial_cross_attention
+        self._hooks = [
+            temporal.attention.sampling.register_forward_hook(self._see_temporal_samples),
+            spatial.attention.sampling.register_forward_hook(self._see_spatial_samples),
+            spatial.register_forward_hook(self._see_hits),
+            self._layer.register_forward_hook(self._see_layer),
+        ]
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for hook in self._hooks:
+            hook.remove()
+
+    def _see_temporal_samples(self, _module: object, arguments: tuple[Any, ...], sampled: Tensor) -> None:
+        cells = arguments[4][0]  # queries of the first map
+        norms = sampled.detach().unflatten(0, (-1, 2, cells)).norm(dim=-1)  # (B, 2, Y·X)
+        self.history_share = norms[:, 0] / norms.sum(1).clamp(min=1e-12)
+
+    def _see_spatial_samples(self, _module: object, arguments: tuple[Any, ...], _sampled: Tensor) -> None:
+        self._locations, self._weights = arguments[2].detach(), arguments[3].detach()
+
+    def _see_hits(self, _module: object, arguments: tuple[Any, ...], _attended: Tensor) -> None:
+        hits: PillarHits = arguments[2]
+        counts = torch.tensor(hits.hits_per_camera, device=hits.cell.device)
+        camera = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
+        chosen = torch.isin(hits.cell, self.cells)
+        self.spatial = SpatialSamples(camera[chosen], hits.cell[chosen], self._locations[chosen], self._weights[chosen])
+
+    def _see_layer(self, _module: object, arguments: tuple[Any, ...], _query: Tensor) -> None:
+        if arguments[2] is None:  # without history both maps are the current one
+            self.history_share = None
+
+
 def probe_cells(probes: tuple[tuple[float, float], ...], grid: BevGrid) -> Tensor:
-    """(K,) int64 indices of the cells at K places (x, y) in metres, bev frame. Raises InputError outside the grid."""
+    """(K,) int64 indices of the cells at K positions (x, y) in metres, bev frame.
+
+    Raises InputError for a position outside the grid.
+    """
     cells = []
     for x, y in probes:
         row, column = grid.cell_of((x, y))
@@ -27,7 +115,7 @@ def probe_cells(probes: tuple[tuple[float, float], ...], grid: BevGrid) -> Tenso
 
 
 def attention_view(probe: AttentionProbe, prepared: PreparedFrame, config: BEVFormerConfig) -> AttentionView:
-    """The answers of a probe, one frame (batch of one)."""
+    """What a probe observed in one frame (a batch of one), in BEV cells and in pixels of the images as read."""
     grid = config.bev_grid
     share = probe.history_share
     history = None if share is None else share[0].float().cpu().double().numpy().reshape(grid.rows, grid.columns)
@@ -40,16 +128,17 @@ def attention_view(probe: AttentionProbe, prepared: PreparedFrame, config: BEVFo
 def _samples(
     samples: SpatialSamples | None, cell: int, prepared: PreparedFrame, config: BEVFormerConfig
 ) -> dict[str, CameraSamples]:
+    """The samples of a cell by camera; no entry for a camera that does not see it."""
     if samples is None:
         return {}
     chosen = (samples.cell == cell).nonzero()[:, 0].tolist()
     size = np.array(config.image.padded_size, dtype=np.float64)
     result = {}
     for row in chosen:
-        place = int(samples.camera[row])
-        camera = prepared.frame.rig[prepared.assignment.cameras[place]]
-        pixels = samples.locations[row].float().cpu().double().numpy().reshape(-1, 2) * size / prepared.scales[place]
+        index = int(samples.camera[row])
+        camera = prepared.frame.rig[prepared.assignment.cameras[index]]
+        pixels = samples.locations[row].float().cpu().double().numpy().reshape(-1, 2) * size / prepared.scales[index]
         weights = samples.weights[row].float().cpu().double().numpy().reshape(-1)
-        shares = weights / (len(chosen) * samples.weights.shape[1])  # of all heads and cameras together
+        shares = weights / (len(chosen) * samples.weights.shape[1])  # the sum over all heads and cameras is 1
         result[camera.name] = CameraSamples(camera.distorted(pixels), shares)
     return result

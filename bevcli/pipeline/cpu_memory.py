@@ -1,4 +1,4 @@
-"""Keeps glibc from handing each large tensor's memory back to the kernel, only to ask for it again."""
+"""Settings of the C library's memory allocator, for the whole process. The command line sets them at its start."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ import ctypes
 # Parameters of mallopt(3).
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 _LARGEST_BLOCK = 1 << 30
-# Where glibc's own thresholds end up in a process that frees large blocks.
+# What glibc's own thresholds become in a process that frees large blocks.
 _USUAL_MMAP_THRESHOLD = 32 << 20
 
 
 def keep_freed_memory() -> None:
-    """For the whole process: freed blocks are kept for the next tensor of that size.
+    """Keeps freed blocks for the next tensor of their size instead of returning them to the kernel.
 
-    By default every tensor over 32 MiB is mapped, zeroed page by page and unmapped again: in ResNet-50 on six images
-    that was 2.4 million page faults and half of the time. Does nothing where the C library is not glibc.
+    By default every tensor over 32 MiB is mapped, zeroed page by page and unmapped again. In ResNet-50 on six images
+    that caused 2.4 million page faults and took half of the time. Does nothing where the C library is not glibc.
     """
     _set_thresholds(mmap=_LARGEST_BLOCK, trim=(1 << 31) - 1)
 
 
 def return_freed_memory() -> None:
-    """As glibc does by itself; what is free now goes back to the kernel at once."""
+    """Goes back to glibc's default behaviour, and returns the memory that is free now to the kernel."""
     _set_thresholds(mmap=_USUAL_MMAP_THRESHOLD, trim=2 * _USUAL_MMAP_THRESHOLD)
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:

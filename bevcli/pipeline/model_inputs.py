@@ -10,7 +10,7 @@ import torch
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import Pose
 from bevcli.model.bevformer import BEVFormerConfig, BEVFormerInputs
-from bevcli.model.ego_motion_inputs import EgoMotionInputs, ego_motion_inputs
+from bevcli.model.ego_motion import EgoMotionInputs, ego_motion_inputs
 from bevcli.pipeline.preprocess import PreparedFrame
 
 

@@ -16,8 +16,7 @@ from torch import Tensor
 from bevcli.frame import Frame
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Array, inverse
-from bevcli.model.bevformer import BEVFormerConfig
-from bevcli.model.image_config import ImageConfig
+from bevcli.model.bevformer import BEVFormerConfig, ImageConfig
 from bevcli.pipeline.camera_assignment import CameraAssignment, assign_cameras
 
 

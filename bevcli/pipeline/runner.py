@@ -13,13 +13,11 @@ from torch import Tensor
 from bevcli.frame import AttentionView, BevMap, Frame, FrameStamp, Prediction, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
-from bevcli.model.attention_probe import AttentionProbe
 from bevcli.model.bevformer import BEVFormer, BEVFormerInputs, BEVFormerOutputs
 from bevcli.model.box_coding import decode
-from bevcli.model.panoptic_merging import decode_maps
 from bevcli.model.prepared import Precision
-from bevcli.pipeline.attention import attention_view, probe_cells
-from bevcli.pipeline.cpu_memory import keep_freed_memory
+from bevcli.model.segmentation import decode_maps
+from bevcli.pipeline.attention import AttentionProbe, attention_view, probe_cells
 from bevcli.pipeline.model_inputs import model_inputs
 from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
 from bevcli.pipeline.read_ahead import read_ahead
@@ -59,8 +57,6 @@ class Runner:
         self.device = device
         self.options = StepOptions() if options is None else options
         self.clock = StageClock(model, device)
-        if device.type == "cpu":
-            keep_freed_memory()
 
     @torch.inference_mode()
     def step(self, state: BevState | None, prepared: PreparedFrame) -> tuple[BevState | None, Prediction]:
@@ -71,14 +67,14 @@ class Runner:
             state = None
         if not frame.images:
             return state, self._prediction(prepared, started_anew, Boxes3D.empty(), None)
-        self.clock.start()
-        probe = self._probe(frame)
-        with self._autocast():
-            inputs = self._inputs(prepared, state)
-            outputs = self.model(inputs, None if state is None else state.bev, probe)
-        boxes = decode(outputs, self.config)[0]
-        self.clock.mark("box_decoding")
-        segmentation = self._segmentation(outputs)
+        probe = self._probe()
+        with self.clock:
+            with self._autocast(), probe or contextlib.nullcontext():
+                inputs = self._inputs(prepared, state)
+                outputs = self.model(inputs, None if state is None else state.bev)
+            boxes = decode(outputs, self.config)[0]
+            self.clock.mark("box_decoding")
+            segmentation = self._segmentation(outputs)
         view = None if probe is None else attention_view(probe, prepared, self.config)
         prediction = self._prediction(prepared, started_anew, boxes, outputs.bev[0], view, segmentation)
         return BevState(outputs.bev, frame.world_from_ego, frame.stamp), prediction
@@ -109,11 +105,11 @@ class Runner:
         inputs = model_inputs([prepared], [None if state is None else state.pose], self.config)
         return inputs.to(self.device)
 
-    def _probe(self, frame: Frame) -> AttentionProbe | None:
+    def _probe(self) -> AttentionProbe | None:
         if not self.options.ask_attention:
             return None
         cells = probe_cells(self.options.probes, self.config.bev_grid)
-        return AttentionProbe(layer=self.config.encoder.layers - 1, cells=cells.to(self.device))
+        return AttentionProbe(self.model, self.config.encoder.layers - 1, cells.to(self.device))
 
     def _segmentation(self, outputs: BEVFormerOutputs) -> BevMap | None:
         if outputs.segmentation is None:
@@ -124,7 +120,8 @@ class Runner:
         return bev_map
 
     def _autocast(self) -> contextlib.AbstractContextManager[object]:
-        if self.options.precision == "fp32" or self.model.prepared:
+        # For a plain model; a prepared one has a precision of its own and ignores it.
+        if self.options.precision == "fp32":
             return contextlib.nullcontext()
         return torch.autocast(self.device.type, _AUTOCAST[self.options.precision])
 

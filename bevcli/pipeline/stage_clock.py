@@ -1,14 +1,16 @@
-"""StageClock: how long each stage of a step takes, seen from outside the model by hooks."""
+"""StageClock: the time of each stage of a step, measured by forward hooks on the model."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from types import TracebackType
 
 import torch
 from torch import nn
+from torch.utils.hooks import RemovableHandle
 
-# Stage of what has been computed when a module is done, by the module's name.
+# Module name -> the stage that ends with this module.
 STAGES = {
     "backbone": "backbone",
     "neck": "neck",
@@ -19,11 +21,15 @@ STAGES = {
 
 
 class StageClock:
-    """Seconds per stage of one step.
+    """Seconds of each stage of one step. The model has hooks inside the `with` block only:
 
-    stages: module name -> stage; what passed since the last mark belongs to it once the module is done. starts:
-    the same for the moment before a module begins. On a GPU the marks are events in its queue: nothing waits for
-    it before `read`.
+        with clock:
+            model(inputs)
+            clock.mark("decoding")
+        clock.read()
+
+    Time is attributed by marks: the time since the last mark belongs to the stage of the new mark. On a GPU, marks are
+    events in its queue, and only `read` waits for the GPU.
     """
 
     def __init__(
@@ -33,25 +39,44 @@ class StageClock:
         stages: Mapping[str, str] = STAGES,
         starts: Mapping[str, str] | None = None,
     ) -> None:
+        """A clock that is not running.
+
+        Args:
+            model: modules that it lacks are left out.
+            device: where the model runs.
+            stages: module name -> stage that is marked when the module ends.
+            starts: module name -> stage that is marked before the module begins.
+        """
         self._on_gpu = device.type == "cuda"
         self._marks: list[tuple[str, float | torch.cuda.Event]] = []
+        self._hooks: list[RemovableHandle] = []
         modules = dict(model.named_modules())
-        for name in stages.keys() & modules.keys():
-            modules[name].register_forward_hook(lambda *_, stage=stages[name]: self.mark(stage))
-        for name, stage in (starts or {}).items():
-            modules[name].register_forward_pre_hook(lambda *_, stage=stage: self.mark(stage))
+        self._ends = [(modules[name], stage) for name, stage in stages.items() if name in modules]
+        self._starts = [(modules[name], stage) for name, stage in (starts or {}).items()]
 
-    def start(self) -> None:
+    def __enter__(self) -> StageClock:
         """A new step begins now."""
+        for module, stage in self._ends:
+            self._hooks.append(module.register_forward_hook(lambda *_, stage=stage: self.mark(stage)))
+        for module, stage in self._starts:
+            self._hooks.append(module.register_forward_pre_hook(lambda *_, stage=stage: self.mark(stage)))
         self._marks = []
         self.mark("")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for hook in self._hooks:
+            hook.remove()
+        self._hooks = []
 
     def mark(self, stage: str) -> None:
-        """What passed since the last mark belongs to this stage."""
+        """The time since the last mark belongs to this stage."""
         self._marks.append((stage, self._now()))
 
     def read(self) -> Mapping[str, float]:
-        """Stage -> seconds, of the step so far."""
+        """Stage -> seconds, of the last step."""
         if self._on_gpu:
             torch.cuda.synchronize()
         seconds: dict[str, float] = {}

@@ -19,7 +19,7 @@ from bevcli.recording.bev_images import BevImages
 from bevcli.recording.blueprint import recording_blueprint
 from bevcli.recording.colors import EGO_COLOR
 from bevcli.recording.log_cameras import PosedCamera
-from bevcli.recording.matching import counted, match
+from bevcli.recording.matching import detectable, true_positives
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.vehicle import load_vehicle
 
@@ -197,11 +197,11 @@ class Recording:
         true = np.ones(len(shown), dtype=bool)
         if frame.ground_truth is not None:
             in_recording = frame.ground_truth.transformed(self._moved_to_origin(np.eye(4)))
-            truth = counted(in_recording.transformed(inverse(world_from_bev)), prediction.grid)
+            truth = detectable(in_recording.transformed(inverse(world_from_bev)), prediction.grid)
             if self.untrained:  # random boxes match nothing: a scene all in red would be useless
                 found = np.ones(len(truth), dtype=bool)
             else:
-                true, found = match(shown, truth)
+                true, found = true_positives(shown, truth)
                 found |= log_boxes.other_classes(truth, self.class_names)
             self._log_ground_truth(truth, found, world_from_bev, cameras)
         stream, names = self._stream, self.class_names

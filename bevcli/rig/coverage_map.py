@@ -1,4 +1,4 @@
-"""The coverage map: the BEV grid from above, how many cameras see each cell, and where the cameras stand."""
+"""coverage.png: the BEV grid from above, how many cameras see each cell, and the cameras' fields of view."""
 
 from __future__ import annotations
 
@@ -16,10 +16,17 @@ from bevcli.errors import OutputError
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import apply, inverse
 from bevcli.rig.coverage import Coverage
-from bevcli.rig.pose import seen_range_deg
+from bevcli.rig.mounting import seen_range_deg
 
 PAPER, INK, FAINT = "#14171c", "#e8ecf1", "#8a93a0"
-COUNT_COLORS = ("#b3324a", "#2b4a63", "#3f8f8a", "#9fd67a", "#f4f1a1")  # seen by 0, 1, 2, 3, 4 or more cameras
+COUNT_COLORS = (
+    "#b3324a",
+    "#2b4a63",
+    "#3f8f8a",
+    "#9fd67a",
+    "#f4f1a1",
+)  # of 0, 1, 2, 3, and 4 or more cameras
+LEGEND_STYLE = {"facecolor": PAPER, "edgecolor": "none", "labelcolor": INK, "fontsize": 9}
 CAR_LENGTH_M, CAR_WIDTH_M, AXLE_TO_TAIL_M = 4.6, 1.8, 1.0
 
 
@@ -33,11 +40,8 @@ def write_coverage_map(path: Path, rig: CameraRig, coverage: Coverage) -> None:
     save(figure, path)
 
 
-LEGEND_STYLE = {"facecolor": PAPER, "edgecolor": "none", "labelcolor": INK, "fontsize": 9}
-
-
 def draw_coverage(axes: Axes, rig: CameraRig, coverage: Coverage) -> None:
-    """The map on axes: the bev frame's x and y in metres, with the vehicle and its cameras."""
+    """Draw the map on axes: x and y of the bev frame in metres, with the vehicle and its cameras."""
     grid = coverage.grid
     colors, norm = ListedColormap(COUNT_COLORS), BoundaryNorm(np.arange(-0.5, 5), 5)
     extent = (*grid.x_range_m, *grid.y_range_m)

@@ -1,4 +1,4 @@
-"""A camera's image with what its calibration says: pillars, ground grid, horizon. Drawn at the size of display."""
+"""A camera's image with pillars, ground grid and horizon, as its calibration projects them."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, apply
 from bevcli.recording.colors import Color, colormap
-from bevcli.rig.coverage import pillar_pixels
-from bevcli.rig.pose import horizon
+from bevcli.rig.coverage import pixels_in_image
+from bevcli.rig.mounting import horizon
 
 GRID_STEP_M, GRID_REACH_M = 5.0, 30.0
-PILLAR_LINES_M = 25.0  # farther pillars stand so close that their lines would hide the image
-PILLAR_GRID = BevGrid(rows=20, columns=20)  # one pillar every 5.12 m: more would hide the image
+PILLAR_LINES_M = 25.0  # lines of farther pillars would be too dense
+PILLAR_GRID = BevGrid(rows=20, columns=20)  # one pillar every 5.12 m; a denser grid would hide the image
 LABELLED_M = (5.0, 10.0, 20.0, 40.0)
 GROUND: Color = (120, 205, 140)
 HORIZON: Color = (255, 214, 64)
@@ -28,7 +28,13 @@ Pixels = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class PillarPoints:
-    """What of the pillars a camera sees: pixels (M, 2), distances (M,) in metres, colours (M, 3) RGB by height."""
+    """The M pillar points that are inside a camera's image.
+
+    Attributes:
+        pixels: (M, 2).
+        distances: (M,), from the camera, metres.
+        colors: (M, 3), RGB by height.
+    """
 
     pixels: Array
     distances: Array
@@ -36,9 +42,9 @@ class PillarPoints:
 
 
 def pillars_in(camera: Camera, ego_from_bev: Array, grid: BevGrid = PILLAR_GRID) -> PillarPoints:
-    """The pillars' points that lie in the camera's image, the farthest first."""
+    """The pillar points that are inside the camera's image, the farthest first. ego_from_bev: (4, 4)."""
     points = apply(ego_from_bev, grid.pillars()).reshape(-1, 3)
-    pixels = pillar_pixels(camera, points)
+    pixels = pixels_in_image(camera, points)
     distances = np.linalg.norm(points - camera.ego_from_camera[:3, 3], axis=1)
     colors = np.tile(height_colors(grid), (grid.rows * grid.columns, 1))
     order = np.argsort(-distances)
@@ -47,12 +53,12 @@ def pillars_in(camera: Camera, ego_from_bev: Array, grid: BevGrid = PILLAR_GRID)
 
 
 def height_colors(grid: BevGrid) -> NDArray[np.uint8]:
-    """(Z, 3) RGB of the heights of a pillar's points, the lowest first."""
+    """(Z, 3) RGB, the colours of a pillar's points, the lowest first."""
     return colormap(np.linspace(0.12, 0.9, grid.pillar_points), "turbo")
 
 
 def ground_lines(camera: Camera) -> list[Array]:
-    """Lines (P, 2) in pixels of a 5 m grid on the ground around the ego origin, where they are near the image."""
+    """Lines (P, 2) in pixels of a 5 m grid on the ground around the ego origin, cut near the image border."""
     along = np.arange(-GRID_REACH_M, GRID_REACH_M + 0.05, 0.1)
     lines: list[Array] = []
     for offset in np.arange(-GRID_REACH_M, GRID_REACH_M + 0.1, GRID_STEP_M):
@@ -63,7 +69,7 @@ def ground_lines(camera: Camera) -> list[Array]:
 
 
 def pillar_lines(camera: Camera, ego_from_bev: Array, grid: BevGrid = PILLAR_GRID) -> list[Array]:
-    """Lines (P, 2) in pixels from the lowest to the highest point of each pillar nearer than 25 m."""
+    """Lines (P, 2) in pixels from the lowest to the highest point of each pillar within 25 m."""
     pillars = grid.pillars().reshape(-1, grid.pillar_points, 3)
     low, high = pillars[:, :1], pillars[:, -1:]
     points = apply(ego_from_bev, low + np.linspace(0, 1, 24)[:, None] * (high - low))  # (Y X, 24, 3)
@@ -72,7 +78,7 @@ def pillar_lines(camera: Camera, ego_from_bev: Array, grid: BevGrid = PILLAR_GRI
 
 
 def _near_image(camera: Camera, points_ego: Array) -> Array:
-    """Pixels (P, 2) of points (P, 3), NaN an image's size outside: what is drawn is clipped to the image anyway."""
+    """Points (P, 3) in the ego frame -> pixels (P, 2), NaN where they are more than an image size outside the image."""
     pixels, depth = camera.project_ego(points_ego)
     size = np.array([camera.width, camera.height])
     with np.errstate(invalid="ignore"):
@@ -81,14 +87,17 @@ def _near_image(camera: Camera, points_ego: Array) -> Array:
 
 
 def visible_runs(pixels: Array) -> list[Array]:
-    """A line (P, 2) cut where it has NaN: its parts of two points or more."""
+    """A line (P, 2), split where it has NaN, into parts of two points or more."""
     seen = np.isfinite(pixels).all(-1)
     cuts = np.flatnonzero(np.diff(seen.astype(int))) + 1
     return [run for run in np.split(pixels, cuts) if len(run) > 1 and np.isfinite(run).all()]
 
 
 def draw_overlay(camera: Camera, ego_from_bev: Array, image_bgr: Pixels | None, width: int) -> Pixels:
-    """The camera's image (H, W, 3) BGR, or a dark one without image, resized to `width`, with the overlay; RGB."""
+    """The camera's image with the overlay, (h, width, 3) RGB.
+
+    image_bgr: (H, W, 3); a dark image is used where it is None. width: of the result, pixels.
+    """
     shown = camera.scaled(width / camera.width)
     if image_bgr is None:
         canvas = np.full((shown.height, shown.width, 3), BACKDROP, dtype=np.uint8)
@@ -120,12 +129,12 @@ def _draw_pillars(canvas: Pixels, points: PillarPoints) -> None:
 
 
 def _draw_distances(canvas: Pixels, camera: Camera) -> None:
-    """How far the ground is along the viewing direction, where the labels have room."""
+    """Label distances on the ground along the viewing direction, where the labels do not overlap."""
     ahead = np.array([np.cos(camera.yaw), np.sin(camera.yaw), 0.0])
     start = camera.ego_from_camera[:3, 3] * [1, 1, 0]
     last = np.inf
     for distance in LABELLED_M:
-        pixel = pillar_pixels(camera, start + distance * ahead)
+        pixel = pixels_in_image(camera, start + distance * ahead)
         if np.isfinite(pixel).all() and last - pixel[1] > 22:
             last = float(pixel[1])
             _label(canvas, f"{distance:g} m", (round(pixel[0]), round(pixel[1])))

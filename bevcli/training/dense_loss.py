@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.detection_head import BOX_CODE_SIZE
+from bevcli.model.decoder import BOX_CODE_SIZE
 from bevcli.training.detection_loss import DetectionLoss, DetectionLossConfig, box_loss
 from bevcli.training.detection_targets import DetectionTargets
 from bevcli.training.focal_loss import focal_loss

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bevcli.model.segmentation_head import STUFF_CLASSES, SegmentationOutputs
+from bevcli.model.segmentation import STUFF_CLASSES, SegmentationOutputs
 from bevcli.training.focal_loss import focal_cost, focal_loss
 from bevcli.training.hungarian_matching import hungarian_matching
 from bevcli.training.segmentation_targets import SegmentationTargets

@@ -13,7 +13,7 @@ from bevcli.errors import InputError
 from bevcli.frame import MAP_CLASSES, BevMap
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.model.segmentation_head import STUFF_CLASSES
+from bevcli.model.segmentation import STUFF_CLASSES
 from bevcli.synth.render.bev_map import VEHICLE_CLASSES
 from bevcli.training.detection_targets import has_points
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from bevcli.evaluation.config import DetectionConfig
-from bevcli.evaluation.detection import evaluate
+from bevcli.evaluation.detection import evaluate_detections
 from bevcli.evaluation.detection_scores import DetectionScores
 from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmentation
 from bevcli.frame import MAP_CLASSES, Frame, Prediction
@@ -75,7 +75,8 @@ def validate(
             if prediction.segmentation is not None and frame.ground_truth_map is not None:
                 maps.append((prediction.segmentation, frame.ground_truth_map))
             after_frame()
-    return Validation(config, evaluate(predictions, truths, config), evaluate_segmentation(maps) if maps else None)
+    detection = evaluate_detections(predictions, truths, config)
+    return Validation(config, detection, evaluate_segmentation(maps) if maps else None)
 
 
 def nearest_side_m(config: BEVFormerConfig) -> float:

@@ -1,4 +1,4 @@
-"""`bevcli bench`: what it prints, and that its numbers follow from each other."""
+"""`bevcli bench`: its output, and the numbers that are derived from others."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def small_model_file(tmp_path: Path) -> Path:
     return path
 
 
-def test_times_limit_is_the_frame_over_its_operations_at_full_speed():
+def test_times_limit_is_frame_time_over_operations_at_peak_rate():
     assert RESULT.times_limit == pytest.approx(3.0 / 2.0)  # 400 G operations at 200 G a second are 2 s
 
 
@@ -58,9 +58,9 @@ def test_speedup_is_the_ratio_of_medians():
     assert replace(RESULT, comparison=None).speedup is None
 
 
-def test_the_text_says_the_same_numbers():
+def test_the_text_contains_the_derived_numbers():
     text = RESULT.text()
-    for words in ("1.50 times as long", "0.333 frames a second", "2.00 times as long", "100.0%"):
+    for words in ("1.50 times their time", "0.333 frames per second", "2.00 times the prepared model's", "100.0%"):
         assert words in text
 
 
@@ -94,7 +94,7 @@ def test_profile_of_a_frame_in_half_precision(small_model_file, tmp_path):
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU")
-def test_a_gpu_is_timed_by_its_own_events(small_model_file):
+def test_on_a_gpu_the_stages_add_up_to_the_frame(small_model_file):
     options = ["--device", "cuda", "--against", "plain", "--json"]
     answer = CliRunner().invoke(app, ["bench", "--model", str(small_model_file), *options], catch_exceptions=False)
     data = json.loads(answer.stdout)

@@ -29,7 +29,7 @@ def random_truth(seed: int, frames: int = 6, per_class: int = 3) -> list[Boxes3D
 
 
 def as_predictions(truth: list[Boxes3D], seed: int, noise_m: float = 0.0, false_per_frame: int = 0) -> list[Boxes3D]:
-    """The truth with scores, moved by noise, and inventions among it."""
+    """The truth with scores, moved by noise, with false positives."""
     rng = np.random.default_rng(seed)
     predictions = []
     for boxes in truth:

@@ -1,4 +1,4 @@
-"""Detection scores: numbers worked out by hand, and what must hold for any boxes."""
+"""Detection scores: numbers computed by hand, and properties that hold for any boxes."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from random_boxes import as_predictions, random_truth
 
-from bevcli.evaluation.config import ERRORS, DetectionConfig
-from bevcli.evaluation.detection import evaluate
+from bevcli.evaluation.config import DetectionConfig
+from bevcli.evaluation.detection import evaluate_detections
 from bevcli.evaluation.detection_scores import DetectionScores
-from bevcli.evaluation.matching import by_falling_score, match
+from bevcli.evaluation.matching import descending_scores, match_greedily
 from bevcli.evaluation.scored_boxes import gather
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import rigid, rotation_about_z
@@ -40,39 +40,39 @@ def numbers(scores: DetectionScores) -> dict[str, float]:
     return found
 
 
-def test_average_precision_worked_out_by_hand() -> None:
-    # A false alarm, then both cars. Precision 0, 1/2, 2/3 at recall 0, 1/2, 1, straight lines between. What counts
+def test_average_precision_computed_by_hand() -> None:
+    # A false positive, then both cars. Precision 0, 1/2, 2/3 at recall 0, 1/2, 1, linear between them. Counted
     # are recalls 0.11 to 1.00: the sum of (p - 0.1) is 0.01 + ... + 0.40 = 8.2 up to the half,
     # and 50 * 0.4 + (0.01 + ... + 0.50) / 3 = 24.25 beyond; over 90 recalls, over 0.9.
-    scores = evaluate([cars([40, 0, 20], [0.9, 0.8, 0.7])], [cars([0, 20])])
+    scores = evaluate_detections([cars([40, 0, 20], [0.9, 0.8, 0.7])], [cars([0, 20])])
     assert scores.overall.classes["car"].aps[2.0] == pytest.approx((8.2 + 24.25) / 90 / 0.9)
 
 
-def test_half_of_the_cars_found_without_a_mistake() -> None:
+def test_half_of_the_cars_found_without_a_false_positive() -> None:
     # Precision 1 up to recall 0.5: of recalls 0.11 to 1.00, 40 of 90 count.
-    scores = evaluate([cars([0, 10], [0.9, 0.8])], [cars([0, 10, 20, 30])])
+    scores = evaluate_detections([cars([0, 10], [0.9, 0.8])], [cars([0, 10, 20, 30])])
     assert scores.overall.classes["car"].aps[0.5] == pytest.approx(40 / 90)
     assert scores.overall.classes["car"].recall == 0.5
 
 
-def test_the_distance_decides() -> None:
-    found = evaluate([cars([1.5], [0.9])], [cars([0.0])]).overall.classes["car"].aps
+def test_a_match_is_closer_than_the_matching_distance() -> None:
+    found = evaluate_detections([cars([1.5], [0.9])], [cars([0.0])]).overall.classes["car"].aps
     assert found == pytest.approx({0.5: 0, 1.0: 0, 2.0: 1, 4.0: 1})
 
 
 def test_a_car_is_found_once() -> None:
-    twice = evaluate([cars([0, 0.1], [0.9, 0.8])], [cars([0.0, 30.0])])
+    twice = evaluate_detections([cars([0, 0.1], [0.9, 0.8])], [cars([0.0, 30.0])])
     assert twice.overall.classes["car"].recall == 0.5
 
 
-def test_the_better_score_chooses_first() -> None:
-    # The second best is nearer, but the car is taken: it goes to the other one, 1.9 m away.
+def test_the_highest_score_is_matched_first() -> None:
+    # The second prediction is nearer to the first car, but it is taken: it matches the other one, 1.9 m away.
     truth = gather([cars([0.0, 2.0])], np.zeros((1, 2)))
     predictions = gather([cars([0.4, 0.1], [0.9, 0.8])], np.zeros((1, 2)))
-    np.testing.assert_array_equal(match(truth, predictions, (2.0, 1.0)), [[0, 1], [0, -1]])
+    np.testing.assert_array_equal(match_greedily(truth, predictions, (2.0, 1.0)), [[0, 1], [0, -1]])
 
 
-def test_the_five_errors_worked_out_by_hand() -> None:
+def test_the_five_errors_computed_by_hand() -> None:
     truth = replace(cars([0.0]), velocities=np.array([[3.0, 0.0]]))
     found = replace(
         cars([0.6], [0.9]),
@@ -82,7 +82,7 @@ def test_the_five_errors_worked_out_by_hand() -> None:
         velocities=np.array([[3.0, 2.0]]),
         attributes=np.array(["vehicle.moving"]),
     )
-    errors = evaluate([found], [truth]).overall.classes["car"].errors
+    errors = evaluate_detections([found], [truth]).overall.classes["car"].errors
     expected = {"trans_err": 1.0, "scale_err": 0.5, "orient_err": 0.3, "vel_err": 2.0, "attr_err": 1.0}
     assert errors == pytest.approx(expected)
 
@@ -90,15 +90,15 @@ def test_the_five_errors_worked_out_by_hand() -> None:
 def test_a_barrier_has_no_front() -> None:
     truth, found = cars([0.0], class_name="barrier"), cars([0.0], [0.9], class_name="barrier")
     turned = replace(found, yaws=np.array([np.pi - 0.2]))
-    assert evaluate([turned], [truth]).overall.classes["barrier"].errors["orient_err"] == pytest.approx(0.2)
+    assert evaluate_detections([turned], [truth]).overall.classes["barrier"].errors["orient_err"] == pytest.approx(0.2)
     turned_car = replace(cars([0.0], [0.9]), yaws=np.array([np.pi - 0.2]))
-    errors = evaluate([turned_car], [cars([0.0])]).overall.classes["car"].errors
+    errors = evaluate_detections([turned_car], [cars([0.0])]).overall.classes["car"].errors
     assert errors["orient_err"] == pytest.approx(np.pi - 0.2)
 
 
 def test_perfect_predictions_score_one() -> None:
     truth = random_truth(1)
-    scores = evaluate(as_predictions(truth, 2), truth)
+    scores = evaluate_detections(as_predictions(truth, 2), truth)
     assert scores.overall.mean_ap == pytest.approx(1)
     assert scores.overall.nd_score == pytest.approx(1)
     assert all(part.mean_recall == 1 for part in scores.by_visibility)
@@ -106,14 +106,14 @@ def test_perfect_predictions_score_one() -> None:
 
 def test_no_predictions_score_zero() -> None:
     truth = random_truth(1)
-    scores = evaluate([Boxes3D.empty()] * len(truth), truth)
+    scores = evaluate_detections([Boxes3D.empty()] * len(truth), truth)
     assert scores.prediction_count == 0
     assert (scores.overall.mean_ap, scores.overall.nd_score) == (0, 0)
     assert set(scores.overall.errors.values()) == {1.0}
 
 
-def test_nothing_on_either_side_scores_zero() -> None:
-    scores = evaluate([Boxes3D.empty()], [Boxes3D.empty()])
+def test_no_boxes_on_either_side_score_zero() -> None:
+    scores = evaluate_detections([Boxes3D.empty()], [Boxes3D.empty()])
     assert (scores.overall.mean_ap, scores.overall.nd_score) == (0, 0)
 
 
@@ -122,63 +122,64 @@ def test_the_order_of_boxes_and_frames_does_not_matter() -> None:
     predictions = as_predictions(truth, 4, noise_m=0.7, false_per_frame=30)
     rng = np.random.default_rng(5)
     order = rng.permutation(len(truth))
-    shuffled = evaluate(
+    shuffled = evaluate_detections(
         [predictions[place][rng.permutation(len(predictions[place]))] for place in order],
         [truth[place][rng.permutation(len(truth[place]))] for place in order],
     )
-    assert numbers(shuffled) == pytest.approx(numbers(evaluate(predictions, truth)), nan_ok=True)
+    assert numbers(shuffled) == pytest.approx(numbers(evaluate_detections(predictions, truth)), nan_ok=True)
 
 
 def test_a_rigid_motion_of_the_world_changes_nothing() -> None:
     truth = random_truth(6)
     predictions = as_predictions(truth, 7, noise_m=0.7, false_per_frame=30)
     motions = [rigid((1000.0 * k, -500.0, 7.0), rotation_about_z(0.7 * k)) for k in range(1, len(truth) + 1)]
-    moved = evaluate(
+    moved = evaluate_detections(
         [boxes.transformed(motion) for boxes, motion in zip(predictions, motions, strict=True)],
         [boxes.transformed(motion) for boxes, motion in zip(truth, motions, strict=True)],
         ego_xy=np.array([motion[:2, 3] for motion in motions]),
     )
-    assert numbers(moved) == pytest.approx(numbers(evaluate(predictions, truth)), nan_ok=True)
+    assert numbers(moved) == pytest.approx(numbers(evaluate_detections(predictions, truth)), nan_ok=True)
 
 
 def test_what_is_beyond_the_range_of_its_class_does_not_count() -> None:
-    near = evaluate([cars([0], [0.5])], [cars([0])])
-    both = evaluate([cars([0, 51], [0.5, 0.9])], [cars([0, 60])])
+    near = evaluate_detections([cars([0], [0.5])], [cars([0])])
+    both = evaluate_detections([cars([0, 51], [0.5, 0.9])], [cars([0, 60])])
     assert numbers(both) == pytest.approx(numbers(near), nan_ok=True)
-    cut = evaluate([cars([0, 35], [0.5, 0.9])], [cars([0, 40])], DetectionConfig().cut_at(32))
+    cut = evaluate_detections([cars([0, 35], [0.5, 0.9])], [cars([0, 40])], DetectionConfig().cut_at(32))
     assert numbers(cut) == pytest.approx(numbers(near), nan_ok=True)
-    assert evaluate([cars([0, 51], [0.5, 0.9])], [cars([0])], DetectionConfig().unlimited()).prediction_count == 2
+    unlimited = evaluate_detections([cars([0, 51], [0.5, 0.9])], [cars([0])], DetectionConfig().unlimited())
+    assert unlimited.prediction_count == 2
 
 
 def test_the_ego_vehicle_is_where_ranges_start() -> None:
-    assert evaluate([cars([60], [0.5])], [cars([60])], ego_xy=[[30.0, 0.0]]).ground_truth_count == 1
-    assert evaluate([cars([60], [0.5])], [cars([60])]).ground_truth_count == 0
+    assert evaluate_detections([cars([60], [0.5])], [cars([60])], ego_xy=[[30.0, 0.0]]).ground_truth_count == 1
+    assert evaluate_detections([cars([60], [0.5])], [cars([60])]).ground_truth_count == 0
 
 
 def test_ground_truth_without_points_is_left_out() -> None:
     truth = replace(cars([0, 20, 30]), num_points=np.array([3, 0, -1]))
-    scores = evaluate([cars([0], [0.5])], [truth])
+    scores = evaluate_detections([cars([0], [0.5])], [truth])
     assert scores.ground_truth_count == 2
 
 
 def test_ground_truth_given_as_predictions_is_perfect() -> None:
     truth = [replace(boxes, num_points=boxes.num_points % 3) for boxes in random_truth(10)]
-    scores = evaluate([replace(boxes, scores=np.ones(len(boxes))) for boxes in truth], truth)
+    scores = evaluate_detections([replace(boxes, scores=np.ones(len(boxes))) for boxes in truth], truth)
     assert scores.overall.nd_score == pytest.approx(1)
 
 
-def test_an_error_that_nobody_knows_is_left_out_of_nds() -> None:
+def test_an_error_without_ground_truth_is_left_out_of_nds() -> None:
     truth = random_truth(1)
     untold = [replace(boxes, attributes=None, velocities=np.full((len(boxes), 2), np.nan)) for boxes in truth]
-    scores = evaluate(as_predictions(truth, 2), untold)
+    scores = evaluate_detections(as_predictions(truth, 2), untold)
     assert scores.unmeasured == ("vel_err", "attr_err")
     assert np.isnan(scores.overall.errors["vel_err"])
     assert scores.overall.nd_score == pytest.approx(1)
 
 
-def test_range_bins_share_out_what_there_is() -> None:
+def test_each_box_counts_in_one_range_bin() -> None:
     truth = random_truth(8)
-    scores = evaluate(as_predictions(truth, 9, noise_m=0.5, false_per_frame=20), truth)
+    scores = evaluate_detections(as_predictions(truth, 9, noise_m=0.5, false_per_frame=20), truth)
     counts = [sum(c.ground_truth_count for c in part.table.classes.values()) for part in scores.by_range]
     assert sum(counts) == scores.ground_truth_count
     found = sum(c.recall * c.ground_truth_count for part in scores.by_range for c in part.table.classes.values())
@@ -187,8 +188,8 @@ def test_range_bins_share_out_what_there_is() -> None:
     )
 
 
-def test_a_pair_across_a_bins_border_stays_whole() -> None:
-    scores = evaluate([cars([10.4], [0.9])], [cars([9.6])])
+def test_a_pair_across_the_border_of_bins_is_not_split() -> None:
+    scores = evaluate_detections([cars([10.4], [0.9])], [cars([9.6])])
     bins = {part.low_m: part.table for part in scores.by_range}
     assert bins[0].classes["car"].aps[1.0] == pytest.approx(1)
     assert not bins[10].classes
@@ -196,21 +197,21 @@ def test_a_pair_across_a_bins_border_stays_whole() -> None:
 
 def test_recall_by_visibility_counts_at_two_metres() -> None:
     truth = replace(cars([0, 10, 20, 30, 40]), visibilities=np.array([0.1, 0.39, 0.4, 1.0, np.nan]))
-    scores = evaluate([cars([1.9, 22.1, 30], [0.9, 0.8, 0.1])], [truth])
+    scores = evaluate_detections([cars([1.9, 22.1, 30], [0.9, 0.8, 0.1])], [truth])
     found = {part.low: (part.found_count, part.ground_truth_count) for part in scores.by_visibility}
     assert found == {0.0: (1, 2), 0.4: (0, 1), 0.6: (0, 0), 0.8: (1, 1)}
-    assert evaluate([cars([0], [0.9])], [cars([0])]).by_visibility == ()
+    assert evaluate_detections([cars([0], [0.9])], [cars([0])]).by_visibility == ()
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_matching_equals_the_rule_written_out_plainly(seed: int) -> None:
+def test_matching_equals_a_plain_loop(seed: int) -> None:
     truth = random_truth(seed, per_class=8)
     predictions = as_predictions(truth, seed + 100, noise_m=1.5, false_per_frame=200)
     ego = np.zeros((len(truth), 2))
     true, found = gather(truth, ego), gather(predictions, ego)
     true, found = true[true.boxes.classes == "car"], found[found.boxes.classes == "car"]
     assert found.boxes.scores is not None
-    found = found[by_falling_score(found.boxes.scores)]
+    found = found[descending_scores(found.boxes.scores)]
     for limit in (0.5, 2.0, 4.0):
         taken: set[int] = set()
         expected = []
@@ -223,8 +224,4 @@ def test_matching_equals_the_rule_written_out_plainly(seed: int) -> None:
             taken.add(best)
             taken.discard(-1)
             expected.append(best)
-        np.testing.assert_array_equal(match(true, found, (limit,))[0], expected)
-
-
-def test_errors_are_named_as_the_devkit_names_them() -> None:
-    assert ERRORS == ("trans_err", "scale_err", "orient_err", "vel_err", "attr_err")
+        np.testing.assert_array_equal(match_greedily(true, found, (limit,))[0], expected)

@@ -1,4 +1,4 @@
-"""Exports say what the boxes file says; KITTI labels are read back by KITTI's own formulas."""
+"""Exports contain the boxes of the file; KITTI labels are read back with the formulas of KITTI's development kit."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_kitti_labels_are_the_boxes_in_the_cameras_frame() -> None:
         assert len(fields) == 16
 
 
-def test_a_label_stands_for_every_box_in_view_and_frames_it() -> None:
+def test_every_box_in_view_has_a_label_with_its_2d_box() -> None:
     boxes = boxes_around()
     rotation, translation = cv2.Rodrigues(CAMERA.camera_from_ego[:3, :3])[0], CAMERA.camera_from_ego[:3, 3]
     labels = kitti_labels(boxes, CAMERA)
@@ -132,9 +132,9 @@ def test_kitti_files_do_not_depend_on_the_world(tmp_path: Path) -> None:
     np.testing.assert_allclose(CAMERA.ego_from_camera @ velo, default_ego_from_bev(), atol=1e-9)
 
 
-def test_kitti_refuses_frame_numbers_that_repeat(tmp_path: Path) -> None:
+def test_kitti_refuses_repeated_frame_indices(tmp_path: Path) -> None:
     file = file_of(boxes_around(), Pose.identity())
-    with pytest.raises(InputError, match="frame numbers repeat"):
+    with pytest.raises(InputError, match="frame indices repeat"):
         write_kitti(BoxesFile("world", file.frames * 2), CAMERA, default_ego_from_bev(), tmp_path)
 
 

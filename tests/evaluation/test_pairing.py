@@ -1,4 +1,4 @@
-"""Frames of two files find each other, and their boxes meet in one frame of reference."""
+"""Frames of two files are paired, and their boxes are moved into one frame of reference."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from random_boxes import as_predictions, random_truth
 
 from bevcli.errors import InputError
-from bevcli.evaluation.detection import evaluate
+from bevcli.evaluation.detection import evaluate_detections
 from bevcli.evaluation.pairing import FramePairs, pair_frames
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
@@ -24,7 +24,10 @@ POSES = [Pose.from_matrix(rigid((500 + 10 * k, -20.0, 1.0), rotation_about_z(0.4
 
 
 def boxes_file(frames: list[Boxes3D], reference: str = "ego", **stamps: Any) -> BoxesFile:
-    """Boxes given in the ego frame, told in another; stamps: scene, first (frame number), start_ns, poses."""
+    """A file of boxes given in the ego frame, in another frame of reference.
+
+    stamps: scene, first (frame index), start_ns, poses.
+    """
     bev = Pose.from_matrix(default_ego_from_bev())
     rows = []
     for place, boxes in enumerate(frames):
@@ -42,7 +45,7 @@ def boxes_file(frames: list[Boxes3D], reference: str = "ego", **stamps: Any) -> 
 
 
 def nds(pairs: FramePairs) -> float:
-    return evaluate(pairs.predictions, pairs.ground_truth, None, pairs.ego_xy).overall.nd_score
+    return evaluate_detections(pairs.predictions, pairs.ground_truth, None, pairs.ego_xy).overall.nd_score
 
 
 @pytest.mark.parametrize("one", ["world", "ego", "bev"])
@@ -54,10 +57,10 @@ def test_the_frame_of_reference_does_not_matter(one: str, other: str) -> None:
     assert pairs.ego_pose_known == ("world" in (one, other))
 
 
-def test_boxes_that_no_pose_can_move_are_an_error() -> None:
+def test_boxes_without_a_pose_for_the_transformation_are_an_error() -> None:
     world = boxes_file(TRUTH, "world")
     bev = replace(boxes_file(PREDICTIONS, "bev"), ego_from_bev=None)
-    with pytest.raises(InputError, match=r'frame 0: boxes in the bev frame .* state "ego_from_bev"'):
+    with pytest.raises(InputError, match=r'frame 0: boxes in the bev frame .* add "ego_from_bev"'):
         pair_frames(bev, world)
 
 
@@ -67,11 +70,11 @@ def test_boxes_that_no_pose_can_move_are_an_error() -> None:
         ({}, "scene and timestamp_ns"),
         ({"first": 7}, "scene and timestamp_ns"),
         ({"scene": "b"}, "timestamp_ns"),
-        ({"start_ns": 1}, "scene and frame number"),
-        ({"start_ns": 1, "scene": "b"}, "frame number"),
+        ({"start_ns": 1}, "scene and frame index"),
+        ({"start_ns": 1, "scene": "b"}, "frame index"),
     ],
 )
-def test_what_frames_are_matched_by(stamps: dict[str, Any], matched_by: str) -> None:
+def test_the_key_that_frames_are_matched_by(stamps: dict[str, Any], matched_by: str) -> None:
     pairs = pair_frames(boxes_file(PREDICTIONS, **stamps), boxes_file(TRUTH))
     assert pairs.matched_by == matched_by
     assert len(pairs.predictions) == 4
@@ -89,7 +92,7 @@ def test_sample_tokens_go_first() -> None:
     assert nds(pairs) == pytest.approx(nds(pair_frames(boxes_file(PREDICTIONS), boxes_file(TRUTH))))
 
 
-def test_frames_of_one_side_are_left_out_or_counted_and_said() -> None:
+def test_frames_of_one_side_are_left_out_or_counted_with_a_note() -> None:
     half = boxes_file(PREDICTIONS[:2])
     left_out = pair_frames(half, boxes_file(TRUTH))
     assert len(left_out.predictions) == 2
@@ -105,5 +108,5 @@ def test_files_of_different_drives_are_refused() -> None:
     other = boxes_file(TRUTH, scene="b", first=100, start_ns=10**18)
     with pytest.raises(InputError, match='no frame in common: predictions start with scene "a" frame 0 at 0 ns'):
         pair_frames(boxes_file(PREDICTIONS), other)
-    with pytest.raises(InputError, match="the predictions hold no frame at all"):
+    with pytest.raises(InputError, match="the predictions contain no frame"):
         pair_frames(BoxesFile("ego", ()), boxes_file(TRUTH))

@@ -1,4 +1,4 @@
-"""IoU of maps, worked out by hand."""
+"""IoU of maps, computed by hand."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_cells_are_summed_over_frames() -> None:
     assert scores.iou == pytest.approx({"vehicle": 5 / 8})  # not the mean of 1/4 and 1
 
 
-def test_a_finer_and_wider_prediction_is_read_at_the_truths_cells() -> None:
+def test_a_finer_and_wider_prediction_is_sampled_at_the_cells_of_the_ground_truth() -> None:
     true = bev_map([[1, 0], [0, 2]])
     wide = np.zeros((8, 8), dtype=np.uint8)  # cells of 1 m over 8 m
     wide[2:4, 2:4], wide[4:6, 4:6], wide[0], wide[7] = 1, 2, 8, 8
@@ -42,7 +42,7 @@ def test_a_finer_and_wider_prediction_is_read_at_the_truths_cells() -> None:
     assert np.isnan(scores.iou["vehicle"])  # lies outside the truth
 
 
-def test_cells_that_the_prediction_does_not_reach_are_left_out() -> None:
+def test_cells_outside_the_prediction_are_left_out() -> None:
     true = bev_map([[1, 1], [1, 1]])
     ahead_only = bev_map([[1, 1]], ((-2.0, 2.0), (0.0, 2.0)))
     assert evaluate_segmentation([(ahead_only, true)]).iou["drivable_road"] == 1

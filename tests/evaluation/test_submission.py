@@ -1,4 +1,4 @@
-"""A submission keeps the rules that the nuScenes devkit checks when it reads one, restated here."""
+"""A submission follows the rules that the nuScenes devkit checks when it reads one; they are restated here."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from bevcli.errors import InputError
-from bevcli.evaluation.read_submission import is_submission, read_submission
-from bevcli.evaluation.submission import SubmissionWriter, write_submission
+from bevcli.evaluation.submission import SubmissionWriter, is_submission, read_submission, write_submission
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import CLASSES, Boxes3D, attributes_by_speed
 from bevcli.geometry.transforms import Pose, yaw_of_quaternion
@@ -65,7 +64,7 @@ def frame(index: int, boxes: Boxes3D, **extras: Any) -> FrameBoxes:
     return FrameBoxes(FrameStamp(index, "s", index), Pose.identity(), boxes, extras)
 
 
-def test_the_devkits_rules_are_kept(tmp_path: Path) -> None:
+def test_the_devkits_rules_are_followed(tmp_path: Path) -> None:
     boxes = many_boxes(620)
     rows = (
         frame(0, boxes, sample_token="t0"),
@@ -86,7 +85,7 @@ def test_the_devkits_rules_are_kept(tmp_path: Path) -> None:
     assert yaw_of_quaternion(written[0]["rotation"]) == pytest.approx(boxes.yaws[first])
 
 
-def test_a_submission_is_whole_after_every_frame(tmp_path: Path) -> None:
+def test_a_submission_is_valid_after_every_frame(tmp_path: Path) -> None:
     path = tmp_path / "results_nusc.json"
     with SubmissionWriter(path) as writer:
         for count in range(3):
@@ -153,7 +152,7 @@ def test_a_wrong_submission_is_named(tmp_path: Path, key: str, value: Any, messa
         read_submission(path)
 
 
-def test_what_is_not_of_nuscenes_is_refused(tmp_path: Path) -> None:
+def test_boxes_without_sample_token_or_world_frame_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match='needs a "sample_token"'):
         write_submission(BoxesFile("world", (frame(0, many_boxes(1)),)), tmp_path / "a.json")
     with pytest.raises(InputError, match="these are in the ego frame"):

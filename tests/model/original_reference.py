@@ -1,8 +1,8 @@
-"""What the original BEVFormer was given and what it answered, kept in tests/data.
+"""Inputs and outputs of the released BEVFormer code, from files in tests/data.
 
 golden_inputs.json: rig and poses of four frames. golden_keys.json: names and shapes of the official weights.
-golden_tiny.npz: the original's numbers with weights and images by the rule of stated_rule.py, the BEV maps on every
-23rd cell, the codes and logits of every 9th query.
+golden_tiny.npz: outputs with weights and images by the rule of stated_rule.py; the BEV maps at every 23rd cell, the
+codes and logits of every 9th query.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from bevcli.config import load_config
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
 from bevcli.model.bevformer import BEVFormer, BEVFormerConfig, BEVFormerInputs
-from bevcli.model.ego_motion_inputs import EgoMotionInputs, ego_motion_inputs
+from bevcli.model.ego_motion import EgoMotionInputs, ego_motion_inputs
 from bevcli.model.official_keys import from_official
 
 DATA = Path(__file__).parents[1] / "data"
@@ -37,19 +37,19 @@ def frames() -> list[dict[str, Any]]:
 
 
 def official_shapes(model: str) -> dict[str, tuple[int, ...]]:
-    """Shapes of the official weights by key."""
+    """Key -> shape of the official weights."""
     keys = json.loads((DATA / "golden_keys.json").read_text())[model]
     return {key: tuple(shape) for key, shape in keys.items()}
 
 
 def official_state(model: str) -> dict[str, torch.Tensor]:
-    """Official weights by the rule."""
+    """A state dict with the official keys, its values by the rule of stated_rule.py."""
     shapes = official_shapes(model)
     return {key: torch.from_numpy(rule_tensor(key, shape, STEM_GAIN[model])) for key, shape in shapes.items()}
 
 
 def rule_model(name: str, history_shift: str) -> BEVFormer:
-    """A model with weights by the rule, in evaluation mode."""
+    """A model with weights by the rule of stated_rule.py, in evaluation mode."""
     config = load_config(name)
     motion = replace(config.ego_motion, history_shift=history_shift)
     model = BEVFormer(replace(config, ego_motion=motion)).eval()
@@ -58,7 +58,7 @@ def rule_model(name: str, history_shift: str) -> BEVFormer:
 
 
 def with_history_shift(model: BEVFormer, history_shift: str) -> BEVFormer:
-    """The same weights with the other history shift."""
+    """A model with the same weights and another history_shift."""
     motion = replace(model.config.ego_motion, history_shift=history_shift)
     other = BEVFormer(replace(model.config, ego_motion=motion)).eval()
     other.load_state_dict(model.state_dict())
@@ -66,7 +66,7 @@ def with_history_shift(model: BEVFormer, history_shift: str) -> BEVFormer:
 
 
 def image_from_bev(frame: int, config: BEVFormerConfig) -> np.ndarray:
-    """(N, 4, 4) bev metres to network-input pixels, by textbook formulas."""
+    """(N, 4, 4) bev metres to pixels of the network's input, by textbook formulas."""
     matrices = []
     for name in config.cameras:
         camera = frames()[frame]["cams"][name]
@@ -121,7 +121,7 @@ def inputs(frame: int, config: BEVFormerConfig) -> BEVFormerInputs:
 
 
 def match_boxes(boxes: Boxes3D, expected: np.ndarray, labels: np.ndarray, classes: Sequence[str]) -> list[int]:
-    """For each expected box the row of ours with its class and the nearest centre: scores may tie."""
+    """For each expected box, the index of our box with its class and the nearest centre; the order is lost on ties."""
     distance = np.linalg.norm(expected[:, None, :3] - boxes.centers[None], axis=-1)
     other_class = np.array(classes)[labels][:, None] != boxes.classes[None]
     rows = np.where(other_class, np.inf, distance).argmin(axis=1).tolist()

@@ -1,4 +1,4 @@
-"""A BEVFormer of some thousand weights, and made-up inputs for it."""
+"""A BEVFormer with some thousand weights, and random inputs for it."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ import numpy as np
 import torch
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.bevformer import BEVFormer, BEVFormerConfig, BEVFormerInputs
+from bevcli.model.bevformer import BEVFormer, BEVFormerConfig, BEVFormerInputs, ImageConfig
 from bevcli.model.decoder import DecoderConfig
 from bevcli.model.encoder import EncoderConfig
 from bevcli.model.fpn import FPNConfig
-from bevcli.model.image_config import ImageConfig
 from bevcli.model.image_tokens import ImageTokensConfig
 from bevcli.model.resnet import ResNetConfig
 
@@ -37,7 +36,7 @@ def small_config(**changes: object) -> BEVFormerConfig:
 
 
 def small_model(seed: int = 0, **changes: object) -> BEVFormer:
-    """In evaluation mode, with every weight drawn at random, so that nothing is hidden by a zero."""
+    """In evaluation mode. Random numbers are added to all weights, so that none is zero and hides an error."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         model = BEVFormer(small_config(**changes)).eval()
@@ -48,7 +47,7 @@ def small_model(seed: int = 0, **changes: object) -> BEVFormer:
 
 
 def small_inputs(seed: int = 0, batch: int = 1) -> BEVFormerInputs:
-    """Random images, one camera looking along y and one against it, a slightly moved vehicle."""
+    """Random images, one camera that looks along +y and one along -y, and a vehicle that moved slightly."""
     random = torch.Generator().manual_seed(seed)
     projections = torch.from_numpy(np.stack([_image_from_bev(1.0), _image_from_bev(-1.0)])).float()
     return BEVFormerInputs(
@@ -63,7 +62,7 @@ def small_inputs(seed: int = 0, batch: int = 1) -> BEVFormerInputs:
 
 
 def _image_from_bev(direction: float) -> np.ndarray:
-    """A camera at the origin of the bev frame that looks along +y (1) or -y (-1), 90 degrees wide."""
+    """A camera at the origin of the bev frame that looks along +y (1) or -y (-1), field of view 90 degrees."""
     image_from_camera = np.array([[WIDTH / 2, 0, WIDTH / 2, 0], [0, WIDTH / 2, HEIGHT / 2, 0], [0, 0, 1, 0]])
     camera_from_bev = np.array([[direction, 0, 0, 0], [0, 0, -1, 0], [0, direction, 0, 0], [0, 0, 0, 1.0]])
     return np.concatenate([image_from_camera @ camera_from_bev, [[0, 0, 0, 1]]])

@@ -1,7 +1,7 @@
-"""Weights and images by a stated rule, so that equality with the original needs no download.
+"""Weights and images by a rule, so that the comparison with the released code needs no download.
 
-The rule is part of the reference numbers in tests/data: every tensor is one draw from a generator seeded by
-the CRC-32 of its official key, scaled by what the tensor is for.
+The reference numbers in tests/data were computed with the same rule: every tensor is one draw from a generator that is
+seeded by the CRC-32 of its official key, and its scale depends on the kind of tensor.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import zlib
 import numpy as np
 from numpy.typing import NDArray
 
-# Pattern of the key, then the factor on a draw with unit variance over the fan-in, or on a plain draw.
+# Pattern of the key, then the factor on a draw divided by the root of the fan-in; or mean and deviation of a draw.
 _OVER_FAN_IN = (
     (r"conv_offset\.weight$", 0.5),
     (r"^img_backbone\..*", math.sqrt(2)),
@@ -34,12 +34,12 @@ _PLAIN = (
 
 
 def stream(name: str) -> np.random.Generator:
-    """The random stream of a name."""
+    """The random generator of a name."""
     return np.random.Generator(np.random.PCG64(zlib.crc32(name.encode())))
 
 
 def rule_tensor(key: str, shape: tuple[int, ...], stem_gain: float) -> np.ndarray:
-    """One tensor of a state dict, from its official key and shape."""
+    """A tensor of a state dict, by its official key and shape."""
     if key.endswith("num_batches_tracked"):
         return np.zeros(shape, np.int64)
     if key.endswith("running_var"):

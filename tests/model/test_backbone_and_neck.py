@@ -1,4 +1,4 @@
-"""ResNet and FPN: sizes, strides, and the way of context from coarse to fine."""
+"""ResNet and FPN: sizes, strides, and the flow of context from coarse to fine maps."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ def test_stages_halve_the_map_and_double_the_channels(style: str) -> None:
 
 
 @pytest.mark.parametrize(("style", "strided"), [("pytorch", "conv2"), ("caffe", "conv1")])
-def test_the_stride_sits_where_the_style_says(style: str, strided: str) -> None:
+def test_the_style_decides_which_convolution_has_the_stride(style: str, strided: str) -> None:
     block = Bottleneck(16, 8, 2, style, deformable=False)
     strides = {name: getattr(block, name).stride for name in ("conv1", "conv2")}
     assert [name for name, stride in strides.items() if stride == (2, 2)] == [strided]
 
 
-def test_a_fresh_block_passes_its_input_on() -> None:
+def test_an_untrained_block_is_the_identity() -> None:
     x = torch.rand(1, 32, 5, 5)
     assert torch.equal(Bottleneck(32, 8, 1, "pytorch", deformable=False).eval()(x), x)
 
 
-def test_a_backbone_without_its_last_stages_does_not_hold_them() -> None:
+def test_stages_after_the_last_output_stage_are_left_out() -> None:
     config = ResNetConfig((1, 1, 1, 1), output_stages=(2,), width=4)
     assert len(ResNet(config).stages) == 2
 
 
-def test_levels_beyond_the_backbones_halve_the_last_one() -> None:
+def test_each_extra_level_halves_the_one_before() -> None:
     neck = FPN((8, 16), 6, FPNConfig(levels=4))
     maps = neck([torch.randn(1, 8, 10, 14), torch.randn(1, 16, 5, 7)])
     assert [tuple(x.shape) for x in maps] == [(1, 6, 10, 14), (1, 6, 5, 7), (1, 6, 3, 4), (1, 6, 2, 2)]
 
 
-def test_context_runs_from_coarse_to_fine_only() -> None:
+def test_context_flows_from_coarse_to_fine_only() -> None:
     neck = FPN((4, 4), 4, FPNConfig(levels=2))
     for convolution in neck.modules():
         if isinstance(convolution, nn.Conv2d):

@@ -1,4 +1,4 @@
-"""The whole model: its state goes in and comes out, and nothing else is remembered."""
+"""The whole model: shapes, invariants, gradients, and that the BEV map is its only state."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ import pytest
 import torch
 from small_model import small_inputs, small_model
 
-from bevcli.model.attention_probe import AttentionProbe
 from bevcli.model.bevformer import BEVFormer, BEVFormerInputs, BEVFormerOutputs
+from bevcli.model.prepared import prepare_for_inference
+from bevcli.model.segmentation import SegmentationConfig
+from bevcli.pipeline.attention import AttentionProbe
 
 
 def drive(model: BEVFormer, seeds: list[int], history: torch.Tensor | None = None) -> list[BEVFormerOutputs]:
-    """The outputs of frames with these seeds, the BEV map handed on."""
+    """The outputs of frames with these seeds; each frame's history is the BEV map of the one before."""
     outputs = []
     with torch.inference_mode():
         for seed in seeds:
@@ -76,28 +78,31 @@ def test_the_order_of_the_cameras_does_not_matter() -> None:
     assert_same(model(inputs), model(swapped))
 
 
-def test_a_camera_without_an_image_is_not_looked_at() -> None:
+def test_a_camera_without_an_image_has_no_effect() -> None:
     model, inputs = small_model(), replace(small_inputs(), has_image=torch.tensor([[True, False]]))
     other_pixels = inputs.images.clone()
     other_pixels[:, 1] = 3
     assert_same(model(inputs), model(replace(inputs, images=other_pixels)))
-    assert not model.project_pillars(inputs).hit[0, 1].any()
+    assert not hit(model, inputs)[0, 1].any()
 
 
-def test_no_image_at_all_still_gives_an_answer() -> None:
+def test_outputs_without_any_image_are_finite() -> None:
     inputs = replace(small_inputs(), has_image=torch.zeros(1, 2, dtype=torch.bool))
     assert small_model()(inputs).box_codes.isfinite().all()
 
 
 def test_every_parameter_receives_a_gradient() -> None:
-    model = small_model().train()
+    segmentation = SegmentationConfig(5, attention_heads=4, feed_forward_width=48)
+    model = small_model(heads=("detection", "segmentation"), segmentation=segmentation).train()
     outputs = model(small_inputs(), torch.randn(1, 48, 32))
-    (outputs.class_logits.square().mean() + outputs.box_codes.square().mean()).backward()
-    without = [name for name, parameter in model.named_parameters() if parameter.grad is None]
+    assert outputs.segmentation is not None
+    maps = (outputs.segmentation.mask_logits, outputs.segmentation.class_logits, outputs.segmentation.locations)
+    torch.stack([x.square().mean() for x in (outputs.class_logits, outputs.box_codes, *maps)]).sum().backward()
+    without = [name for name, x in model.named_parameters() if x.grad is None or not x.grad.any()]
     assert without == []
 
 
-def test_classes_start_at_a_score_of_a_hundredth() -> None:
+def test_untrained_class_scores_are_a_hundredth() -> None:
     torch.manual_seed(0)
     model = BEVFormer(small_model().config)
     for branch in model.detection_head.class_branches:
@@ -111,7 +116,7 @@ def test_box_centers_lie_in_the_range() -> None:
     assert ((codes[..., 4] >= -3) & (codes[..., 4] <= 2)).all()
 
 
-def test_bfloat16_autocast_keeps_boxes_in_float32_and_near() -> None:
+def test_with_bfloat16_autocast_boxes_stay_float32_and_near() -> None:
     model, inputs = small_model(), small_inputs()
     with torch.inference_mode():
         exact = model(inputs)
@@ -121,14 +126,19 @@ def test_bfloat16_autocast_keeps_boxes_in_float32_and_near() -> None:
     assert (half.box_codes - exact.box_codes).abs().mean() < 0.05
 
 
-def test_a_probe_tells_what_a_layer_looked_at_and_changes_nothing() -> None:
+@pytest.mark.parametrize("prepared", [False, True])
+def test_a_probe_holds_the_samples_of_a_layer_and_changes_nothing(prepared: bool) -> None:
     model, inputs, history = small_model(), small_inputs(), torch.randn(1, 48, 32)
-    probe = AttentionProbe(layer=1, cells=torch.tensor([9, 40]))
-    assert_same(model(inputs, history, probe), model(inputs, history))
+    visible = hit(model, inputs)[0]
+    if prepared:
+        model = prepare_for_inference(model, torch.device("cpu"))
+    with torch.inference_mode():
+        expected = model(inputs, history)
+        with AttentionProbe(model, layer=1, cells=torch.tensor([9, 40])) as probe:
+            assert_same(model(inputs, history), expected)
     assert probe.spatial is not None
     assert set(probe.spatial.cell.tolist()) <= {9, 40}
-    hit = model.project_pillars(inputs).hit[0]
-    assert len(probe.spatial.cell) == hit[:, [9, 40]].sum()
+    assert len(probe.spatial.cell) == visible[:, [9, 40]].sum() > 0
     torch.testing.assert_close(
         probe.spatial.weights.sum((-1, -2)), torch.ones(len(probe.spatial.cell), 4), atol=1e-5, rtol=1e-5
     )
@@ -136,10 +146,45 @@ def test_a_probe_tells_what_a_layer_looked_at_and_changes_nothing() -> None:
     assert ((probe.history_share > 0) & (probe.history_share < 1)).all()
 
 
-def test_without_history_a_probe_tells_no_share_of_it() -> None:
-    probe = AttentionProbe(layer=0, cells=torch.tensor([0]))
-    small_model()(small_inputs(), None, probe)
+def test_a_probe_finds_the_sampling_points_of_untrained_heads_around_the_pillar() -> None:
+    """Untrained, point p of head h lies p + 1 cells of each level away, in the direction of its ring."""
+    model, inputs = BEVFormer(small_model().config).eval(), small_inputs()
+    with torch.no_grad(), AttentionProbe(model, layer=0, cells=torch.arange(48)) as probe:
+        model(inputs)
+    assert probe.spatial is not None
+    projection = model.pillars.project(inputs.image_from_bev, inputs.image_size, inputs.has_image)
+    reference = projection.reference_points[0, probe.spatial.camera, probe.spatial.cell]  # (K', Z, 2)
+    ring = torch.tensor([[1.0, 0], [0, 1], [-1, 0], [0, -1]])
+    finest = torch.tensor([6.0, 4.0])  # columns and rows of the first level, of stride 16
+    for point in range(4):
+        expected = reference[:, point % 2, None] + (point + 1) * ring / finest
+        found = probe.spatial.locations[:, :, 0, point]
+        torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
+
+
+def test_without_history_a_probe_has_no_history_share() -> None:
+    model = small_model()
+    with AttentionProbe(model, layer=0, cells=torch.tensor([0])) as probe:
+        model(small_inputs())
     assert probe.history_share is None
+
+
+def test_a_probe_leaves_no_hooks_behind_even_after_an_error() -> None:
+    model, wrong_inputs = small_model(), replace(small_inputs(), shift=torch.zeros(1, 3))
+    probe = AttentionProbe(model, layer=0, cells=torch.tensor([0]))
+    with pytest.raises(RuntimeError), probe:
+        model(wrong_inputs, torch.zeros(1, 48, 32))
+    assert hooks(model) == 0
+
+
+def hit(model: BEVFormer, inputs: BEVFormerInputs) -> torch.Tensor:
+    """(B, N, Y·X) bool: whether a camera sees a cell."""
+    return model.pillars.project(inputs.image_from_bev, inputs.image_size, inputs.has_image).hit
+
+
+def hooks(model: BEVFormer) -> int:
+    """Number of hooks on the model's modules."""
+    return sum(len(module._forward_hooks) + len(module._forward_pre_hooks) for module in model.modules())
 
 
 def _row(inputs: BEVFormerInputs, i: int) -> BEVFormerInputs:

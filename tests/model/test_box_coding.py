@@ -1,4 +1,4 @@
-"""Box codes and boxes, both directions."""
+"""Box codes to boxes, and back."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CONFIG = small_config()
 
 
 def outputs(logits: np.ndarray, codes: np.ndarray) -> BEVFormerOutputs:
-    """Two decoder layers, of which the first is nonsense; logits (Q, classes), codes (Q, 10)."""
+    """Two decoder layers, the first with arbitrary numbers; logits (Q, classes), codes (Q, 10)."""
     layers = [torch.from_numpy(np.stack([np.full_like(x, 7), x])).float()[:, None] for x in (logits, codes)]
     return BEVFormerOutputs(torch.zeros(1, 1, 1), *layers)
 
@@ -35,7 +35,7 @@ def some_boxes(count: int) -> Boxes3D:
 def test_decoding_undoes_encoding() -> None:
     boxes = some_boxes(6)
     logits = np.full((6, 3), -9.0)
-    logits[:, 0] = np.arange(6, 0, -1)  # in this order by score
+    logits[:, 0] = np.arange(6, 0, -1)  # so that the order by score is this one
     decoded = decode(outputs(logits, encode(boxes)), CONFIG)[0][:6]
     for name in ("centers", "sizes_lwh", "velocities"):
         np.testing.assert_allclose(getattr(decoded, name), getattr(boxes, name), atol=1e-4)
@@ -43,7 +43,7 @@ def test_decoding_undoes_encoding() -> None:
     assert decoded.classes.tolist() == ["car"] * 6
 
 
-def test_the_code_of_a_car_that_heads_along_y_by_hand() -> None:
+def test_the_code_of_a_car_that_heads_along_y() -> None:
     car = Boxes3D(
         np.array([[1.0, 2, -1]]),
         np.array([[4.5, 1.9, 1.6]]),
@@ -56,13 +56,13 @@ def test_the_code_of_a_car_that_heads_along_y_by_hand() -> None:
     np.testing.assert_allclose(encode(car)[0], expected, atol=1e-12)
 
 
-def test_unknown_velocities_stay_unknown() -> None:
+def test_unknown_velocities_are_nan_in_the_code() -> None:
     boxes = some_boxes(1)
     boxes.velocities[:] = np.nan
     assert np.isnan(encode(boxes)[0, 8:]).all()
 
 
-def test_the_best_scores_win_and_a_query_may_appear_for_two_classes() -> None:
+def test_the_best_scores_are_decoded_and_a_query_may_have_two_classes() -> None:
     logits = np.array([[3.0, 2.0, -5.0], [-4.0, 1.0, -6.0]])
     codes = encode(some_boxes(2))
     boxes = decode(outputs(logits, codes), CONFIG)[0]
@@ -73,7 +73,7 @@ def test_the_best_scores_win_and_a_query_may_appear_for_two_classes() -> None:
 
 
 @pytest.mark.parametrize(("queries", "expected"), [(2, 6), (50, 10)])
-def test_there_are_at_most_as_many_boxes_as_the_model_states(queries: int, expected: int) -> None:
+def test_there_are_at_most_max_boxes_boxes(queries: int, expected: int) -> None:
     random = np.random.default_rng(0)
     boxes = decode(outputs(random.normal(size=(queries, 3)), random.normal(size=(queries, 10))), CONFIG)[0]
     assert len(boxes) == expected

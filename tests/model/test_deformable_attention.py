@@ -1,4 +1,4 @@
-"""Deformable attention against its definition in loops, and how its learned parts start."""
+"""Deformable attention compared with its definition as loops, and its initial weights."""
 
 from __future__ import annotations
 
@@ -8,49 +8,48 @@ import numpy as np
 import pytest
 import torch
 
-from bevcli.model.deformable_attention import DeformableAttention, deformable_attention, sampling_locations
+from bevcli.model.deformable_attention import DeformableAttention, GridSampling, sampling_locations
 
 SHAPES = ((4, 6), (2, 3))
+sample = GridSampling()
 
 
-def test_equals_its_definition_written_as_loops() -> None:
+def test_sampling_equals_its_definition_as_loops() -> None:
     random = np.random.default_rng(0)
     values = random.normal(size=(2, 30, 3, 4))
     locations = random.uniform(-0.3, 1.3, size=(5, 3, 2, 2, 2))
     weights = random.random((5, 3, 2, 2))
-    ours = deformable_attention(
+    ours = sample(
         torch.from_numpy(values).float(), SHAPES, torch.from_numpy(locations).float(), torch.from_numpy(weights), [2, 3]
     )
     np.testing.assert_allclose(ours, _by_loops(values, locations, weights, map_of_query=[0, 0, 1, 1, 1]), atol=1e-5)
 
 
-def test_a_map_that_no_query_samples_is_left_out() -> None:
+def test_a_map_that_no_query_samples_changes_nothing() -> None:
     values, locations, weights = torch.randn(3, 24, 2, 4), torch.rand(6, 2, 1, 2, 2), torch.rand(6, 2, 1, 2)
-    with_empty = deformable_attention(values, SHAPES[:1], locations, weights, [4, 0, 2])
-    without = deformable_attention(values[[0, 2]], SHAPES[:1], locations, weights, [4, 2])
+    with_empty = sample(values, SHAPES[:1], locations, weights, [4, 0, 2])
+    without = sample(values[[0, 2]], SHAPES[:1], locations, weights, [4, 2])
     assert torch.equal(with_empty, without)
 
 
-def test_no_query_at_all_gives_no_row() -> None:
-    empty = deformable_attention(
-        torch.randn(2, 24, 2, 4), SHAPES[:1], torch.rand(0, 2, 1, 2, 2), torch.rand(0, 2, 1, 2), [0, 0]
-    )
+def test_without_queries_the_result_has_no_rows() -> None:
+    empty = sample(torch.randn(2, 24, 2, 4), SHAPES[:1], torch.rand(0, 2, 1, 2, 2), torch.rand(0, 2, 1, 2), [0, 0])
     assert empty.shape == (0, 8)
 
 
-def test_points_a_thousand_kilometres_away_count_as_zero() -> None:
+def test_samples_far_outside_the_map_are_zero() -> None:
     locations = torch.full((1, 1, 1, 1, 2), 6.7e6)
     assert torch.equal(
-        deformable_attention(torch.ones(1, 24, 1, 4), SHAPES[:1], locations, torch.ones(1, 1, 1, 1), [1]),
+        sample(torch.ones(1, 24, 1, 4), SHAPES[:1], locations, torch.ones(1, 1, 1, 1), [1]),
         torch.zeros(1, 4),
     )
 
 
-def test_gradients_reach_values_places_and_weights() -> None:
+def test_gradients_reach_values_locations_and_weights() -> None:
     values = torch.randn(1, 30, 2, 2, dtype=torch.float32, requires_grad=True)
     locations = torch.rand(3, 2, 2, 2, 2, requires_grad=True)
     weights = torch.rand(3, 2, 2, 2, requires_grad=True)
-    deformable_attention(values, SHAPES, locations, weights, [3]).square().sum().backward()
+    sample(values, SHAPES, locations, weights, [3]).square().sum().backward()
     for leaf in (values, locations, weights):
         assert leaf.grad is not None
         assert leaf.grad.abs().sum() > 0
@@ -64,9 +63,9 @@ def test_offsets_are_cells_of_their_own_level() -> None:
 
 
 @pytest.mark.parametrize("heads", [4, 8])
-def test_heads_start_in_a_ring_and_weigh_places_equally(heads: int) -> None:
+def test_untrained_heads_sample_in_a_ring_with_equal_weights(heads: int) -> None:
     attention = DeformableAttention(16, 16, heads, points=3, levels=2)
-    offsets, weights = attention.look(torch.randn(5, 16))
+    offsets, weights = attention.predict(torch.randn(5, 16))
     torch.testing.assert_close(weights, torch.full_like(weights, 1 / 6))
     for head in range(heads):
         angle = 2 * math.pi * head / heads

@@ -1,4 +1,4 @@
-"""Modulated deformable convolution against a plain convolution and against its definition in loops."""
+"""Modulated deformable convolution compared with a plain convolution and with its definition as loops."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_without_offsets_and_with_a_full_mask_it_is_a_plain_convolution(stride: 
 
 
 @pytest.mark.parametrize("stride", [1, 2])
-def test_equals_its_definition_written_as_loops(stride: int) -> None:
+def test_it_equals_its_definition_as_loops(stride: int) -> None:
     random = np.random.default_rng(1)
     x, weight = random.normal(size=(3, 6, 7)), random.normal(size=(2, 3, 3, 3))
     out_height, out_width = (6 - 1) // stride + 1, (7 - 1) // stride + 1
@@ -37,7 +37,7 @@ def test_equals_its_definition_written_as_loops(stride: int) -> None:
     np.testing.assert_allclose(ours[0].numpy(), expected, atol=1e-4)
 
 
-def test_channels_of_the_offset_convolution_are_pairs_of_dy_dx_then_the_mask() -> None:
+def test_the_predicted_channels_are_pairs_of_dy_dx_then_the_mask() -> None:
     layer = ModulatedDeformableConvolution(1, 1)
     with torch.no_grad():
         layer.weight.zero_()
@@ -49,7 +49,7 @@ def test_channels_of_the_offset_convolution_are_pairs_of_dy_dx_then_the_mask() -
         torch.testing.assert_close(layer(x)[0, 0, :4, 1:], x[0, 0, 2:, :5], atol=1e-4, rtol=1e-4)
 
 
-def test_a_fresh_layer_is_half_a_plain_convolution() -> None:
+def test_an_untrained_layer_is_half_a_plain_convolution() -> None:
     torch.manual_seed(2)
     layer, x = ModulatedDeformableConvolution(4, 6, stride=2), torch.randn(1, 4, 8, 8)
     expected = 0.5 * F.conv2d(x, layer.weight, stride=2, padding=1)
@@ -68,7 +68,7 @@ def _by_loops(x: np.ndarray, offsets: np.ndarray, mask: np.ndarray, weight: np.n
 
 
 def _bilinear(x: np.ndarray, y: float, x_: float) -> np.ndarray:
-    """x: (C, H, W) at a place in cells, zero outside."""
+    """x: (C, H, W) at a location in cells, zero outside."""
     value = np.zeros(len(x))
     top, left = int(np.floor(y)), int(np.floor(x_))
     for i, j in ((top, left), (top, left + 1), (top + 1, left), (top + 1, left + 1)):

@@ -1,4 +1,4 @@
-"""The tiny model answers as the original does, on the numbers kept in tests/data (float32, CPU)."""
+"""The tiny model equals the released code, compared with the numbers in tests/data (float32, CPU)."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ def model() -> BEVFormer:
 
 
 @pytest.fixture(scope="module")
-def answers(model: BEVFormer) -> dict[str, BEVFormerOutputs]:
-    """Frames 0 and 1 in the version "history", frame 1 in the version "both"; frame 0 has no history to shift."""
+def outputs_of(model: BEVFormer) -> dict[str, BEVFormerOutputs]:
+    """Frames 0 and 1 with history_shift "history", frame 1 with "both"; frame 0 has no history to shift."""
     shifts_both = original.with_history_shift(model, "both")
     with torch.inference_mode():
         first = model(original.inputs(0, model.config))
@@ -34,32 +34,35 @@ def answers(model: BEVFormer) -> dict[str, BEVFormerOutputs]:
 
 
 @pytest.mark.parametrize("step", ["history_0", "history_1", "both_1"])
-def test_bev_map_and_head_outputs_equal_the_originals(answers: dict[str, BEVFormerOutputs], step: str) -> None:
-    outputs = answers[step]
+def test_bev_map_and_head_outputs_equal_the_originals(outputs_of: dict[str, BEVFormerOutputs], step: str) -> None:
+    outputs = outputs_of[step]
     np.testing.assert_allclose(outputs.bev[0, ::23], KEPT[f"{step}_bev"], atol=1e-3)
     np.testing.assert_allclose(outputs.class_logits[:, 0, ::9], KEPT[f"{step}_class_logits"], atol=1e-3)
     np.testing.assert_allclose(outputs.box_codes[:, 0, ::9], KEPT[f"{step}_box_codes"], atol=1e-2)
 
 
 @pytest.mark.parametrize("step", ["history_0", "history_1", "both_1"])
-def test_decoded_boxes_equal_the_originals(model: BEVFormer, answers: dict[str, BEVFormerOutputs], step: str) -> None:
-    boxes = decode(answers[step], model.config)[0]
+def test_decoded_boxes_equal_the_originals(
+    model: BEVFormer, outputs_of: dict[str, BEVFormerOutputs], step: str
+) -> None:
+    boxes = decode(outputs_of[step], model.config)[0]
     expected, scores, labels = (KEPT[f"{step}_{name}"] for name in ("boxes", "scores", "labels"))
     np.testing.assert_allclose(boxes.scores, scores, atol=1e-4)
     row = original.match_boxes(boxes, expected, labels, model.config.classes)
     np.testing.assert_allclose(boxes.centers[row], expected[:, :3], atol=1e-2)
     np.testing.assert_allclose(boxes.sizes_lwh[row], expected[:, [4, 3, 5]], rtol=1e-3)
-    # The original's yaw runs clockwise from -y.
+    # The original's yaw is measured clockwise from -y.
     np.testing.assert_allclose(wrap_angle(boxes.yaws[row] + expected[:, 6] + np.pi / 2), 0, atol=1e-3)
     np.testing.assert_allclose(boxes.velocities[row], expected[:, 7:], atol=1e-3)
 
 
-def test_the_two_versions_of_the_history_shift_differ(answers: dict[str, BEVFormerOutputs]) -> None:
-    assert (answers["history_1"].bev - answers["both_1"].bev).abs().mean() > 0.1
+def test_the_two_history_shifts_differ(outputs_of: dict[str, BEVFormerOutputs]) -> None:
+    assert (outputs_of["history_1"].bev - outputs_of["both_1"].bev).abs().mean() > 0.1
 
 
-def test_pillars_appear_where_the_original_projects_them(model: BEVFormer) -> None:
-    projection = model.project_pillars(original.inputs(0, model.config))
+def test_projected_pillars_equal_the_originals(model: BEVFormer) -> None:
+    inputs = original.inputs(0, model.config)
+    projection = model.pillars.project(inputs.image_from_bev, inputs.image_size, inputs.has_image)
     visible = projection.visible[0].numpy()
     bits = np.unpackbits(KEPT["visible_bits"])[: visible.size].reshape(visible.shape).astype(bool)
     assert np.array_equal(visible, bits)

@@ -1,6 +1,6 @@
-"""Stage by stage and over several frames, the models answer as the original does.
+"""The models equal the released code in every stage, over several frames.
 
-Runs where BEVCLI_SHARED names a folder with golden/: the original's full numbers (float32, CPU).
+Needs the original's full numbers (float32, CPU) in the folder golden/ of BEVCLI_SHARED.
 """
 
 from __future__ import annotations
@@ -23,17 +23,18 @@ SHARED = os.environ.get("BEVCLI_SHARED", "")
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.timeout(3600),
-    pytest.mark.skipif(not SHARED, reason="BEVCLI_SHARED does not name the original's full numbers"),
+    pytest.mark.skipif(not SHARED, reason="BEVCLI_SHARED is not set: no full numbers of the original"),
 ]
 
-# Where a nearest-neighbour rotation falls on a tie, a cell may take its neighbour's history; and the decoder of
-# base with weights by the rule answers noise of 1e-6 on the BEV map with 9e-4 in the logits of its touchiest query.
+# Share of cells and logits that may differ. Where the nearest-neighbour rotation meets a tie, a cell may take its
+# neighbour's history. With the weights of stated_rule.py, the decoder of base turns noise of 1e-6 in the BEV map into
+# 9e-4 in the logits of its most sensitive query.
 SHARE_OFF = {"tiny": 0.0, "base": 1e-3}
 
 
 @dataclass(frozen=True)
 class Golden:
-    """The original's arrays of one model and version."""
+    """The original's arrays for one model and one history_shift."""
 
     arrays: Any
     row_stride: int
@@ -74,7 +75,7 @@ def test_every_stage_of_every_frame_equals_the_originals(name: str, history_shif
 
 
 def record_stages(model: BEVFormer) -> dict[str, Any]:
-    """A dict that each forward pass fills with the outputs of neck, BEV queries and encoder layers."""
+    """A dict that every forward pass fills with the outputs of neck, BEV queries and encoder layers."""
     stages: dict[str, Any] = {}
     parts = {"neck": model.neck, "bev_queries": model.bev_queries}
     parts |= {f"enc{i}_sub": layer for i, layer in enumerate(model.encoder.layers)}
@@ -119,6 +120,6 @@ def check_outputs(outputs: BEVFormerOutputs, model: BEVFormer, golden: Golden, f
 
 
 def assert_cells_close(cells: torch.Tensor, expected: np.ndarray, share_off: float) -> None:
-    """BEV cells (K, C) within 1e-3, but for a share of them (of a small sample: one)."""
+    """All BEV cells (K, C) but a share of them, at least one, are within 1e-3."""
     difference = np.abs(cells.numpy() - expected.reshape(cells.shape)).max(axis=-1)
     assert (difference > 1e-3).sum() <= np.ceil(share_off * len(difference)), f"largest {difference.max():.2g}"

@@ -1,4 +1,4 @@
-"""Turning the history map: against numpy's quarter turns, and about the centre that is asked for."""
+"""Rotation of the history map: compared with numpy's quarter turns, and about the configured centre."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.history_alignment import rotate_history
+from bevcli.model.ego_motion import rotate_history
 
 SQUARE = BevGrid(6, 6)
 
@@ -25,16 +25,16 @@ def random_map(rows: int, columns: int) -> np.ndarray:
 @pytest.mark.parametrize("quarters", [0, 1, 2, 3, -1])
 def test_quarter_turns_are_those_of_numpy(quarters: int) -> None:
     history = random_map(6, 6)
-    # Rows grow along y, ahead: seen with rows downwards, a turn to the left of the vehicle runs the same way.
+    # Row indices grow ahead of the vehicle, so that its left turn is a rotation in numpy's direction.
     np.testing.assert_array_equal(turn(history, 90.0 * quarters), np.rot90(history, quarters))
 
 
-def test_a_full_circle_more_or_less_changes_nothing() -> None:
+def test_angles_a_full_circle_apart_are_the_same() -> None:
     history = random_map(6, 6)
     np.testing.assert_array_equal(turn(history, 7.0), turn(history, 7.0 - 360.0))
 
 
-def test_a_cell_ahead_of_a_vehicle_that_turned_left_is_then_to_its_right() -> None:
+def test_a_cell_ahead_is_on_the_right_after_a_left_turn() -> None:
     grid = BevGrid(51, 51)
     history = np.zeros((51, 51, 1))
     history[45, 25] = 1  # twenty cells ahead
@@ -42,13 +42,13 @@ def test_a_cell_ahead_of_a_vehicle_that_turned_left_is_then_to_its_right() -> No
     assert (row - 25, column - 25) == (round(20 * np.cos(np.pi / 6)), round(20 * np.sin(np.pi / 6)))
 
 
-def test_what_comes_from_outside_the_map_is_zero() -> None:
+def test_cells_from_outside_the_map_are_zero() -> None:
     turned = turn(np.ones((6, 6, 1)), 45.0)
     assert turned[0, 0] == 0
     assert turned[3, 3] == 1
 
 
-def test_the_originals_centre_is_a_hundred_cells_at_every_size() -> None:
+def test_the_original_centre_is_cell_100_at_every_grid_size() -> None:
     history = np.random.default_rng(1).normal(size=(50, 50, 1))
     small = BevGrid(50, 50)
     np.testing.assert_array_equal(turn(history, 5.0, "original", small), turn(history, 5.0, (100.0, 100.0), small))
@@ -58,7 +58,7 @@ def test_the_originals_centre_is_a_hundred_cells_at_every_size() -> None:
     np.testing.assert_array_equal(turn(history, 5.0, "original", large), turn(history, 5.0, "center", large))
 
 
-def test_each_batch_element_turns_by_its_own_angle() -> None:
+def test_each_batch_element_is_rotated_by_its_own_angle() -> None:
     history = torch.randn(2, 36, 3)
     together = rotate_history(history, torch.tensor([10.0, -40.0]), SQUARE, "center")
     for i, degrees in enumerate((10.0, -40.0)):

@@ -1,21 +1,24 @@
-"""A model made ready for inference answers as the model itself does."""
+"""A prepared model equals the model itself."""
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import pytest
 import torch
 from small_model import small_inputs, small_model
+from torch import nn
 
+from bevcli.benchmark.textbook import textbook_version
 from bevcli.model.bevformer import BEVFormer, BEVFormerOutputs
-from bevcli.model.prepared import prepare_for_inference, textbook_version
+from bevcli.model.prepared import fold_batch_norms, prepare_for_inference
 
 CPU = torch.device("cpu")
 
 
 def two_steps(model: BEVFormer) -> BEVFormerOutputs:
-    """The second of two steps, so that history takes part."""
+    """The outputs of the second of two steps, which has history."""
     with torch.inference_mode():
         return model(small_inputs(1), model(small_inputs(0)).bev)
 
@@ -24,21 +27,21 @@ def two_steps(model: BEVFormer) -> BEVFormerOutputs:
 def model() -> BEVFormer:
     model = small_model()
     random = torch.Generator().manual_seed(1)
-    for name, buffer in model.named_buffers():  # batch norms that have seen images
+    for name, buffer in model.named_buffers():  # as after training
         if name.endswith(("running_mean", "running_var")):
             buffer.copy_(0.5 + torch.rand(buffer.shape, generator=random))
     return model
 
 
 @pytest.mark.parametrize("version", [prepare_for_inference, textbook_version])
-def test_answers_are_the_models(model, version):
+def test_outputs_are_the_models(model, version):
     expected, found = two_steps(model), two_steps(version(model, CPU))
     torch.testing.assert_close(found.bev, expected.bev, atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(found.class_logits, expected.class_logits, atol=1e-3, rtol=1e-3)
     torch.testing.assert_close(found.box_codes, expected.box_codes, atol=1e-3, rtol=1e-3)
 
 
-def test_another_calibration_is_noticed(model):
+def test_a_changed_calibration_changes_the_cached_hits(model):
     prepared = prepare_for_inference(model, CPU)
     with torch.inference_mode():
         for seed in (0, 1, 0):
@@ -46,6 +49,16 @@ def test_another_calibration_is_noticed(model):
             torch.testing.assert_close(prepared(inputs).bev, model(inputs).bev, atol=1e-4, rtol=1e-4)
         blind = replace(inputs, has_image=torch.tensor([[True, False]]))
         torch.testing.assert_close(prepared(blind).bev, model(blind).bev, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_folding_batch_norms_changes_no_feature_map(model, device):
+    """The device decides only which module takes the place of deformable convolutions; all of them run on a CPU."""
+    folded, images = copy.deepcopy(model.backbone).requires_grad_(False), small_inputs(0).images[0]
+    fold_batch_norms(folded, torch.device(device))
+    assert not any(isinstance(module, nn.BatchNorm2d) for module in folded.modules())
+    for found, expected in zip(folded(images), model.backbone(images), strict=True):
+        torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
 
 
 def test_a_batch_of_two_is_two_batches_of_one(model):
@@ -56,6 +69,15 @@ def test_a_batch_of_two_is_two_batches_of_one(model):
     torch.testing.assert_close(both.box_codes, expected.box_codes, atol=1e-3, rtol=1e-3)
 
 
+def test_autocast_around_a_prepared_model_has_no_effect(model):
+    prepared = prepare_for_inference(model, CPU)
+    expected = two_steps(prepared)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = two_steps(prepared)
+    assert torch.equal(found.bev, expected.bev)
+    assert torch.equal(found.box_codes, expected.box_codes)
+
+
 @pytest.mark.parametrize("precision", ["bf16", "fp16"])
 def test_half_precision_stays_near(model, precision):
     expected, found = two_steps(model), two_steps(prepare_for_inference(model, CPU, precision))
@@ -64,7 +86,7 @@ def test_half_precision_stays_near(model, precision):
     assert found.box_codes.dtype == found.class_logits.dtype == torch.float32
 
 
-def test_the_model_itself_stays_as_it_is(model):
+def test_preparing_leaves_the_model_unchanged(model):
     before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
     prepare_for_inference(model, CPU, "bf16")
     after = model.state_dict()
@@ -76,7 +98,7 @@ def test_the_model_itself_stays_as_it_is(model):
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU")
 @pytest.mark.parametrize(("precision", "tolerance"), [("fp32", 1e-3), ("bf16", 0.05), ("fp16", 0.02)])
-def test_a_gpu_answers_as_the_cpu(model, precision, tolerance):
+def test_a_gpu_equals_the_cpu(model, precision, tolerance):
     gpu = torch.device("cuda")
     prepared = prepare_for_inference(model, gpu, precision)
     with torch.inference_mode():

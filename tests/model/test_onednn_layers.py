@@ -1,4 +1,4 @@
-"""oneDNN's layers answer as PyTorch's do."""
+"""oneDNN's layers compute the same as PyTorch's."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from torch import nn
 
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.kernels import onednn as onednn_layers
+from bevcli.model.kernels.compiled import CompiledDeformableConvolution
 from bevcli.model.kernels.onednn import FusedBottleneck, PackedLinear, has_onednn, use_onednn
 from bevcli.model.prepared import prepare_for_inference
 from bevcli.model.resnet import Bottleneck
@@ -23,7 +24,7 @@ def dtypes() -> list[torch.dtype]:
 
 @pytest.mark.parametrize("rows", [(0,), (1,), (2, 900)])
 @pytest.mark.parametrize("bias", [True, False])
-def test_a_packed_linear_layer_answers_the_same(rows, bias):
+def test_a_packed_linear_layer_equals_a_linear_layer(rows, bias):
     for dtype in dtypes():
         linear = nn.Linear(48, 20, bias).to(dtype)
         x = torch.randn(*rows, 48, dtype=dtype)
@@ -35,16 +36,16 @@ def test_a_packed_linear_layer_answers_the_same(rows, bias):
 @pytest.mark.parametrize("style", ["pytorch", "caffe"])
 @pytest.mark.parametrize(("in_channels", "stride"), [(64, 1), (32, 2)])
 @pytest.mark.parametrize("deformable", [False, True])
-def test_a_fused_bottleneck_answers_the_same(style, in_channels, stride, deformable):
+def test_a_fused_bottleneck_equals_a_bottleneck(style, in_channels, stride, deformable):
     for dtype in dtypes():
         block = Bottleneck(in_channels, 16, stride, style, deformable)
         for name, module in list(block.named_modules()):
-            if isinstance(module, nn.BatchNorm2d):  # as folding leaves it: biases in the convolutions
+            if isinstance(module, nn.BatchNorm2d):  # as after folding, with biases in the convolutions
                 block.set_submodule(name, nn.Identity())
-            elif isinstance(module, nn.Conv2d | ModulatedDeformableConvolution):
+            elif isinstance(module, nn.Conv2d):
                 module.bias = nn.Parameter(torch.randn(len(module.weight)))
-            if isinstance(module, ModulatedDeformableConvolution):
-                module.backend = "compiled"
+        if isinstance(block.conv2, ModulatedDeformableConvolution):
+            block.conv2 = CompiledDeformableConvolution(block.conv2, torch.randn(16))
         block = block.to(dtype).to(memory_format=torch.channels_last).requires_grad_(False)
         x = torch.randn(2, in_channels, 12, 20, dtype=dtype).to(memory_format=torch.channels_last)
         before = x.clone()

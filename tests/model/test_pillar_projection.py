@@ -1,4 +1,4 @@
-"""Pillars in the cameras, against OpenCV's projection; and the list of hits."""
+"""Pillars in the cameras, compared with OpenCV's projection; and the list of hits."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def project(image_from_bev: np.ndarray, points: np.ndarray, image: bool = True) 
     return project_pillars(matrix, torch.from_numpy(points).float(), SIZE, torch.tensor([[image]]))
 
 
-def test_pillars_of_a_real_rig_lie_where_opencv_projects_them() -> None:
+def test_pillars_of_a_real_rig_are_projected_as_by_opencv() -> None:
     config = load_config("tiny")
     pillars = config.bev_grid.pillars().reshape(-1, 4, 3)
     ours = project_pillars(
@@ -40,7 +40,7 @@ def test_pillars_of_a_real_rig_lie_where_opencv_projects_them() -> None:
         pixels = pixels.reshape(-1, 4, 2)
         in_image = ((pixels > 0) & (pixels < (800, 480))).all(-1) & (depth > 0)
         visible = ours.visible[0, i].numpy()
-        assert (visible != in_image).sum() <= 2  # a point on the very edge
+        assert (visible != in_image).sum() <= 2  # points on the edge of an image
         both = visible & in_image
         np.testing.assert_allclose(ours.reference_points[0, i].numpy()[both] * (800, 480), pixels[both], atol=0.01)
 
@@ -51,7 +51,7 @@ def test_a_point_behind_the_camera_is_not_visible() -> None:
     assert project(image_from_bev, points).visible.flatten().tolist() == [True, False, False]
 
 
-def test_edges_of_the_image_are_outside() -> None:
+def test_a_point_on_the_edge_of_the_image_is_not_visible() -> None:
     image_from_bev = np.array([[400, 0, 0, 0], [0, 240, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
     points = np.array([[[0, 1, 1.0]], [[2, 1, 1.0]], [[1, 2, 1.0]], [[1.999, 1.999, 1.0]]])
     assert project(image_from_bev, points).visible.flatten().tolist() == [False, False, False, True]
@@ -64,7 +64,7 @@ def test_a_cell_is_hit_when_any_point_of_its_pillar_is_visible() -> None:
     assert not project(image_from_bev, points, image=False).hit.any()
 
 
-def test_hits_list_every_seen_pair_of_camera_and_cell_once() -> None:
+def test_hits_list_every_visible_pair_of_camera_and_cell_once() -> None:
     visible = torch.zeros(2, 3, 4, 2, dtype=torch.bool)
     for batch, camera, cell in ((0, 0, 1), (0, 2, 1), (0, 2, 3), (1, 1, 0)):
         visible[batch, camera, cell, 1] = True

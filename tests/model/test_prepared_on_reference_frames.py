@@ -1,4 +1,4 @@
-"""The prepared tiny model on the four frames of the reference numbers, weights by the rule."""
+"""The prepared tiny model on the four reference frames, with weights by the rule of stated_rule.py."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def prepared_fp32(model: BEVFormer) -> list[BEVFormerOutputs]:
 
 
 def four_frames(model: BEVFormer) -> list[BEVFormerOutputs]:
-    """Frames 0 to 2 are one scene, 3 another."""
+    """The outputs of all frames; 0 to 2 are one scene, 3 is another."""
     outputs: list[BEVFormerOutputs] = []
     with torch.inference_mode():
         for frame in range(4):
@@ -37,7 +37,7 @@ def four_frames(model: BEVFormer) -> list[BEVFormerOutputs]:
 
 
 def nearest(boxes: Boxes3D, others: Boxes3D) -> np.ndarray:
-    """For each box the distance to the nearest of the others with its class, metres."""
+    """For each box the distance to the nearest other box of its class, metres."""
     distance = np.linalg.norm(boxes.centers[:, None] - others.centers[None], axis=-1)
     return np.where(boxes.classes[:, None] == others.classes[None], distance, np.inf).min(axis=1)
 

@@ -1,4 +1,4 @@
-"""The segmentation head: shapes, what its parts respond to, and the rules by which masks become a map."""
+"""The segmentation head: shapes, its parts, and the rules by which masks become a map."""
 
 from __future__ import annotations
 
@@ -10,15 +10,21 @@ import torch
 from small_model import small_config, small_inputs, small_model
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.mask_decoder import MaskDecoderLayer
-from bevcli.model.panoptic_merging import PanopticMap, decode_maps, merge
-from bevcli.model.segmentation_head import SegmentationConfig, SegmentationHead, SegmentationOutputs
+from bevcli.model.segmentation import (
+    MaskDecoderLayer,
+    PanopticMap,
+    SegmentationConfig,
+    SegmentationHead,
+    SegmentationOutputs,
+    assign_cells,
+    decode_maps,
+)
 
 BOTH = ("detection", "segmentation")
 SEGMENTATION = SegmentationConfig(5, location_layers=2, mask_layers=3, attention_heads=4, feed_forward_width=48)
 
 
-def test_one_forward_pass_serves_both_heads() -> None:
+def test_one_forward_pass_computes_both_heads() -> None:
     outputs = small_model(heads=BOTH, segmentation=SEGMENTATION)(small_inputs(batch=2))
     assert outputs.class_logits.shape == (2, 2, 12, 3)
     assert outputs.segmentation is not None
@@ -27,7 +33,7 @@ def test_one_forward_pass_serves_both_heads() -> None:
     assert outputs.segmentation.locations.shape == (2, 2, 5, 4)
 
 
-def test_without_the_head_there_is_no_segmentation_and_no_weight_of_it() -> None:
+def test_without_the_head_there_are_no_segmentation_outputs_and_weights() -> None:
     model = small_model()
     assert model(small_inputs()).segmentation is None
     assert not [key for key in model.state_dict() if "segmentation" in key]
@@ -38,7 +44,7 @@ def test_locations_lie_on_the_map() -> None:
     assert ((locations >= 0) & (locations <= 1)).all()
 
 
-def test_a_mask_is_where_its_query_attends() -> None:
+def test_a_mask_is_the_weighted_sum_of_attention_maps() -> None:
     layer = MaskDecoderLayer(channels=8, heads=2, feed_forward_width=8, dropout=0.0)
     with torch.no_grad():
         for projection in (layer.query_projection, layer.key_projection):
@@ -48,8 +54,8 @@ def test_a_mask_is_where_its_query_attends() -> None:
         layer.mask_projection.bias.zero_()
     query, bev = torch.zeros(1, 1, 8), torch.zeros(1, 3, 8)
     query[0, 0] = torch.tensor([1.0, 0, 0, 0, 1, 0, 0, 0])
-    bev[0, 1, 0] = 6.0  # found by the first head, which counts once
-    bev[0, 2, 4] = 6.0  # found by the second, which counts twice
+    bev[0, 1, 0] = 6.0  # attended by the first head, with weight 1
+    bev[0, 2, 4] = 6.0  # attended by the second head, with weight 2
     _, masks, _ = layer(query, torch.zeros(3, 8), bev)
     assert masks[0, 0].tolist() == pytest.approx([0, 6 / math.sqrt(4), 2 * 6 / math.sqrt(4)])
 
@@ -59,29 +65,31 @@ def in_a_row(*rows: list[float]) -> torch.Tensor:
     return torch.tensor(rows)[:, None, :]
 
 
-def test_a_cell_is_of_the_query_that_most_probably_has_it() -> None:
-    assert merge(in_a_row([0.9, 0.5, 0.3, 0.1], [0.0, 0.4, 0.6, 0.2]), least=0.2, scale=1).tolist() == [[0, 0, 1, -1]]
+def test_a_cell_belongs_to_its_most_probable_query() -> None:
+    assert assign_cells(in_a_row([0.9, 0.5, 0.3, 0.1], [0.0, 0.4, 0.6, 0.2]), minimum=0.2, scale=1).tolist() == [
+        [0, 0, 1, -1]
+    ]
 
 
-def test_a_query_that_is_nowhere_probable_keeps_its_place_in_the_order() -> None:
-    assert merge(in_a_row([0.1, 0.1], [0.0, 0.7]), least=0.2, scale=1).tolist() == [[-1, 1]]
-    assert merge(in_a_row([0.1, 0.1]), least=0.2, scale=2).tolist() == [[-1] * 4] * 2
+def test_improbable_queries_do_not_change_the_indices_of_others() -> None:
+    assert assign_cells(in_a_row([0.1, 0.1], [0.0, 0.7]), minimum=0.2, scale=1).tolist() == [[-1, 1]]
+    assert assign_cells(in_a_row([0.1, 0.1]), minimum=0.2, scale=2).tolist() == [[-1] * 4] * 2
 
 
-def test_a_finer_map_has_its_borders_between_the_cells() -> None:
+def test_a_finer_map_interpolates_between_the_cells() -> None:
     row = in_a_row([1.0, 0.0])  # over four half cells: 1, 0.75, 0.25, 0
-    assert merge(row, least=0.5, scale=2)[0].tolist() == [0, 0, -1, -1]
-    assert merge(row, least=0.2, scale=2)[0].tolist() == [0, 0, 0, -1]
+    assert assign_cells(row, minimum=0.5, scale=2)[0].tolist() == [0, 0, -1, -1]
+    assert assign_cells(row, minimum=0.2, scale=2)[0].tolist() == [0, 0, 0, -1]
 
 
-def test_a_probability_is_that_of_the_class_times_the_mask() -> None:
+def test_a_probability_is_class_times_mask() -> None:
     masks, classes = torch.full((1, 1, 4, 1), 0.5).logit(), torch.tensor([0.9, 0.7, 0.7, 0.3]).logit()[None, None]
     outputs = SegmentationOutputs(masks, classes, torch.zeros(1, 1, 1, 4))
     one = decode_maps(outputs, SegmentationConfig(map_scale=1, min_stuff=0.4, min_thing=0.2), BevGrid(1, 1))[0]
     assert (one.stuff.ravel().tolist(), one.things.tolist()) == ([True, False, False], [[-1]])
 
 
-def test_a_map_is_written_with_its_bits_and_ahead_on_top() -> None:
+def test_a_bev_map_has_one_bit_for_each_class_and_its_first_row_ahead() -> None:
     grid = BevGrid(2, 3, x_range_m=(-3, 3), y_range_m=(-2, 2))
     logits = torch.full((1, 1, 5, 6), -9.0)
     logits[0, 0, 0, :3] = 9.0  # the road: the row behind the vehicle
@@ -95,12 +103,12 @@ def test_a_map_is_written_with_its_bits_and_ahead_on_top() -> None:
     assert (bev_map.x_range_m, bev_map.y_range_m) == ((-3, 3), (-2, 2))
 
 
-def test_vehicles_keep_their_identity_and_stuff_lies_upon_stuff() -> None:
+def test_a_cell_may_have_several_classes() -> None:
     stuff = np.array([[[True, True]], [[True, False]], [[False, False]]])
     panoptic = PanopticMap(stuff, np.array([[4, 7]]))
     assert panoptic.bev_map(BevGrid(1, 2)).cells.tolist() == [[1 + 2 + 8, 1 + 8]]
 
 
-def test_heads_without_detection_are_refused() -> None:
+def test_heads_without_detection_are_an_error() -> None:
     with pytest.raises(ValueError, match="heads must name"):
         small_config(heads=("segmentation",))

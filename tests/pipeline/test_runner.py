@@ -135,8 +135,19 @@ def test_removing_a_camera_changes_only_the_cells_that_it_saw(mini_model):
     runner.step(None, preprocess(WithoutImages({0: ["CAM_FRONT_LEFT"]}, count=1).load(0)))
     handle.remove()
     changed = (seen["queries"] - with_camera).abs().amax(-1)[0] > 1e-6
-    projection = project_pillars(whole.image_from_bev, mini_model.pillars, (96, 160), whole.has_image)
+    projection = project_pillars(whole.image_from_bev, mini_model.pillars.points, (96, 160), whole.has_image)
     hits = projection.hit[0, mini_model.config.cameras.index("CAM_FRONT_LEFT")]
     assert changed.any()
     assert not (changed & ~hits).any()
     assert (changed == hits).float().mean() > 0.99
+
+
+def test_runners_leave_no_hooks_on_a_model(mini_model):
+    """Several runners in turn, as in training, and one whose step fails."""
+    for _ in range(3):
+        run(mini_model, MemorySequence(1), ask_attention=True, probes=((0.0, 12.0),))
+    runner = Runner(mini_model, CPU)
+    prepared = Preprocessor(mini_model.config)(MemorySequence(1).load(0))
+    with pytest.raises(RuntimeError):
+        runner.step(None, replace(prepared, images=prepared.images[:, :, :1]))
+    assert not any(module._forward_hooks or module._forward_pre_hooks for module in mini_model.modules())

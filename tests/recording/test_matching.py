@@ -1,12 +1,15 @@
-"""What counts as found, missed and false."""
+"""True positives and missed ground truth in the display are those of `bevcli eval`."""
 
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
+from bevcli.evaluation.config import DetectionConfig
+from bevcli.evaluation.detection import evaluate_detections
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.recording.matching import counted, match
+from bevcli.recording.matching import detectable, true_positives
 
 
 def boxes(places, classes, scores=None) -> Boxes3D:
@@ -19,18 +22,62 @@ def boxes(places, classes, scores=None) -> Boxes3D:
 def test_a_box_is_found_within_two_metres_and_its_class():
     truth = boxes([(0, 0), (10, 0), (20, 0)], ["car", "car", "bus"])
     predicted = boxes([(0, 1.9), (10, 2.1), (20, 0)], ["car", "car", "car"], [0.9, 0.8, 0.7])
-    true, found = match(predicted, truth)
+    true, found = true_positives(predicted, truth)
     assert true.tolist() == [True, False, False]
     assert found.tolist() == [True, False, False]
 
 
-def test_one_box_is_found_once_by_the_best():
+def test_a_box_is_found_once_by_the_prediction_with_the_highest_score():
     truth = boxes([(0, 0)], ["car"])
-    true, found = match(boxes([(0.1, 0), (0.5, 0)], ["car", "car"], [0.3, 0.9]), truth)
+    true, found = true_positives(boxes([(0.1, 0), (0.5, 0)], ["car", "car"], [0.3, 0.9]), truth)
     assert true.tolist() == [False, True]
     assert found.tolist() == [True]
 
 
-def test_nothing_is_missed_that_nobody_could_see():
+def test_ground_truth_outside_the_grid_or_without_points_is_not_detectable():
     truth = replace(boxes([(0, 0), (1, 1), (80, 0)], ["car"] * 3), num_points=np.array([5, 0, 5]))
-    assert counted(truth, BevGrid(50, 50)).centers[:, 0].tolist() == [0]
+    assert detectable(truth, BevGrid(50, 50)).centers[:, 0].tolist() == [0]
+
+
+def evaluated(predicted, truth):
+    """As `true_positives`, from the matching of the evaluation at 2 m."""
+    scores = evaluate_detections([predicted], [truth], DetectionConfig().unlimited())
+    centers = {"truth": [], "predicted": []}
+    row = DetectionConfig().distances_m.index(2.0)
+    for part in scores.matches:
+        centers["predicted"] += part.predictions.boxes.centers[part.matched[row] >= 0].tolist()
+        centers["truth"] += part.ground_truth.boxes.centers[part.found(row)].tolist()
+    return (
+        [center in centers["predicted"] for center in predicted.centers.tolist()],
+        [center in centers["truth"] for center in truth.centers.tolist()],
+    )
+
+
+def test_at_exactly_two_metres_the_display_agrees_with_the_evaluation():
+    truth = boxes([(0, 0), (10, 0)], ["car", "car"])
+    predicted = boxes([(0, 2.0), (10, np.nextafter(2.0, 0))], ["car", "car"], [0.9, 0.8])
+    true, found = true_positives(predicted, truth)
+    assert true.tolist() == found.tolist() == [False, True]
+    assert evaluated(predicted, truth) == (true.tolist(), found.tolist())
+
+
+def test_of_equal_scores_the_display_chooses_the_one_that_the_evaluation_chooses():
+    truth = boxes([(0, 0)], ["car"])
+    predicted = boxes([(0.1, 0), (0.5, 0)], ["car", "car"], [0.7, 0.7])
+    true, found = true_positives(predicted, truth)
+    assert true.tolist() == [False, True]  # the later one, as in the devkit
+    assert evaluated(predicted, truth) == (true.tolist(), found.tolist())
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_display_agrees_with_the_evaluation(seed):
+    rng = np.random.default_rng(seed)
+    names = np.array(["car", "bus", "pedestrian"])
+    truth = boxes(rng.integers(0, 8, (25, 2)) + rng.uniform(0, 1e-6, (25, 2)), rng.choice(names, 25))
+    predicted = boxes(
+        rng.integers(0, 8, (60, 2)) + rng.uniform(0, 1e-6, (60, 2)), rng.choice(names, 60), rng.integers(1, 5, 60) / 5
+    )
+    true, found = true_positives(predicted, truth)
+    assert true.any()
+    assert not true.all()
+    assert evaluated(predicted, truth) == (true.tolist(), found.tolist())

@@ -1,4 +1,4 @@
-"""Healthy rigs as calibration.json's documents, made with SciPy's rotations only."""
+"""Healthy rigs as the content of calibration.json, made with SciPy's rotations only."""
 
 from copy import deepcopy
 
@@ -90,5 +90,5 @@ HEALTHY = {
 
 
 def copy_of(name):
-    """A healthy rig's document, free to be spoilt."""
+    """A healthy rig's document, to plant mistakes in."""
     return deepcopy(HEALTHY[name])

@@ -1,4 +1,4 @@
-"""The command: exit codes, the JSON, the images, and what it says of a sequence."""
+"""The command and its library function: exit codes, JSON, images, and findings about a sequence."""
 
 import json
 import shutil
@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError
+from bevcli.rig.check_calibration import check_calibration
 from bevcli.viewer.screenshot import take_screenshot
 
 FILES = {"cameras.png", "coverage.png", "recording.rrd", "findings.json"}
@@ -28,8 +29,11 @@ def calibration(document, folder):
 
 @pytest.fixture
 def small_drive(tmp_path):
+    return write_drive(tmp_path / "drive")
+
+
+def write_drive(folder):
     """Five frames of two cameras, driving straight ahead at 10 m/s."""
-    folder = tmp_path / "drive"
     document = copy_of("six")
     document["cameras"] = {name: document["cameras"][name] for name in ("CAM_FRONT", "CAM_BACK")}
     for name, camera in document["cameras"].items():
@@ -48,10 +52,11 @@ def small_drive(tmp_path):
     return folder
 
 
-def write_motion(folder, heading):
-    rows = ["timestamp_ns,x,y,z,qw,qx,qy,qz"]
-    rows += [f"{t},{t / 1e8},0,0,{','.join(map(str, heading))}" for t in range(10**9 - 10**8, 4 * 10**9, 10**8)]
-    (folder / "ego_motion.csv").write_text("\n".join(rows))
+def write_motion(folder, heading, rows=31):
+    """Ego-motion with 10 poses a second, from 0.1 s before the first frame; 31 rows cover all frames."""
+    times = range(10**9 - 10**8, 4 * 10**9, 10**8)[:rows]
+    lines = [f"{t},{t / 1e8},0,0,{','.join(map(str, heading))}" for t in times]
+    (folder / "ego_motion.csv").write_text("\n".join(["timestamp_ns,x,y,z,qw,qx,qy,qz", *lines]))
 
 
 @pytest.mark.parametrize("name", HEALTHY)
@@ -141,8 +146,7 @@ def test_images_of_another_size_are_explained(small_drive, tmp_path):
 
 
 def test_ego_motion_that_does_not_cover_the_frames_is_explained_and_the_images_shown(small_drive, tmp_path):
-    rows = (small_drive / "ego_motion.csv").read_text().splitlines()
-    (small_drive / "ego_motion.csv").write_text("\n".join(rows[:6]))
+    write_motion(small_drive, heading=(1, 0, 0, 0), rows=5)
     result = run(small_drive, "--out", tmp_path / "out", "--json")
     errors = [f for f in json.loads(result.stdout)["findings"] if f["severity"] == "error"]
     assert [error["code"] for error in errors] == ["sequence-refused"]
@@ -168,3 +172,14 @@ def test_the_viewer_shows_all_views_of_the_recording(small_drive, tmp_path):
     views = take_screenshot(tmp_path / "out" / "recording.rrd", tmp_path / "shot.png")
     assert set(views) == {"The rig", "Cameras per BEV cell", "Findings", "CAM_FRONT", "CAM_BACK"}
     assert cv2.imread(str(tmp_path / "shot.png")).std() > 10
+
+
+def test_the_command_prints_what_the_library_returns(small_drive, tmp_path):
+    write_motion(small_drive, heading=(0.5**0.5, 0, 0, 0.5**0.5))
+    check = check_calibration(str(small_drive), frame=3)
+    assert [error.code for error in check.errors] == ["ego-sideways"]
+    assert (check.images["CAM_BACK"] == 120).all()  # frame 3
+    assert {path.name for path in check.write(tmp_path / "here")} == FILES
+    printed = run(small_drive, "--frame", 3, "--out", tmp_path / "out", "--json").stdout
+    assert printed == check.to_json() + "\n" == (tmp_path / "here" / "findings.json").read_text()
+    assert run(small_drive, "--frame", 3, "--out", tmp_path / "out").stdout.startswith(check.text())

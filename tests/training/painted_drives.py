@@ -14,12 +14,11 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.ego_motion import GRAVITY, Kinematics
 from bevcli.geometry.transforms import Pose, apply, inverse
-from bevcli.model.bevformer import BEVFormerConfig
+from bevcli.model.bevformer import BEVFormerConfig, ImageConfig
 from bevcli.model.decoder import DecoderConfig
 from bevcli.model.encoder import EncoderConfig
-from bevcli.model.image_config import ImageConfig
 from bevcli.model.resnet import ResNetConfig
-from bevcli.model.segmentation_head import SegmentationConfig
+from bevcli.model.segmentation import SegmentationConfig
 
 COLORS = {"car": (40, 60, 220), "pedestrian": (60, 200, 60)}
 SIZES = {"car": (4.5, 2.0, 1.6), "pedestrian": (0.8, 0.8, 1.8)}

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bevcli.model.segmentation_head import SegmentationOutputs
+from bevcli.model.segmentation import SegmentationOutputs
 from bevcli.training.segmentation_loss import SegmentationLossConfig, segmentation_loss
 from bevcli.training.segmentation_targets import SegmentationTargets
 

@@ -1,7 +1,7 @@
-"""Compiled loops that sample feature maps bilinearly and sum what they find; they hold no sampled values.
+"""Compiled loops for bilinear sampling and weighted sums of samples; they store no sampled values.
 
-Plain functions of arrays without Python objects: many threads may run one on disjoint ranges of queries or rows.
-The compiled code is kept on disk (NUMBA_CACHE_DIR, beside this file or in the user's cache folder).
+The functions take arrays and no Python objects. Several threads may run one on disjoint ranges of queries or rows.
+The compiled code is cached on disk (in NUMBA_CACHE_DIR, next to this file, or in the user's cache folder).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from numba.extending import overload
 
 
 def as_float32(number: object) -> np.float32:
-    """A float32, or a bfloat16 that comes as its 16 bits (uint16), as float32. Only for compiled code."""
+    """A float32, or the 16 bits of a bfloat16 (uint16), as float32. For compiled code only."""
     raise NotImplementedError
 
 
@@ -24,7 +24,7 @@ def _as_float32(number):  # type: ignore[no-untyped-def]
 
 
 def put_float32(array: object, index: int, number: object) -> None:
-    """Stores a float32 in an array of float32, or of bfloat16 bits, rounded to nearest. Only for compiled code."""
+    """Stores a float32 in an array of float32, or of bfloat16 bits, rounded to nearest. For compiled code only."""
     raise NotImplementedError
 
 
@@ -37,7 +37,7 @@ def _put_float32(array, index, number):  # type: ignore[no-untyped-def]
     else:
 
         def put(array, index, number):  # type: ignore[no-untyped-def]
-            # Casts after every step: sums of two uint32 would be worked out in 64 bits, half as many at a time.
+            # Cast after every step: the compiler adds uint32 in 64 bits, which halves the SIMD width.
             bits = np.uint32(np.float32(number).view(np.uint32) + np.uint32(0x8000))
             array[index] = np.uint16(np.uint32(bits >> np.uint32(16)))
 
@@ -46,9 +46,12 @@ def _put_float32(array, index, number):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"}, inline="never")
 def bilinear_corners(x, y, height, width):  # type: ignore[no-untyped-def]
-    """The four cells around a place (x, y) in cells and their shares: (top, bottom, left, right, four shares).
+    """The four cells around a location (x, y) in cells, and their interpolation weights.
 
-    A neighbour outside of the map counts nothing: its share is zero and a cell inside stands for it.
+    A neighbour outside the map has weight zero, and its index is replaced by one inside.
+
+    Returns:
+        (top, bottom, left, right, four weights).
     """
     one, zero = np.float32(1), np.float32(0)
     left, top = np.int64(np.floor(x)), np.int64(np.floor(y))
@@ -73,12 +76,12 @@ def sample_maps(values, level_shapes, locations, weights, map_of_query, out, beg
 
     values: (G, S, heads, D) float32 or bfloat16 bits. level_shapes: (L, 2) int64 height, width.
     locations: (M, heads, L, P, 2) float32, x and y, 0 to 1. weights: (M, heads, L, P) float32.
-    map_of_query: (M,) int64, which of the G maps a query samples. Outside of a map values are zero.
+    map_of_query: (M,) int64, which of the G maps a query samples. Values outside a map are zero.
 
-    For a head of a query, first all corners are found, then all are read: the processor has many reads under way.
+    For each head of a query, the indices of all corners are computed before any is read, so that the reads overlap.
     """
     heads, levels, points = weights.shape[1:]
-    # Unsigned: a number that may be negative would count from the array's end, and each read would ask whether.
+    # Unsigned: for a signed index, each read would check whether it counts from the array's end.
     depth = np.uint64(values.shape[3])
     flat = values.reshape(-1)
     step = heads * values.shape[3]
@@ -93,7 +96,7 @@ def sample_maps(values, level_shapes, locations, weights, map_of_query, out, beg
                 for point in range(points):
                     x = locations[query, head, level, point, 0] * np.float32(width) - np.float32(0.5)
                     y = locations[query, head, level, point, 1] * np.float32(height) - np.float32(0.5)
-                    # Written so that NaN is outside too. A place outside counts nothing; the first cell stands for it.
+                    # NaN counts as outside. A location outside gets weight zero, and the first cell is read for it.
                     inside = x > -1 and x < width and y > -1 and y < height
                     x, y = (x, y) if inside else (np.float32(0), np.float32(0))
                     weight = weights[query, head, level, point] if inside else np.float32(0)
@@ -125,10 +128,11 @@ def sample_maps_backward(  # type: ignore[no-untyped-def]
     values, level_shapes, locations, weights, starts, out_gradient,
     values_gradient, locations_gradient, weights_gradient, begin, end,
 ) -> None:  # fmt: skip
-    """The gradients of `sample_maps`, for heads begin to end - 1, counted through the maps: map * heads + head.
+    """The gradients of `sample_maps`, for units begin to end - 1; a unit is map * heads + head.
 
-    Heads of maps, and not queries, are shared out: no two of them write to the same place. All float32, the gradients
-    shaped as what they belong to; values_gradient is added to. starts: (G + 1,) int64, where each map's queries begin.
+    Threads get ranges of units, not of queries, because no two units write to the same element. All arrays are
+    float32, and each gradient has the shape of what it belongs to; values_gradient is added to. starts: (G + 1,) int64,
+    index of each map's first query.
     """
     heads, levels, points = weights.shape[1:]
     depth = values.shape[3]
@@ -155,7 +159,7 @@ def sample_maps_backward(  # type: ignore[no-untyped-def]
                     left_share, top_share = one - right_share, one - bottom_share
                     first = start + top * width + left
                     at_left, at_right, at_top, at_bottom = left >= 0, left + 1 < width, top >= 0, top + 1 < height
-                    # Outside of the map there is nothing to read, and what is written is not used.
+                    # Outside the map zeros are read, and what is written is not used.
                     a = tokens[first, head] if at_top and at_left else nothing
                     b = tokens[first + 1, head] if at_top and at_right else nothing
                     c = tokens[first + width, head] if at_bottom and at_left else nothing
@@ -192,7 +196,7 @@ def sample_maps_backward(  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
 def sample_taps(x, offsets, mask, stride, first, out, begin, end) -> None:  # type: ignore[no-untyped-def]
-    """Writes the nine sampled and masked taps of output positions first + begin to first + end - 1.
+    """Samples and masks the nine taps of output positions first + begin to first + end - 1.
 
     x: (B, H, W, C) float32 or bfloat16 bits. offsets: (B, H', W', 9, 2) float32, dy and dx in cells, taps row by row.
     mask: (B, H', W', 9) float32. Positions count through B, H', W'. out: (rows, 9, C) in the dtype of x; row `begin`
@@ -226,6 +230,6 @@ def sample_taps(x, offsets, mask, stride, first, out, begin, end) -> None:  # ty
                     + w10 * as_float32(c[channel])
                     + w11 * as_float32(d[channel])
                 )
-            # A loop of its own: in one with the rounding, the sums of bfloat16 are not worked out side by side.
+            # A separate loop: together with the rounding, the sums of bfloat16 would not be vectorised.
             for channel in range(channels):
                 put_float32(target, channel, total[channel])

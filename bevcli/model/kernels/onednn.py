@@ -1,7 +1,7 @@
-"""Layers as oneDNN runs them on a CPU, for inference: weights packed once, what follows a convolution in its own pass.
+"""Layers run by oneDNN on a CPU, for inference: weights are packed once, ReLU and sums are fused into convolutions.
 
-The operators are those that PyTorch's compiler puts in place of convolutions and linear layers. Where a build of
-PyTorch has none of them, a model keeps the layers that it has.
+The operators are those that PyTorch's compiler uses for convolutions and linear layers. Where a build of PyTorch lacks
+them, a model keeps its own layers.
 """
 
 from __future__ import annotations
@@ -11,12 +11,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.resnet import Bottleneck
 
 
 def has_onednn(dtype: torch.dtype) -> bool:
-    """Whether these layers run here in a dtype."""
+    """Whether this build of PyTorch and this CPU can run these layers in a dtype."""
     operators = ("_convolution_pointwise", "_linear_pointwise", "_reorder_linear_weight", "_is_mkldnn_bf16_supported")
     if not torch.backends.mkldnn.is_available() or not all(hasattr(torch.ops.mkldnn, name) for name in operators):
         return False
@@ -24,7 +23,7 @@ def has_onednn(dtype: torch.dtype) -> bool:
 
 
 class PackedLinear(nn.Module):
-    """A linear layer whose weight lies as oneDNN reads it."""
+    """A linear layer with its weight in oneDNN's own layout."""
 
     def __init__(self, weight: Tensor, bias: Tensor | None) -> None:
         super().__init__()
@@ -45,7 +44,7 @@ class ActivatedConvolution(nn.Module):
         self.geometry = (list(convolution.padding), list(convolution.stride), list(convolution.dilation), 1)
 
     def forward(self, x: Tensor, shortcut: Tensor | None = None) -> Tensor:
-        """x: (B, in, H, W), shortcut: as the result -> (B, out, H', W')."""
+        """x: (B, in, H, W), shortcut: (B, out, H', W') -> (B, out, H', W')."""
         convolve: Any = torch.ops.mkldnn._convolution_pointwise
         if shortcut is None:
             return convolve(x, self.weight, self.bias, *self.geometry, "relu", [], "")
@@ -62,23 +61,22 @@ class FusedBottleneck(nn.Module):
         if isinstance(block.conv2, nn.Conv2d):
             self.conv2: nn.Module = ActivatedConvolution(block.conv2)
         else:
-            self.conv2 = nn.Sequential(block.conv2, nn.ReLU(inplace=True))
+            self.conv2 = nn.Sequential(block.conv2, nn.ReLU(inplace=True))  # a deformable convolution
         self.downsample = block.downsample
 
     def forward(self, x: Tensor) -> Tensor:
+        """As `Bottleneck.forward`."""
         return self.conv3(self.conv2(self.conv1(x)), self.downsample(x))
 
 
 def use_onednn(part: nn.Module) -> None:
-    """Puts these layers in place of a module's linear layers and of its bottlenecks, whose batch norms are folded."""
+    """Replaces the linear layers and the bottlenecks of a module, in place. Batch norms must be folded already."""
     for name, child in part.named_children():
         if isinstance(child, Bottleneck) and has_onednn(child.conv1.weight.dtype):
             child = FusedBottleneck(child)
             setattr(part, name, child)
-        if isinstance(child, ModulatedDeformableConvolution) and has_onednn(child.weight.dtype):
-            child.product = PackedLinear(child.taps_matrix(), child.bias)
-        # Multi-head attention derives its output layer from nn.Linear and reads the weight itself.
-        elif type(child) is nn.Linear and has_onednn(child.weight.dtype):
+        # Not the subclass of nn.Linear in multi-head attention, which reads the weight of that layer itself.
+        if type(child) is nn.Linear and has_onednn(child.weight.dtype):
             setattr(part, name, PackedLinear(child.weight, child.bias))
         else:
             use_onednn(child)

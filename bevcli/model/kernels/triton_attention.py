@@ -1,4 +1,4 @@
-"""Deformable attention on a GPU as one Triton kernel; imported only where Triton is installed."""
+"""Deformable attention on a GPU as one Triton kernel. Import it only where Triton is installed."""
 
 from __future__ import annotations
 
@@ -7,44 +7,48 @@ from collections.abc import Sequence
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
+from torch import Tensor, nn
 
 QUERIES_PER_PROGRAM = 32
 
 
-def sample_triton(
-    values: Tensor,
-    level_shapes: Sequence[tuple[int, int]],
-    locations: Tensor,
-    weights: Tensor,
-    queries_per_map: Sequence[int],
-) -> Tensor:
-    """As `deformable_attention`; no gradients."""
-    _, cells, heads, depth = values.shape
-    queries, _, levels, points, _ = locations.shape
-    counts = torch.tensor(list(queries_per_map), device=values.device)
-    map_of_query = torch.arange(len(counts), device=values.device).repeat_interleave(counts, output_size=queries)
-    shapes = torch.tensor(level_shapes, dtype=torch.int32, device=values.device)
-    out = values.new_empty(queries, heads, depth, dtype=torch.float32)
-    grid = (triton.cdiv(queries, QUERIES_PER_PROGRAM), heads)
-    if queries:
-        _sample[grid](
-            values.contiguous(),
-            shapes,
-            locations.float().contiguous(),
-            weights.float().contiguous(),
-            map_of_query,
-            out,
-            queries,
-            cells,
-            HEADS=heads,
-            DEPTH=depth,
-            PADDED_DEPTH=triton.next_power_of_2(depth),
-            LEVELS=levels,
-            POINTS=points,
-            BLOCK=QUERIES_PER_PROGRAM,
-        )
-    return out.flatten(1)
+class TritonSampling(nn.Module):
+    """Takes the place of `GridSampling` on a GPU, without gradients."""
+
+    def forward(
+        self,
+        values: Tensor,
+        level_shapes: Sequence[tuple[int, int]],
+        locations: Tensor,
+        weights: Tensor,
+        queries_per_map: Sequence[int],
+    ) -> Tensor:
+        """Arguments and result as for `GridSampling`."""
+        _, cells, heads, depth = values.shape
+        queries, _, levels, points, _ = locations.shape
+        counts = torch.tensor(list(queries_per_map), device=values.device)
+        map_of_query = torch.arange(len(counts), device=values.device).repeat_interleave(counts, output_size=queries)
+        shapes = torch.tensor(level_shapes, dtype=torch.int32, device=values.device)
+        out = values.new_empty(queries, heads, depth, dtype=torch.float32)
+        grid = (triton.cdiv(queries, QUERIES_PER_PROGRAM), heads)
+        if queries:
+            _sample[grid](
+                values.contiguous(),
+                shapes,
+                locations.float().contiguous(),
+                weights.float().contiguous(),
+                map_of_query,
+                out,
+                queries,
+                cells,
+                HEADS=heads,
+                DEPTH=depth,
+                PADDED_DEPTH=triton.next_power_of_2(depth),
+                LEVELS=levels,
+                POINTS=points,
+                BLOCK=QUERIES_PER_PROGRAM,
+            )
+        return out.flatten(1)
 
 
 @triton.jit
@@ -64,7 +68,7 @@ def _sample(  # type: ignore[no-untyped-def]
     POINTS: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """One program sums the samples of BLOCK queries in one head; tensors are laid out as in `deformable_attention`."""
+    """One program sums the samples of BLOCK queries in one head; tensors are laid out as for `GridSampling`."""
     query = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     head = tl.program_id(1)
     channel = tl.arange(0, PADDED_DEPTH)
@@ -76,13 +80,13 @@ def _sample(  # type: ignore[no-untyped-def]
         height = tl.load(shapes + 2 * level)
         width = tl.load(shapes + 2 * level + 1)
         for point in range(POINTS):
-            place = ((query * HEADS + head) * LEVELS + level) * POINTS + point
-            # Beyond one cell around the map nothing is found; the clamp keeps far places within an int32.
-            x = tl.load(locations + 2 * place, exists, -1.0) * width - 0.5
-            y = tl.load(locations + 2 * place + 1, exists, -1.0) * height - 0.5
+            sample = ((query * HEADS + head) * LEVELS + level) * POINTS + point
+            # Locations more than a cell outside the map contribute nothing; the clamp keeps them within an int32.
+            x = tl.load(locations + 2 * sample, exists, -1.0) * width - 0.5
+            y = tl.load(locations + 2 * sample + 1, exists, -1.0) * height - 0.5
             x = tl.minimum(tl.maximum(x, -2.0), width + 1.0)
             y = tl.minimum(tl.maximum(y, -2.0), height + 1.0)
-            weight = tl.load(weights + place, exists, 0.0)
+            weight = tl.load(weights + sample, exists, 0.0)
             left = tl.floor(x)
             top = tl.floor(y)
             for corner in tl.static_range(4):

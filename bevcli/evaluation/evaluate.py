@@ -1,0 +1,151 @@
+"""`evaluate`: read predictions and ground truth, match their frames, and score boxes and maps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from bevcli.evaluation.config import DetectionConfig
+from bevcli.evaluation.detection import evaluate_detections
+from bevcli.evaluation.detection_scores import DetectionScores
+from bevcli.evaluation.inputs import ScoredInput, open_ground_truth, open_predictions, without_cycles_in_racks
+from bevcli.evaluation.pairing import FramePairs, pair_frames
+from bevcli.evaluation.scores_report import scores_table, scores_to_dict
+from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmentation
+from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
+from bevcli.sequences.nuscenes.choice import NuScenesChoice
+
+
+@dataclass(frozen=True)
+class Scores:
+    """The result of `evaluate`.
+
+    Attributes:
+        pairs: the frames that were scored.
+        config: the parameters of the detection score.
+        detection: the scores of the boxes.
+        segmentation: the scores of the maps; None where predictions or ground truth have none.
+        notes: what was assumed or left out, one line each.
+    """
+
+    pairs: FramePairs
+    config: DetectionConfig
+    detection: DetectionScores
+    segmentation: SegmentationScores | None
+    notes: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """All scores as a dict for JSON, with the devkit's key names; undefined numbers are None."""
+        return scores_to_dict(self.detection, self.config, self.segmentation, self.notes)
+
+    def table(self) -> str:
+        """The scores as text for a terminal."""
+        frames = f"{self.detection.frame_count} frames, matched by {self.pairs.matched_by}"
+        return f"{frames}\n\n{scores_table(self.detection, self.segmentation)}"
+
+    def write_plots(self, folder: Path | str) -> list[Path]:
+        """Write plots as PNG files into a folder, made where it is missing; return their paths. Raises OutputError."""
+        from bevcli.evaluation.bev_sheet import draw_bev_sheet  # only plots need matplotlib
+        from bevcli.evaluation.plots import draw_errors_by_range, draw_precision_recall, save_figures
+
+        figures = {
+            "precision_recall.png": draw_precision_recall(self.detection),
+            "errors_by_range.png": draw_errors_by_range(self.detection),
+            "misses_and_false_alarms.png": draw_bev_sheet(self.detection, self.config, self.pairs),
+        }
+        return save_figures(figures, Path(folder))
+
+
+def evaluate(
+    predictions: Path | str,
+    ground_truth: Path | str,
+    max_range: float | None = None,
+    count_missing: bool = False,
+    *,
+    scene: str | None = None,
+    version: str | None = None,
+    split: str | None = None,
+) -> Scores:
+    """Score predictions with the nuScenes detection metrics, and maps with IoU where both sides have them.
+
+    Args:
+        predictions: a predictions.json, the folder of a run, or a nuScenes submission (results_nusc.json).
+        ground_truth: a ground_truth.json, a sequence folder that contains one, or a nuScenes root.
+        max_range: distance from the ego vehicle beyond which nothing is scored, metres. Default: nuScenes' range of
+            each class, or no limit where no frame has an ego pose, as in the devkit.
+        count_missing: whether ground-truth frames without a prediction count as missed; they are left out by default.
+        scene: score only this scene of the ground truth.
+        version: of a nuScenes root, such as "v1.0-mini".
+        split: of a nuScenes root, such as "val".
+
+    Returns:
+        The scores. Predictions without attributes get them from class and speed.
+
+    Raises:
+        InputError: a file is missing or wrong, or the two have no frame in common.
+        ConfigError: max_range is not positive.
+    """
+    truth = open_ground_truth(Path(ground_truth), NuScenesChoice(version, scene, split))
+    found = open_predictions(Path(predictions))
+    pairs = pair_frames(found.boxes, truth.boxes, count_missing=count_missing)
+    pairs = without_cycles_in_racks(pairs, truth.bicycle_racks)
+    config = DetectionConfig()
+    if max_range is not None:
+        config = config.cut_at(max_range)
+    elif not pairs.ego_pose_known:
+        config = config.unlimited()
+    detection = evaluate_detections(_with_attributes(pairs.predictions), pairs.ground_truth, config, pairs.ego_xy)
+    segmentation, map_notes = _score_maps(found, truth, pairs)
+    notes = [*pairs.notes, *map_notes]
+    if max_range is None and not pairs.ego_pose_known:
+        notes.append('no frame has "world_from_ego": class ranges are not applied (--max-range M applies them)')
+    return Scores(pairs, config, detection, segmentation, (*notes, *_detection_notes(detection)))
+
+
+def _with_attributes(frames: Sequence[Boxes3D]) -> Sequence[Boxes3D]:
+    if any(boxes.attributes is not None for boxes in frames):
+        return frames
+    return [replace(boxes, attributes=attributes_by_speed(boxes)) for boxes in frames]
+
+
+def _score_maps(
+    predictions: ScoredInput, ground_truth: ScoredInput, pairs: FramePairs
+) -> tuple[SegmentationScores | None, list[str]]:
+    """The scores of the maps, and notes about frames that were left out."""
+    found, true = predictions.maps, ground_truth.maps
+    if found is None or true is None:
+        missing = "predictions" if found is None else "ground truth"
+        return None, [f"maps are not scored: the {missing} have none"] if found or true else []
+    indices = [
+        (one.index, other.index)
+        for one, other in zip(pairs.prediction_stamps, pairs.ground_truth_stamps, strict=True)
+        if found.has(one.index) and true.has(other.index)
+    ]
+    left_out = len(pairs.predictions) - len(indices)
+    notes = [f"{left_out} of {len(pairs.predictions)} frames lack a map on one side: left out"] if left_out else []
+    classes = [name for name in true.classes if name in found.classes]
+    maps = ((found.load(one), true.load(other)) for one, other in indices)
+    return evaluate_segmentation(maps, classes), notes
+
+
+def _detection_notes(detection: DetectionScores) -> list[str]:
+    notes = []
+    if not detection.prediction_count:
+        notes.append("the predictions contain no box within the class ranges: every score is 0")
+    classes = detection.overall.classes
+    absent = [name for name, scores in classes.items() if not scores.ground_truth_count]
+    if len(absent) == len(classes):
+        notes.append("the ground truth contains no box that is scored: every score is 0")
+    elif absent:
+        present = detection.overall.of_classes_with_ground_truth()
+        notes.append(
+            f"no ground truth of {', '.join(absent)}: these classes have AP 0 in mAP and NDS, as in the nuScenes "
+            f"devkit; without them mAP {present.mean_ap:.3f}, NDS {present.nd_score:.3f}"
+        )
+    if detection.unmeasured:
+        names = {"vel_err": "velocities", "attr_err": "attributes"}
+        what = " or ".join(names[name] for name in detection.unmeasured)
+        notes.append(f"the ground truth has no {what}: NDS is the mean without that error")
+    return notes

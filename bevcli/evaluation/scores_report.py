@@ -1,0 +1,156 @@
+"""Scores as a dict for JSON, with the key names of the nuScenes devkit, and as a table for the terminal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from bevcli.evaluation.config import ERRORS, DetectionConfig
+from bevcli.evaluation.detection_scores import ClassScores, DetectionScores, RangeScores, ScoreTable, VisibilityRecall
+from bevcli.evaluation.segmentation import SegmentationScores
+
+_ERROR_HEADS = ("ATE m", "ASE", "AOE rad", "AVE m/s", "AAE")
+
+
+def scores_to_dict(
+    detection: DetectionScores,
+    config: DetectionConfig,
+    segmentation: SegmentationScores | None = None,
+    notes: tuple[str, ...] = (),
+) -> dict[str, Any]:
+    """All scores as a dict for JSON; undefined numbers are None. docs/scoring.md explains the keys."""
+    present = detection.overall.of_classes_with_ground_truth()
+    content = {
+        **_table_to_dict(detection.overall),
+        "classes_with_ground_truth": {
+            "classes": list(present.classes),
+            "mean_ap": present.mean_ap,
+            "nd_score": present.nd_score,
+        },
+        "by_range": [_range_to_dict(part) for part in detection.by_range],
+        "recall_by_visibility": [_visibility_to_dict(part) for part in detection.by_visibility],
+        "iou": None if segmentation is None else dict(segmentation.iou),
+        "frames": detection.frame_count,
+        "map_frames": 0 if segmentation is None else segmentation.frame_count,
+        "ground_truth_boxes": detection.ground_truth_count,
+        "prediction_boxes": detection.prediction_count,
+        "notes": list(notes),
+        "cfg": {
+            "class_range": dict(config.class_ranges_m),
+            "dist_ths": list(config.distances_m),
+            "dist_th_tp": config.error_distance_m,
+            "min_recall": config.min_recall,
+            "min_precision": config.min_precision,
+            "mean_ap_weight": config.mean_ap_weight,
+        },
+    }
+    return _finite(content)
+
+
+def scores_table(detection: DetectionScores, segmentation: SegmentationScores | None = None) -> str:
+    """Detection scores by class, range and visibility, and IoU if there are maps, as text for a terminal."""
+    parts = [_classes(detection), _ranges(detection)]
+    if detection.by_visibility:
+        parts.append(_visibilities(detection))
+    if segmentation is not None:
+        parts.append(_maps(segmentation))
+    return "\n\n".join(parts)
+
+
+def _table_to_dict(table: ScoreTable) -> dict[str, Any]:
+    return {
+        "mean_ap": table.mean_ap,
+        "nd_score": table.nd_score,
+        "tp_errors": table.errors,
+        "tp_scores": table.error_scores,
+        "label_aps": {
+            name: {f"{distance:.1f}": ap for distance, ap in scores.aps.items()}
+            for name, scores in table.classes.items()
+        },
+        "mean_dist_aps": {name: scores.mean_ap for name, scores in table.classes.items()},
+        "label_tp_errors": {name: dict(scores.errors) for name, scores in table.classes.items()},
+        "label_recalls": {name: scores.recall for name, scores in table.classes.items()},
+        "label_ground_truth_boxes": {name: scores.ground_truth_count for name, scores in table.classes.items()},
+    }
+
+
+def _range_to_dict(part: RangeScores) -> dict[str, Any]:
+    return {"from_m": part.low_m, "to_m": part.high_m, **_table_to_dict(part.table)}
+
+
+def _visibility_to_dict(part: VisibilityRecall) -> dict[str, Any]:
+    return {
+        "from": part.low,
+        "to": part.high,
+        "recall": part.mean_recall,
+        "ground_truth_boxes": part.ground_truth_count,
+        "found_boxes": part.found_count,
+        "label_recalls": dict(part.recalls),
+    }
+
+
+def _finite(value: Any) -> Any:
+    """The value with None in place of NaN and infinity, which JSON does not have."""
+    if isinstance(value, dict):
+        return {key: _finite(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _classes(detection: DetectionScores) -> str:
+    table = detection.overall
+    distances = [f"AP@{distance:g}m" for distance in next(iter(table.classes.values())).aps]
+    rows = [("class", "boxes", "AP", *distances, "recall", *_ERROR_HEADS)]
+    rows += [_class_row(name, scores) for name, scores in table.classes.items()]
+    means = [_number(table.errors[name]) for name in ERRORS]
+    rows.append(("all", str(detection.ground_truth_count), _number(table.mean_ap), *[""] * len(distances), "", *means))
+    return f"{_aligned(rows)}\n\nmAP {_number(table.mean_ap)}   NDS {_number(table.nd_score)}"
+
+
+def _class_row(name: str, scores: ClassScores) -> tuple[str, ...]:
+    aps = [_number(ap) for ap in scores.aps.values()]
+    errors = [_number(scores.errors[error]) for error in ERRORS]
+    return (name, str(scores.ground_truth_count), _number(scores.mean_ap), *aps, _number(scores.recall), *errors)
+
+
+def _ranges(detection: DetectionScores) -> str:
+    bins = detection.by_range
+    rows = [("AP by range", *(f"{part.low_m:g}-{part.high_m:g} m" for part in bins))]
+    for name in detection.overall.classes:
+        found = [part.table.classes.get(name) for part in bins]
+        rows.append((name, *(_number(scores.mean_ap) if scores else "-" for scores in found)))
+    rows.append(("mAP", *(_number(part.table.mean_ap) for part in bins)))
+    rows.append(("NDS", *(_number(part.table.nd_score) for part in bins)))
+    return _aligned(rows)
+
+
+def _visibilities(detection: DetectionScores) -> str:
+    rows = [("visibility", "boxes", "found", "recall, mean over classes")]
+    for part in detection.by_visibility:
+        percent = f"{100 * part.low:.0f}-{100 * part.high:.0f} %"
+        rows.append((percent, str(part.ground_truth_count), str(part.found_count), _number(part.mean_recall)))
+    return _aligned(rows)
+
+
+def _maps(segmentation: SegmentationScores) -> str:
+    rows = [("map class", "IoU"), *((name, _number(iou)) for name, iou in segmentation.iou.items())]
+    return f"{_aligned(rows)}\n({segmentation.frame_count} maps)"
+
+
+def _aligned(rows: Iterable[Sequence[str]]) -> str:
+    """Rows as aligned columns, the first to the left, the others to the right."""
+    lines = list(rows)
+    widths = [max(len(cell) for cell in column) for column in zip(*lines, strict=True)]
+    return "\n".join(
+        "  ".join(
+            cell.rjust(width) if place else cell.ljust(width)
+            for place, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    )
+
+
+def _number(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:.3f}"

@@ -1,0 +1,204 @@
+"""A trace: one frame through the model, with the intermediate results that the figures show."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from bevcli.errors import InputError
+from bevcli.frame import Frame, Prediction, Sequence
+from bevcli.geometry.bev_grid import BevGrid
+from bevcli.geometry.transforms import Array, inverse
+from bevcli.model.bevformer import BEVFormer, BEVFormerConfig, BEVFormerInputs, BEVFormerOutputs
+from bevcli.model.pillar_projection import project_pillars
+from bevcli.pipeline.model_inputs import model_inputs
+from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
+from bevcli.pipeline.runner import BevState, Runner, StepOptions
+
+RECENT = 4  # frames that the figure of the recurrence shows, the traced one included
+DEFAULT_DISTANCE_M = 10.0  # of the default cell, ahead of the vehicle, where no box is
+
+
+@dataclass(frozen=True)
+class Trace:
+    """One frame's way through the model. Batch axes of size 1 are removed.
+
+    Attributes:
+        config: of the model.
+        recent: the last frames and their predictions, oldest first; the traced frame is the last one.
+        prepared: the traced frame as the network's input.
+        inputs: the same as a step of the model (B = 1).
+        outputs: of the model (B = 1).
+        feature_maps: the neck's maps, (N, C, H_l, W_l) per level.
+        bev_embedding: (Y·X, C), the learned BEV queries before the can-bus embedding is added.
+        position: (Y·X, C), the position embedding of the cells.
+        layer_maps: (Y·X, C) per encoder layer, its output.
+        aligned_history: (Y·X, C), the rotated history map; None without history.
+        first_reference_points: (Q, 3), where the object queries start, 0 to 1 over the grid's ranges.
+        visible: (N, Y·X, Z) bool, which pillar points each camera sees.
+        cell: row and column of the BEV cell that the figures follow.
+    """
+
+    config: BEVFormerConfig
+    recent: tuple[tuple[Frame, Prediction], ...]
+    prepared: PreparedFrame
+    inputs: BEVFormerInputs
+    outputs: BEVFormerOutputs
+    feature_maps: tuple[Tensor, ...]
+    bev_embedding: Tensor
+    position: Tensor
+    layer_maps: tuple[Tensor, ...]
+    aligned_history: Tensor | None
+    first_reference_points: Tensor
+    visible: Tensor
+    cell: tuple[int, int]
+
+    @property
+    def frame(self) -> Frame:
+        """The traced frame."""
+        return self.recent[-1][0]
+
+    @property
+    def prediction(self) -> Prediction:
+        """The prediction of the traced frame."""
+        return self.recent[-1][1]
+
+    @property
+    def grid(self) -> BevGrid:
+        """The model's BEV grid."""
+        return self.config.bev_grid
+
+    @property
+    def cell_index(self) -> int:
+        """Index of the followed cell in Y·X."""
+        return self.cell[0] * self.grid.columns + self.cell[1]
+
+    @property
+    def cell_center(self) -> Array:
+        """(2,) x, y of the followed cell, metres, bev frame."""
+        center: Array = self.grid.cell_centers()[self.cell]
+        return center
+
+    def cell_map(self, tokens: Tensor) -> np.ndarray:
+        """Tokens (Y·X, C) -> array (Y, X, C) float32, rows from the smallest y."""
+        return tokens.detach().float().cpu().numpy().reshape(self.grid.rows, self.grid.columns, -1)
+
+
+def trace(
+    model: BEVFormer, device: torch.device, sequence: Sequence, place: int, cell_xy: tuple[float, float] | None
+) -> Trace:
+    """Runs the model over the frames of one scene up to a place, with its recurrent state, and traces the last one.
+
+    model: the plain model, not a prepared one. place: index in `sequence.stamps`.
+    cell_xy: x, y of the cell to follow, metres, bev frame; None takes the cell under the best box ahead of the
+    vehicle. Raises InputError when the cell lies outside the grid, or when the frame has no image.
+    """
+    cell = None if cell_xy is None else cell_at(cell_xy, model.config.bev_grid)
+    runner = Runner(model, device, StepOptions())
+    preprocessor = Preprocessor(model.config)
+    places = range(_scene_start(sequence, place), place)
+    state: BevState | None = None
+    recent: list[tuple[Frame, Prediction]] = []
+    for frame, prediction, state in runner.run(sequence, places, preprocessor):  # noqa: B007
+        recent = [*recent, (frame, prediction)][-RECENT + 1 :]
+    prepared = preprocessor(sequence.load(place))
+    if not prepared.frame.images:
+        raise InputError(f"frame {prepared.frame.stamp.index} has no image: choose another frame")
+    with torch.inference_mode():
+        if cell is None:
+            _, prediction = runner.step(state, prepared)
+            cell = cell_at(_default_cell(prepared.frame, prediction), model.config.bev_grid)
+        return _traced_step(runner, state, prepared, recent, cell)
+
+
+def cell_at(cell_xy: tuple[float, float], grid: BevGrid) -> tuple[int, int]:
+    """Row and column of the cell at x, y (metres, bev frame). Raises InputError outside the grid."""
+    row, column = (int(number) for number in grid.cell_of(cell_xy))
+    if row < 0:
+        (x0, x1), (y0, y1) = grid.x_range_m, grid.y_range_m
+        raise InputError(
+            f"cell {cell_xy[0]:g},{cell_xy[1]:g} is outside the BEV grid (x {x0:g} to {x1:g} m, y {y0:g} to {y1:g} m)"
+        )
+    return row, column
+
+
+def _scene_start(sequence: Sequence, place: int) -> int:
+    scene = sequence.stamps[place].scene
+    start = place
+    while start > 0 and sequence.stamps[start - 1].scene == scene:
+        start -= 1
+    return start
+
+
+def _default_cell(frame: Frame, prediction: Prediction) -> tuple[float, float]:
+    """The centre of the best-scored box ahead of the vehicle; without one, a place ahead of the vehicle."""
+    boxes = prediction.boxes
+    ahead = prediction.boxes_ego.centers[:, 0] > 0
+    inside = (prediction.grid.cell_of(boxes.centers[:, :2]) >= 0).all(-1)
+    chosen = np.flatnonzero(ahead & inside)
+    if boxes.scores is not None and len(chosen) and boxes.scores[chosen[0]] > 0.25:
+        x, y = boxes.centers[chosen[0], :2]
+        return float(x), float(y)
+    x, y = (inverse(frame.rig.ego_from_bev) @ [DEFAULT_DISTANCE_M, 0.0, 0.0, 1.0])[:2]
+    return float(x), float(y)
+
+
+def _traced_step(
+    runner: Runner,
+    state: BevState | None,
+    prepared: PreparedFrame,
+    recent: list[tuple[Frame, Prediction]],
+    cell: tuple[int, int],
+) -> Trace:
+    model, config, grid = runner.model, runner.config, runner.config.bev_grid
+    x, y = grid.cell_centers()[cell]
+    runner.options = replace(runner.options, ask_attention=True, probes=((float(x), float(y)),))
+    with _outputs_of(model, model.neck, *model.encoder.layers) as outputs:
+        _, prediction = runner.step(state, prepared)
+    used = None if prediction.started_anew else state
+    inputs = model_inputs([prepared], [None if used is None else used.pose], config).to(runner.device)
+    aligned = None if used is None else model.align_history(used.bev, inputs.rotation_deg)[0]
+    position, _ = model.decoder.query_embedding[: config.decoder.queries].chunk(2, dim=-1)
+    return Trace(
+        config=config,
+        recent=(*recent, (prepared.frame, prediction)),
+        prepared=prepared,
+        inputs=inputs,
+        outputs=outputs[model],
+        feature_maps=tuple(outputs[model.neck]),
+        bev_embedding=model.bev_queries.embedding,
+        position=model.bev_queries.position(),
+        layer_maps=tuple(outputs[layer][0] for layer in model.encoder.layers),
+        aligned_history=aligned,
+        first_reference_points=model.decoder.reference_points(position).sigmoid(),
+        visible=_visible_points(inputs, config),
+        cell=cell,
+    )
+
+
+def _visible_points(inputs: BEVFormerInputs, config: BEVFormerConfig) -> Tensor:
+    """(N, Y·X, Z) bool, which pillar points each camera sees."""
+    points = torch.as_tensor(config.bev_grid.pillars(), dtype=torch.float32, device=inputs.images.device)
+    height, width = inputs.images.shape[-2:]
+    return project_pillars(inputs.image_from_bev, points.flatten(0, 1), (height, width), inputs.has_image).visible[0]
+
+
+@contextmanager
+def _outputs_of(*modules: nn.Module) -> Iterator[dict]:
+    """A dict that is filled with each module's output while the context is open."""
+    outputs: dict = {}
+
+    def keep(module: nn.Module, _: object, output: object) -> None:
+        outputs[module] = output
+
+    handles = [module.register_forward_hook(keep) for module in modules]
+    try:
+        yield outputs
+    finally:
+        for handle in handles:
+            handle.remove()

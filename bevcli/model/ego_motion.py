@@ -1,0 +1,166 @@
+"""Ego-motion in the model (paper, section 3.4): can-bus numbers, and the shift and rotation of the history map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from bevcli.geometry.bev_grid import BevGrid
+from bevcli.geometry.transforms import Array, Pose, yaw_of_quaternion
+
+CAN_BUS_SIZE = 18
+
+# The released code rotates about this cell at every grid size; it is the map's centre only with 200 x 200 cells.
+ORIGINAL_ROTATION_CENTER = (100.0, 100.0)
+
+RotationCenter = Literal["original", "center"] | tuple[float, float]
+
+
+@dataclass(frozen=True)
+class EgoMotionConfig:
+    """How ego-motion enters the model.
+
+    The first three are the paper's switches. The others are quirks of the released code, with which its published
+    weights were trained.
+
+    Attributes:
+        can_bus: whether the can-bus embedding is added to the BEV queries.
+        shift: whether the reference points in the history map follow the vehicle's translation.
+        rotation: whether the history map is rotated by the change of heading.
+        history_shift: "history" shifts the reference points of the history map only, as in the paper; "both" shifts
+            those of the current map too, as the released code does because two of its tensors share memory.
+        history_rotation_center: "center" of the BEV map; "original" for (100, 100) at every grid size; or (x, y) in
+            cells from the map's corner.
+        can_bus_quaternion: the quaternion in the can-bus numbers: "wxyz", or "w" for w four times, as in the released
+            code.
+    """
+
+    can_bus: bool = True
+    shift: bool = True
+    rotation: bool = True
+    history_shift: Literal["both", "history"] = "both"
+    history_rotation_center: RotationCenter = "original"
+    can_bus_quaternion: Literal["w", "wxyz"] = "w"
+
+
+@dataclass(frozen=True)
+class EgoMotionInputs:
+    """The model's ego-motion inputs for one frame.
+
+    Attributes:
+        can_bus: (18,) float32, the translation and the change of heading since the previous frame included.
+        shift: (2,) float32, translation of the history map (x, y) in normalised BEV coordinates.
+        rotation_deg: rotation of the history map.
+    """
+
+    can_bus: np.ndarray
+    shift: np.ndarray
+    rotation_deg: float
+
+
+def ego_motion_inputs(
+    pose: Pose,
+    previous_pose: Pose | None,
+    acceleration: ArrayLike,
+    angular_rate: ArrayLike,
+    velocity: ArrayLike,
+    grid: BevGrid,
+    config: EgoMotionConfig,
+) -> EgoMotionInputs:
+    """The model's ego-motion inputs for one frame, computed in float64 as in the released code.
+
+    Args:
+        pose: world_from_ego, with the sign of the quaternion as stored.
+        previous_pose: world_from_ego of the previous frame of the same scene; None for a scene's first frame, which
+            has neither translation nor rotation.
+        acceleration: (3,) m/s², ego frame.
+        angular_rate: (3,) rad/s, ego frame.
+        velocity: (3,) m/s, ego frame.
+        grid: the BEV grid.
+        config: how ego-motion enters the model.
+    """
+    position = np.asarray(pose.translation, dtype=np.float64)
+    yaw_deg = heading_deg(pose.quaternion)
+    moved, turned_deg = np.zeros(3), 0.0
+    if previous_pose is not None:
+        moved = position - np.asarray(previous_pose.translation, dtype=np.float64)
+        # Not wrapped to ±180, as in the training of the published weights: crossing 0 gives about ±360.
+        turned_deg = yaw_deg - heading_deg(previous_pose.quaternion)
+    w, x, y, z = np.asarray(pose.quaternion, dtype=np.float64)
+    quaternion = [w, w, w, w] if config.can_bus_quaternion == "w" else [w, x, y, z]
+    yaws = [np.radians(yaw_deg), turned_deg]
+    can_bus = np.concatenate([moved, quaternion, acceleration, angular_rate, velocity, yaws])
+    return EgoMotionInputs(
+        can_bus=can_bus.astype(np.float32),
+        shift=(_history_shift(moved, yaw_deg, grid) * config.shift).astype(np.float32),
+        rotation_deg=turned_deg * config.rotation,
+    )
+
+
+def heading_deg(quaternion: ArrayLike) -> float:
+    """Yaw of a pose in degrees, in [0, 360), from its quaternion (4,) w, x, y, z."""
+    return float(np.degrees(yaw_of_quaternion(quaternion)) % 360.0)
+
+
+def rotate_history(history: Tensor, rotation_deg: Tensor, grid: BevGrid, center: RotationCenter) -> Tensor:
+    """Rotates BEV maps; a cell takes the nearest old cell, or zero where that lies outside the map.
+
+    Args:
+        history: (B, Y·X, C).
+        rotation_deg: (B,).
+        grid: the BEV grid.
+        center: centre of the rotation, see EgoMotionConfig.
+
+    Returns:
+        (B, Y·X, C).
+    """
+    rows, columns = grid.rows, grid.columns
+    row, column = _source_cells(rotation_deg, grid, center)  # (B, Y, X) each
+    inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+    source = (row.clamp(0, rows - 1) * columns + column.clamp(0, columns - 1)).flatten(1)  # (B, Y·X)
+    batch = torch.arange(len(history), device=history.device)[:, None]
+    return history[batch, source] * inside.flatten(1)[..., None]
+
+
+def _history_shift(moved: Array, yaw_deg: float, grid: BevGrid) -> Array:
+    """A translation (3,) in world metres as (2,), to the right and ahead of the ego, over the extent of the BEV."""
+    distance = np.hypot(moved[0], moved[1])
+    angle = np.radians(yaw_deg) - np.arctan2(moved[1], moved[0])
+    extent_x = grid.x_range_m[1] - grid.x_range_m[0]
+    extent_y = grid.y_range_m[1] - grid.y_range_m[0]
+    return np.array([distance * np.sin(angle) / extent_x, distance * np.cos(angle) / extent_y])
+
+
+def _source_cells(rotation_deg: Tensor, grid: BevGrid, center: RotationCenter) -> tuple[Tensor, Tensor]:
+    """Row and column (B, Y, X) int64 of the old cell that each cell takes its history from.
+
+    Computed in float32 and in halves of the map, as the released code's affine grid is, so that both choose the same
+    cell where a source lies midway between two.
+    """
+    half = torch.tensor([grid.columns / 2, grid.rows / 2], device=rotation_deg.device)
+    angle = torch.deg2rad(rotation_deg.double())
+    rotation = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()], -1).unflatten(-1, (2, 2))
+    pivot = torch.tensor(_center_cells(grid, center), device=half.device).double() - half
+    translation = (pivot - rotation @ pivot).float() / half  # (B, 2)
+    by_x, by_y = (rotation.float() / half[:, None]).unbind(-1)  # (B, 2) each
+    x = torch.arange(grid.columns, device=half.device) + 0.5 - half[0]  # (X,)
+    y = torch.arange(grid.rows, device=half.device) + 0.5 - half[1]  # (Y,)
+    turned = [by_x[:, i, None, None] * x + by_y[:, i, None, None] * y[:, None] for i in (0, 1)]
+    source_x, source_y = (part + translation[:, i, None, None] for i, part in enumerate(turned))
+    row = (((source_y + 1) * grid.rows - 1) / 2).round().long()
+    column = (((source_x + 1) * grid.columns - 1) / 2).round().long()
+    return row, column
+
+
+def _center_cells(grid: BevGrid, center: RotationCenter) -> tuple[float, float]:
+    """x and y of the centre of rotation, in cells from the map's corner."""
+    if center == "original":
+        return ORIGINAL_ROTATION_CENTER
+    if center == "center":
+        return grid.columns / 2, grid.rows / 2
+    return float(center[0]), float(center[1])

@@ -1,0 +1,150 @@
+"""Deformable attention and deformable convolution on the CPU, by compiled loops that hold no sampled values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, split_offsets_and_mask
+
+# More ranges than threads: where another process delays one thread, the others take over its ranges.
+RANGES_PER_THREAD = 8
+# Sampled taps of one tile: large enough for a fast matrix product, small enough to stay in the cache.
+TILE_BYTES = 8 << 20
+
+
+class CompiledSampling(nn.Module):
+    """Takes the place of `GridSampling` on the CPU, with gradients."""
+
+    def forward(
+        self,
+        values: Tensor,
+        level_shapes: Sequence[tuple[int, int]],
+        locations: Tensor,
+        weights: Tensor,
+        queries_per_map: Sequence[int],
+    ) -> Tensor:
+        """Arguments and result as for `GridSampling`; the gradients are computed in float32."""
+        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (values, locations, weights)):
+            values = values.float()
+        return _WeightedSums.apply(values, locations.float(), weights.float(), level_shapes, queries_per_map)
+
+
+class _WeightedSums(torch.autograd.Function):
+    """The sums, and their gradients for values in float32."""
+
+    @staticmethod
+    def forward(
+        context: Any,
+        values: Tensor,
+        locations: Tensor,
+        weights: Tensor,
+        level_shapes: Sequence[tuple[int, int]],
+        queries_per_map: Sequence[int],
+    ) -> Tensor:
+        from bevcli.model.kernels.bilinear import sample_maps  # loads the compiler, which not every run needs
+
+        context.save_for_backward(values, locations, weights)
+        context.level_shapes, context.queries_per_map = level_shapes, queries_per_map
+        shapes = np.asarray(level_shapes, dtype=np.int64)
+        map_of_query = np.repeat(np.arange(len(values)), queries_per_map)
+        out = torch.empty(len(locations), *values.shape[2:])
+        arrays = (as_array(values), shapes, as_array(locations), as_array(weights), map_of_query)
+        in_threads(partial(sample_maps, *arrays, out.numpy()), len(locations))
+        return out.flatten(1)
+
+    @staticmethod
+    def backward(context: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        from bevcli.model.kernels.bilinear import sample_maps_backward
+
+        values, locations, weights = context.saved_tensors
+        results = torch.zeros(values.shape), torch.empty(locations.shape), torch.empty(weights.shape)
+        out_gradient = gradients[0].unflatten(-1, values.shape[2:])
+        shapes = np.asarray(context.level_shapes, dtype=np.int64)
+        starts = np.cumsum([0, *context.queries_per_map])
+        read = (as_array(values), shapes, as_array(locations), as_array(weights), starts, as_array(out_gradient))
+        written = [tensor.numpy() for tensor in results]
+        heads_of_maps = values.shape[0] * values.shape[2]
+        in_threads(partial(sample_maps_backward, *read, *written), heads_of_maps, min_range=1)
+        return (*results, None, None)
+
+
+class CompiledDeformableConvolution(nn.Module):
+    """Takes the place of a `ModulatedDeformableConvolution` on the CPU, with a bias and without gradients.
+
+    The output positions are divided into tiles. For each tile, a compiled loop samples the taps, then one matrix
+    product with the weight of all nine taps gives the result.
+    """
+
+    def __init__(self, convolution: ModulatedDeformableConvolution, bias: Tensor) -> None:
+        """bias: (O,), the rest of a batch norm that was folded into the convolution."""
+        super().__init__()
+        self.stride, self.out_channels = convolution.stride, len(convolution.weight)
+        self.offset_and_mask = convolution.offset_and_mask
+        weight = convolution.weight.detach()  # (O, C, 3, 3)
+        self.product = nn.Linear(9 * weight.shape[1], len(weight), device="meta")
+        self.product.weight = nn.Parameter(weight.permute(0, 2, 3, 1).flatten(1).contiguous(), requires_grad=False)
+        self.product.bias = nn.Parameter(bias.detach(), requires_grad=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """x: (B, C, H, W) -> (B, O, H', W'), channels last."""
+        from bevcli.model.kernels.bilinear import sample_taps  # loads the compiler, which not every run needs
+
+        offsets, mask = split_offsets_and_mask(self.offset_and_mask(x))
+        batch, channels = x.shape[:2]
+        height, width = mask.shape[-2:]
+        rows = batch * height * width
+        tile = min(rows, max(64, TILE_BYTES // (9 * channels * x.element_size())))
+        arrays = (
+            as_array(x.permute(0, 2, 3, 1)),
+            as_array(offsets.permute(0, 3, 4, 1, 2)),
+            as_array(mask.permute(0, 2, 3, 1)),
+        )
+        # The compiled loops write bfloat16 and float32.
+        taps = torch.empty(tile, 9, channels, dtype=torch.bfloat16 if x.dtype == torch.bfloat16 else torch.float32)
+        out = x.new_empty(rows, self.out_channels)
+        for first in range(0, rows, tile):
+            count = min(tile, rows - first)
+            in_threads(partial(sample_taps, *arrays, self.stride, first, as_array(taps)), count)
+            out[first : first + count] = self.product(taps[:count].flatten(1).to(x.dtype))
+        return out.view(batch, height, width, -1).permute(0, 3, 1, 2)
+
+
+def load_compiled(dtype: torch.dtype) -> None:
+    """Loads the compiler and the loops for values of float32 and of a dtype, so that the first frame need not wait."""
+    sampling = CompiledSampling()
+    for values in (torch.zeros(1, 1, 1, 1), torch.zeros(1, 1, 1, 1, dtype=dtype)):
+        sampling(values, [(1, 1)], torch.zeros(1, 1, 1, 1, 2), torch.zeros(1, 1, 1, 1), [1])
+
+
+def as_array(tensor: Tensor) -> np.ndarray:
+    """A contiguous array for compiled loops, a view where possible; bfloat16 as its bits, float16 as float32."""
+    tensor = tensor.detach().contiguous()
+    if tensor.dtype == torch.bfloat16:
+        return tensor.view(torch.int16).numpy().view(np.uint16)
+    return tensor.float().numpy()
+
+
+def in_threads(work: Callable[[int, int], None], rows: int, min_range: int = 64) -> None:
+    """Calls work(begin, end) for ranges that together cover 0 to rows, in as many threads as PyTorch uses.
+
+    Args:
+        work: must release the GIL; an exception in it is raised here.
+        rows: number of rows.
+        min_range: smallest number of rows that is worth a call of its own.
+    """
+    threads = torch.get_num_threads()
+    step = max(min_range, -(-rows // (threads * RANGES_PER_THREAD)))
+    starts = range(0, rows, step)
+    if threads == 1 or len(starts) <= 1:
+        work(0, rows)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        for future in [pool.submit(work, start, min(start + step, rows)) for start in starts]:
+            future.result()

@@ -1,0 +1,208 @@
+"""Checks of a sequence: ego-motion (units, jumps, axes) and the timestamps of the cameras' images."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.findings import Finding
+from bevcli.geometry.ego_motion import EgoMotion
+from bevcli.geometry.transforms import Array, rotation_from_quaternion
+
+MAX_SPEED = 70.0  # m/s, 250 km/h
+MIN_MOVING_SPEED = 1.0  # m/s; at lower speeds the direction of motion is noise
+SPEED_FACTOR = 1.3  # largest ratio of the stated speed to the speed from the poses
+MAX_TILT_DEG = 20.0
+FORWARD_DEG = 45.0
+MOST_STEPS = 0.8  # share of the steps that counts as the whole drive
+MIN_DISTANCE_M = 5.0  # on shorter drives the direction of motion is not checked
+JUMP_FACTOR = 5.0  # a step this much faster than the median is a jump
+OFFSET_WARNING_S = 0.1  # nuScenes' cameras are within 0.05 s of the frame
+OFFSET_ERROR_S = 0.5
+JITTER_WARNING_S = 0.05
+
+
+@dataclass(frozen=True)
+class _Drive:
+    """T poses of a drive.
+
+    Attributes:
+        rotations: (T, 3, 3), world_from_ego.
+        steps: (T-1, 3), from each pose to the next, metres in the world frame.
+        seconds: (T-1,), duration of each step.
+    """
+
+    rotations: Array
+    steps: Array
+    seconds: Array
+
+    @property
+    def speeds(self) -> Array:
+        """(T-1,), speed from pose to pose, m/s."""
+        return np.linalg.norm(self.steps, axis=1) / self.seconds
+
+    def tilt_deg(self) -> float:
+        """Median angle between z of the ego frame and z of the world frame, degrees."""
+        return float(np.degrees(np.median(np.arccos(np.clip(self.rotations[:, 2, 2], -1, 1)))))
+
+    def distance_m(self) -> float:
+        """Distance driven in metres, steps below the moving speed left out."""
+        return float(np.linalg.norm(self.steps, axis=1)[self.speeds > MIN_MOVING_SPEED].sum())
+
+    def headings_deg(self) -> Array:
+        """(M,), direction of each step with motion, degrees counter-clockwise from ego x; empty for a short drive."""
+        moving = (self.speeds > MIN_MOVING_SPEED) & (self.distance_m() >= MIN_DISTANCE_M)
+        steps = np.einsum("tji,tj->ti", self.rotations[:-1], self.steps)[moving]
+        return np.degrees(np.arctan2(steps[:, 1], steps[:, 0]))
+
+    def is_plausible(self) -> bool:
+        """Whether the vehicle is level, not too fast, and drives forward in most steps."""
+        headings = self.headings_deg()
+        ahead = len(headings) == 0 or (np.abs(headings) <= FORWARD_DEG).mean() >= MOST_STEPS
+        return bool(self.tilt_deg() <= MAX_TILT_DEG and np.median(self.speeds) <= MAX_SPEED and ahead)
+
+
+def check_ego_motion(ego_motion: EgoMotion) -> tuple[Finding, ...]:
+    """Findings about the poses of one scene, or else about its stated velocities; none for a single row."""
+    drive = _drive(ego_motion, ego_motion.translations, ego_motion.quaternions)
+    if len(drive.steps) == 0:
+        return ()
+    cause = None if drive.is_plausible() else _mistake(drive, ego_motion) or _units(drive)
+    if cause is not None:
+        return (cause,)
+    findings = [finding for finding in (_jump(drive, ego_motion), _direction(drive)) if finding is not None]
+    speed = None if findings else _stated_speed(drive, ego_motion)
+    return (*findings, speed) if speed is not None else tuple(findings)
+
+
+def check_camera_times(frame_ns: Sequence[int], camera_ns: Mapping[str, Sequence[int | None]]) -> tuple[Finding, ...]:
+    """Findings about the timestamps of images, at most one a camera.
+
+    frame_ns: F frame timestamps, nanoseconds. camera_ns: by camera, the timestamps of its F images; None without image.
+    An offset of 0.1 s is a warning: ego-motion compensates a known offset for static objects, not for moving ones.
+    """
+    findings = (_check_times_of(name, np.array(frame_ns, dtype=np.int64), times) for name, times in camera_ns.items())
+    return tuple(finding for finding in findings if finding is not None)
+
+
+def _drive(ego_motion: EgoMotion, translations: Array, quaternions: Array) -> _Drive:
+    rotations = np.stack([rotation_from_quaternion(quaternion) for quaternion in quaternions])
+    seconds = np.diff(ego_motion.timestamps_ns) / 1e9
+    return _Drive(rotations, np.diff(translations, axis=0), seconds)
+
+
+def _units(drive: _Drive) -> Finding | None:
+    """Translations in millimetres or timestamps in another unit than nanoseconds make every step too fast."""
+    median = float(np.median(drive.speeds))
+    if median <= MAX_SPEED:
+        return None
+    advice = "give metres and nanoseconds; a speed that is wrong by 1000 or 1000000 shows which unit is wrong"
+    found, expected = f"median {median:.0f} m/s", f"at most {MAX_SPEED:g} m/s"
+    message = "the vehicle is impossibly fast in most steps: wrong unit of timestamps or translations"
+    return Finding("ego-units", "error", None, message, found, expected, advice)
+
+
+def _jump(drive: _Drive, ego_motion: EgoMotion) -> Finding | None:
+    speeds = drive.speeds
+    jumps = np.flatnonzero((speeds > MAX_SPEED) & (speeds > JUMP_FACTOR * np.median(speeds)))
+    if len(jumps) == 0:
+        return None
+    first = int(jumps[0])
+    found = f"{len(jumps)} of {len(speeds)} steps; {np.linalg.norm(drive.steps[first]):.1f} m in "
+    found += f"{drive.seconds[first]:.2f} s at {int(ego_motion.timestamps_ns[first + 1])} ns"
+    message, advice = "the vehicle's position jumps", "start a new scene there, or correct the poses"
+    return Finding("ego-jump", "error", None, message, found, f"at most {MAX_SPEED:g} m/s", advice)
+
+
+def _mistake(drive: _Drive, ego_motion: EgoMotion) -> Finding | None:
+    """The common mistake whose undoing gives a plausible drive."""
+    for code, message, advice, undone in _undone(ego_motion):
+        if undone.is_plausible():
+            return _error(code, message, _motion_text(drive), "level, driving forward", advice)
+    return None
+
+
+def _direction(drive: _Drive) -> Finding | None:
+    """A tilted ego frame, or driving sideways or backwards in most steps."""
+    if drive.tilt_deg() > MAX_TILT_DEG:
+        message, advice = (
+            "the ego frame is tilted in the world",
+            "z of the ego frame and of the world frame point up: check the axes",
+        )
+        return _error("ego-tilted", message, _motion_text(drive), "level", advice)
+    headings = drive.headings_deg()
+    if len(headings) == 0:
+        return None
+    ahead = float((np.abs(headings) <= FORWARD_DEG).mean())
+    back = float((np.abs(headings) >= 180 - FORWARD_DEG).mean())
+    if back >= MOST_STEPS:
+        advice = "x of the ego frame is forward: rotate the poses by 180° about z, unless the whole drive is in reverse"
+        return _error("ego-backwards", "the vehicle drives backwards", _motion_text(drive), "forward", advice)
+    if 1 - ahead - back >= MOST_STEPS:
+        advice = "the ego frame is x forward, y left: rotate the poses into it"
+        return _error("ego-sideways", "the vehicle drives sideways", _motion_text(drive), "forward", advice)
+    return None
+
+
+def _motion_text(drive: _Drive) -> str:
+    headings, tilt = drive.headings_deg(), f"tilt {drive.tilt_deg():.0f}°"
+    if len(headings) == 0:
+        return tilt
+    middle = float(np.degrees(np.angle(np.exp(1j * np.radians(headings)).mean())))
+    return f"moves {middle:.0f}° from forward over {drive.distance_m():.0f} m, {tilt}"
+
+
+def _undone(ego_motion: EgoMotion) -> list[tuple[str, str, str, _Drive]]:
+    """Code, message, advice and corrected drive of each common mistake."""
+    translations, quaternions = ego_motion.translations, ego_motion.quaternions
+    conjugated = quaternions * [1, -1, -1, -1]
+    turned = np.stack([rotation_from_quaternion(q) for q in quaternions])
+    inverted = -np.einsum("tji,tj->ti", turned, translations)
+    order, advice = "the quaternions are not in the order w, x, y, z", "put qw first"
+    return [
+        ("ego-quaternion-order", order, advice, _drive(ego_motion, translations, np.roll(quaternions, 1, axis=1))),
+        ("ego-quaternion-order", order, advice, _drive(ego_motion, translations, np.roll(quaternions, -1, axis=1))),
+        ("ego-inverted", "the poses are ego_from_world, the inverse", "invert them",
+         _drive(ego_motion, inverted, conjugated)),
+    ]  # fmt: skip
+
+
+def _stated_speed(drive: _Drive, ego_motion: EgoMotion) -> Finding | None:
+    """Velocities in the file that do not fit the distance between its poses."""
+    moving = drive.speeds > MIN_MOVING_SPEED
+    if not moving.any():
+        return None
+    stated = np.linalg.norm((ego_motion.velocities[:-1] + ego_motion.velocities[1:]) / 2, axis=1)[moving]
+    ratio = float(np.median(stated / drive.speeds[moving]))
+    if 1 / SPEED_FACTOR <= ratio <= SPEED_FACTOR:
+        return None
+    found = f"stated {np.median(stated):.1f} m/s, from the poses {np.median(drive.speeds[moving]):.1f} m/s"
+    message, advice = "the stated speed does not fit the poses", "give vx, vy, vz in m/s, or leave them out"
+    return _error("ego-speed", message, found, f"equal within a factor of {SPEED_FACTOR:g}", advice)
+
+
+def _error(code: str, message: str, found: str, expected: str, advice: str) -> Finding:
+    return Finding(code, "error", None, message, found, expected, advice)
+
+
+def _check_times_of(name: str, frame_ns: NDArray[np.int64], times: Sequence[int | None]) -> Finding | None:
+    pairs = zip(times, frame_ns, strict=True)
+    offsets = np.array([time - int(frame) for time, frame in pairs if time is not None]) / 1e9
+    if len(offsets) == 0:
+        message = "has no image in any frame"
+        return Finding(
+            "camera-without-pictures", "warning", name, message, "0", f"{len(times)}", "check its image paths"
+        )
+    offset, jitter = float(np.median(offsets)), float(np.std(offsets))
+    found = f"{offset * 1e3:+.0f} ms, standard deviation {jitter * 1e3:.0f} ms"
+    advice = "give the timestamp of each image, or assign this camera's images to other frames"
+    if abs(offset) > OFFSET_ERROR_S:
+        message, expected = "its images are far from the frame timestamps", f"within {OFFSET_ERROR_S * 1e3:g} ms"
+        return Finding("time-offset", "error", name, message, found, expected, advice)
+    if abs(offset) > OFFSET_WARNING_S or jitter > JITTER_WARNING_S:
+        message, expected = "its images deviate from the frame timestamps", f"within {OFFSET_WARNING_S * 1e3:g} ms"
+        return Finding("time-offset", "warning", name, message, found, expected, advice)
+    return None

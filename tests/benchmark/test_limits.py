@@ -1,0 +1,29 @@
+"""The number of operations, compared with published figures."""
+
+from __future__ import annotations
+
+import pytest
+
+from bevcli.benchmark.limits import count_operations
+from bevcli.config import load_config
+
+HITS = (400,) * 6
+RESNET50_OPERATIONS = 2 * 4.09e9  # for one image of 224 x 224, as published with the weights
+
+
+def test_tiny_needs_slightly_more_operations_than_resnet50_on_six_images():
+    backbone = 6 * RESNET50_OPERATIONS * (480 * 800) / 224**2
+    assert 1.02 * backbone < count_operations(load_config("tiny"), HITS) < 1.12 * backbone
+
+
+def test_one_more_hit_adds_its_samples_in_every_layer():
+    config = load_config("tiny")
+    more = count_operations(config, (401, *HITS[1:])) - count_operations(config, HITS)
+    # 3 layers, 8 heads, 8 points, 32 channels; a product and a sum for four neighbours and for the weight.
+    assert more == 3 * 8 * 8 * 32 * (4 * 2 + 2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["small", "base"])
+def test_larger_models_need_more_operations(name):
+    assert count_operations(load_config(name), HITS) > 4 * count_operations(load_config("tiny"), HITS)
