@@ -31,7 +31,7 @@ def convert(
         Path,
         typer.Argument(
             metavar="INPUT",
-            help="A sequence folder (images or videos), a nuScenes root, an .mcap file or a rosbag2 folder.",
+            help="Sequence folder (images or videos), nuScenes root, .mcap file or rosbag2 folder.",
         ),
     ],
     out: Annotated[Path, typer.Argument(metavar="OUT_SEQUENCE", help="The native sequence folder to write.")],

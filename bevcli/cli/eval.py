@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from bevcli.cli.input_options import SceneOption, SplitOption, VersionOption
+from bevcli.cli.input_options import ClassMapOption, SceneOption, SplitOption, VersionOption, parse_class_map
 
 
 def evaluate(
@@ -38,6 +38,7 @@ def evaluate(
     scene: SceneOption = None,
     version: VersionOption = None,
     split: SplitOption = None,
+    class_map: ClassMapOption = None,
 ) -> None:
     """Score PREDICTIONS against GROUND_TRUTH with the nuScenes detection metrics, and maps with IoU if both have them.
 
@@ -47,7 +48,16 @@ def evaluate(
 
     from bevcli.evaluation.evaluate import evaluate
 
-    scores = evaluate(predictions, ground_truth, max_range, count_missing, scene=scene, version=version, split=split)
+    scores = evaluate(
+        predictions,
+        ground_truth,
+        max_range,
+        count_missing,
+        scene=scene,
+        version=version,
+        split=split,
+        class_map=parse_class_map(class_map),
+    )
     print(json.dumps(scores.to_dict(), indent=1) if as_json else scores.table())
     for note in scores.notes:
         typer.echo(f"note: {note}", err=True)

@@ -43,7 +43,7 @@ MODEL, OUTPUT, RECORDING = "Model", "Output", "Recording"
 def run(
     sequence: Annotated[
         Path,
-        typer.Argument(help="A sequence folder (images or videos), a nuScenes root, an .mcap file or a rosbag2 folder."),
+        typer.Argument(help="Sequence folder (images or videos), nuScenes root, .mcap file or rosbag2 folder."),
     ],
     model: Annotated[
         str | None,

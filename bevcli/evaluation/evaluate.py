@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from bevcli.evaluation.pairing import FramePairs, pair_frames
 from bevcli.evaluation.scores_report import scores_table, scores_to_dict
 from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmentation
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
+from bevcli.sequences.files.class_names import count_other_classes, other_classes_note
 from bevcli.sequences.nuscenes.choice import NuScenesChoice
 
 
@@ -67,6 +68,7 @@ def evaluate(
     scene: str | None = None,
     version: str | None = None,
     split: str | None = None,
+    class_map: Mapping[str, str] | None = None,
 ) -> Scores:
     """Score predictions with the nuScenes detection metrics, and maps with IoU where both sides have them.
 
@@ -79,6 +81,7 @@ def evaluate(
         scene: score only this scene of the ground truth.
         version: of a nuScenes root, such as "v1.0-mini".
         split: of a nuScenes root, such as "val".
+        class_map: class names in the files -> the ten classes, such as {"Lorry": "truck"}.
 
     Returns:
         The scores. Predictions without attributes get them from class and speed.
@@ -87,8 +90,8 @@ def evaluate(
         InputError: a file is missing or wrong, or the two have no frame in common.
         ConfigError: max_range is not positive.
     """
-    truth = open_ground_truth(Path(ground_truth), NuScenesChoice(version, scene, split))
-    found = open_predictions(Path(predictions))
+    truth = open_ground_truth(Path(ground_truth), NuScenesChoice(version, scene, split), class_map)
+    found = open_predictions(Path(predictions), class_map)
     pairs = pair_frames(found.boxes, truth.boxes, count_missing=count_missing)
     pairs = without_cycles_in_racks(pairs, truth.bicycle_racks)
     config = DetectionConfig()
@@ -98,7 +101,7 @@ def evaluate(
         config = config.unlimited()
     detection = evaluate_detections(_with_attributes(pairs.predictions), pairs.ground_truth, config, pairs.ego_xy)
     segmentation, map_notes = _score_maps(found, truth, pairs)
-    notes = [*pairs.notes, *map_notes]
+    notes = [*pairs.notes, *map_notes, *_other_class_notes(pairs)]
     if max_range is None and not pairs.ego_pose_known:
         notes.append('no frame has "world_from_ego": class ranges are not applied (--max-range M applies them)')
     return Scores(pairs, config, detection, segmentation, (*notes, *_detection_notes(detection)))
@@ -128,6 +131,14 @@ def _score_maps(
     classes = [name for name in true.classes if name in found.classes]
     maps = ((found.load(one), true.load(other)) for one, other in indices)
     return evaluate_segmentation(maps, classes), notes
+
+
+def _other_class_notes(pairs: FramePairs) -> Iterator[str]:
+    """Name the classes on each side that are not scored."""
+    for side, frames in (("the ground truth", pairs.ground_truth), ("the predictions", pairs.predictions)):
+        others = count_other_classes(frames)
+        if others:
+            yield other_classes_note(others, side)
 
 
 def _detection_notes(detection: DetectionScores) -> list[str]:

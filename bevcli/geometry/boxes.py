@@ -144,5 +144,8 @@ def attributes_by_speed(boxes: Boxes3D) -> NDArray[np.str_]:
     """
     moving = np.linalg.norm(boxes.velocities, axis=1) > MOVING_MPS
     none = ("", "")
-    names = [_MOVING_AND_STILL.get(str(name), none)[0 if fast else 1] for name, fast in zip(boxes.classes, moving, strict=True)]
+    names = [
+        _MOVING_AND_STILL.get(str(name), none)[0 if fast else 1]
+        for name, fast in zip(boxes.classes, moving, strict=True)
+    ]
     return np.array(names, dtype=np.str_)

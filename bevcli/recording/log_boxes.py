@@ -59,7 +59,7 @@ def log_boxes_3d(
 
 
 def other_classes(truth: Boxes3D, class_names: Sequence[str]) -> np.ndarray:
-    """(M,) bool, whether a ground-truth box has a class that neither nuScenes nor the model has. It cannot be missed."""
+    """(M,) bool, whether a ground-truth box has a class that neither nuScenes nor the model has: it is never missed."""
     return ~np.isin(truth.classes, (*CLASSES, *class_names))
 
 

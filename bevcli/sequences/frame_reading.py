@@ -43,7 +43,7 @@ def read_frame(
     """
     images, dropped = reader.read(entry.sources, rig, entry.dropped)
     frame_ns = entry.stamp.timestamp_ns
-    times = {name: frame_ns for name in rig.names}
+    times = dict.fromkeys(rig.names, frame_ns)
     times |= {name: source.timestamp_ns for name, source in entry.sources.items()}
     times |= {name: image.timestamp_ns for name, image in images.items()}
 

@@ -54,8 +54,7 @@ class Source(Protocol):
     """
 
     @property
-    def timestamp_ns(self) -> int:  # noqa: D102
-        ...
+    def timestamp_ns(self) -> int: ...
 
 
 @runtime_checkable

@@ -105,10 +105,21 @@ def open_sequence(
         raise InputError(f"--rate {rate_hz:g}: expected frames per second, above 0")
     if every is not None and every < 1:
         raise InputError(f"--every {every}: expected an integer, 1 or more")
-    given = (intrinsics, extrinsics, calibration, ego_motion_file, topics_file)
-    files = [None if file is None else Path(file) for file in given]
-    truth = GroundTruthUse(ground_truth, class_map or {})
-    options = _Options(ego_motion, strict, scene, version, split, sweeps, *files, topics or {}, truth)
+    options = _Options(
+        ego_motion,
+        strict,
+        scene,
+        version,
+        split,
+        sweeps,
+        intrinsics=_path(intrinsics),
+        extrinsics=_path(extrinsics),
+        calibration=_path(calibration),
+        ego_motion_file=_path(ego_motion_file),
+        topics_file=_path(topics_file),
+        topics=topics or {},
+        ground_truth=GroundTruthUse(ground_truth, class_map or {}),
+    )
     opener = _opener_of(path)
     if opener is not _open_bag and (options.topics or options.topics_file):
         raise InputError(f"{path}: --topic and --topics are for MCAP files and ROS bags: remove them")
@@ -118,6 +129,10 @@ def open_sequence(
     if rate_hz is not None:
         sequence = select_rate(sequence, rate_hz)
     return sequence if frames is None else select_range(sequence, frames)
+
+
+def _path(file: str | Path | None) -> Path | None:
+    return None if file is None else Path(file)
 
 
 def _open_nuscenes(path: Path, options: _Options) -> Sequence:

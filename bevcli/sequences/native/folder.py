@@ -53,7 +53,9 @@ class FolderSequence:
         self.name = path.resolve().name
         self.rig = read_calibration(path / "calibration.json") if rig is None else rig
         self._entries, notes = _read_entries(path, self.rig)
-        self.ego_motion, motion_notes = _read_motion(ego_motion_file or path / "ego_motion.csv", ego_motion, self._entries)
+        self.ego_motion, motion_notes = _read_motion(
+            ego_motion_file or path / "ego_motion.csv", ego_motion, self._entries
+        )
         self.has_ego_motion = self.ego_motion is not None
         self._truth = FolderGroundTruth(path, ground_truth)
         self.notes = (*rig_notes(self.rig), *notes, *motion_notes, *self._truth.notes)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 
@@ -140,7 +141,7 @@ def motion_from_transforms(
     frames: the frame of the world first, each the parent of the next. child_from_ego: (4, 4) from the last of them to
     the ego vehicle, None if they are the same.
     """
-    links = [f"{parent} to {child}" for parent, child in zip(frames, frames[1:], strict=False)]
+    links = [f"{parent} to {child}" for parent, child in pairwise(frames)]
     by_child = dict(zip(frames[1:], links, strict=True))
     parts = [capture_times(bag, topic) for topic in topics]
     order = np.argsort(np.concatenate(parts), kind="stable")
@@ -183,4 +184,3 @@ def _kinematics(times: np.ndarray, translations: Array, quaternions: Array) -> t
     return tuple(  # type: ignore[return-value]
         np.stack([np.interp(seconds, seconds[kept], column) for column in part.T], axis=-1) for part in derived
     )
-

@@ -15,6 +15,7 @@ from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
 from bevcli.geometry.transforms import Array, rigid
 from bevcli.sequences.files.calibration_file import read_calibration
+from bevcli.sequences.frame_reading import read_frame
 from bevcli.sequences.images import ImageReader, Source
 from bevcli.sequences.native.ego_motion_file import read_ego_motion
 from bevcli.sequences.native.folder import EgoMotionUse, rig_notes
@@ -28,7 +29,6 @@ from bevcli.sequences.ros.packets import BagVideo
 from bevcli.sequences.ros.topics import CameraTopics, TopicFinder
 from bevcli.sequences.ros.topics_file import StatedTopics
 from bevcli.sequences.ros.transforms import TransformTree, is_static, sampled_transforms
-from bevcli.sequences.frame_reading import read_frame
 
 # Usual names of the frame of the vehicle, and of the world.
 EGO_FRAMES = ("base_link", "base_footprint", "ego_vehicle", "ego", "vehicle", "vehicle_frame", "chassis")
@@ -214,7 +214,7 @@ def _find_motion(
         return _Motion(poses, changing[0])
     if use == "required":
         raise InputError(
-            f'{bag.path}: has no poses of the vehicle: no Odometry or PoseStamped, and no transform that moves '
+            f"{bag.path}: has no poses of the vehicle: no Odometry or PoseStamped, and no transform that moves "
             f'"{ego_frame}" ({finder.seen()}): pass --ego-motion FILE, --static if the vehicle stands, or '
             "--no-temporal to run without history"
         )
@@ -279,7 +279,9 @@ def _source_times(entry: FrameEntry) -> list[int]:
 
 
 def _coverage_notes(total: int, kept: int) -> tuple[str, ...]:
-    return (f"{total - kept} of {total} frames are left out: there are no poses at their times",) if kept < total else ()
+    return (
+        (f"{total - kept} of {total} frames are left out: there are no poses at their times",) if kept < total else ()
+    )
 
 
 def _period_ns(times: NDArray[np.int64]) -> float:
