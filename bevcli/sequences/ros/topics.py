@@ -139,7 +139,8 @@ class TopicFinder:
     def _facts(self, name: str) -> tuple[str, str]:
         times = self._bag.times(name)
         rate = f", {1e9 / np.median(np.diff(times)):.3g} Hz" if len(times) > 2 and np.median(np.diff(times)) else ""
-        return short_type(self._bag.topics[name].type_name), f"{len(times)} message{"s" * (len(times) != 1)}{rate}"
+        count = "1 message" if len(times) == 1 else f"{len(times)} messages"
+        return short_type(self._bag.topics[name].type_name), count + rate
 
     def _check_exists(self, name: str) -> None:
         if name not in self._bag.topics:
