@@ -32,6 +32,7 @@ from bevcli.sequences.ros.transforms import TransformTree, is_static, sampled_tr
 
 # Usual names of the frame of the vehicle, and of the world.
 EGO_FRAMES = ("base_link", "base_footprint", "ego_vehicle", "ego", "vehicle", "vehicle_frame", "chassis")
+SAME_RATE = 0.98  # cameras whose rates differ by less have the same rate; the first of them leads
 CALIBRATION_FILE, EGO_MOTION_FILE = "calibration.json", "ego_motion.csv"
 
 
@@ -225,7 +226,8 @@ def _entries(bag: Bag, cameras: tuple[CameraTopics, ...]) -> tuple[FrameEntry, .
     """One frame for each image of the camera with the lowest rate, with the other cameras' nearest images."""
     times = {one.camera: capture_times(bag, one.images) for one in cameras}
     periods = {name: _period_ns(own) for name, own in times.items()}
-    leading = max(periods, key=lambda name: periods[name])  # the first of cameras with equal rates
+    slowest = max(periods.values())
+    leading = next(name for name, period in periods.items() if period >= SAME_RATE * slowest)
     makers = {one.camera: _source_maker(bag, one) for one in cameras}
     topics = {one.camera: one.images for one in cameras}
     entries: list[FrameEntry] = []

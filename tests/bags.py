@@ -18,7 +18,6 @@ from bevcli.geometry.transforms import Pose
 # One message: topic, type, time in ns, fields.
 Message = tuple[str, str, int, dict[str, Any]]
 
-TIME = "builtin_interfaces/Time stamp\nstring frame_id"
 SEPARATOR = "\n" + "=" * 80 + "\n"
 PARTS = {
     "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
@@ -27,7 +26,8 @@ PARTS = {
     "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z",
     "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
     "geometry_msgs/Transform": "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation",
-    "geometry_msgs/TransformStamped": "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform",
+    "geometry_msgs/TransformStamped": "std_msgs/Header header\nstring child_frame_id\n"
+    "geometry_msgs/Transform transform",
     "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
     "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose\nfloat64[36] covariance",
     "geometry_msgs/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular",
@@ -227,7 +227,6 @@ def write_protobuf_mcap(path: Path, messages: list[Message], files: Any) -> Path
     pool = descriptor_pool.DescriptorPool()
     for file in files.file:
         pool.Add(file)
-    kinds: dict[int, str] = {}
 
     def encode(fields: dict[str, Any]) -> bytes:
         name = fields.pop("__type")
@@ -235,7 +234,6 @@ def write_protobuf_mcap(path: Path, messages: list[Message], files: Any) -> Path
         text = json.loads(json.dumps(fields, default=lambda data: base64.b64encode(data).decode()))
         return json_format.ParseDict(text, message).SerializeToString()
 
-    del kinds
     typed = [(topic, kind, time, {**fields, "__type": kind}) for topic, kind, time, fields in messages]
     return _write_encoded(path, typed, encode, "protobuf", "protobuf", lambda kind: files.SerializeToString())
 
