@@ -28,7 +28,8 @@ def evaluate(
         float | None,
         typer.Option(
             metavar="METRES",
-            help="Cut nuScenes' class ranges at this distance from the ego vehicle.",
+            help="Cut nuScenes' class ranges at this distance from the ego vehicle. Default: the model's range.",
+            show_default=False,
         ),
     ] = None,
     count_missing: Annotated[

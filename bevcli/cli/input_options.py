@@ -9,6 +9,9 @@ import typer
 
 PANEL = "Input"
 
+DeviceOption = Annotated[
+    str, typer.Option(metavar="auto|cpu|cuda|cuda:N", help="auto uses a GPU if there is one; cuda:1 is the second GPU.")
+]
 SceneOption = Annotated[str | None, typer.Option(help="Only this scene, such as scene-0103.", rich_help_panel=PANEL)]
 StrictOption = Annotated[
     bool,
@@ -111,6 +114,16 @@ StaticOption = Annotated[
     bool,
     typer.Option("--static", help="The vehicle stands still; ego_motion.csv is not needed.", rich_help_panel=PANEL),
 ]
+
+
+def complete_model(incomplete: str) -> list[str]:
+    """The known models that start with a text, for completion in a shell."""
+    from importlib import resources  # not bevcli.config, which loads PyTorch: completion must be quick
+
+    files = [file.name for file in resources.files("bevcli.configs").iterdir()]
+    return sorted(
+        file.removesuffix(".toml") for file in files if file.endswith(".toml") and file.startswith(incomplete)
+    )
 
 
 def parse_frames(text: str | None) -> slice | None:

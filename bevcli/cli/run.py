@@ -10,6 +10,7 @@ import typer
 from bevcli.cli.input_options import (
     CalibrationOption,
     ClassMapOption,
+    DeviceOption,
     EgoMotionOption,
     EveryOption,
     ExtrinsicsOption,
@@ -25,6 +26,7 @@ from bevcli.cli.input_options import (
     TopicOption,
     TopicsOption,
     VersionOption,
+    complete_model,
     ego_motion_use,
     parse_class_map,
     parse_frames,
@@ -35,6 +37,7 @@ from bevcli.cli.input_options import (
 
 if TYPE_CHECKING:
     from bevcli.frame import Frame, Prediction, Sequence
+    from bevcli.geometry.transforms import Array
     from bevcli.pipeline.model_loading import Model
 
 MODEL, OUTPUT, RECORDING = "Model", "Output", "Recording"
@@ -48,6 +51,7 @@ def run(
     model: Annotated[
         str | None,
         typer.Option(
+            autocompletion=complete_model,
             help="tiny, small, base, demo, or a FILE.toml. Default: the model that WEIGHTS fit, else demo.",
             rich_help_panel=MODEL,
             show_default=False,
@@ -67,9 +71,7 @@ def run(
             "--untrained", help="Use random weights; all outputs are labelled UNTRAINED.", rich_help_panel=MODEL
         ),
     ] = False,
-    device: Annotated[
-        Literal["auto", "cpu", "cuda"], typer.Option(help="auto uses a GPU if there is one.", rich_help_panel=MODEL)
-    ] = "auto",
+    device: DeviceOption = "auto",
     precision: Annotated[
         Literal["fp32", "bf16", "fp16"] | None,
         typer.Option(
@@ -224,9 +226,31 @@ def notes(model: Model, drive: Sequence) -> list[str]:
     found = list(drive.notes)
     if model.untrained:
         found.append("the weights are UNTRAINED: random weights, the boxes are meaningless")
+    tilt = tilt_note(drive.rig.ego_from_bev, bundled=model.bundled)
+    if tilt:
+        found.append(tilt)
     if model.bundled:
         found.append("these weights were trained on rendered streets, not on the real world (docs/model-card.md)")
     return found
+
+
+def tilt_note(ego_from_bev: Array, *, bundled: bool) -> str | None:
+    """What to tell of a bev frame that is tilted more than the one that the weights were trained with.
+
+    bundled: whether the weights are those of the package, which were trained with a level frame; published ones were
+    trained with nuScenes' LIDAR_TOP, which is tilted by up to 3°.
+    """
+    import numpy as np
+
+    tilt_deg = float(np.degrees(np.arccos(np.clip(ego_from_bev[2, 2], -1, 1))))
+    if tilt_deg <= (1.0 if bundled else 4.0):
+        return None
+    trained = "a level one" if bundled else "one tilted by up to 3°"
+    height = 30 * np.tan(np.radians(tilt_deg))
+    return (
+        f"the bev frame is tilted by {tilt_deg:.1f}°, but the weights were trained with {trained}: boxes 30 m away may "
+        f'be {height:.1f} m too high or too low (level "ego_from_bev" in the calibration)'
+    )
 
 
 def warnings(frame: Frame, prediction: Prediction) -> list[str]:

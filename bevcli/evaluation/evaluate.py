@@ -76,7 +76,8 @@ def evaluate(
         predictions: a predictions.json, the folder of a run, or a nuScenes submission (results_nusc.json).
         ground_truth: a ground_truth.json, a sequence folder that contains one, or a nuScenes root.
         max_range: distance from the ego vehicle beyond which nothing is scored, metres. Default: nuScenes' range of
-            each class, or no limit where no frame has an ego pose, as in the devkit.
+            each class, cut where the model's BEV grid ends if the predictions state it; no limit where no frame has an
+            ego pose, as in the devkit.
         count_missing: whether ground-truth frames without a prediction count as missed; they are left out by default.
         scene: score only this scene of the ground truth.
         version: of a nuScenes root, such as "v1.0-mini".
@@ -95,15 +96,23 @@ def evaluate(
     pairs = pair_frames(found.boxes, truth.boxes, count_missing=count_missing)
     pairs = without_cycles_in_racks(pairs, truth.bicycle_racks)
     config = DetectionConfig()
+    model_range = _model_range_m(found, config)
     if max_range is not None:
         config = config.cut_at(max_range)
     elif not pairs.ego_pose_known:
         config = config.unlimited()
+    elif model_range is not None:
+        config = config.cut_at(model_range)
     detection = evaluate_detections(_with_attributes(pairs.predictions), pairs.ground_truth, config, pairs.ego_xy)
     segmentation, map_notes = _score_maps(found, truth, pairs)
     notes = [*pairs.notes, *map_notes, *_other_class_notes(pairs)]
     if max_range is None and not pairs.ego_pose_known:
         notes.append('no frame has "world_from_ego": class ranges are not applied (--max-range M applies them)')
+    elif max_range is None and model_range is not None:
+        notes.append(
+            f"nothing beyond {model_range:g} m is scored: the BEV grid of the model that made the predictions ends "
+            "there (--max-range M sets another limit)"
+        )
     return Scores(pairs, config, detection, segmentation, (*notes, *_detection_notes(detection)))
 
 
@@ -131,6 +140,14 @@ def _score_maps(
     classes = [name for name in true.classes if name in found.classes]
     maps = ((found.load(one), true.load(other)) for one, other in indices)
     return evaluate_segmentation(maps, classes), notes
+
+
+def _model_range_m(predictions: ScoredInput, config: DetectionConfig) -> float | None:
+    """Distance to the end of the model's BEV grid, metres; None if unknown or beyond all class ranges."""
+    stated = predictions.boxes.extras.get("range_m")
+    if not isinstance(stated, (int, float)) or not 0 < stated < max(config.class_ranges_m.values()):
+        return None
+    return float(stated)
 
 
 def _other_class_notes(pairs: FramePairs) -> Iterator[str]:

@@ -125,6 +125,7 @@ def _split_by_scene(ego_motion: EgoMotion, stamps: tuple[FrameStamp, ...]) -> It
                 ego_motion.accelerations[part],
                 ego_motion.angular_rates[part],
                 ego_motion.velocities[part],
+                velocities_are_stated=ego_motion.velocities_are_stated,
             )
 
 

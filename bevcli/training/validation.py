@@ -13,7 +13,6 @@ from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmenta
 from bevcli.frame import MAP_CLASSES, Frame, Prediction
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.transforms import inverse
-from bevcli.model.bevformer import BEVFormerConfig
 from bevcli.pipeline.preprocess import Preprocessor
 from bevcli.pipeline.runner import Runner
 from bevcli.training.drives import Drives
@@ -63,7 +62,7 @@ def validate(
         max_range_m: ignore boxes beyond this distance, metres; by default beyond the nearest side of the BEV grid.
         after_frame: called after each frame.
     """
-    config = DetectionConfig().cut_at(nearest_side_m(runner.config) if max_range_m is None else max_range_m)
+    config = DetectionConfig().cut_at(runner.config.bev_grid.nearest_side_m if max_range_m is None else max_range_m)
     predictions, truths, maps = [], [], []
     for index in range(len(drives)):
         sequence = drives.open(index)
@@ -77,12 +76,6 @@ def validate(
             after_frame()
     detection = evaluate_detections(predictions, truths, config)
     return Validation(config, detection, evaluate_segmentation(maps) if maps else None)
-
-
-def nearest_side_m(config: BEVFormerConfig) -> float:
-    """Distance from the origin to the nearest side of the BEV grid, metres."""
-    grid = config.bev_grid
-    return min(abs(end) for end in (*grid.x_range_m, *grid.y_range_m))
 
 
 def _boxes_ego(frame: Frame, ground_truth: Boxes3D, prediction: Prediction) -> tuple[Boxes3D, Boxes3D]:
