@@ -120,7 +120,7 @@ def complete_model(incomplete: str) -> list[str]:
     """The known models that start with a text, for completion in a shell."""
     from importlib import resources  # not bevcli.config, which loads PyTorch: completion must be quick
 
-    files = [file.name for file in resources.files("bevcli.configs").iterdir()]
+    files = [file.name for file in resources.files("bevcli").joinpath("configs").iterdir()]
     return sorted(
         file.removesuffix(".toml") for file in files if file.endswith(".toml") and file.startswith(incomplete)
     )
