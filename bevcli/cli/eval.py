@@ -36,6 +36,10 @@ def evaluate(
         bool,
         typer.Option("--count-missing", help="Count ground-truth frames without a prediction as missed."),
     ] = False,
+    tracking: Annotated[
+        bool,
+        typer.Option("--tracking", help="Also score tracks: AMOTA, identity switches and the other tracking metrics."),
+    ] = False,
     scene: SceneOption = None,
     version: VersionOption = None,
     split: SplitOption = None,
@@ -54,6 +58,7 @@ def evaluate(
         ground_truth,
         max_range,
         count_missing,
+        tracking=tracking,
         scene=scene,
         version=version,
         split=split,
