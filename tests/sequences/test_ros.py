@@ -1,5 +1,7 @@
 """Bags written with the packages of ROS and MCAP, read as sequences."""
 
+import base64
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -500,3 +502,55 @@ def test_options_for_other_inputs_are_refused(tmp_path: Path, drive: Path, nativ
         open_sequence(path, scene="one")
     with pytest.raises(InputError, match="are for MCAP files and ROS bags"):
         open_sequence(drive, topics={"CAM_FRONT": "/a"})
+
+
+def vp9_packets(folder: Path) -> list[bytes]:
+    """12 images of 64x48 in grey levels 10, 30, ..., written by OpenCV into an IVF container."""
+    path = folder / "video.ivf"
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"VP90"), 10, (64, 48))
+    for level in range(10, 250, 20):
+        writer.write(np.full((48, 64, 3), level, dtype=np.uint8))
+    writer.release()
+    data, at, packets = path.read_bytes(), 32, []
+    while at < len(data):
+        size = int.from_bytes(data[at : at + 4], "little")
+        packets.append(data[at + 12 : at + 12 + size])
+        at += 12 + size
+    return packets
+
+
+def video_bag(folder: Path, native: Sequence, packets: list[bytes], video_format: str) -> Path:
+    """The small drive with CAM_FRONT as a video of ten images per second."""
+    messages = [m for m in messages_of(native, None) if m[0] != "/CAM_FRONT/image/compressed"]
+    camera = replace(native.rig["CAM_FRONT"], width=64, height=48)
+    messages = [
+        (t, k, time, camera_info(camera, time, "CAM_FRONT_optical") if t == "/CAM_FRONT/camera_info" else fields)
+        for t, k, time, fields in messages
+    ]
+    for number, packet in enumerate(packets):
+        time = 10**9 + number * 100_000_000
+        timestamp = {"sec": time // 10**9, "nanosec": time % 10**9}
+        fields = {"timestamp": timestamp, "frame_id": "CAM_FRONT_optical", "data": packet, "format": video_format}
+        messages.append(("/CAM_FRONT/video", "foxglove_msgs/CompressedVideo", time, fields))
+    return write_mcap(folder / "bag.mcap", messages)
+
+
+@pytest.mark.parametrize("video_format", ["h264", "h265", "vp9"])
+def test_video_packets_are_decoded_in_any_order(tmp_path: Path, native: Sequence, video_format: str) -> None:
+    stored = json.loads((Path(__file__).parents[1] / "data/video_packets.json").read_text())
+    if video_format == "vp9":
+        packets = vp9_packets(tmp_path)
+    else:
+        packets = [base64.b64decode(text) for text in stored[video_format]]
+    sequence = open_sequence(video_bag(tmp_path, native, packets, video_format), ego_motion="static")
+    assert "/CAM_FRONT/video" in sequence.notes[0]
+    for place in (1, 0, 2):  # at 1.5, 1.0 and 2.0 s; CAM_BACK, which leads, is 20 ms late
+        image = sequence.load(place).images["CAM_FRONT"]
+        assert image.timestamp_ns == 10**9 + place * 500_000_000
+        assert image.pixels_bgr.mean() == pytest.approx(10 + 20 * 5 * place, abs=5)
+
+
+def test_an_unknown_video_format_is_an_error(tmp_path: Path, native: Sequence) -> None:
+    path = video_bag(tmp_path, native, [b"abc"], "theora")
+    with pytest.raises(InputError, match="video format theora is not supported"):
+        open_sequence(path, ego_motion="static")
