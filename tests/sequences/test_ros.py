@@ -554,3 +554,12 @@ def test_an_unknown_video_format_is_an_error(tmp_path: Path, native: Sequence) -
     path = video_bag(tmp_path, native, [b"abc"], "theora")
     with pytest.raises(InputError, match="video format theora is not supported"):
         open_sequence(path, ego_motion="static")
+
+
+def test_without_the_extra_the_error_names_it(
+    tmp_path: Path, native: Sequence, motion: EgoMotion, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_mcap(tmp_path / "bag.mcap", messages_of(native, motion))
+    monkeypatch.setattr("bevcli.sequences.ros.bag.PACKAGES", ("rosbags", "a_package.that_is_missing"))
+    with pytest.raises(InputError, match=r"run pip install 'bevcli\[ros\]'"):
+        open_sequence(path)
