@@ -22,6 +22,7 @@ from bevcli.cli.export import export
 from bevcli.cli.project_debug import project_debug
 from bevcli.cli.render import render
 from bevcli.cli.run import run
+from bevcli.cli.samples import samples
 from bevcli.cli.train import train
 from bevcli.cli.validate import validate
 from bevcli.cli.viz import viz
@@ -61,6 +62,7 @@ app.command()(export)
 app.command()(project_debug)
 app.command()(render)
 app.command()(run)
+app.command()(samples)
 app.command()(train)
 app.command()(validate)
 app.command()(viz)

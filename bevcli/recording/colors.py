@@ -24,6 +24,7 @@ CLASS_COLORS: dict[str, Color] = {
     "traffic_cone": (245, 222, 90),
 }
 GROUND_TRUTH_COLOR: Color = (235, 238, 245)
+OTHER_COLOR: Color = (128, 132, 140)  # ground truth of a class that is not among the model's
 MISSED_COLOR: Color = (255, 45, 85)
 FALSE_COLOR: Color = (255, 45, 85)
 EGO_COLOR: Color = (90, 200, 250)

@@ -10,10 +10,17 @@ import numpy as np
 import pyarrow as pa
 import rerun as rr
 
-from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.boxes import CLASSES, Boxes3D
 from bevcli.geometry.transforms import Array
 from bevcli.recording import entities
-from bevcli.recording.colors import DUPLICATE_COLOR, FALSE_COLOR, GROUND_TRUTH_COLOR, MISSED_COLOR, class_color
+from bevcli.recording.colors import (
+    DUPLICATE_COLOR,
+    FALSE_COLOR,
+    GROUND_TRUTH_COLOR,
+    MISSED_COLOR,
+    OTHER_COLOR,
+    class_color,
+)
 from bevcli.recording.labels import labels_in_scene
 
 MOVING_M_S = 0.5  # slower objects get no velocity arrow
@@ -74,9 +81,26 @@ def log_boxes_3d(
     stream.log(entities.DUPLICATES, rr.LineStrips3D(diagonals, colors=DUPLICATE_COLOR, radii=THICK))
 
 
-def log_ground_truth_3d(stream: rr.RecordingStream, truth: Boxes3D, found: np.ndarray) -> None:
-    """Writes ground-truth boxes (in the recording's world) into the scene: pale where found (M,), red where missed."""
-    pale = rr.Boxes3D(**_shape(truth[found]), colors=[*GROUND_TRUTH_COLOR, 150], radii=THIN)
+def other_classes(truth: Boxes3D, class_names: Sequence[str]) -> np.ndarray:
+    """(M,) bool, whether a ground-truth box has a class that neither nuScenes nor the model has: it is never missed."""
+    return ~np.isin(truth.classes, (*CLASSES, *class_names))
+
+
+def ground_truth_colors(found: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """(M, 3) uint8 colours of ground-truth boxes: pale where found, red where missed, grey for other classes.
+
+    found: (M,) bool. other: (M,) bool, classes that are not among the model's.
+    """
+    colors = np.where(found[:, None], GROUND_TRUTH_COLOR, MISSED_COLOR)
+    return np.where(other[:, None], OTHER_COLOR, colors).astype(np.uint8).reshape(-1, 3)
+
+
+def log_ground_truth_3d(stream: rr.RecordingStream, truth: Boxes3D, found: np.ndarray, colors: np.ndarray) -> None:
+    """Writes ground-truth boxes (in the recording's world) into the scene; found and missed ones are two entities.
+
+    found: (M,) bool. colors: (M, 3) uint8.
+    """
+    pale = rr.Boxes3D(**_shape(truth[found]), colors=_with_alpha(colors[found], 150), radii=THIN)
     stream.log(entities.GROUND_TRUTH, pale, rr.AnyValues(name=_names(truth[found])))
     missed = truth[~found]
     red = rr.Boxes3D(**_shape(missed), colors=MISSED_COLOR, radii=THIN)
@@ -105,15 +129,17 @@ def log_boxes_bev(stream: rr.RecordingStream, boxes: Boxes3D, marks: Marks, clas
     stream.log(entities.BEV_DUPLICATES, rr.LineStrips2D(diagonals, colors=DUPLICATE_COLOR, radii=THIN, draw_order=32))
 
 
-def log_ground_truth_bev(stream: rr.RecordingStream, truth: Boxes3D, found: np.ndarray) -> None:
-    """Writes ground-truth boxes (in the bev frame) into the BEV view: pale where found (M,), red where missed."""
-    for entity, part, color in (
-        (entities.BEV_GROUND_TRUTH, truth[found], GROUND_TRUTH_COLOR),
-        (entities.BEV_MISSED, truth[~found], MISSED_COLOR),
-    ):
-        outlines, headings = footprints(part)
+def log_ground_truth_bev(stream: rr.RecordingStream, truth: Boxes3D, found: np.ndarray, colors: np.ndarray) -> None:
+    """Writes ground-truth boxes (in the bev frame) into the BEV view, as `log_ground_truth_3d`."""
+    for entity, chosen in ((entities.BEV_GROUND_TRUTH, found), (entities.BEV_MISSED, ~found)):
+        outlines, headings = footprints(truth[chosen])
+        doubled = np.tile(_with_alpha(colors[chosen], 200), (2, 1))
         strips = [*outlines, *headings]
-        stream.log(entity, rr.LineStrips2D(strips, colors=[*color, 200], radii=THIN, draw_order=20))
+        stream.log(entity, rr.LineStrips2D(strips, colors=doubled, radii=THIN, draw_order=20))
+
+
+def _with_alpha(colors: np.ndarray, alpha: int) -> np.ndarray:
+    return np.column_stack([colors, np.full(len(colors), alpha, dtype=np.uint8)])
 
 
 def footprints(boxes: Boxes3D) -> tuple[Array, Array]:

@@ -15,7 +15,7 @@ from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.recording import entities
 from bevcli.recording.box_lines import lines_in_image
-from bevcli.recording.colors import GROUND_TRUTH_COLOR, MISSED_COLOR, colormap
+from bevcli.recording.colors import colormap
 from bevcli.recording.labels import box_labels, labels_in_image
 from bevcli.recording.log_boxes import box_colors
 from bevcli.recording.video_images import Av1Encoder
@@ -123,11 +123,10 @@ def log_boxes_in_image(
 
 
 def log_ground_truth_in_image(
-    stream: rr.RecordingStream, posed: PosedCamera, truth: Boxes3D, found: np.ndarray
+    stream: rr.RecordingStream, posed: PosedCamera, truth: Boxes3D, colors: np.ndarray
 ) -> None:
-    """Draws ground-truth boxes (in the recording's world) into the image: pale where found (M,), red where missed."""
+    """Draws ground-truth boxes (in the recording's world) into the image. colors: (M, 3) uint8."""
     lines = lines_in_image(truth, posed.camera, posed.camera_from_world)
-    colors = np.where(found[:, None], GROUND_TRUTH_COLOR, MISSED_COLOR).astype(np.uint8).reshape(-1, 3)
     stream.log(
         entities.overlay(posed.name, "ground_truth"),
         rr.LineStrips2D(

@@ -23,7 +23,8 @@ SPEED_LABEL_M = (1.35, 0.0, 3.2)  # in the ego frame: above the vehicle
 PILLARS_PER_SIDE = 25  # more pillars than this along one side of the grid would hide the image
 HOW_TO_READ = """\
 - **Predicted boxes** have the colour of their class. The front face is crossed; from above, a line points to the front.
-- **Ground truth** is pale where a prediction matches it, and red where it was missed.
+- **Ground truth** is pale where a prediction matches it, and red where it was missed. Classes that are not scored are
+  grey.
 - **False positives** are crossed out in red: no ground truth of their class is within 2 m.
 - **Duplicates**, a second box on an object, have one grey diagonal.
 - **Tracks** have a number in their label and a trail: the last 5 s, and, fainter, the next second at the predicted

@@ -251,6 +251,7 @@ class Recording:
                 found = np.ones(len(truth), dtype=bool)
             else:
                 _, found = true_positives(shown, truth)
+                found |= log_boxes.other_classes(truth, self.class_names)
                 marks = Marks(*false_and_duplicate(shown, truth))
             self._log_ground_truth(truth, found, world_from_bev, cameras)
         stream, names = self._stream, self.class_names
@@ -270,10 +271,11 @@ class Recording:
         self, truth: Boxes3D, found: np.ndarray, world_from_bev: Array, cameras: PosedCameras
     ) -> None:
         in_world = truth.transformed(world_from_bev)
-        log_boxes.log_ground_truth_3d(self._stream, in_world, found)
-        log_boxes.log_ground_truth_bev(self._stream, truth, found)
+        colors = log_boxes.ground_truth_colors(found, log_boxes.other_classes(truth, self.class_names))
+        log_boxes.log_ground_truth_3d(self._stream, in_world, found, colors)
+        log_boxes.log_ground_truth_bev(self._stream, truth, found, colors)
         for posed in cameras:
-            log_cameras.log_ground_truth_in_image(self._stream, posed, in_world, found)
+            log_cameras.log_ground_truth_in_image(self._stream, posed, in_world, colors)
 
     def _log_curves(self, prediction: Prediction) -> None:
         stages = prediction.stage_seconds

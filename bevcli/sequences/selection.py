@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from collections.abc import Sequence as Indices
+from dataclasses import replace
 
 import numpy as np
 
@@ -36,6 +37,17 @@ class Selection:
     def load(self, place: int) -> Frame:
         """The frame at position `place` of the selection, with decoded images."""
         return self._sequence.load(self._indices[place])
+
+
+class WithoutGroundTruth(Selection):
+    """A sequence without its ground truth."""
+
+    def __init__(self, sequence: Sequence) -> None:
+        super().__init__(sequence, range(len(sequence.stamps)))
+
+    def load(self, place: int) -> Frame:
+        """The frame at position `place`, without boxes and map."""
+        return replace(super().load(place), ground_truth=None, ground_truth_map=None)
 
 
 def select(sequence: Sequence, indices: Indices[int], notes: tuple[str, ...] = ()) -> Sequence:

@@ -93,6 +93,7 @@ def prepare_training(
     out: Path | None = None,
     weights: Path | None = None,
     steps: int | None = None,
+    held_out: int | None = None,
     seed: int = 0,
     resume: bool = False,
 ) -> TrainingJob:
@@ -106,6 +107,7 @@ def prepare_training(
         out: the output folder, by default runs/train-MODEL.
         weights: a file to start from, in place of random weights.
         steps: replaces `steps` of the [training] table.
+        held_out: replaces `held_out` of the [training] table.
         seed: of all draws after the initial weights.
         resume: the output folder may hold a checkpoint.
 
@@ -115,16 +117,17 @@ def prepare_training(
     model_config = load_config(model_name_or_file)
     config = load_table(model_name_or_file, TRAINING, TrainingConfig)
     config = config if steps is None else replace(config, steps=steps)
+    config = config if held_out is None else replace(config, held_out=held_out)
     check_window(model_config, config)
     out = Path("runs") / f"train-{model_config.name}" if out is None else out
     check_training_seeds(rendered_seeds or ())
     drives = open_drives(folders, rendered_seeds, out / "drives", model_config)
-    drives, held_out = split_drives(drives, config.held_out)
+    drives, evaluated = split_drives(drives, config.held_out)
     prepare_folder(out, resume=resume)
     model = build_model(model_config)
     if weights is not None:
         load_weights(weights, model, resample=True)
-    return TrainingJob(model, config, drives, held_out, out, device, seed, join_process_group(device))
+    return TrainingJob(model, config, drives, evaluated, out, device, seed, join_process_group(device))
 
 
 def check_window(model: BEVFormerConfig, config: TrainingConfig) -> None:

@@ -58,27 +58,34 @@ class Trainer:
         self,
         after_step: Callable[[], None] = lambda: None,
         after_validation: Callable[[int, Validation], None] = lambda step, scores: None,
+        stop: Callable[[], bool] = lambda: False,
     ) -> None:
         """Runs the remaining steps and leaves the model in evaluation mode. Raises BevcliError if a loss is not finite.
 
         Args:
             after_step: called by the leader after each step.
             after_validation: called by the leader with the number of steps done and the scores.
+            stop: asked after each step; if it is true, a checkpoint is written and the training ends early.
         """
         config = self.job.config
         remaining = range(self.done, config.steps)
         for batches in read_ahead(self._load, remaining, depth=config.loaders, threads=config.loaders):
             row = self._step(batches)
             self.done += 1
+            stopped = stop()
             if not self.job.group.leads:
+                if stopped:
+                    break
                 continue
             self._loss_curve.add(self.done, row)
             last = self.done == config.steps
             if self.done % config.evaluate_every == 0 or last:
                 after_validation(self.done, self._validate())
-            if self.done % config.checkpoint_every == 0 or last:
+            if self.done % config.checkpoint_every == 0 or last or stopped:
                 save_checkpoint(self.job.out / CHECKPOINT, self.done, self.trained, self.optimizer)
             after_step()
+            if stopped:
+                break
         self.job.model.eval()
 
     @property
