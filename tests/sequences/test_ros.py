@@ -563,3 +563,30 @@ def test_without_the_extra_the_error_names_it(
     monkeypatch.setattr("bevcli.sequences.ros.bag.PACKAGES", ("rosbags", "a_package.that_is_missing"))
     with pytest.raises(InputError, match=r"run pip install 'bevcli\[ros\]'"):
         open_sequence(path)
+
+
+def nav_sat_fix(time: int, latitude: float, longitude: float, status: int = 0) -> Message:
+    fields = {
+        "header": header(time, "gnss"),
+        "status": {"status": status, "service": 1},
+        "latitude": latitude,
+        "longitude": longitude,
+        "altitude": 0.0,
+        "position_covariance": [0.0] * 9,
+        "position_covariance_type": 0,
+    }
+    return "/gnss/fix", "sensor_msgs/NavSatFix", time, fields
+
+
+def test_the_first_valid_satellite_position_places_the_drive_on_earth(native, motion, tmp_path):
+    times = [stamp.timestamp_ns for stamp in native.stamps]
+    fixes = [nav_sat_fix(times[0], 0.0, 0.0, status=-1), nav_sat_fix(times[1], 48.137, 11.575)]
+    path = write_mcap(tmp_path / "drive.mcap", [*messages_of(native, motion), *fixes])
+    opened = open_sequence(path)
+    vehicle = opened.load(1).world_from_ego.translation
+    assert opened.facts.geo_origin.latitude_longitude(vehicle) == pytest.approx([48.137, 11.575], abs=1e-5)  # a metre
+
+
+def test_a_bag_without_satellite_positions_has_no_geo_origin(native, motion, tmp_path):
+    opened = open_sequence(write_mcap(tmp_path / "drive.mcap", messages_of(native, motion)))
+    assert opened.facts.geo_origin is None

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import Frame, FrameStamp
+from bevcli.frame import DriveFacts, Frame, FrameStamp
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
 from bevcli.geometry.transforms import Array, rigid
-from bevcli.sequences.files.calibration_file import read_calibration
+from bevcli.sequences.files.calibration_file import read_calibration, read_facts
 from bevcli.sequences.frame_reading import read_frame
 from bevcli.sequences.images import ImageReader, Source
 from bevcli.sequences.native.ego_motion_file import read_ego_motion
@@ -23,6 +23,7 @@ from bevcli.sequences.native.frames_table import FrameEntry
 from bevcli.sequences.ros.bag import Bag
 from bevcli.sequences.ros.capture_times import capture_times
 from bevcli.sequences.ros.ego_motion import BagEgoMotion, motion_from_poses, motion_from_transforms
+from bevcli.sequences.ros.geo_origin import find_geo_origin
 from bevcli.sequences.ros.images import BagImage
 from bevcli.sequences.ros.messages import CameraInfo, camera_info_of, frame_of, pose_of
 from bevcli.sequences.ros.packets import BagVideo
@@ -74,6 +75,11 @@ class RosSequence:
         motion = _find_motion(self._bag, finder, stated, tree, reader, ego_motion, ego_motion_file)
         self._motion = motion.poses
         self.has_ego_motion = motion.poses is not None
+        calibration = folder / CALIBRATION_FILE
+        stated_facts = read_facts(calibration) if calibration.is_file() else DriveFacts()
+        self.facts = replace(
+            stated_facts, geo_origin=stated_facts.geo_origin or find_geo_origin(self._bag, motion.poses)
+        )
         entries = _entries(self._bag, finder.cameras)
         self._entries = _covered(entries, self._motion, path)
         self.notes = (
