@@ -87,13 +87,13 @@ class Encoder(nn.Module):
         """
         # With history, all layers attend to the same two maps; without it, to their own queries twice.
         bev_maps = None if history is None else torch.stack([history, bev_query], dim=1)
-        reference_points = self._reference_points(None if history is None else shift)
+        reference_points = self.reference_points(None if history is None else shift)
         bev = bev_query
         for layer in self.layers:
             bev = layer(bev, position, bev_maps, reference_points, image_features, hits)
         return bev
 
-    def _reference_points(self, shift: Tensor | None) -> Tensor:
+    def reference_points(self, shift: Tensor | None) -> Tensor:
         """(B or 1, 2, Y·X, 2) float32: where the cells' centres lie in the history map and in the current one."""
         centers = self.cell_centers.float()
         if shift is None:
