@@ -28,8 +28,8 @@ class ExportedStep(nn.Module):
     false, because a graph has no optional inputs.
     """
 
-    mean: Tensor
-    std: Tensor
+    image_mean: Tensor
+    image_std: Tensor
 
     def __init__(self, model: BEVFormer, deformable_convolution: DeformableConvolution, *, decode: bool) -> None:
         """A copy of the model, with its parts replaced; the model itself stays unchanged."""
@@ -38,8 +38,8 @@ class ExportedStep(nn.Module):
         self.config, self.decode = model.config, decode
         replace_parts(self.network, deformable_convolution)
         image = self.config.image
-        self.register_buffer("mean", torch.tensor(image.mean)[:, None, None])
-        self.register_buffer("std", torch.tensor(image.std)[:, None, None])
+        self.register_buffer("image_mean", torch.tensor(image.mean)[:, None, None])
+        self.register_buffer("image_std", torch.tensor(image.std)[:, None, None])
 
     def forward(
         self,
@@ -61,7 +61,7 @@ class ExportedStep(nn.Module):
         history = network.align_history(previous_bev, rotation)
         centers = network.encoder.cell_centers.expand(1, 2, -1, -1)
         reference_points = torch.where(use_previous, network.encoder.reference_points(shift), centers)
-        hits = list_hits(network.pillars.project(image_from_bev, images.shape[2:4], has_image))
+        hits = list_hits(network.pillars.project(image_from_bev, (images.shape[2], images.shape[3]), has_image))
         image_features = network.image_tokens(feature_maps, camera_index)
         with_history = torch.stack([history, bev_query], dim=1)
         bev = bev_query
@@ -83,7 +83,7 @@ class ExportedStep(nn.Module):
         planes = images[0].permute(0, 3, 1, 2)
         if self.config.image.color_order == "rgb":
             planes = planes.flip(1)
-        return (planes - self.mean) / self.std
+        return (planes - self.image_mean) / self.image_std
 
 
 @dataclass(frozen=True)

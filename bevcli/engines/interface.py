@@ -40,6 +40,7 @@ def input_ports(config: BEVFormerConfig, cameras: int) -> tuple[Port, ...]:
     width, height = image.padded_size
     cells = grid.rows * grid.columns
     pad = ", ".join(f"{value:g}" for value in pad_value_bgr(config))
+    quaternion = "quaternion w x y z" if config.ego_motion.can_bus_quaternion == "wxyz" else "quaternion w w w w"
     names = ", ".join(f"{index} {name}" for index, name in enumerate(config.cameras))
     return (
         Port(
@@ -58,13 +59,22 @@ def input_ports(config: BEVFormerConfig, cameras: int) -> tuple[Port, ...]:
             "resized image and depth d in metres. Bev frame: x to the right, y ahead, z up.",
         ),
         Port("camera_index", (cameras,), torch.int64, f"(N,): the camera embedding of each image: {names}."),
-        Port("has_image", (1, cameras), torch.bool, "(1, N): false for a camera without an image, which then sees nothing."),
+        Port(
+            "has_image",
+            (1, cameras),
+            torch.bool,
+            "(1, N): false for a camera without an image, which then sees nothing.",
+        ),
         Port(
             "can_bus",
             (1, 18),
             torch.float32,
             "(1, 18): 0-2 translation since the previous frame, metres, world frame; 3-6 "
-            + ("quaternion w x y z" if config.ego_motion.can_bus_quaternion == "wxyz" else "w of the quaternion, four times,")
+            + (
+                "quaternion w x y z"
+                if config.ego_motion.can_bus_quaternion == "wxyz"
+                else "w of the quaternion, four times,"
+            )
             + " of world_from_ego; 7-9 acceleration with gravity, m/s^2; 10-12 angular rate, rad/s; 13-15 velocity, "
             "m/s, ego frame; 16 yaw in radians, 0 to 2 pi; 17 change of yaw since the previous frame, degrees. "
             "0-2 and 17 are zero without a previous frame.",
