@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from bevcli.config import load_config
 from bevcli.engines.check import check_exported
 from bevcli.engines.export_onnx import export_onnx
 from bevcli.engines.onnx_runtime import OnnxBEVFormer
@@ -29,7 +30,7 @@ onnxruntime = pytest.importorskip("onnxruntime")
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.fixture(scope="module", params=["operator", "gridsample"])
+@pytest.fixture(scope="module", params=["operator", pytest.param("gridsample", marks=pytest.mark.slow)])
 def small_file(request, tmp_path_factory) -> Path:
     """A small model with deformable convolutions."""
     file = tmp_path_factory.mktemp("small") / "small.onnx"
@@ -92,6 +93,7 @@ def test_a_file_holds_standard_operators_only_and_documents_every_input_and_outp
         assert all(value.doc_string.startswith("(") for value in values)
 
 
+@pytest.mark.slow
 def test_demo_equals_our_model_over_a_real_drive(demo_file, shared):
     drive = open_sequence(shared / "data" / "nuscenes-scene-0103", rate_hz=2.0, frames=slice(0, 4))
     agree(demo_file, load_model("demo"), drive)
@@ -114,6 +116,7 @@ def agree(file: Path, model: Model, drive) -> None:
     assert max(row.masks for row in differences) < 1e-3
 
 
+@pytest.mark.slow
 def test_the_program_of_the_deployment_page_finds_the_boxes_of_bevcli(demo_file, tmp_path):
     page = (ROOT / "docs" / "deploy.md").read_text()
     program = page.split("```python\n")[1].split("```")[0]
@@ -132,11 +135,11 @@ def test_the_program_of_the_deployment_page_finds_the_boxes_of_bevcli(demo_file,
         np.testing.assert_allclose(json.loads(best)[:3], boxes.centers[0], atol=0.02)
 
 
-def test_mistakes_are_named(demo_file, tmp_path):
+def test_mistakes_are_named(small_file, tmp_path):
     with pytest.raises(BevcliError, match="expected 19 or newer"):
         export_onnx(small_model(), tmp_path / "old.onnx", opset=18)
-    with pytest.raises(WeightsError, match="holds the model demo, expected small-for-tests"):
-        OnnxBEVFormer(demo_file, small_model().config)
+    with pytest.raises(WeightsError, match="holds the model small-for-tests, expected demo"):
+        OnnxBEVFormer(small_file, load_config("demo"))
     (tmp_path / "broken.onnx").write_bytes(b"no model")
     with pytest.raises(WeightsError, match="cannot load it"):
         OnnxBEVFormer(tmp_path / "broken.onnx", small_model().config)
