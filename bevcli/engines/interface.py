@@ -71,8 +71,8 @@ def input_ports(config: BEVFormerConfig, cameras: int) -> tuple[Port, ...]:
             torch.float32,
             "(1, 18): 0-2 translation since the previous frame, metres, world frame; 3-6 "
             f"{quaternion} of world_from_ego; 7-9 acceleration with gravity, m/s^2; 10-12 angular rate, rad/s; "
-            "13-15 velocity, m/s, ego frame; 16 yaw in radians, 0 to 2 pi; 17 change of yaw since the previous frame, degrees. "
-            "0-2 and 17 are zero without a previous frame.",
+            "13-15 velocity, m/s, ego frame; 16 yaw in radians, 0 to 2 pi; 17 change of yaw since the previous "
+            "frame, degrees. 0-2 and 17 are zero without a previous frame.",
         ),
         Port(
             "shift",
