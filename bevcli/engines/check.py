@@ -54,8 +54,7 @@ def check_exported(file: Path, model: Model, sequence: Sequence) -> Iterator[Fra
     cpu = torch.device("cpu")
     networks = (prepare_for_inference(model.network, cpu), OnnxBEVFormer(file, model.config))
     outputs = [_Latest(network) for network in networks]
-    # A runner needs no more of a network than its configuration and its forward.
-    runners = [Runner(network, cpu) for network in networks]  # type: ignore[arg-type]
+    runners = [Runner(network, cpu) for network in networks]
     states = [None, None]
     preprocess = Preprocessor(model.config)
     for place, stamp in enumerate(sequence.stamps):

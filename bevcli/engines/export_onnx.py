@@ -15,14 +15,14 @@ from bevcli.engines.export_parts import DeformableConvolution, ExportedStep
 from bevcli.engines.interface import Port, input_ports, metadata, output_ports
 from bevcli.engines.packages import require
 from bevcli.errors import BevcliError, OutputError
-from bevcli.model.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer, BEVFormerBase
 
 # GridSample exists since opset 16, ScatterND with a sum since 16, LayerNormalization since 17, DeformConv since 19.
 MIN_OPSET = {"operator": 19, "gridsample": 17}
 
 
 def export_onnx(
-    network: BEVFormer,
+    network: BEVFormerBase,
     out: Path,
     *,
     opset: int = 19,
@@ -45,7 +45,7 @@ def export_onnx(
         decode: add the outputs boxes, scores and classes.
 
     Raises:
-        BevcliError: the extra bevcli[onnx] is not installed, or the opset is too old.
+        BevcliError: the extra bevcli[onnx] is not installed, the opset is too old, or the model is a BEVFormerV2.
         OutputError: the file cannot be written.
     """
     require("onnx", "onnxscript")
@@ -57,6 +57,11 @@ def export_onnx(
             f"--deformable-convolution {deformable_convolution}"
         )
     config = network.config
+    if not isinstance(network, BEVFormer) or config.image.crop is not None:
+        raise BevcliError(
+            f"{config.name}: BEVFormerV2 and models that crop images cannot be exported yet "
+            "(expected a recurrent BEVFormer, such as tiny, small, base or demo)"
+        )
     inputs = input_ports(config, len(config.cameras) if cameras is None else cameras)
     outputs = output_ports(config, decode=decode)
     step = ExportedStep(network, deformable_convolution, decode=decode).eval()

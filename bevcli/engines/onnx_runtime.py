@@ -11,11 +11,11 @@ from torch import Tensor, nn
 
 from bevcli.engines.packages import require
 from bevcli.errors import WeightsError
-from bevcli.model.bevformer import BEVFormerConfig, BEVFormerInputs, BEVFormerOutputs
+from bevcli.model.bevformer import BEVFormer, BEVFormerConfig, BEVFormerInputs, BEVFormerOutputs
 from bevcli.model.segmentation import SegmentationOutputs
 
 
-class OnnxBEVFormer(nn.Module):
+class OnnxBEVFormer(BEVFormer):
     """An exported file, run by ONNX Runtime on the CPU. A `Runner` takes it in the place of a BEVFormer.
 
     It has no parts to look into: stage times and the sampling points of the attentions are not available.
@@ -33,7 +33,7 @@ class OnnxBEVFormer(nn.Module):
             BevcliError: ONNX Runtime is not installed.
             WeightsError: the file is missing, cannot be loaded, or holds another model.
         """
-        super().__init__()
+        nn.Module.__init__(self)  # not BEVFormer's, which would make its parts
         self.config = config
         self.session = open_session(file, torch.get_num_threads() if threads is None else threads)
         self.metadata = self.session.get_modelmeta().custom_metadata_map

@@ -10,9 +10,10 @@ from typing import Literal
 import torch
 
 from bevcli.checkpoints import load_weights
-from bevcli.config import load_config, load_training
-from bevcli.errors import OutputError
+from bevcli.config import TRAINING, load_config, load_table
+from bevcli.errors import ConfigError, OutputError
 from bevcli.model.bevformer import BEVFormer
+from bevcli.model.bevformer_v2 import BEVFormerV2Config
 from bevcli.training.augmentation import AugmentationConfig
 from bevcli.training.clips import ClipConfig
 from bevcli.training.drives import Drives, check_training_seeds, open_drives, split_drives
@@ -112,13 +113,15 @@ def prepare_training(
         BevcliError: a file, the choice of drives, or the output folder is wrong.
     """
     model_config = load_config(model_name_or_file)
-    config = load_training(model_name_or_file, TrainingConfig)
+    config = load_table(model_name_or_file, TRAINING, TrainingConfig)
     config = config if steps is None else replace(config, steps=steps)
     out = Path("runs") / f"train-{model_config.name}" if out is None else out
     check_training_seeds(rendered_seeds or ())
     drives = open_drives(folders, rendered_seeds, out / "drives", model_config)
     drives, held_out = split_drives(drives, config.held_out)
     prepare_folder(out, resume=resume)
+    if isinstance(model_config, BEVFormerV2Config):
+        raise ConfigError(f"model {model_config.name} is a BEVFormerV2, which cannot be trained yet (use a BEVFormer)")
     model = BEVFormer(model_config)
     if weights is not None:
         load_weights(weights, model, resample=True)
