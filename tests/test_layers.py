@@ -8,7 +8,7 @@ import bevcli
 ROOT = Path(bevcli.__file__).parent
 # From the lowest to the highest; names in one set may not import each other.
 LAYERS = (
-    {"errors", "findings"},
+    {"duration", "errors", "findings"},
     {"geometry"},
     {"frame"},
     {"model"},

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from bevcli.cli.input_options import DeviceOption, complete_model
+from bevcli.cli.input_options import DeviceOption, complete_model, parse_position
 
 DEFAULT_FRAME = 10
 
@@ -74,7 +74,7 @@ def explain(
     from bevcli.pipeline.model_loading import load_model
     from bevcli.sequences.open import open_sequence
 
-    followed = None if cell is None else parse_cell(cell)
+    followed = None if cell is None else parse_position(cell, "--cell")
     loaded = load_model(model, weights, device=device, untrained=untrained)
     drive = open_sequence(sequence, scene=scene, rate_hz=loaded.config.rate_hz)
     place = place_of_frame(frame, [stamp.index for stamp in drive.stamps])
@@ -85,17 +85,6 @@ def explain(
     typer.echo(f"frame {traced.frame.stamp.index}, BEV cell at x {x:.2f} m, y {y:.2f} m (bev frame)")
     for figure in write_figures(traced, out, image_format, untrained=loaded.untrained):
         typer.echo(f"{figure.step}: left out, {figure.left_out}" if figure.path is None else str(figure.path))
-
-
-def parse_cell(text: str) -> tuple[float, float]:
-    """ "X,Y" -> x, y in metres. Raises click's usage error."""
-    try:
-        x, y = (float(part) for part in text.split(","))
-    except ValueError:
-        raise typer.BadParameter(
-            f'"{text}": expected two numbers X,Y in metres, such as -7.5,13.5', param_hint="--cell"
-        ) from None
-    return x, y
 
 
 def place_of_frame(frame: int | None, indices: list[int]) -> int:

@@ -155,6 +155,17 @@ def parse_rate(text: str | None, *, default_hz: float | None) -> float | None:
     return rate_hz
 
 
+def parse_position(text: str, option: str) -> tuple[float, float]:
+    """The value "X,Y" of an option in metres. Raises click's usage error."""
+    try:
+        x, y = map(float, text.split(","))
+    except ValueError:
+        raise typer.BadParameter(
+            f'"{text}" is not a position (expected X,Y in metres, such as 10,-2.5)', param_hint=option
+        ) from None
+    return x, y
+
+
 def parse_pairs(texts: list[str] | None, option: str, expected: str) -> dict[str, str]:
     """The values of a repeated option "NAME=VALUE" as a mapping. Raises click's usage error."""
     pairs = {}

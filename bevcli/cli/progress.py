@@ -8,22 +8,14 @@ import time
 from types import TracebackType
 from typing import TYPE_CHECKING, TextIO
 
+from bevcli.duration import duration
+
 if TYPE_CHECKING:
     import rich.progress
 
 LINES_ON_A_PIPE = 10  # about this many progress lines for a whole run
 SLOW_S = 2.0  # work whose units take longer also gets a line after the first one, and its pace in seconds
 LONGEST_SILENCE_S = 30.0  # between two lines on a pipe, if units are done meanwhile
-
-
-def duration(seconds: float) -> str:
-    """Seconds in words: "8 s", "2 min 05 s", "1 h 12 min"."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60:02d} s"
-    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
 
 
 class Progress:

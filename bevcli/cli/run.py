@@ -32,6 +32,7 @@ from bevcli.cli.input_options import (
     parse_class_map,
     parse_frames,
     parse_pairs,
+    parse_position,
     parse_rate,
     parse_topics,
 )
@@ -193,7 +194,8 @@ def run(
     from bevcli.recording.options import RecordingOptions
     from bevcli.sequences.open import open_sequence
 
-    recording = RecordingOptions(record, bev, score, tuple(map(parse_probe, probe or ())), vehicle_mesh, images)
+    probes = tuple(parse_position(text, "--probe") for text in probe or ())
+    recording = RecordingOptions(record, bev, score, probes, vehicle_mesh, images)
     loaded = load_model(model, weights, device=device, precision=precision, untrained=untrained)
     drive = open_sequence(
         sequence,
@@ -288,14 +290,3 @@ def warnings(frame: Frame, prediction: Prediction) -> list[str]:
     if prediction.started_anew.startswith("gap"):
         found.append(f"{where}: {prediction.started_anew}; the history starts anew")
     return found
-
-
-def parse_probe(text: str) -> tuple[float, float]:
-    """ "X,Y" -> metres. Raises click's usage error."""
-    try:
-        x, y = map(float, text.split(","))
-    except ValueError:
-        raise typer.BadParameter(
-            f'"{text}" is not a position (expected X,Y in metres, such as 10,-2.5)', param_hint="--probe"
-        ) from None
-    return x, y

@@ -8,6 +8,7 @@ from pathlib import Path
 from statistics import median
 
 from bevcli import __version__
+from bevcli.duration import duration
 from bevcli.frame import Frame, Prediction, Sequence
 from bevcli.pipeline.model_loading import Model
 
@@ -101,7 +102,7 @@ class RunSummary:
         guessed = [f"{name} as {given}" for name, given in self._embeddings.items() if name != given]
         stages = ", ".join(f"{stage} {1000 * median(s):.0f} ms" for stage, s in self._seconds.items())
         rows = [
-            ("frames", f"{len(self._whole)} in {_duration(sum(self._whole))}, {self._rate():.2f} per second"),
+            ("frames", f"{len(self._whole)} in {duration(sum(self._whole))}, {self._rate():.2f} per second"),
             ("boxes", f"{sum(self._boxes.values())} with a score of {self._score:g} or more"),
             ("stages", f"{stages} (medians)"),
         ]
@@ -118,13 +119,3 @@ class RunSummary:
 
     def _rate(self) -> float:
         return len(self._whole) / sum(self._whole) if self._whole else 0.0
-
-
-def _duration(seconds: float) -> str:
-    """Seconds in words: "8 s", "2 min 05 s", "1 h 12 min"."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60:02d} s"
-    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from memory_drive import MemorySequence, WithoutImages
+from runs import CPU, run
 
 from bevcli.geometry.transforms import Pose, inverse
 from bevcli.model.bev_fusion import BevFusionConfig
@@ -16,10 +17,8 @@ from bevcli.model.bevformer import BEVFormerConfig
 from bevcli.model.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config, fill_window
 from bevcli.model.fpn import FPNConfig
 from bevcli.pipeline.preprocess import Preprocessor
-from bevcli.pipeline.runner import Runner, StepOptions
+from bevcli.pipeline.runner import Runner
 from bevcli.pipeline.temporal import other_bev_from_bev
-
-CPU = torch.device("cpu")
 
 
 @pytest.fixture(scope="module")
@@ -37,16 +36,6 @@ def window_model(mini_config: BEVFormerConfig):
         return model
 
     return make
-
-
-def run(model, sequence, places=None, state=None, **options):
-    runner = Runner(model, CPU, StepOptions(**options))
-    places = range(len(sequence.stamps)) if places is None else places
-    predictions = []
-    for _, prediction, after in runner.run(sequence, places, Preprocessor(model.config), state):
-        predictions.append(prediction)
-        state = after
-    return predictions, state
 
 
 def assert_same(one, other):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from memory_drive import MemorySequence, WithoutImages, make_rig
+from runs import CPU, run
 
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import apply
@@ -12,18 +13,6 @@ from bevcli.model.pillar_projection import project_pillars
 from bevcli.pipeline.camera_assignment import NUSCENES_YAWS_DEG
 from bevcli.pipeline.preprocess import Preprocessor
 from bevcli.pipeline.runner import Runner, StepOptions
-
-CPU = torch.device("cpu")
-
-
-def run(model, sequence, places=None, state=None, **options):
-    runner = Runner(model, CPU, StepOptions(**options))
-    places = range(len(sequence.stamps)) if places is None else places
-    predictions = []
-    for _, prediction, after in runner.run(sequence, places, Preprocessor(model.config), state):
-        predictions.append(prediction)
-        state = after
-    return predictions, state
 
 
 def assert_same(one, other):

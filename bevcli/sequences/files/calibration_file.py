@@ -37,19 +37,15 @@ class RigDraft:
 
 def read_calibration(path: Path) -> CameraRig:
     """The rig in calibration.json. Raises InputError with the first mistake in the file."""
-    return _without_errors(path).rig
+    return read_rig_and_facts(path)[0]
 
 
-def read_facts(path: Path) -> DriveFacts:
-    """What calibration.json states about the drive. Raises InputError with the first mistake in the file."""
-    return _without_errors(path).facts
-
-
-def _without_errors(path: Path) -> RigDraft:
+def read_rig_and_facts(path: Path) -> tuple[CameraRig, DriveFacts]:
+    """The rig in calibration.json, and what the file states about the drive. Raises as `read_calibration`."""
     draft = draft_calibration(path)
     for error in errors_of(draft.findings):
         raise InputError(f"{path}: {error.line}")
-    return draft
+    return draft.rig, draft.facts
 
 
 def draft_calibration(path: Path) -> RigDraft:

@@ -9,7 +9,7 @@ from bevcli.errors import InputError
 from bevcli.frame import DriveFacts, Frame, FrameStamp
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
-from bevcli.sequences.files.calibration_file import read_calibration, read_facts
+from bevcli.sequences.files.calibration_file import read_rig_and_facts
 from bevcli.sequences.frame_reading import read_frame
 from bevcli.sequences.images import ImageReader
 from bevcli.sequences.native.ego_motion_file import read_ego_motion
@@ -52,8 +52,7 @@ class FolderSequence:
         self.path = path
         self.name = path.resolve().name
         calibration = path / "calibration.json"
-        self.rig = read_calibration(calibration) if rig is None else rig
-        self.facts = read_facts(calibration) if calibration.is_file() and rig is None else DriveFacts()
+        self.rig, self.facts = read_rig_and_facts(calibration) if rig is None else (rig, DriveFacts())
         self._entries, notes = _read_entries(path, self.rig)
         self.ego_motion, motion_notes = _read_motion(
             ego_motion_file or path / "ego_motion.csv", ego_motion, self._entries

@@ -14,7 +14,7 @@ from bevcli.frame import DriveFacts, Frame, FrameStamp
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
 from bevcli.geometry.transforms import Array, rigid
-from bevcli.sequences.files.calibration_file import read_calibration, read_facts
+from bevcli.sequences.files.calibration_file import read_rig_and_facts
 from bevcli.sequences.frame_reading import read_frame
 from bevcli.sequences.images import ImageReader, Source
 from bevcli.sequences.native.ego_motion_file import read_ego_motion
@@ -61,9 +61,11 @@ class RosSequence:
         self._bag = Bag(path)
         folder = path.parent if path.is_file() else path
         beside: list[str] = []
-        if rig is None and (folder / CALIBRATION_FILE).is_file():
-            rig = read_calibration(folder / CALIBRATION_FILE)
-            beside.append(f"{folder / CALIBRATION_FILE} is used in place of the calibration in the bag")
+        calibration = folder / CALIBRATION_FILE
+        stated_rig, stated_facts = read_rig_and_facts(calibration) if calibration.is_file() else (None, DriveFacts())
+        if rig is None and stated_rig is not None:
+            rig = stated_rig
+            beside.append(f"{calibration} is used in place of the calibration in the bag")
         if ego_motion_file is None and ego_motion != "static" and (folder / EGO_MOTION_FILE).is_file():
             ego_motion_file = folder / EGO_MOTION_FILE
             beside.append(f"{ego_motion_file} is used in place of the poses in the bag")
@@ -75,8 +77,6 @@ class RosSequence:
         motion = _find_motion(self._bag, finder, stated, tree, reader, ego_motion, ego_motion_file)
         self._motion = motion.poses
         self.has_ego_motion = motion.poses is not None
-        calibration = folder / CALIBRATION_FILE
-        stated_facts = read_facts(calibration) if calibration.is_file() else DriveFacts()
         self.facts = replace(
             stated_facts, geo_origin=stated_facts.geo_origin or find_geo_origin(self._bag, motion.poses)
         )
