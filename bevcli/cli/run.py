@@ -203,6 +203,8 @@ def notes(model: Model, drive: Sequence) -> list[str]:
     found = list(drive.notes)
     if model.untrained:
         found.append("the weights are UNTRAINED: random weights, the boxes are meaningless")
+    if model.left_out:
+        found.append(f"{model.weights}: left out, and not run: {', '.join(model.left_out)}")
     if model.bundled:
         found.append("these weights were trained on rendered streets, not on the real world (docs/model-card.md)")
     return found

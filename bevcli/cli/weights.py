@@ -80,6 +80,7 @@ def _as_data(summary: CheckpointSummary) -> dict[str, object]:
         "parameters": summary.parameters,
         "file_bytes": summary.file_bytes,
         "states": dict(summary.facts),
+        "left_out": list(summary.left_out),
     }
 
 
@@ -91,6 +92,8 @@ def _as_text(summary: CheckpointSummary) -> str:
         f"  fits            {', '.join(summary.models) or 'none of our models'}",
     ]
     lines += [f"  {name:<15} {value}" for name, value in summary.facts.items()]
+    if summary.left_out:
+        lines.append(f"  left out        {', '.join(summary.left_out)} (objects that are no weights; nothing was run)")
     return "\n".join(lines)
 
 

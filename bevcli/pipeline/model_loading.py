@@ -28,6 +28,7 @@ class Model:
         precision: of the image features; the rest of the network computes in float32.
         weights: the file that the weights came from, None for random weights.
         bundled: whether that file is part of the package.
+        left_out: classes and functions in the file whose objects were not read.
     """
 
     network: BEVFormer
@@ -35,6 +36,7 @@ class Model:
     precision: Precision = "fp32"
     weights: Path | None = None
     bundled: bool = False
+    left_out: tuple[str, ...] = ()
 
     @property
     def config(self) -> BEVFormerConfig:
@@ -100,9 +102,9 @@ def load_model(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(UNTRAINED_SEED)
         network = BEVFormer(config)
-    if file is not None:
-        load_weights(file, network)
-    return Model(network.eval(), target, choose_precision(precision, target), file, bundled=bundled is not None)
+    left_out = () if file is None else load_weights(file, network).left_out
+    chosen = choose_precision(precision, target)
+    return Model(network.eval(), target, chosen, file, bundled=bundled is not None, left_out=left_out)
 
 
 def _model_of(weights: Path) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 
@@ -37,7 +38,15 @@ def load_checkpoint(path: Path, trained: nn.Module, optimizer: torch.optim.AdamW
         return int(contents["step"])
     except FileNotFoundError:
         raise WeightsError(f"{path}: no checkpoint to resume from; leave out --resume to start a training") from None
-    except (RuntimeError, ValueError, KeyError, TypeError, EOFError) as error:
+    except (
+        pickle.UnpicklingError,
+        RuntimeError,
+        ValueError,
+        LookupError,
+        TypeError,
+        AttributeError,
+        EOFError,
+    ) as error:
         reason = str(error).split("\n")[0]
         raise WeightsError(f"{path}: is not a checkpoint of this model: {reason}") from error
 
