@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
-import tomllib
 import types
 import typing
 from importlib import resources
@@ -14,6 +13,8 @@ from typing import Any, Literal, TypeVar
 
 from bevcli.errors import ConfigError
 from bevcli.model.bevformer import BEVFormerConfig
+from bevcli.parsing.documents import TOML_BYTES, parse_toml
+from bevcli.parsing.files import read_text
 
 T = TypeVar("T")
 
@@ -43,10 +44,7 @@ def load_training(name_or_path: str | Path, kind: type[T]) -> T:
 
 
 def _parse(text: str, file: str) -> dict[str, Any]:
-    try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{file}: invalid TOML: {error}") from error
+    return parse_toml(text, file, ConfigError)
 
 
 def _read_model(name: str) -> tuple[str, str]:
@@ -64,10 +62,7 @@ def _read_model(name: str) -> tuple[str, str]:
 
 
 def _read(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}") from error
+    return read_text(path, TOML_BYTES, error=ConfigError)
 
 
 def _dataclass(table: dict[str, Any], kind: type[T], file: str, prefix: str) -> T:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from bevcli.cli.input_options import (
+    AllowOutsideOption,
     ExtrinsicsOption,
     IntrinsicsOption,
     SceneOption,
@@ -30,6 +31,7 @@ def convert(
     sweeps: SweepsOption = False,
     intrinsics: IntrinsicsOption = None,
     extrinsics: ExtrinsicsOption = None,
+    allow_outside: AllowOutsideOption = False,
     force: Annotated[bool, typer.Option("--force", help="Overwrite an existing sequence in OUT_SEQUENCE.")] = False,
 ) -> None:
     """Write any input as a native sequence folder.
@@ -53,6 +55,7 @@ def convert(
         sweeps=sweeps,
         intrinsics=intrinsics,
         extrinsics=extrinsics,
+        allow_outside=allow_outside,
     )
     for note in sequence.notes:
         typer.echo(f"note: {note}", err=True)

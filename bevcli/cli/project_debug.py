@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from bevcli.cli.input_options import AllowOutsideOption
+
 ERRORS_FOUND = 3
 
 
@@ -20,6 +22,7 @@ def project_debug(
         Path | None,
         typer.Option(help="The output folder. Default: runs/<name>-project-debug.", show_default=False),
     ] = None,
+    allow_outside: AllowOutsideOption = False,
     json: Annotated[
         bool, typer.Option("--json", help="Print the findings and the coverage as one JSON object.")
     ] = False,
@@ -34,7 +37,7 @@ def project_debug(
     """
     from bevcli.rig.check_calibration import check_calibration
 
-    check = check_calibration(calibration, sequence, frame)
+    check = check_calibration(calibration, sequence, frame, allow_outside=allow_outside)
     written = check.write(out or Path("runs") / f"{check.name}-project-debug")
     if json:
         print(check.to_json())

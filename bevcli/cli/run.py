@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from bevcli.cli.input_options import (
+    AllowOutsideOption,
     EveryOption,
     ExtrinsicsOption,
     FramesOption,
@@ -93,6 +94,7 @@ def run(
     sweeps: SweepsOption = False,
     intrinsics: IntrinsicsOption = None,
     extrinsics: ExtrinsicsOption = None,
+    allow_outside: AllowOutsideOption = False,
     out: Annotated[
         Path | None, typer.Option(help="Default: runs/SEQUENCE-MODEL.", rich_help_panel=OUTPUT, show_default=False)
     ] = None,
@@ -176,6 +178,7 @@ def run(
         sweeps=sweeps,
         intrinsics=intrinsics,
         extrinsics=extrinsics,
+        allow_outside=allow_outside,
     )
     out = Path("runs") / f"{drive.name}-{loaded.name}" if out is None else out
     options = RunOptions(temporal, dict(map(parse_camera, camera or ())), recording, save_bev)
@@ -216,6 +219,8 @@ def warnings(frame: Frame, prediction: Prediction) -> list[str]:
     found = [f"{where}: camera {camera} has no image: {why}" for camera, why in frame.dropped.items()]
     if prediction.skipped:
         found.append(f"{where}: no camera has an image; the state is passed on to the next frame")
+    if prediction.not_finite:
+        found.append(f"{where}: NaN or infinity in {prediction.not_finite}; no boxes, the history starts anew")
     if prediction.started_anew.startswith("gap"):
         found.append(f"{where}: {prediction.started_anew}; the history starts anew")
     return found

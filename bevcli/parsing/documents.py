@@ -1,7 +1,8 @@
 """JSON, TOML and YAML with limits on nesting and on the size of numbers.
 
 Parsers refuse a broken text, but many well-formed texts break the code behind them: lists nested a thousand levels
-deep, integers that no array can hold, YAML objects that contain themselves. They are refused here, once for all readers.
+deep, integers that no array can hold, YAML objects that contain themselves. They are refused here, for all
+readers.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ def read_json(
 
 
 def parse_json(text: bytes, path: Path, *, pairs: Callable[[list[tuple[str, Any]]], Any] | None = None) -> Any:
-    """Parses JSON with at most 64 nested levels and integers of at most 62 bits. Raises InputError that names `path`."""
+    """Parses JSON: at most 64 nested levels, integers of at most 62 bits. Raises InputError, which names `path`."""
     if _depth_bound(text) > DEEPEST and _exact_depth(text) > DEEPEST:
         raise InputError(f"{path}: is nested too deeply (expected at most {DEEPEST} levels of lists and objects)")
 

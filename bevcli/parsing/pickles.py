@@ -93,6 +93,9 @@ class PickleReader:
             raise PickleError("the pickle is cut off")
         return data
 
+    def _skip(self, count: int) -> None:
+        self._bytes(count)
+
     def _integer(self, width: int) -> int:
         return int.from_bytes(self._bytes(width), "little")
 
@@ -230,7 +233,7 @@ def _number(pattern: str) -> Callable[[PickleReader], None]:
 
 _HANDLERS: dict[bytes, Callable[[PickleReader], None]] = {
     b"\x80": PickleReader._protocol,
-    b"\x95": lambda reader: reader._bytes(8) and None,  # FRAME: only a hint for buffering
+    b"\x95": lambda reader: reader._skip(8),  # FRAME: only a hint for buffering
     b"(": lambda reader: reader._push(_MARK),
     b"0": lambda reader: reader._pop() and None,
     b"N": _constant(lambda: None),

@@ -29,6 +29,7 @@ class RunSummary:
         self._boxes: Counter[str] = Counter()
         self._dropped: list[dict[str, object]] = []
         self._skipped: list[int] = []
+        self._not_finite: list[dict[str, object]] = []
         self._started_anew: list[dict[str, object]] = []
         self._embeddings: dict[str, str] = {}
 
@@ -52,6 +53,8 @@ class RunSummary:
         self._dropped += [{"frame": index, "camera": name, "reason": why} for name, why in frame.dropped.items()]
         if prediction.skipped:
             self._skipped.append(index)
+        if prediction.not_finite:
+            self._not_finite.append({"frame": index, "where": prediction.not_finite})
         if prediction.started_anew:
             self._started_anew.append({"frame": index, "reason": prediction.started_anew})
 
@@ -77,6 +80,7 @@ class RunSummary:
             "camera_embeddings": self._embeddings,
             "dropped_pictures": self._dropped,
             "skipped_frames": self._skipped,
+            "not_finite_frames": self._not_finite,
             "started_anew": self._started_anew,
             "notes": list(self._sequence.notes),
             "files": [str(path) for path in self.files],
@@ -101,6 +105,9 @@ class RunSummary:
             rows.append(("cameras", f"{', '.join(guessed)} (embeddings; --camera changes them)"))
         if self._dropped:
             rows.append(("dropped", f"{len(self._dropped)} images, {len(self._skipped)} frames without any"))
+        if self._not_finite:
+            first = self._not_finite[0]
+            rows.append(("failed", f"{len(self._not_finite)} frames: NaN or infinity, first in {first['where']}"))
         if self._model.untrained:
             rows.append(("weights", "UNTRAINED: random weights, the boxes are meaningless"))
         rows += [("written", str(path)) for path in self.files]

@@ -19,6 +19,7 @@ from bevcli.model.prepared import Precision
 from bevcli.model.segmentation import decode_maps
 from bevcli.pipeline.attention import AttentionProbe, attention_view, probe_cells
 from bevcli.pipeline.model_inputs import model_inputs
+from bevcli.pipeline.not_finite import is_finite, origin
 from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
 from bevcli.pipeline.read_ahead import read_ahead
 from bevcli.pipeline.stage_clock import StageClock
@@ -60,7 +61,11 @@ class Runner:
 
     @torch.inference_mode()
     def step(self, state: BevState | None, prepared: PreparedFrame) -> tuple[BevState | None, Prediction]:
-        """One frame. A frame without any image passes the state on: the next alignment spans it."""
+        """One frame. A frame without any image passes the state on: the next alignment spans it.
+
+        Where the model's numbers stop being finite, the prediction has no boxes and says where, and the state is None:
+        the next frame starts anew.
+        """
         frame = prepared.frame
         started_anew = self._reason_to_start_anew(state, frame.stamp)
         if started_anew:
@@ -71,7 +76,11 @@ class Runner:
         with self.clock:
             with self._autocast(), probe or contextlib.nullcontext():
                 inputs = self._inputs(prepared, state)
-                outputs = self.model(inputs, None if state is None else state.bev)
+                history = None if state is None else state.bev
+                outputs = self.model(inputs, history)
+                if not is_finite(outputs):
+                    where = origin(self.model, inputs, history)
+                    return None, self._prediction(prepared, started_anew, Boxes3D.empty(), None, not_finite=where)
             boxes = decode(outputs, self.config)[0]
             self.clock.mark("box_decoding")
             segmentation = self._segmentation(outputs)
@@ -133,6 +142,7 @@ class Runner:
         bev: Tensor | None,
         attention: AttentionView | None = None,
         segmentation: BevMap | None = None,
+        not_finite: str = "",
     ) -> Prediction:
         frame, assignment = prepared.frame, prepared.assignment
         return Prediction(
@@ -144,7 +154,8 @@ class Runner:
             bev=bev,
             started_anew=started_anew,
             camera_embeddings=dict(zip(assignment.cameras, assignment.embeddings, strict=True)),
-            skipped=bev is None,
+            skipped=bev is None and not not_finite,
+            not_finite=not_finite,
             segmentation=segmentation,
             attention=attention,
             stage_seconds={} if bev is None else self.clock.read(),

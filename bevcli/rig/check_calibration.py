@@ -83,13 +83,16 @@ class CalibrationCheck:
         return [folder / name for name in ("cameras.png", "coverage.png", "recording.rrd", "findings.json")]
 
 
-def check_calibration(path: Path | str, sequence: Path | str | None = None, frame: int = 0) -> CalibrationCheck:
+def check_calibration(
+    path: Path | str, sequence: Path | str | None = None, frame: int = 0, *, allow_outside: bool = False
+) -> CalibrationCheck:
     """Find the mistakes in a calibration.
 
     Args:
         path: a calibration.json, a sequence folder that contains one, or a nuScenes root.
         sequence: a sequence folder whose images, ego-motion and timestamps belong to the calibration.
         frame: index of the frame in the sequence whose images are kept, from 0.
+        allow_outside: read images outside of the sequence's folder too, see `open_sequence`.
 
     Returns:
         The findings with what is needed to draw them. Mistakes in the calibration are findings, not exceptions.
@@ -97,7 +100,8 @@ def check_calibration(path: Path | str, sequence: Path | str | None = None, fram
     Raises:
         InputError: the file is missing or not a JSON object, or the sequence has no such frame.
     """
-    inputs = read_inputs(Path(path), None if sequence is None else Path(sequence), frame)
+    folder = None if sequence is None else Path(sequence)
+    inputs = read_inputs(Path(path), folder, frame, allow_outside=allow_outside)
     report = with_findings(check_rig(inputs.rig, inputs.rig_findings), inputs.sequence_findings)
     return CalibrationCheck(inputs.name, inputs.rig, report, inputs.images)
 

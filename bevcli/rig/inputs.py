@@ -43,42 +43,44 @@ class CalibrationInputs:
     images: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
 
 
-def read_inputs(path: Path, sequence: Path | None, frame: int) -> CalibrationInputs:
+def read_inputs(path: Path, sequence: Path | None, frame: int, *, allow_outside: bool = False) -> CalibrationInputs:
     """Read a calibration.json or a sequence with its own calibration.
 
     sequence: a folder that gives images and ego-motion to a calibration.json elsewhere. frame: index of the frame whose
-    images are read. Raises InputError where the file is missing or not a JSON object, or there is no such frame.
+    images are read. allow_outside: whether images may lie outside of the folder.
+    Raises InputError where the file is missing or not a JSON object, or there is no such frame.
     """
     if path.is_dir() and not (path / CALIBRATION).exists():
-        return _read_other_sequence(path, frame)
+        return _read_other_sequence(path, frame, allow_outside)
     file = path / CALIBRATION if path.is_dir() else path
     draft = draft_calibration(file)
     folder = path if path.is_dir() and sequence is None else sequence
     name = (folder or file.with_suffix("")).resolve().name
     if folder is None or not draft.rig.cameras:
         return CalibrationInputs(name, draft.rig, draft.findings)
-    findings, images = _read_folder(folder, draft.rig, frame)
+    findings, images = _read_folder(folder, draft.rig, frame, allow_outside)
     return CalibrationInputs(name, draft.rig, draft.findings, findings, images)
 
 
-def _read_other_sequence(path: Path, frame: int) -> CalibrationInputs:
+def _read_other_sequence(path: Path, frame: int, allow_outside: bool) -> CalibrationInputs:
     """A sequence that is not a native folder, such as a nuScenes root, read as `bevcli run` reads it."""
-    sequence = open_sequence(path)
+    sequence = open_sequence(path, allow_outside=allow_outside)
     shown = sequence.load(_checked_index(sequence.stamps, frame, path))
     return CalibrationInputs(sequence.name, shown.rig, (), _missing_images(shown), _pixels(shown))
 
 
 def _read_folder(
-    folder: Path, rig: CameraRig, frame: int
+    folder: Path, rig: CameraRig, frame: int, allow_outside: bool
 ) -> tuple[tuple[Finding, ...], Mapping[str, NDArray[np.uint8]]]:
     """The findings about a native folder, and the images of one of its frames."""
     findings: list[Finding] = []
     try:
-        sequence = FolderSequence(folder, rig=rig, ego_motion="optional")
+        sequence = FolderSequence(folder, rig=rig, ego_motion="optional", allow_outside=allow_outside)
     except InputError as error:
         findings.append(_refused(error))
         try:
-            sequence = FolderSequence(folder, rig=rig, ego_motion="static")  # images may be readable without ego-motion
+            # Images may be readable without ego-motion.
+            sequence = FolderSequence(folder, rig=rig, ego_motion="static", allow_outside=allow_outside)
         except InputError:
             return tuple(findings), {}
     if sequence.ego_motion is not None:

@@ -30,6 +30,7 @@ class _Options:
     sweeps: bool
     intrinsics: Path | None
     extrinsics: Path | None
+    allow_outside: bool
 
 
 def open_sequence(
@@ -46,6 +47,7 @@ def open_sequence(
     sweeps: bool = False,
     intrinsics: str | Path | None = None,
     extrinsics: str | Path | None = None,
+    allow_outside: bool = False,
 ) -> Sequence:
     """Open a drive: a native sequence folder (with images or videos) or a nuScenes dataset root.
 
@@ -71,6 +73,7 @@ def open_sequence(
         sweeps: nuScenes: also the images between the keyframes.
         intrinsics: native folder: Kalibr or ROS intrinsics that, with `extrinsics`, replace calibration.json.
         extrinsics: native folder: JSON with the cameras' poses, see `kalibr_ros.read_rig`.
+        allow_outside: read images outside of the folder too: absolute paths, "..", and links that lead out of it.
 
     Raises InputError if the folder has no known format, a file in it is missing or invalid, an option does not apply
     to the format, or no frame is left. Its messages name the options as the command line does, such as --scene.
@@ -82,8 +85,8 @@ def open_sequence(
         raise InputError(f"--rate {rate_hz:g}: expected frames per second, above 0")
     if every is not None and every < 1:
         raise InputError(f"--every {every}: expected an integer, 1 or more")
-    files = tuple(None if file is None else Path(file) for file in (intrinsics, extrinsics))
-    options = _Options(ego_motion, strict, scene, version, split, sweeps, *files)
+    yaml, poses = (None if file is None else Path(file) for file in (intrinsics, extrinsics))
+    options = _Options(ego_motion, strict, scene, version, split, sweeps, yaml, poses, allow_outside)
     sequence = _opener_of(path)(path, options)
     if every is not None:
         sequence = select_every(sequence, every)
@@ -98,7 +101,7 @@ def _open_nuscenes(path: Path, options: _Options) -> Sequence:
     if options.ego_motion == "static":
         raise InputError(f"{path}: a nuScenes root has its own ego-motion: remove --static")
     choice = NuScenesChoice(options.version, options.scene, options.split, options.sweeps)
-    return NuScenesSequence(path, choice, strict=options.strict)
+    return NuScenesSequence(path, choice, strict=options.strict, allow_outside=options.allow_outside)
 
 
 def _open_native_folder(path: Path, options: _Options) -> Sequence:
@@ -107,7 +110,9 @@ def _open_native_folder(path: Path, options: _Options) -> Sequence:
             f"{path}: --version, --split and --sweeps are for nuScenes roots (found no v1.0-* folder): remove them"
         )
     rig = read_rig(options.intrinsics, options.extrinsics)
-    sequence = FolderSequence(path, ego_motion=options.ego_motion, strict=options.strict, rig=rig)
+    sequence = FolderSequence(
+        path, ego_motion=options.ego_motion, strict=options.strict, rig=rig, allow_outside=options.allow_outside
+    )
     return sequence if options.scene is None else select_scene(sequence, options.scene)
 
 

@@ -15,6 +15,8 @@ from bevcli.errors import OutputError, WeightsError
 from bevcli.model.bevformer import BEVFormer
 
 FORMAT = "bevcli-training/1"
+# The exceptions for a file that PyTorch cannot read, or whose contents belong to another model.
+_DAMAGE = (pickle.UnpicklingError, RuntimeError, ValueError, LookupError, TypeError, AttributeError, EOFError)
 
 
 def save_checkpoint(path: Path, step: int, trained: nn.Module, optimizer: torch.optim.AdamW) -> None:

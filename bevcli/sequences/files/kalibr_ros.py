@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from bevcli.errors import InputError
 from bevcli.findings import errors_of
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.transforms import Array, inverse
+from bevcli.parsing.documents import read_json, read_yaml
 from bevcli.sequences.files.camera_fields import parse_camera
 from bevcli.sequences.files.json_fields import Report, parse_numbers
 from bevcli.sequences.files.transform_json import parse_transform, transform_to_json
@@ -80,14 +79,7 @@ def _cameras_in(path: Path) -> Iterator[tuple[str, Fields]]:
 
 
 def _load_yaml(path: Path) -> Mapping[str, Any]:
-    try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: the file is missing") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({error})") from None
-    except yaml.YAMLError as error:
-        raise InputError(f"{path}: broken YAML ({' '.join(str(error).split())})") from None
+    document = read_yaml(path)
     if not isinstance(document, dict):
         raise InputError(f"{path}: expected a mapping (Kalibr camchain or ROS camera_info)")
     return document
@@ -148,12 +140,7 @@ def _lens(model: str, coefficients: list[float], known: Mapping[str, str], where
 
 
 def _read_extrinsics(path: Path) -> Mapping[str, Any]:
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: the file is missing") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as JSON ({error})") from None
+    document = read_json(path)
     if not isinstance(document, dict) or not isinstance(document.get("cameras"), dict):
         raise InputError(
             f'{path}: "cameras" is missing (expected {{"cameras": {{"cam0": {{"ego_from_camera": ...}}}}}})'

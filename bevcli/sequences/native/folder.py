@@ -35,7 +35,7 @@ def is_native_folder(path: Path) -> bool:
 class FolderSequence:
     """A native sequence folder as a `Sequence`.
 
-    rig: used in place of calibration.json, if given.
+    rig: used in place of calibration.json, if given. allow_outside: whether images may lie outside of the folder.
     Raises InputError if a file of the folder is missing or invalid.
     """
 
@@ -46,6 +46,7 @@ class FolderSequence:
         ego_motion: EgoMotionUse = "required",
         strict: bool = False,
         rig: CameraRig | None = None,
+        allow_outside: bool = False,
     ) -> None:
         if not path.is_dir():
             raise InputError(f"{path}: the sequence folder is missing")
@@ -53,11 +54,13 @@ class FolderSequence:
         self.name = path.resolve().name
         self.rig = read_calibration(path / "calibration.json") if rig is None else rig
         self._entries, notes = _read_entries(path, self.rig)
+        if not allow_outside:
+            _check_paths(path, self._entries)
         self.ego_motion, motion_notes = _read_motion(path, ego_motion, self._entries)
         self.has_ego_motion = self.ego_motion is not None
         self.notes = (*_rig_notes(self.rig), *notes, *motion_notes)
         self._truth = FolderGroundTruth(path)
-        self._images = ImageReader(strict=strict)
+        self._images = ImageReader(strict=strict, inside=None if allow_outside else path)
 
     @property
     def stamps(self) -> tuple[FrameStamp, ...]:
@@ -97,6 +100,17 @@ def _read_entries(path: Path, rig: CameraRig) -> tuple[tuple[FrameEntry, ...], t
     found = find_frames(path, rig.names)
     check_times(found.entries)
     return found.entries, (found.note,)
+
+
+def _check_paths(folder: Path, entries: tuple[FrameEntry, ...]) -> None:
+    """Raise InputError for an absolute path or one with "..". Links are followed when the image is read."""
+    for entry in entries:
+        for camera, source in entry.sources.items():
+            if not source.path.is_relative_to(folder) or ".." in source.path.relative_to(folder).parts:
+                raise InputError(
+                    f"{entry.origin}: camera {camera}: {source.path}: leads out of the folder: "
+                    "pass --allow-outside to read it"
+                )
 
 
 def _camera_times(entry: FrameEntry, rig: CameraRig) -> dict[str, int]:

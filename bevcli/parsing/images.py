@@ -1,8 +1,12 @@
-"""The size of a JPEG or PNG from its header, before anything is decoded."""
+"""Decodes JPEG and PNG images. The size is read from the header first: a small file can state a size of gigabytes."""
 
 from __future__ import annotations
 
 import struct
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 # Markers of a JPEG that state its size (start of frame): all from C0 to CF except DHT, JPG and DAC.
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -14,6 +18,20 @@ def media_type_of(encoded: bytes) -> str | None:
     if encoded.startswith(b"\xff\xd8\xff"):
         return "image/jpeg"
     return "image/png" if encoded.startswith(b"\x89PNG\r\n\x1a\n") else None
+
+
+def decode_image(encoded: bytes, flags: int, most_pixels: int) -> NDArray | None:
+    """The pixels of a whole JPEG or PNG, as `cv2.imdecode` gives them.
+
+    None for another format, a damaged or cut file, and for an image with more than `most_pixels` pixels.
+    """
+    size = size_of_image(encoded)
+    if size is None or not 0 < size[0] * size[1] <= most_pixels or _is_cut_short(encoded):
+        return None
+    try:
+        return cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), flags)
+    except cv2.error:
+        return None
 
 
 def size_of_image(encoded: bytes) -> tuple[int, int] | None:
@@ -46,3 +64,10 @@ def _jpeg_size(encoded: bytes) -> tuple[int, int] | None:
             return None
         if marker and marker not in _WITHOUT_LENGTH:
             place += max(2, int.from_bytes(encoded[place : place + 2], "big"))
+
+
+def _is_cut_short(encoded: bytes) -> bool:
+    """Whether the end of a JPEG or PNG is missing. OpenCV fills the missing part with grey, without an error."""
+    if media_type_of(encoded) == "image/jpeg":
+        return encoded.rfind(b"\xff\xd9") < encoded.rfind(b"\xff\xda")  # the end marker comes before the last scan
+    return b"IEND" not in encoded[-64:]
