@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+import re
 import types
 import typing
 from importlib import resources
@@ -34,7 +35,12 @@ def load_config(name_or_path: str | Path) -> BEVFormerConfig:
     """
     text, file = _read_model(str(name_or_path))
     table = _parse(text, file)
-    return _dataclass({key: table[key] for key in table if key != TRAINING}, BEVFormerConfig, file, "")
+    config = _dataclass({key: table[key] for key in table if key != TRAINING}, BEVFormerConfig, file, "")
+    if not re.fullmatch(r"[\w][\w. +-]{0,99}", config.name):
+        raise ConfigError(
+            f'{file}: "name" must be up to 100 letters, digits and - . + (it names folders), is {config.name!r:.60}'
+        )
+    return config
 
 
 def load_training(name_or_path: str | Path, kind: type[T]) -> T:
