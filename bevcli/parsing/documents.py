@@ -23,6 +23,7 @@ from bevcli.parsing.files import MIB, read_bytes, read_text
 DEEPEST = 64  # levels of nested lists and objects
 LARGEST_INTEGER = 2**62  # the difference of two such integers still fits 64 bits
 JSON_BYTES, TOML_BYTES, YAML_BYTES = 64 * MIB, MIB, MIB // 4
+MOST_VALUES = 200_000  # of a TOML or YAML file
 _BRACKETS = b"[]{}"
 _NO_BRACKETS = bytes(set(range(256)) - set(_BRACKETS))
 _DIGITS_TO_ZERO = bytes.maketrans(b"123456789", b"000000000")
@@ -60,12 +61,15 @@ def parse_json(text: bytes, path: Path, *, pairs: Callable[[list[tuple[str, Any]
     # A Python function for integers makes parsing slow, and only a long row of digits needs it.
     long_number = b"0" * 19 in text.translate(_DIGITS_TO_ZERO)
     try:
-        return json.loads(text, object_pairs_hook=pairs, parse_int=integer if long_number else None)
+        document = json.loads(text, object_pairs_hook=pairs, parse_int=integer if long_number else None)
+        if b"\\u" in text:  # an escape may be half of a character, which no file or terminal takes
+            json.dumps(document, ensure_ascii=False).encode()
+        return document
     except json.JSONDecodeError as error:
         where = f"line {error.lineno}, column {error.colno}"
         raise InputError(f"{path}: {where}: broken JSON: {error.msg}") from None
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: cannot be read as JSON ({error})") from None
+    except UnicodeError as error:
+        raise InputError(f"{path}: cannot be read as JSON ({_first_line(error)})") from None
     except RecursionError:
         raise InputError(f"{path}: is nested too deeply to be read as JSON") from None
 
@@ -83,10 +87,10 @@ def parse_toml(text: str, path: str | Path, error: type[BevcliError] = InputErro
 
 
 def read_yaml(path: Path) -> Any:
-    """The contents of a YAML file with plain values and without aliases. Raises InputError."""
+    """The contents of a YAML file with plain values. Raises InputError."""
     text = read_text(path, YAML_BYTES)
     try:
-        _check_yaml_events(text, path)
+        _check_yaml_depth(text, path)
         document = yaml.load(text, _YamlLoader)  # the safe loader, which makes no Python objects
     except yaml.YAMLError as error:
         raise InputError(f"{path}: broken YAML ({_first_line(error)})") from None
@@ -99,6 +103,7 @@ def read_yaml(path: Path) -> Any:
 def check_values(document: Any, path: str | Path, error: type[BevcliError] = InputError) -> None:
     """Raises `error` where a parsed document is nested too deeply or contains an integer beyond 62 bits."""
     level = [document]
+    count = 0
     for _ in range(DEEPEST + 1):
         below: list[Any] = []
         for value in level:
@@ -108,17 +113,20 @@ def check_values(document: Any, path: str | Path, error: type[BevcliError] = Inp
                 below += value
             elif isinstance(value, int) and abs(value) > LARGEST_INTEGER:
                 raise error(f"{path}: an integer is too large (expected at most 62 bits)")
+            if len(below) > MOST_VALUES:
+                break
         if not below:
             return
+        count += len(below)
+        if count > MOST_VALUES:  # YAML's aliases can repeat a list in a list in a list
+            raise error(f"{path}: has more than {MOST_VALUES} values, aliases written out")
         level = below
     raise error(f"{path}: is nested too deeply (expected at most {DEEPEST} levels)")
 
 
-def _check_yaml_events(text: str, path: Path) -> None:
+def _check_yaml_depth(text: str, path: Path) -> None:
     depth = 0
     for event in yaml.parse(text, _YamlLoader):
-        if isinstance(event, yaml.AliasEvent):
-            raise InputError(f"{path}: the alias *{event.anchor} is not supported: write its contents out")
         if isinstance(event, yaml.CollectionStartEvent):
             depth += 1
         elif isinstance(event, yaml.CollectionEndEvent):

@@ -25,7 +25,7 @@ def read_bytes(
         if size > largest:
             raise error(f"{path}: the file has {_size(size)} (expected at most {_size(largest)})")
         try:
-            return file.read(largest)
+            return file.read(size)
         except OSError as failure:
             raise error(f"{path}: cannot be read ({failure.strerror})") from None
 
