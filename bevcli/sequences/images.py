@@ -105,7 +105,10 @@ class ImageReader:
         """Raises InputError for an image that lies outside of the sequence, also behind a link."""
         if self._inside is None:
             return
-        path = os.path.realpath(source.path)
+        try:
+            path = os.path.realpath(source.path)
+        except ValueError:  # a null byte
+            raise UnreadableImage(f"{str(source.path)!r} is not a file name") from None
         if os.path.commonpath((path, self._inside)) != self._inside:
             raise InputError(
                 f"{source.path}: leads out of the folder {self._inside} (to {path}): pass --allow-outside to read it"

@@ -14,9 +14,19 @@ Edit = tuple[str, int, int]
 BYTES = ("flip", "set", "cut", "repeat", "remove", "insert", "number")
 TEXT = ("word", "word", "swap")
 TREE = ("value", "value", "drop", "nest", "copy")
-KINDS = {"bytes": BYTES, "text": TEXT + BYTES, "json": TREE + TREE + TEXT + BYTES}
+KINDS = {"bytes": BYTES, "text": TEXT * 3 + BYTES, "json": TREE * 4 + TEXT * 2 + BYTES}
 
-ODD_BYTES = (b"\x00", b"\xff" * 8, b"\n" * 3, b"{" * 9, b"[" * 5000, b"\xf0\x9f\x98\x80", b"\xc3\x28", b'"', b"9" * 5000)
+ODD_BYTES = (
+    b"\x00",
+    b"\xff" * 8,
+    b"\n" * 3,
+    b"{" * 9,
+    b"[" * 5000,
+    b"\xf0\x9f\x98\x80",
+    b"\xc3\x28",
+    b'"',
+    b"9" * 5000,
+)
 ODD_NUMBERS = (0, 1, -1, 0x7F, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0xFFFFFFFF, 1 << 20, 1 << 31)
 ODD_WORDS = (
     b"", b"0", b"-1", b"nan", b"inf", b"-inf", b"1e308", b"1e400", b"9" * 19, b"-" + b"9" * 25, b"9" * 4400, b"1.5",

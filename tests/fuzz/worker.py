@@ -14,7 +14,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 SECONDS = 10.0
-MEMORY = 1 << 30  # bytes beyond what the libraries and the seed files take
+MEMORY = 1 << 30
 START_SECONDS = 240.0
 
 
@@ -77,7 +77,7 @@ def _serve(connection: Connection, seeds: Path, path: list[str]) -> None:
             os.dup2(silent.fileno(), 2)
         for reader in READERS.values():
             reader.read(own)
-        limit = _bytes_of("VmSize") + 2 * MEMORY
+        limit = _bytes_of("VmSize") + 4 * MEMORY
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
         base = _bytes_of("VmRSS")
         connection.send("ready")
@@ -103,7 +103,7 @@ def _outcome(reader, own: Path, data: bytes, base: int) -> str:
     finally:
         file.write_bytes(whole)
     grown = _bytes_of("VmHWM") - base
-    return answer if grown <= MEMORY else f"memory: {grown >> 20} MiB more than before; {answer}"
+    return answer if grown <= reader.memory else f"memory: {grown >> 20} MiB more than before; {answer}"
 
 
 def _bytes_of(name: str) -> int:

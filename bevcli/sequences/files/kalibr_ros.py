@@ -7,7 +7,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-
 from bevcli.errors import InputError
 from bevcli.findings import errors_of
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
