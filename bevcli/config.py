@@ -8,6 +8,7 @@ import math
 import re
 import types
 import typing
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -19,6 +20,7 @@ from bevcli.parsing.files import read_text
 
 T = TypeVar("T")
 
+TRACKING = "tracking"  # the table of a model's file with the parameters of the tracker
 TRAINING = "training"  # the table of a model's file with the settings of its training, which the model does not need
 
 
@@ -35,18 +37,21 @@ def load_config(name_or_path: str | Path) -> BEVFormerConfig:
     """
     text, file = _read_model(str(name_or_path))
     table = _parse(text, file)
-    config = _dataclass({key: table[key] for key in table if key != TRAINING}, BEVFormerConfig, file, "")
+    model = {key: table[key] for key in table if key not in (TRACKING, TRAINING)}
+    config = _dataclass(model, BEVFormerConfig, file, "")
     if not re.fullmatch(r"[\w][\w. +-]{0,99}", config.name):
-        raise ConfigError(
-            f'{file}: "name" must be up to 100 letters, digits and - . + (it names folders), is {config.name!r:.60}'
-        )
+        expected = "up to 100 letters, digits and - . + _, because it names folders"
+        raise ConfigError(f'{file}: "name" is {config.name!r:.60} (expected {expected})')
     return config
 
 
-def load_training(name_or_path: str | Path, kind: type[T]) -> T:
-    """The [training] table of a model's file as a dataclass of type `kind`; its defaults where the file has none."""
+def load_table(name_or_path: str | Path, table: str, kind: type[T]) -> T:
+    """A table of a model's file, TRACKING or TRAINING, as a dataclass of type `kind`; its defaults without the table.
+
+    Raises ConfigError where there is no such file, or where its contents are wrong.
+    """
     text, file = _read_model(str(name_or_path))
-    return _dataclass(_parse(text, file).get(TRAINING, {}), kind, file, f"{TRAINING}.")
+    return _dataclass(_parse(text, file).get(table, {}), kind, file, f"{table}.")
 
 
 def _parse(text: str, file: str) -> dict[str, Any]:
@@ -75,7 +80,9 @@ def _dataclass(table: dict[str, Any], kind: type[T], file: str, prefix: str) -> 
     fields = {field.name: field for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
     hints = typing.get_type_hints(kind)
     for key in table.keys() - fields.keys():
-        raise ConfigError(f'{file}: unknown key "{prefix}{key}"; {_nearest(key, list(fields))}')
+        renamed: Mapping[str, str] = getattr(kind, "RENAMED_KEYS", {})
+        hint = renamed[key] if key in renamed else _nearest(key, list(fields))
+        raise ConfigError(f'{file}: unknown key "{prefix}{key}"; {hint}')
     values = {key: _value(value, hints[key], file, prefix + key) for key, value in table.items()}
     for name, field in fields.items():
         optional = field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING

@@ -32,7 +32,9 @@ class Boxes3D:
         classes: (N,) class names.
         scores: (N,) confidence, 0 to 1. Optional.
         attributes: (N,) nuScenes attribute names, "" for none. Optional.
-        instances: (N,) object identities, constant over time. Optional.
+        instances: (N,) object identities, constant over time, "" for none. Optional.
+        track_scores: (N,) score of the track that a box belongs to, 0 to 1; NaN without a track. Optional.
+        duplicates: (N,) whether a better box describes the same object. Optional.
         visibilities: (N,) visible fraction, 0 to 1; NaN if unknown. Optional.
         num_points: (N,) number of lidar and radar points; boxes with 0 are not scored, -1 if unknown. Optional.
     """
@@ -45,6 +47,8 @@ class Boxes3D:
     scores: Array | None = None
     attributes: NDArray[np.str_] | None = None
     instances: NDArray[np.str_] | None = None
+    track_scores: Array | None = None
+    duplicates: NDArray[np.bool_] | None = None
     visibilities: Array | None = None
     num_points: NDArray[np.int64] | None = None
 
@@ -109,6 +113,30 @@ class Boxes3D:
         x = c * local[..., 0] - s * local[..., 1]
         y = s * local[..., 0] + c * local[..., 1]
         return np.stack([x, y, local[..., 2]], axis=-1) + self.centers[:, None, :]
+
+    def to_numpy(self) -> Array:
+        """(N, 9) float64: x, y, z of the centre, length, width, height, yaw, velocity x and y; metres, radians, m/s."""
+        return np.concatenate([self.centers, self.sizes_lwh, self.yaws[:, None], self.velocities], axis=1)
+
+    def to_dict(self) -> dict[str, list[Any]]:
+        """The boxes as a table: column name -> N values. `pandas.DataFrame` and `polars.DataFrame` take it.
+
+        The columns are class, score, x, y, z, length, width, height, yaw, vx, vy, attribute, instance, track_score,
+        duplicate, visibility and num_points, without the optional ones that are None.
+        """
+        numbers = ("x", "y", "z", "length", "width", "height", "yaw", "vx", "vy")
+        columns = {
+            "class": self.classes,
+            "score": self.scores,
+            **dict(zip(numbers, self.to_numpy().T, strict=True)),
+            "attribute": self.attributes,
+            "instance": self.instances,
+            "track_score": self.track_scores,
+            "duplicate": self.duplicates,
+            "visibility": self.visibilities,
+            "num_points": self.num_points,
+        }
+        return {name: column.tolist() for name, column in columns.items() if column is not None}
 
     def _map(self, change: Callable[[NDArray], NDArray]) -> Boxes3D:
         columns = {f.name: getattr(self, f.name) for f in fields(self)}

@@ -30,8 +30,10 @@ ODD_BYTES = (
 ODD_NUMBERS = (0, 1, -1, 0x7F, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0xFFFFFFFF, 1 << 20, 1 << 31)
 ODD_WORDS = (
     b"", b"0", b"-1", b"nan", b"inf", b"-inf", b"1e308", b"1e400", b"9" * 19, b"-" + b"9" * 25, b"9" * 4400, b"1.5",
-    b"true", b"null", b"[]", b"{}", b"../../etc/passwd", b"/dev/zero", b"/etc", b"a#99999999999999999999", b"2001-99-99",
-    b"x" * 3000, b"&a [*a]", b"!!python/object/apply:os.system [true]", b"0x7fffffffffffffffff", b"1:2:3:4", b"<<", b"~",
+    b"true", b"null", b"[]", b"{}", b"../../etc/passwd", b"/dev/zero", b"/etc",
+    b"a#99999999999999999999", b"2001-99-99",
+    b"x" * 3000, b"&a [*a]", b"!!python/object/apply:os.system [true]", b"0x7fffffffffffffffff",
+    b"1:2:3:4", b"<<", b"~",
     b"\x00", b"\xe2\x80\xae", b"[" * 2000, b"1_0", b"'", b"=", b"1e-320", b"\xc2\xb2",
 )  # fmt: skip
 ODD_VALUES: tuple[Any, ...] = (

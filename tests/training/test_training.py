@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 from painted_drives import CONFIG, PaintedDrives
+from safetensors.torch import load_file
 
 from bevcli.checkpoints import load_weights
-from bevcli.config import load_config, load_training
+from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import BevcliError, ConfigError, InputError, OutputError, WeightsError
 from bevcli.model.bevformer import BEVFormer
 from bevcli.training.augmentation import AugmentationConfig
@@ -18,9 +19,9 @@ from bevcli.training.checkpoint import save_checkpoint
 from bevcli.training.clips import ClipConfig
 from bevcli.training.dense_loss import DenseLossConfig
 from bevcli.training.drives import FIRST_HELD_OUT_SEED, RenderedDrives, open_drives, parse_seeds, split_drives
-from bevcli.training.image_loss import ImageLossConfig
 from bevcli.training.job import TrainingConfig, TrainingJob, prepare_folder, prepare_training
 from bevcli.training.optimizer import OptimizerConfig, make_optimizer, set_learning_rate
+from bevcli.training.perspective_loss import PerspectiveLossConfig
 from bevcli.training.trainer import Trainer, alternated
 
 SHORT = TrainingConfig(
@@ -92,10 +93,10 @@ def test_alternated_iterators_give_one_item_each_in_turn() -> None:
 
 
 def test_a_training_with_all_options_on_resumes_exactly_too(tmp_path: Path) -> None:
-    """Updates on every frame, alternating batches, query groups, the dense and the image loss."""
+    """Updates on every frame, alternating batches, query groups, the dense and the perspective loss."""
     settings = replace(
         SHORT, steps=3, evaluate_every=3, checkpoint_every=1, clips=ClipConfig(2, 2, 0.0, "all", in_turn=2),
-        dense_loss=DenseLossConfig(1.0), picture_loss=ImageLossConfig(1.0),
+        dense_loss=DenseLossConfig(1.0), perspective_loss=PerspectiveLossConfig(1.0),
     )  # fmt: skip
 
     def with_all_options(out: Path, resume: bool = False) -> Trainer:
@@ -110,9 +111,11 @@ def test_a_training_with_all_options_on_resumes_exactly_too(tmp_path: Path) -> N
     assert [len(batch.inputs) for batch in whole._load(0)] == [2, 2]
     whole.run()
     assert parameters_without_gradient(whole) == []
-    # Checkpoints of earlier versions must stay readable: these keys are part of the format.
+    # These keys are part of the checkpoint format.
     keys = torch.load(tmp_path / "whole" / "checkpoint.pt", weights_only=True)["model"]
-    assert {key.partition(".")[0] for key in keys} == {"model", "dense_reader", "picture_reader"}
+    assert {key.partition(".")[0] for key in keys} == {"model", "dense_reader", "perspective_head"}
+    exported = load_file(tmp_path / "whole" / "weights.safetensors")
+    assert exported.keys() == whole.job.model.state_dict().keys()
     run_and_kill(with_all_options(tmp_path / "killed"), after=1)
     resumed = with_all_options(tmp_path / "killed", resume=True)
     assert resumed.done == 1
@@ -134,7 +137,7 @@ def test_every_parameter_receives_a_gradient_that_is_not_zero(tmp_path: Path) ->
 
 
 def test_training_and_validation_leave_no_hooks_on_the_model(tmp_path: Path) -> None:
-    settings = replace(SHORT, steps=2, evaluate_every=1, picture_loss=ImageLossConfig(1.0))
+    settings = replace(SHORT, steps=2, evaluate_every=1, perspective_loss=PerspectiveLossConfig(1.0))
     one = trainer(tmp_path, settings=settings)
     hooks_after_validation = []
 
@@ -188,6 +191,17 @@ def test_resuming_from_nothing_or_from_another_model_is_rejected(tmp_path: Path)
         trainer(tmp_path, resume=True)
 
 
+def test_a_checkpoint_with_the_image_loss_of_earlier_versions_is_rejected(tmp_path: Path) -> None:
+    old = trainer(tmp_path)
+    old.trained["picture_reader"] = torch.nn.Linear(2, 2)
+    save_checkpoint(tmp_path / "checkpoint.pt", 1, old.trained, old.optimizer)
+    with pytest.raises(
+        WeightsError, match=r"with \[training.picture_loss\], and cannot be resumed; start a new"
+    ) as caught:
+        trainer(tmp_path, resume=True)
+    assert "\n" not in str(caught.value)
+
+
 def test_a_nan_loss_stops_the_training(tmp_path: Path) -> None:
     one = trainer(tmp_path)
     with torch.no_grad():
@@ -213,11 +227,11 @@ def test_the_training_table_is_read_and_is_no_part_of_the_model_config(tmp_path:
     file = tmp_path / "mine.toml"
     file.write_text(f"{tiny}\n[training]\nsteps = 12\n[training.clips]\nframes = 4\n")
     assert load_config(file) == load_config("tiny")
-    assert load_training(file, TrainingConfig) == TrainingConfig(steps=12, clips=ClipConfig(frames=4))
-    assert load_training("tiny", TrainingConfig) == TrainingConfig()
+    assert load_table(file, TRAINING, TrainingConfig) == TrainingConfig(steps=12, clips=ClipConfig(frames=4))
+    assert load_table("tiny", TRAINING, TrainingConfig) == TrainingConfig()
     file.write_text(f"{tiny}\n[training]\nstep = 12\n")
     with pytest.raises(ConfigError, match=r'unknown key "training.step"; did you mean "steps"'):
-        load_training(file, TrainingConfig)
+        load_table(file, TRAINING, TrainingConfig)
 
 
 def test_drives_come_from_folders_or_from_seeds(tmp_path: Path) -> None:
@@ -264,7 +278,7 @@ def test_a_job_is_prepared_from_a_model_file_and_seeds(tmp_path: Path) -> None:
     job = prepare_training("demo", cpu, rendered_seeds=range(10), out=out, steps=3, seed=4)
     assert (job.model.config, job.config) == (
         load_config("demo"),
-        replace(load_training("demo", TrainingConfig), steps=3),
+        replace(load_table("demo", TRAINING, TrainingConfig), steps=3),
     )
     assert (len(job.drives), len(job.held_out)) == (6, 4)
     assert (job.seed, job.group.size, job.out.is_dir()) == (4, 1, True)
