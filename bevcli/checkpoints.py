@@ -14,7 +14,8 @@ from torch import Tensor
 
 from bevcli.config import known_models, load_config
 from bevcli.errors import WeightsError
-from bevcli.model.bevformer import BEVFormer, BEVFormerConfig
+from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
+from bevcli.model.bevformer_v2 import build_model
 from bevcli.model.official_keys import from_official, is_official
 from bevcli.parsing.pickles import Placeholder
 from bevcli.parsing.pth import StoredTensor, read_pth
@@ -22,6 +23,13 @@ from bevcli.parsing.pth import StoredTensor, read_pth
 # The types of numbers that weights may have, and the end of the only keys whose numbers are integers.
 FLOATS = (torch.float32, torch.float16, torch.bfloat16, torch.float64)
 INTEGER_KEY = "num_batches_tracked"
+
+
+# Parts of the official BEVFormerV2 files that only its training uses: a head on the image features, and further groups
+# of object queries.
+_PERSPECTIVE_HEAD = "fcos3d_bbox_head."
+_OBJECT_QUERIES = "decoder.query_embedding"
+OFFICIAL_QUERIES = 900  # of all published models; a group of BEVFormerV2 has as many
 
 
 @dataclass(frozen=True)
@@ -58,14 +66,16 @@ class Checkpoint:
         state: state dict with our key names.
         official: whether the file uses the key names of the released code.
         facts: metadata in the file, such as its epoch.
-        left_out: classes and functions in the file whose objects were not read, such as "numpy.dtype".
+        left_out: what of the file is for training only and was left out of `state`; "" for nothing.
+        not_read: classes and functions in the file whose objects were not read, such as "numpy.dtype".
     """
 
     path: Path
     state: Mapping[str, Tensor]
     official: bool
     facts: Mapping[str, str] = field(default_factory=dict)
-    left_out: tuple[str, ...] = ()
+    left_out: str = ""
+    not_read: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -80,7 +90,8 @@ class CheckpointSummary:
         parameters: number of values in all tensors, running statistics of batch norms included.
         file_bytes: size of the file.
         facts: metadata in the file, such as its epoch.
-        left_out: classes and functions in the file whose objects were not read.
+        left_out: what of the file is for training only and is not counted; "" for nothing.
+        not_read: classes and functions in the file whose objects were not read.
     """
 
     path: Path
@@ -90,10 +101,11 @@ class CheckpointSummary:
     parameters: int
     file_bytes: int
     facts: Mapping[str, str]
-    left_out: tuple[str, ...] = ()
+    left_out: str = ""
+    not_read: tuple[str, ...] = ()
 
 
-def load_weights(path: Path, model: BEVFormer, *, resample: bool = False) -> Checkpoint:
+def load_weights(path: Path, model: BEVFormerBase, *, resample: bool = False) -> Checkpoint:
     """Loads a weights file into a model, in place. Keys and shapes must be exactly those of the model.
 
     Args:
@@ -169,14 +181,16 @@ def read_checkpoint(path: Path) -> Checkpoint:
     """
     if not path.is_file():
         raise WeightsError(f"{path}: weights file not found")
-    left_out: tuple[str, ...] = ()
+    not_read: tuple[str, ...] = ()
     if path.suffix == ".safetensors":
         state, facts = _read_safetensors(path)
     else:
-        state, facts, left_out = _read_pth(path)
+        state, facts, not_read = _read_pth(path)
     _check_numbers(path, state)
-    official = is_official(state)
-    return Checkpoint(path, from_official(state) if official else state, official, facts, left_out)
+    if not is_official(state):
+        return Checkpoint(path, state, official=False, facts=facts, not_read=not_read)
+    state, left_out = _without_training_parts(from_official(state))
+    return Checkpoint(path, state, official=True, facts=facts, left_out=left_out, not_read=not_read)
 
 
 def bundled_weights(model: str) -> Path | None:
@@ -208,7 +222,21 @@ def fitting_models(state: Mapping[str, Tensor]) -> tuple[str, ...]:
 def expected_state(config: BEVFormerConfig) -> dict[str, Tensor]:
     """The state dict that a model needs, with tensors that have a shape but no contents."""
     with torch.device("meta"):
-        return BEVFormer(config).state_dict()
+        return build_model(config).state_dict()
+
+
+def _without_training_parts(state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
+    """A state dict of an official file without the parts that only training uses, and these parts in words."""
+    head = [key for key in state if key.startswith(_PERSPECTIVE_HEAD)]
+    kept = {key: tensor for key, tensor in state.items() if key not in head}
+    parts = [f"{len(head)} keys {_PERSPECTIVE_HEAD}*"] if head else []
+    queries = state.get(_OBJECT_QUERIES)
+    if queries is not None and queries.ndim == 2:
+        groups, rest = divmod(len(queries), OFFICIAL_QUERIES)
+        if groups > 1 and not rest:
+            kept[_OBJECT_QUERIES] = queries[:OFFICIAL_QUERIES].clone()
+            parts.append(f"{groups - 1} of {groups} groups of object queries")
+    return kept, " and ".join(parts)
 
 
 def _read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -15,10 +15,15 @@ from typing import Any, Literal, TypeVar
 
 from bevcli.errors import ConfigError
 from bevcli.model.bevformer import BEVFormerConfig
+from bevcli.model.bevformer_v2 import BEVFormerV2Config
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import read_text
 
 T = TypeVar("T")
+
+# The key that says which model a file configures, and its values. A file without it configures a BEVFormer.
+ARCHITECTURE = "architecture"
+ARCHITECTURES: dict[str, type[BEVFormerConfig]] = {"BEVFormer": BEVFormerConfig, "BEVFormerV2": BEVFormerV2Config}
 
 TRACKING = "tracking"  # the table of a model's file with the parameters of the tracker
 TRAINING = "training"  # the table of a model's file with the settings of its training, which the model does not need
@@ -37,8 +42,12 @@ def load_config(name_or_path: str | Path) -> BEVFormerConfig:
     """
     text, file = _read_model(str(name_or_path))
     table = _parse(text, file)
-    model = {key: table[key] for key in table if key not in (TRACKING, TRAINING)}
-    config = _dataclass(model, BEVFormerConfig, file, "")
+    architecture = table.get(ARCHITECTURE, "BEVFormer")
+    if architecture not in list(ARCHITECTURES):
+        expected = " or ".join(f'"{name}"' for name in ARCHITECTURES)
+        raise ConfigError(f'{file}: "{ARCHITECTURE}" must be {expected}, but is {architecture!r:.60}')
+    settings = {key: table[key] for key in table if key not in (TRACKING, TRAINING, ARCHITECTURE)}
+    config = _dataclass(settings, ARCHITECTURES[architecture], file, "")
     if not re.fullmatch(r"[\w][\w. +-]{0,99}", config.name):
         expected = "up to 100 letters, digits and - . + _, because it names folders"
         raise ConfigError(f'{file}: "name" is {config.name!r:.60} (expected {expected})')

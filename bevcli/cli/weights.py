@@ -23,7 +23,8 @@ def inspect(
     model: Annotated[
         str | None,
         typer.Option(
-            help="List the parts of this model, tiny, small, base or a FILE.toml; FILE must fit it.", show_default=False
+            help="List the parts of this model, such as tiny, base or v2-t2, or a FILE.toml; FILE must fit it.",
+            show_default=False,
         ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
@@ -79,8 +80,9 @@ def _as_data(summary: CheckpointSummary) -> dict[str, object]:
         "tensors": summary.tensors,
         "parameters": summary.parameters,
         "file_bytes": summary.file_bytes,
+        "left_out": summary.left_out,
         "states": dict(summary.facts),
-        "left_out": list(summary.left_out),
+        "not_read": list(summary.not_read),
     }
 
 
@@ -91,9 +93,11 @@ def _as_text(summary: CheckpointSummary) -> str:
         f"  key names       {'the original BEVFormer' if summary.official else 'bevcli'}",
         f"  fits            {', '.join(summary.models) or 'none of our models'}",
     ]
-    lines += [f"  {name:<15} {value}" for name, value in summary.facts.items()]
     if summary.left_out:
-        lines.append(f"  left out        {', '.join(summary.left_out)} (objects that are no weights; nothing was run)")
+        lines.append(f"  left out        {summary.left_out}, which only training uses")
+    lines += [f"  {name:<15} {value}" for name, value in summary.facts.items()]
+    if summary.not_read:
+        lines.append(f"  not read        {', '.join(summary.not_read)} (objects that are no weights; nothing was run)")
     return "\n".join(lines)
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
-from dataclasses import fields
+from collections.abc import Callable, Iterator
+from dataclasses import fields, is_dataclass
 
 import torch
 from torch import Tensor, nn
 
-from bevcli.model.bevformer import BEVFormer, BEVFormerInputs, BEVFormerOutputs
+from bevcli.model.bevformer import BEVFormerOutputs
 
 
 def is_finite(outputs: BEVFormerOutputs) -> bool:
@@ -19,37 +19,35 @@ def is_finite(outputs: BEVFormerOutputs) -> bool:
     return bool(torch.isfinite(extremes).all())
 
 
-def origin(model: BEVFormer, inputs: BEVFormerInputs, history: Tensor | None) -> str:
+def origin(model: nn.Module, step: Callable[[], object]) -> str:
     """Where numbers stop being finite: an input, or the first module whose output has NaN or infinity.
 
-    Runs the step once more, with a check after every module.
-
     Args:
-        model: the model that the step was made with.
-        inputs: of the step.
-        history: (1, Y·X, C), the BEV map of the previous frame, or None.
+        model: the model that the step is made with.
+        step: makes the step once more; every module is checked meanwhile.
     """
-    for part in fields(inputs):
-        if not _all_finite([getattr(inputs, part.name)]):
-            return f"input {part.name}"
-    if history is not None and not _all_finite([history]):
-        return "history"
     found: list[str] = []
 
     def check(name: str, output: object) -> None:
-        if not found and not _all_finite(_tensors(output)):
-            found.append(name)
+        if not found and any(not _is_finite(tensor) for _, tensor in _tensors(output, "")):
+            found.append(describe(name))
+
+    def check_inputs(arguments: object) -> None:
+        bad = [name for name, tensor in _tensors(arguments, "history") if not _is_finite(tensor)]
+        if bad and not found:
+            found.append(f"input {bad[0]}")
 
     def watch(name: str, module: nn.Module) -> torch.utils.hooks.RemovableHandle:
         return module.register_forward_hook(lambda module, arguments, output: check(name, output))
 
     hooks = [watch(name, module) for name, module in model.named_modules() if name]
+    hooks.append(model.register_forward_pre_hook(lambda module, arguments: check_inputs(arguments)))
     try:
-        model(inputs, history)
+        step()
     finally:
         for hook in hooks:
             hook.remove()
-    return describe(found[0]) if found else "the whole model"
+    return found[0] if found else "the whole model"
 
 
 def describe(name: str) -> str:
@@ -59,13 +57,17 @@ def describe(name: str) -> str:
     return part if part == name else f"{part} ({name})"
 
 
-def _tensors(output: object) -> Iterable[Tensor]:
-    if isinstance(output, Tensor):
-        yield output
-    elif isinstance(output, tuple | list):
-        for part in output:
-            yield from _tensors(part)
+def _tensors(value: object, name: str) -> Iterator[tuple[str, Tensor]]:
+    """The tensors in lists and dataclasses, with the name of the field that holds them, `name` outside of one."""
+    if isinstance(value, Tensor):
+        yield name, value
+    elif isinstance(value, tuple | list):
+        for part in value:
+            yield from _tensors(part, name)
+    elif is_dataclass(value) and not isinstance(value, type):
+        for field in fields(value):
+            yield from _tensors(getattr(value, field.name), field.name)
 
 
-def _all_finite(tensors: Iterable[Tensor]) -> bool:
-    return all(bool(torch.isfinite(tensor).all()) for tensor in tensors if tensor.is_floating_point())
+def _is_finite(tensor: Tensor) -> bool:
+    return not tensor.is_floating_point() or bool(torch.isfinite(tensor).all())

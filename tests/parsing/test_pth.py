@@ -94,7 +94,7 @@ def test_objects_beside_the_tensors_are_left_out_and_named(tmp_path: Path, optio
     found = read_checkpoint(path)
     assert torch.equal(found.state["weight"], torch.arange(3.0))
     assert found.facts == {"epoch": "24", "time": "Tue Aug 16"}
-    named = " ".join(found.left_out)
+    named = " ".join(found.not_read)
     for name in ("datetime.datetime", "ConfigDict", "pathlib", "numpy"):
         assert name in named
 
@@ -130,7 +130,7 @@ def test_tensors_hidden_behind_code_are_refused_and_the_code_does_not_run(
         with pytest.raises(WeightsError, match="hidden behind code"):
             read_checkpoint(path)
     torch.save({"state_dict": {"weight": torch.zeros(1)}, "meta": Runs(print, "ran")}, path, **options)
-    assert [name.split(".")[1] for name in read_checkpoint(path).left_out] == ["print"]
+    assert [name.split(".")[1] for name in read_checkpoint(path).not_read] == ["print"]
     assert "ran" not in capsys.readouterr().out
 
 
