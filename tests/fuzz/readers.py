@@ -64,10 +64,12 @@ def _maps(folder: Path) -> None:
 
 def _model(folder: Path) -> None:
     from bevcli.checkpoints import expected_state
-    from bevcli.config import load_config, load_training
+    from bevcli.config import TRACKING, TRAINING, load_config, load_table
+    from bevcli.pipeline.tracking import TrackerConfig
     from bevcli.training.job import TrainingConfig
 
-    load_training(folder / "model.toml", TrainingConfig)
+    load_table(folder / "model.toml", TRACKING, TrackerConfig)
+    load_table(folder / "model.toml", TRAINING, TrainingConfig)
     expected_state(load_config(folder / "model.toml"))
 
 

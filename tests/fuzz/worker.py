@@ -31,7 +31,7 @@ class Worker:
 
     def read(self, reader: str, data: bytes) -> str:
         """What comes of a broken file: "read", "refused: …" (one BevcliError), or what went wrong."""
-        if self._process is None:
+        if self._process is None or not self._process.is_alive():
             self._start()
         assert self._connection is not None
         try:
@@ -60,7 +60,8 @@ class Worker:
         other.close()
         if not self._connection.poll(START_SECONDS):
             raise RuntimeError("the fuzz worker does not start")
-        assert self._connection.recv() == "ready"
+        answer = self._connection.recv()
+        assert answer == "ready", answer
 
 
 def _serve(connection: Connection, seeds: Path, path: list[str]) -> None:
@@ -75,8 +76,12 @@ def _serve(connection: Connection, seeds: Path, path: list[str]) -> None:
         os.chdir(folder)
         with open(os.devnull, "w") as silent:  # FFmpeg and libpng complain there about every broken file
             os.dup2(silent.fileno(), 2)
-        for reader in READERS.values():
-            reader.read(own)
+        try:
+            for reader in READERS.values():
+                reader.read(own)
+        except BaseException:
+            connection.send(traceback.format_exc())
+            raise
         limit = _bytes_of("VmSize") + 4 * MEMORY
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
         base = _bytes_of("VmRSS")
