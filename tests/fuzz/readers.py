@@ -137,7 +137,7 @@ READERS = {
     "pth": Reader("weights.pth", "bytes", _weights("weights.pth")),
     "old pth": Reader("old.pth", "bytes", _weights("old.pth")),
     "safetensors": Reader("weights.safetensors", "bytes", _weights("weights.safetensors")),
-    "recording": Reader("recording.rrd", "bytes", _recording, memory=3 << 30),  # rerun trusts sizes
+    "recording": Reader("recording.rrd", "bytes", _recording, memory=3 << 30),  # rerun believes the sizes in a file
     "predictions": Reader("predictions.json", "json", _predictions),
     "submission": Reader("results_nusc.json", "json", _submission),
     "CAN bus": Reader("nuscenes/can_bus/scene-0001_pose.json", "json", _nuscenes),
