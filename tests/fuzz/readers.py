@@ -15,13 +15,11 @@ class Reader:
         file: the seed file that is broken.
         kind: how it is broken, see `mutations.edits`.
         read: reads the folder of seed files.
-        memory: the most bytes that it may take, beyond those of the libraries and the seed files.
     """
 
     file: str
     kind: str
     read: Callable[[Path], object]
-    memory: int = 1 << 30
 
 
 def _open(folder: Path, **options: object) -> None:
@@ -137,7 +135,7 @@ READERS = {
     "pth": Reader("weights.pth", "bytes", _weights("weights.pth")),
     "old pth": Reader("old.pth", "bytes", _weights("old.pth")),
     "safetensors": Reader("weights.safetensors", "bytes", _weights("weights.safetensors")),
-    "recording": Reader("recording.rrd", "bytes", _recording, memory=3 << 30),  # rerun believes the sizes in a file
+    "recording": Reader("recording.rrd", "bytes", _recording),
     "predictions": Reader("predictions.json", "json", _predictions),
     "submission": Reader("results_nusc.json", "json", _submission),
     "CAN bus": Reader("nuscenes/can_bus/scene-0001_pose.json", "json", _nuscenes),
