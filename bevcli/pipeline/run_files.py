@@ -63,7 +63,12 @@ class RunFiles:
     def __enter__(self) -> RunFiles:
         out, sequence, model = self._out, self._sequence, self._model
         recording = Recording(out / RECORDING, sequence, model, self._options, self._live)
-        extras = {"model": model.name, "untrained": model.untrained, "classes": list(model.config.classes)}
+        extras = {
+            "model": model.name,
+            "untrained": model.untrained,
+            "classes": list(model.config.classes),
+            "range_m": model.config.bev_grid.nearest_side_m,
+        }
         boxes = BoxesWriter(out / PREDICTIONS, self._reference, extras)
         with self._stack:  # closes what is open if the next one cannot be opened
             self._recording = self._stack.enter_context(recording)

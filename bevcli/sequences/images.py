@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from bevcli.parsing.images import decode_image, media_type_of, size_of_image
 from bevcli.sequences.video import VideoReader
 
 DECODING_THREADS = 6
+MOST_PIXELS = 64 << 20  # of an image in a bag
 LARGEST_METADATA = 4 * MIB  # bytes of an image file beyond its pixels
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".webm", ".mov", ".m4v")
@@ -49,6 +51,26 @@ class UnreadableImage(Exception):
     """An image is missing or broken. The message is the reason."""
 
 
+class Source(Protocol):
+    """Where one image is: an `ImageSource`, or one of another format, which reads itself.
+
+    Attributes:
+        timestamp_ns: time of the image, at least roughly.
+    """
+
+    @property
+    def timestamp_ns(self) -> int: ...
+
+
+@runtime_checkable
+class ReadableSource(Protocol):
+    """A source that reads its own image. It may be used from several threads."""
+
+    def read(self) -> CameraImage:
+        """The image. Raises UnreadableImage."""
+        ...
+
+
 class ImageReader:
     """Reads the images of frames, which should be asked for in order.
 
@@ -64,7 +86,7 @@ class ImageReader:
         self._threads = ThreadPoolExecutor(DECODING_THREADS, thread_name_prefix="decode")
 
     def read(
-        self, sources: Mapping[str, ImageSource], rig: CameraRig, dropped: Mapping[str, str]
+        self, sources: Mapping[str, Source], rig: CameraRig, dropped: Mapping[str, str]
     ) -> tuple[dict[str, CameraImage], dict[str, str]]:
         """The images by camera, and the reasons for missing images by camera.
 
@@ -88,7 +110,14 @@ class ImageReader:
                 reasons[name] = str(unreadable)
         return images, reasons
 
-    def _read_one(self, source: ImageSource, camera: Camera) -> CameraImage:
+    def _read_one(self, source: Source, camera: Camera) -> CameraImage:
+        if isinstance(source, ReadableSource):
+            image = source.read()
+            self._check_size(source, camera, (image.pixels_bgr.shape[1], image.pixels_bgr.shape[0]))
+            self._fitting.add(camera.name)
+            return image
+        if not isinstance(source, ImageSource):
+            raise TypeError(f"{source} is not an image source")
         self._check_place(source)
         if source.video_index is None:
             encoded, size = _read_file(source, camera)
@@ -114,7 +143,7 @@ class ImageReader:
                 f"{source.path}: leads out of the folder {self._inside} (to {path}): pass --allow-outside to read it"
             )
 
-    def _check_size(self, source: ImageSource, camera: Camera, size: tuple[int, int]) -> None:
+    def _check_size(self, source: Source, camera: Camera, size: tuple[int, int]) -> None:
         """Raises InputError for a wrong size of a camera's first image, UnreadableImage for that of a later one."""
         if size == (camera.width, camera.height):
             return
@@ -146,6 +175,12 @@ def _read_file(source: ImageSource, camera: Camera) -> tuple[bytes, tuple[int, i
     if size is None:
         raise UnreadableImage(f"{source.path} is not a complete image (expected a JPEG or PNG)")
     return encoded, size
+
+
+def decode(encoded: bytes) -> NDArray[np.uint8] | None:
+    """(H, W, 3) uint8 BGR of a JPEG or PNG; None for another format, a damaged one, or one of more than 64 MP."""
+    pixels = decode_image(encoded, DECODE_FLAGS, MOST_PIXELS)
+    return None if pixels is None else pixels.astype(np.uint8, copy=False)
 
 
 def _decode(source: ImageSource, encoded: bytes, size: tuple[int, int]) -> CameraImage:

@@ -31,6 +31,7 @@ except Exception as error:
 """
 CHECK_MEMORY = 4 << 30  # bytes of address space, most of it never used, beside a multiple of the file's size
 SECONDS, BYTES_PER_SECOND = 20.0, 10e6  # time limit of a process that reads a recording
+RECORDING = "recording.rrd"
 MAGIC, FOOTER = b"RRF2", b"RRF2FOOT"  # the first bytes of an .rrd file, and the bytes 12 before its end
 
 
@@ -51,8 +52,11 @@ class RecordingFile:
 def open_recording(path: Path) -> Iterator[RecordingFile]:
     """The recording at a path. If its end is missing: a repaired copy, which is deleted when the context ends.
 
+    path: the recording, or the output folder of `bevcli run`.
+
     Raises InputError if the file is missing, is not a recording, was cut off before its first frame, or is damaged.
     """
+    path = recording_in(path)
     if _is_whole(path):
         _check(path, path)
         yield RecordingFile(path, repaired=False)
@@ -65,6 +69,16 @@ def open_recording(path: Path) -> Iterator[RecordingFile]:
             raise InputError(f"{path}: the recording was cut off before its first frame; nothing can be shown")
         _check(copy, path)
         yield RecordingFile(copy, repaired=True)
+
+
+def recording_in(path: Path) -> Path:
+    """The recording of a run's folder; any other path as it is. Raises InputError for a folder without a recording."""
+    if not path.is_dir():
+        return path
+    recording = path / RECORDING
+    if not recording.is_file():
+        raise InputError(f"{path}: the folder has no {RECORDING} (expected a recording, or a folder of `bevcli run`)")
+    return recording
 
 
 def _check(file: Path, path: Path) -> None:
@@ -89,8 +103,6 @@ def _run(command: list[str], path: Path) -> subprocess.CompletedProcess[bytes]:
 
 
 def _is_whole(path: Path) -> bool:
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder (expected a recording, such as {path / 'recording.rrd'})")
     try:
         with path.open("rb") as file:
             start = file.read(len(MAGIC))

@@ -49,7 +49,7 @@ def test_a_file_that_is_not_a_recording_is_an_error_of_one_line(tmp_path, conten
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_file_and_a_folder_are_errors(tmp_path):
+def test_a_missing_file_and_a_folder_without_a_recording_are_errors(tmp_path):
     with pytest.raises(InputError, match="no such recording"), open_recording(tmp_path / "none.rrd"):
         pass
     with pytest.raises(InputError, match="folder"), open_recording(tmp_path):
