@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 from bevcli.errors import InputError
 from bevcli.parsing.files import open_regular
 
-# Where the beginning of a file shows its container: place and bytes.
+# Where the beginning of a file shows its container: place and bytes. The last row is that of streams in bags: H.264 and
+# H.265, VP9 and AV1.
 CONTAINERS = (
     (4, b"ftyp"), (4, b"moov"), (4, b"mdat"), (4, b"wide"), (4, b"free"), (4, b"skip"), (0, b"RIFF"),
     (0, b"\x1a\x45\xdf\xa3"),
+    (0, b"\x00\x00\x00\x01"), (0, b"\x00\x00\x01"), (0, b"DKIF"),
 )  # fmt: skip
 MOST_PIXELS = 1 << 26
 SMALLEST_IMAGE = 8  # bytes of a container for each of its images, at least

@@ -101,6 +101,16 @@ def _nuscenes(folder: Path) -> None:
     _open(folder / "nuscenes")
 
 
+def _bag(name: str) -> Callable[[Path], None]:
+    return lambda folder: _open(folder / name)
+
+
+def _classes(folder: Path) -> None:
+    from bevcli.sequences.files.class_names import read_class_map
+
+    read_class_map(folder / "classes.toml")
+
+
 def _predictions(folder: Path) -> None:
     from bevcli.evaluation.evaluate import evaluate
 
@@ -137,6 +147,9 @@ READERS = {
     "safetensors": Reader("weights.safetensors", "bytes", _weights("weights.safetensors")),
     "recording": Reader("recording.rrd", "bytes", _recording),
     "predictions": Reader("predictions.json", "json", _predictions),
+    "class map": Reader("classes.toml", "text", _classes),
+    "MCAP": Reader("bag.mcap", "bytes", _bag("bag.mcap")),
+    "rosbag2": Reader("rosbag2/rosbag2.db3", "bytes", _bag("rosbag2")),
     "submission": Reader("results_nusc.json", "json", _submission),
     "CAN bus": Reader("nuscenes/can_bus/scene-0001_pose.json", "json", _nuscenes),
     **{

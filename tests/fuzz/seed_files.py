@@ -13,9 +13,13 @@ import numpy as np
 import safetensors.torch
 import torch
 import yaml
+from bags import drive_messages, write_mcap, write_rosbag2
 from memory_drive import MemorySequence, make_rig
 from nuscenes_tables import Size, scene_name, write_tables
 from recorded_drive import record
+
+from bevcli.sequences.native.ego_motion_file import read_ego_motion
+from bevcli.sequences.open import open_sequence
 
 CAMERAS = ("CAM_FRONT", "CAM_BACK")
 SIZE = (64, 36)
@@ -32,6 +36,8 @@ def write_seeds(folder: Path) -> None:
     record(folder / "recording.rrd", MemorySequence(1, make_rig({"CAM_FRONT": 0.0})))
     _nuscenes(folder / "nuscenes")
     _boxes(folder)
+    _bags(folder)
+    (folder / "classes.toml").write_text('"Lorry" = "truck"\nVan = "car"\n')
     (folder / "model.toml").write_bytes(resources.files("bevcli").joinpath("configs", "demo.toml").read_bytes())
 
 
@@ -138,6 +144,13 @@ def _weights(folder: Path) -> None:
     torch.save(contents, folder / "old.pth", _use_new_zipfile_serialization=False)
     tensors = {name: tensor.contiguous().clone() for name, tensor in state.items()}
     safetensors.torch.save_file(tensors, folder / "weights.safetensors", {"epoch": "3"})
+
+
+def _bags(folder: Path) -> None:
+    motion = read_ego_motion(folder / "drive/ego_motion.csv")
+    messages = list(drive_messages(open_sequence(folder / "drive"), motion))
+    write_mcap(folder / "bag.mcap", messages)
+    write_rosbag2(folder / "rosbag2", messages, "sqlite3")
 
 
 def _nuscenes(root: Path) -> None:
