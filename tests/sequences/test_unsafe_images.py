@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 import shutil
 import struct
 import time
@@ -80,6 +81,15 @@ def test_the_header_states_the_size_of_the_image(suffix):
         for cut in range(min(len(encoded), 200)):
             size_of_image(encoded[:cut])
             assert decode_image(encoded[:cut], cv2.IMREAD_COLOR, width * height) is None
+
+
+def test_a_png_chunk_longer_than_the_file_is_refused_before_decoding():
+    encoded = bytearray(cv2.imencode(".png", np.zeros((36, 64, 3), np.uint8))[1].tobytes())
+    place = encoded.index(b"IDAT") - 4
+    encoded[place : place + 4] = struct.pack(">I", 2**31 - 1)
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert decode_image(bytes(encoded), cv2.IMREAD_COLOR, 64 * 36) is None
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory < 100_000  # KiB
 
 
 def test_the_size_of_a_progressive_jpeg_with_metadata_is_read():
