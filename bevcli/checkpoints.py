@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
-import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from importlib import resources
@@ -19,12 +17,12 @@ from bevcli.errors import WeightsError
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
 from bevcli.model.bevformer_v2 import build_model
 from bevcli.model.official_keys import from_official, is_official
+from bevcli.parsing.pickles import Placeholder
+from bevcli.parsing.pth import StoredTensor, read_pth
 
-# The exceptions of torch's restricted unpickler for a file that is not a valid pickle.
-_BROKEN_PICKLE = (
-    pickle.UnpicklingError, RuntimeError, OSError, EOFError, ValueError, LookupError, TypeError, AttributeError,
-    struct.error,
-)  # fmt: skip
+# The types of numbers that weights may have, and the end of the only keys whose numbers are integers.
+FLOATS = (torch.float32, torch.float16, torch.bfloat16, torch.float64)
+INTEGER_KEY = "num_batches_tracked"
 
 
 # Parts of the official BEVFormerV2 files that only its training uses: a head on the image features, and further groups
@@ -69,6 +67,7 @@ class Checkpoint:
         official: whether the file uses the key names of the released code.
         facts: metadata in the file, such as its epoch.
         left_out: what of the file is for training only and was left out of `state`; "" for nothing.
+        not_read: classes and functions in the file whose objects were not read, such as "numpy.dtype".
     """
 
     path: Path
@@ -76,6 +75,7 @@ class Checkpoint:
     official: bool
     facts: Mapping[str, str] = field(default_factory=dict)
     left_out: str = ""
+    not_read: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -91,6 +91,7 @@ class CheckpointSummary:
         file_bytes: size of the file.
         facts: metadata in the file, such as its epoch.
         left_out: what of the file is for training only and is not counted; "" for nothing.
+        not_read: classes and functions in the file whose objects were not read.
     """
 
     path: Path
@@ -101,6 +102,7 @@ class CheckpointSummary:
     file_bytes: int
     facts: Mapping[str, str]
     left_out: str = ""
+    not_read: tuple[str, ...] = ()
 
 
 def load_weights(path: Path, model: BEVFormerBase, *, resample: bool = False) -> Checkpoint:
@@ -172,14 +174,23 @@ def inspect(path: Path) -> CheckpointSummary:
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
-    """Reads an official .pth or a .safetensors, with official key names or ours. Code in the file never runs."""
+    """Reads an official .pth or a .safetensors, with official key names or ours.
+
+    Code in the file never runs: objects other than tensors and plain values are left out. Raises WeightsError where
+    the file has no state dict, or where a tensor has a wrong type or contains NaN or infinity.
+    """
     if not path.is_file():
         raise WeightsError(f"{path}: weights file not found")
-    state, facts = _read_safetensors(path) if path.suffix == ".safetensors" else _read_pth(path)
+    not_read: tuple[str, ...] = ()
+    if path.suffix == ".safetensors":
+        state, facts = _read_safetensors(path)
+    else:
+        state, facts, not_read = _read_pth(path)
+    _check_numbers(path, state)
     if not is_official(state):
-        return Checkpoint(path, state, official=False, facts=facts)
+        return Checkpoint(path, state, official=False, facts=facts, not_read=not_read)
     state, left_out = _without_training_parts(from_official(state))
-    return Checkpoint(path, state, official=True, facts=facts, left_out=left_out)
+    return Checkpoint(path, state, official=True, facts=facts, left_out=left_out, not_read=not_read)
 
 
 def bundled_weights(model: str) -> Path | None:
@@ -237,19 +248,64 @@ def _read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         raise WeightsError(f"{path}: not a valid safetensors file: {error}") from error
 
 
-def _read_pth(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    try:
-        contents = torch.load(path, map_location="cpu", weights_only=True)
-    except _BROKEN_PICKLE as error:
+def _read_pth(path: Path) -> tuple[dict[str, Tensor], dict[str, str], tuple[str, ...]]:
+    file = read_pth(path)
+    contents = file.contents
+    state = contents.get("state_dict", contents) if isinstance(contents, dict) else contents
+    hidden = _placeholders(state)
+    if hidden:
         raise WeightsError(
-            f"{path}: not a weights file that is safe to read (expected .safetensors, or a PyTorch file of tensors and "
-            "plain values): it is damaged, is another kind of file, or holds objects that could run code"
-        ) from error
-    state = contents.get("state_dict", contents) if isinstance(contents, dict) else None
-    if not isinstance(state, dict) or not state or not all(isinstance(v, Tensor) for v in state.values()):
+            f"{path}: is not safe to read: its tensors are hidden behind code ({hidden:.100}), which was not run "
+            "(expected tensors by name, at the top level or under state_dict)"
+        )
+    if not isinstance(state, dict) or not state or not all(_is_tensor(key, value) for key, value in state.items()):
         raise WeightsError(
             f"{path}: contains no state dict (expected tensors by name, at the top level or under state_dict)"
         )
     meta = contents.get("meta")
-    facts = {} if not isinstance(meta, dict) else {k: str(meta[k]) for k in ("epoch", "iter", "time") if k in meta}
-    return state, facts
+    facts = (
+        {}
+        if not isinstance(meta, dict)
+        else {key: _fact(meta[key]) for key in ("epoch", "iter", "time") if key in meta}
+    )
+    return file.tensors(state), {key: fact for key, fact in facts.items() if fact}, file.left_out
+
+
+def _is_tensor(key: object, value: object) -> bool:
+    return isinstance(key, str) and isinstance(value, StoredTensor)
+
+
+def _placeholders(state: object) -> str:
+    """What stands in place of tensors: the class or function of the first placeholder, "" for none."""
+    values = state.items() if isinstance(state, dict) else [("", state)]
+    for key, value in values:
+        if isinstance(value, Placeholder):
+            return f"{key}: {value.made_by}" if key else str(value.made_by)
+    return ""
+
+
+def _fact(value: object) -> str:
+    """A plain value of a checkpoint's metadata as text, "" for anything else."""
+    if isinstance(value, int) and abs(value) >= 2**62:
+        return ""
+    return str(value)[:200] if isinstance(value, str | int | float) else ""
+
+
+def _check_numbers(path: Path, state: Mapping[str, Tensor]) -> None:
+    """Raises WeightsError, which names the tensor, for a number type that weights do not have, for NaN or infinity."""
+    for name, tensor in state.items():
+        if tensor.dtype not in FLOATS and not name.endswith(INTEGER_KEY):
+            kind = str(tensor.dtype).removeprefix("torch.")
+            expected = ", ".join(str(dtype).removeprefix("torch.") for dtype in FLOATS)
+            raise WeightsError(f"{path}: tensor {name}: numbers of type {kind} (expected {expected})")
+        # Numbers that a stride of 0 repeats are checked once.
+        for dimension, stride in enumerate(tensor.stride()):
+            if stride == 0 and tensor.shape[dimension] > 1:
+                tensor = tensor.narrow(dimension, 0, 1)
+        bad = ~torch.isfinite(tensor.float())
+        if bad.any():
+            place = tuple(bad.nonzero()[0].tolist())
+            raise WeightsError(
+                f"{path}: tensor {name}: {int(bad.sum())} of {tensor.numel()} numbers are not finite, the first at "
+                f"index {place}: {float(tensor[place])} (expected finite numbers): the file is damaged"
+            )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
-import tomllib
+import re
 import types
 import typing
 from collections.abc import Mapping
@@ -16,6 +16,8 @@ from typing import Any, Literal, TypeVar
 from bevcli.errors import ConfigError
 from bevcli.model.bevformer import BEVFormerConfig
 from bevcli.model.bevformer_v2 import BEVFormerV2Config
+from bevcli.parsing.documents import TOML_BYTES, parse_toml
+from bevcli.parsing.files import read_text
 
 T = TypeVar("T")
 
@@ -43,9 +45,13 @@ def load_config(name_or_path: str | Path) -> BEVFormerConfig:
     architecture = table.get(ARCHITECTURE, "BEVFormer")
     if architecture not in list(ARCHITECTURES):
         expected = " or ".join(f'"{name}"' for name in ARCHITECTURES)
-        raise ConfigError(f'{file}: "{ARCHITECTURE}" must be {expected}, but is {architecture!r}')
+        raise ConfigError(f'{file}: "{ARCHITECTURE}" must be {expected}, but is {architecture!r:.60}')
     settings = {key: table[key] for key in table if key not in (TRACKING, TRAINING, ARCHITECTURE)}
-    return _dataclass(settings, ARCHITECTURES[architecture], file, "")
+    config = _dataclass(settings, ARCHITECTURES[architecture], file, "")
+    if not re.fullmatch(r"[\w][\w. +-]{0,99}", config.name):
+        expected = "up to 100 letters, digits and - . + _, because it names folders"
+        raise ConfigError(f'{file}: "name" is {config.name!r:.60} (expected {expected})')
+    return config
 
 
 def load_table(name_or_path: str | Path, table: str, kind: type[T]) -> T:
@@ -58,10 +64,7 @@ def load_table(name_or_path: str | Path, table: str, kind: type[T]) -> T:
 
 
 def _parse(text: str, file: str) -> dict[str, Any]:
-    try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{file}: invalid TOML: {error}") from error
+    return parse_toml(text, file, ConfigError)
 
 
 def _read_model(name: str) -> tuple[str, str]:
@@ -79,10 +82,7 @@ def _read_model(name: str) -> tuple[str, str]:
 
 
 def _read(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}") from error
+    return read_text(path, TOML_BYTES, error=ConfigError)
 
 
 def _dataclass(table: dict[str, Any], kind: type[T], file: str, prefix: str) -> T:

@@ -201,10 +201,12 @@ class Prediction:
         world_from_ego: the vehicle's pose at the frame's time.
         grid: the BEV grid.
         bev: (Y·X, C) tensor, the BEV feature map; cell index row * columns + column, rows from the smallest y. None
-            where the frame has no image.
+            where the frame has no image or its numbers are not finite.
         started_anew: why no history was used ("first frame", "new scene", …), "" where it was used.
         camera_embeddings: camera of the rig -> camera of the model whose embedding it took, in the model's order.
         skipped: whether the frame has no image at all: no boxes, and the state was passed on.
+        not_finite: the part of the model where numbers became NaN or infinite, such as "encoder layer 3 (…)": the frame
+            has no boxes, and the state was reset. "" where all numbers are finite.
         segmentation: the map of the segmentation head, None without one.
         attention: what the attentions sampled, where this was asked for.
         stage_seconds: stage of the pipeline -> seconds, in the order of execution.
@@ -219,6 +221,7 @@ class Prediction:
     started_anew: str
     camera_embeddings: Mapping[str, str] = field(default_factory=dict)
     skipped: bool = False
+    not_finite: str = ""
     segmentation: BevMap | None = None
     attention: AttentionView | None = None
     stage_seconds: Mapping[str, float] = field(default_factory=dict)

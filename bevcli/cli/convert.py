@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from bevcli.cli.input_options import (
+    AllowOutsideOption,
     CalibrationOption,
     ClassMapOption,
     EgoMotionOption,
@@ -48,6 +49,7 @@ def convert(
     topics: TopicsOption = None,
     ground_truth: GroundTruthOption = True,
     class_map: ClassMapOption = None,
+    allow_outside: AllowOutsideOption = False,
     force: Annotated[bool, typer.Option("--force", help="Overwrite an existing sequence in OUT_SEQUENCE.")] = False,
 ) -> None:
     """Write any input as a native sequence folder.
@@ -78,6 +80,7 @@ def convert(
         topics_file=topics,
         ground_truth=ground_truth,
         class_map=parse_class_map(class_map),
+        allow_outside=allow_outside,
     )
     for note in sequence.notes:
         typer.echo(f"note: {note}", err=True)

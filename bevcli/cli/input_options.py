@@ -17,6 +17,14 @@ StrictOption = Annotated[
     bool,
     typer.Option("--strict", help="Treat a missing or unreadable image as an error.", rich_help_panel=PANEL),
 ]
+AllowOutsideOption = Annotated[
+    bool,
+    typer.Option(
+        "--allow-outside",
+        help='Read images outside of the folder too: absolute paths, "..", and links that lead out of it.',
+        rich_help_panel=PANEL,
+    ),
+]
 VersionOption = Annotated[
     str | None,
     typer.Option(

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from bevcli.cli.input_options import TopicOption, TopicsOption, parse_topics
+from bevcli.cli.input_options import AllowOutsideOption, TopicOption, TopicsOption, parse_topics
 
 ERRORS_FOUND = 3
 
@@ -26,6 +26,7 @@ def project_debug(
     ] = None,
     topic: TopicOption = None,
     topics: TopicsOption = None,
+    allow_outside: AllowOutsideOption = False,
     json: Annotated[
         bool, typer.Option("--json", help="Print the findings and the coverage as one JSON object.")
     ] = False,
@@ -40,8 +41,8 @@ def project_debug(
     """
     from bevcli.rig.check_calibration import check_calibration
 
-    options = {} if not (topic or topics) else {"topics": parse_topics(topic), "topics_file": topics}
-    check = check_calibration(calibration, sequence, frame, **options)
+    options: dict[str, Any] = {"topics": parse_topics(topic), "topics_file": topics} if topic or topics else {}
+    check = check_calibration(calibration, sequence, frame, allow_outside=allow_outside, **options)
     written = check.write(out or Path("runs") / f"{check.name}-project-debug")
     if json:
         print(check.to_json())

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from bevcli.cli.input_options import (
+    AllowOutsideOption,
     CalibrationOption,
     ClassMapOption,
     DeviceOption,
@@ -119,6 +120,7 @@ def run(
     topics: TopicsOption = None,
     ground_truth: GroundTruthOption = True,
     class_map: ClassMapOption = None,
+    allow_outside: AllowOutsideOption = False,
     out: Annotated[
         Path | None, typer.Option(help="Default: runs/SEQUENCE-MODEL.", rich_help_panel=OUTPUT, show_default=False)
     ] = None,
@@ -216,6 +218,7 @@ def run(
         topics_file=topics,
         ground_truth=ground_truth,
         class_map=parse_class_map(class_map),
+        allow_outside=allow_outside,
     )
     out = Path("runs") / f"{drive.name}-{loaded.name}" if out is None else out
     embeddings = parse_pairs(camera, "--camera", "NAME=MODEL_CAMERA")
@@ -249,6 +252,8 @@ def notes(model: Model, drive: Sequence, *, live: bool = False) -> list[str]:
         found.append("the weights are UNTRAINED: random weights, the boxes are meaningless")
     if model.left_out:
         found.append(f"{model.weights}: left out {model.left_out}, which only training uses")
+    if model.not_read:
+        found.append(f"{model.weights}: objects that were not read, and not run: {', '.join(model.not_read)}")
     config = model.config
     if live and isinstance(config, BEVFormerV2Config) and config.later_frames:
         found.append(
@@ -287,6 +292,8 @@ def warnings(frame: Frame, prediction: Prediction) -> list[str]:
     found = [f"{where}: camera {camera} has no image: {why}" for camera, why in frame.dropped.items()]
     if prediction.skipped:
         found.append(f"{where}: no camera has an image; the state is passed on to the next frame")
+    if prediction.not_finite:
+        found.append(f"{where}: NaN or infinity in {prediction.not_finite}; no boxes, the history starts anew")
     if prediction.started_anew.startswith("gap"):
         found.append(f"{where}: {prediction.started_anew}; the history starts anew")
     return found

@@ -8,14 +8,37 @@ from typing import Annotated
 import typer
 
 
+def parse_host(text: str) -> str:
+    """An address of this machine to listen on, unchanged. Raises click's usage error."""
+    import socket
+
+    if not text.strip():
+        raise typer.BadParameter("is empty (expected an address of this machine, such as 127.0.0.1)")
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(text, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as tried:
+            tried.bind(address)
+    except (OSError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or "not a host name"
+        raise typer.BadParameter(
+            f'"{text[:60]}": cannot listen there ({reason}; expected an address of this machine, such as 127.0.0.1)'
+        ) from None
+    return text
+
+
 def viz(
     recording: Annotated[Path, typer.Argument(help="A recording (.rrd), or the output folder of `bevcli run`.")],
     web: Annotated[bool, typer.Option("--web", help="Show it in the browser, even if there is a display.")] = False,
     host: Annotated[
-        str, typer.Option(help="Address that the web viewer listens on. 0.0.0.0 allows access from other machines.")
+        str,
+        typer.Option(
+            metavar="ADDRESS",
+            parser=parse_host,
+            help="Address that the web viewer listens on. 0.0.0.0 allows access from other machines.",
+        ),
     ] = "127.0.0.1",
     port: Annotated[
-        int, typer.Option(help="Port of the web viewer. If it is in use, the next free one is taken.")
+        int, typer.Option(min=1, max=65535, help="Port of the web viewer. If it is in use, the next free one is taken.")
     ] = 9090,
     screenshot: Annotated[
         Path | None, typer.Option(metavar="OUT.png|.jpg", help="Write a screenshot of the viewer. Needs no screen.")

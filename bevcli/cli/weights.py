@@ -82,6 +82,7 @@ def _as_data(summary: CheckpointSummary) -> dict[str, object]:
         "file_bytes": summary.file_bytes,
         "left_out": summary.left_out,
         "states": dict(summary.facts),
+        "not_read": list(summary.not_read),
     }
 
 
@@ -95,6 +96,8 @@ def _as_text(summary: CheckpointSummary) -> str:
     if summary.left_out:
         lines.append(f"  left out        {summary.left_out}, which only training uses")
     lines += [f"  {name:<15} {value}" for name, value in summary.facts.items()]
+    if summary.not_read:
+        lines.append(f"  not read        {', '.join(summary.not_read)} (objects that are no weights; nothing was run)")
     return "\n".join(lines)
 
 

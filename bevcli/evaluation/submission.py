@@ -14,8 +14,10 @@ from bevcli.evaluation.tracking.config import TRACKING_CLASSES
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.transforms import rotation_from_quaternion, yaw_of_rotation
+from bevcli.parsing.documents import read_json
+from bevcli.parsing.files import open_regular
 from bevcli.sequences.files.box_json import boxes_from_json
-from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
+from bevcli.sequences.files.boxes_file import LARGEST_BYTES, BoxesFile, FrameBoxes
 from bevcli.sequences.files.incremental_json import IncrementalJson
 
 MAX_BOXES = 500  # per sample, by the rules of the benchmark; the best by score are kept
@@ -136,9 +138,9 @@ def write_submission(boxes: BoxesFile, path: Path, *, tracking: bool = False) ->
 def is_submission(path: Path) -> bool:
     """Whether the beginning of a file is that of a submission; False where it cannot be read."""
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             head = file.read(_PEEK_BYTES)
-    except OSError:
+    except (InputError, OSError):
         return False
     return b'"bevcli-boxes' not in head and (b'"meta"' in head or b'"results"' in head)
 
@@ -148,10 +150,7 @@ def read_submission(path: Path) -> BoxesFile:
 
     A submission has no scenes, timestamps and ego poses.
     """
-    try:
-        content = json.loads(path.read_bytes())
-    except (ValueError, OSError) as error:
-        raise InputError(f"{path}: cannot be read as JSON ({error})") from None
+    content = read_json(path, largest=LARGEST_BYTES)
     results = content.get("results") if isinstance(content, dict) else None
     if not isinstance(results, dict):
         raise InputError(f'{path}: "results" must be an object of sample tokens, as in a nuScenes submission')

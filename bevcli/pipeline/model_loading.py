@@ -33,6 +33,7 @@ class Model:
         bundled: whether that file is part of the package.
         left_out: what of that file is for training only and was left out; "" for nothing.
         tracker: the parameters of the tracker, the table [tracking] of the model's TOML file.
+        not_read: classes and functions in the weights file whose objects were not read.
     """
 
     network: BEVFormerBase
@@ -42,6 +43,7 @@ class Model:
     bundled: bool = False
     left_out: str = ""
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
+    not_read: tuple[str, ...] = ()
 
     @property
     def config(self) -> BEVFormerConfig:
@@ -107,15 +109,16 @@ def load_model(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(UNTRAINED_SEED)
         network: BEVFormerBase = build_model(config)
-    left_out = "" if file is None else load_weights(file, network).left_out
+    loaded = None if file is None else load_weights(file, network)
     return Model(
         network.eval(),
         target,
         choose_precision(precision, target),
         file,
         bundled=bundled is not None,
-        left_out=left_out,
+        left_out="" if loaded is None else loaded.left_out,
         tracker=tracker,
+        not_read=() if loaded is None else loaded.not_read,
     )
 
 

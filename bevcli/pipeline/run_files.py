@@ -111,6 +111,8 @@ class RunFiles:
 def frame_boxes(frame: Frame, prediction: Prediction, *, world: bool) -> FrameBoxes:
     """A prediction as predictions.json holds it: all boxes, with attributes, in the world frame or the ego frame."""
     extras: dict[str, object] = {"skipped": True} if prediction.skipped else {}
+    if prediction.not_finite:
+        extras["not_finite"] = prediction.not_finite
     if frame.sample_token is not None:
         extras["sample_token"] = frame.sample_token
     boxes = prediction.boxes_world if world else prediction.boxes_ego

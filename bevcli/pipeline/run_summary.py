@@ -31,6 +31,7 @@ class RunSummary:
         self._tracks: dict[str, str] | None = None  # identity -> class
         self._dropped: list[dict[str, object]] = []
         self._skipped: list[int] = []
+        self._not_finite: list[dict[str, object]] = []
         self._started_anew: list[dict[str, object]] = []
         self._embeddings: dict[str, str] = {}
 
@@ -59,6 +60,8 @@ class RunSummary:
         self._dropped += [{"frame": index, "camera": name, "reason": why} for name, why in frame.dropped.items()]
         if prediction.skipped:
             self._skipped.append(index)
+        if prediction.not_finite:
+            self._not_finite.append({"frame": index, "where": prediction.not_finite})
         if prediction.started_anew:
             self._started_anew.append({"frame": index, "reason": prediction.started_anew})
 
@@ -86,6 +89,7 @@ class RunSummary:
             "camera_embeddings": self._embeddings,
             "dropped_pictures": self._dropped,
             "skipped_frames": self._skipped,
+            "not_finite_frames": self._not_finite,
             "started_anew": self._started_anew,
             "notes": list(self._sequence.notes),
             "files": [str(path) for path in self.files],
@@ -112,6 +116,9 @@ class RunSummary:
             rows.append(("cameras", f"{', '.join(guessed)} (embeddings; --camera changes them)"))
         if self._dropped:
             rows.append(("dropped", f"{len(self._dropped)} images, {len(self._skipped)} frames without any"))
+        if self._not_finite:
+            first = self._not_finite[0]
+            rows.append(("failed", f"{len(self._not_finite)} frames: NaN or infinity, first in {first['where']}"))
         if self._model.untrained:
             rows.append(("weights", "UNTRAINED: random weights, the boxes are meaningless"))
         rows += [("written", str(path)) for path in self.files]

@@ -19,6 +19,7 @@ from bevcli.model.box_coding import decode
 from bevcli.model.prepared import Precision
 from bevcli.model.segmentation import decode_maps
 from bevcli.pipeline.attention import AttentionProbe, attention_view, probe_cells
+from bevcli.pipeline.not_finite import is_finite, origin
 from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
 from bevcli.pipeline.read_ahead import read_ahead
 from bevcli.pipeline.stage_clock import StageClock
@@ -82,7 +83,8 @@ class Runner:
 
         Returns:
             the new state and the prediction. A frame without any image returns the state unchanged, so that the next
-            alignment by ego-motion spans both frames.
+            alignment by ego-motion spans both frames. Where the model's numbers stop being finite, the prediction has
+            no boxes and names the place, and the state is None: the next frame starts anew.
         """
         frame = prepared.frame
         started_anew = self._reason_to_start_anew(None if state is None else state.stamp, frame.stamp)
@@ -93,8 +95,11 @@ class Runner:
         probe = self._probe()
         with self.clock:
             with self._autocast(), probe or contextlib.nullcontext():
-                memory = None if state is None else state.memory
-                outputs, memory = self.temporal_model.step(prepared, memory, self._usable(prepared, upcoming))
+                before, later = None if state is None else state.memory, self._usable(prepared, upcoming)
+                outputs, memory = self.temporal_model.step(prepared, before, later)
+                if not is_finite(outputs):
+                    where = origin(self.model, lambda: self.temporal_model.step(prepared, before, later))
+                    return None, self._prediction(prepared, started_anew, Boxes3D.empty(), None, not_finite=where)
             boxes = decode(outputs, self.config)[0]
             self.clock.mark("box_decoding")
             segmentation = self._segmentation(outputs)
@@ -171,6 +176,7 @@ class Runner:
         bev: Tensor | None,
         attention: AttentionView | None = None,
         segmentation: BevMap | None = None,
+        not_finite: str = "",
     ) -> Prediction:
         frame, assignment = prepared.frame, prepared.assignment
         return Prediction(
@@ -182,7 +188,8 @@ class Runner:
             bev=bev,
             started_anew=started_anew,
             camera_embeddings=dict(zip(assignment.cameras, assignment.embeddings, strict=True)),
-            skipped=bev is None,
+            skipped=bev is None and not not_finite,
+            not_finite=not_finite,
             segmentation=segmentation,
             attention=attention,
             stage_seconds={} if bev is None else self.clock.read(),

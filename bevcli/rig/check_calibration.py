@@ -92,7 +92,7 @@ def check_calibration(
         path: a calibration.json, a sequence folder that contains one, a nuScenes root, or a ROS bag.
         sequence: a sequence folder or bag whose images, ego-motion and timestamps belong to the calibration.
         frame: index of the frame in the sequence whose images are kept, from 0.
-        options: of `open_sequence`, for a nuScenes root or a bag, such as topics.
+        options: of `open_sequence`, such as allow_outside, or topics for a bag.
 
     Returns:
         The findings with what is needed to draw them. Mistakes in the calibration are findings, not exceptions.

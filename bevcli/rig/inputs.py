@@ -51,10 +51,9 @@ def read_inputs(
 ) -> CalibrationInputs:
     """Read a calibration.json or a sequence with its own calibration.
 
-    options: further arguments of `open_sequence`, for a sequence that is not a native folder.
-
     sequence: a folder that gives images and ego-motion to a calibration.json elsewhere. frame: index of the frame whose
-    images are read. Raises InputError where the file is missing or not a JSON object, or there is no such frame.
+    images are read. options: further arguments of `open_sequence`; a native folder takes only allow_outside.
+    Raises InputError where the file is missing or not a JSON object, or there is no such frame.
     """
     if is_ros_bag(path) or (path.is_dir() and not (path / CALIBRATION).exists()):
         return _read_other_sequence(path, frame, options or {})
@@ -66,7 +65,7 @@ def read_inputs(
         return _read_other_sequence(folder, frame, {**(options or {}), "calibration": file})
     if folder is None or not draft.rig.cameras:
         return CalibrationInputs(name, draft.rig, draft.findings)
-    findings, images = _read_folder(folder, draft.rig, frame)
+    findings, images = _read_folder(folder, draft.rig, frame, bool((options or {}).get("allow_outside")))
     return CalibrationInputs(name, draft.rig, draft.findings, findings, images)
 
 
@@ -78,18 +77,22 @@ def _read_other_sequence(path: Path, frame: int, options: Mapping[str, Any]) -> 
 
 
 def _read_folder(
-    folder: Path, rig: CameraRig, frame: int
+    folder: Path, rig: CameraRig, frame: int, allow_outside: bool
 ) -> tuple[tuple[Finding, ...], Mapping[str, NDArray[np.uint8]]]:
     """The findings about a native folder, and the images of one of its frames."""
     findings: list[Finding] = []
     unread = GroundTruthUse(is_read=False)
     try:
-        sequence = FolderSequence(folder, rig=rig, ego_motion="optional", ground_truth=unread)
+        sequence = FolderSequence(
+            folder, rig=rig, ego_motion="optional", ground_truth=unread, allow_outside=allow_outside
+        )
     except InputError as error:
         findings.append(_refused(error))
         try:
             # Images may be readable without ego-motion.
-            sequence = FolderSequence(folder, rig=rig, ego_motion="static", ground_truth=unread)
+            sequence = FolderSequence(
+                folder, rig=rig, ego_motion="static", ground_truth=unread, allow_outside=allow_outside
+            )
         except InputError:
             return tuple(findings), {}
     if sequence.ego_motion is not None:

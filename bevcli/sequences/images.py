@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -15,9 +16,13 @@ from numpy.typing import NDArray
 from bevcli.errors import InputError
 from bevcli.frame import CameraImage
 from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.parsing.files import MIB, read_bytes
+from bevcli.parsing.images import decode_image, media_type_of, size_of_image
 from bevcli.sequences.video import VideoReader
 
 DECODING_THREADS = 6
+MOST_PIXELS = 64 << 20  # of an image in a bag
+LARGEST_METADATA = 4 * MIB  # bytes of an image file beyond its pixels
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".webm", ".mov", ".m4v")
 # The calibration refers to the pixels as they are stored, so an EXIF orientation must not rotate them.
@@ -70,10 +75,13 @@ class ImageReader:
     """Reads the images of frames, which should be asked for in order.
 
     strict: a missing or broken image raises InputError.
+    inside: the folder that no path or link may lead out of. None: images may be anywhere.
     """
 
-    def __init__(self, *, strict: bool = False) -> None:
+    def __init__(self, *, strict: bool = False, inside: Path | None = None) -> None:
         self._strict = strict
+        self._inside = None if inside is None else os.path.realpath(inside)
+        self._fitting: set[str] = set()  # cameras that had an image of the calibration's size
         self._videos: dict[str, VideoReader] = {}  # by camera, so that only one thread at a time uses a reader
         self._threads = ThreadPoolExecutor(DECODING_THREADS, thread_name_prefix="decode")
 
@@ -83,7 +91,8 @@ class ImageReader:
         """The images by camera, and the reasons for missing images by camera.
 
         dropped: cameras already known to have no image, with the reasons.
-        Raises InputError for an image whose size differs from the calibration and, with `strict`, a missing image.
+        Raises InputError where a camera's first image has another size than the calibration states, where an image
+        lies outside of the folder and, with `strict`, for a missing image.
         """
         if self._strict and dropped:
             camera, reason = next(iter(dropped.items()))
@@ -104,19 +113,44 @@ class ImageReader:
     def _read_one(self, source: Source, camera: Camera) -> CameraImage:
         if isinstance(source, ReadableSource):
             image = source.read()
-        elif not isinstance(source, ImageSource):
+            self._check_size(source, camera, (image.pixels_bgr.shape[1], image.pixels_bgr.shape[0]))
+            self._fitting.add(camera.name)
+            return image
+        if not isinstance(source, ImageSource):
             raise TypeError(f"{source} is not an image source")
-        elif source.video_index is None:
-            image = _read_file(source)
+        self._check_place(source)
+        if source.video_index is None:
+            encoded, size = _read_file(source, camera)
+            self._check_size(source, camera, size)
+            image = _decode(source, encoded, size)
         else:
-            image = CameraImage(source.timestamp_ns, self._read_video(source, camera.name))
-        height, width = image.pixels_bgr.shape[:2]
-        if (width, height) != (camera.width, camera.height):
-            raise InputError(
-                f"{source}: camera {camera.name}: the image is {width}x{height} (expected {camera.width}x"
-                f"{camera.height}, as in the calibration): use the calibration of this image size"
-            )
+            pixels = self._read_video(source, camera.name)
+            self._check_size(source, camera, (pixels.shape[1], pixels.shape[0]))
+            image = CameraImage(source.timestamp_ns, pixels)
+        self._fitting.add(camera.name)
         return image
+
+    def _check_place(self, source: ImageSource) -> None:
+        """Raises InputError for an image that lies outside of the sequence, also behind a link."""
+        if self._inside is None:
+            return
+        try:
+            path = os.path.realpath(source.path)
+        except ValueError:  # a null byte
+            raise UnreadableImage(f"{str(source.path)!r} is not a file name") from None
+        if os.path.commonpath((path, self._inside)) != self._inside:
+            raise InputError(
+                f"{source.path}: leads out of the folder {self._inside} (to {path}): pass --allow-outside to read it"
+            )
+
+    def _check_size(self, source: Source, camera: Camera, size: tuple[int, int]) -> None:
+        """Raises InputError for a wrong size of a camera's first image, UnreadableImage for that of a later one."""
+        if size == (camera.width, camera.height):
+            return
+        found = f"the image is {size[0]}x{size[1]} (expected {camera.width}x{camera.height}, as in the calibration)"
+        if camera.name in self._fitting:
+            raise UnreadableImage(f"{source}: {found}")
+        raise InputError(f"{source}: camera {camera.name}: {found}: use the calibration of this image size")
 
     def _read_video(self, source: ImageSource, camera: str) -> NDArray[np.uint8]:
         reader = self._videos.get(camera)
@@ -129,38 +163,28 @@ class ImageReader:
             raise UnreadableImage(str(error)) from None
 
 
-def _read_file(source: ImageSource) -> CameraImage:
+def _read_file(source: ImageSource, camera: Camera) -> tuple[bytes, tuple[int, int]]:
+    """The contents of an image file, and (width, height) by its header, without decoding it."""
+    # An uncompressed image with four channels of 16 bits, and room for metadata.
+    largest = 8 * camera.width * camera.height + LARGEST_METADATA
     try:
-        encoded = source.path.read_bytes()
-    except FileNotFoundError:
-        raise UnreadableImage(f"{source.path} is missing") from None
-    except OSError as error:
-        raise UnreadableImage(f"{source.path} cannot be read ({error.strerror})") from None
-    media_type = media_type_of(encoded)
-    pixels = decode(encoded)
-    if pixels is None:
-        raise UnreadableImage(f"{source.path} is not a complete image")
-    return CameraImage(source.timestamp_ns, pixels, encoded if media_type else None, media_type)
+        encoded = read_bytes(source.path, largest, missing="is missing")
+    except InputError as error:
+        raise UnreadableImage(str(error)) from None
+    size = size_of_image(encoded)
+    if size is None:
+        raise UnreadableImage(f"{source.path} is not a complete image (expected a JPEG or PNG)")
+    return encoded, size
 
 
 def decode(encoded: bytes) -> NDArray[np.uint8] | None:
-    """(H, W, 3) uint8 BGR of an encoded image; None if it is not an image or incomplete."""
-    if not encoded or _is_cut_short(encoded):
-        return None
-    pixels = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), DECODE_FLAGS)
+    """(H, W, 3) uint8 BGR of a JPEG or PNG; None for another format, a damaged one, or one of more than 64 MP."""
+    pixels = decode_image(encoded, DECODE_FLAGS, MOST_PIXELS)
     return None if pixels is None else pixels.astype(np.uint8, copy=False)
 
 
-def media_type_of(encoded: bytes) -> str | None:
-    """The media type of an encoded image: "image/jpeg", "image/png", or None for another format."""
-    if encoded.startswith(b"\xff\xd8\xff"):
-        return "image/jpeg"
-    return "image/png" if encoded.startswith(b"\x89PNG\r\n") else None
-
-
-def _is_cut_short(encoded: bytes) -> bool:
-    """Whether the end of a JPEG or PNG is missing. OpenCV fills the missing part with grey, without an error."""
-    kind = media_type_of(encoded)
-    if kind == "image/jpeg":
-        return encoded.rfind(b"\xff\xd9") < encoded.rfind(b"\xff\xda")  # the end marker comes before the last scan
-    return kind == "image/png" and b"IEND" not in encoded[-64:]
+def _decode(source: ImageSource, encoded: bytes, size: tuple[int, int]) -> CameraImage:
+    pixels = decode_image(encoded, DECODE_FLAGS, size[0] * size[1])
+    if pixels is None:
+        raise UnreadableImage(f"{source.path} is not a complete image")
+    return CameraImage(source.timestamp_ns, pixels.astype(np.uint8, copy=False), encoded, media_type_of(encoded))

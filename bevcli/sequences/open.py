@@ -40,6 +40,7 @@ class _Options:
     topics_file: Path | None
     topics: Mapping[str, str]
     ground_truth: GroundTruthUse
+    allow_outside: bool
 
 
 def open_sequence(
@@ -62,6 +63,7 @@ def open_sequence(
     class_map: Mapping[str, str] | None = None,
     topics: Mapping[str, str] | None = None,
     topics_file: str | Path | None = None,
+    allow_outside: bool = False,
 ) -> Sequence:
     """Open a drive: a native sequence folder (images or videos), a nuScenes dataset root, an MCAP file or a ROS 2 bag.
 
@@ -94,6 +96,7 @@ def open_sequence(
         class_map: native folder: class names in its ground truth -> the ten classes, such as {"Lorry": "truck"}.
         topics: bag: camera -> its image topic, where it is not found. Such a camera gets this name.
         topics_file: bag: TOML with topics and frames, see `bevcli.sequences.ros.topics_file`.
+        allow_outside: read images outside of the folder too: absolute paths, "..", and links that lead out of it.
 
     Raises InputError if the folder has no known format, a file in it is missing or invalid, an option does not apply
     to the format, or no frame is left. Its messages name the options as the command line does, such as --scene.
@@ -119,6 +122,7 @@ def open_sequence(
         topics_file=_path(topics_file),
         topics=topics or {},
         ground_truth=GroundTruthUse(ground_truth, class_map or {}),
+        allow_outside=allow_outside,
     )
     opener = _opener_of(path)
     if opener is not _open_bag and (options.topics or options.topics_file):
@@ -144,7 +148,7 @@ def _open_nuscenes(path: Path, options: _Options) -> Sequence:
         given = "--static" if options.ego_motion == "static" else "--ego-motion"
         raise InputError(f"{path}: a nuScenes root has its own ego-motion: remove {given}")
     choice = NuScenesChoice(options.version, options.scene, options.split, options.sweeps)
-    sequence = NuScenesSequence(path, choice, strict=options.strict)
+    sequence = NuScenesSequence(path, choice, strict=options.strict, allow_outside=options.allow_outside)
     return sequence if options.ground_truth.is_read else WithoutGroundTruth(sequence)
 
 
@@ -160,6 +164,7 @@ def _open_native_folder(path: Path, options: _Options) -> Sequence:
         rig=_stated_rig(options),
         ego_motion_file=options.ego_motion_file,
         ground_truth=options.ground_truth,
+        allow_outside=options.allow_outside,
     )
     return sequence if options.scene is None else select_scene(sequence, options.scene)
 

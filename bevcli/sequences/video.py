@@ -10,6 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
+from bevcli.parsing.files import open_regular
+
+# Where the beginning of a file shows its container: place and bytes. The last row is that of streams in bags: H.264 and
+# H.265, VP9 and AV1.
+CONTAINERS = (
+    (4, b"ftyp"), (4, b"moov"), (4, b"mdat"), (4, b"wide"), (4, b"free"), (4, b"skip"), (0, b"RIFF"),
+    (0, b"\x1a\x45\xdf\xa3"),
+    (0, b"\x00\x00\x00\x01"), (0, b"\x00\x00\x01"), (0, b"DKIF"),
+)  # fmt: skip
+MOST_PIXELS = 1 << 26
+SMALLEST_IMAGE = 8  # bytes of a container for each of its images, at least
 
 
 @dataclass(frozen=True)
@@ -47,12 +58,12 @@ class VideoReader:
         if index == self._at and self._pixels is not None:
             return self._pixels
         while self._at < index:
-            if not self._capture.grab():
+            if not _grab(self._capture):
                 self._end, self._capture = self._at + 1, None
                 raise InputError(f"{self.path} has no image {index} (the last is {self._end - 1})")
             self._at += 1
-        readable, pixels = self._capture.retrieve()
-        if not readable:
+        pixels = _retrieve(self._capture)
+        if pixels is None:
             raise InputError(f"{self.path}: image {index} cannot be decoded")
         self._pixels = pixels.astype(np.uint8, copy=False)
         return self._pixels
@@ -60,19 +71,44 @@ class VideoReader:
 
 def open_capture(path: Path) -> cv2.VideoCapture:
     """Open a video. Raises InputError if it is missing or OpenCV cannot read it."""
-    if not path.is_file():
-        raise InputError(f"{path} is missing")
-    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    with open_regular(path, missing="is missing") as file:
+        start = file.read(12)
+    # FFmpeg recognises playlists too, which could lead it to other files and to servers.
+    if not any(start[place:].startswith(magic) for place, magic in CONTAINERS):
+        raise InputError(f"{path} is not a video (expected MP4, MOV, MKV, WebM or AVI)")
+    try:
+        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    except cv2.error:
+        capture = cv2.VideoCapture()
     if not capture.isOpened():
         raise InputError(f"{path} cannot be opened as a video (expected a codec such as H.264 or FFV1)")
+    width, height = (capture.get(side) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+    if not 0 < width * height <= MOST_PIXELS:
+        capture.release()
+        raise InputError(f"{path} has images of {width:.0f}x{height:.0f} (expected at most {MOST_PIXELS} pixels)")
     return capture
+
+
+def _grab(capture: cv2.VideoCapture) -> bool:
+    try:
+        return capture.grab()
+    except cv2.error:  # a damaged stream
+        return False
+
+
+def _retrieve(capture: cv2.VideoCapture) -> NDArray | None:
+    try:
+        readable, pixels = capture.retrieve()
+    except cv2.error:
+        return None
+    return pixels if readable else None
 
 
 def video_facts(path: Path) -> VideoFacts:
     """Number of images and rate of a video. Raises InputError if it cannot be opened or does not state them."""
     capture = open_capture(path)
-    count, rate = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), float(capture.get(cv2.CAP_PROP_FPS))
+    count, rate = float(capture.get(cv2.CAP_PROP_FRAME_COUNT)), float(capture.get(cv2.CAP_PROP_FPS))
     capture.release()
-    if count <= 0 or not 0 < rate < 10_000:
-        raise InputError(f"{path} states {count} images at {rate:g} per second: list its images in frames.csv")
-    return VideoFacts(count, rate)
+    if not 0 < count <= path.stat().st_size / SMALLEST_IMAGE or not 0.001 < rate < 10_000:
+        raise InputError(f"{path} states {count:.0f} images at {rate:g} per second: list its images in frames.csv")
+    return VideoFacts(int(count), rate)

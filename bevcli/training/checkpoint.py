@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from bevcli.errors import OutputError, WeightsError
 from bevcli.model.bevformer import BEVFormerBase
 
 FORMAT = "bevcli-training/1"
+# The exceptions for a file that PyTorch cannot read, or whose contents belong to another model.
+_DAMAGE = (pickle.UnpicklingError, RuntimeError, ValueError, LookupError, TypeError, AttributeError, EOFError)
 
 
 def save_checkpoint(path: Path, step: int, trained: nn.Module, optimizer: torch.optim.AdamW) -> None:
@@ -42,7 +45,7 @@ def load_checkpoint(path: Path, trained: nn.Module, optimizer: torch.optim.AdamW
         return int(contents["step"])
     except FileNotFoundError:
         raise WeightsError(f"{path}: no checkpoint to resume from; leave out --resume to start a training") from None
-    except (RuntimeError, ValueError, KeyError, TypeError, EOFError) as error:
+    except _DAMAGE as error:
         reason = " ".join(line.strip() for line in str(error).split("\n")[:2])
         raise WeightsError(f"{path}: is not a checkpoint of this model: {reason}") from error
 

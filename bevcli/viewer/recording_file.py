@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,6 +13,24 @@ from pathlib import Path
 from bevcli.errors import InputError
 from bevcli.viewer.native import viewer_binary, viewer_environment
 
+# Reads all of a recording in a process of its own: damaged data ends rerun's process at once, without an exception.
+CHECK = """
+import sys, warnings
+from rerun.chunk import RrdReader
+try:
+    import resource
+    resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[2]), int(sys.argv[2])))
+except (ImportError, ValueError, OSError):
+    pass
+warnings.simplefilter("ignore")
+try:
+    for chunk in RrdReader(sys.argv[1]).stream():
+        chunk.to_record_batch()
+except Exception as error:
+    sys.exit(" ".join(str(error).split()))
+"""
+CHECK_MEMORY = 4 << 30  # bytes of address space, most of it never used, beside a multiple of the file's size
+SECONDS, BYTES_PER_SECOND = 20.0, 10e6  # time limit of a process that reads a recording
 RECORDING = "recording.rrd"
 MAGIC, FOOTER = b"RRF2", b"RRF2FOOT"  # the first bytes of an .rrd file, and the bytes 12 before its end
 
@@ -35,18 +54,20 @@ def open_recording(path: Path) -> Iterator[RecordingFile]:
 
     path: the recording, or the output folder of `bevcli run`.
 
-    Raises InputError if the file is missing, is not a recording, or was cut off before its first frame.
+    Raises InputError if the file is missing, is not a recording, was cut off before its first frame, or is damaged.
     """
     path = recording_in(path)
     if _is_whole(path):
+        _check(path, path)
         yield RecordingFile(path, repaired=False)
         return
     with tempfile.TemporaryDirectory(prefix="bevcli-") as folder:
         copy = Path(folder) / path.name
         command = [str(viewer_binary()), "rrd", "filter", "--continue-on-error", str(path), "-o", str(copy)]
-        subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, env=viewer_environment(), check=False)
+        _run(command, path)
         if not copy.is_file() or copy.stat().st_size < 1000:
             raise InputError(f"{path}: the recording was cut off before its first frame; nothing can be shown")
+        _check(copy, path)
         yield RecordingFile(copy, repaired=True)
 
 
@@ -58,6 +79,27 @@ def recording_in(path: Path) -> Path:
     if not recording.is_file():
         raise InputError(f"{path}: the folder has no {RECORDING} (expected a recording, or a folder of `bevcli run`)")
     return recording
+
+
+def _check(file: Path, path: Path) -> None:
+    """Raises InputError, which names `path`, unless all of a file can be read."""
+    memory = CHECK_MEMORY + 4 * file.stat().st_size
+    done = _run([sys.executable, "-c", CHECK, str(file), str(memory)], path)
+    if done.returncode:
+        lines = done.stderr.decode(errors="replace").strip().splitlines() if done.returncode == 1 else []
+        reason = lines[-1].replace(str(file), path.name) if lines else "rerun ends when it reads it"
+        raise InputError(f"{path}: the recording cannot be read: it is damaged ({reason:.200})")
+
+
+def _run(command: list[str], path: Path) -> subprocess.CompletedProcess[bytes]:
+    seconds = SECONDS + path.stat().st_size / BYTES_PER_SECOND
+    environment = {**viewer_environment(), "RUST_BACKTRACE": "0"}
+    try:
+        return subprocess.run(
+            command, stdin=subprocess.DEVNULL, capture_output=True, env=environment, check=False, timeout=seconds
+        )
+    except subprocess.TimeoutExpired:
+        raise InputError(f"{path}: the recording cannot be read within {seconds:.0f} s: it is damaged") from None
 
 
 def _is_whole(path: Path) -> bool:

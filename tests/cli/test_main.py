@@ -1,10 +1,12 @@
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 import bevcli
 
+SAMPLE = Path(__file__).parents[2] / "samples" / "street"
 HEAVY = ("torch", "cv2", "rerun", "matplotlib", "trimesh", "scipy", "numba")
 
 
@@ -54,4 +56,46 @@ def test_an_interrupt_exits_130(tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", code, "wait"], capture_output=True, text=True, check=False)
     assert done.returncode == 130
+    assert "Traceback" not in done.stderr
+
+
+NAME_OF_300 = "x" * 300
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("run", SAMPLE, "--out", NAME_OF_300, "--frames", "0:1"),
+        ("convert", SAMPLE, NAME_OF_300),
+        ("project-debug", SAMPLE, "--out", NAME_OF_300),
+        ("render", NAME_OF_300),
+    ],
+    ids=lambda arguments: arguments[0],
+)
+def test_an_output_name_that_the_system_refuses_is_one_line(arguments, tmp_path):
+    done = bevcli_command(*map(str, arguments), cwd=tmp_path)
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].startswith("error: ")
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no full device")
+@pytest.mark.parametrize("arguments", [("--version",), ("--help",), ("weights", "inspect", "--model", "demo")])
+def test_a_full_output_device_is_one_line(arguments, tmp_path):
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "bevcli", *arguments], stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+    assert done.returncode == 1
+    assert done.stderr == "error: No space left on device\n"
+
+
+@pytest.mark.parametrize(
+    "options",
+    [("--port", "99999"), ("--port", "0"), ("--host", ""), ("--host", "no.such.host.invalid"), ("--host", "192.0.2.1")],
+)
+def test_an_address_that_cannot_be_listened_on_is_a_usage_error(options, tmp_path):
+    done = bevcli_command("viz", "recording.rrd", "--web", *options, cwd=tmp_path)
+    assert done.returncode == 2
+    assert options[0] in done.stderr
     assert "Traceback" not in done.stderr

@@ -54,3 +54,20 @@ def test_a_missing_file_and_a_folder_without_a_recording_are_errors(tmp_path):
         pass
     with pytest.raises(InputError, match="folder"), open_recording(tmp_path):
         pass
+
+
+@pytest.mark.parametrize("place", range(1, 12))
+def test_damaged_data_never_ends_the_process(recording, tmp_path, place):
+    content = bytearray(recording.read_bytes())
+    start = place * len(content) // 12 if place < 6 else place * 1500  # in an image, or in the descriptions of data
+    content[start : start + 8] = bytes(byte ^ 0x55 for byte in content[start : start + 8])
+    damaged = tmp_path / "damaged.rrd"
+    damaged.write_bytes(content)
+    message = f"{damaged}: "
+    try:
+        with open_recording(damaged) as file:
+            assert list(RecordingReader(file.path).frames())
+    except InputError as error:
+        message = str(error)
+    assert message.startswith(f"{damaged}: ")
+    assert "\n" not in message

@@ -7,8 +7,10 @@ The compiled code is cached on disk (in NUMBA_CACHE_DIR, next to this file, or i
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, types
+from numba import types
 from numba.extending import overload
+
+from bevcli.jit import njit
 
 
 def as_float32(number: object) -> np.float32:
@@ -44,7 +46,7 @@ def _put_float32(array, index, number):  # type: ignore[no-untyped-def]
     return put
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"}, inline="never")
+@njit(nogil=True, error_model="numpy", fastmath={"contract"}, inline="never")
 def bilinear_corners(x, y, height, width):  # type: ignore[no-untyped-def]
     """The four cells around a location (x, y) in cells, and their interpolation weights.
 
@@ -70,7 +72,7 @@ def bilinear_corners(x, y, height, width):  # type: ignore[no-untyped-def]
     return top, bottom, left, right, shares
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+@njit(nogil=True, error_model="numpy", fastmath={"contract"})
 def sample_maps(values, level_shapes, locations, weights, map_of_query, out, begin, end) -> None:  # type: ignore[no-untyped-def]
     """Writes the weighted sums of queries begin to end - 1 to out (M, heads, D) float32.
 
@@ -123,7 +125,7 @@ def sample_maps(values, level_shapes, locations, weights, map_of_query, out, beg
             out[query, head] = total
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+@njit(nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
 def sample_maps_backward(  # type: ignore[no-untyped-def]
     values, level_shapes, locations, weights, starts, out_gradient,
     values_gradient, locations_gradient, weights_gradient, begin, end,
@@ -194,7 +196,7 @@ def sample_maps_backward(  # type: ignore[no-untyped-def]
                 start += height * width
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+@njit(nogil=True, error_model="numpy", fastmath={"contract"})
 def sample_taps(x, offsets, mask, stride, first, out, begin, end) -> None:  # type: ignore[no-untyped-def]
     """Samples and masks the nine taps of output positions first + begin to first + end - 1.
 

@@ -16,6 +16,7 @@ from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
+from bevcli.parsing.documents import read_json
 from bevcli.sequences.files.box_json import boxes_from_json, boxes_to_json
 from bevcli.sequences.files.class_names import ClassNames
 from bevcli.sequences.files.incremental_json import IncrementalJson
@@ -23,6 +24,7 @@ from bevcli.sequences.files.transform_json import pose_from_json, pose_to_json
 from bevcli.sequences.garbage_collection import without_garbage_collection
 
 FORMAT = "bevcli-boxes/1"
+LARGEST_BYTES = 4 << 30
 FRAMES_OF_REFERENCE = ("world", "ego", "bev")
 _FILE_KEYS = ("format", "frame_of_reference", "ego_from_bev", "frames")
 _FRAME_KEYS = ("frame", "scene", "timestamp_ns", "world_from_ego", "boxes")
@@ -146,14 +148,8 @@ class BoxesWriter:
 
 
 def _load(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_bytes())
-    except FileNotFoundError:
-        raise InputError(f'{path}: the file is missing (expected a boxes file, "format": "{FORMAT}")') from None
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}: broken JSON at line {error.lineno}, column {error.colno}: {error.msg}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as JSON ({error})") from None
+    missing = f'the file is missing (expected a boxes file, "format": "{FORMAT}")'
+    content = read_json(path, largest=LARGEST_BYTES, missing=missing)
     found = content.get("format") if isinstance(content, dict) else type(content).__name__
     if found != FORMAT:
         raise InputError(f'{path}: is not a boxes file: "format" must be "{FORMAT}", found {found!r:.40}')

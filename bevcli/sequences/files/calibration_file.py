@@ -13,11 +13,13 @@ from bevcli.findings import Finding, errors_of
 from bevcli.frame import DriveFacts
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.geographic import EAST_DEG, GeoOrigin
+from bevcli.parsing.documents import read_json
 from bevcli.sequences.files.camera_fields import parse_camera
 from bevcli.sequences.files.json_fields import Report, parse_numbers
 from bevcli.sequences.files.transform_json import parse_transform, transform_to_json
 
 FORMAT = "bevcli-calibration/1"
+LARGEST_BYTES = 4 << 20
 
 
 @dataclass(frozen=True)
@@ -81,27 +83,20 @@ def write_calibration(path: Path, rig: CameraRig, facts: DriveFacts | None = Non
 
 
 def _load_object(path: Path) -> dict[str, Any]:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: the file is missing (expected a calibration)") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as text ({error})") from error
-    try:
-        document = json.loads(text, object_pairs_hook=lambda pairs: _unique(pairs, path))
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}: line {error.lineno}, column {error.colno}: broken JSON: {error.msg}") from error
+    missing = "the file is missing (expected a calibration)"
+    document = read_json(path, largest=LARGEST_BYTES, missing=missing, pairs=lambda pairs: _unique(pairs, path))
     if not isinstance(document, dict):
         raise InputError(f'{path}: is not a JSON object (expected {{"format": "{FORMAT}", "cameras": {{...}}}})')
     return document
 
 
 def _unique(pairs: list[tuple[str, Any]], path: Path) -> dict[str, Any]:
-    keys = [key for key, _ in pairs]
-    for key in keys:
-        if keys.count(key) > 1:
-            raise InputError(f'{path}: "{key}" appears twice in the same object: remove or rename one')
-    return dict(pairs)
+    unique = dict(pairs)
+    if len(unique) < len(pairs):
+        keys = [key for key, _ in pairs]
+        twice = next(key for place, key in enumerate(keys) if key in keys[:place])
+        raise InputError(f'{path}: "{twice}" appears twice in the same object: remove or rename one')
+    return unique
 
 
 def _parse_cameras(document: Mapping[str, Any], report: Report) -> tuple[Camera, ...]:

@@ -9,16 +9,21 @@ import numpy as np
 
 from bevcli.geometry.cameras import Camera, Distortion
 from bevcli.geometry.transforms import Array
-from bevcli.sequences.files.json_fields import Report, parse_numbers
+from bevcli.sequences.files.json_fields import Report, parse_numbers, shortened
 from bevcli.sequences.files.transform_json import parse_transform
 
 KEYS = ("width", "height", "intrinsics", "distortion", "ego_from_camera")
+LARGEST_SIZE = 16384  # pixels of a side
 FOCAL_RANGE = (0.05, 50.0)  # focal length divided by image size, from extreme fisheye to extreme telephoto
 COEFFICIENT_COUNTS = {"brown_conrady": (4, 5, 8), "kannala_brandt": (4,)}
 
 
 def parse_camera(name: str, value: object, report: Report) -> Camera | None:
     """The camera, or None if a field is invalid. All fields are read, so that all mistakes are reported."""
+    if not is_camera_name(name):
+        expected = "up to 100 letters, digits and signs, no slash"
+        report.error("camera-name", shortened(name), "is not the name of a camera", expected=expected)
+        return None
     if not isinstance(value, dict):
         report.error("wrong-shape", name, "is not a camera", expected="an object with " + ", ".join(KEYS), found=value)
         return None
@@ -31,6 +36,11 @@ def parse_camera(name: str, value: object, report: Report) -> Camera | None:
     if not _are_plausible(intrinsics, width, height, report):
         return None
     return Camera(name, width, height, intrinsics, ego_from_camera, distortion)
+
+
+def is_camera_name(name: str) -> bool:
+    """Whether a camera may have this name: it becomes the name of a folder when images are written."""
+    return 0 < len(name) <= 100 and name.isprintable() and not set(name) & {"/", "\\"} and name.strip(". ") != ""
 
 
 def parse_intrinsics(camera: Mapping[str, Any], report: Report) -> Array | None:
@@ -87,8 +97,9 @@ def _parse_size(camera: Mapping[str, Any], name: str, report: Report) -> int | N
     if value is None:
         report.missing(name, "the image size in pixels")
         return None
-    if isinstance(value, bool) or not isinstance(value, int) or value <= 0:
-        report.error("wrong-size", name, "is not an image size", expected="a positive integer", found=value)
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 < value <= LARGEST_SIZE:
+        expected = f"a positive integer, at most {LARGEST_SIZE}"
+        report.error("wrong-size", name, "is not an image size", expected=expected, found=value)
         return None
     return value
 

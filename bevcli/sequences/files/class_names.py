@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -11,6 +10,8 @@ import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.geometry.boxes import CLASSES, Boxes3D
+from bevcli.parsing.documents import TOML_BYTES, parse_toml
+from bevcli.parsing.files import read_text
 
 _KNOWN = {name: name for name in CLASSES}
 
@@ -44,10 +45,7 @@ class ClassNames:
 
 def read_class_map(path: Path) -> dict[str, str]:
     """A class map in TOML, one `"Name in the file" = "class"` a line. Raises InputError if it is not one."""
-    try:
-        stated = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as a class map in TOML ({error})") from None
+    stated = parse_toml(read_text(path, TOML_BYTES), path)
     for name, target in stated.items():
         if not isinstance(target, str):
             raise InputError(f'{path}: {name}: expected the name of a class, such as "truck", found {target!r:.40}')

@@ -14,6 +14,8 @@ import numpy as np
 from bevcli.findings import Finding
 from bevcli.geometry.transforms import Array
 
+LARGEST_NUMBER = 1e12
+
 
 @dataclass(frozen=True)
 class Report:
@@ -64,8 +66,8 @@ def parse_numbers(owner: Mapping[str, Any], name: str, shape: tuple[int, ...], r
         found = "x".join(map(str, array.shape)) or value
         report.error("wrong-shape", name, "has the wrong shape", expected=expected, found=found)
         return None
-    if not np.isfinite(array).all():
-        report.error("not-finite", name, "contains NaN or infinity", expected="finite numbers", found=value)
+    if not (np.abs(array) < LARGEST_NUMBER).all():
+        report.error("not-finite", name, "contains NaN or infinity", expected="finite numbers below 1e12", found=value)
         return None
     return array
 
@@ -79,6 +81,6 @@ def shortened(value: object) -> str:
 def _array_of_numbers(value: object) -> Array | None:
     try:
         array = np.array(value)
-    except ValueError:  # rows of different lengths
+    except (ValueError, OverflowError):  # rows of different lengths
         return None
     return array.astype(np.float64) if array.dtype.kind in "iuf" else None

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import yaml
-
 from bevcli.errors import InputError
 from bevcli.findings import errors_of
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.transforms import Array, inverse
+from bevcli.parsing.documents import read_json, read_yaml
 from bevcli.sequences.files.camera_fields import parse_camera
 from bevcli.sequences.files.json_fields import Report, parse_numbers
 from bevcli.sequences.files.transform_json import parse_transform, transform_to_json
@@ -80,14 +77,7 @@ def _cameras_in(path: Path) -> Iterator[tuple[str, Fields]]:
 
 
 def _load_yaml(path: Path) -> Mapping[str, Any]:
-    try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: the file is missing") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({error})") from None
-    except yaml.YAMLError as error:
-        raise InputError(f"{path}: broken YAML ({' '.join(str(error).split())})") from None
+    document = read_yaml(path)
     if not isinstance(document, dict):
         raise InputError(f"{path}: expected a mapping (Kalibr camchain or ROS camera_info)")
     return document
@@ -97,7 +87,7 @@ def _kalibr_fields(entry: Any, where: str) -> Fields:
     if not isinstance(entry, dict):
         raise InputError(f"{where}: expected a mapping with intrinsics and resolution")
     if entry.get("camera_model", "pinhole") != "pinhole":
-        raise InputError(f"{where}: camera_model {entry['camera_model']} is not supported (expected pinhole)")
+        raise InputError(f"{where}: camera_model {entry['camera_model']!s:.60} is not supported (expected pinhole)")
     fx, fy, cx, cy = _numbers(entry, "intrinsics", 4, where)
     width, height = _numbers(entry, "resolution", 2, where)
     fields: Fields = {
@@ -109,18 +99,18 @@ def _kalibr_fields(entry: Any, where: str) -> Fields:
         ),
     }
     if "T_cn_cnm1" in entry:
-        matrix = np.array(entry["T_cn_cnm1"], dtype=object)
-        if matrix.shape != (4, 4):
-            raise InputError(f"{where}: T_cn_cnm1: expected a 4x4 matrix, found {entry['T_cn_cnm1']!r:.60}")
-        fields[CHAIN] = matrix.astype(np.float64)
+        report = Report()
+        matrix = parse_numbers(entry, "T_cn_cnm1", (4, 4), report)
+        _raise_first(report, where)
+        fields[CHAIN] = matrix
     return fields
 
 
 def _ros_fields(document: Mapping[str, Any], path: Path) -> Fields:
     """Fields of a ROS calibration file (camera_matrix: {data: ...}) or printed message (k: [...] or K: [...])."""
     where = str(path)
-    matrix = document.get("camera_matrix", {}).get("data") or document.get("k") or document.get("K")
-    coefficients = document.get("distortion_coefficients", {}).get("data") or document.get("d") or document.get("D")
+    matrix = _data(document, "camera_matrix") or document.get("k") or document.get("K")
+    coefficients = _data(document, "distortion_coefficients") or document.get("d") or document.get("D")
     numbers = _numbers({"camera_matrix": matrix}, "camera_matrix", 9, where)
     return {
         "width": document.get("image_width", document.get("width")),
@@ -128,6 +118,11 @@ def _ros_fields(document: Mapping[str, Any], path: Path) -> Fields:
         "intrinsics": [numbers[0:3], numbers[3:6], numbers[6:9]],
         "distortion": _lens(document.get("distortion_model") or "plumb_bob", coefficients or [], ROS_LENSES, where),
     }
+
+
+def _data(document: Mapping[str, Any], name: str) -> Any:
+    value = document.get(name)
+    return value.get("data") if isinstance(value, dict) else None
 
 
 def _numbers(owner: Mapping[str, Any], name: str, count: int, where: str) -> list[float]:
@@ -139,21 +134,18 @@ def _numbers(owner: Mapping[str, Any], name: str, count: int, where: str) -> lis
     return [float(number) for number in numbers]
 
 
-def _lens(model: str, coefficients: list[float], known: Mapping[str, str], where: str) -> Fields:
-    if model not in known:
-        raise InputError(f"{where}: distortion_model {model} is not supported (expected {', '.join(known)})")
+def _lens(model: object, coefficients: object, known: Mapping[str, str], where: str) -> Fields:
+    if not isinstance(coefficients, list):
+        raise InputError(f"{where}: the distortion coefficients must be a list, found {coefficients!r:.60}")
+    if not isinstance(model, str) or model not in known:
+        raise InputError(f"{where}: distortion_model {model!s:.60} is not supported (expected {', '.join(known)})")
     if not any(coefficients):
         return {"model": "none"}
     return {"model": known[model], "coefficients": coefficients}
 
 
 def _read_extrinsics(path: Path) -> Mapping[str, Any]:
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: the file is missing") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as JSON ({error})") from None
+    document = read_json(path)
     if not isinstance(document, dict) or not isinstance(document.get("cameras"), dict):
         raise InputError(
             f'{path}: "cameras" is missing (expected {{"cameras": {{"cam0": {{"ego_from_camera": ...}}}}}})'
@@ -194,6 +186,6 @@ def _camera(name: str, fields: Fields, ego_from_camera: Array | None, path: Path
     return camera
 
 
-def _raise_first(report: Report, path: Path) -> None:
+def _raise_first(report: Report, path: Path | str) -> None:
     for error in errors_of(report.findings):
         raise InputError(f"{path}: {error.line}")

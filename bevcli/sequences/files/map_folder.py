@@ -12,9 +12,13 @@ import numpy as np
 
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import MAP_CLASSES, BevMap
+from bevcli.parsing.documents import read_json
+from bevcli.parsing.files import read_bytes
+from bevcli.parsing.images import decode_image
 
 FORMAT = "bevcli-map/1"
 LEGEND = "map.json"
+LARGEST_BYTES, LARGEST_CELLS = 64 << 20, 64 << 20  # of one map
 
 
 @dataclass(frozen=True)
@@ -42,7 +46,7 @@ class MapFolder:
         path = _image(self.path, frame)
         if not path.is_file():
             raise InputError(f"{path}: the map of frame {frame} is missing")
-        cells = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        cells = decode_image(read_bytes(path, LARGEST_BYTES), cv2.IMREAD_UNCHANGED, LARGEST_CELLS)
         if cells is None or cells.ndim != 2 or cells.dtype != np.uint8:
             found = "an unreadable image" if cells is None else f"{cells.dtype} of shape {cells.shape}"
             raise InputError(f"{path}: expected an 8-bit image with one channel, found {found}")
@@ -55,14 +59,8 @@ class MapFolder:
 def open_maps(path: Path) -> MapFolder:
     """Open a folder of maps. Only map.json is read here. Raises InputError if it is missing or invalid."""
     legend_path = path / LEGEND
-    try:
-        legend = json.loads(legend_path.read_bytes())
-    except FileNotFoundError:
-        raise InputError(
-            f"{legend_path}: the file is missing (expected the extent and classes of the maps in this folder)"
-        ) from None
-    except (ValueError, OSError) as error:
-        raise InputError(f"{legend_path}: cannot be read as JSON ({error})") from None
+    missing = "the file is missing (expected the extent and classes of the maps in this folder)"
+    legend = read_json(legend_path, missing=missing)
     found = legend.get("format") if isinstance(legend, dict) else type(legend).__name__
     if found != FORMAT:
         raise InputError(f'{legend_path}: "format" must be "{FORMAT}", found {found!r:.40}')

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import csv
-import math
+import io
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from bevcli.errors import InputError
+from bevcli.parsing.documents import LARGEST_INTEGER
+from bevcli.parsing.files import read_text
+
+LARGEST_BYTES = 256 << 20
+LARGEST_NUMBER = 1e12  # in SI units, far beyond any position or motion of a vehicle
 
 
 @dataclass(frozen=True)
@@ -34,7 +39,9 @@ class CsvRow:
         text = self.cells[column]
         digits = text.removeprefix("-")
         if not (digits.isascii() and digits.isdigit()):
-            raise self.error(column, f'expected an integer, found "{text}": remove decimal point and exponent')
+            raise self.error(column, f'expected an integer, found "{text:.40}": remove decimal point and exponent')
+        if len(digits) > 19 or int(digits) > LARGEST_INTEGER:
+            raise self.error(column, f'the integer "{text:.24}" is too large (expected at most 62 bits)')
         return int(text)
 
     def number(self, column: str) -> float:
@@ -43,9 +50,9 @@ class CsvRow:
         try:
             value = float(text)
         except ValueError:
-            raise self.error(column, f'expected a number, found "{text}"') from None
-        if not math.isfinite(value):
-            raise self.error(column, f'expected a finite number, found "{text}": correct or remove the row')
+            raise self.error(column, f'expected a number, found "{text:.40}"') from None
+        if not abs(value) < LARGEST_NUMBER:
+            raise self.error(column, f'expected a finite number, found "{text:.24}": correct or remove the row')
         return value
 
 
@@ -78,13 +85,11 @@ def read_csv(path: Path, required: Iterable[str], optional: Iterable[str] = ()) 
 
 def _lines(path: Path) -> list[tuple[int, list[str]]]:
     """Line number and cells of every line that is not blank."""
+    text = read_text(path, LARGEST_BYTES).removeprefix("\ufeff")
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
-            return [(reader.line_num, cells) for cells in reader if cells]
-    except FileNotFoundError:
-        raise InputError(f"{path}: the file is missing") from None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        reader = csv.reader(io.StringIO(text, newline=""))
+        return [(reader.line_num, cells) for cells in reader if cells]
+    except csv.Error as error:
         raise InputError(f"{path}: cannot be read as CSV ({error})") from None
 
 

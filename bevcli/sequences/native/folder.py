@@ -11,7 +11,7 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
 from bevcli.sequences.files.calibration_file import read_rig_and_facts
 from bevcli.sequences.frame_reading import read_frame
-from bevcli.sequences.images import ImageReader
+from bevcli.sequences.images import ImageReader, ImageSource
 from bevcli.sequences.native.ego_motion_file import read_ego_motion
 from bevcli.sequences.native.frames_table import FrameEntry, check_times, read_frames_table
 from bevcli.sequences.native.ground_truth import FolderGroundTruth, GroundTruthUse
@@ -33,7 +33,7 @@ class FolderSequence:
     """A native sequence folder as a `Sequence`.
 
     rig: used in place of calibration.json, if given. ego_motion_file: used in place of ego_motion.csv, if given.
-    ground_truth: see `GroundTruthUse`.
+    ground_truth: see `GroundTruthUse`. allow_outside: whether images may lie outside of the folder.
     Raises InputError if a file of the folder is missing or invalid.
     """
 
@@ -46,6 +46,7 @@ class FolderSequence:
         rig: CameraRig | None = None,
         ego_motion_file: Path | None = None,
         ground_truth: GroundTruthUse = GroundTruthUse(),
+        allow_outside: bool = False,
     ) -> None:
         if not path.is_dir():
             raise InputError(f"{path}: the sequence folder is missing")
@@ -54,13 +55,15 @@ class FolderSequence:
         calibration = path / "calibration.json"
         self.rig, self.facts = read_rig_and_facts(calibration) if rig is None else (rig, DriveFacts())
         self._entries, notes = _read_entries(path, self.rig)
+        if not allow_outside:
+            _check_paths(path, self._entries)
         self.ego_motion, motion_notes = _read_motion(
             ego_motion_file or path / "ego_motion.csv", ego_motion, self._entries
         )
         self.has_ego_motion = self.ego_motion is not None
         self._truth = FolderGroundTruth(path, ground_truth)
         self.notes = (*rig_notes(self.rig), *notes, *motion_notes, *self._truth.notes)
-        self._images = ImageReader(strict=strict)
+        self._images = ImageReader(strict=strict, inside=None if allow_outside else path)
 
     @property
     def stamps(self) -> tuple[FrameStamp, ...]:
@@ -84,6 +87,17 @@ def _read_entries(path: Path, rig: CameraRig) -> tuple[tuple[FrameEntry, ...], t
     found = find_frames(path, rig.names)
     check_times(found.entries)
     return found.entries, (found.note,)
+
+
+def _check_paths(folder: Path, entries: tuple[FrameEntry, ...]) -> None:
+    """Raise InputError for an absolute path or one with "..". Links are followed when the image is read."""
+    for entry in entries:
+        for camera, source in entry.sources.items():
+            path = source.path if isinstance(source, ImageSource) else folder
+            if not path.is_relative_to(folder) or ".." in path.relative_to(folder).parts:
+                raise InputError(
+                    f"{entry.origin}: camera {camera}: {path}: leads out of the folder: pass --allow-outside to read it"
+                )
 
 
 def _read_motion(

@@ -9,13 +9,14 @@ rate_hz = 24.0
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from bevcli.errors import InputError
+from bevcli.parsing.documents import TOML_BYTES, parse_toml
+from bevcli.parsing.files import read_text
 
 FILE_NAME = "timing.toml"
 
@@ -66,10 +67,7 @@ def read_timing(folder: Path, cameras: tuple[str, ...]) -> Timing:
     path = folder / FILE_NAME
     if not path.is_file():
         return Timing()
-    try:
-        stated = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as TOML ({error})") from None
+    stated = parse_toml(read_text(path, TOML_BYTES), path)
     _check_keys(path, "", stated, ("start_ns", "rate_hz", "cameras"))
     own = stated.get("cameras", {})
     if not isinstance(own, dict):

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array
 from bevcli.sequences.nuscenes.index import Annotations, Ints
 from bevcli.sequences.nuscenes.json_tables import (
@@ -14,8 +16,10 @@ from bevcli.sequences.nuscenes.json_tables import (
     column,
     integers,
     places_of,
+    quaternions,
     read_batches,
     read_rows,
+    texts,
     tokens,
     vectors,
 )
@@ -54,10 +58,17 @@ class _Names:
 
     def __init__(self, tables: Path) -> None:
         categories = _texts(tables / "category.json", "name")
-        instances = _optional_rows(tables / "instance.json")
-        self.category = {row["token"]: categories[row["category_token"]].encode() for row in instances}
+        path = tables / "instance.json"
+        instances = _optional_rows(path)
+        owners, own = texts(instances, "category_token", path), texts(instances, "token", path)
+        for token in owners:
+            if token not in categories:
+                raise InputError(f'{path}: category "{token}" is missing in category.json')
+        self.category = {token: categories[owner].encode() for token, owner in zip(own, owners, strict=True)}
         self.attribute = {token: name.encode() for token, name in _texts(tables / "attribute.json", "name").items()}
-        self.visibility = {t: _middle(level) for t, level in _texts(tables / "visibility.json", "level").items()}
+        self.visibility = {
+            token: _middle(level, tables) for token, level in _texts(tables / "visibility.json", "level").items()
+        }
 
 
 def _optional_rows(path: Path) -> list[Row]:
@@ -65,19 +76,24 @@ def _optional_rows(path: Path) -> list[Row]:
 
 
 def _texts(path: Path, name: str) -> dict[str, str]:
-    return {row["token"]: row[name] for row in _optional_rows(path)}
+    rows = _optional_rows(path)
+    return dict(zip(texts(rows, "token", path), texts(rows, name, path), strict=True))
 
 
-def _middle(level: str) -> float:
+def _middle(level: str, tables: Path) -> float:
     """The middle of a visibility level such as "v40-60", as a fraction from 0 to 1."""
-    low, high = level.removeprefix("v").split("-")
-    return (float(low) + float(high)) / 200
+    found = re.fullmatch(r"v([0-9]{1,3})-([0-9]{1,3})", level)
+    if found is None:
+        raise InputError(f'{tables / "visibility.json"}: unknown level "{level:.40}" (expected such as v40-60)')
+    return (int(found[1]) + int(found[2])) / 200
 
 
 def _columns(rows: list[Row], path: Path, names: _Names) -> dict[str, NDArray]:
-    instances = column(rows, "instance_token", path)
+    instances = texts(rows, "instance_token", path)
     attributes = column(rows, "attribute_tokens", path)
-    visibilities = column(rows, "visibility_token", path)
+    visibilities = texts(rows, "visibility_token", path)
+    if not all(type(own) is list and all(type(token) is str for token in own) for own in attributes):
+        raise InputError(f'{path}: "attribute_tokens": expected a list of tokens in every row')
     return {
         "tokens": tokens(rows, "token", path),
         "samples": tokens(rows, "sample_token", path),
@@ -85,10 +101,10 @@ def _columns(rows: list[Row], path: Path, names: _Names) -> dict[str, NDArray]:
         "next": tokens(rows, "next", path),
         "categories": np.array([names.category.get(token, b"") for token in instances]),
         "attributes": np.array([names.attribute.get(own[0], b"") if own else b"" for own in attributes]),
-        "instances": np.array(instances, dtype="S"),
+        "instances": tokens(rows, "instance_token", path),
         "centers": vectors(rows, "translation", path, 3),
         "sizes_wlh": vectors(rows, "size", path, 3),
-        "quaternions": vectors(rows, "rotation", path, 4),
+        "quaternions": quaternions(rows, "rotation", path),
         "visibilities": np.array([names.visibility.get(token, np.nan) for token in visibilities]),
         "num_points": integers(rows, "num_lidar_pts", path) + integers(rows, "num_radar_pts", path),
     }

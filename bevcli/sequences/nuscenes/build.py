@@ -15,11 +15,14 @@ from bevcli.sequences.nuscenes.annotations import read_annotations
 from bevcli.sequences.nuscenes.index import Images, Ints, NuScenesIndex, Samples, Scenes, Sensors
 from bevcli.sequences.nuscenes.json_tables import (
     Row,
+    array_of,
     column,
     integers,
     places_of,
+    quaternions,
     read_batches,
     read_rows,
+    texts,
     tokens,
     vectors,
 )
@@ -86,16 +89,29 @@ def build_index(tables: Path) -> NuScenesIndex:
 
 def _read_sensors(tables: Path) -> tuple[NDArray[np.bytes_], Sensors]:
     path = tables / "calibrated_sensor.json"
-    channels = {row["token"]: row["channel"] for row in read_rows(tables / "sensor.json")}
+    sensor_path = tables / "sensor.json"
+    sensor_rows = read_rows(sensor_path)
+    names = texts(sensor_rows, "channel", sensor_path)
+    channels = dict(zip(texts(sensor_rows, "token", sensor_path), names, strict=True))
     rows = read_rows(path)
-    none = np.full((3, 3), np.nan)
     sensors = Sensors(
-        np.array([channels.get(token, "") for token in column(rows, "sensor_token", path)], dtype=np.str_),
+        np.array([channels.get(token, "") for token in texts(rows, "sensor_token", path)], dtype=np.str_),
         vectors(rows, "translation", path, 3),
-        vectors(rows, "rotation", path, 4),
-        np.array([row.get("camera_intrinsic") or none for row in rows], dtype=np.float64),
+        quaternions(rows, "rotation", path),
+        np.array([_intrinsics(row, path) for row in rows], dtype=np.float64).reshape(-1, 3, 3),
     )
     return tokens(rows, "token", path), sensors
+
+
+def _intrinsics(row: Row, path: Path) -> Array:
+    """(3, 3) pixels; NaN for a sensor that is no camera."""
+    value = row.get("camera_intrinsic")
+    if not value:
+        return np.full((3, 3), np.nan)
+    array = array_of(value, (3, 3))
+    if array is None or not min(array[0, 0], array[1, 1]) > 0:
+        raise InputError(f'{path}: "camera_intrinsic": expected a camera matrix of 3x3 numbers, or []')
+    return array
 
 
 def _read_samples(tables: Path) -> tuple[NDArray[np.str_], NDArray[np.bytes_], Ints, Ints]:
@@ -107,7 +123,7 @@ def _read_samples(tables: Path) -> tuple[NDArray[np.str_], NDArray[np.bytes_], I
     in_scene = places_of(tokens(rows, "scene_token", path), tokens(scenes, "token", scene_path), scene_path)
     times = integers(rows, "timestamp", path)
     order = np.lexsort((times, in_scene))
-    names = np.array(column(scenes, "name", scene_path), dtype=np.str_)
+    names = np.array(texts(scenes, "name", scene_path), dtype=np.str_)
     return names, tokens(rows, "token", path)[order], times[order], in_scene[order]
 
 
@@ -119,7 +135,7 @@ def _read_sensor_data(
     cameras = {token.decode() for token in sensor_tokens[np.isfinite(sensors.intrinsics).all((1, 2))]}
     parts = []
     for batch in read_batches(path):
-        owners, keys = column(batch, "calibrated_sensor_token", path), column(batch, "is_key_frame", path)
+        owners, keys = texts(batch, "calibrated_sensor_token", path), column(batch, "is_key_frame", path)
         needed = [
             row
             for row, owner, key in zip(batch, owners, keys, strict=True)
@@ -144,7 +160,7 @@ def _sensor_data_of(
         times_us=integers(rows, "timestamp", path),
         keys=integers(rows, "is_key_frame", path).astype(bool),
         sizes=np.stack([integers(rows, "width", path), integers(rows, "height", path)], axis=1),
-        files=np.array([str(name).encode() for name in column(rows, "filename", path)]),
+        files=np.array([name.encode("utf-8", "surrogatepass") for name in texts(rows, "filename", path)]),
     )
 
 
@@ -152,15 +168,15 @@ def _read_poses(tables: Path, wanted: NDArray[np.bytes_]) -> tuple[Array, Array]
     """Translations (P, 3), metres, and quaternions (P, 4) of world_from_ego for the pose tokens (P,)."""
     path = tables / "ego_pose.json"
     needed = {token.decode() for token in wanted}
-    found, translations, quaternions = [], [], []
+    found, translations, rotations = [], [], []
     for batch in read_batches(path):
-        rows = [row for row, token in zip(batch, column(batch, "token", path), strict=True) if token in needed]
+        rows = [row for row, token in zip(batch, texts(batch, "token", path), strict=True) if token in needed]
         if rows:
             found.append(tokens(rows, "token", path))
             translations.append(vectors(rows, "translation", path, 3))
-            quaternions.append(vectors(rows, "rotation", path, 4))
+            rotations.append(quaternions(rows, "rotation", path))
     places = places_of(wanted, np.concatenate(found) if found else np.zeros(0, "S32"), path)
-    chosen = np.concatenate(quaternions)[places]
+    chosen = np.concatenate(rotations)[places]
     return np.concatenate(translations)[places], chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
 
 

@@ -81,7 +81,7 @@ def split_of(scene: str, *, mini: bool) -> str:
     mini: whether to name the split of the mini version (mini_train, mini_val) instead of train, val or test.
     """
     number = scene.removeprefix("scene-")
-    if not number.isdigit():
+    if not (number.isascii() and number.isdigit() and len(number) < 10):
         return ""
     if mini:
         return "mini_val" if int(number) in numbers(MINI_VAL) else "mini_train"

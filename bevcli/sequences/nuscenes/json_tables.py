@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,9 +12,14 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array
+from bevcli.parsing.documents import LARGEST_INTEGER, parse_json
+from bevcli.parsing.files import open_regular, read_bytes
 
 Row: TypeAlias = dict[str, Any]
 BATCH_BYTES = 16 << 20
+LONGEST_TEXT = 400  # characters of a token, name or path
+LARGEST_NUMBER = 1e12  # metres or pixels
+SHORTEST_QUATERNION = 1e-3
 # The text between two rows. Rows of large tables contain no objects and no free text, so it occurs nowhere else.
 BETWEEN_ROWS = re.compile(rb"}\s*,\s*{")
 TAIL_BYTES = 1 << 14  # the end of a batch in which its last complete row ends; no row is longer
@@ -31,9 +35,9 @@ def read_batches(path: Path) -> Iterator[list[Row]]:
     if not path.is_file():
         raise InputError(f"{path}: the table is missing (expected a nuScenes table)")
     if path.stat().st_size <= BATCH_BYTES:
-        yield _parse(path, path.read_bytes())
+        yield _parse(path, read_bytes(path, BATCH_BYTES))
         return
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         rest = file.read(BATCH_BYTES).lstrip()[1:]  # without the list's opening bracket
         while block := file.read(BATCH_BYTES):
             text = rest + block
@@ -53,26 +57,54 @@ def column(rows: list[Row], name: str, path: Path) -> list[Any]:
 
 def integers(rows: list[Row], name: str, path: Path) -> NDArray[np.int64]:
     """(N,) int64 values of a column. Raises InputError for anything but integers."""
-    values = np.array(column(rows, name, path))
-    if len(values) and (values.ndim != 1 or values.dtype.kind not in "iub"):
-        raise InputError(f'{path}: "{name}": expected an integer in every row')
-    return values.astype(np.int64)
+    values = column(rows, name, path)
+    array = np.array(values) if set(map(type, values)) <= {int, bool} else np.array("")
+    if len(values) and (
+        array.dtype.kind not in "iub" or np.abs(array.astype(np.int64)).max() > LARGEST_INTEGER // 1000
+    ):
+        raise InputError(f'{path}: "{name}": expected an integer of at most 52 bits in every row')
+    return array.astype(np.int64) if len(values) else np.zeros(0, dtype=np.int64)
 
 
 def vectors(rows: list[Row], name: str, path: Path, size: int) -> Array:
     """(N, size) values of a column of number lists. Raises InputError for another length or a non-finite number."""
-    try:
-        values = np.array(column(rows, name, path), dtype=np.float64)
-    except (ValueError, TypeError):
-        values = np.full((1, 0), np.nan)
-    if values.shape != (len(rows), size) or not np.isfinite(values).all():
+    values = array_of(column(rows, name, path), (len(rows), size))
+    if values is None:
         raise InputError(f'{path}: "{name}": expected {size} finite numbers in every row')
     return values
 
 
+def quaternions(rows: list[Row], name: str, path: Path) -> Array:
+    """(N, 4) w, x, y, z of a column. Raises InputError for a quaternion of norm 0."""
+    values = vectors(rows, name, path, 4)
+    if not (np.linalg.norm(values, axis=1) > SHORTEST_QUATERNION).all():
+        raise InputError(f'{path}: "{name}": expected quaternions of norm 1, found one of norm 0')
+    return values
+
+
+def array_of(value: Any, shape: tuple[int, ...]) -> Array | None:
+    """Nested lists as a float64 array of finite numbers of this shape; None if they are not."""
+    try:
+        array = np.array(value, dtype=np.float64).reshape(shape if 0 in shape else np.shape(value))
+    except (ValueError, TypeError, OverflowError):
+        return None
+    return array if array.shape == shape and (np.abs(array) < LARGEST_NUMBER).all() else None
+
+
+def texts(rows: list[Row], name: str, path: Path) -> list[str]:
+    """The texts of a column, each of at most 400 characters. Raises InputError for anything else."""
+    values = column(rows, name, path)
+    if not set(map(type, values)) <= {str} or max(map(len, values), default=0) > LONGEST_TEXT:
+        raise InputError(f'{path}: "{name}": expected a text of at most {LONGEST_TEXT} characters in every row')
+    return values
+
+
 def tokens(rows: list[Row], name: str, path: Path) -> NDArray[np.bytes_]:
-    """(N,) tokens of a column, as bytes."""
-    return np.array(column(rows, name, path), dtype="S") if rows else np.zeros(0, dtype="S32")
+    """(N,) tokens of a column, as bytes. Raises InputError for anything but ASCII texts."""
+    try:
+        return np.array(texts(rows, name, path), dtype="S") if rows else np.zeros(0, dtype="S32")
+    except UnicodeEncodeError:
+        raise InputError(f'{path}: "{name}": expected a token of ASCII characters in every row') from None
 
 
 def places_of(wanted: NDArray[np.bytes_], table: NDArray[np.bytes_], path: Path) -> NDArray[np.int64]:
@@ -98,10 +130,7 @@ def _last_row_end(text: bytes) -> int:
 
 
 def _parse(path: Path, text: bytes) -> list[Row]:
-    try:
-        rows = json.loads(text)
-    except ValueError as error:
-        raise InputError(f"{path}: cannot be read as JSON ({error})") from None
-    if not isinstance(rows, list):
+    rows = parse_json(text, path)
+    if not isinstance(rows, list) or not all(type(row) is dict for row in rows):
         raise InputError(f"{path}: expected a list of rows (a nuScenes table)")
     return rows

@@ -40,12 +40,20 @@ class NuScenesSequence:
     """Frames of a nuScenes root, scene after scene, numbered from 0: keyframes, and sweeps if they are chosen.
 
     The bev frame is the scene's LIDAR_TOP frame. The world frame is that of nuScenes' map.
+    allow_outside: whether images may lie outside of the root.
     Raises InputError if a table is missing or invalid, or the choice contains no scene.
     """
 
     has_ego_motion = True
 
-    def __init__(self, root: Path, choice: NuScenesChoice = NuScenesChoice(), *, strict: bool = False) -> None:
+    def __init__(
+        self,
+        root: Path,
+        choice: NuScenesChoice = NuScenesChoice(),
+        *,
+        strict: bool = False,
+        allow_outside: bool = False,
+    ) -> None:
         self.root = root
         self.tables = tables_of(root, choice.version)
         self.index, note = open_index(self.tables)
@@ -53,7 +61,7 @@ class NuScenesSequence:
         self.name = choice.scene or choice.split or self.tables.name
         self.rig = scene_rig(self.index, scenes[0])[0]
         self._frames = tuple(self._find_frames(scenes, choice.sweeps))
-        self._images = ImageReader(strict=strict)
+        self._images = ImageReader(strict=strict, inside=None if allow_outside else root)
         self._facts = lru_cache(maxsize=2)(partial(read_scene_facts, self.index, root))
         self.notes = tuple(text for text in (note, self._can_bus_note(scenes)) if text)
 

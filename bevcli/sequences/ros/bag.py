@@ -5,22 +5,36 @@ from __future__ import annotations
 import importlib.util
 import re
 import threading
+from collections.abc import Iterator
 from collections.abc import Sequence as Indices
+from contextlib import contextmanager
 from itertools import groupby
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
-from bevcli.errors import InputError
+from bevcli.errors import BevcliError, InputError
+from bevcli.parsing.documents import read_yaml
 from bevcli.sequences.ros.decoding import Decode, Topic, decoder
 
 SUFFIXES = (".mcap", ".db3")
 METADATA = "metadata.yaml"
 SPLIT_NAME = re.compile(r"(?P<stem>.*?)_\d+")  # rosbag2 numbers the files of a recording: drive_0.mcap, drive_1.mcap
 PACKAGES = ("mcap", "rosbags", "google.protobuf")
+
+
+@contextmanager
+def _broken_files_refused(path: Path) -> Iterator[None]:
+    """Makes one InputError of one line of what the packages for MCAP, SQLite and ROS raise for broken bytes."""
+    try:
+        yield
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        if isinstance(error, BevcliError):
+            raise type(error)(reason) from None
+        raise InputError(f"{path}: is damaged ({reason:.200})") from None
 
 
 class BagFile(Protocol):
@@ -52,7 +66,8 @@ class Bag:
         self.path = path
         self._lock = threading.RLock()
         self._compression = ""
-        self._files = [_open_file(file) for file in self._file_paths()]
+        with _broken_files_refused(path):
+            self._files = [_open_file(file) for file in self._file_paths()]
         self.topics = {name: topic for file in self._files for name, topic in sorted(file.topics.items())}
         self._decoders: dict[str, Decode] = {}
         self._starts: dict[str, NDArray[np.int64]] = {}
@@ -66,22 +81,24 @@ class Bag:
     def times(self, topic: str) -> NDArray[np.int64]:
         """(N,) log times of a topic's messages, ns. They come from the index."""
         if topic not in self._times:
-            with self._lock:
+            with self._lock, _broken_files_refused(self.path):
                 parts = [file.times(topic) for file in self._files if topic in file.topics]
             self._times[topic] = np.concatenate([np.zeros(0, dtype=np.int64), *parts])
         return self._times[topic]
 
     def message(self, topic: str, index: int) -> Any:
         """Message `index` of a topic, from 0. Raises InputError if it is broken."""
-        data = self._bytes(topic, index)
-        with self._lock:
+        with _broken_files_refused(self.path):
+            data = self._bytes(topic, index)
+        with self._lock, _broken_files_refused(self.path):
             if topic not in self._decoders:
                 self._decoders[topic] = decoder(self.topics[topic])
             decode = self._decoders[topic]
         try:
             return decode(data)
         except Exception as error:  # the decoders of the packages raise errors of many types for broken bytes
-            raise InputError(f"{self.path}: {topic}: message {index} cannot be decoded ({error})") from None
+            reason = " ".join(str(error).split())
+            raise InputError(f"{self.path}: {topic}: message {index} cannot be decoded ({reason:.200})") from None
 
     def _bytes(self, topic: str, index: int) -> bytes:
         with self._lock:
@@ -129,8 +146,8 @@ def _metadata(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        document = read_yaml(path)
+    except InputError:
         return {}
     found = document.get("rosbag2_bagfile_information") if isinstance(document, dict) else None
     return found if isinstance(found, dict) else {}

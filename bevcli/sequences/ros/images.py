@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.frame import CameraImage
-from bevcli.sequences.images import UnreadableImage, decode, media_type_of
+from bevcli.parsing.images import media_type_of
+from bevcli.sequences.images import UnreadableImage, decode
 from bevcli.sequences.ros.bag import Bag
 from bevcli.sequences.ros.messages import payload, timestamp_ns
 

@@ -26,6 +26,7 @@ MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence number, log time, publish time
 CACHE_BYTES = 256 * 2**20  # of decompressed chunks
+LARGEST_CHUNK = 512 * 2**20  # bytes after decompression
 NO_CHUNK = -1  # the message lies outside of chunks
 Entries = list[tuple[int, int, int]]  # log time ns, start of the chunk in the file or NO_CHUNK, offset
 
@@ -80,7 +81,7 @@ class McapFile:
         """The summary, None if the file has none, or one that does not list all messages."""
         try:
             summary = SeekingReader(self._file).get_summary()
-        except (McapError, ValueError, EOFError, OSError, struct.error, StopIteration):
+        except (McapError, ValueError, EOFError, OSError, struct.error, StopIteration, OverflowError, MemoryError):
             return None
         if summary is None or not summary.chunk_indexes or not summary.channels:
             return None
@@ -118,7 +119,7 @@ class McapFile:
     def _record(self, position: int, opcode: int) -> bytes:
         self._file.seek(position)
         found, length = RECORD_HEAD.unpack(self._file.read(RECORD_HEAD.size))
-        if found != opcode:
+        if found != opcode or length > self.path.stat().st_size:
             raise InputError(f"{self.path}: the index is broken (at byte {position})")
         return self._file.read(length)
 
@@ -203,7 +204,13 @@ class McapFile:
 
 
 def _decompressed(content: bytes) -> bytes:
+    """The records of a chunk. Raises ValueError for a damaged one."""
     stream: Any = ReadDataStream(BytesIO(content))
-    chunk = Chunk.read(stream)
-    data, length = get_chunk_data_stream(chunk)
-    return data.read(length)
+    try:
+        chunk = Chunk.read(stream)
+        if chunk.uncompressed_size > LARGEST_CHUNK:
+            raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
+        data, length = get_chunk_data_stream(chunk)
+        return data.read(length)
+    except Exception as error:  # each compression has exceptions of its own
+        raise ValueError(str(error)) from None

@@ -13,13 +13,14 @@ CAM_FRONT = "camera0/camera_optical_link"
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 from bevcli.errors import InputError
+from bevcli.parsing.documents import TOML_BYTES, parse_toml
+from bevcli.parsing.files import read_text
 
 
 @dataclass(frozen=True)
@@ -52,10 +53,7 @@ def read_topics_file(path: Path | None, topics: Mapping[str, str]) -> StatedTopi
     """
     if path is None:
         return StatedTopics(renamed=topics)
-    try:
-        stated = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as TOML ({error})") from None
+    stated = parse_toml(read_text(path, TOML_BYTES), path)
     known = [one.name for one in fields(StatedTopics) if one.name != "renamed"]
     for key, value in stated.items():
         if key not in known:

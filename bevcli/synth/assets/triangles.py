@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from bevcli.jit import njit
 from bevcli.synth.assets.mesh import Material, Mesh
 
 NO_FACADES = np.zeros((0, 16), np.float32)
@@ -129,7 +129,7 @@ class MeshTemplate:
         return PlacedMesh(Triangles(corners, normals, mesh.albedo, mesh.material, no_facade, NO_FACADES), sphere)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _turn_and_shift(
     faces: NDArray, normals: NDArray, cosine: float, sine: float, x: float, y: float, z: float,
     out_corners: NDArray, out_normals: NDArray,

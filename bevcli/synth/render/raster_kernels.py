@@ -6,12 +6,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from bevcli.jit import njit
 
 NEAR_M = 0.1  # depth of the near plane, at which triangles are clipped
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def rasterise_meshes(world, meshes, camera_from_world, pinhole, eye,
                      triangles, inverse_depth, last_objects, unoccluded):  # fmt: skip
     """Draw meshes; those that are hidden or out of view are skipped as a whole.
@@ -69,7 +70,7 @@ def rasterise_meshes(world, meshes, camera_from_world, pinhole, eye,
             _draw_triangle(p, cut, t, owner, pinhole, triangles, inverse_depth, last_objects, unoccluded)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _is_hidden(center, radius, pinhole, inverse_depth):
     """Whether all pixels that a sphere may cover already see something nearer.
 
@@ -93,7 +94,7 @@ def _is_hidden(center, radius, pinhole, inverse_depth):
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _draw_triangle(p, cut, t, owner, pinhole, triangles, inverse_depth, last_objects, unoccluded):
     """Draw triangle number t, with corners p (3, 3) in the camera frame, clipped at the near plane.
 
@@ -118,7 +119,7 @@ def _draw_triangle(p, cut, t, owner, pinhole, triangles, inverse_depth, last_obj
         _fill(p, cut, 0, i, i + 1, pinhole, t, owner, triangles, inverse_depth, last_objects, unoccluded)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _fill(p, q, a, b, c, pinhole, t, owner, triangles, inverse_depth, last_objects, unoccluded):
     """Fill the triangle of rows a, b, c of q, row by row; its edges bound the columns of each row.
 
@@ -167,7 +168,7 @@ def _fill(p, q, a, b, c, pinhole, t, owner, triangles, inverse_depth, last_objec
                 triangles[v, u] = t
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(nogil=True, inline="always")
 def _narrow(low, high, slope, needed, origin):
     """The part of the interval [low, high] where slope * (u - origin) >= needed."""
     if slope > 0:
@@ -179,7 +180,7 @@ def _narrow(low, high, slope, needed, origin):
     return low, high
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def rasterise_heights(corners, shear_x, shear_y, origin_x, origin_y, scale, heights):
     """Draw triangles that face the sun into the heights (S, S) of a `ShadowMap`, in place.
 

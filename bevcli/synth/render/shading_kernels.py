@@ -10,8 +10,8 @@ Positions are in the world frame in metres, colours are linear RGB.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from bevcli.jit import njit
 from bevcli.synth.assets.mesh import Material
 
 LIGHT_LIMIT = 1.6  # the brightest light in the display table
@@ -21,7 +21,7 @@ GROUND, FACADE, GLASS, PAINT, GLOW = (
 )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, image):
     """Colour every pixel of `image` (H, W, 3) uint8 BGR, in place.
 
@@ -104,7 +104,7 @@ def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, image)
             _put(image, v, u, a, table, table_scale)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(nogil=True, inline="always")
 def _put(image, v, u, color, table, scale):
     """Write a colour (3,) to a pixel. scale: entries of the table for each unit of light."""
     for c in range(3):
@@ -112,7 +112,7 @@ def _put(image, v, u, color, table, scale):
         image[v, u, 2 - c] = table[min(max(level, 0), table.shape[0] - 1)]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _sky(x, y, z, light, to_sun, clouds, out):
     """Light of the sky from the unit vector (x, y, z) into out (3,): gradient, clouds, glow around the sun."""
     zenith, horizon, cloud = light[3], light[4], light[6]
@@ -137,7 +137,7 @@ def _sky(x, y, z, light, to_sun, clouds, out):
         out[c] = base + (cloud[c] - base) * cover + glow * light[0, c]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _reflect(x, y, z, nx, ny, nz, kind, light, to_sun, clouds, sunlit, mirror, color):
     """Mix the reflection in glass or paint into `color` (3,): the sky, or a dark street below the horizon.
 
@@ -170,7 +170,7 @@ def _reflect(x, y, z, nx, ny, nz, kind, light, to_sun, clouds, sunlit, mirror, c
             color[c] += shine * light[0, c]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _shadow(shadows, x, y, z):
     """Fraction of the sunlight, 0 to 1, that is blocked at a point."""
     heights, origin_x, origin_y, texel, shear_x, shear_y, softness = shadows
@@ -198,7 +198,7 @@ def _shadow(shadows, x, y, z):
     return (b00 * (1 - wu) + b01 * wu) * (1 - wv) + (b10 * (1 - wu) + b11 * wu) * wv
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _ground(ground, x, y, across, along, rx, ry, out):
     """Albedo of the ground at (x, y) into out (3,). Returns the roughness, a relative brightness around 0.
 
@@ -248,7 +248,7 @@ def _ground(ground, x, y, across, along, rx, ry, out):
     return grain
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _facade(row, x, y, z, footprint, lamps, out):
     """Albedo of a wall at a point into out (3,). Returns whether the point is glass.
 
@@ -306,7 +306,7 @@ def _facade(row, x, y, z, footprint, lamps, out):
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _bricks(u, z, footprint, brick, out):
     """Multiply out (3,) by a brick pattern at u along the wall and height z.
 
@@ -325,7 +325,7 @@ def _bricks(u, z, footprint, brick, out):
         out[c] *= factor
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _pane(seed, column, storey, up, lamps, out):
     """Albedo of a window into out (3,): a dark room, a curtain, or a lit room.
 
@@ -339,7 +339,7 @@ def _pane(seed, column, storey, up, lamps, out):
         out[0], out[1], out[2] = 1.5, 1.1, 0.6
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _shop(u, z, length, shop_m, seed, out):
     """Albedo of a shop front into out (3,): posts, windows, doors, signs. Returns whether the point is glass.
 
@@ -377,7 +377,7 @@ def _shop(u, z, length, shop_m, seed, out):
     return True
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(nogil=True, inline="always")
 def _hash(a, b):
     """Hash two integers to one from 0 to 2^31 - 1."""
     h = (a * 73856093) ^ (b * 19349663)

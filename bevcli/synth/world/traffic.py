@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from bevcli.geometry.transforms import Array
+from bevcli.jit import njit
 from bevcli.synth.assets.catalog import Body
 from bevcli.synth.world.route import JunctionPass, Route
 from bevcli.synth.world.signals import Light, Signals
@@ -156,7 +156,7 @@ def _has_priority(other: Vehicle, theirs: JunctionPass, vehicle: Vehicle, crossi
     return False
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def points_between(points: Array, positions: Array, start: float, end: float, count: int) -> Array:
     """(count, 2) evenly spaced points of a route from position start to end.
 
@@ -172,7 +172,7 @@ def points_between(points: Array, positions: Array, start: float, end: float, co
     return found
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _nearest_in_way(
     points: Array, positions: Array, front: float, obstacles: Array, owners: NDArray, own: int, corridor: float
 ) -> tuple[float, int]:

@@ -1,0 +1,66 @@
+"""`njit` of numba for all compiled functions: where nothing may be written, they are compiled without a cache.
+
+numba keeps compiled functions beside the source file, or in the user's cache folder. Where neither can be written, as
+for a read-only installation without a home, numba itself raises an error at import.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import stat
+import tempfile
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numba
+
+_NO_CACHE = "cannot cache function"
+
+
+def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """`numba.njit(cache=True, **options)`, with a temporary cache or none where numba finds no place for it."""
+
+    def compiled(function: Callable[..., Any]) -> Any:
+        try:
+            return numba.njit(cache=True, **options)(function)
+        except RuntimeError as error:
+            if _NO_CACHE not in str(error):
+                raise
+        if not _temporary_cache():
+            return numba.njit(**options)(function)
+        try:
+            return numba.njit(cache=True, **options)(function)
+        except RuntimeError:
+            return numba.njit(**options)(function)
+
+    return compiled
+
+
+@cache
+def _temporary_cache() -> bool:
+    """Sets numba's cache folder to one in the temporary folder, once. False where there is no such place."""
+    name = f"bevcli-numba-{os.getuid()}" if os.name == "posix" else ""
+    folder = _private_folder(Path(tempfile.gettempdir()) / name) if name else None
+    where = "compiled functions are not cached: every start takes some seconds longer"
+    if folder is not None:
+        setattr(numba.config, "CACHE_DIR", str(folder))  # noqa: B010, an attribute that numba makes at run time
+        where = f"compiled functions are cached in {folder}"
+    logging.getLogger("bevcli").warning(
+        "note: neither the installation nor the home folder can be written: %s (NUMBA_CACHE_DIR sets another folder)",
+        where,
+    )
+    return folder is not None
+
+
+def _private_folder(path: Path) -> Path | None:
+    """The folder, made where it is missing. None where it is not ours alone: cached functions are code."""
+    try:
+        path.mkdir(mode=0o700, exist_ok=True)
+        facts = path.lstat()
+    except OSError:
+        return None
+    ours = stat.S_ISDIR(facts.st_mode) and facts.st_uid == os.getuid() and not facts.st_mode & 0o077
+    return path if ours and os.access(path, os.W_OK) else None

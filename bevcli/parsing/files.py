@@ -1,0 +1,62 @@
+"""Reads whole files, of a limited size. Pipes, devices and sockets are refused, because they may never end."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+from typing import BinaryIO
+
+from bevcli.errors import BevcliError, InputError
+
+MIB = 1 << 20
+
+
+def read_bytes(
+    path: Path, largest: int, *, missing: str = "the file is missing", error: type[BevcliError] = InputError
+) -> bytes:
+    """The contents of a regular file of at most `largest` bytes.
+
+    missing: text of the message for a file that is not there.
+    error: kind of exception for a file that is missing, larger, no regular file, or cannot be read.
+    """
+    with open_regular(path, missing=missing, error=error) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > largest:
+            raise error(f"{path}: the file has {_size(size)} (expected at most {_size(largest)})")
+        try:
+            return file.read(size)
+        except OSError as failure:
+            raise error(f"{path}: cannot be read ({failure.strerror})") from None
+
+
+def read_text(
+    path: Path, largest: int, *, missing: str = "the file is missing", error: type[BevcliError] = InputError
+) -> str:
+    """The contents of a UTF-8 file, see `read_bytes`."""
+    try:
+        return read_bytes(path, largest, missing=missing, error=error).decode()
+    except UnicodeDecodeError as failure:
+        raise error(f"{path}: cannot be read as text ({failure})") from None
+
+
+def open_regular(
+    path: Path, *, missing: str = "the file is missing", error: type[BevcliError] = InputError
+) -> BinaryIO:
+    """Opens a regular file for reading. Raises `error` for anything else; opening a pipe does not wait for a writer."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    except FileNotFoundError:
+        raise error(f"{path}: {missing}") from None
+    except OSError as failure:
+        raise error(f"{path}: cannot be read ({failure.strerror})") from None
+    except ValueError:  # a null byte in the name
+        raise error(f"{str(path)!r}: is not a file name") from None
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise error(f"{path}: is not a regular file (expected no folder, pipe or device)")
+    return os.fdopen(descriptor, "rb")
+
+
+def _size(count: int) -> str:
+    return f"{count} bytes" if count < MIB else f"{count / MIB:.0f} MiB"

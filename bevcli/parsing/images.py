@@ -1,0 +1,85 @@
+"""Decodes JPEG and PNG images. The size is read from the header first: a small file can state a size of gigabytes."""
+
+from __future__ import annotations
+
+import struct
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+# Markers of a JPEG that state its size (start of frame): all from C0 to CF except DHT, JPG and DAC.
+_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_WITHOUT_LENGTH = frozenset(range(0xD0, 0xD9)) | {0x01}
+
+
+def media_type_of(encoded: bytes) -> str | None:
+    """The media type of an encoded image: "image/jpeg", "image/png", or None for another format."""
+    if encoded.startswith(b"\xff\xd8\xff"):
+        return "image/jpeg"
+    return "image/png" if encoded.startswith(b"\x89PNG\r\n\x1a\n") else None
+
+
+def decode_image(encoded: bytes, flags: int, most_pixels: int) -> NDArray | None:
+    """The pixels of a whole JPEG or PNG, as `cv2.imdecode` gives them.
+
+    None for another format, a damaged or cut file, and for an image with more than `most_pixels` pixels.
+    """
+    size = size_of_image(encoded)
+    if size is None or not 0 < size[0] * size[1] <= most_pixels or _is_cut_short(encoded):
+        return None
+    try:
+        return cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), flags)
+    except cv2.error:
+        return None
+
+
+def size_of_image(encoded: bytes) -> tuple[int, int] | None:
+    """(width, height) in pixels as the header of a JPEG or PNG states it; None where it states none."""
+    kind = media_type_of(encoded)
+    if kind == "image/png":
+        if len(encoded) < 24 or encoded[12:16] != b"IHDR":
+            return None
+        width, height = struct.unpack(">II", encoded[16:24])
+        return width, height
+    return _jpeg_size(encoded) if kind == "image/jpeg" else None
+
+
+def _jpeg_size(encoded: bytes) -> tuple[int, int] | None:
+    place = 2
+    while True:
+        place = encoded.find(b"\xff", place)
+        while place >= 0 and encoded[place : place + 1] == b"\xff":  # markers may be padded
+            place += 1
+        if place < 0 or place + 3 > len(encoded):
+            return None
+        marker = encoded[place]
+        place += 1
+        if marker in _FRAMES:
+            if place + 7 > len(encoded):
+                return None
+            height, width = struct.unpack(">HH", encoded[place + 3 : place + 7])
+            return width, height
+        if marker == 0xDA:  # the pixels begin, and no size was stated
+            return None
+        if marker and marker not in _WITHOUT_LENGTH:
+            place += max(2, int.from_bytes(encoded[place : place + 2], "big"))
+
+
+def _is_cut_short(encoded: bytes) -> bool:
+    """Whether the end of a JPEG or PNG is missing. OpenCV fills the missing part with grey, without an error."""
+    if media_type_of(encoded) == "image/jpeg":
+        return encoded.rfind(b"\xff\xd9") < encoded.rfind(b"\xff\xda")  # the end marker comes before the last scan
+    return not _has_whole_chunks(encoded)
+
+
+def _has_whole_chunks(encoded: bytes) -> bool:
+    """Whether the chunks of a PNG lie within the file, up to its end marker. OpenCV allocates what a chunk states."""
+    place = 8
+    while place + 12 <= len(encoded):
+        length = int.from_bytes(encoded[place : place + 4], "big")
+        kind = encoded[place + 4 : place + 8]
+        place += 12 + length
+        if kind == b"IEND":
+            return place <= len(encoded)
+    return False

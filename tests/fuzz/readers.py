@@ -1,0 +1,159 @@
+"""Every reader of bevcli with the seed file that the fuzz tests break: what a user's command would do with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A reader.
+
+    Attributes:
+        file: the seed file that is broken.
+        kind: how it is broken, see `mutations.edits`.
+        read: reads the folder of seed files.
+    """
+
+    file: str
+    kind: str
+    read: Callable[[Path], object]
+
+
+def _open(folder: Path, **options: object) -> None:
+    from bevcli.sequences.open import open_sequence
+
+    sequence = open_sequence(folder, **options)
+    for place in range(min(3, len(sequence.stamps))):
+        sequence.load(place)
+
+
+def _drive(folder: Path) -> None:
+    _open(folder / "drive")
+
+
+def _unlisted(folder: Path) -> None:
+    from bevcli.sequences.native.unlisted_frames import find_frames
+
+    find_frames(folder / "drive", ("CAM_FRONT", "CAM_BACK"))
+
+
+def _videos(folder: Path) -> None:
+    _open(folder / "videos_drive", ego_motion="static")
+
+
+def _check(folder: Path) -> None:
+    from bevcli.rig.check_calibration import check_calibration
+
+    check = check_calibration(folder / "drive")
+    check.text()
+    check.to_json()
+
+
+def _maps(folder: Path) -> None:
+    from bevcli.sequences.files.map_folder import open_maps
+
+    maps = open_maps(folder / "drive/ground_truth_map")
+    maps.load(0)
+    maps.load(1)
+
+
+def _model(folder: Path) -> None:
+    from bevcli.checkpoints import expected_state
+    from bevcli.config import TRACKING, TRAINING, load_config, load_table
+    from bevcli.pipeline.tracking import TrackerConfig
+    from bevcli.training.job import TrainingConfig
+
+    load_table(folder / "model.toml", TRACKING, TrackerConfig)
+    load_table(folder / "model.toml", TRAINING, TrainingConfig)
+    expected_state(load_config(folder / "model.toml"))
+
+
+def _rig(name: str) -> Callable[[Path], None]:
+    def read(folder: Path) -> None:
+        from bevcli.sequences.files.kalibr_ros import read_rig
+
+        read_rig(folder / "rig" / name, folder / "rig/extrinsics.json")
+
+    return read
+
+
+def _weights(name: str) -> Callable[[Path], None]:
+    def read(folder: Path) -> None:
+        from bevcli.checkpoints import read_checkpoint
+
+        read_checkpoint(folder / name)
+
+    return read
+
+
+def _recording(folder: Path) -> None:
+    from bevcli.viewer.recording_file import open_recording
+    from bevcli.viewer.summary import summarise
+
+    with open_recording(folder / "recording.rrd") as file:
+        summarise(folder / "recording.rrd", file.path).text()
+
+
+def _nuscenes(folder: Path) -> None:
+    _open(folder / "nuscenes")
+
+
+def _bag(name: str) -> Callable[[Path], None]:
+    return lambda folder: _open(folder / name)
+
+
+def _classes(folder: Path) -> None:
+    from bevcli.sequences.files.class_names import read_class_map
+
+    read_class_map(folder / "classes.toml")
+
+
+def _predictions(folder: Path) -> None:
+    from bevcli.evaluation.evaluate import evaluate
+
+    evaluate(folder / "predictions.json", folder / "drive/ground_truth.json")
+
+
+def _submission(folder: Path) -> None:
+    from bevcli.evaluation.inputs import open_predictions
+
+    open_predictions(folder / "results_nusc.json")
+
+
+TABLES = ("scene", "sample", "sensor", "calibrated_sensor", "sample_data", "ego_pose", "sample_annotation", "instance")
+SMALL_TABLES = ("category", "attribute", "visibility")
+READERS = {
+    "calibration": Reader("drive/calibration.json", "json", _drive),
+    "calibration check": Reader("drive/calibration.json", "json", _check),
+    "frames": Reader("drive/frames.csv", "text", _drive),
+    "ego-motion": Reader("drive/ego_motion.csv", "text", _drive),
+    "ground truth": Reader("drive/ground_truth.json", "json", _drive),
+    "map": Reader("drive/ground_truth_map/000000.png", "bytes", _maps),
+    "map legend": Reader("drive/ground_truth_map/map.json", "json", _maps),
+    "timing": Reader("drive/timing.toml", "text", _unlisted),
+    "model": Reader("model.toml", "text", _model),
+    "Kalibr": Reader("rig/camchain.yaml", "text", _rig("camchain.yaml")),
+    "ROS": Reader("rig/camera_info.yaml", "text", _rig("camera_info.yaml")),
+    "extrinsics": Reader("rig/extrinsics.json", "json", _rig("camchain.yaml")),
+    "JPEG": Reader("drive/images/CAM_FRONT/0.jpg", "bytes", _drive),
+    "PNG": Reader("drive/images/CAM_BACK/1.png", "bytes", _drive),
+    "MP4": Reader("videos_drive/videos/CAM_FRONT.mp4", "bytes", _videos),
+    "AVI": Reader("videos_drive/videos/CAM_BACK.avi", "bytes", _videos),
+    "pth": Reader("weights.pth", "bytes", _weights("weights.pth")),
+    "old pth": Reader("old.pth", "bytes", _weights("old.pth")),
+    "safetensors": Reader("weights.safetensors", "bytes", _weights("weights.safetensors")),
+    "recording": Reader("recording.rrd", "bytes", _recording),
+    "predictions": Reader("predictions.json", "json", _predictions),
+    "class map": Reader("classes.toml", "text", _classes),
+    "MCAP": Reader("bag.mcap", "bytes", _bag("bag.mcap")),
+    "rosbag2": Reader("rosbag2/rosbag2.db3", "bytes", _bag("rosbag2")),
+    "submission": Reader("results_nusc.json", "json", _submission),
+    "CAN bus": Reader("nuscenes/can_bus/scene-0001_pose.json", "json", _nuscenes),
+    **{
+        f"nuScenes {name}": Reader(f"nuscenes/v1.0-mini/{name}.json", "json", _nuscenes)
+        for name in (*TABLES, *SMALL_TABLES)
+    },
+}

@@ -1,0 +1,118 @@
+"""A process that reads broken files, with limits on time and memory; what it cannot survive ends only the process."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import resource
+import shutil
+import sys
+import tempfile
+import traceback
+import warnings
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+SECONDS = 10.0
+MEMORY = 1 << 30  # bytes beyond what the libraries and the seed files take
+START_SECONDS = 240.0
+
+
+class Worker:
+    """Reads broken files, one after the other, in another process, which is replaced where a file ends it.
+
+    seeds: the folder of seed files; each process works in a copy.
+    """
+
+    def __init__(self, seeds: Path) -> None:
+        self._seeds = seeds
+        self._process: multiprocessing.process.BaseProcess | None = None
+        self._connection: Connection | None = None
+
+    def read(self, reader: str, data: bytes) -> str:
+        """What comes of a broken file: "read", "refused: …" (one BevcliError), or what went wrong."""
+        if self._process is None or not self._process.is_alive():
+            self._start()
+        assert self._connection is not None
+        try:
+            self._connection.send((reader, data))
+            if self._connection.poll(SECONDS):
+                return self._connection.recv()
+            answer = f"hang: more than {SECONDS:.0f} s"
+        except (EOFError, ConnectionError):
+            answer = "crash: the process died"
+        self.close()
+        return answer
+
+    def close(self) -> None:
+        """Ends the process."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.join()
+            self._process = None
+
+    def _start(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._connection, other = context.Pipe()
+        os.environ.setdefault("MALLOC_ARENA_MAX", "2")
+        self._process = context.Process(target=_serve, args=(other, self._seeds, sys.path), daemon=True)
+        self._process.start()
+        other.close()
+        if not self._connection.poll(START_SECONDS):
+            raise RuntimeError("the fuzz worker does not start")
+        answer = self._connection.recv()
+        assert answer == "ready", answer
+
+
+def _serve(connection: Connection, seeds: Path, path: list[str]) -> None:
+    sys.path[:] = path
+    from readers import READERS
+
+    warnings.simplefilter("ignore")
+    with tempfile.TemporaryDirectory(prefix="bevcli-fuzz-") as folder:
+        own = Path(folder) / "files"
+        shutil.copytree(seeds, own)
+        os.environ["XDG_CACHE_HOME"] = folder
+        os.chdir(folder)
+        with open(os.devnull, "w") as silent:  # FFmpeg and libpng complain there about every broken file
+            os.dup2(silent.fileno(), 2)
+        try:
+            for reader in READERS.values():
+                reader.read(own)
+        except BaseException:
+            connection.send(traceback.format_exc())
+            raise
+        limit = _bytes_of("VmSize") + 4 * MEMORY
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+        base = _bytes_of("VmRSS")
+        connection.send("ready")
+        while True:
+            name, data = connection.recv()
+            Path("/proc/self/clear_refs").write_text("5")  # the peak is measured from now on
+            connection.send(_outcome(READERS[name], own, data, base))
+
+
+def _outcome(reader, own: Path, data: bytes, base: int) -> str:
+    from bevcli.errors import BevcliError
+
+    file = own / reader.file
+    whole = file.read_bytes()
+    try:
+        file.write_bytes(data)
+        reader.read(own)
+        answer = "read"
+    except BevcliError as error:
+        answer = f"refused: {error}" if "\n" not in str(error) else f"several lines: {error}"
+    except BaseException:
+        answer = traceback.format_exc()
+    finally:
+        file.write_bytes(whole)
+    grown = _bytes_of("VmHWM") - base
+    return answer if grown <= MEMORY else f"memory: {grown >> 20} MiB more than before; {answer}"
+
+
+def _bytes_of(name: str) -> int:
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(f"{name}:"):
+            return int(line.split()[1]) << 10
+    raise KeyError(name)

@@ -1,0 +1,65 @@
+"""A read-only installation without a writable home compiles without a cache, or with one in the temporary folder."""
+
+import os
+import shutil
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import bevcli
+
+CODE = "import bevcli.model.kernels.bilinear, bevcli.synth.assets.triangles; print('ok')"
+
+
+@pytest.fixture
+def read_only(tmp_path: Path):
+    """A copy of the package whose cache folders cannot be made: files stand in their places (root ignores modes)."""
+    root = tmp_path / "installed"
+    shutil.copytree(
+        Path(bevcli.__file__).parent, root / "bevcli", ignore=shutil.ignore_patterns("__pycache__", "*.nb?")
+    )
+    for folder in [root / "bevcli", *(p for p in (root / "bevcli").rglob("*") if p.is_dir())]:
+        (folder / "__pycache__").write_text("")
+    return root
+
+
+def start(root: Path, temporary: Path) -> subprocess.CompletedProcess[str]:
+    environment = {
+        **{name: value for name, value in os.environ.items() if not name.startswith(("NUMBA", "XDG"))},
+        "PYTHONPATH": str(root),
+        "HOME": "/dev/null/home",
+        "TMPDIR": str(temporary),
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
+    return subprocess.run(
+        [sys.executable, "-c", CODE],
+        capture_output=True,
+        text=True,
+        env=environment,
+        cwd=root,
+        check=False,
+        timeout=120,
+    )
+
+
+def test_without_a_writable_place_the_cache_is_a_private_temporary_folder(read_only, tmp_path):
+    (tmp_path / "temporary").mkdir()
+    done = start(read_only, tmp_path / "temporary")
+    assert (done.returncode, done.stdout) == (0, "ok\n"), done.stderr
+    assert done.stderr.count("note:") == 1
+    folder = next((tmp_path / "temporary").glob("bevcli-numba-*"))
+    assert str(folder) in done.stderr
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+
+
+def test_a_temporary_folder_that_others_can_write_is_not_used(read_only, tmp_path):
+    shared = tmp_path / "temporary" / f"bevcli-numba-{os.getuid()}"
+    shared.mkdir(parents=True)
+    shared.chmod(0o777)
+    done = start(read_only, tmp_path / "temporary")
+    assert (done.returncode, done.stdout) == (0, "ok\n"), done.stderr
+    assert "not cached" in done.stderr
+    assert not any(shared.iterdir())
