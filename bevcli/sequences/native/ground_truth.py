@@ -8,6 +8,7 @@ from bevcli.frame import BevMap
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, Pose, inverse
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes
+from bevcli.sequences.files.incremental_json import existing
 from bevcli.sequences.files.map_folder import open_maps
 
 BOXES_FILE = "ground_truth.json"
@@ -19,7 +20,7 @@ class FolderGroundTruth:
 
     def __init__(self, folder: Path) -> None:
         boxes_path, maps_path = folder / BOXES_FILE, folder / MAPS_FOLDER
-        self._boxes: BoxesFile | None = read_boxes(boxes_path) if boxes_path.is_file() else None
+        self._boxes: BoxesFile | None = read_boxes(boxes_path) if existing(boxes_path).is_file() else None
         self._frames = {frame.stamp.index: frame for frame in self._boxes.frames} if self._boxes else {}
         self._maps = open_maps(maps_path) if maps_path.is_dir() else None
 
