@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import tempfile
 from collections.abc import Iterator
@@ -13,6 +14,8 @@ from bevcli.errors import InputError
 from bevcli.viewer.native import viewer_binary, viewer_environment
 
 MAGIC, FOOTER = b"RRF2", b"RRF2FOOT"  # the first bytes of an .rrd file, and the bytes 12 before its end
+
+REPAIR_S, REPAIR_BYTES_PER_S = 30.0, 5e6  # time limit of a repair: it starts, and reads at least this fast
 
 
 @dataclass(frozen=True)
@@ -39,11 +42,45 @@ def open_recording(path: Path) -> Iterator[RecordingFile]:
         return
     with tempfile.TemporaryDirectory(prefix="bevcli-") as folder:
         copy = Path(folder) / path.name
-        command = [str(viewer_binary()), "rrd", "filter", "--continue-on-error", str(path), "-o", str(copy)]
-        subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, env=viewer_environment(), check=False)
+        _repair(path, copy)
         if not copy.is_file() or copy.stat().st_size < 1000:
             raise InputError(f"{path}: the recording was cut off before its first frame; nothing can be shown")
         yield RecordingFile(copy, repaired=True)
+
+
+def restore_index(path: Path) -> bool:
+    """Gives a recording that lacks its end an index, in place. False if it stays as it is, such as on a full disk.
+
+    Every reader of this package reads a recording without an index too; it then works on a repaired copy.
+    """
+    copy = path.with_name(path.name + ".repaired")
+    try:
+        _repair(path, copy)
+        if not _is_whole(copy):
+            return False
+        os.replace(copy, path)
+    except (OSError, InputError):
+        return False
+    finally:
+        copy.unlink(missing_ok=True)
+    return True
+
+
+def _repair(path: Path, copy: Path) -> None:
+    """Copies all messages of a recording that can be read. Raises InputError if this takes too long."""
+    command = [str(viewer_binary()), "rrd", "filter", "--continue-on-error", str(path), "-o", str(copy)]
+    limit_s = REPAIR_S + path.stat().st_size / REPAIR_BYTES_PER_S
+    try:
+        subprocess.run(
+            command,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            env=viewer_environment(),
+            check=False,
+            timeout=limit_s,
+        )
+    except subprocess.TimeoutExpired:
+        raise InputError(f"{path}: the recording could not be repaired within {limit_s:.0f} s") from None
 
 
 def _is_whole(path: Path) -> bool:
