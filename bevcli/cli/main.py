@@ -69,8 +69,8 @@ app.add_typer(weights_app, name="weights")
 
 def run_app() -> None:
     """The console entry point: a user's mistake is one line on stderr and exit code 1, never a traceback."""
-    # Read when PyTorch is loaded: its threads sleep while they wait, so that a frame on a busy machine is not held up
-    # by spinning.
+    # PyTorch reads this when it is loaded. Its threads then sleep while they wait instead of spinning, which would slow
+    # down a busy machine.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     keep_freed_memory()
     try:
@@ -79,5 +79,5 @@ def run_app() -> None:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(1)
     except BrokenPipeError:
-        sys.stderr.close()  # whoever read our output has gone; there is nobody left to tell
+        sys.stderr.close()  # the reader of the output is gone
         sys.exit(0)

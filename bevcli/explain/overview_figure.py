@@ -1,4 +1,4 @@
-"""The overview: the whole model as a flow from images to boxes, with this frame's own results as pictures."""
+"""The overview: the whole model as a flow from images to boxes, with this frame's own results as images."""
 
 from __future__ import annotations
 

@@ -110,6 +110,28 @@ class Boxes3D:
         y = s * local[..., 0] + c * local[..., 1]
         return np.stack([x, y, local[..., 2]], axis=-1) + self.centers[:, None, :]
 
+    def to_numpy(self) -> Array:
+        """(N, 9) float64: x, y, z of the centre, length, width, height, yaw, velocity x and y; metres, radians, m/s."""
+        return np.concatenate([self.centers, self.sizes_lwh, self.yaws[:, None], self.velocities], axis=1)
+
+    def to_dict(self) -> dict[str, list[Any]]:
+        """The boxes as a table: column name -> N values. `pandas.DataFrame` and `polars.DataFrame` take it.
+
+        The columns are class, score, x, y, z, length, width, height, yaw, vx, vy, attribute, instance, visibility and
+        num_points, without the optional ones that are None.
+        """
+        numbers = ("x", "y", "z", "length", "width", "height", "yaw", "vx", "vy")
+        columns = {
+            "class": self.classes,
+            "score": self.scores,
+            **dict(zip(numbers, self.to_numpy().T, strict=True)),
+            "attribute": self.attributes,
+            "instance": self.instances,
+            "visibility": self.visibilities,
+            "num_points": self.num_points,
+        }
+        return {name: column.tolist() for name, column in columns.items() if column is not None}
+
     def _map(self, change: Callable[[NDArray], NDArray]) -> Boxes3D:
         columns = {f.name: getattr(self, f.name) for f in fields(self)}
         changed: dict[str, Any] = {name: None if c is None else change(c) for name, c in columns.items()}

@@ -28,7 +28,13 @@ _AUTOCAST = {"bf16": torch.bfloat16, "fp16": torch.float16}
 
 @dataclass(frozen=True)
 class BevState:
-    """All that a run remembers from one frame to the next. bev: (1, Y·X, C); pose: world_from_ego, then."""
+    """The state of a run between two frames.
+
+    Attributes:
+        bev: (1, Y·X, C) BEV map of the previous frame.
+        pose: world_from_ego at that frame's time.
+        stamp: of that frame.
+    """
 
     bev: Tensor
     pose: Pose
@@ -37,9 +43,13 @@ class BevState:
 
 @dataclass(frozen=True)
 class StepOptions:
-    """precision: of the network's arithmetic. temporal: whether history is used.
+    """How a step is computed.
 
-    ask_attention: whether predictions carry an AttentionView. probes: x, y in metres, bev frame, the cells asked.
+    Attributes:
+        precision: of a plain model, by autocast; a prepared model has its own.
+        temporal: whether history is used.
+        ask_attention: whether predictions carry an AttentionView.
+        probes: x, y in metres, bev frame: the cells whose sampling points the AttentionView shows.
     """
 
     precision: Precision = "fp32"
@@ -49,7 +59,7 @@ class StepOptions:
 
 
 class Runner:
-    """A model on a device, and how it is to be run. It keeps nothing between frames: `BevState` goes in and out."""
+    """Runs a model on a device, step by step. The state is an argument and a result; the runner keeps none."""
 
     def __init__(self, model: BEVFormer, device: torch.device, options: StepOptions | None = None) -> None:
         self.model = model.to(device).eval()
@@ -60,7 +70,16 @@ class Runner:
 
     @torch.inference_mode()
     def step(self, state: BevState | None, prepared: PreparedFrame) -> tuple[BevState | None, Prediction]:
-        """One frame. A frame without any image passes the state on: the next alignment spans it."""
+        """Runs the model on one frame.
+
+        Args:
+            state: the result of the step before; None at the start.
+            prepared: the frame, preprocessed.
+
+        Returns:
+            the new state and the prediction. A frame without any image returns the state unchanged, so that the next
+            alignment by ego-motion spans both frames.
+        """
         frame = prepared.frame
         started_anew = self._reason_to_start_anew(state, frame.stamp)
         if started_anew:
@@ -82,7 +101,7 @@ class Runner:
     def run(
         self, sequence: Sequence, places: Items[int], preprocessor: Preprocessor, state: BevState | None = None
     ) -> Iterator[tuple[Frame, Prediction, BevState | None]]:
-        """The frames at these places, read and prepared ahead; nothing is kept of a frame once it is yielded."""
+        """Yields frame, prediction and state at these places of a sequence. Frames are read and prepared in advance."""
 
         def prepare(place: int) -> PreparedFrame:
             return preprocessor(sequence.load(place))

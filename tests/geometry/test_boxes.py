@@ -52,3 +52,20 @@ def test_selecting_and_concatenating_keep_columns_aligned():
     assert joined.scores == pytest.approx(boxes.scores[[3, 1]])
     assert joined.instances is None
     assert len(Boxes3D.concatenate([])) == 0
+
+
+def test_boxes_as_an_array_and_as_a_table():
+    boxes = Boxes3D(
+        centers=np.array([[1.0, 2.0, 3.0]]),
+        sizes_lwh=np.array([[4.0, 5.0, 6.0]]),
+        yaws=np.array([0.5]),
+        velocities=np.array([[7.0, 8.0]]),
+        classes=np.array(["car"]),
+        scores=np.array([0.9]),
+    )
+    assert boxes.to_numpy().tolist() == [[1, 2, 3, 4, 5, 6, 0.5, 7, 8]]
+    assert boxes.to_dict() == {
+        "class": ["car"], "score": [0.9], "x": [1], "y": [2], "z": [3], "length": [4], "width": [5], "height": [6],
+        "yaw": [0.5], "vx": [7], "vy": [8],
+    }  # fmt: skip
+    assert Boxes3D.empty().to_numpy().shape == (0, 9)
