@@ -17,6 +17,7 @@ from bevcli.model.bevformer import BEVFormerConfig
 
 T = TypeVar("T")
 
+TRACKING = "tracking"  # the table of a model's file with the parameters of the tracker
 TRAINING = "training"  # the table of a model's file with the settings of its training, which the model does not need
 
 
@@ -33,13 +34,16 @@ def load_config(name_or_path: str | Path) -> BEVFormerConfig:
     """
     text, file = _read_model(str(name_or_path))
     table = _parse(text, file)
-    return _dataclass({key: table[key] for key in table if key != TRAINING}, BEVFormerConfig, file, "")
+    return _dataclass({key: table[key] for key in table if key not in (TRACKING, TRAINING)}, BEVFormerConfig, file, "")
 
 
-def load_training(name_or_path: str | Path, kind: type[T]) -> T:
-    """The [training] table of a model's file as a dataclass of type `kind`; its defaults where the file has none."""
+def load_table(name_or_path: str | Path, table: str, kind: type[T]) -> T:
+    """A table of a model's file, TRACKING or TRAINING, as a dataclass of type `kind`; its defaults without the table.
+
+    Raises ConfigError where there is no such file, or where its contents are wrong.
+    """
     text, file = _read_model(str(name_or_path))
-    return _dataclass(_parse(text, file).get(TRAINING, {}), kind, file, f"{TRAINING}.")
+    return _dataclass(_parse(text, file).get(table, {}), kind, file, f"{table}.")
 
 
 def _parse(text: str, file: str) -> dict[str, Any]:

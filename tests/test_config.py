@@ -8,7 +8,7 @@ from typing import Literal
 
 import pytest
 
-from bevcli.config import known_models, load_config, load_training
+from bevcli.config import TRAINING, known_models, load_config, load_table
 from bevcli.errors import ConfigError
 
 
@@ -39,7 +39,7 @@ def load(folder: Path, text: str) -> Car:
     """The training table of a file car.toml, read as a Car."""
     path = folder / "car.toml"
     path.write_text(f"[training]\n{text}")
-    return load_training(path, Car)
+    return load_table(path, TRAINING, Car)
 
 
 MINIMAL = 'name = "a"\n{}\n[training.wheel]\nwidth = 1'

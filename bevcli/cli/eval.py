@@ -35,6 +35,10 @@ def evaluate(
         bool,
         typer.Option("--count-missing", help="Count ground-truth frames without a prediction as missed."),
     ] = False,
+    tracking: Annotated[
+        bool,
+        typer.Option("--tracking", help="Also score tracks: AMOTA, identity switches and the other tracking metrics."),
+    ] = False,
     scene: SceneOption = None,
     version: VersionOption = None,
     split: SplitOption = None,
@@ -47,7 +51,16 @@ def evaluate(
 
     from bevcli.evaluation.evaluate import evaluate
 
-    scores = evaluate(predictions, ground_truth, max_range, count_missing, scene=scene, version=version, split=split)
+    scores = evaluate(
+        predictions,
+        ground_truth,
+        max_range,
+        count_missing,
+        tracking=tracking,
+        scene=scene,
+        version=version,
+        split=split,
+    )
     print(json.dumps(scores.to_dict(), indent=1) if as_json else scores.table())
     for note in scores.notes:
         typer.echo(f"note: {note}", err=True)

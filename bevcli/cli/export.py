@@ -11,12 +11,19 @@ import typer
 def export(
     predictions: Annotated[Path, typer.Argument(help="predictions.json, ground_truth.json, or the folder of a run.")],
     form: Annotated[
-        Literal["csv", "kitti", "nuscenes"],
-        typer.Option("--format", help="csv: one table. kitti: label_2 and calib. nuscenes: results_nusc.json."),
+        Literal["csv", "kitti", "nuscenes", "nuscenes-tracking"],
+        typer.Option(
+            "--format",
+            help="csv: one table. kitti: label_2 and calib. nuscenes: results_nusc.json. nuscenes-tracking: "
+            "tracking_nusc.json.",
+        ),
     ],
     out: Annotated[
         Path | None,
-        typer.Option(help="Default: boxes.csv, kitti or results_nusc.json next to PREDICTIONS.", show_default=False),
+        typer.Option(
+            help="Default: boxes.csv, kitti, results_nusc.json or tracking_nusc.json next to PREDICTIONS.",
+            show_default=False,
+        ),
     ] = None,
     score: Annotated[float, typer.Option(min=0, max=1, help="Leave out boxes scored below this.")] = 0.0,
     calibration: Annotated[
@@ -27,7 +34,7 @@ def export(
         typer.Option(help="kitti: the camera. Default: CAM_FRONT, else the one that looks most directly ahead."),
     ] = None,
 ) -> None:
-    """Write boxes as a CSV table, as KITTI labels of one camera, or as a nuScenes submission.
+    """Write boxes as a CSV table, as KITTI labels of one camera, or as a nuScenes submission for detection or tracking.
 
     KITTI labels are the boxes that one camera sees, in the camera frame. They need --calibration.
     """
@@ -39,12 +46,17 @@ def export(
 
     file = predictions / "predictions.json" if predictions.is_dir() else predictions
     boxes = above_score(read_boxes(file), score)
-    default_name = {"csv": "boxes.csv", "kitti": "kitti", "nuscenes": "results_nusc.json"}[form]
-    target = file.parent / default_name if out is None else out
+    default_names = {
+        "csv": "boxes.csv",
+        "kitti": "kitti",
+        "nuscenes": "results_nusc.json",
+        "nuscenes-tracking": "tracking_nusc.json",
+    }
+    target = file.parent / default_names[form] if out is None else out
     if form == "csv":
         typer.echo(f"{target}: {write_csv(boxes, target)} boxes")
-    elif form == "nuscenes":
-        write_submission(boxes, target)
+    elif form in ("nuscenes", "nuscenes-tracking"):
+        write_submission(boxes, target, tracking=form == "nuscenes-tracking")
         typer.echo(f"{target}: {len(boxes.frames)} samples")
     else:
         if calibration is None:

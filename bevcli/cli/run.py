@@ -73,6 +73,12 @@ def run(
         bool,
         typer.Option("--temporal/--no-temporal", help="Use the BEV map of the previous frame.", rich_help_panel=MODEL),
     ] = True,
+    track: Annotated[
+        bool,
+        typer.Option(
+            "--track/--no-track", help="Give boxes identities over time, and write tracks.csv.", rich_help_panel=MODEL
+        ),
+    ] = True,
     camera: Annotated[
         list[str] | None,
         typer.Option(
@@ -153,7 +159,7 @@ def run(
     """Run BEVFormer on SEQUENCE, frame by frame, and write boxes and a recording.
 
     The output folder gets recording.rrd (open it with `bevcli viz`), predictions.json (all boxes of all frames),
-    summary.json and, for models with a segmentation head, segmentation/.
+    tracks.csv (one row a box with its track), summary.json and, for models with a segmentation head, segmentation/.
     """
     from bevcli.cli.progress import Progress
     from bevcli.pipeline.model_loading import load_model
@@ -178,7 +184,7 @@ def run(
         extrinsics=extrinsics,
     )
     out = Path("runs") / f"{drive.name}-{loaded.name}" if out is None else out
-    options = RunOptions(temporal, dict(map(parse_camera, camera or ())), recording, save_bev)
+    options = RunOptions(temporal, track, dict(map(parse_camera, camera or ())), recording, save_bev)
 
     view = None
     if live:

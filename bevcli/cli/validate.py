@@ -35,6 +35,9 @@ def validate(
             metavar="METRES", help="Ignore boxes beyond this distance. Default: the nearest side of the BEV grid."
         ),
     ] = None,
+    tracking: Annotated[
+        bool, typer.Option("--tracking", help="Also run the tracker and score its tracks: AMOTA, identity switches.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")] = False,
     device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="auto uses a GPU if there is one.")] = "auto",
 ) -> None:
@@ -47,6 +50,7 @@ def validate(
 
     from bevcli.cli.progress import Progress
     from bevcli.evaluation.scores_report import scores_table, scores_to_dict
+    from bevcli.evaluation.tracking.report import tracking_table, tracking_to_dict
     from bevcli.pipeline.model_loading import load_model
     from bevcli.pipeline.runner import Runner, StepOptions
     from bevcli.training.drives import count_frames, open_drives, parse_seeds
@@ -57,8 +61,14 @@ def validate(
     drives = open_drives(data or (), seeds, cache, loaded.config)
     runner = Runner(loaded.prepared, loaded.device, StepOptions(loaded.precision, temporal))
     with Progress(count_frames(drives), "frames") as progress:
-        scores = validate_model(runner, drives, max_range, progress.advance)
+        scores = validate_model(
+            runner, drives, max_range, loaded.tracker if tracking else None, after_frame=progress.advance
+        )
     if as_json:
-        print(json.dumps(scores_to_dict(scores.detection, scores.config, scores.segmentation), indent=1))
+        content = scores_to_dict(scores.detection, scores.config, scores.segmentation)
+        content |= {} if scores.tracking is None else {"tracking": tracking_to_dict(scores.tracking)}
+        print(json.dumps(content, indent=1))
     else:
         print(f"drives  {len(drives)}\n\n{scores_table(scores.detection, scores.segmentation)}")
+        if scores.tracking is not None:
+            print(f"\n{tracking_table(scores.tracking)}")

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from statistics import median
+from typing import Any, TypeVar
 
 from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import evaluate_detections
@@ -14,8 +16,13 @@ from bevcli.evaluation.inputs import ScoredInput, open_ground_truth, open_predic
 from bevcli.evaluation.pairing import FramePairs, pair_frames
 from bevcli.evaluation.scores_report import scores_table, scores_to_dict
 from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmentation
+from bevcli.evaluation.tracking.config import TrackingConfig
+from bevcli.evaluation.tracking.report import tracking_table, tracking_to_dict
+from bevcli.evaluation.tracking.scoring import TrackingScores, evaluate_tracking
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.sequences.nuscenes.choice import NuScenesChoice
+
+Config = TypeVar("Config", DetectionConfig, TrackingConfig)
 
 
 @dataclass(frozen=True)
@@ -27,6 +34,7 @@ class Scores:
         config: the parameters of the detection score.
         detection: the scores of the boxes.
         segmentation: the scores of the maps; None where predictions or ground truth have none.
+        tracking: the scores of the tracks; None if they were not asked for.
         notes: what was assumed or left out, one line each.
     """
 
@@ -34,16 +42,21 @@ class Scores:
     config: DetectionConfig
     detection: DetectionScores
     segmentation: SegmentationScores | None
+    tracking: TrackingScores | None
     notes: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
         """All scores as a dict for JSON, with the devkit's key names; undefined numbers are None."""
-        return scores_to_dict(self.detection, self.config, self.segmentation, self.notes)
+        scores = scores_to_dict(self.detection, self.config, self.segmentation, self.notes)
+        return scores if self.tracking is None else {**scores, "tracking": tracking_to_dict(self.tracking)}
 
     def table(self) -> str:
         """The scores as text for a terminal."""
         frames = f"{self.detection.frame_count} frames, matched by {self.pairs.matched_by}"
-        return f"{frames}\n\n{scores_table(self.detection, self.segmentation)}"
+        parts = [frames, scores_table(self.detection, self.segmentation)]
+        if self.tracking is not None:
+            parts.append(tracking_table(self.tracking))
+        return "\n\n".join(parts)
 
     def write_plots(self, folder: Path | str) -> list[Path]:
         """Write plots as PNG files into a folder, made where it is missing; return their paths. Raises OutputError."""
@@ -64,6 +77,7 @@ def evaluate(
     max_range: float | None = None,
     count_missing: bool = False,
     *,
+    tracking: bool = False,
     scene: str | None = None,
     version: str | None = None,
     split: str | None = None,
@@ -76,6 +90,8 @@ def evaluate(
         max_range: distance from the ego vehicle beyond which nothing is scored, metres. Default: nuScenes' range of
             each class, or no limit where no frame has an ego pose, as in the devkit.
         count_missing: whether ground-truth frames without a prediction count as missed; they are left out by default.
+        tracking: whether to score tracks, too: AMOTA and the metrics that come with it. Predictions and ground truth
+            need identities ("instance").
         scene: score only this scene of the ground truth.
         version: of a nuScenes root, such as "v1.0-mini".
         split: of a nuScenes root, such as "val".
@@ -84,24 +100,54 @@ def evaluate(
         The scores. Predictions without attributes get them from class and speed.
 
     Raises:
-        InputError: a file is missing or wrong, or the two have no frame in common.
+        InputError: a file is missing or wrong, the two have no frame in common, or `tracking` and one of them has no
+            identities.
         ConfigError: max_range is not positive.
     """
     truth = open_ground_truth(Path(ground_truth), NuScenesChoice(version, scene, split))
     found = open_predictions(Path(predictions))
     pairs = pair_frames(found.boxes, truth.boxes, count_missing=count_missing)
     pairs = without_cycles_in_racks(pairs, truth.bicycle_racks)
-    config = DetectionConfig()
-    if max_range is not None:
-        config = config.cut_at(max_range)
-    elif not pairs.ego_pose_known:
-        config = config.unlimited()
+    config = _config(DetectionConfig(), pairs, max_range)
     detection = evaluate_detections(_with_attributes(pairs.predictions), pairs.ground_truth, config, pairs.ego_xy)
     segmentation, map_notes = _score_maps(found, truth, pairs)
     notes = [*pairs.notes, *map_notes]
+    tracks, track_notes = None, list[str]()
+    if tracking:
+        tracks, track_notes = _score_tracks(pairs, _config(TrackingConfig(), pairs, max_range))
     if max_range is None and not pairs.ego_pose_known:
         notes.append('no frame has "world_from_ego": class ranges are not applied (--max-range M applies them)')
-    return Scores(pairs, config, detection, segmentation, (*notes, *_detection_notes(detection)))
+    return Scores(pairs, config, detection, segmentation, tracks, (*notes, *_detection_notes(detection), *track_notes))
+
+
+def _config(config: Config, pairs: FramePairs, max_range: float | None) -> Config:
+    """The parameters with the class ranges that hold for these frames."""
+    if max_range is not None:
+        return config.cut_at(max_range)
+    return config if pairs.ego_pose_known else config.unlimited()
+
+
+def _score_tracks(pairs: FramePairs, config: TrackingConfig) -> tuple[TrackingScores, list[str]]:
+    """The scores of the tracks, and notes about what differs from nuScenes."""
+    stamps = pairs.ground_truth_stamps
+    scores = evaluate_tracking(pairs.predictions, pairs.ground_truth, stamps, config, pairs.ego_xy)
+    notes = []
+    if pairs.frame_of_reference != "world":
+        notes.append(
+            f"tracks are scored in the {pairs.frame_of_reference} frame: gaps in tracks are interpolated there, not in "
+            "the world frame"
+        )
+    gaps = [
+        (later.timestamp_ns - earlier.timestamp_ns) / 1e9
+        for earlier, later in pairwise(sorted(stamps, key=lambda stamp: (stamp.scene, stamp.timestamp_ns)))
+        if later.scene == earlier.scene
+    ]
+    if gaps and not 0.8 < median(gaps) / config.frame_period_s < 1.25:
+        notes.append(
+            f"frames are {median(gaps):.2g} s apart, but TID and LGD count {config.frame_period_s:g} s for each of "
+            "them, as in the nuScenes devkit"
+        )
+    return scores, notes
 
 
 def _with_attributes(frames: Sequence[Boxes3D]) -> Sequence[Boxes3D]:

@@ -17,6 +17,8 @@ _UNKNOWN = {
     "scores": np.float64(np.nan),
     "attributes": np.str_(""),
     "instances": np.str_(""),
+    "track_scores": np.float64(np.nan),
+    "duplicates": np.bool_(False),
     "visibilities": np.float64(np.nan),
     "num_points": np.int64(-1),
 }

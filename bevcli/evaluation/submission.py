@@ -1,4 +1,4 @@
-"""results_nusc.json: predictions as a nuScenes detection submission, read and written."""
+"""Predictions as a nuScenes submission for detection (results_nusc.json) or tracking, read and written."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from bevcli.errors import InputError
+from bevcli.evaluation.tracking.config import TRACKING_CLASSES
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.transforms import rotation_from_quaternion, yaw_of_rotation
@@ -30,14 +31,15 @@ class SubmissionWriter:
     Raises OutputError where the file cannot be written.
     """
 
-    def __init__(self, path: Path, resume_at: int | None = None) -> None:
+    def __init__(self, path: Path, resume_at: int | None = None, *, tracking: bool = False) -> None:
+        self._objects = tracking_submission_boxes if tracking else submission_boxes
         self.file = IncrementalJson(path, json.dumps({"meta": META})[:-1] + ', "results": {', _TAIL, resume_at)
 
     def write(self, frame: FrameBoxes) -> None:
         """Add a frame, its boxes in the world frame. A frame without a sample token (no keyframe) is left out."""
         token = frame.extras.get("sample_token")
         if token is not None:
-            self.file.append(submission_boxes(frame.boxes, token), f"frame {frame.stamp.index}", key=token)
+            self.file.append(self._objects(frame.boxes, token), f"frame {frame.stamp.index}", key=token)
 
     def __enter__(self) -> SubmissionWriter:
         return self
@@ -58,16 +60,45 @@ def submission_boxes(boxes: Boxes3D, sample_token: str) -> list[dict[str, Any]]:
     best = boxes if boxes.scores is None else boxes[np.argsort(-boxes.scores, kind="stable")[:MAX_BOXES]]
     attributes = attributes_by_speed(best) if best.attributes is None else best.attributes
     scores = np.zeros(0) if best.scores is None else best.scores
-    half_yaws = best.yaws / 2
+    named = zip(best.classes.tolist(), scores.tolist(), attributes.tolist(), strict=True)
+    return [
+        {**placed, "detection_name": name, "detection_score": score, "attribute_name": attribute}
+        for placed, (name, score, attribute) in zip(_placed_boxes(best, sample_token), named, strict=True)
+    ]
+
+
+def tracking_submission_boxes(boxes: Boxes3D, sample_token: str) -> list[dict[str, Any]]:
+    """The best 500 boxes with a track, of the seven tracking classes, as objects of a tracking submission.
+
+    boxes: in the world frame. The order is that of descending track score. An unknown velocity is written as 0.
+    """
+    if boxes.instances is None or boxes.track_scores is None:
+        return []
+    tracked = boxes[(boxes.instances != "") & np.isin(boxes.classes, TRACKING_CLASSES)]
+    assert tracked.instances is not None
+    assert tracked.track_scores is not None
+    best = np.argsort(-tracked.track_scores, kind="stable")[:MAX_BOXES]
+    named = zip(
+        tracked.instances[best].tolist(),
+        tracked.classes[best].tolist(),
+        tracked.track_scores[best].tolist(),
+        strict=True,
+    )
+    return [
+        {**placed, "tracking_id": instance, "tracking_name": name, "tracking_score": score}
+        for placed, (instance, name, score) in zip(_placed_boxes(tracked[best], sample_token), named, strict=True)
+    ]
+
+
+def _placed_boxes(boxes: Boxes3D, sample_token: str) -> list[dict[str, Any]]:
+    """The keys that detection and tracking submissions share."""
+    half_yaws = boxes.yaws / 2
     rows = zip(
-        best.centers.tolist(),
-        best.sizes_lwh[:, [1, 0, 2]].tolist(),
+        boxes.centers.tolist(),
+        boxes.sizes_lwh[:, [1, 0, 2]].tolist(),
         np.cos(half_yaws).tolist(),
         np.sin(half_yaws).tolist(),
-        np.nan_to_num(best.velocities, nan=0.0).tolist(),
-        best.classes.tolist(),
-        scores.tolist(),
-        attributes.tolist(),
+        np.nan_to_num(boxes.velocities, nan=0.0).tolist(),
         strict=True,
     )
     return [
@@ -77,16 +108,17 @@ def submission_boxes(boxes: Boxes3D, sample_token: str) -> list[dict[str, Any]]:
             "size": size_wlh,
             "rotation": [w, 0.0, 0.0, z],
             "velocity": velocity,
-            "detection_name": name,
-            "detection_score": score,
-            "attribute_name": attribute,
         }
-        for center, size_wlh, w, z, velocity, name, score, attribute in rows
+        for center, size_wlh, w, z, velocity in rows
     ]
 
 
-def write_submission(boxes: BoxesFile, path: Path) -> None:
-    """Write a submission. Raises InputError if boxes are not in the world frame or frames have no sample token."""
+def write_submission(boxes: BoxesFile, path: Path, *, tracking: bool = False) -> None:
+    """Write a submission for the detection task, or for the tracking task.
+
+    Raises InputError if boxes are not in the world frame, frames have no sample token, or `tracking` and no box has a
+    track.
+    """
     if boxes.frame_of_reference != "world":
         raise InputError(
             "a nuScenes submission needs boxes in the world frame, but these are in the "
@@ -94,7 +126,11 @@ def write_submission(boxes: BoxesFile, path: Path) -> None:
         )
     if not any("sample_token" in frame.extras for frame in boxes.frames):
         raise InputError('a nuScenes submission needs a "sample_token" in every frame: run on a nuScenes root')
-    with SubmissionWriter(path) as writer:
+    if tracking and all(frame.boxes.track_scores is None for frame in boxes.frames):
+        raise InputError(
+            'a nuScenes tracking submission needs boxes with "instance" and "track_score": run with --track'
+        )
+    with SubmissionWriter(path, tracking=tracking) as writer:
         for frame in boxes.frames:
             writer.write(frame)
 
@@ -137,19 +173,26 @@ def _frame_from_json(index: int, token: str, rows: Any, path: Path) -> FrameBoxe
 
 def _box_object(row: Any, where: str) -> dict[str, Any]:
     """A box of a submission with the keys of a boxes file, whose reader checks the values."""
-    needed = ("translation", "size", "rotation", "velocity", "detection_name", "detection_score", "attribute_name")
+    tracking = isinstance(row, dict) and "tracking_id" in row
+    own = ("tracking_name", "tracking_score") if tracking else ("detection_name", "detection_score", "attribute_name")
+    needed = ("translation", "size", "rotation", "velocity", *own)
     missing = [key for key in needed if not isinstance(row, dict) or key not in row]
     if missing:
         raise InputError(f'{where}: "{missing[0]}" is missing')
     size = row["size"]
+    names = {"class": row[own[0]], "score": row[own[1]]}
+    extras = (
+        {"instance": row["tracking_id"], "track_score": row["tracking_score"]}
+        if tracking
+        else {"attribute": row["attribute_name"]}
+    )
     return {
-        "class": row["detection_name"],
+        **names,
+        **extras,
         "center": row["translation"],
         "size_lwh": [size[1], size[0], size[2]] if isinstance(size, list) and len(size) == 3 else size,
         "yaw": _yaw(row["rotation"], where),
         "velocity": row["velocity"],
-        "score": row["detection_score"],
-        "attribute": row["attribute_name"],
     }
 
 

@@ -32,7 +32,9 @@ class Boxes3D:
         classes: (N,) class names.
         scores: (N,) confidence, 0 to 1. Optional.
         attributes: (N,) nuScenes attribute names, "" for none. Optional.
-        instances: (N,) object identities, constant over time. Optional.
+        instances: (N,) object identities, constant over time, "" for none. Optional.
+        track_scores: (N,) score of the track that a box belongs to, 0 to 1; NaN without a track. Optional.
+        duplicates: (N,) whether a better box describes the same object. Optional.
         visibilities: (N,) visible fraction, 0 to 1; NaN if unknown. Optional.
         num_points: (N,) number of lidar and radar points; boxes with 0 are not scored, -1 if unknown. Optional.
     """
@@ -45,6 +47,8 @@ class Boxes3D:
     scores: Array | None = None
     attributes: NDArray[np.str_] | None = None
     instances: NDArray[np.str_] | None = None
+    track_scores: Array | None = None
+    duplicates: NDArray[np.bool_] | None = None
     visibilities: Array | None = None
     num_points: NDArray[np.int64] | None = None
 
@@ -117,8 +121,8 @@ class Boxes3D:
     def to_dict(self) -> dict[str, list[Any]]:
         """The boxes as a table: column name -> N values. `pandas.DataFrame` and `polars.DataFrame` take it.
 
-        The columns are class, score, x, y, z, length, width, height, yaw, vx, vy, attribute, instance, visibility and
-        num_points, without the optional ones that are None.
+        The columns are class, score, x, y, z, length, width, height, yaw, vx, vy, attribute, instance, track_score,
+        duplicate, visibility and num_points, without the optional ones that are None.
         """
         numbers = ("x", "y", "z", "length", "width", "height", "yaw", "vx", "vy")
         columns = {
@@ -127,6 +131,8 @@ class Boxes3D:
             **dict(zip(numbers, self.to_numpy().T, strict=True)),
             "attribute": self.attributes,
             "instance": self.instances,
+            "track_score": self.track_scores,
+            "duplicate": self.duplicates,
             "visibility": self.visibilities,
             "num_points": self.num_points,
         }

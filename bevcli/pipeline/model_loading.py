@@ -9,10 +9,11 @@ from pathlib import Path
 import torch
 
 from bevcli.checkpoints import bundled_weights, inspect, load_weights
-from bevcli.config import known_models, load_config
+from bevcli.config import TRACKING, known_models, load_config, load_table
 from bevcli.errors import BevcliError, WeightsError
 from bevcli.model.bevformer import BEVFormer, BEVFormerConfig
 from bevcli.model.prepared import Precision, prepare_for_inference
+from bevcli.pipeline.tracking import TrackerConfig
 
 DEFAULT_MODEL = "demo"
 UNTRAINED_SEED = 0  # two untrained runs of one drive agree
@@ -28,6 +29,7 @@ class Model:
         precision: of the image features; the rest of the network computes in float32.
         weights: the file that the weights came from, None for random weights.
         bundled: whether that file is part of the package.
+        tracker: the parameters of the tracker, the table [tracking] of the model's TOML file.
     """
 
     network: BEVFormer
@@ -35,6 +37,7 @@ class Model:
     precision: Precision = "fp32"
     weights: Path | None = None
     bundled: bool = False
+    tracker: TrackerConfig = field(default_factory=TrackerConfig)
 
     @property
     def config(self) -> BEVFormerConfig:
@@ -88,7 +91,7 @@ def load_model(
         raise WeightsError(f"--weights {weights} and --untrained exclude each other: give one of them")
     if name is None:
         name = DEFAULT_MODEL if weights is None else _model_of(weights)
-    config = load_config(name)
+    config, tracker = load_config(name), load_table(name, TRACKING, TrackerConfig)
     bundled = bundled_weights(str(name)) if weights is None and not untrained else None
     file = weights or bundled
     if file is None and not untrained:
@@ -102,7 +105,8 @@ def load_model(
         network = BEVFormer(config)
     if file is not None:
         load_weights(file, network)
-    return Model(network.eval(), target, choose_precision(precision, target), file, bundled=bundled is not None)
+    precision = choose_precision(precision, target)
+    return Model(network.eval(), target, precision, file, bundled=bundled is not None, tracker=tracker)
 
 
 def _model_of(weights: Path) -> str:

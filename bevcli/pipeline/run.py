@@ -13,6 +13,7 @@ from bevcli.pipeline.preprocess import Preprocessor
 from bevcli.pipeline.run_files import RunFiles, prepare_folder
 from bevcli.pipeline.run_summary import RunSummary
 from bevcli.pipeline.runner import Runner, StepOptions
+from bevcli.pipeline.tracking import track as track_boxes
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.writer import LiveSink
 
@@ -22,6 +23,7 @@ def run(
     sequence: Sequence,
     *,
     temporal: bool = True,
+    track: bool = True,
     attention: bool = False,
     probes: tuple[tuple[float, float], ...] = (),
     cameras: Mapping[str, str] | None = None,
@@ -37,6 +39,7 @@ def run(
         model: of `load_model`.
         sequence: of `open_sequence`.
         temporal: whether the previous BEV map is used.
+        track: whether the boxes get identities over time: the columns `instances`, `track_scores` and `duplicates`.
         attention: whether `Prediction.attention` is filled in.
         probes: x, y in metres, bev frame: BEV cells whose sampling points `Prediction.attention` shows. They imply
             `attention`.
@@ -49,7 +52,10 @@ def run(
     options = StepOptions(model.precision, temporal, ask_attention=attention or bool(probes), probes=tuple(probes))
     runner = Runner(model.prepared, model.device, options)
     steps = runner.run(sequence, range(len(sequence.stamps)), Preprocessor(model.config, cameras))
-    return ((frame, prediction) for frame, prediction, _ in steps)
+    predictions = ((frame, prediction) for frame, prediction, _ in steps)
+    if not track:
+        return predictions
+    return ((frame, prediction) for frame, prediction, _ in track_boxes(model.tracker, predictions))
 
 
 @dataclass(frozen=True)
@@ -58,12 +64,14 @@ class RunOptions:
 
     Attributes:
         temporal: whether the previous BEV map is used.
+        track: whether boxes get identities over time, and tracks.csv is written.
         cameras: camera of the rig -> camera of the model whose embedding it takes, see `run`.
         recording: what goes into recording.rrd.
         save_bev: folder for each frame's BEV features, None for none.
     """
 
     temporal: bool = True
+    track: bool = True
     cameras: Mapping[str, str] = field(default_factory=dict)
     recording: RecordingOptions = field(default_factory=RecordingOptions)
     save_bev: Path | None = None
@@ -79,7 +87,7 @@ def run_into_folder(
     force: bool = False,
     after_frame: Callable[[Frame, Prediction], None] = lambda frame, prediction: None,
 ) -> RunSummary:
-    """Runs a model over a sequence and writes recording, boxes, maps and summary.json into a folder.
+    """Runs a model over a sequence and writes recording, boxes, tracks, maps and summary.json into a folder.
 
     Every file is complete after each frame. summary.json is written whatever ends the run.
 
@@ -98,12 +106,13 @@ def run_into_folder(
     """
     options = RunOptions() if options is None else options
     prepare_folder(out, force=force)
-    files = RunFiles(out, sequence, model, options.recording, options.save_bev, live)
+    files = RunFiles(out, sequence, model, options.recording, options.save_bev, live, track=options.track)
     summary = RunSummary(model, sequence, options.recording.score, temporal=options.temporal)
     predictions = run(
         model,
         sequence,
         temporal=options.temporal,
+        track=options.track,
         attention=options.recording.shows_internals,
         probes=options.recording.probes,
         cameras=options.cameras,

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import TracebackType
 
 from bevcli.errors import OutputError
+from bevcli.evaluation.export_csv import CsvWriter
 from bevcli.evaluation.submission import SubmissionWriter
 from bevcli.frame import Frame, Prediction, Sequence
 from bevcli.geometry.boxes import attributes_by_speed
@@ -20,7 +21,7 @@ from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.map_folder import write_map
 
 RECORDING, PREDICTIONS, SUBMISSION = "recording.rrd", "predictions.json", "results_nusc.json"
-SEGMENTATION = "segmentation"
+TRACKS, SEGMENTATION = "tracks.csv", "segmentation"
 
 
 def prepare_folder(out: Path, *, force: bool) -> None:
@@ -31,7 +32,7 @@ def prepare_folder(out: Path, *, force: bool) -> None:
         raise OutputError(f"{out}: exists already; pass --force to overwrite it, or --out DIR for another folder")
     try:
         out.mkdir(parents=True, exist_ok=True)
-        earlier = [out / name for name in (RECORDING, PREDICTIONS, SUBMISSION, SUMMARY)]
+        earlier = [out / name for name in (RECORDING, PREDICTIONS, TRACKS, SUBMISSION, SUMMARY)]
         for path in (*earlier, *(out / SEGMENTATION).glob("[0-9]*.png")):
             path.unlink(missing_ok=True)
     except OSError as error:
@@ -39,7 +40,7 @@ def prepare_folder(out: Path, *, force: bool) -> None:
 
 
 class RunFiles:
-    """`with RunFiles(…) as files: files.write(frame, prediction)`: recording, boxes, maps and BEV features."""
+    """`with RunFiles(…) as files: files.write(frame, prediction)`: recording, boxes, tracks, maps and BEV features."""
 
     def __init__(
         self,
@@ -49,20 +50,26 @@ class RunFiles:
         recording: RecordingOptions,
         bev_folder: Path | None = None,
         live: LiveSink | None = None,
+        *,
+        track: bool = True,
     ) -> None:
         self._out, self._sequence, self._model, self._bev_folder = out, sequence, model, bev_folder
-        self._options, self._live = recording, live
+        self._options, self._live, self._track = recording, live, track
         self._stack = contextlib.ExitStack()
         self._submission: SubmissionWriter | None = None
+        self._tracks: CsvWriter | None = None
+        self._reference = "world" if sequence.has_ego_motion else "ego"
 
     def __enter__(self) -> RunFiles:
         out, sequence, model = self._out, self._sequence, self._model
         recording = Recording(out / RECORDING, sequence, model, self._options, self._live)
         extras = {"model": model.name, "untrained": model.untrained, "classes": list(model.config.classes)}
-        boxes = BoxesWriter(out / PREDICTIONS, "world" if sequence.has_ego_motion else "ego", extras)
+        boxes = BoxesWriter(out / PREDICTIONS, self._reference, extras)
         with self._stack:  # closes what is open if the next one cannot be opened
             self._recording = self._stack.enter_context(recording)
             self._boxes = self._stack.enter_context(boxes)
+            if self._track:
+                self._tracks = self._stack.enter_context(CsvWriter(out / TRACKS))
             for note in sequence.notes:
                 self._recording.event(note, "WARN")
             self._stack = self._stack.pop_all()
@@ -78,6 +85,8 @@ class RunFiles:
         self._recording.log(frame, prediction)
         boxes = frame_boxes(frame, prediction, world=self._sequence.has_ego_motion)
         self._boxes.write(boxes)
+        if self._tracks is not None:
+            self._tracks.write(_with_identity(boxes), self._reference)
         if frame.sample_token is not None:
             if self._submission is None:
                 self._submission = self._stack.enter_context(SubmissionWriter(self._out / SUBMISSION))
@@ -90,7 +99,7 @@ class RunFiles:
 
     def written(self) -> tuple[Path, ...]:
         """The files and folders that exist so far."""
-        paths = [self._out / name for name in (RECORDING, PREDICTIONS, SUBMISSION, SEGMENTATION)]
+        paths = [self._out / name for name in (RECORDING, PREDICTIONS, TRACKS, SUBMISSION, SEGMENTATION)]
         return tuple(path for path in (*paths, self._bev_folder) if path is not None and path.exists())
 
 
@@ -102,3 +111,9 @@ def frame_boxes(frame: Frame, prediction: Prediction, *, world: bool) -> FrameBo
     boxes = prediction.boxes_world if world else prediction.boxes_ego
     boxes = replace(boxes, attributes=attributes_by_speed(boxes))
     return FrameBoxes(frame.stamp, frame.world_from_ego if world else None, boxes, extras)
+
+
+def _with_identity(frame: FrameBoxes) -> FrameBoxes:
+    """The boxes of a frame that belong to a track."""
+    instances = frame.boxes.instances
+    return frame if instances is None else replace(frame, boxes=frame.boxes[instances != ""])

@@ -27,6 +27,7 @@ class RunSummary:
         self._seconds: dict[str, list[float]] = defaultdict(list)
         self._whole: list[float] = []
         self._boxes: Counter[str] = Counter()
+        self._tracks: dict[str, str] | None = None  # identity -> class
         self._dropped: list[dict[str, object]] = []
         self._skipped: list[int] = []
         self._started_anew: list[dict[str, object]] = []
@@ -47,7 +48,12 @@ class RunSummary:
             self._seconds[stage].append(seconds)
         scores = prediction.boxes.scores
         if scores is not None:
-            self._boxes.update(prediction.boxes.classes[scores >= self._score].tolist())
+            shown = prediction.boxes[scores >= self._score]
+            self._boxes.update(shown.classes.tolist())
+            if shown.instances is not None:
+                owners = zip(shown.instances.tolist(), shown.classes.tolist(), strict=True)
+                self._tracks = self._tracks or {}
+                self._tracks.update({instance: name for instance, name in owners if instance})
         index = frame.stamp.index
         self._dropped += [{"frame": index, "camera": name, "reason": why} for name, why in frame.dropped.items()]
         if prediction.skipped:
@@ -72,6 +78,8 @@ class RunSummary:
             "score": self._score,
             "boxes": sum(self._boxes.values()),
             "boxes_by_class": dict(self._boxes),
+            "tracks": None if self._tracks is None else len(self._tracks),
+            "tracks_by_class": dict(Counter((self._tracks or {}).values())),
             "frames_per_second": self._rate(),
             "stage_ms": {stage: round(1000 * median(s), 3) for stage, s in self._seconds.items()},
             "camera_embeddings": self._embeddings,
@@ -97,6 +105,8 @@ class RunSummary:
             ("boxes", f"{sum(self._boxes.values())} with a score of {self._score:g} or more"),
             ("stages", f"{stages} (medians)"),
         ]
+        if self._tracks is not None:
+            rows.insert(2, ("tracks", f"{len(self._tracks)} objects have such boxes"))
         if guessed:
             rows.append(("cameras", f"{', '.join(guessed)} (embeddings; --camera changes them)"))
         if self._dropped:

@@ -10,7 +10,7 @@ from typing import Literal
 import torch
 
 from bevcli.checkpoints import load_weights
-from bevcli.config import load_config, load_training
+from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import OutputError
 from bevcli.model.bevformer import BEVFormer
 from bevcli.training.augmentation import AugmentationConfig
@@ -112,7 +112,7 @@ def prepare_training(
         BevcliError: a file, the choice of drives, or the output folder is wrong.
     """
     model_config = load_config(model_name_or_file)
-    config = load_training(model_name_or_file, TrainingConfig)
+    config = load_table(model_name_or_file, TRAINING, TrainingConfig)
     config = config if steps is None else replace(config, steps=steps)
     out = Path("runs") / f"train-{model_config.name}" if out is None else out
     check_training_seeds(rendered_seeds or ())

@@ -6,16 +6,21 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import evaluate_detections
 from bevcli.evaluation.detection_scores import DetectionScores
 from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmentation
-from bevcli.frame import MAP_CLASSES, Frame, Prediction
+from bevcli.evaluation.tracking.config import TrackingConfig
+from bevcli.evaluation.tracking.scoring import TrackingScores, evaluate_tracking
+from bevcli.frame import MAP_CLASSES, Frame, FrameStamp, Prediction
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
-from bevcli.geometry.transforms import inverse
+from bevcli.geometry.transforms import Array, inverse
 from bevcli.model.bevformer import BEVFormerConfig
 from bevcli.pipeline.preprocess import Preprocessor
 from bevcli.pipeline.runner import Runner
+from bevcli.pipeline.tracking import TrackerConfig, track
 from bevcli.training.drives import Drives
 
 
@@ -27,11 +32,13 @@ class Validation:
         config: the settings of the detection metrics.
         detection: AP, errors and NDS.
         segmentation: IoU by class; None if the model or the drives have no maps.
+        tracking: AMOTA and the metrics that come with it; None without a tracker.
     """
 
     config: DetectionConfig
     detection: DetectionScores
     segmentation: SegmentationScores | None
+    tracking: TrackingScores | None = None
 
     def summary(self) -> dict[str, float]:
         """mAP, NDS and mAVE (m/s) over the classes that have ground truth, and IoU by class; NaN if not measured."""
@@ -55,28 +62,42 @@ def validate(
     runner: Runner,
     drives: Drives,
     max_range_m: float | None = None,
+    tracker: TrackerConfig | None = None,
     after_frame: Callable[[], None] = lambda: None,
 ) -> Validation:
     """Runs every frame of the drives and scores the frames that have ground truth.
 
     Args:
         max_range_m: ignore boxes beyond this distance, metres; by default beyond the nearest side of the BEV grid.
+        tracker: parameters of the tracker whose tracks are scored; None scores no tracks.
         after_frame: called after each frame.
     """
-    config = DetectionConfig().cut_at(nearest_side_m(runner.config) if max_range_m is None else max_range_m)
+    range_m = nearest_side_m(runner.config) if max_range_m is None else max_range_m
+    config = DetectionConfig().cut_at(range_m)
     predictions, truths, maps = [], [], []
+    tracks: list[_TrackedFrame] = []
     for index in range(len(drives)):
         sequence = drives.open(index)
-        for frame, prediction, _ in runner.run(sequence, range(len(sequence.stamps)), Preprocessor(runner.config)):
+        steps = runner.run(sequence, range(len(sequence.stamps)), Preprocessor(runner.config))
+        results = ((frame, prediction) for frame, prediction, _ in steps)
+        if tracker is not None:
+            results = ((frame, prediction) for frame, prediction, _ in track(tracker, results))
+        for frame, prediction in results:
             if frame.ground_truth is not None:
+                if tracker is not None:
+                    tracks.append(_tracked_frame(index, frame, frame.ground_truth, prediction))
                 predicted, truth = _boxes_ego(frame, frame.ground_truth, prediction)
                 predictions.append(predicted)
                 truths.append(truth)
             if prediction.segmentation is not None and frame.ground_truth_map is not None:
                 maps.append((prediction.segmentation, frame.ground_truth_map))
             after_frame()
-    detection = evaluate_detections(predictions, truths, config)
-    return Validation(config, detection, evaluate_segmentation(maps) if maps else None)
+    return Validation(
+        config,
+        evaluate_detections(predictions, truths, config),
+        evaluate_segmentation(maps) if maps else None,
+        None if tracker is None else _score_tracks(tracks, TrackingConfig().cut_at(range_m)),
+    )
 
 
 def nearest_side_m(config: BEVFormerConfig) -> float:
@@ -90,3 +111,28 @@ def _boxes_ego(frame: Frame, ground_truth: Boxes3D, prediction: Prediction) -> t
     predicted = prediction.boxes_ego
     predicted = replace(predicted, attributes=attributes_by_speed(predicted))
     return predicted, ground_truth.transformed(inverse(frame.world_from_ego.matrix))
+
+
+@dataclass(frozen=True)
+class _TrackedFrame:
+    """What the tracking metrics need of a frame: boxes in the world frame, and the ego vehicle's position (2,)."""
+
+    stamp: FrameStamp
+    predictions: Boxes3D
+    ground_truth: Boxes3D
+    ego_xy: Array
+
+
+def _tracked_frame(drive: int, frame: Frame, ground_truth: Boxes3D, prediction: Prediction) -> _TrackedFrame:
+    stamp = replace(frame.stamp, scene=f"{drive} {frame.stamp.scene}")  # scenes of different drives may share a name
+    return _TrackedFrame(stamp, prediction.boxes_world, ground_truth, frame.world_from_ego.translation[:2])
+
+
+def _score_tracks(frames: list[_TrackedFrame], config: TrackingConfig) -> TrackingScores:
+    return evaluate_tracking(
+        [frame.predictions for frame in frames],
+        [frame.ground_truth for frame in frames],
+        [frame.stamp for frame in frames],
+        config,
+        np.array([frame.ego_xy for frame in frames]).reshape(-1, 2),
+    )

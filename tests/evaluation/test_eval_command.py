@@ -208,3 +208,64 @@ def test_the_command_prints_what_the_library_returns(files: tuple[Path, Path]) -
     assert evaluated(*files, "--max-range", "20") == scores.to_dict()
     result = CliRunner().invoke(app, ["eval", *map(str, files), "--max-range", "20"], catch_exceptions=False)
     assert result.stdout == scores.table() + "\n"
+
+
+@pytest.fixture
+def tracked_files(tmp_path: Path) -> tuple[Path, Path]:
+    """Five frames of 14 objects that move 1 m a frame, and predictions that lose and exchange identities."""
+    first = random_truth(31, frames=1, per_class=2)[0]
+    first = replace(
+        first, instances=np.array([f"object-{k}" for k in range(len(first))]), num_points=np.full(len(first), 9)
+    )
+    truth = [replace(first, centers=first.centers + (frame, 0, 0)) for frame in range(5)]
+    found = []
+    for frame, boxes in enumerate(truth):
+        count = len(boxes)
+        instances = np.roll(boxes.instances, 1) if frame == 3 else boxes.instances
+        scores = np.full(count, 0.8)
+        found.append(replace(boxes, instances=instances, scores=scores, track_scores=scores))
+    return (
+        write_frames(tmp_path / "tracked.json", found, "world", Pose.identity()),
+        write_frames(tmp_path / "tracked_truth.json", truth, "world", Pose.identity()),
+    )
+
+
+def test_tracks_are_scored_when_asked_for(tracked_files: tuple[Path, Path]) -> None:
+    assert "tracking" not in evaluated(*tracked_files)
+    tracking = evaluated(*tracked_files, "--tracking")["tracking"]
+    expected = evaluate(*tracked_files, tracking=True).tracking
+    assert expected is not None
+    assert tracking["amota"] == pytest.approx(expected.overall["amota"])
+    assert tracking["label_metrics"]["ids"]["car"] == expected.classes["car"].metrics["ids"]
+    assert set(tracking["label_metrics"]["amota"]) == {
+        "bicycle", "bus", "car", "motorcycle", "pedestrian", "trailer", "truck",
+    }  # fmt: skip
+    assert (tracking["scenes"], tracking["frames"]) == (1, 5)
+    assert tracking["recall"] == 1
+
+
+def test_the_tracking_table_names_every_metric(tracked_files: tuple[Path, Path]) -> None:
+    result = CliRunner().invoke(app, ["eval", *map(str, tracked_files), "--tracking"], catch_exceptions=False)
+    for name in ("AMOTA", "AMOTP", "MOTA", "IDS", "FRAG", "TID", "LGD", "identity switches"):
+        assert name in result.stdout
+
+
+def test_tracks_cannot_be_scored_without_identities(tracked_files: tuple[Path, Path], files: tuple[Path, Path]) -> None:
+    with pytest.raises(InputError, match=r'ground truth: scene "s" frame 0: .* boxes have no "instance"'):
+        evaluate(tracked_files[0], files[1], tracking=True)
+    with pytest.raises(InputError, match='predictions: no box has an "instance"'):
+        evaluate(files[0], tracked_files[1], tracking=True)
+
+
+def test_frames_of_another_rate_are_noted(tmp_path: Path, tracked_files: tuple[Path, Path]) -> None:
+    def slowed(path: Path) -> Path:
+        file = read_boxes(path)
+        with BoxesWriter(tmp_path / f"slow-{path.name}", "world") as writer:
+            for frame in file.frames:
+                stamp = replace(frame.stamp, timestamp_ns=4 * frame.stamp.timestamp_ns)
+                writer.write(replace(frame, stamp=stamp))
+        return tmp_path / f"slow-{path.name}"
+
+    notes = evaluate(*map(slowed, tracked_files), tracking=True).notes
+    assert any("frames are 2 s apart, but TID and LGD count 0.5 s" in note for note in notes)
+    assert not any("apart" in note for note in evaluate(*tracked_files, tracking=True).notes)

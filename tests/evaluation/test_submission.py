@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -160,3 +161,57 @@ def test_boxes_without_sample_token_or_world_frame_are_refused(tmp_path: Path) -
     with pytest.raises(InputError, match="these are in the ego frame"):
         write_submission(BoxesFile("ego", (frame(0, many_boxes(1), sample_token="t"),)), tmp_path / "a.json")
     assert not (tmp_path / "a.json").exists()
+
+
+def tracked_boxes(count: int, seed: int) -> Boxes3D:
+    boxes = many_boxes(count, seed)
+    instances = np.array([str(k) if k % 4 else "" for k in range(count)])
+    scores = np.where(instances == "", np.nan, np.random.default_rng(seed).uniform(0, 1, count))
+    return replace(boxes, instances=instances, track_scores=scores)
+
+
+def test_a_tracking_submission_keeps_the_devkits_rules(tmp_path: Path) -> None:
+    rows = (
+        frame(0, tracked_boxes(1200, 1), sample_token="t0"),
+        frame(1, tracked_boxes(8, 2)),  # between keyframes: no token
+        frame(2, Boxes3D.empty(), sample_token="t2"),
+    )
+    path = tmp_path / "tracking_nusc.json"
+    write_submission(BoxesFile("world", rows), path, tracking=True)
+    submission = json.loads(path.read_text())
+    assert set(submission) == {"meta", "results"}
+    assert set(submission["results"]) == {"t0", "t2"}
+    written = submission["results"]["t0"]
+    assert len(written) == 500
+    keys = {"sample_token", "translation", "size", "rotation", "velocity", "tracking_id", "tracking_name"}
+    for box in written:
+        assert set(box) == keys | {"tracking_score"}
+        assert type(box["tracking_id"]) is str
+        assert type(box["tracking_score"]) is float
+        assert box["tracking_name"] in {"bicycle", "bus", "car", "motorcycle", "pedestrian", "trailer", "truck"}
+        for key, length in (("translation", 3), ("size", 3), ("rotation", 4), ("velocity", 2)):
+            assert len(box[key]) == length
+            assert all(type(number) is float and math.isfinite(number) for number in box[key])
+    scores = [box["tracking_score"] for box in written]
+    assert scores == sorted(scores, reverse=True)
+    assert len({box["tracking_id"] for box in written}) == 500
+
+
+def test_a_tracking_submission_is_read_back(tmp_path: Path) -> None:
+    boxes = tracked_boxes(40, 3)
+    boxes = boxes[(boxes.instances != "") & (boxes.classes == "car")]
+    path = tmp_path / "tracking_nusc.json"
+    write_submission(BoxesFile("world", (frame(0, boxes, sample_token="t"),)), path, tracking=True)
+    assert is_submission(path)
+    read = read_submission(path).frames[0].boxes
+    assert boxes.track_scores is not None
+    order = np.argsort(-boxes.track_scores)
+    assert list(read.instances) == list(boxes.instances[order])
+    assert read.track_scores == pytest.approx(boxes.track_scores[order])
+    assert read.centers == pytest.approx(boxes.centers[order])
+
+
+def test_a_tracking_submission_needs_tracks(tmp_path: Path) -> None:
+    file = BoxesFile("world", (frame(0, many_boxes(3), sample_token="t"),))
+    with pytest.raises(InputError, match="run with --track"):
+        write_submission(file, tmp_path / "out.json", tracking=True)

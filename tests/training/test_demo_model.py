@@ -8,10 +8,9 @@ import pytest
 import torch
 
 from bevcli.checkpoints import bundled_weights
-from bevcli.config import load_config, load_training
+from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import WeightsError
 from bevcli.model.bevformer import BEVFormer
-from bevcli.model.prepared import prepare_for_inference
 from bevcli.pipeline.model_loading import load_model
 from bevcli.pipeline.runner import Runner
 from bevcli.training.drives import FolderDrives
@@ -35,7 +34,7 @@ def test_the_demo_model_has_every_part() -> None:
 
 
 def test_the_demo_model_is_trained_with_history() -> None:
-    settings = load_training("demo", TrainingConfig)
+    settings = load_table("demo", TRAINING, TrainingConfig)
     assert settings.clips.frames >= 2
     assert settings.held_out > 0
     assert settings.weights_dtype == "float16"
@@ -69,8 +68,10 @@ def test_the_model_follows_from_the_weights() -> None:
 
 def test_it_finds_cars_and_road_in_the_sample_street() -> None:
     """Thresholds far below the model card's scores, but far above those of random weights."""
-    model = load_model().network
-    cpu = torch.device("cpu")
-    scores = validate(Runner(prepare_for_inference(model, cpu), cpu), FolderDrives([STREET], 2.0))
+    model = load_model(device="cpu")
+    scores = validate(Runner(model.prepared, model.device), FolderDrives([STREET], 2.0), tracker=model.tracker)
     assert scores.detection.overall.classes["car"].mean_ap > 0.2
     assert scores.segmentation.iou["drivable_road"] > 0.6
+    cars = scores.tracking.classes["car"].metrics
+    assert cars["amota"] > 0.5
+    assert cars["ids"] < 0.02 * cars["gt"]

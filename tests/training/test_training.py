@@ -10,7 +10,7 @@ import torch
 from painted_drives import CONFIG, PaintedDrives
 
 from bevcli.checkpoints import load_weights
-from bevcli.config import load_config, load_training
+from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import BevcliError, ConfigError, InputError, OutputError, WeightsError
 from bevcli.model.bevformer import BEVFormer
 from bevcli.training.augmentation import AugmentationConfig
@@ -213,11 +213,11 @@ def test_the_training_table_is_read_and_is_no_part_of_the_model_config(tmp_path:
     file = tmp_path / "mine.toml"
     file.write_text(f"{tiny}\n[training]\nsteps = 12\n[training.clips]\nframes = 4\n")
     assert load_config(file) == load_config("tiny")
-    assert load_training(file, TrainingConfig) == TrainingConfig(steps=12, clips=ClipConfig(frames=4))
-    assert load_training("tiny", TrainingConfig) == TrainingConfig()
+    assert load_table(file, TRAINING, TrainingConfig) == TrainingConfig(steps=12, clips=ClipConfig(frames=4))
+    assert load_table("tiny", TRAINING, TrainingConfig) == TrainingConfig()
     file.write_text(f"{tiny}\n[training]\nstep = 12\n")
     with pytest.raises(ConfigError, match=r'unknown key "training.step"; did you mean "steps"'):
-        load_training(file, TrainingConfig)
+        load_table(file, TRAINING, TrainingConfig)
 
 
 def test_drives_come_from_folders_or_from_seeds(tmp_path: Path) -> None:
@@ -264,7 +264,7 @@ def test_a_job_is_prepared_from_a_model_file_and_seeds(tmp_path: Path) -> None:
     job = prepare_training("demo", cpu, rendered_seeds=range(10), out=out, steps=3, seed=4)
     assert (job.model.config, job.config) == (
         load_config("demo"),
-        replace(load_training("demo", TrainingConfig), steps=3),
+        replace(load_table("demo", TRAINING, TrainingConfig), steps=3),
     )
     assert (len(job.drives), len(job.held_out)) == (6, 4)
     assert (job.seed, job.group.size, job.out.is_dir()) == (4, 1, True)

@@ -14,8 +14,11 @@ from bevcli.geometry.boxes import CLASSES, Boxes3D
 from bevcli.geometry.transforms import Array
 
 KEYS = frozenset(
-    ("class", "center", "size_lwh", "yaw", "velocity", "score", "attribute", "instance", "visibility", "num_points")
-)
+    (
+        "class", "center", "size_lwh", "yaw", "velocity", "score", "attribute", "instance", "track_score", "duplicate",
+        "visibility", "num_points",
+    )
+)  # fmt: skip
 _UNKNOWN_VELOCITY = [None, None]
 
 
@@ -39,7 +42,9 @@ def boxes_from_json(objects: Any, where: str) -> Boxes3D:
         scores=_scores(objects, where),
         attributes=_names(objects, "attribute", where),
         instances=_names(objects, "instance", where),
-        visibilities=_visibilities(objects, where),
+        track_scores=_shares(objects, "track_score", where),
+        duplicates=_flags(objects, "duplicate", where),
+        visibilities=_shares(objects, "visibility", where),
         num_points=_num_points(objects, where),
     )
     for key, column in (("center", boxes.centers), ("size_lwh", boxes.sizes_lwh), ("yaw", boxes.yaws)):
@@ -49,7 +54,10 @@ def boxes_from_json(objects: Any, where: str) -> Boxes3D:
 
 
 def boxes_to_json(boxes: Boxes3D) -> list[dict[str, Any]]:
-    """N JSON objects. Unknown values (NaN visibility, "" names, -1 points) are left out; NaN velocities become null."""
+    """N JSON objects. Unknown values (NaN visibility, "" names, -1 points) are left out; NaN velocities become null.
+
+    "duplicate" is written only where it is true.
+    """
     velocities = [[None if math.isnan(v) else v for v in row] for row in boxes.velocities.tolist()]
     columns: dict[str, list[Any]] = {
         "class": boxes.classes.tolist(),
@@ -65,6 +73,8 @@ def boxes_to_json(boxes: Boxes3D) -> list[dict[str, Any]]:
         ("score", boxes.scores, lambda value: True),
         ("attribute", boxes.attributes, lambda value: value != ""),
         ("instance", boxes.instances, lambda value: value != ""),
+        ("track_score", boxes.track_scores, lambda value: not math.isnan(value)),
+        ("duplicate", boxes.duplicates, lambda value: value),
         ("visibility", boxes.visibilities, lambda value: not math.isnan(value)),
         ("num_points", boxes.num_points, lambda value: value >= 0),
     )
@@ -141,14 +151,25 @@ def _scores(objects: Sequence[dict[str, Any]], where: str) -> Array | None:
     return scores
 
 
-def _visibilities(objects: Sequence[dict[str, Any]], where: str) -> Array | None:
-    if not any("visibility" in box for box in objects):
+def _shares(objects: Sequence[dict[str, Any]], key: str, where: str) -> Array | None:
+    """An optional column of numbers from 0 to 1, NaN where a box has none."""
+    if not any(key in box for box in objects):
         return None
-    values = [box.get("visibility") for box in objects]
-    numbers = _numbers([math.nan if v is None else v for v in values], 1, f"{where}: box", "visibility")
+    values = [box.get(key) for box in objects]
+    numbers = _numbers([math.nan if v is None else v for v in values], 1, f"{where}: box", key)
     good = np.isnan(numbers) | ((numbers >= 0) & (numbers <= 1))
-    _require(good, numbers, f"{where}: box", "visibility", "0 to 1")
+    _require(good, numbers, f"{where}: box", key, "0 to 1")
     return numbers
+
+
+def _flags(objects: Sequence[dict[str, Any]], key: str, where: str) -> NDArray[np.bool_] | None:
+    if not any(key in box for box in objects):
+        return None
+    values = [box.get(key, False) for box in objects]
+    for place, value in enumerate(values):
+        if type(value) is not bool:
+            raise InputError(f"{where}: box {place}: {key}: expected true or false, found {value!r:.40}")
+    return np.array(values)
 
 
 def _num_points(objects: Sequence[dict[str, Any]], where: str) -> NDArray[np.int64] | None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from bevcli.errors import OutputError
+from bevcli.sequences.files.growing_file import GrowingFile
 
 PARTIAL = ".partial"
 
@@ -59,7 +60,6 @@ class IncrementalJson:
 
     Attributes:
         path: the file, which has its name once it is closed.
-        size: bytes of the head and the entries written so far. Pass it as `resume_at` to go on from here.
     """
 
     def __init__(self, path: Path, head: str, tail: str, resume_at: int | None = None) -> None:
@@ -71,19 +71,20 @@ class IncrementalJson:
         self.path = path
         self._partial = partial_path(path)
         self._tail = f"\n{tail}\n".encode()
-        self.size = 0
         self._separator = "\n"
-        try:
-            if resume_at is None:
-                self._file = self._partial.open("wb", buffering=0)  # unbuffered: an entry is in the file at once
-            else:
-                self._file = self._reopen(resume_at)
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
+        self._is_closed = False
+        if resume_at is not None and not self._partial.exists() and path.exists():
+            _rename(path, self._partial)
+        self._file = GrowingFile(self._partial, resume_at, name=path)
         if resume_at is None:
-            self._write(head)
+            self._file.append(head.encode())
         elif resume_at > len(head.encode()):
             self._separator = ",\n"
+
+    @property
+    def size(self) -> int:
+        """Bytes of the head and the entries written so far. Pass it as `resume_at` to go on from here."""
+        return self._file.size
 
     def append(self, entry: Any, name: str, key: str | None = None) -> None:
         """Write an entry.
@@ -98,50 +99,28 @@ class IncrementalJson:
                 f"{self.path}: {name}: a box or pose has a number that is not finite, so the model's output is "
                 "invalid: try --precision fp32"
             ) from None
-        self._write(self._separator + ("" if key is None else f"{json.dumps(key)}: ") + text)
+        member = text if key is None else f"{json.dumps(key)}: {text}"
+        self._file.append((self._separator + member).encode())
         self._separator = ",\n"
 
     def close(self) -> None:
         """Completes the file and gives it its name. Raises OutputError; the partial file then keeps all entries."""
-        if self._file.closed:
+        if self._is_closed:
             return
+        self._is_closed = True
         try:
-            with self._file:
-                _write_all(self._file.fileno(), self._tail, self.size)
-            os.replace(self._partial, self.path)
-        except OSError as error:
-            raise OutputError(f"{self.path}: cannot be written ({error.strerror})") from None
+            self._file.append(self._tail)
+        finally:
+            self._file.close()
+        _rename(self._partial, self.path)
 
     def is_deleted(self) -> bool:
         """Whether somebody has deleted the file that is being written."""
-        return os.fstat(self._file.fileno()).st_nlink == 0
-
-    def _reopen(self, size: int) -> Any:
-        if not self._partial.exists():
-            os.replace(self.path, self._partial)
-        file = self._partial.open("r+b", buffering=0)
-        file.truncate(size)
-        file.seek(size)
-        self.size = size
-        return file
-
-    def _write(self, addition: str) -> None:
-        encoded = addition.encode()
-        try:
-            _write_all(self._file.fileno(), encoded, self.size)
-        except OSError as error:
-            raise OutputError(f"{self.path}: cannot be written ({error.strerror})") from None
-        self.size += len(encoded)
+        return self._file.is_deleted()
 
 
-def _write_all(descriptor: int, content: bytes, size: int) -> None:
-    """Writes all bytes at the end of a file of this size, or none of them. Raises OSError."""
+def _rename(path: Path, to: Path) -> None:
     try:
-        rest = memoryview(content)
-        while rest:
-            rest = rest[os.write(descriptor, rest) :]
-    except OSError:
-        with contextlib.suppress(OSError):
-            os.ftruncate(descriptor, size)
-            os.lseek(descriptor, size, os.SEEK_SET)
-        raise
+        os.replace(path, to)
+    except OSError as error:
+        raise OutputError(f"{to}: cannot be written ({error.strerror})") from None

@@ -1,0 +1,1 @@
+"""Tracking metrics of nuScenes: AMOTA and the numbers that come with it."""

@@ -1,0 +1,230 @@
+"""The tracking metrics are those of the nuScenes devkit; hand-made cases show what each of them counts."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bevcli.errors import InputError
+from bevcli.evaluation.tracking.scoring import TrackingScores, evaluate_tracking
+from bevcli.frame import FrameStamp
+from bevcli.geometry.boxes import Boxes3D
+
+GOLDEN = Path(__file__).parents[1] / "data" / "golden_tracking.json.gz"  # made with nuscenes-devkit 1.2.0
+Row = tuple[str, float, float]  # identity, x, y
+VARIANTS = ({}, {"ground_truth": "bus"}, {"predictions": "trailer"}, {"ground_truth": "bus", "predictions": "trailer"})
+
+
+@pytest.fixture(scope="module")
+def golden() -> dict[str, Any]:
+    return json.loads(gzip.decompress(GOLDEN.read_bytes()))
+
+
+def golden_scores(golden: dict[str, Any], without: dict[str, str]) -> TrackingScores:
+    """The scores of the golden file's boxes, less those of one class on one side."""
+    stamps = [FrameStamp(row["frame"], row["scene"], row["timestamp_us"] * 1000) for row in golden["frames"]]
+
+    def frames(side: str, identity: str) -> list[Boxes3D]:
+        rows = defaultdict(list)
+        for row in golden[side]:
+            if row["class"] != without.get(side):
+                rows[row["scene"], row["frame"]].append(row)
+        return [golden_boxes(rows[stamp.scene, stamp.index], identity) for stamp in stamps]
+
+    ego_xy = np.array([row["ego_translation"][:2] for row in golden["frames"]])
+    return evaluate_tracking(
+        frames("predictions", "tracking_id"), frames("ground_truth", "instance"), stamps, ego_xy=ego_xy
+    )
+
+
+def golden_boxes(rows: list[dict[str, Any]], identity: str) -> Boxes3D:
+    if not rows:
+        return Boxes3D.empty()
+    columns = {key: np.array([row[key] for row in rows]) for key in rows[0]}
+    return Boxes3D(
+        columns["translation"],
+        columns["size_lwh"],
+        columns["yaw"],
+        columns["velocity"],
+        columns["class"],
+        instances=columns[identity],
+        track_scores=columns.get("tracking_score"),
+        num_points=columns["num_points"],
+    )
+
+
+def number(value: float | None) -> float:
+    return np.nan if value is None else value
+
+
+@pytest.mark.parametrize("without", VARIANTS, ids=str)
+def test_every_number_equals_the_devkits(golden: dict[str, Any], without: dict[str, str]) -> None:
+    scores = golden_scores(golden, without)
+    expected = golden["expected"]
+    if without:
+        dropped = {f"drop_{side}_of": name for side, name in without.items()}
+        expected = next(v["expected"] for v in golden["variants"] if v.keys() - {"expected"} == dropped.keys())
+    for metric, classes in expected["label_metrics"].items():
+        for name, value in classes.items():
+            found = scores.classes[name].metrics[metric]
+            assert found == pytest.approx(number(value), abs=1e-9, nan_ok=True), (metric, name)
+    for metric, value in expected["mean_metrics"].items():
+        assert scores.overall[metric] == pytest.approx(number(value), abs=1e-9, nan_ok=True), metric
+
+
+def test_the_metrics_at_every_recall_level_equal_the_devkits(golden: dict[str, Any]) -> None:
+    scores = golden_scores(golden, {})
+    for name, metrics in golden["expected"]["per_threshold"].items():
+        for metric, values in metrics.items():
+            expected = np.array([number(value) for value in values])
+            np.testing.assert_allclose(
+                scores.classes[name].levels[metric], expected, atol=1e-9, rtol=0, err_msg=f"{metric} of {name}"
+            )
+
+
+def cars(rows: list[Row], score: float | None = None) -> Boxes3D:
+    count = len(rows)
+    return Boxes3D(
+        np.array([(x, y, 0) for _, x, y in rows], dtype=np.float64).reshape(-1, 3),
+        np.tile([4.0, 2.0, 1.5], (count, 1)),
+        np.zeros(count),
+        np.zeros((count, 2)),
+        np.full(count, "car"),
+        instances=np.array([name for name, _, _ in rows], dtype=np.str_),
+        track_scores=None if score is None else np.full(count, score),
+    )
+
+
+def car_scores(predicted: list[list[Row]], truth: list[list[Row]], scenes: str | None = None) -> TrackingScores:
+    """The scores of frames half a second apart; the ego vehicle stands at the origin."""
+    scenes = "a" * len(truth) if scenes is None else scenes
+    stamps = [FrameStamp(k, scene, k * 500_000_000) for k, scene in enumerate(scenes)]
+    return evaluate_tracking([cars(rows, 0.9) for rows in predicted], [cars(rows) for rows in truth], stamps)
+
+
+def two_cars(left: str = "A", right: str = "B", frames: int = 10, apart: float = 6.0) -> list[list[Row]]:
+    """Two cars side by side; `left` and `right` name each car's identity, one letter for all frames or one a frame."""
+    left, right = (name * frames if len(name) == 1 else name for name in (left, right))
+    return [[(left[k], k, apart / 2), (right[k], k, -apart / 2)] for k in range(frames)]
+
+
+def metrics(scores: TrackingScores) -> dict[str, float]:
+    return dict(scores.classes["car"].metrics)
+
+
+def test_perfect_tracks_have_amota_one_and_no_error():
+    found = metrics(car_scores(two_cars("s", "t"), two_cars()))
+    assert (found["amota"], found["mota"], found["recall"], found["mt"]) == (1, 1, 1, 2)
+    assert [found[name] for name in ("amotp", "motp", "ids", "frag", "fp", "fn", "ml", "tid", "lgd")] == [0] * 9
+
+
+def test_exchanged_identities_are_two_switches():
+    found = metrics(car_scores(two_cars("sssssttttt", "tttttsssss"), two_cars()))
+    assert (found["ids"], found["tp"], found["mota"], found["motar"], found["frag"]) == (2, 18, 0.9, 1, 0)
+    assert found["amota"] == 35 / 40  # the scores of 18 matches reach 35 of the 40 recall levels
+
+
+def test_identities_exchanged_in_one_frame_are_four_switches():
+    found = metrics(car_scores(two_cars("ssssstssss", "tttttstttt"), two_cars()))
+    assert (found["ids"], found["mota"], found["amota"]) == (4, 0.8, pytest.approx(31 / 40))
+
+
+def test_an_object_keeps_its_track_while_it_is_near():
+    found = metrics(car_scores(two_cars("sssssttttt", "tttttsssss", apart=1), two_cars(apart=1)))
+    assert (found["ids"], found["motp"], found["amota"]) == (0, 0.5, 1)
+
+
+def test_a_track_that_changes_its_name_in_a_gap_is_a_fragmentation_and_a_switch():
+    truth = [[("A", k, 0)] for k in range(10)]
+    predicted = [[("s", k, 0)] if k < 4 else [("t", k, 0)] if k >= 6 else [] for k in range(10)]
+    found = metrics(car_scores(predicted, truth))
+    assert (found["frag"], found["ids"], found["fn"], found["tp"]) == (1, 1, 2, 7)
+    assert found["lgd"] == 1.0  # two frames of half a second
+
+
+def test_a_gap_inside_a_track_is_interpolated():
+    truth = [[("A", k, 0)] for k in range(10)]
+    predicted = [[("s", k, 0)] if k not in (4,) else [] for k in range(10)]
+    found = metrics(car_scores(predicted, truth))
+    assert (found["frag"], found["fn"], found["amota"], found["motp"]) == (0, 0, 1, 0)
+
+
+def test_longer_gaps_are_interpolated_with_the_devkits_inverted_weights():
+    truth = [[("A", k, 0)] for k in range(4)]
+    predicted = [[("s", 0, 0)], [], [], [("s", 3, 0)]]
+    found = metrics(car_scores(predicted, truth))
+    assert found["motp"] == pytest.approx((0 + 1 + 1 + 0) / 4)  # at 2 m and 1 m in place of 1 m and 2 m
+
+
+def test_a_late_start_counts_the_seconds_before_the_first_match():
+    truth = [[("A", k, 0)] for k in range(10)]
+    predicted = [[("s", k, 0)] if k >= 3 else [] for k in range(10)]
+    found = metrics(car_scores(predicted, truth))
+    assert (found["tid"], found["lgd"], found["frag"], found["fn"]) == (1.5, 1.5, 0, 3)
+    assert (found["mt"], found["ml"]) == (0, 0)  # found in seven of ten frames
+
+
+def test_the_same_names_in_another_scene_are_other_objects_and_tracks():
+    truth = two_cars(frames=5) + two_cars(frames=5)
+    swapped = two_cars("s", "t", frames=5) + two_cars("t", "s", frames=5)
+    scores = car_scores(swapped, truth, scenes="aaaaabbbbb")
+    assert metrics(scores)["ids"] == 0
+    assert metrics(scores)["mt"] == 4
+    assert scores.scenes == 2
+
+
+def test_frames_may_come_in_any_order():
+    truth, predicted = two_cars(), two_cars("sssssttttt", "tttttsssss")
+    stamps = [FrameStamp(k, "a", k * 500_000_000) for k in range(10)]
+    order = np.random.default_rng(0).permutation(10)
+    shuffled = evaluate_tracking(
+        [cars(predicted[k], 0.9) for k in order], [cars(truth[k]) for k in order], [stamps[k] for k in order]
+    )
+    assert metrics(shuffled) == metrics(car_scores(predicted, truth))
+
+
+def test_boxes_beyond_the_range_of_their_class_do_not_count():
+    truth = [[("A", 10, 0), ("B", 50, 0)] for _ in range(5)]
+    found = metrics(car_scores([[("s", 10, 0), ("t", 50.1, 0)] for _ in range(5)], truth))
+    assert (found["gt"], found["fp"], found["amota"]) == (5, 0, 1)
+
+
+def test_as_many_pairs_as_possible_are_matched_even_if_they_are_farther():
+    truth = [[("A", 0, 0), ("B", 1.9, 0)]]
+    predicted = [[("s", 1.8, 0), ("t", 3.7, 0)]]  # s is nearest to B, but then t would be left over for nobody
+    found = metrics(car_scores(predicted, truth))
+    assert (found["tp"], found["fn"], found["motp"]) == (2, 0, pytest.approx(1.8))
+
+
+def test_predictions_without_an_identity_are_left_out():
+    found = metrics(car_scores([[("s", 0, 0), ("", 20, 0)]] * 3, [[("A", 0, 0)]] * 3))
+    assert (found["tp"], found["fp"]) == (3, 0)
+
+
+def test_without_ground_truth_everything_is_nan():
+    scores = car_scores([[("s", 0, 0)]], [[]])
+    assert all(np.isnan(value) for value in metrics(scores).values())
+    assert np.isnan(scores.overall["amota"])
+
+
+def test_without_predictions_a_class_gets_the_worst_values():
+    found = metrics(car_scores([[], []], [[("A", 0, 0)], [("A", 0, 0)]]))
+    assert (found["amota"], found["amotp"], found["ml"], found["fn"], found["tid"]) == (0, 2, 1, 2, 20)
+
+
+def test_one_identity_twice_in_a_frame_is_an_error():
+    with pytest.raises(InputError, match='predictions: scene "a" frame 1: two boxes have the instance "s"'):
+        car_scores([[("s", 0, 0)], [("s", 0, 0), ("s", 9, 0)]], [[("A", 0, 0)]] * 2)
+
+
+def test_boxes_without_an_identity_cannot_be_scored():
+    with pytest.raises(InputError, match='ground truth: scene "a" frame 1: 1 of 2 boxes have no "instance"'):
+        car_scores([[("s", 0, 0)]] * 2, [[("A", 0, 0)], [("A", 0, 0), ("", 9, 0)]])
+    with pytest.raises(InputError, match='predictions: no box has an "instance"'):
+        car_scores([[("", 0, 0)]], [[("A", 0, 0)]])
