@@ -39,6 +39,7 @@ class Progress:
         self.total, self.unit = total, unit
         self.stream = sys.stderr if stream is None else stream
         self.done = 0
+        self.skipped = 0
         self.started = time.perf_counter()
         self._bar: rich.progress.Progress | None = None
 
@@ -63,6 +64,11 @@ class Progress:
         elif self._line_is_due(count):
             print(self.state(), file=self.stream, flush=True)
 
+    def skip(self, count: int) -> None:
+        """Adds units of work that were done before: they do not count for the rate."""
+        self.skipped = count
+        self.advance(count)
+
     def message(self, text: str) -> None:
         """Prints a line, above the bar if there is one."""
         if self._bar is not None:
@@ -72,9 +78,9 @@ class Progress:
 
     def state(self) -> str:
         """The progress in words, such as "3/8 frames, 0.35 per second, 14 s left"."""
-        if not self.done:
+        if self.done == self.skipped:
             return f"{self.done}/{self.total} {self.unit}"
-        rate = self.done / max(time.perf_counter() - self.started, 1e-9)
+        rate = (self.done - self.skipped) / max(time.perf_counter() - self.started, 1e-9)
         left = duration((self.total - self.done) / rate)
         return f"{self.done}/{self.total} {self.unit}, {rate:.2f} per second, {left} left"
 

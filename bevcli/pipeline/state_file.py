@@ -1,7 +1,7 @@
-"""State files: trees of frozen dataclasses, tensors, arrays and plain values in a .safetensors file.
+"""State files: trees of dataclasses, tensors, arrays and plain values in a .safetensors file.
 
 A node of the tree is one of: None, bool, int, float, str; a tuple, list or dict of nodes; a torch tensor; a numpy array
-of numbers, booleans or strings; an instance of a frozen dataclass of this package. Reading runs no code: it imports
+of numbers, booleans or strings; an instance of a dataclass of this package. Reading runs no code: it imports
 nothing, and fills in the fields of the dataclasses without calling them.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
 import json
 import os
 import sys
@@ -46,12 +47,22 @@ def load_state(path: Path) -> Any:
     try:
         with safe_open(path, "pt") as file:
             metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118: no mapping
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         if metadata.get("format") != FORMAT:
             raise InputError(f'{path}: is not a state file: "format" must be "{FORMAT}"')
         return _from_json(json.loads(metadata["tree"]), tensors)
     except (OSError, SafetensorError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(f"{path}: the state cannot be read ({error})") from None
+
+
+def digest(tree: object) -> str:
+    """A hash of a tree that `save_state` could write."""
+    tensors: dict[str, Tensor] = {}
+    found = hashlib.sha256(json.dumps(_to_json(tree, tensors)).encode())
+    for tensor in tensors.values():
+        found.update(f"{tensor.dtype}{list(tensor.shape)}".encode())
+        found.update(tensor.reshape(-1).view(torch.uint8).numpy().tobytes())
+    return found.hexdigest()
 
 
 def _to_json(value: Any, tensors: dict[str, Tensor]) -> Any:
@@ -102,7 +113,7 @@ def _from_json(node: Any, tensors: dict[str, Tensor]) -> Any:
 
 
 def _rebuilt(module: str, name: str, fields: dict[str, Any]) -> Any:
-    """An instance of a frozen dataclass of a module of this package that is imported already."""
+    """An instance of a dataclass of a module of this package that is imported already."""
     kind = getattr(sys.modules.get(module), name, None) if module.startswith("bevcli.") else None
     if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
         raise ValueError(f"{module}.{name} is not a state of this version")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from collections.abc import Sequence as Indices
+from pathlib import Path
 
 import numpy as np
 
@@ -25,6 +26,7 @@ class Selection:
         self.rig = sequence.rig
         self.has_ego_motion = sequence.has_ego_motion
         self.notes = (*sequence.notes, *notes)
+        self.input_files: tuple[Path, ...] = getattr(sequence, "input_files", ())
 
     @property
     def stamps(self) -> tuple[FrameStamp, ...]:
