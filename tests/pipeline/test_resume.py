@@ -134,10 +134,10 @@ def test_another_run_cannot_be_resumed_and_the_difference_is_named(model, mini_m
     shifted.stamps = (FrameStamp(0, "b", 5), *shifted.stamps[1:])
     with pytest.raises(OutputError, match=r"frames of the input: was 6, \w+, is 6, \w+"):
         run_all(model, interrupted, shifted, resume=True)
-    with pytest.raises(OutputError, match="option recording: was .*0.0.*is .*0.5") as error:
+    with pytest.raises(OutputError, match=r"option recording: was .*0.0.*is .*0.5") as error:
         run_all(model, interrupted, score=0.5, resume=True)
     assert "\n" not in str(error.value)
-    with pytest.raises(OutputError, match="model: was .* weights: was"):
+    with pytest.raises(OutputError, match=r"model: was .* weights: was"):
         run_all(Model(mini_model), interrupted, resume=True)
     with pytest.raises(OutputError, match="exclude each other"):
         run_all(model, interrupted, resume=True, force=True)
@@ -202,7 +202,7 @@ def test_a_folder_that_is_deleted_during_the_run_is_an_error(model, tmp_path):
         if frame.stamp.index == 2:
             shutil.rmtree(tmp_path / "out")
 
-    with pytest.raises(OutputError, match="deleted|cannot be written"):
+    with pytest.raises(OutputError, match=r"deleted|cannot be written"):
         run_all(model, tmp_path / "out", after_frame=delete)
 
 

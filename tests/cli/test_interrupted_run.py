@@ -1,0 +1,204 @@
+"""`bevcli run` that is killed, stopped, or runs out of disk: it loses no finished frame, and `--resume` goes on."""
+
+import json
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from memory_drive import MemorySequence
+from test_run import MINI_TOML
+
+from bevcli.sequences.files.boxes_file import read_boxes
+from bevcli.sequences.native.writer import NativeWriter
+from bevcli.viewer.recording_file import open_recording
+from bevcli.viewer.recording_reader import RecordingReader
+
+FRAMES = 24
+COMMAND = [sys.executable, "-m", "bevcli", "run", "drive", "--model", "mini.toml", "--untrained", "--rate", "all"]
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder with a drive, a model and the folder `whole` of an uninterrupted run."""
+    folder = tmp_path_factory.mktemp("interrupted")
+    (folder / "mini.toml").write_text(MINI_TOML)
+    sequence = MemorySequence(FRAMES, scenes="a" * FRAMES)
+    with NativeWriter(folder / "drive", with_ego_motion=True) as writer:
+        for index in range(FRAMES):
+            writer.write(sequence.load(index))
+    done = start(folder, "whole")
+    assert done.wait(120) == 0, done.stderr.read()
+    return folder
+
+
+def start(folder, out, *more, **options) -> subprocess.Popen:
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(
+        [*COMMAND, "--out", str(out), *more],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+        **options,
+    )
+
+
+def finished(out: Path) -> int:
+    """The number of frames in predictions.json or its partial file; 0 without one."""
+    partial = out / "predictions.json.partial"
+    if not (partial.exists() or (out / "predictions.json").exists()):
+        return 0
+    return len(read_boxes(out / "predictions.json").frames)
+
+
+def wait_for_frames(process: subprocess.Popen, out: Path, count: int) -> None:
+    deadline = time.monotonic() + 60
+    while process.poll() is None and time.monotonic() < deadline:
+        if (out / "predictions.json.partial").exists() and finished(out) >= count:
+            return
+        time.sleep(0.005)
+    raise AssertionError(f"the run ended before frame {count}: {process.stderr.read()}")
+
+
+def frames_of_recording(path: Path) -> list[int]:
+    with open_recording(path) as file:
+        return [frame.index for frame in RecordingReader(file.path).frames()]
+
+
+def assert_finished_frames_are_whole(out: Path, folder: Path) -> int:
+    count = finished(out)
+    whole = json.loads((folder / "whole/predictions.json").read_text())
+    frames = read_boxes(out / "predictions.json").frames if count else ()
+    assert [frame.stamp.index for frame in frames] == [row["frame"] for row in whole["frames"][:count]]
+    if count:
+        assert frames_of_recording(out / "recording.rrd")[:count] == list(range(count))
+    return count
+
+
+def assert_equals_whole(out: Path, folder: Path) -> None:
+    for name in ("predictions.json", "tracks.csv"):
+        assert (out / name).read_bytes() == (folder / "whole" / name).read_bytes()
+    assert frames_of_recording(out / "recording.rrd") == list(range(FRAMES))
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_signal_ends_the_run_after_its_frame_and_resume_completes_it(place, number, code):
+    out = place / f"signal-{code}"
+    process = start(place, out)
+    wait_for_frames(process, out, 2)
+    process.send_signal(number)
+    _, printed = process.communicate(timeout=20)
+    assert process.returncode == code
+    assert "Traceback" not in printed
+    count = assert_finished_frames_are_whole(out, place)
+    assert 2 <= count < FRAMES
+    assert json.loads((out / "summary.json").read_text())["frames"] == count
+    again = start(place, out, "--resume")
+    assert again.wait(60) == 0, again.stderr.read()
+    assert_equals_whole(out, place)
+
+
+def test_a_second_signal_ends_the_run_at_once(place):
+    out = place / "twice"
+    process = start(place, out)
+    wait_for_frames(process, out, 1)
+    os.kill(process.pid, signal.SIGSTOP)  # both signals come within one frame
+    for number in (signal.SIGTERM, signal.SIGINT):
+        process.send_signal(number)
+    os.kill(process.pid, signal.SIGCONT)
+    process.communicate(timeout=10)
+    assert process.returncode != 0
+
+
+def assert_fails_in_one_line(process: subprocess.Popen, *words: str) -> None:
+    _, printed = process.communicate(timeout=60)
+    lines = [
+        line for line in printed.splitlines() if not line.startswith(("note:", "warning:")) and "frames" not in line
+    ]
+    assert process.returncode == 1, printed
+    assert len(lines) == 1, printed
+    assert lines[0].startswith("error: ")
+    assert all(word in lines[0] for word in words), printed
+
+
+@pytest.mark.parametrize("limit", [100, 3_000, 100_000, 600_000, 1_500_000])
+def test_a_file_size_limit_is_an_error_of_one_line(place, limit):
+    out = place / f"limit-{limit}"
+
+    def limit_files():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+
+    assert_fails_in_one_line(start(place, out, preexec_fn=limit_files), "written")
+    assert_finished_frames_are_whole(out, place)
+
+
+@pytest.mark.parametrize("size", ["300k", "2m", "4m"])
+def test_a_full_disk_is_an_error_of_one_line_and_resume_goes_on_with_more_space(place, size):
+    disk = place / f"disk-{size}"
+    disk.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "none", disk], check=False, timeout=10)
+    if mounted.returncode != 0:
+        pytest.skip("cannot mount a small file system here (needs root)")
+    try:
+        assert_fails_in_one_line(start(place, disk / "out"), "No space left on device")
+        assert_finished_frames_are_whole(disk / "out", place)
+        subprocess.run(["mount", "-o", "remount,size=100m", disk], check=True, timeout=10)
+        again = start(place, disk / "out", "--resume")
+        assert again.wait(60) == 0, again.stderr.read()
+        assert_equals_whole(disk / "out", place)
+    finally:
+        subprocess.run(["umount", disk], check=True, timeout=10)
+
+
+def test_a_deleted_output_folder_is_an_error_of_one_line(place):
+    out = place / "deleted"
+    process = start(place, out)
+    wait_for_frames(process, out, 1)
+    out.rename(place / "moved")
+    subprocess.run(["rm", "-r", place / "moved"], check=False, timeout=10)
+    assert_fails_in_one_line(process, "deleted")
+    assert not out.exists()
+
+
+def kill_until_done(place: Path, out: Path, randomness: random.Random, duration_s: float, *more: str) -> int:
+    """Starts the run, kills it at a random moment, and checks what is left. Returns the number of finished frames."""
+    process = start(place, out, *more)
+    time.sleep(randomness.uniform(0.5, 1.0) * duration_s)
+    process.kill()
+    process.communicate(timeout=10)
+    return assert_finished_frames_are_whole(out, place) if out.exists() else 0
+
+
+def run_seconds(place: Path) -> float:
+    began = time.monotonic()
+    start(place, "timed", "--force").communicate(timeout=60)
+    return time.monotonic() - began
+
+
+def check_kills(place: Path, kills: int, name: str) -> None:
+    """Kills at random moments: every second run is resumed and killed again, the others start anew."""
+    randomness = random.Random(19)
+    duration_s = run_seconds(place)
+    for number in range(kills // 2):
+        kill_until_done(place, place / f"{name}-killed", randomness, duration_s, "--force")
+        kill_until_done(place, place / f"{name}-resumed", randomness, duration_s, "--resume")
+    last = start(place, place / f"{name}-resumed", "--resume")
+    assert last.wait(60) == 0, last.stderr.read()
+    assert_equals_whole(place / f"{name}-resumed", place)
+
+
+def test_a_few_kills_lose_no_finished_frame(place):
+    check_kills(place, 4, "few")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_hundred_kills_lose_no_finished_frame(place):
+    check_kills(place, 100, "many")
