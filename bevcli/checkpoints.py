@@ -16,7 +16,8 @@ from torch import Tensor
 
 from bevcli.config import known_models, load_config
 from bevcli.errors import WeightsError
-from bevcli.model.bevformer import BEVFormer, BEVFormerConfig
+from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
+from bevcli.model.bevformer_v2 import build_model
 from bevcli.model.official_keys import from_official, is_official
 
 # The exceptions of torch's restricted unpickler for a file that is not a valid pickle.
@@ -24,6 +25,13 @@ _BROKEN_PICKLE = (
     pickle.UnpicklingError, RuntimeError, OSError, EOFError, ValueError, LookupError, TypeError, AttributeError,
     struct.error,
 )  # fmt: skip
+
+
+# Parts of the official BEVFormerV2 files that only its training uses: a head on the image features, and further groups
+# of object queries.
+_PERSPECTIVE_HEAD = "fcos3d_bbox_head."
+_OBJECT_QUERIES = "decoder.query_embedding"
+OFFICIAL_QUERIES = 900  # of all published models; a group of BEVFormerV2 has as many
 
 
 @dataclass(frozen=True)
@@ -60,12 +68,14 @@ class Checkpoint:
         state: state dict with our key names.
         official: whether the file uses the key names of the released code.
         facts: metadata in the file, such as its epoch.
+        left_out: what of the file is for training only and was left out of `state`; "" for nothing.
     """
 
     path: Path
     state: Mapping[str, Tensor]
     official: bool
     facts: Mapping[str, str] = field(default_factory=dict)
+    left_out: str = ""
 
 
 @dataclass(frozen=True)
@@ -80,6 +90,7 @@ class CheckpointSummary:
         parameters: number of values in all tensors, running statistics of batch norms included.
         file_bytes: size of the file.
         facts: metadata in the file, such as its epoch.
+        left_out: what of the file is for training only and is not counted; "" for nothing.
     """
 
     path: Path
@@ -89,9 +100,10 @@ class CheckpointSummary:
     parameters: int
     file_bytes: int
     facts: Mapping[str, str]
+    left_out: str = ""
 
 
-def load_weights(path: Path, model: BEVFormer, *, resample: bool = False) -> Checkpoint:
+def load_weights(path: Path, model: BEVFormerBase, *, resample: bool = False) -> Checkpoint:
     """Loads a weights file into a model, in place. Keys and shapes must be exactly those of the model.
 
     Args:
@@ -155,6 +167,7 @@ def inspect(path: Path) -> CheckpointSummary:
         parameters=sum(tensor.numel() for tensor in checkpoint.state.values()),
         file_bytes=path.stat().st_size,
         facts=checkpoint.facts,
+        left_out=checkpoint.left_out,
     )
 
 
@@ -163,8 +176,10 @@ def read_checkpoint(path: Path) -> Checkpoint:
     if not path.is_file():
         raise WeightsError(f"{path}: weights file not found")
     state, facts = _read_safetensors(path) if path.suffix == ".safetensors" else _read_pth(path)
-    official = is_official(state)
-    return Checkpoint(path, from_official(state) if official else state, official, facts)
+    if not is_official(state):
+        return Checkpoint(path, state, official=False, facts=facts)
+    state, left_out = _without_training_parts(from_official(state))
+    return Checkpoint(path, state, official=True, facts=facts, left_out=left_out)
 
 
 def bundled_weights(model: str) -> Path | None:
@@ -196,7 +211,21 @@ def fitting_models(state: Mapping[str, Tensor]) -> tuple[str, ...]:
 def expected_state(config: BEVFormerConfig) -> dict[str, Tensor]:
     """The state dict that a model needs, with tensors that have a shape but no contents."""
     with torch.device("meta"):
-        return BEVFormer(config).state_dict()
+        return build_model(config).state_dict()
+
+
+def _without_training_parts(state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
+    """A state dict of an official file without the parts that only training uses, and these parts in words."""
+    head = [key for key in state if key.startswith(_PERSPECTIVE_HEAD)]
+    kept = {key: tensor for key, tensor in state.items() if key not in head}
+    parts = [f"{len(head)} keys {_PERSPECTIVE_HEAD}*"] if head else []
+    queries = state.get(_OBJECT_QUERIES)
+    if queries is not None and queries.ndim == 2:
+        groups, rest = divmod(len(queries), OFFICIAL_QUERIES)
+        if groups > 1 and not rest:
+            kept[_OBJECT_QUERIES] = queries[:OFFICIAL_QUERIES].clone()
+            parts.append(f"{groups - 1} of {groups} groups of object queries")
+    return kept, " and ".join(parts)
 
 
 def _read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

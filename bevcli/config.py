@@ -8,14 +8,20 @@ import math
 import tomllib
 import types
 import typing
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from bevcli.errors import ConfigError
 from bevcli.model.bevformer import BEVFormerConfig
+from bevcli.model.bevformer_v2 import BEVFormerV2Config
 
 T = TypeVar("T")
+
+# The key that says which model a file configures, and its values. A file without it configures a BEVFormer.
+ARCHITECTURE = "architecture"
+ARCHITECTURES: dict[str, type[BEVFormerConfig]] = {"BEVFormer": BEVFormerConfig, "BEVFormerV2": BEVFormerV2Config}
 
 TRACKING = "tracking"  # the table of a model's file with the parameters of the tracker
 TRAINING = "training"  # the table of a model's file with the settings of its training, which the model does not need
@@ -34,7 +40,12 @@ def load_config(name_or_path: str | Path) -> BEVFormerConfig:
     """
     text, file = _read_model(str(name_or_path))
     table = _parse(text, file)
-    return _dataclass({key: table[key] for key in table if key not in (TRACKING, TRAINING)}, BEVFormerConfig, file, "")
+    architecture = table.get(ARCHITECTURE, "BEVFormer")
+    if architecture not in list(ARCHITECTURES):
+        expected = " or ".join(f'"{name}"' for name in ARCHITECTURES)
+        raise ConfigError(f'{file}: "{ARCHITECTURE}" must be {expected}, but is {architecture!r}')
+    settings = {key: table[key] for key in table if key not in (TRACKING, TRAINING, ARCHITECTURE)}
+    return _dataclass(settings, ARCHITECTURES[architecture], file, "")
 
 
 def load_table(name_or_path: str | Path, table: str, kind: type[T]) -> T:
@@ -78,7 +89,9 @@ def _dataclass(table: dict[str, Any], kind: type[T], file: str, prefix: str) -> 
     fields = {field.name: field for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
     hints = typing.get_type_hints(kind)
     for key in table.keys() - fields.keys():
-        raise ConfigError(f'{file}: unknown key "{prefix}{key}"; {_nearest(key, list(fields))}')
+        renamed: Mapping[str, str] = getattr(kind, "RENAMED_KEYS", {})
+        hint = renamed[key] if key in renamed else _nearest(key, list(fields))
+        raise ConfigError(f'{file}: unknown key "{prefix}{key}"; {hint}')
     values = {key: _value(value, hints[key], file, prefix + key) for key, value in table.items()}
     for name, field in fields.items():
         optional = field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING

@@ -21,12 +21,13 @@ from bevcli.checkpoints import (
     inspect,
     load_weights,
     read_checkpoint,
+    require_fit,
 )
 from bevcli.cli.main import app
 from bevcli.config import known_models, load_config
 from bevcli.errors import WeightsError
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.bevformer import BEVFormer
+from bevcli.model.bevformer_v2 import build_model
 from bevcli.model.official_keys import from_official
 from bevcli.model.parts import model_parts
 
@@ -64,6 +65,44 @@ def test_official_keys_map_one_to_one_to_the_keys_of_our_model(model: str) -> No
     state = {key: torch.empty(shape, device="meta") for key, shape in KEYS[model].items()}
     report = compare(from_official(state), expected_state(load_config(model)))
     assert report.fits, report.describe()
+
+
+V2_MODELS = ("v2-t1-base", "v2-t1", "v2-t2", "v2-t8")
+
+
+def v2_keys(model: str) -> dict[str, list[int]]:
+    """Key -> shape of an official BEVFormerV2 file, the keys for training only included."""
+    keys = json.loads((Path(__file__).parent / "data" / "golden_keys_v2.json").read_text())
+    return {**keys["v2-t1-base"], **keys[model], **keys["training only"]}
+
+
+def official_v2(model: str, tmp_path: Path, **changes: tuple[int, ...]) -> Path:
+    """An official BEVFormerV2 file of zeros that takes no space. changes: other shapes, by the last part of the key."""
+    path = tmp_path / f"{model}.pth"
+    shapes = {key: changes.get(key.rpartition(".")[2], tuple(shape)) for key, shape in v2_keys(model).items()}
+    torch.save({"state_dict": {key: torch.zeros(()).expand(shape) for key, shape in shapes.items()}}, path)
+    return path
+
+
+@pytest.mark.parametrize("model", V2_MODELS)
+def test_parts_of_official_v2_files_for_training_only_are_named_and_left_out(model: str, tmp_path: Path) -> None:
+    summary = inspect(official_v2(model, tmp_path))
+    assert model in summary.models
+    assert set(summary.models) <= {model, "v2-t1-base", "v2-t1"}  # these two differ only in what is left out
+    groups = "" if model == "v2-t1-base" else " and 10 of 11 groups of object queries"
+    assert summary.left_out == f"363 keys fcos3d_bbox_head.*{groups}"
+
+
+def test_other_differences_of_v2_files_are_refused(tmp_path: Path) -> None:
+    path = official_v2("v2-t2", tmp_path, level_embeds=(5, 256))
+    with pytest.raises(WeightsError, match=r"does not fit model v2-t2 .*1 misshapen: image_tokens\.level_embedding"):
+        require_fit(read_checkpoint(path), "v2-t2", expected_state(load_config("v2-t2")))
+
+
+def test_weights_inspect_names_what_is_left_out(tmp_path: Path) -> None:
+    command = ["weights", "inspect", str(official_v2("v2-t8", tmp_path))]
+    answer = CliRunner().invoke(app, command, catch_exceptions=False)
+    assert "left out        363 keys fcos3d_bbox_head.* and 10 of 11 groups" in answer.stdout
 
 
 def test_a_state_dict_fits_its_own_model_alone() -> None:
@@ -220,7 +259,7 @@ def test_every_parameter_of_a_model_belongs_to_one_part() -> None:
     for name in known_models():
         config = load_config(name)
         with torch.device("meta"):
-            expected = sum(parameter.numel() for parameter in BEVFormer(config).parameters())
+            expected = sum(parameter.numel() for parameter in build_model(config).parameters())
         assert sum(part.parameters for part in model_parts(config)) == expected
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from bevcli.config import TRAINING, known_models, load_config, load_table
 from bevcli.errors import ConfigError
+from bevcli.model.bevformer_v2 import BEVFormerV2Config
 
 
 @dataclass(frozen=True)
@@ -149,3 +150,27 @@ def test_the_error_for_a_file_that_is_not_text_names_the_file(tmp_path: Path) ->
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ConfigError, match=r"bytes\.toml: cannot be read"):
         load_config(path)
+
+
+def test_the_architecture_of_a_file_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    text = (Path(__file__).parents[1] / "bevcli" / "configs" / "v2-t2.toml").read_text()
+    path.write_text(text)
+    config = load_config(path)
+    assert isinstance(config, BEVFormerV2Config)
+    assert (config.frames, config.image.padded_size, config.encoder_levels) == ((-1, 0), (1600, 640), 4)
+    for wrong, message in [
+        (
+            ('"BEVFormerV2"', '"BEVFormerV3"'),
+            '"architecture" must be "BEVFormer" or "BEVFormerV2", but is \'BEVFormerV3\'',
+        ),
+        (("frames = [-1, 0]", ""), '"frames" is missing; expected a list, each element'),
+        (("frames = [-1, 0]", "frames = [-2, -1]"), "frames must be ascending, and hold 0, the current frame"),
+        (("can_bus = false", "can_bus = true"), "ego_motion: can_bus, shift and rotation must be false"),
+        (("260, 1600, 900]", "260, 1600, 901]"), "crop must be left, top, right, bottom inside size"),
+        (('architecture = "BEVFormerV2"', ""), 'unknown key "f'),
+    ]:
+        path.write_text(text.replace(*wrong))
+        with pytest.raises(ConfigError) as error:
+            load_config(path)
+        assert message in str(error.value)

@@ -9,7 +9,7 @@ import torch
 from bevcli.benchmark.result import Comparison
 from bevcli.benchmark.textbook import textbook_version
 from bevcli.benchmark.version import Version
-from bevcli.model.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormerBase
 from bevcli.pipeline.cpu_memory import keep_freed_memory, return_freed_memory
 from bevcli.pipeline.preprocess import PreparedFrame
 
@@ -17,7 +17,7 @@ NEAR_M = 0.1
 
 
 def compare_with_plain(
-    model: BEVFormer, fast: Version, frames: Iterable[PreparedFrame]
+    model: BEVFormerBase, fast: Version, frames: Iterable[PreparedFrame]
 ) -> tuple[Comparison, tuple[float, ...]]:
     """Runs both versions on each frame in turn, each with its own history.
 

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
-from bevcli.model.bevformer import BEVFormer, BEVFormerConfig
+from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
+from bevcli.model.bevformer_v2 import BEVFormerV2, build_model
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.prepared import DTYPES, Precision
@@ -72,11 +73,16 @@ def count_operations(config: BEVFormerConfig, hits_per_camera: tuple[int, ...]) 
     """
     counter = FlopCounterMode(display=False, custom_mapping={torch.ops.aten.grid_sampler_2d: _sampling_operations})
     with torch.device("meta"), counter:
-        model = BEVFormer(config).eval().requires_grad_(False)
+        model: BEVFormerBase = build_model(config).eval().requires_grad_(False)
         width, height = config.image.padded_size
-        maps = model.neck(model.backbone(torch.empty(len(hits_per_camera), 3, height, width)))
-        tokens = model.image_tokens(maps, torch.zeros(len(hits_per_camera), dtype=torch.int64))
-        bev = _encode(model, tokens, hits_per_camera)
+        images = torch.empty(1, len(hits_per_camera), 3, height, width)
+        features = model.image_features(images, torch.zeros(len(hits_per_camera), dtype=torch.int64))
+        if isinstance(model, BEVFormerV2):
+            # Every frame of the window is encoded anew; its images were seen before.
+            maps = [_encode(model, features, hits_per_camera, history=False) for _ in model.config.frames]
+            bev = maps[0] if model.fusion is None else model.fusion(maps)
+        else:
+            bev = _encode(model, features, hits_per_camera, history=True)
         model.decoder(bev, model.detection_head)
     return float(counter.get_total_flops())
 
@@ -93,7 +99,7 @@ def _best_seconds(work: Callable[[], object], device: torch.device) -> float:
     return best
 
 
-def _encode(model: BEVFormer, tokens: FeatureMaps, hits_per_camera: tuple[int, ...]) -> Tensor:
+def _encode(model: BEVFormerBase, features: FeatureMaps, hits_per_camera: tuple[int, ...], *, history: bool) -> Tensor:
     """The encoder on tensors of the right shapes."""
     grid, total = model.config.bev_grid, sum(hits_per_camera)
     hits = PillarHits(
@@ -103,8 +109,8 @@ def _encode(model: BEVFormer, tokens: FeatureMaps, hits_per_camera: tuple[int, .
         cameras_per_cell=torch.ones(grid.rows * grid.columns, dtype=torch.int64),
     )
     query = model.bev_queries(torch.empty(1, 18))
-    history = torch.empty(1, grid.rows * grid.columns, model.config.channels)
-    return model.encoder(query, model.bev_queries.position(), tokens, hits, history, torch.empty(1, 2))
+    before = torch.empty(1, grid.rows * grid.columns, model.config.channels) if history else None
+    return model.encoder(query, model.bev_queries.position(), features, hits, before, torch.empty(1, 2))
 
 
 def _sampling_operations(*_shapes: Any, out_val: Any = None, out_shape: Any = None, **_options: Any) -> int:

@@ -13,7 +13,8 @@ from bevcli.frame import CameraImage, Frame, FrameStamp
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import GRAVITY, Kinematics
 from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
-from bevcli.model.bevformer import BEVFormer, BEVFormerConfig
+from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
+from bevcli.model.bevformer_v2 import build_model
 from bevcli.pipeline.camera_assignment import NUSCENES_YAWS_DEG
 
 WIDTH, HEIGHT = 1600, 900
@@ -62,7 +63,7 @@ class MadeUpDrive:
         return CameraImage(stamp.timestamp_ns, pixels.astype(np.uint8, copy=False), encoded, "image/jpeg")
 
 
-def made_up_model(config: BEVFormerConfig) -> BEVFormer:
+def made_up_model(config: BEVFormerConfig) -> BEVFormerBase:
     """A model with random weights, the same at every call.
 
     Weights that are initialised to zero get small random numbers, so that every part affects the result and an error
@@ -70,7 +71,7 @@ def made_up_model(config: BEVFormerConfig) -> BEVFormer:
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(SEED)
-        model = BEVFormer(config).eval()
+        model: BEVFormerBase = build_model(config).eval()
         with torch.no_grad():
             for name, parameter in model.named_parameters():
                 if name.endswith("bn3.weight"):

@@ -22,13 +22,14 @@ from bevcli.benchmark.limits import count_operations, measure_limits
 from bevcli.benchmark.made_up import MadeUpDrive, made_up_model
 from bevcli.benchmark.result import BenchmarkResult
 from bevcli.benchmark.version import Version
-from bevcli.model.bevformer import BEVFormer, BEVFormerConfig
+from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
+from bevcli.model.bevformer_v2 import BEVFormerV2Config
 from bevcli.model.prepared import Precision, prepare_for_inference
 from bevcli.pipeline.model_loading import Model
 from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
 from bevcli.recording.writer import Recording
 
-WARM_UP_FRAMES = 2  # one without and one with history
+MIN_WARM_UP_FRAMES = 2  # one without and one with history
 MIN_RUN_FRAMES = 3  # of the run with reading and recording, whose first frame is not timed
 
 
@@ -59,7 +60,7 @@ def run_benchmark(settings: BenchmarkSettings) -> BenchmarkResult:
     limits = measure_limits(device, settings.precision)
     model = made_up_model(config)
     fast = Version(prepare_for_inference(model, device, settings.precision), device)
-    drive = MadeUpDrive(max(WARM_UP_FRAMES + settings.frames, MIN_RUN_FRAMES))
+    drive = MadeUpDrive(max(warm_up_frames(config) + settings.frames, MIN_RUN_FRAMES))
     stages = _time_stages(fast, drive, settings.frames)
     frame_s, peak = tuple(fast.seconds), _peak_memory(device)
     run_frame_s = _time_run(fast, drive, max(settings.frames, MIN_RUN_FRAMES))
@@ -84,6 +85,12 @@ def run_benchmark(settings: BenchmarkSettings) -> BenchmarkResult:
     )
 
 
+def warm_up_frames(config: BEVFormerConfig) -> int:
+    """The number of frames before the timed ones: until the model has all the history that it uses."""
+    past = config.past_frames if isinstance(config, BEVFormerV2Config) else 1
+    return max(MIN_WARM_UP_FRAMES, past + 1)
+
+
 def describe_machine(device: torch.device) -> str:
     """Name of the processor or GPU, number of threads and PyTorch's version."""
     if device.type == "cuda":
@@ -101,8 +108,9 @@ def _time_stages(fast: Version, drive: MadeUpDrive, frames: int) -> dict[str, tu
     preprocessor = Preprocessor(fast.runner.config)
     times: dict[str, list[float]] = defaultdict(list)
     with _recording(drive, fast) as recording:
-        for place in range(WARM_UP_FRAMES + frames):
-            if place == WARM_UP_FRAMES:
+        warm_up = warm_up_frames(fast.runner.config)
+        for place in range(warm_up + frames):
+            if place == warm_up:
                 times.clear()
                 fast.forget_times()
             marks = [time.perf_counter()]
@@ -151,7 +159,7 @@ def _prepared(drive: MadeUpDrive, config: BEVFormerConfig, place: int) -> Prepar
     return Preprocessor(config)(drive.load(place))
 
 
-def _hits(model: BEVFormer, prepared: PreparedFrame) -> tuple[int, ...]:
+def _hits(model: BEVFormerBase, prepared: PreparedFrame) -> tuple[int, ...]:
     size = (prepared.images.shape[-2], prepared.images.shape[-1])
     return model.pillars(prepared.image_from_bev, size, prepared.has_image).hits_per_camera
 

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from bevcli.model.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormerBase
 from bevcli.model.deformable_attention import DeformableAttention, LevelShapes, sample_maps
 
 
-def textbook_version(model: BEVFormer, device: torch.device) -> BEVFormer:
+def textbook_version(model: BEVFormerBase, device: torch.device) -> BEVFormerBase:
     """A copy of the plain model on a device that samples as the released code does.
 
     Separate batch norms, channels-first float32, `grid_sample` with the queries of every camera padded to the longest

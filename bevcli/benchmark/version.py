@@ -9,7 +9,7 @@ from torch import nn
 
 from bevcli.benchmark.limits import wait_for
 from bevcli.frame import Prediction
-from bevcli.model.bevformer import BEVFormer, BEVFormerOutputs
+from bevcli.model.bevformer import BEVFormerBase, BEVFormerOutputs
 from bevcli.pipeline.preprocess import PreparedFrame
 from bevcli.pipeline.runner import BevState, Runner, StepOptions
 from bevcli.pipeline.stage_clock import StageClock
@@ -25,7 +25,7 @@ class Version:
         scores: (Q, classes) of the same queries.
     """
 
-    def __init__(self, model: BEVFormer, device: torch.device) -> None:
+    def __init__(self, model: BEVFormerBase, device: torch.device) -> None:
         self.runner = Runner(model, device, StepOptions())
         self.runner.clock = StageClock(model, device, *fine_stages(model))
         self.seconds: list[float] = []
@@ -60,7 +60,7 @@ class Version:
         self.scores = outputs.class_logits[-1, 0].sigmoid()
 
 
-def fine_stages(model: BEVFormer) -> tuple[dict[str, str], dict[str, str]]:
+def fine_stages(model: BEVFormerBase) -> tuple[dict[str, str], dict[str, str]]:
     """The `stages` and `starts` of a StageClock that tells the parts of the encoder apart."""
     stages = {"backbone": "backbone", "neck": "neck", "decoder": "decoder and head"}
     parts = {
@@ -71,5 +71,5 @@ def fine_stages(model: BEVFormer) -> tuple[dict[str, str], dict[str, str]]:
     for layer in range(model.config.encoder.layers):
         stages |= {f"encoder.layers.{layer}.{part}": stage for part, stage in parts.items()}
     # The last norm of the encoder counts as FFN; pillars and history are computed just before the encoder.
-    stages |= {"encoder": "FFN", "segmentation_head": "segmentation head"}
+    stages |= {"encoder": "FFN", "fusion": "fusion", "segmentation_head": "segmentation head"}
     return stages, {"backbone": "input", "encoder": "projection"}

@@ -9,7 +9,9 @@ import typer
 
 
 def bench(
-    model: Annotated[str, typer.Option(help="tiny, small, base, or a FILE.toml.")] = "tiny",
+    model: Annotated[
+        str, typer.Option(help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, or a FILE.toml.")
+    ] = "tiny",
     device: Annotated[
         Literal["auto", "cpu", "cuda"], typer.Option(help="auto takes a GPU where there is one.")
     ] = "auto",

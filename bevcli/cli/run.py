@@ -40,7 +40,8 @@ def run(
     model: Annotated[
         str | None,
         typer.Option(
-            help="tiny, small, base, demo, or a FILE.toml. Default: the model that WEIGHTS fit, else demo.",
+            help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, demo, or a FILE.toml. Default: the model that "
+            "WEIGHTS fit, else demo.",
             rich_help_panel=MODEL,
             show_default=False,
         ),
@@ -72,7 +73,7 @@ def run(
     ] = None,
     temporal: Annotated[
         bool,
-        typer.Option("--temporal/--no-temporal", help="Use the BEV map of the previous frame.", rich_help_panel=MODEL),
+        typer.Option("--temporal/--no-temporal", help="Use the frames before (and after).", rich_help_panel=MODEL),
     ] = True,
     track: Annotated[
         bool,
@@ -210,7 +211,7 @@ def run(
         progress.advance()
 
     with Progress(len(drive.stamps), "frames") as progress:
-        for note in notes(loaded, drive):
+        for note in notes(loaded, drive, live=live):
             progress.message(f"note: {note}")
         with StopSignals() as signals:
             summary = run_into_folder(
@@ -231,11 +232,20 @@ def run(
         raise typer.Exit(signals.exit_code)
 
 
-def notes(model: Model, drive: Sequence) -> list[str]:
-    """What the user should know before the run starts."""
+def notes(model: Model, drive: Sequence, *, live: bool = False) -> list[str]:
+    """What the user should know before the run starts. live: whether a viewer follows the run."""
+    from bevcli.model.bevformer_v2 import BEVFormerV2Config
+
     found = list(drive.notes)
     if model.untrained:
         found.append("the weights are UNTRAINED: random weights, the boxes are meaningless")
+    if model.left_out:
+        found.append(f"{model.weights}: left out {model.left_out}, which only training uses")
+    config = model.config
+    if live and isinstance(config, BEVFormerV2Config) and config.later_frames:
+        found.append(
+            f"model {model.name} looks ahead: the viewer shows a frame when {config.later_frames} more are read"
+        )
     if model.bundled:
         found.append("these weights were trained on rendered streets, not on the real world (docs/model-card.md)")
     return found

@@ -23,7 +23,8 @@ def inspect(
     model: Annotated[
         str | None,
         typer.Option(
-            help="List the parts of this model, tiny, small, base or a FILE.toml; FILE must fit it.", show_default=False
+            help="List the parts of this model, such as tiny, base or v2-t2, or a FILE.toml; FILE must fit it.",
+            show_default=False,
         ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
@@ -79,6 +80,7 @@ def _as_data(summary: CheckpointSummary) -> dict[str, object]:
         "tensors": summary.tensors,
         "parameters": summary.parameters,
         "file_bytes": summary.file_bytes,
+        "left_out": summary.left_out,
         "states": dict(summary.facts),
     }
 
@@ -90,6 +92,8 @@ def _as_text(summary: CheckpointSummary) -> str:
         f"  key names       {'the original BEVFormer' if summary.official else 'bevcli'}",
         f"  fits            {', '.join(summary.models) or 'none of our models'}",
     ]
+    if summary.left_out:
+        lines.append(f"  left out        {summary.left_out}, which only training uses")
     lines += [f"  {name:<15} {value}" for name, value in summary.facts.items()]
     return "\n".join(lines)
 

@@ -14,11 +14,12 @@ from bevcli.errors import InputError
 from bevcli.frame import Frame, Prediction, Sequence
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.transforms import Array, inverse
-from bevcli.model.bevformer import BEVFormer, BEVFormerConfig, BEVFormerInputs, BEVFormerOutputs
+from bevcli.model.bevformer import BEVFormer, BEVFormerBase, BEVFormerConfig, BEVFormerInputs, BEVFormerOutputs
 from bevcli.model.pillar_projection import project_pillars
 from bevcli.pipeline.model_inputs import model_inputs
 from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
 from bevcli.pipeline.runner import BevState, Runner, StepOptions
+from bevcli.pipeline.temporal import BevHistory
 
 RECENT = 4  # frames that the figure of the recurrence shows, the traced one included
 DEFAULT_DISTANCE_M = 10.0  # of the default cell, ahead of the vehicle, where no box is
@@ -90,14 +91,19 @@ class Trace:
 
 
 def trace(
-    model: BEVFormer, device: torch.device, sequence: Sequence, place: int, cell_xy: tuple[float, float] | None
+    model: BEVFormerBase, device: torch.device, sequence: Sequence, place: int, cell_xy: tuple[float, float] | None
 ) -> Trace:
     """Runs the model over the frames of one scene up to a place, with its recurrent state, and traces the last one.
 
     model: the plain model, not a prepared one. place: index in `sequence.stamps`.
     cell_xy: x, y of the cell to follow, metres, bev frame; None takes the cell under the best box ahead of the
-    vehicle. Raises InputError when the cell lies outside the grid, or when the frame has no image.
+    vehicle. Raises InputError when the cell lies outside the grid, when the frame has no image, or for a BEVFormerV2.
     """
+    if not isinstance(model, BEVFormer):
+        raise InputError(
+            f"model {model.config.name} is a BEVFormerV2: the figures show BEVFormer's recurrence "
+            "(use tiny, small, base or demo; docs/bevformer.md explains BEVFormerV2)"
+        )
     cell = None if cell_xy is None else cell_at(cell_xy, model.config.bev_grid)
     runner = Runner(model, device, StepOptions())
     preprocessor = Preprocessor(model.config)
@@ -156,11 +162,13 @@ def _traced_step(
     cell: tuple[int, int],
 ) -> Trace:
     model, config, grid = runner.model, runner.config, runner.config.bev_grid
+    assert isinstance(model, BEVFormer)
     x, y = grid.cell_centers()[cell]
     runner.options = replace(runner.options, ask_attention=True, probes=((float(x), float(y)),))
     with _outputs_of(model, model.neck, *model.encoder.layers) as outputs:
         _, prediction = runner.step(state, prepared)
-    used = None if prediction.started_anew else state
+    used = None if state is None or prediction.started_anew else state.memory
+    assert used is None or isinstance(used, BevHistory)
     inputs = model_inputs([prepared], [None if used is None else used.pose], config).to(runner.device)
     aligned = None if used is None else model.align_history(used.bev, inputs.rotation_deg)[0]
     position, _ = model.decoder.query_embedding[: config.decoder.queries].chunk(2, dim=-1)

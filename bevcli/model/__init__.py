@@ -1,1 +1,1 @@
-"""BEVFormer in plain PyTorch, one block of the paper a file."""
+"""BEVFormer and BEVFormerV2 in plain PyTorch, one block of the papers a file."""

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.bev_queries import BevQueries
 from bevcli.model.decoder import Decoder, DecoderConfig, DetectionHead
+from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.ego_motion import EgoMotionConfig, rotate_history
 from bevcli.model.encoder import Encoder, EncoderConfig
 from bevcli.model.fpn import FPN, FPNConfig
@@ -22,16 +23,18 @@ from bevcli.model.segmentation import SegmentationConfig, SegmentationHead, Segm
 
 @dataclass(frozen=True)
 class ImageConfig:
-    """How an image becomes the network's input: resized, normalised in float, padded at the right and the bottom.
+    """How an image becomes the network's input: resized, cropped, normalised in float, padded at right and bottom.
 
     Attributes:
-        size: (width, height) in pixels, before padding. Images of another aspect ratio are scaled to fit inside.
+        size: (width, height) in pixels that an image is resized to. Images of another aspect ratio are scaled to fit
+            inside.
         mean: of each channel, subtracted, on the scale 0 to 255 and in color_order.
         std: of each channel, the divisor, on the same scale.
         color_order: order of the channels, "rgb" or "bgr".
         pad_divisor: width and height are padded with zeros to a multiple of it.
         resize: "linear", as the published weights were trained, aliases where images shrink to less than half;
             "area" averages the pixels that fall into one.
+        crop: (left, top, right, bottom) in pixels of the resized image: the part that the network sees. None for all.
     """
 
     size: tuple[int, int]
@@ -40,15 +43,25 @@ class ImageConfig:
     color_order: Literal["rgb", "bgr"]
     pad_divisor: int = 32
     resize: Literal["linear", "area"] = "linear"
+    crop: tuple[int, int, int, int] | None = None
 
     def __post_init__(self) -> None:
         if min(self.size) < 1 or min(self.std) <= 0 or self.pad_divisor < 1:
             raise ValueError("size, std and pad_divisor must be positive")
+        left, top, right, bottom = self.crop_box
+        if not (0 <= left < right <= self.size[0] and 0 <= top < bottom <= self.size[1]):
+            raise ValueError("crop must be left, top, right, bottom inside size, left < right and top < bottom")
+
+    @property
+    def crop_box(self) -> tuple[int, int, int, int]:
+        """Left, top, right and bottom of the part of the resized image that the network sees, pixels."""
+        return (0, 0, *self.size) if self.crop is None else self.crop
 
     @property
     def padded_size(self) -> tuple[int, int]:
         """(width, height) of the network's input, pixels."""
-        width, height = (-(-extent // self.pad_divisor) * self.pad_divisor for extent in self.size)
+        left, top, right, bottom = self.crop_box
+        width, height = (-(-extent // self.pad_divisor) * self.pad_divisor for extent in (right - left, bottom - top))
         return width, height
 
 
@@ -109,11 +122,19 @@ class BEVFormerConfig:
             raise ValueError(f"channels is {self.channels}; it must be even and a multiple of the attention_heads")
         if self.encoder.spatial_points % grid.pillar_points:
             raise ValueError("encoder.spatial_points must be a multiple of bev_grid.pillar_points")
-        if not len(self.backbone.output_stages) <= levels <= self.image_tokens.level_embeddings:
+        if not len(self.backbone.output_stages) <= levels <= self._most_neck_levels():
             raise ValueError(
                 f"neck.levels is {levels}; expected at least the number of backbone.output_stages, "
                 f"at most image_tokens.level_embeddings"
             )
+
+    @property
+    def encoder_levels(self) -> int:
+        """Number of the neck's levels that the BEV encoder attends to, the finest ones."""
+        return min(self.neck.levels, self.image_tokens.level_embeddings)
+
+    def _most_neck_levels(self) -> int:
+        return self.image_tokens.level_embeddings
 
 
 @dataclass(frozen=True)
@@ -154,7 +175,7 @@ class BEVFormerOutputs:
     """What one step computes.
 
     Attributes:
-        bev: (B, Y·X, C), the BEV map, which is the next frame's history.
+        bev: (B, Y·X, C), the BEV map. For BEVFormer it is the next frame's history.
         class_logits: (L, B, Q, classes) of the L decoder layers.
         box_codes: (L, B, Q, 10): cx, cy, log w, log l, cz, log h, sin, cos, vx, vy; centres in metres, bev frame.
         segmentation: outputs of the segmentation head, None without one.
@@ -166,13 +187,13 @@ class BEVFormerOutputs:
     segmentation: SegmentationOutputs | None = None
 
 
-class BEVFormer(nn.Module):
-    """The whole model, its parts in the order of the paper's figure 2."""
+class BEVFormerBase(nn.Module):
+    """The parts that BEVFormer and BEVFormerV2 share, in the order of the paper's figure 2."""
 
     def __init__(self, config: BEVFormerConfig) -> None:
         super().__init__()
         self.config = config
-        grid, channels, levels = config.bev_grid, config.channels, config.neck.levels
+        grid, channels, levels = config.bev_grid, config.channels, config.encoder_levels
         bev_shape = (grid.rows, grid.columns)
         self.backbone = ResNet(config.backbone)
         self.neck = FPN(config.backbone.output_channels(), channels, config.neck)
@@ -185,9 +206,18 @@ class BEVFormer(nn.Module):
         segments = "segmentation" in config.heads
         self.segmentation_head = SegmentationHead(config.segmentation, channels, bev_shape) if segments else None
 
-    def forward(self, inputs: BEVFormerInputs, history: Tensor | None = None) -> BEVFormerOutputs:
-        """One step. history: (B, Y·X, C), the BEV map of the previous frame, or None for a scene's first frame."""
-        bev = self.bev_map(inputs, history)
+    def image_features(self, images: Tensor, camera_index: Tensor) -> FeatureMaps:
+        """The tokens of B·N images, for the encoder.
+
+        Args:
+            images: (B, N, 3, H, W), normalised and padded.
+            camera_index: (N,) int64, the camera embedding of each image.
+        """
+        feature_maps = self.neck(self.backbone(images.flatten(0, 1)))
+        return self.image_tokens(feature_maps[: self.config.encoder_levels], camera_index)
+
+    def decode(self, bev: Tensor) -> BEVFormerOutputs:
+        """What the decoder and the heads find in the BEV map (B, Y·X, C)."""
         # In float32: half precision is too coarse for the refinement of boxes.
         with torch.autocast(bev.device.type, enabled=False):
             class_logits, box_codes = self.decoder(bev.float(), self.detection_head)
@@ -196,13 +226,21 @@ class BEVFormer(nn.Module):
                 segmentation = self.segmentation_head(bev.float(), self.bev_queries.position())
         return BEVFormerOutputs(bev, class_logits, box_codes, segmentation)
 
+
+class BEVFormer(BEVFormerBase):
+    """The whole model: a recurrence, in which the BEV map of a frame is the history of the next."""
+
+    def forward(self, inputs: BEVFormerInputs, history: Tensor | None = None) -> BEVFormerOutputs:
+        """One step. history: (B, Y·X, C), the BEV map of the previous frame, or None for a scene's first frame."""
+        return self.decode(self.bev_map(inputs, history))
+
     def bev_map(self, inputs: BEVFormerInputs, history: Tensor | None) -> Tensor:
         """The BEV map (B, Y·X, C): the part of `forward` before the decoder and the heads."""
-        feature_maps = self.neck(self.backbone(inputs.images.flatten(0, 1)))
+        image_features = self.image_features(inputs.images, inputs.camera_index)
         return self.encoder(
             bev_query=self.bev_queries(inputs.can_bus),
             position=self.bev_queries.position(),
-            image_features=self.image_tokens(feature_maps, inputs.camera_index),
+            image_features=image_features,
             hits=self.pillars(inputs.image_from_bev, inputs.image_size, inputs.has_image),
             history=None if history is None else self.align_history(history, inputs.rotation_deg),
             shift=inputs.shift,

@@ -69,8 +69,8 @@ class Encoder(nn.Module):
         position: Tensor,
         image_features: FeatureMaps,
         hits: PillarHits,
-        history: Tensor | None,
-        shift: Tensor,
+        history: Tensor | None = None,
+        shift: Tensor | None = None,
     ) -> Tensor:
         """The BEV map.
 
@@ -80,21 +80,25 @@ class Encoder(nn.Module):
             image_features: tokens of B·N images.
             hits: the cells that each camera sees.
             history: (B, Y·X, C), the previous BEV map, rotated to the current heading; None without history.
-            shift: (B, 2), translation of the history (x, y) in normalised BEV coordinates.
+            shift: (B, 2), translation of the history (x, y) in normalised BEV coordinates;
+                needed with history.
 
         Returns:
             (B, Y·X, C).
         """
         # With history, all layers attend to the same two maps; without it, to their own queries twice.
         bev_maps = None if history is None else torch.stack([history, bev_query], dim=1)
-        reference_points = self._reference_points(None if history is None else shift)
+        reference_points = self.reference_points(None if history is None else shift)
         bev = bev_query
         for layer in self.layers:
             bev = layer(bev, position, bev_maps, reference_points, image_features, hits)
         return bev
 
-    def _reference_points(self, shift: Tensor | None) -> Tensor:
-        """(B or 1, 2, Y·X, 2) float32: where the cells' centres lie in the history map and in the current one."""
+    def reference_points(self, shift: Tensor | None) -> Tensor:
+        """(B or 1, 2, Y·X, 2) float32: where the cells' centres lie in the history map and in the current one.
+
+        shift: as for `forward`; None without history.
+        """
         centers = self.cell_centers.float()
         if shift is None:
             return centers.expand(1, 2, -1, -1)

@@ -21,7 +21,7 @@ class FPNConfig:
 
 
 class FPN(nn.Module):
-    """Brings the backbone's maps to C channels and adds coarse context to the finer maps; no norm, no activation."""
+    """Brings the backbone's maps to C channels and adds coarse context to the finer maps; no norm."""
 
     def __init__(self, in_channels: Sequence[int], channels: int, config: FPNConfig) -> None:
         super().__init__()
@@ -40,6 +40,7 @@ class FPN(nn.Module):
         for i in range(len(merged) - 1, 0, -1):
             merged[i - 1] = merged[i - 1] + F.interpolate(merged[i], size=merged[i - 1].shape[-2:], mode="nearest")
         outputs = [output(x) for output, x in zip(self.output, merged, strict=True)]
-        for convolution in self.extra:
-            outputs.append(convolution(outputs[-1]))
+        for i, convolution in enumerate(self.extra):
+            # As in the released code, a ReLU stands before every extra level but the first.
+            outputs.append(convolution(F.relu(outputs[-1]) if i else outputs[-1]))
         return outputs

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import torch
 
-from bevcli.model.bevformer import BEVFormer, BEVFormerConfig
+from bevcli.model.bevformer import BEVFormerConfig
+from bevcli.model.bevformer_v2 import BEVFormerV2Config, build_model
 
 Shape = tuple[int, ...]
 
@@ -34,7 +35,7 @@ class ModelPart:
 def model_parts(config: BEVFormerConfig) -> tuple[ModelPart, ...]:
     """All parts of a model, in the order of a frame's way through it. Every parameter belongs to exactly one part."""
     with torch.device("meta"):
-        model = BEVFormer(config)
+        model = build_model(config)
     left = {name: tuple(parameter.shape) for name, parameter in model.named_parameters()}
     parts = []
     for name, *modules in _names_and_modules(config):
@@ -73,6 +74,10 @@ def _names_and_modules(config: BEVFormerConfig) -> Iterator[tuple[str, ...]]:
         yield f"encoder layer {layer}: spatial cross-attention", f"{prefix}.spatial_cross_attention"
         yield f"encoder layer {layer}: feed-forward network", f"{prefix}.feed_forward"
         yield f"encoder layer {layer}: norms", f"{prefix}.norms"
+    if isinstance(config, BEVFormerV2Config):
+        for block in range(config.fusion.blocks):
+            yield f"fusion of the window: residual block {block}", f"fusion.blocks.{block}"
+        yield "fusion of the window: projection and norm", "fusion.projection", "fusion.norm"
     yield "object queries (position, content)", "decoder.query_embedding"
     yield "object queries: reference points", "decoder.reference_points"
     for layer in range(config.decoder.layers):

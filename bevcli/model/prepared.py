@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 import threading
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 from typing import Literal
@@ -15,11 +16,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_weights
 
-from bevcli.model.bevformer import BEVFormer, BEVFormerInputs, BEVFormerOutputs
+from bevcli.model.bev_fusion import FusionBlock
+from bevcli.model.bevformer import BEVFormer, BEVFormerBase, BEVFormerInputs, BEVFormerOutputs
+from bevcli.model.bevformer_v2 import BEVFormerV2, WindowFrame
 from bevcli.model.decoder import Decoder, DecoderLayer
-from bevcli.model.deformable_attention import DeformableAttention, GridSampling
+from bevcli.model.deformable_attention import DeformableAttention, FeatureMaps, GridSampling
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
-from bevcli.model.encoder import SpatialCrossAttention
+from bevcli.model.encoder import EncoderLayer, SpatialCrossAttention
 from bevcli.model.kernels.compiled import CompiledDeformableConvolution, CompiledSampling, load_compiled
 from bevcli.model.kernels.onednn import use_onednn
 from bevcli.model.pillar_projection import PillarHits, Pillars
@@ -29,9 +32,16 @@ Precision = Literal["fp32", "bf16", "fp16"]
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 
 
-def prepare_for_inference(model: BEVFormer, device: torch.device, precision: Precision = "fp32") -> PreparedBEVFormer:
+def prepare_for_inference(
+    model: BEVFormerBase, device: torch.device, precision: Precision = "fp32"
+) -> PreparedBEVFormer | PreparedBEVFormerV2:
     """A copy of the model on the device, for inference only; the model itself stays unchanged."""
-    prepared = PreparedBEVFormer(model, device, precision)
+    prepared: PreparedBEVFormer | PreparedBEVFormerV2
+    if isinstance(model, BEVFormerV2):
+        prepared = PreparedBEVFormerV2(model, device, precision)
+    else:
+        assert isinstance(model, BEVFormer)
+        prepared = PreparedBEVFormer(model, device, precision)
     if device.type == "cpu":
         # Runs beside the first frame's backbone, which needs no Python. Started any earlier, it would slow down the
         # copying of the model.
@@ -54,24 +64,54 @@ class PreparedBEVFormer(BEVFormer):
     def __init__(self, model: BEVFormer, device: torch.device, precision: Precision) -> None:
         nn.Module.__init__(self)  # not BEVFormer's, which would make new weights
         self.__dict__.update(copy.deepcopy(model).__dict__)
-        self.to(device).eval().requires_grad_(False)
         self.images_dtype = DTYPES[precision]
-        fold_batch_norms(self.backbone, device)
-        choose_kernels(self, device)
-        self.pillars = CachedPillars(self.config.bev_grid).to(device)
-        self.decoder.layers[0].self_attention = ConstantSelfAttention(self.decoder)
-        for part in (self.backbone, self.neck):
-            part.to(self.images_dtype)
-        for module in self.encoder.modules():
-            if isinstance(module, SpatialCrossAttention):
-                module.attention.value_projection.to(self.images_dtype)
-        if device.type == "cpu":
-            use_onednn(self)
+        _prepare(self, device, self.images_dtype)
 
     def forward(self, inputs: BEVFormerInputs, history: Tensor | None = None) -> BEVFormerOutputs:
         """As `BEVFormer.forward`."""
         with torch.autocast(inputs.images.device.type, enabled=False):
             return super().forward(replace(inputs, images=inputs.images.to(self.images_dtype)), history)
+
+
+class PreparedBEVFormerV2(BEVFormerV2):
+    """A BEVFormerV2 for inference on one device: see `PreparedBEVFormer`.
+
+    The first temporal self-attention of the encoder is constant too, because no ego-motion enters the BEV queries.
+    """
+
+    def __init__(self, model: BEVFormerV2, device: torch.device, precision: Precision) -> None:
+        nn.Module.__init__(self)
+        self.__dict__.update(copy.deepcopy(model).__dict__)
+        self.images_dtype = DTYPES[precision]
+        self.eval().requires_grad_(False)
+        self.encoder.layers[0].temporal_self_attention = ConstantTemporalSelfAttention(self)
+        _prepare(self, device, self.images_dtype)
+
+    def image_features(self, images: Tensor, camera_index: Tensor) -> FeatureMaps:
+        """As `BEVFormerV2.image_features`."""
+        with torch.autocast(images.device.type, enabled=False):
+            return super().image_features(images.to(self.images_dtype), camera_index)
+
+    def forward(self, window: Sequence[WindowFrame | None]) -> BEVFormerOutputs:
+        """As `BEVFormerV2.forward`."""
+        with torch.autocast(self.encoder.cell_centers.device.type, enabled=False):
+            return super().forward(window)
+
+
+def _prepare(model: BEVFormerBase, device: torch.device, images_dtype: torch.dtype) -> None:
+    """Replaces the parts of a model by faster ones, in place."""
+    model.to(device).eval().requires_grad_(False)
+    fold_batch_norms(model, device)
+    choose_kernels(model, device)
+    model.pillars = CachedPillars(model.config.bev_grid).to(device)
+    model.decoder.layers[0].self_attention = ConstantSelfAttention(model.decoder)
+    for part in (model.backbone, model.neck):
+        part.to(images_dtype)
+    for module in model.encoder.modules():
+        if isinstance(module, SpatialCrossAttention):
+            module.attention.value_projection.to(images_dtype)
+    if device.type == "cpu":
+        use_onednn(model)
 
 
 class CachedPillars(Pillars):
@@ -112,6 +152,27 @@ class ConstantSelfAttention(nn.Module):
         return self.attended.expand_as(value), None
 
 
+class ConstantTemporalSelfAttention(nn.Module):
+    """Takes the place of the first encoder layer's temporal self-attention, whose input is the same in every frame."""
+
+    attended: Tensor
+
+    def __init__(self, model: BEVFormerV2) -> None:
+        super().__init__()
+        layer = model.encoder.layers[0]
+        assert isinstance(layer, EncoderLayer)
+        self.attention = layer.temporal_self_attention.attention  # for observers of the encoder
+        queries = model.bev_queries.embedding[None]
+        maps, reference_points = torch.stack([queries, queries], dim=1), model.encoder.reference_points(None)
+        with torch.no_grad():
+            attended = layer.temporal_self_attention(queries, model.bev_queries.position(), maps, reference_points)
+        self.register_buffer("attended", attended, persistent=False)  # (1, Y·X, C)
+
+    def forward(self, query: Tensor, position: Tensor, bev_maps: Tensor, reference_points: Tensor) -> Tensor:
+        """Arguments as for `TemporalSelfAttention`, of which only the shape of the query is read -> (B, Y·X, C)."""
+        return self.attended.expand_as(query)
+
+
 class BiasedDeformableConvolution(nn.Module):
     """A deformable convolution with the bias that is left of a batch norm folded into it."""
 
@@ -125,13 +186,14 @@ class BiasedDeformableConvolution(nn.Module):
         return self.convolution(x) + self.bias[:, None, None]
 
 
-def choose_kernels(model: BEVFormer, device: torch.device, *, gradients: bool = False) -> None:
+def choose_kernels(model: BEVFormerBase, device: torch.device, *, gradients: bool = False) -> None:
     """Gives a model, in place, the memory layout and the deformable attention that are fastest on a device.
 
     gradients: whether the model is trained; then only kernels with gradients are used.
     """
-    for part in (model.backbone, model.neck):
-        part.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    fusion = getattr(model, "fusion", None)
+    for part in (model.backbone, model.neck, *([] if fusion is None else [fusion])):
+        part.to(memory_format=torch.channels_last)
     for module in model.modules():
         if isinstance(module, DeformableAttention):
             module.sampling = fastest_sampling(device, gradients=gradients)
@@ -148,12 +210,13 @@ def fastest_sampling(device: torch.device, *, gradients: bool = False) -> nn.Mod
     return GridSampling()
 
 
-def fold_batch_norms(backbone: ResNet, device: torch.device) -> None:
+def fold_batch_norms(model: nn.Module, device: torch.device) -> None:
     """Folds every batch norm into the convolution before it, in place, for inference on a device."""
-    _fold(backbone, "conv1", "bn1", device)
-    for block in backbone.modules():
-        if isinstance(block, Bottleneck):
-            for number in (1, 2, 3):
+    for block in model.modules():
+        if isinstance(block, ResNet):
+            _fold(block, "conv1", "bn1", device)
+        if isinstance(block, Bottleneck | FusionBlock):
+            for number in (1, 2, 3) if isinstance(block, Bottleneck) else (1, 2):
                 _fold(block, f"conv{number}", f"bn{number}", device)
             if isinstance(block.downsample, nn.Sequential):
                 _fold(block.downsample, "0", "1", device)

@@ -14,7 +14,7 @@ from torch.utils.hooks import RemovableHandle
 from bevcli.errors import InputError
 from bevcli.frame import AttentionView, CameraSamples, Probe
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.bevformer import BEVFormer, BEVFormerConfig
+from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
 from bevcli.model.encoder import EncoderLayer
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.pipeline.preprocess import PreparedFrame
@@ -54,7 +54,7 @@ class AttentionProbe:
             map has a softmax of its own and the two results are averaged.
     """
 
-    def __init__(self, model: BEVFormer, layer: int, cells: Tensor) -> None:
+    def __init__(self, model: BEVFormerBase, layer: int, cells: Tensor) -> None:
         self.cells = cells
         self.spatial: SpatialSamples | None = None
         self.history_share: Tensor | None = None
@@ -137,7 +137,8 @@ def _samples(
     for row in chosen:
         index = int(samples.camera[row])
         camera = prepared.frame.rig[prepared.assignment.cameras[index]]
-        pixels = samples.locations[row].float().cpu().double().numpy().reshape(-1, 2) * size / prepared.scales[index]
+        network_pixels = samples.locations[row].float().cpu().double().numpy().reshape(-1, 2) * size
+        pixels = (network_pixels + config.image.crop_box[:2]) / prepared.scales[index]
         weights = samples.weights[row].float().cpu().double().numpy().reshape(-1)
         shares = weights / (len(chosen) * samples.weights.shape[1])  # the sum over all heads and cameras is 1
         result[camera.name] = CameraSamples(camera.distorted(pixels), shares)

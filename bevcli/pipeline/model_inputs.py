@@ -37,7 +37,7 @@ def model_inputs(
     motions = [_motion(prepared, pose, config) for prepared, pose in zip(frames, previous_poses, strict=True)]
     return BEVFormerInputs(
         images=torch.cat([prepared.images for prepared in frames]),
-        image_from_bev=torch.cat([prepared.image_from_bev for prepared in frames]),
+        image_from_bev=torch.cat([prepared.image_from_bev for prepared in frames]).float(),
         camera_index=index,
         has_image=torch.cat([prepared.has_image for prepared in frames]),
         can_bus=torch.from_numpy(np.stack([motion.can_bus for motion in motions])),

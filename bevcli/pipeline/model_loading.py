@@ -11,7 +11,8 @@ import torch
 from bevcli.checkpoints import bundled_weights, inspect, load_weights
 from bevcli.config import TRACKING, known_models, load_config, load_table
 from bevcli.errors import BevcliError, WeightsError
-from bevcli.model.bevformer import BEVFormer, BEVFormerConfig
+from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
+from bevcli.model.bevformer_v2 import build_model
 from bevcli.model.prepared import Precision, prepare_for_inference
 from bevcli.pipeline.tracking import TrackerConfig
 
@@ -24,19 +25,21 @@ class Model:
     """A model with its weights, and the device that it runs on.
 
     Attributes:
-        network: the plain BEVFormer, as in the paper, on the CPU.
+        network: the plain BEVFormer or BEVFormerV2, as in its paper, on the CPU.
         device: where it runs.
         precision: of the image features; the rest of the network computes in float32.
         weights: the file that the weights came from, None for random weights.
         bundled: whether that file is part of the package.
+        left_out: what of that file is for training only and was left out; "" for nothing.
         tracker: the parameters of the tracker, the table [tracking] of the model's TOML file.
     """
 
-    network: BEVFormer
+    network: BEVFormerBase
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     precision: Precision = "fp32"
     weights: Path | None = None
     bundled: bool = False
+    left_out: str = ""
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
 
     @property
@@ -55,7 +58,7 @@ class Model:
         return self.weights is None
 
     @cached_property
-    def prepared(self) -> BEVFormer:
+    def prepared(self) -> BEVFormerBase:
         """The network on its device, made ready for inference on the first use: same results, faster."""
         return prepare_for_inference(self.network, self.device, self.precision)
 
@@ -73,8 +76,8 @@ def load_model(
         model = bevcli.load_model("tiny", weights="bevformer_tiny_epoch_24.pth", device="cuda")
 
     Args:
-        name: a known model ("tiny", "small", "base", "demo") or a FILE.toml. None takes the model that the weights
-            fit, or "demo" where there are no weights.
+        name: a known model ("tiny", "small", "base", "v2-t1-base", "v2-t1", "v2-t2", "v2-t8", "demo") or a FILE.toml.
+            None takes the model that the weights fit, or "demo" where there are no weights.
         weights: an official .pth as published, or a .safetensors. None takes the weights of the package, which only
             "demo" has.
         device: "auto" takes a GPU where there is one, else the CPU; or "cpu", "cuda".
@@ -102,11 +105,17 @@ def load_model(
     target = choose_device(device)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(UNTRAINED_SEED)
-        network = BEVFormer(config)
-    if file is not None:
-        load_weights(file, network)
-    precision = choose_precision(precision, target)
-    return Model(network.eval(), target, precision, file, bundled=bundled is not None, tracker=tracker)
+        network: BEVFormerBase = build_model(config)
+    left_out = "" if file is None else load_weights(file, network).left_out
+    return Model(
+        network.eval(),
+        target,
+        choose_precision(precision, target),
+        file,
+        bundled=bundled is not None,
+        left_out=left_out,
+        tracker=tracker,
+    )
 
 
 def _model_of(weights: Path) -> str:

@@ -27,9 +27,9 @@ class PreparedFrame:
     Attributes:
         frame: the frame as it was read.
         assignment: the N cameras and the model cameras whose embeddings they use.
-        scales: (N,) network pixels per pixel of the camera's image.
+        scales: (N,) pixels of the resized image per pixel of the camera's image.
         images: (1, N, 3, H, W) float32, normalised; zero where an image is missing.
-        image_from_bev: (1, N, 4, 4) float32, to network pixels.
+        image_from_bev: (1, N, 4, 4) float64, to network pixels.
         camera_index: (N,) int64, index of each camera's embedding.
         has_image: (1, N) bool.
     """
@@ -73,13 +73,14 @@ class Preprocessor:
             task.result()
         scales = tuple(network_scale(frame.rig[name], image) for name in names)
         matrices = [image_from_bev(frame, name) for name in names]
-        scaled = [np.diag([scale, scale, 1.0, 1.0]) @ m for scale, m in zip(scales, matrices, strict=True)]
+        networks = [network_from_image(frame.rig[name], image) for name in names]
+        projections = [network @ matrix for network, matrix in zip(networks, matrices, strict=True)]
         return PreparedFrame(
             frame=frame,
             assignment=self._assignment,
             scales=scales,
             images=images,
-            image_from_bev=torch.from_numpy(np.stack(scaled)).float()[None],
+            image_from_bev=torch.from_numpy(np.stack(projections))[None],
             camera_index=torch.tensor([self.config.cameras.index(name) for name in self._assignment.embeddings]),
             has_image=torch.tensor([[name in frame.images for name in names]]),
         )
@@ -92,12 +93,21 @@ class Preprocessor:
 
 
 def network_scale(camera: Camera, image: ImageConfig) -> float:
-    """Network pixels per pixel of the camera's image: the largest scale at which the image fits the model's size."""
+    """Pixels of the resized image per pixel of the camera's: the largest scale at which it fits the model's size."""
     return min(image.size[0] / camera.width, image.size[1] / camera.height)
 
 
+def network_from_image(camera: Camera, image: ImageConfig) -> Array:
+    """(4, 4) float64: homogeneous pixels (u·d, v·d, d, 1) of the camera's image to those of the network's input."""
+    scale = network_scale(camera, image)
+    left, top = image.crop_box[:2]
+    matrix = np.diag([scale, scale, 1.0, 1.0])
+    matrix[:2, 2] = -left, -top
+    return matrix
+
+
 def write_network_image(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: NDArray[np.float32]) -> None:
-    """Resize and normalise an image and write it to the top left corner of `out`; the rest is left unchanged.
+    """Resize, crop and normalise an image and write it to the top left corner of `out`; the rest is left unchanged.
 
     The image is resized as float32, which equals the original's order (normalise, then resize) up to rounding.
 
@@ -109,11 +119,13 @@ def write_network_image(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: 
     # "area" averages, which is only defined for shrinking; enlarged images are always interpolated.
     interpolation = cv2.INTER_AREA if image.resize == "area" and scale < 1 else cv2.INTER_LINEAR
     resized = cv2.resize(pixels_bgr.astype(np.float32), (new_width, new_height), interpolation=interpolation)
+    left, top, right, bottom = image.crop_box
+    cropped = resized[top:bottom, left:right]
     if image.color_order == "rgb":
-        resized = resized[..., ::-1]
-    planes = resized.transpose(2, 0, 1)
+        cropped = cropped[..., ::-1]
+    planes = cropped.transpose(2, 0, 1)
     mean, std = (np.asarray(values, dtype=np.float32)[:, None, None] for values in (image.mean, image.std))
-    region = out[:, :new_height, :new_width]
+    region = out[:, : planes.shape[1], : planes.shape[2]]
     np.subtract(planes, mean, out=region)
     np.divide(region, std, out=region)
 

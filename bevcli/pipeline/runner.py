@@ -1,27 +1,28 @@
-"""The recurrent run: frame by frame, each BEV map the next frame's history."""
+"""The temporal run: frame by frame, with the memory that the model keeps."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterable, Iterator
 from collections.abc import Sequence as Items
 from dataclasses import dataclass
+from itertools import islice
 
 import torch
 from torch import Tensor
 
 from bevcli.frame import AttentionView, BevMap, Frame, FrameStamp, Prediction, Sequence
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.transforms import Pose
-from bevcli.model.bevformer import BEVFormer, BEVFormerInputs, BEVFormerOutputs
+from bevcli.model.bevformer import BEVFormerBase, BEVFormerOutputs
 from bevcli.model.box_coding import decode
 from bevcli.model.prepared import Precision
 from bevcli.model.segmentation import decode_maps
 from bevcli.pipeline.attention import AttentionProbe, attention_view, probe_cells
-from bevcli.pipeline.model_inputs import model_inputs
 from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
 from bevcli.pipeline.read_ahead import read_ahead
 from bevcli.pipeline.stage_clock import StageClock
+from bevcli.pipeline.temporal import Memory, temporal_model
 
 _AUTOCAST = {"bf16": torch.bfloat16, "fp16": torch.float16}
 
@@ -31,13 +32,11 @@ class BevState:
     """The state of a run between two frames.
 
     Attributes:
-        bev: (1, Y·X, C) BEV map of the previous frame.
-        pose: world_from_ego at that frame's time.
-        stamp: of that frame.
+        memory: of the model; the runner only passes it on.
+        stamp: of the frame.
     """
 
-    bev: Tensor
-    pose: Pose
+    memory: Memory
     stamp: FrameStamp
 
 
@@ -61,27 +60,32 @@ class StepOptions:
 class Runner:
     """Runs a model on a device, step by step. The state is an argument and a result; the runner keeps none."""
 
-    def __init__(self, model: BEVFormer, device: torch.device, options: StepOptions | None = None) -> None:
+    def __init__(self, model: BEVFormerBase, device: torch.device, options: StepOptions | None = None) -> None:
         self.model = model.to(device).eval()
+        self.temporal_model = temporal_model(self.model, device)
         self.config = model.config
         self.device = device
         self.options = StepOptions() if options is None else options
         self.clock = StageClock(model, device)
 
     @torch.inference_mode()
-    def step(self, state: BevState | None, prepared: PreparedFrame) -> tuple[BevState | None, Prediction]:
+    def step(
+        self, state: BevState | None, prepared: PreparedFrame, upcoming: Items[PreparedFrame] = ()
+    ) -> tuple[BevState | None, Prediction]:
         """Runs the model on one frame.
 
         Args:
             state: the result of the step before; None at the start.
             prepared: the frame, preprocessed.
+            upcoming: the frames after it, for a model that looks ahead. Those after the end of the scene, after a gap
+                or without images are not used.
 
         Returns:
             the new state and the prediction. A frame without any image returns the state unchanged, so that the next
             alignment by ego-motion spans both frames.
         """
         frame = prepared.frame
-        started_anew = self._reason_to_start_anew(state, frame.stamp)
+        started_anew = self._reason_to_start_anew(None if state is None else state.stamp, frame.stamp)
         if started_anew:
             state = None
         if not frame.images:
@@ -89,40 +93,55 @@ class Runner:
         probe = self._probe()
         with self.clock:
             with self._autocast(), probe or contextlib.nullcontext():
-                inputs = self._inputs(prepared, state)
-                outputs = self.model(inputs, None if state is None else state.bev)
+                memory = None if state is None else state.memory
+                outputs, memory = self.temporal_model.step(prepared, memory, self._usable(prepared, upcoming))
             boxes = decode(outputs, self.config)[0]
             self.clock.mark("box_decoding")
             segmentation = self._segmentation(outputs)
         view = None if probe is None else attention_view(probe, prepared, self.config)
         prediction = self._prediction(prepared, started_anew, boxes, outputs.bev[0], view, segmentation)
-        return BevState(outputs.bev, frame.world_from_ego, frame.stamp), prediction
+        return BevState(memory, frame.stamp), prediction
 
     def run(
         self, sequence: Sequence, places: Items[int], preprocessor: Preprocessor, state: BevState | None = None
     ) -> Iterator[tuple[Frame, Prediction, BevState | None]]:
-        """Yields frame, prediction and state at these places of a sequence. Frames are read and prepared in advance."""
+        """Yields frame, prediction and state at these places of a sequence. Frames are read and prepared in advance.
+
+        A model that looks ahead sees the later ones of these places.
+        """
 
         def prepare(place: int) -> PreparedFrame:
             return preprocessor(sequence.load(place))
 
-        for prepared in read_ahead(prepare, places):
-            state, prediction = self.step(state, prepared)
+        ahead = self.temporal_model.later_frames if self.options.temporal else 0
+        for prepared, upcoming in with_upcoming(read_ahead(prepare, places), ahead):
+            state, prediction = self.step(state, prepared, upcoming)
             yield prepared.frame, prediction, state
 
-    def _reason_to_start_anew(self, state: BevState | None, stamp: FrameStamp) -> str:
+    def _reason_to_start_anew(self, before: FrameStamp | None, stamp: FrameStamp) -> str:
         if not self.options.temporal:
             return "history is off"
-        if state is None:
+        if not self.temporal_model.uses_history:
+            return "the model uses no history"
+        if before is None:
             return "first frame"
-        if stamp.scene != state.stamp.scene:
+        if stamp.scene != before.scene:
             return "new scene"
-        seconds = (stamp.timestamp_ns - state.stamp.timestamp_ns) / 1e9
+        seconds = (stamp.timestamp_ns - before.timestamp_ns) / 1e9
         return f"gap of {seconds:.1f} s" if not 0 < seconds <= self.config.max_gap_s else ""
 
-    def _inputs(self, prepared: PreparedFrame, state: BevState | None) -> BEVFormerInputs:
-        inputs = model_inputs([prepared], [None if state is None else state.pose], self.config)
-        return inputs.to(self.device)
+    def _usable(self, prepared: PreparedFrame, upcoming: Items[PreparedFrame]) -> list[PreparedFrame]:
+        """The upcoming frames with images that continue the frame's scene without a gap."""
+        usable: list[PreparedFrame] = []
+        stamp = prepared.frame.stamp
+        for later in upcoming[: self.temporal_model.later_frames]:
+            if not later.frame.images:
+                continue
+            if self._reason_to_start_anew(stamp, later.frame.stamp):
+                break
+            usable.append(later)
+            stamp = later.frame.stamp
+        return usable
 
     def _probe(self) -> AttentionProbe | None:
         if not self.options.ask_attention:
@@ -168,3 +187,15 @@ class Runner:
             attention=attention,
             stage_seconds={} if bev is None else self.clock.read(),
         )
+
+
+def with_upcoming(
+    frames: Iterable[PreparedFrame], count: int
+) -> Iterator[tuple[PreparedFrame, tuple[PreparedFrame, ...]]]:
+    """Each frame with the next ones, up to `count`; fewer at the end."""
+    source = iter(frames)
+    waiting = deque(islice(source, count + 1))
+    while waiting:
+        frame = waiting.popleft()
+        yield frame, tuple(waiting)
+        waiting.extend(islice(source, 1))

@@ -15,6 +15,7 @@ STAGES = {
     "backbone": "backbone",
     "neck": "neck",
     "encoder": "encoder",
+    "fusion": "fusion",
     "decoder": "decoder",
     "segmentation_head": "segmentation_head",
 }

@@ -11,7 +11,9 @@ In the order of a training step:
     detection_loss         focal and L1 loss after each decoder layer
     segmentation_loss      focal, dice and L1 loss after each mask layer; `focal_loss` serves all losses
     dense_loss             auxiliary loss on the BEV map
-    image_loss             auxiliary loss on the image features
+    perspective_targets    boxes projected into each camera -> targets of the pixels of the feature maps
+    perspective_head       BEVFormerV2's detector on the image features, in training only
+    perspective_loss       its loss
     frame_losses           all losses of a frame, by name
     optimizer              AdamW and its learning rate schedule
     trainer                the loop: clips in, updates of the weights, checkpoints and curves out

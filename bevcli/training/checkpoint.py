@@ -32,13 +32,18 @@ def load_checkpoint(path: Path, trained: nn.Module, optimizer: torch.optim.AdamW
         contents = torch.load(path, map_location="cpu", weights_only=True)
         if contents["format"] != FORMAT:
             raise WeightsError(f'{path}: "format" must be "{FORMAT}", found {contents["format"]!r}')
+        if any(key.startswith("picture_reader.") for key in contents["model"]):
+            raise WeightsError(
+                f"{path}: was written by an earlier version, with [training.picture_loss], and cannot be resumed; "
+                f"start a new training with --weights {path.with_name('weights.safetensors')} and another --out"
+            )
         trained.load_state_dict(contents["model"])
         optimizer.load_state_dict(contents["optimizer"])
         return int(contents["step"])
     except FileNotFoundError:
         raise WeightsError(f"{path}: no checkpoint to resume from; leave out --resume to start a training") from None
     except (RuntimeError, ValueError, KeyError, TypeError, EOFError) as error:
-        reason = str(error).split("\n")[0]
+        reason = " ".join(line.strip() for line in str(error).split("\n")[:2])
         raise WeightsError(f"{path}: is not a checkpoint of this model: {reason}") from error
 
 

@@ -37,8 +37,17 @@ def detection_targets(boxes: Boxes3D, config: BEVFormerConfig) -> DetectionTarge
     Args:
         boxes: ground truth in the bev frame.
     """
-    kept = boxes[np.isin(boxes.classes, config.classes) & in_range(boxes, config) & has_points(boxes)]
-    labels = [config.classes.index(name) for name in kept.classes]
+    return box_targets(boxes[in_range(boxes, config)], config.classes)
+
+
+def box_targets(boxes: Boxes3D, classes: tuple[str, ...]) -> DetectionTargets:
+    """Targets from all boxes that have one of the classes and visible points.
+
+    Args:
+        boxes: ground truth in the bev frame.
+    """
+    kept = boxes[np.isin(boxes.classes, classes) & has_points(boxes)]
+    labels = [classes.index(name) for name in kept.classes]
     return DetectionTargets(torch.tensor(labels, dtype=torch.int64), torch.from_numpy(encode(kept)).float())
 
 

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from torch import Tensor, nn
 
 from bevcli.model.bevformer import BEVFormer, BEVFormerInputs, BEVFormerOutputs
 from bevcli.training.dense_loss import DenseHead, DenseLossConfig, dense_loss
 from bevcli.training.detection_loss import DetectionLossConfig, detection_loss
-from bevcli.training.image_loss import ImageHead, ImageLossConfig, image_loss
+from bevcli.training.perspective_head import PerspectiveHead
+from bevcli.training.perspective_loss import PerspectiveLossConfig, perspective_loss
 from bevcli.training.samples import Targets
 from bevcli.training.segmentation_loss import SegmentationLossConfig, segmentation_loss
 
@@ -25,21 +26,26 @@ class LossConfigs:
         detection_loss: the detection head's.
         segmentation_loss: the segmentation head's, where the model has one.
         dense_loss: auxiliary, on the BEV map.
-        picture_loss: auxiliary, on the image features (the key in the file keeps this name).
+        perspective_loss: auxiliary, on the image features.
+        RENAMED_KEYS: tables of earlier versions, and what replaces them.
     """
 
     detection_loss: DetectionLossConfig = field(default_factory=DetectionLossConfig)
     segmentation_loss: SegmentationLossConfig = field(default_factory=SegmentationLossConfig)
     dense_loss: DenseLossConfig = field(default_factory=DenseLossConfig)
-    picture_loss: ImageLossConfig = field(default_factory=ImageLossConfig)
+    perspective_loss: PerspectiveLossConfig = field(default_factory=PerspectiveLossConfig)
+
+    RENAMED_KEYS: ClassVar[Mapping[str, str]] = {
+        "picture_loss": "[training.perspective_loss] replaces it, with other keys (docs/training.md)"
+    }
 
 
 class FrameLosses:
     """Computes the losses of one forward pass by name.
 
     Attributes:
-        auxiliary_heads: the heads of the dense and the image loss, which train along with the model. Their names are
-            part of the checkpoint format.
+        auxiliary_heads: the heads of the dense and the perspective loss, which train along with the model. Their names
+            are part of the checkpoint format.
     """
 
     def __init__(self, model: BEVFormer, configs: LossConfigs) -> None:
@@ -47,24 +53,24 @@ class FrameLosses:
         self.configs = configs
         self._query_groups = model.config.decoder.training_groups
         self._dense_head: DenseHead | None = None
-        self._image_head: ImageHead | None = None
+        self._perspective_head: PerspectiveHead | None = None
         self.auxiliary_heads = nn.ModuleDict()
         if configs.dense_loss.weight > 0:
             self._dense_head = DenseHead(model.config.channels, classes, model.config.bev_grid)
             self.auxiliary_heads["dense_reader"] = self._dense_head
-        if configs.picture_loss.weight > 0:
-            self._image_head = ImageHead(model.config.channels, classes)
-            self.auxiliary_heads["picture_reader"] = self._image_head
+        if configs.perspective_loss.weight > 0:
+            self._perspective_head = PerspectiveHead(model.config.channels, classes, configs.perspective_loss.layers)
+            self.auxiliary_heads["perspective_head"] = self._perspective_head
 
     @contextlib.contextmanager
     def watching(self, model: BEVFormer) -> Iterator[None]:
-        """Inside, each forward pass of the model keeps its image features for the image loss. Leaves no hook behind."""
-        if self._image_head is None:
+        """Inside, each forward pass of the model keeps its image features for the perspective loss. No hook remains."""
+        if self._perspective_head is None:
             yield
             return
 
         def keep(neck: nn.Module, inputs: tuple[Any, ...], maps: Sequence[Tensor]) -> None:
-            self._image_features = maps[0]  # the finest level
+            self._feature_maps = maps
 
         hook = model.neck.register_forward_hook(keep)
         try:
@@ -86,11 +92,17 @@ class FrameLosses:
             bev, config = outputs.bev.float(), self.configs.dense_loss
             dense = dense_loss(self._dense_head, bev, targets.detection, config, weights)
             losses |= {"cell classes": dense.classes, "cell boxes": dense.boxes}
-        if self._image_head is not None:
-            features = self._image_features.float()
-            image_config = self.configs.picture_loss
-            image = image_loss(self._image_head, features, inputs, targets.detection, image_config, weights)
-            losses |= {"pixel classes": image.classes, "pixel places": image.places}
+        if self._perspective_head is not None:
+            perspective = perspective_loss(
+                self._perspective_head,
+                [features.float() for features in self._feature_maps],
+                inputs.image_from_bev,
+                inputs.has_image,
+                inputs.image_size,
+                targets.perspective,
+                self.configs.perspective_loss,
+            )
+            losses |= {"perspective classes": perspective.classes, "perspective boxes": perspective.boxes}
         if outputs.segmentation is not None:
             maps = segmentation_loss(outputs.segmentation, targets.segmentation, self.configs.segmentation_loss)
             losses |= {"map classes": maps.classes, "masks": maps.masks, "locations": maps.locations}

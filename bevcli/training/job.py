@@ -11,8 +11,9 @@ import torch
 
 from bevcli.checkpoints import load_weights
 from bevcli.config import TRAINING, load_config, load_table
-from bevcli.errors import OutputError
+from bevcli.errors import ConfigError, OutputError
 from bevcli.model.bevformer import BEVFormer
+from bevcli.model.bevformer_v2 import BEVFormerV2Config
 from bevcli.training.augmentation import AugmentationConfig
 from bevcli.training.clips import ClipConfig
 from bevcli.training.drives import Drives, check_training_seeds, open_drives, split_drives
@@ -119,6 +120,8 @@ def prepare_training(
     drives = open_drives(folders, rendered_seeds, out / "drives", model_config)
     drives, held_out = split_drives(drives, config.held_out)
     prepare_folder(out, resume=resume)
+    if isinstance(model_config, BEVFormerV2Config):
+        raise ConfigError(f"model {model_config.name} is a BEVFormerV2, which cannot be trained yet (use a BEVFormer)")
     model = BEVFormer(model_config)
     if weights is not None:
         load_weights(weights, model, resample=True)

@@ -17,7 +17,7 @@ from bevcli.pipeline.model_inputs import model_inputs
 from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
 from bevcli.training.augmentation import AugmentationConfig, distort_images, mask_images
 from bevcli.training.clips import Clip
-from bevcli.training.detection_targets import DetectionTargets, detection_targets
+from bevcli.training.detection_targets import DetectionTargets, box_targets, detection_targets
 from bevcli.training.drives import Drives
 from bevcli.training.segmentation_targets import SegmentationTargets, segmentation_targets
 
@@ -27,17 +27,20 @@ class Targets:
     """The targets of B frames, one of each clip.
 
     Attributes:
-        detection: B.
+        detection: B, the boxes inside the BEV grid.
+        perspective: B, all boxes, for the perspective loss.
         segmentation: B, or empty if the model has no segmentation head.
     """
 
     detection: tuple[DetectionTargets, ...]
+    perspective: tuple[DetectionTargets, ...]
     segmentation: tuple[SegmentationTargets, ...]
 
     def to(self, device: torch.device) -> Targets:
         """A copy on a device."""
         return Targets(
             tuple(targets.to(device) for targets in self.detection),
+            tuple(targets.to(device) for targets in self.perspective),
             tuple(targets.to(device) for targets in self.segmentation),
         )
 
@@ -102,10 +105,12 @@ def ground_truth_boxes(frame: Frame) -> Boxes3D:
 def _targets(frames: Sequence[Frame], config: BEVFormerConfig) -> Targets:
     boxes = [ground_truth_boxes(frame) for frame in frames]
     detection = tuple(detection_targets(of_frame, config) for of_frame in boxes)
+    perspective = tuple(box_targets(of_frame, config.classes) for of_frame in boxes)
     if "segmentation" not in config.heads:
-        return Targets(detection, ())
+        return Targets(detection, perspective, ())
     return Targets(
         detection,
+        perspective,
         tuple(
             segmentation_targets(of_frame, frame.ground_truth_map, config.bev_grid)
             for frame, of_frame in zip(frames, boxes, strict=True)

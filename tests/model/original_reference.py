@@ -1,6 +1,7 @@
 """Inputs and outputs of the released BEVFormer code, from files in tests/data.
 
 golden_inputs.json: rig and poses of four frames. golden_keys.json: names and shapes of the official weights.
+golden_keys_v2.json: the same of BEVFormerV2; models but the first only list what differs.
 golden_tiny.npz: outputs with weights and images by the rule of stated_rule.py; the BEV maps at every 23rd cell, the
 codes and logits of every 9th query.
 """
@@ -21,13 +22,16 @@ from stated_rule import rule_image, rule_tensor
 
 from bevcli.config import load_config
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.transforms import Pose
+from bevcli.geometry.transforms import Pose, rigid, rotation_from_quaternion
 from bevcli.model.bevformer import BEVFormer, BEVFormerConfig, BEVFormerInputs
+from bevcli.model.bevformer_v2 import BEVFormerV2, BEVFormerV2Config, WindowFrame
 from bevcli.model.ego_motion import EgoMotionInputs, ego_motion_inputs
 from bevcli.model.official_keys import from_official
+from bevcli.pipeline.temporal import other_bev_from_bev
 
 DATA = Path(__file__).parents[1] / "data"
-STEM_GAIN = {"tiny": 1.0, "small": 1 / 57, "base": 1 / 57}
+STEM_GAIN = {"tiny": 1.0}
+OTHER_STEM_GAIN = 1 / 57
 
 
 @cache
@@ -38,14 +42,18 @@ def frames() -> list[dict[str, Any]]:
 
 def official_shapes(model: str) -> dict[str, tuple[int, ...]]:
     """Key -> shape of the official weights."""
-    keys = json.loads((DATA / "golden_keys.json").read_text())[model]
+    if model.startswith("v2-"):
+        of_v2 = json.loads((DATA / "golden_keys_v2.json").read_text())
+        keys = {**of_v2["v2-t1-base"], **of_v2[model]}
+    else:
+        keys = json.loads((DATA / "golden_keys.json").read_text())[model]
     return {key: tuple(shape) for key, shape in keys.items()}
 
 
 def official_state(model: str) -> dict[str, torch.Tensor]:
     """A state dict with the official keys, its values by the rule of stated_rule.py."""
-    shapes = official_shapes(model)
-    return {key: torch.from_numpy(rule_tensor(key, shape, STEM_GAIN[model])) for key, shape in shapes.items()}
+    shapes, gain = official_shapes(model), STEM_GAIN.get(model, OTHER_STEM_GAIN)
+    return {key: torch.from_numpy(rule_tensor(key, shape, gain)) for key, shape in shapes.items()}
 
 
 def rule_model(name: str, history_shift: str) -> BEVFormer:
@@ -54,6 +62,17 @@ def rule_model(name: str, history_shift: str) -> BEVFormer:
     motion = replace(config.ego_motion, history_shift=history_shift)
     model = BEVFormer(replace(config, ego_motion=motion)).eval()
     model.load_state_dict(from_official(official_state(name)))
+    return model
+
+
+def rule_model_v2(name: str) -> BEVFormerV2:
+    """A BEVFormerV2 with weights by the rule of stated_rule.py, in evaluation mode."""
+    config = load_config(name)
+    assert isinstance(config, BEVFormerV2Config)
+    model = BEVFormerV2(config).eval()
+    state = from_official(official_state(name))
+    state["decoder.query_embedding"] = state["decoder.query_embedding"][:900].clone()  # the first group
+    model.load_state_dict(state)
     return model
 
 
@@ -76,6 +95,7 @@ def image_from_bev(frame: int, config: BEVFormerConfig) -> np.ndarray:
         image_from_camera = np.eye(4)
         image_from_camera[:3, :3] = camera["cam_intrinsic"]
         scale = np.diag([config.image.size[0] / 1600, config.image.size[1] / 900, 1, 1])
+        scale[:2, 2] = np.negative(config.image.crop_box[:2])
         matrices.append(scale @ image_from_camera @ np.linalg.inv(bev_from_camera))
     return np.stack(matrices)
 
@@ -87,7 +107,9 @@ def network_image(frame: int, camera: str, config: BEVFormerConfig) -> np.ndarra
         image = image[..., ::-1]
     normalised = (image - np.float32(config.image.mean)) / np.float32(config.image.std)
     resized = cv2.resize(normalised, config.image.size, interpolation=cv2.INTER_LINEAR)
-    padded = np.pad(resized, ((0, -resized.shape[0] % 32), (0, -resized.shape[1] % 32), (0, 0)))
+    left, top, right, bottom = config.image.crop_box
+    cropped = resized[top:bottom, left:right]
+    padded = np.pad(cropped, ((0, -cropped.shape[0] % 32), (0, -cropped.shape[1] % 32), (0, 0)))
     return padded.transpose(2, 0, 1)
 
 
@@ -118,6 +140,32 @@ def inputs(frame: int, config: BEVFormerConfig) -> BEVFormerInputs:
         shift=torch.from_numpy(moved.shift)[None],
         rotation_deg=torch.tensor([moved.rotation_deg]),
     )
+
+
+def history_image_from_bev(frame: int, current: int, config: BEVFormerConfig) -> np.ndarray:
+    """(N, 4, 4) bev metres of the current frame to pixels of an earlier frame's images."""
+    info = frames()[current]
+    ego_from_bev = rigid(info["lidar2ego_translation"], rotation_from_quaternion(info["lidar2ego_rotation"]))
+    return image_from_bev(frame, config) @ other_bev_from_bev(pose(current), pose(frame), ego_from_bev)
+
+
+def window(current: int, model: BEVFormerV2) -> list[WindowFrame | None]:
+    """The window of a BEVFormerV2 at one of the four frames; None for frames before the first."""
+    config, count = model.config, len(model.config.cameras)
+    frames_of_window: list[WindowFrame | None] = []
+    for frame in (current + offset for offset in config.frames):
+        if frame < 0:
+            frames_of_window.append(None)
+            continue
+        images = torch.from_numpy(np.stack([network_image(frame, name, config) for name in config.cameras]))[None]
+        matrix = image_from_bev(frame, config)
+        if frame != current:
+            matrix = history_image_from_bev(frame, current, config)
+        features = model.image_features(images, torch.arange(count))
+        has_image = torch.ones(1, count, dtype=torch.bool)
+        size = (images.shape[-2], images.shape[-1])
+        frames_of_window.append(WindowFrame(features, torch.from_numpy(matrix).float()[None], has_image, size))
+    return frames_of_window
 
 
 def match_boxes(boxes: Boxes3D, expected: np.ndarray, labels: np.ndarray, classes: Sequence[str]) -> list[int]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 # Pattern of the key, then the factor on a draw divided by the root of the fan-in; or mean and deviation of a draw.
 _OVER_FAN_IN = (
     (r"conv_offset\.weight$", 0.5),
-    (r"^img_backbone\..*", math.sqrt(2)),
+    (r"(^img_backbone\.|\.fusion\.layers\.)", math.sqrt(2)),
     (r"^img_neck\.", 0.5),
     (r"transformer\.reference_points\.weight$", 2.0),
     (r"\.decoder\..*(attn\.out_proj|ffns\.0\.layers\.1)\.weight$", 0.3),
@@ -29,7 +29,7 @@ _PLAIN = (
     (r"conv_offset\.bias$", 0.0, 0.5),
     (r"(bev|query)_embedding\.weight$", 0.0, 1.0),
     (r"((row|col)_embed\.weight|level_embeds|cams_embeds)$", 0.0, 0.5),
-    (r"^img_backbone\.layer\d+\.\d+\.bn3\.weight$", 0.25, 0.0125),
+    (r"(^img_backbone\.layer\d+\.\d+\.bn3|\.fusion\.layers\.\d+\.bn2)\.weight$", 0.25, 0.0125),
 )
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from painted_drives import CONFIG, PaintedDrives
+from safetensors.torch import load_file
 
 from bevcli.checkpoints import load_weights
 from bevcli.config import TRAINING, load_config, load_table
@@ -18,9 +19,9 @@ from bevcli.training.checkpoint import save_checkpoint
 from bevcli.training.clips import ClipConfig
 from bevcli.training.dense_loss import DenseLossConfig
 from bevcli.training.drives import FIRST_HELD_OUT_SEED, RenderedDrives, open_drives, parse_seeds, split_drives
-from bevcli.training.image_loss import ImageLossConfig
 from bevcli.training.job import TrainingConfig, TrainingJob, prepare_folder, prepare_training
 from bevcli.training.optimizer import OptimizerConfig, make_optimizer, set_learning_rate
+from bevcli.training.perspective_loss import PerspectiveLossConfig
 from bevcli.training.trainer import Trainer, alternated
 
 SHORT = TrainingConfig(
@@ -92,10 +93,10 @@ def test_alternated_iterators_give_one_item_each_in_turn() -> None:
 
 
 def test_a_training_with_all_options_on_resumes_exactly_too(tmp_path: Path) -> None:
-    """Updates on every frame, alternating batches, query groups, the dense and the image loss."""
+    """Updates on every frame, alternating batches, query groups, the dense and the perspective loss."""
     settings = replace(
         SHORT, steps=3, evaluate_every=3, checkpoint_every=1, clips=ClipConfig(2, 2, 0.0, "all", in_turn=2),
-        dense_loss=DenseLossConfig(1.0), picture_loss=ImageLossConfig(1.0),
+        dense_loss=DenseLossConfig(1.0), perspective_loss=PerspectiveLossConfig(1.0),
     )  # fmt: skip
 
     def with_all_options(out: Path, resume: bool = False) -> Trainer:
@@ -110,9 +111,11 @@ def test_a_training_with_all_options_on_resumes_exactly_too(tmp_path: Path) -> N
     assert [len(batch.inputs) for batch in whole._load(0)] == [2, 2]
     whole.run()
     assert parameters_without_gradient(whole) == []
-    # Checkpoints of earlier versions must stay readable: these keys are part of the format.
+    # These keys are part of the checkpoint format.
     keys = torch.load(tmp_path / "whole" / "checkpoint.pt", weights_only=True)["model"]
-    assert {key.partition(".")[0] for key in keys} == {"model", "dense_reader", "picture_reader"}
+    assert {key.partition(".")[0] for key in keys} == {"model", "dense_reader", "perspective_head"}
+    exported = load_file(tmp_path / "whole" / "weights.safetensors")
+    assert exported.keys() == whole.job.model.state_dict().keys()
     run_and_kill(with_all_options(tmp_path / "killed"), after=1)
     resumed = with_all_options(tmp_path / "killed", resume=True)
     assert resumed.done == 1
@@ -134,7 +137,7 @@ def test_every_parameter_receives_a_gradient_that_is_not_zero(tmp_path: Path) ->
 
 
 def test_training_and_validation_leave_no_hooks_on_the_model(tmp_path: Path) -> None:
-    settings = replace(SHORT, steps=2, evaluate_every=1, picture_loss=ImageLossConfig(1.0))
+    settings = replace(SHORT, steps=2, evaluate_every=1, perspective_loss=PerspectiveLossConfig(1.0))
     one = trainer(tmp_path, settings=settings)
     hooks_after_validation = []
 
@@ -186,6 +189,17 @@ def test_resuming_from_nothing_or_from_another_model_is_rejected(tmp_path: Path)
     save_checkpoint(tmp_path / "checkpoint.pt", 1, other, make_optimizer(other, other.backbone, OptimizerConfig()))
     with pytest.raises(WeightsError, match="is not a checkpoint of this model"):
         trainer(tmp_path, resume=True)
+
+
+def test_a_checkpoint_with_the_image_loss_of_earlier_versions_is_rejected(tmp_path: Path) -> None:
+    old = trainer(tmp_path)
+    old.trained["picture_reader"] = torch.nn.Linear(2, 2)
+    save_checkpoint(tmp_path / "checkpoint.pt", 1, old.trained, old.optimizer)
+    with pytest.raises(
+        WeightsError, match=r"with \[training.picture_loss\], and cannot be resumed; start a new"
+    ) as caught:
+        trainer(tmp_path, resume=True)
+    assert "\n" not in str(caught.value)
 
 
 def test_a_nan_loss_stops_the_training(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from bevcli.model.bev_fusion import FusionBlock
 from bevcli.model.resnet import Bottleneck
 
 
@@ -69,11 +70,27 @@ class FusedBottleneck(nn.Module):
         return self.conv3(self.conv2(self.conv1(x)), self.downsample(x))
 
 
+class FusedFusionBlock(nn.Module):
+    """A `FusionBlock` whose batch norms are folded."""
+
+    def __init__(self, block: FusionBlock) -> None:
+        super().__init__()
+        self.conv1, self.conv2 = ActivatedConvolution(block.conv1), ActivatedConvolution(block.conv2)
+        self.downsample = block.downsample
+
+    def forward(self, x: Tensor) -> Tensor:
+        """As `FusionBlock.forward`."""
+        return self.conv2(self.conv1(x), self.downsample(x))
+
+
 def use_onednn(part: nn.Module) -> None:
-    """Replaces the linear layers and the bottlenecks of a module, in place. Batch norms must be folded already."""
+    """Replaces the linear layers and the residual blocks of a module, in place. Batch norms must be folded already."""
     for name, child in part.named_children():
         if isinstance(child, Bottleneck) and has_onednn(child.conv1.weight.dtype):
             child = FusedBottleneck(child)
+            setattr(part, name, child)
+        elif isinstance(child, FusionBlock) and has_onednn(child.conv1.weight.dtype):
+            child = FusedFusionBlock(child)
             setattr(part, name, child)
         # Not the subclass of nn.Linear in multi-head attention, which reads the weight of that layer itself.
         if type(child) is nn.Linear and has_onednn(child.weight.dtype):

@@ -1,0 +1,210 @@
+"""What a run remembers from frame to frame: BEVFormer the last BEV map, BEVFormerV2 the image features of its window.
+
+`temporal_model` wraps a model so that the runner drives both in the same way: memory goes in and comes out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from bevcli.frame import FrameStamp
+from bevcli.geometry.transforms import Array, Pose
+from bevcli.model.bevformer import BEVFormer, BEVFormerBase, BEVFormerOutputs
+from bevcli.model.bevformer_v2 import BEVFormerV2, WindowFrame
+from bevcli.model.deformable_attention import FeatureMaps, LevelShapes
+from bevcli.pipeline.model_inputs import model_inputs
+from bevcli.pipeline.preprocess import PreparedFrame
+
+# Metres. Where poses are nearer to the world's origin, float32 holds them to a millimetre. nuScenes' maps reach 3 km.
+FLOAT32_RANGE_M = 10_000
+
+
+@dataclass(frozen=True)
+class BevHistory:
+    """What BEVFormer remembers.
+
+    Attributes:
+        bev: (1, Y·X, C), the BEV map of the last frame.
+        pose: world_from_ego of that frame.
+    """
+
+    bev: Tensor
+    pose: Pose
+
+
+@dataclass(frozen=True)
+class FrameFeatures:
+    """The image features of one frame and where its cameras were.
+
+    Attributes:
+        stamp: of the frame.
+        pose: its world_from_ego.
+        tokens: (N, S, C) of its N images, in the dtype of the model's image features.
+        level_shapes: (height, width) of each feature level.
+        image_from_bev: (1, N, 4, 4) float64 on the CPU, from the frame's own bev metres to network pixels.
+        has_image: (1, N) bool.
+    """
+
+    stamp: FrameStamp
+    pose: Pose
+    tokens: Tensor
+    level_shapes: LevelShapes
+    image_from_bev: Tensor
+    has_image: Tensor
+
+
+@dataclass(frozen=True)
+class FeatureWindow:
+    """What BEVFormerV2 remembers.
+
+    Attributes:
+        frames: the last frames, and with a model that looks ahead the next ones, in order of time.
+    """
+
+    frames: tuple[FrameFeatures, ...]
+
+
+Memory = BevHistory | FeatureWindow
+
+
+class TemporalModel(Protocol):
+    """A model with its memory, of either kind.
+
+    Attributes:
+        later_frames: how many frames after the current one the model looks at.
+        uses_history: whether earlier or later frames change the result at all.
+    """
+
+    @property
+    def later_frames(self) -> int: ...
+
+    @property
+    def uses_history(self) -> bool: ...
+
+    def step(
+        self, prepared: PreparedFrame, memory: Memory | None, upcoming: Sequence[PreparedFrame]
+    ) -> tuple[BEVFormerOutputs, Memory]:
+        """One frame.
+
+        Args:
+            prepared: the frame.
+            memory: what the step of the frame before returned; None where the history starts anew.
+            upcoming: the next `later_frames` frames that have images; fewer at the end of a scene.
+        """
+        ...
+
+
+def temporal_model(model: BEVFormerBase, device: torch.device) -> TemporalModel:
+    """The model with the memory of its kind."""
+    if isinstance(model, BEVFormerV2):
+        return Window(model, device)
+    assert isinstance(model, BEVFormer)
+    return Recurrence(model, device)
+
+
+class Recurrence:
+    """A BEVFormer: the BEV map of a frame is the history of the next."""
+
+    later_frames = 0
+    uses_history = True
+
+    def __init__(self, model: BEVFormer, device: torch.device) -> None:
+        self.model, self.device = model, device
+
+    def step(
+        self, prepared: PreparedFrame, memory: Memory | None, upcoming: Sequence[PreparedFrame]
+    ) -> tuple[BEVFormerOutputs, BevHistory]:
+        """See `TemporalModel.step`."""
+        assert memory is None or isinstance(memory, BevHistory)
+        previous_pose = None if memory is None else memory.pose
+        inputs = model_inputs([prepared], [previous_pose], self.model.config).to(self.device)
+        outputs = self.model(inputs, None if memory is None else memory.bev)
+        return outputs, BevHistory(outputs.bev, prepared.frame.world_from_ego)
+
+
+class Window:
+    """A BEVFormerV2: a window of frames, whose images pass the backbone once."""
+
+    def __init__(self, model: BEVFormerV2, device: torch.device) -> None:
+        self.model, self.device = model, device
+
+    @property
+    def later_frames(self) -> int:
+        """See `TemporalModel`."""
+        return self.model.config.later_frames
+
+    @property
+    def uses_history(self) -> bool:
+        """See `TemporalModel`."""
+        return len(self.model.config.frames) > 1
+
+    def step(
+        self, prepared: PreparedFrame, memory: Memory | None, upcoming: Sequence[PreparedFrame]
+    ) -> tuple[BEVFormerOutputs, FeatureWindow]:
+        """See `TemporalModel.step`."""
+        assert memory is None or isinstance(memory, FeatureWindow)
+        known = {} if memory is None else {frame.stamp: frame for frame in memory.frames}
+        now, config = prepared.frame.stamp, self.model.config
+        past = [frame for frame in known.values() if frame.stamp.timestamp_ns < now.timestamp_ns]
+        past = past[len(past) - min(config.past_frames, len(past)) :]
+        present = [known.get(one.frame.stamp) or self._features(one) for one in (prepared, *upcoming)]
+        frames, current = (*past, *present), len(past)
+        places = [current + offset for offset in config.frames]
+        outputs: BEVFormerOutputs = self.model(
+            [self._placed(frames[place], prepared) if 0 <= place < len(frames) else None for place in places]
+        )
+        # The next frame needs one frame less of the past.
+        return outputs, FeatureWindow(frames[max(0, current + 1 - config.past_frames) :])
+
+    def _features(self, prepared: PreparedFrame) -> FrameFeatures:
+        images = prepared.images.to(self.device, non_blocking=True)
+        features = self.model.image_features(images, prepared.camera_index.to(self.device))
+        return FrameFeatures(
+            stamp=prepared.frame.stamp,
+            pose=prepared.frame.world_from_ego,
+            tokens=features.tokens,
+            level_shapes=features.level_shapes,
+            image_from_bev=prepared.image_from_bev,
+            has_image=prepared.has_image,
+        )
+
+    def _placed(self, frame: FrameFeatures, current: PreparedFrame) -> WindowFrame:
+        """The frame, seen from the bev frame of the current one."""
+        image_from_bev = frame.image_from_bev
+        if frame.stamp != current.frame.stamp:
+            moved = other_bev_from_bev(current.frame.world_from_ego, frame.pose, current.frame.rig.ego_from_bev)
+            image_from_bev = image_from_bev @ torch.from_numpy(moved)
+        width, height = self.model.config.image.padded_size
+        return WindowFrame(
+            image_features=FeatureMaps(frame.tokens, frame.level_shapes),
+            image_from_bev=image_from_bev.float().to(self.device),
+            has_image=frame.has_image.to(self.device),
+            image_size=(height, width),
+        )
+
+
+def other_bev_from_bev(world_from_ego: Pose, other_world_from_ego: Pose, ego_from_bev: Array) -> Array:
+    """(4, 4) float64 from the bev frame now to the bev frame at another time.
+
+    As in the released code, both times take the current pose of the bev frame in the vehicle, and the arithmetic is
+    float32, so that the same cells are seen at the edges of images. Far from the world's origin float32 is too coarse;
+    there it is float64.
+
+    Args:
+        world_from_ego: the vehicle's pose now.
+        other_world_from_ego: the vehicle's pose at the other time.
+        ego_from_bev: (4, 4), the current pose of the bev frame in the vehicle.
+    """
+    now, other = world_from_ego.matrix, other_world_from_ego.matrix
+    far = max(np.abs(now[:3, 3]).max(), np.abs(other[:3, 3]).max()) > FLOAT32_RANGE_M
+    dtype: type[np.floating] = np.float64 if far else np.float32
+    offset = ego_from_bev.astype(dtype)
+    bev_from_other_bev = np.linalg.inv(offset) @ np.linalg.inv(now.astype(dtype)) @ other.astype(dtype) @ offset
+    moved: Array = np.linalg.inv(bev_from_other_bev).astype(np.float64)
+    return moved

@@ -1,0 +1,131 @@
+"""BEVFormerV2 equals the released code (float32, CPU).
+
+golden_v2.npz in tests/data holds a part of the original's numbers at frame 2: of v2-t1-base the BEV map at every 148th
+cell, logits and codes of every 9th query and the boxes; projections and visible pillar points of the frames before
+(_1: one frame, _2: two frames). The full numbers are in the folder golden/ of BEVCLI_SHARED.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import original_reference as original
+import pytest
+import torch
+
+from bevcli.config import load_config
+from bevcli.model.bevformer_v2 import BEVFormerV2
+from bevcli.model.box_coding import decode
+from bevcli.model.pillar_projection import Pillars
+from bevcli.model.prepared import prepare_for_inference
+
+KEPT = np.load(original.DATA / "golden_v2.npz")
+SHARED = os.environ.get("BEVCLI_SHARED", "")
+FRAME = 2
+
+
+def test_cropped_images_and_their_projection_equal_the_originals() -> None:
+    config = load_config("v2-t1-base")
+    images = np.stack([original.network_image(FRAME, name, config) for name in config.cameras])
+    np.testing.assert_allclose(images[..., ::64, ::64], KEPT["images"], atol=1e-4)
+    np.testing.assert_allclose(original.image_from_bev(FRAME, config), KEPT["image_from_bev"], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("back", [1, 2])
+def test_a_history_frame_lies_in_the_current_bev_frame_as_in_the_original(back: int) -> None:
+    found = original.history_image_from_bev(FRAME - back, FRAME, load_config("v2-t8"))
+    np.testing.assert_allclose(found, KEPT[f"image_from_bev_{back}"], rtol=0, atol=0.02)  # in float64 it is 0.1 off
+
+
+@pytest.mark.parametrize("back", [0, 1])
+def test_the_same_pillar_points_are_visible_as_in_the_original(back: int) -> None:
+    config = load_config("v2-t2")
+    matrix = (
+        original.history_image_from_bev(FRAME - back, FRAME, config) if back else original.image_from_bev(FRAME, config)
+    )
+    projection = Pillars(config.bev_grid).project(
+        torch.from_numpy(matrix)[None], (640, 1600), torch.ones(1, 6, dtype=torch.bool)
+    )
+    visible = projection.visible[0].numpy()
+    assert visible.any(axis=(1, 2)).all()
+    assert np.array_equal(np.packbits(visible), KEPT[f"visible_bits_{back}"])
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("prepared", [False, True])
+def test_t1_base_equals_the_original(prepared: bool) -> None:
+    model = original.rule_model_v2("v2-t1-base")
+    ready = prepare_for_inference(model, torch.device("cpu")) if prepared else model
+    assert isinstance(ready, BEVFormerV2)
+    with torch.inference_mode():
+        outputs = ready(original.window(FRAME, ready))
+    np.testing.assert_allclose(outputs.bev[0, :: 4 * 37], KEPT["bev"], atol=1e-3)
+    np.testing.assert_allclose(outputs.class_logits[-1, 0, ::9], KEPT["class_logits"], atol=1e-3)
+    np.testing.assert_allclose(outputs.box_codes[-1, 0, ::9], KEPT["box_codes"], atol=1e-2)
+    check_boxes(model, outputs, KEPT["coder_bboxes"], KEPT["scores_3d"], KEPT["labels_3d"])
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.skipif(not SHARED, reason="BEVCLI_SHARED is not set: no full numbers of the original")
+@pytest.mark.parametrize("name", ["v2-t1-base", "v2-t2", "v2-t8"])
+def test_every_stage_equals_the_originals(name: str) -> None:
+    stem = Path(SHARED) / "golden" / f"golden_{name.replace('-', '_')}"
+    facts, arrays = json.loads(stem.with_suffix(".json").read_text()), np.load(stem.with_suffix(".npz"))
+    rows = facts["bev_row_stride"]
+    inner_rows = facts.get("inner_row_stride", rows)
+    plain = original.rule_model_v2(name)
+    model = prepare_for_inference(plain, torch.device("cpu"))
+    assert isinstance(model, BEVFormerV2)
+    necks, layers = record_stages(model)
+    with torch.inference_mode():
+        window = original.window(FRAME, model)
+        outputs = model(window)
+    shown = [offset for offset, frame in zip(plain.config.frames, window, strict=True) if frame is not None]
+    assert len(necks) == len(shown)
+    assert len(layers) == len(shown) * plain.config.encoder.layers
+    for place, offset in enumerate(shown):
+        prefix = f"f{FRAME}_" + (f"t{offset}_" if offset else "")
+        check_neck(necks[place], arrays, prefix)
+        for layer, cells in enumerate(layers[6 * place : 6 * place + 6]):
+            close(cells[::inner_rows], arrays[f"{prefix}enc{layer}_sub"], 1e-3)
+    close(outputs.bev[0, ::rows], arrays[f"f{FRAME}_bev_embed_sub"], 1e-3)
+    logits, codes = (arrays[f"f{FRAME}_{key}"] for key in ("all_cls_scores", "all_bbox_preds"))
+    close(outputs.class_logits[-len(logits) :, 0], logits, 1e-3)
+    close(outputs.box_codes[-len(codes) :, 0], codes, 1e-2)
+    check_boxes(plain, outputs, *(arrays[f"f{FRAME}_{key}"] for key in ("coder_bboxes", "scores_3d", "labels_3d")))
+
+
+def record_stages(model: BEVFormerV2) -> tuple[list[list[torch.Tensor]], list[torch.Tensor]]:
+    """Two lists that are filled in the order of execution: maps of the neck, and cells (Y·X, C) of encoder layers."""
+    necks: list[list[torch.Tensor]] = []
+    layers: list[torch.Tensor] = []
+    model.neck.register_forward_hook(lambda *call: necks.append(call[-1]))
+    for layer in model.encoder.layers:
+        layer.register_forward_hook(lambda *call: layers.append(call[-1][0]))
+    return necks, layers
+
+
+def check_neck(levels: list[torch.Tensor], arrays: Any, prefix: str) -> None:
+    assert len(levels) == 5
+    for level, features in enumerate(levels):
+        expected = arrays[f"{prefix}fpn{level}_sub"]
+        stride = round(features.shape[-1] / expected.shape[-1])
+        close(features[:, ::8, ::stride, ::stride], expected, 1e-3)
+
+
+def check_boxes(model: BEVFormerV2, outputs: Any, expected: np.ndarray, scores: np.ndarray, labels: np.ndarray) -> None:
+    boxes = decode(outputs, model.config)[0]
+    np.testing.assert_allclose(boxes.scores, scores, atol=1e-4)
+    rows = original.match_boxes(boxes, expected, labels, model.config.classes)
+    np.testing.assert_allclose(boxes.centers[rows], expected[:, :3], atol=1e-2)
+    np.testing.assert_allclose(boxes.sizes_lwh[rows], expected[:, [4, 3, 5]], rtol=1e-3)
+
+
+def close(found: torch.Tensor, expected: np.ndarray, tolerance: float) -> None:
+    np.testing.assert_allclose(found.numpy(), expected.reshape(found.shape), atol=tolerance, rtol=0)

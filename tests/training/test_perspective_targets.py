@@ -1,0 +1,211 @@
+"""Targets of the perspective head: projections, levels, positive pixels, and boxes that are only partly visible."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.model.box_coding import encode
+from bevcli.training.detection_targets import DetectionTargets
+from bevcli.training.perspective_targets import (
+    OUTLINE_DEPTH_M,
+    PerspectiveTargets,
+    feature_locations,
+    perspective_targets,
+    project_objects,
+)
+
+SIZE = (224, 384)  # height, width
+SHAPES = [(28, 48), (14, 24), (7, 12)]  # strides 8, 16, 32
+FOCAL, PRINCIPAL_POINT = 200.0, (192.0, 112.0)
+INTRINSICS = np.array([[FOCAL, 0, PRINCIPAL_POINT[0]], [0, FOCAL, PRINCIPAL_POINT[1]], [0, 0, 1]])
+CAMERA_FROM_BEV = np.array([[1.0, 0, 0, 0], [0, 0, -1, 1.5], [0, 1, 0, 0], [0, 0, 0, 1]])  # 1.5 m high; ahead is +y
+
+
+def image_from_bev(camera_from_bev: np.ndarray = CAMERA_FROM_BEV, intrinsics: np.ndarray = INTRINSICS) -> torch.Tensor:
+    image_from_camera = np.eye(4)
+    image_from_camera[:3, :3] = intrinsics
+    return torch.from_numpy(image_from_camera @ camera_from_bev).float()
+
+
+def boxes(*rows: tuple[float, ...]) -> Boxes3D:
+    """x, y, z, length, width, height, yaw of each."""
+    table = np.array(rows, dtype=float).reshape(-1, 7)
+    names = np.full(len(table), "car")
+    return Boxes3D(table[:, :3], table[:, 3:6], table[:, 6], np.zeros((len(table), 2)), names)
+
+
+def truth(*rows: tuple[float, ...]) -> DetectionTargets:
+    codes = torch.from_numpy(encode(boxes(*rows))).float()
+    return DetectionTargets(torch.arange(len(codes)), codes)
+
+
+def targets(*rows: tuple[float, ...], shapes: list[tuple[int, int]] = SHAPES) -> PerspectiveTargets:
+    locations = feature_locations(shapes, SIZE, torch.device("cpu"))
+    return perspective_targets(image_from_bev(), truth(*rows), locations, SIZE)
+
+
+def cells(locations: torch.Tensor, shape: tuple[int, int] = SHAPES[0], start: int = 0) -> list[tuple[int, int]]:
+    """Row and column of locations on a level that starts at an index."""
+    return [divmod(int(index) - start, shape[1]) for index in locations]
+
+
+def tilted_camera() -> np.ndarray:
+    """A camera that is turned about all three axes, away from the origin."""
+    camera_from_bev = np.eye(4)
+    rotation = cv2.Rodrigues(np.array([0.1, -0.2, 0.15]))[0]
+    camera_from_bev[:3, :3] = rotation @ CAMERA_FROM_BEV[:3, :3]
+    camera_from_bev[:3, 3] = [0.4, 1.2, -0.7]
+    return camera_from_bev
+
+
+def test_centers_depths_and_outlines_equal_opencv() -> None:
+    rng = np.random.default_rng(0)
+    count = 40
+    rows = np.column_stack(
+        [rng.uniform(-6, 6, count), rng.uniform(9, 40, count), rng.uniform(-1, 2, count),
+         rng.uniform(0.4, 9, (count, 3)), rng.uniform(-4, 4, count)]
+    )  # fmt: skip
+    camera_from_bev = tilted_camera()
+    intrinsics = INTRINSICS * [[1.2], [0.9], [1]]  # fx is not fy
+    objects = project_objects(image_from_bev(camera_from_bev, intrinsics), truth(*rows).codes, SIZE)
+
+    def project(points: np.ndarray) -> np.ndarray:
+        rotation = cv2.Rodrigues(camera_from_bev[:3, :3])[0]
+        return cv2.projectPoints(
+            np.ascontiguousarray(points).reshape(-1, 3), rotation, camera_from_bev[:3, 3], intrinsics, None
+        )[0][:, 0]
+
+    np.testing.assert_allclose(objects.centers, project(rows[:, :3]), atol=1e-2)
+    depths = (rows[:, :3] @ camera_from_bev[:3, :3].T + camera_from_bev[:3, 3])[:, 2]
+    np.testing.assert_allclose(objects.depths, depths, atol=1e-4)
+    assert objects.focal == pytest.approx(FOCAL * math.sqrt(1.2 * 0.9), rel=1e-4)
+
+    corners = project(boxes(*rows).corners()).reshape(count, 8, 2)
+    expected = np.concatenate([corners.min(1).clip(0), np.minimum(corners.max(1), [SIZE[1], SIZE[0]])], 1)
+    shown = (expected[:, 2:] > expected[:, :2]).all(1)
+    assert shown.sum() > 10
+    np.testing.assert_array_equal(objects.visible, shown)
+    np.testing.assert_allclose(objects.outlines[shown], expected[shown], atol=2e-2)
+
+
+def test_a_box_has_the_targets_computed_by_hand() -> None:
+    """A box 4 m long, 1 m wide and 2 m high, 10 m ahead and 2 m to the right, at the camera's height, heading ahead."""
+    found = targets((2, 10, 1.5, 4, 1, 2, math.pi / 2))
+    # The centre projects to x 192 + 200 · 2 / 10 = 232, y 112. The outline spans x from 217 (front left) to 254.5 (rear
+    # right) and y from 87 to 137. Its half extent is 25 pixels, which belongs on stride 8. Pixels of stride 8 have
+    # centres at 4, 12, ...: those up to 12 pixels from (232, 112) are in columns 27 to 30 and rows 12 to 15.
+    found_cells = cells(found.locations)
+    assert sorted(found_cells) == [(row, column) for row in (12, 13, 14, 15) for column in (27, 28, 29, 30)]
+    assert found.labels.tolist() == [0] * 16
+    at = found_cells.index((13, 28))  # its centre is (228, 108)
+    ray_azimuth = math.atan2(10, 2)
+    expected = [
+        4 / 8, 4 / 8, math.log(10 * 8 / 200), math.log(4), math.log(1), math.log(2),
+        math.sin(math.pi / 2 - ray_azimuth), math.cos(math.pi / 2 - ray_azimuth),
+    ]  # fmt: skip
+    np.testing.assert_allclose(found.boxes[at], expected, atol=1e-5)
+    assert not found.ignored.any()
+
+
+@pytest.mark.parametrize(("distance", "level"), [(40, 0), (7, 0), (5, 1), (2.5, 2)])
+def test_the_level_follows_from_the_size_in_the_image(distance: float, level: int) -> None:
+    # The box is seen from its side, 4 m long, with its near face at `distance`: half extents of 10, 57, 80 and
+    # 160 pixels. The limits are 64 pixels at stride 8 and 128 at stride 16.
+    found = targets((0, distance + 0.5, 1.5, 4, 1, 2, 0))
+    starts = [0, 28 * 48, 28 * 48 + 14 * 24, 28 * 48 + 14 * 24 + 7 * 12]
+    assert len(found.locations) > 0
+    assert ((found.locations >= starts[level]) & (found.locations < starts[level + 1])).all()
+    stride = 8 * 2**level
+    torch.testing.assert_close(found.boxes[0, 2].exp(), torch.tensor((distance + 0.5) * stride / FOCAL))
+
+
+@pytest.mark.parametrize("shapes", [[(7, 12)], [(28, 48), (14, 24)], [(28, 48), (14, 24), (7, 12), (4, 6), (2, 3)]])
+def test_every_visible_box_is_detected_with_any_number_of_levels(shapes: list[tuple[int, int]]) -> None:
+    near_and_far = ((0, 3, 1, 4, 2, 1.6, 0), (6, 20, 1, 4, 2, 1.6, 0), (-20, 60, 1, 0.4, 0.4, 1, 0))
+    found = targets(*near_and_far, shapes=shapes)
+    assert set(found.labels.tolist()) == {0, 1, 2}
+
+
+def test_a_box_smaller_than_a_pixel_of_the_features_has_one_positive_pixel() -> None:
+    found = targets((0.5, 60, 1.6, 0.4, 0.4, 1, 0))  # 1.3 x 3.3 pixels around (193.7, 111.7)
+    assert cells(found.locations) == [(13, 24)]
+
+
+def test_of_two_boxes_a_pixel_detects_the_one_with_the_nearer_center() -> None:
+    one, other = (0, 10, 1.5, 1, 1, 1, 0), (1, 10, 1.5, 1, 1, 1, 0)  # centres 20 pixels apart, at x 192 and 212
+    found = targets(one, other)
+    pixels = feature_locations(SHAPES, SIZE, torch.device("cpu")).pixels[found.locations]
+    assert set(found.labels.tolist()) == {0, 1}
+    assert (pixels[found.labels == 0, 0] < 202).all()
+    assert (pixels[found.labels == 1, 0] > 202).all()
+
+
+@pytest.mark.parametrize("row", [(0, -10, 1, 4, 2, 1.6, 0), (100, 10, 1, 4, 2, 1.6, 0), (0, 10, 50, 4, 2, 1.6, 0)])
+def test_boxes_behind_the_camera_or_outside_the_image_teach_nothing(row: tuple[float, ...]) -> None:
+    found = targets(row)
+    assert not len(found.locations)
+    assert not found.ignored.any()
+
+
+def test_no_boxes_give_no_targets() -> None:
+    found = targets()
+    assert found.boxes.shape == (0, 8)
+    assert found.ignored.shape == (28 * 48 + 14 * 24 + 7 * 12,)
+    assert not found.ignored.any()
+
+
+def test_a_box_whose_center_is_just_outside_the_image_is_detected_at_the_border() -> None:
+    found = targets((10.2, 10, 1.5, 4, 2, 2, 0))  # centre at x 396, the image ends at 384, the box begins at 341
+    pixels = feature_locations(SHAPES, SIZE, torch.device("cpu"))
+    assert len(found.locations) > 0
+    strides = pixels.strides[pixels.levels[found.locations]]
+    projected = pixels.pixels[found.locations] + found.boxes[:, :2] * strides
+    torch.testing.assert_close(projected, torch.tensor([[396.0, 112.0]]).expand_as(projected))
+    assert not found.ignored.any()
+
+
+def test_a_truck_beside_the_camera_is_neither_detected_nor_background() -> None:
+    """Its centre is behind the camera, its front end is visible."""
+    row = (3, -1, 1.5, 12, 2, 3, math.pi / 2)
+    found = targets(row)
+    assert not len(found.locations)
+    pixels = feature_locations(SHAPES, SIZE, torch.device("cpu")).pixels[found.ignored]
+    # Its front at y = 5 ends at x = 2 m: pixel 192 + 200 · 2 / 5 = 272. It reaches the right border.
+    assert 272 <= pixels[:, 0].min() < 288
+    assert pixels[:, 0].max() > 376
+
+
+def test_the_outline_of_a_box_partly_behind_the_camera_equals_that_of_its_part_in_front() -> None:
+    """A box from 4 m behind to 8 m ahead looks like the box from the cutting plane to 8 m ahead."""
+    start, end = OUTLINE_DEPTH_M, 8.0
+    whole, part = (1, 2, 1.0, 12, 1, 1, math.pi / 2), (1, (start + end) / 2, 1.0, end - start, 1, 1, math.pi / 2)
+    of_whole, of_part = (project_objects(image_from_bev(), truth(row).codes, SIZE).outlines for row in (whole, part))
+    torch.testing.assert_close(of_whole, of_part, atol=0.5, rtol=0)
+
+
+def test_the_rotation_is_relative_to_the_viewing_ray() -> None:
+    """Boxes around the camera, all turned away from it, have the same rotation: they look alike."""
+    azimuths = np.radians([60, 90, 120])
+    camera = np.linalg.inv(tilted_camera())[:3, 3]
+    rows = [(camera[0] + 12 * math.cos(a), camera[1] + 12 * math.sin(a), 1, 4, 2, 1.6, a + 0.3) for a in azimuths]
+    rotations = project_objects(image_from_bev(tilted_camera()), truth(*rows).codes, SIZE).rotations
+    expected = torch.tensor([[math.sin(0.3), math.cos(0.3)]]).expand(3, 2)
+    torch.testing.assert_close(rotations, expected, atol=1e-4, rtol=0)
+
+
+def test_the_depth_target_does_not_change_when_image_and_focal_length_are_scaled() -> None:
+    """The features of an image do not tell its focal length: the same pixels must have the same target."""
+    half = np.diag([0.5, 0.5, 1]) @ INTRINSICS
+    box = truth((2, 10, 1.5, 4, 1, 2, 0.2))
+    whole_locations = feature_locations(SHAPES, SIZE, torch.device("cpu"))
+    half_locations = feature_locations(SHAPES, (112, 192), torch.device("cpu"))
+    whole = perspective_targets(image_from_bev(), box, whole_locations, SIZE)
+    halved = perspective_targets(image_from_bev(intrinsics=half), box, half_locations, (112, 192))
+    assert torch.equal(whole.locations, halved.locations)
+    torch.testing.assert_close(whole.boxes, halved.boxes)
