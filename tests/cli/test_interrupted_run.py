@@ -204,8 +204,8 @@ def complete(folder: Path, out: Path, *more: str) -> float:
 def check_kills(folder: Path, kills: int, name: str) -> None:
     """Kills at random moments: every second run is resumed and killed again, the others start anew."""
     randomness = random.Random(19)
-    complete(folder, folder / "timed")  # starts the server of the forks
-    duration_s = complete(folder, folder / "timed", "--force")
+    complete(folder, folder / f"{name}-timed")  # starts the server of the forks
+    duration_s = complete(folder, folder / f"{name}-timed", "--force")
     found = []
     for number in range(kills):
         out, how = (folder / f"{name}-killed", "--force") if number % 2 else (folder / f"{name}-resumed", "--resume")
