@@ -17,7 +17,7 @@ install: $(INSTALLED)
 
 $(INSTALLED): pyproject.toml constraints.txt
 	test -x $(BIN)/python || python3 -m venv $(VENV)
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev,onnx]'
 	touch $@
 
 demo: $(INSTALLED)
@@ -30,7 +30,7 @@ test-all: $(VENV)/.viewers
 	$(BIN)/pytest
 
 $(VENV)/.viewers: $(INSTALLED)
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev,notebook]' playwright
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev,notebook,onnx]' playwright
 	.ci/install-viewers
 	touch $@
 

@@ -13,6 +13,7 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import Kinematics
+from bevcli.geometry.geographic import GeoOrigin
 from bevcli.geometry.transforms import Array, Pose
 
 if TYPE_CHECKING:
@@ -99,8 +100,23 @@ class Frame:
     sample_token: str | None = None
 
 
+@dataclass(frozen=True)
+class DriveFacts:
+    """What a drive states about itself beyond its frames.
+
+    Attributes:
+        rendered: whether `bevcli render` made its images.
+        geo_origin: where its world frame is on Earth, None if it does not say.
+    """
+
+    rendered: bool = False
+    geo_origin: GeoOrigin | None = None
+
+
 class Sequence(Protocol):
     """A drive: frames in order. The readers in `bevcli.sequences` follow this protocol.
+
+    A sequence may have an attribute `facts`, see `facts_of`.
 
     Attributes:
         name: of the drive, for output folders and titles.
@@ -126,6 +142,12 @@ class Sequence(Protocol):
         An image that cannot be read is listed in `Frame.dropped`; other mistakes raise InputError.
         """
         ...
+
+
+def facts_of(sequence: Sequence) -> DriveFacts:
+    """The attribute `facts` of a sequence; a sequence without it states nothing."""
+    facts = getattr(sequence, "facts", None)
+    return facts if isinstance(facts, DriveFacts) else DriveFacts()
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ class NamedModel:
     """What a recording takes from a model, without a network."""
 
     untrained: bool = False
+    bundled: bool = False
     config = TINY
 
 

@@ -19,7 +19,7 @@ LAYERS = (
     {"recording"},
     {"viewer"},
     {"pipeline"},
-    {"rig", "synth"},
+    {"rig", "synth", "engines"},
     {"training", "benchmark", "explain"},
     {"cli"},
     {"__main__"},

@@ -7,14 +7,17 @@ from typing import Annotated, Literal
 
 import typer
 
+from bevcli.cli.input_options import DeviceOption, complete_model
+
 
 def bench(
     model: Annotated[
-        str, typer.Option(help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, or a FILE.toml.")
+        str,
+        typer.Option(
+            autocompletion=complete_model, help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, or a FILE.toml."
+        ),
     ] = "tiny",
-    device: Annotated[
-        Literal["auto", "cpu", "cuda"], typer.Option(help="auto takes a GPU where there is one.")
-    ] = "auto",
+    device: DeviceOption = "auto",
     precision: Annotated[
         Literal["fp32", "bf16", "fp16"] | None,
         typer.Option(help="Default: fp32 on the CPU, bf16 on a GPU.", show_default=False),

@@ -8,19 +8,31 @@ from typing import Annotated
 import typer
 
 from bevcli.cli.input_options import (
+    CalibrationOption,
+    ClassMapOption,
+    EgoMotionOption,
     ExtrinsicsOption,
+    GroundTruthOption,
     IntrinsicsOption,
     SceneOption,
     SplitOption,
     StrictOption,
     SweepsOption,
+    TopicOption,
+    TopicsOption,
     VersionOption,
+    parse_class_map,
+    parse_topics,
 )
 
 
 def convert(
     source: Annotated[
-        Path, typer.Argument(metavar="INPUT", help="A sequence folder (with images or videos) or a nuScenes root.")
+        Path,
+        typer.Argument(
+            metavar="INPUT",
+            help="Sequence folder (images or videos), nuScenes root, .mcap file or rosbag2 folder.",
+        ),
     ],
     out: Annotated[Path, typer.Argument(metavar="OUT_SEQUENCE", help="The native sequence folder to write.")],
     strict: StrictOption = False,
@@ -30,6 +42,12 @@ def convert(
     sweeps: SweepsOption = False,
     intrinsics: IntrinsicsOption = None,
     extrinsics: ExtrinsicsOption = None,
+    calibration: CalibrationOption = None,
+    ego_motion: EgoMotionOption = None,
+    topic: TopicOption = None,
+    topics: TopicsOption = None,
+    ground_truth: GroundTruthOption = True,
+    class_map: ClassMapOption = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite an existing sequence in OUT_SEQUENCE.")] = False,
 ) -> None:
     """Write any input as a native sequence folder.
@@ -38,6 +56,7 @@ def convert(
     """
     from bevcli.cli.progress import Progress
     from bevcli.errors import OutputError
+    from bevcli.frame import facts_of
     from bevcli.sequences.native.writer import NativeWriter
     from bevcli.sequences.open import open_sequence
 
@@ -53,13 +72,19 @@ def convert(
         sweeps=sweeps,
         intrinsics=intrinsics,
         extrinsics=extrinsics,
+        calibration=calibration,
+        ego_motion_file=ego_motion,
+        topics=parse_topics(topic),
+        topics_file=topics,
+        ground_truth=ground_truth,
+        class_map=parse_class_map(class_map),
     )
     for note in sequence.notes:
         typer.echo(f"note: {note}", err=True)
     count = len(sequence.stamps)
     gaps = 0
     with (
-        NativeWriter(out, with_ego_motion=sequence.has_ego_motion, force=force) as writer,
+        NativeWriter(out, with_ego_motion=sequence.has_ego_motion, force=force, facts=facts_of(sequence)) as writer,
         Progress(count, "frames") as progress,
     ):
         for place in range(count):

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from bevcli.cli.input_options import SceneOption, SplitOption, VersionOption
+from bevcli.cli.input_options import ClassMapOption, SceneOption, SplitOption, VersionOption, parse_class_map
 
 
 def evaluate(
@@ -28,7 +28,8 @@ def evaluate(
         float | None,
         typer.Option(
             metavar="METRES",
-            help="Cut nuScenes' class ranges at this distance from the ego vehicle.",
+            help="Cut nuScenes' class ranges at this distance from the ego vehicle. Default: the model's range.",
+            show_default=False,
         ),
     ] = None,
     count_missing: Annotated[
@@ -42,6 +43,7 @@ def evaluate(
     scene: SceneOption = None,
     version: VersionOption = None,
     split: SplitOption = None,
+    class_map: ClassMapOption = None,
 ) -> None:
     """Score PREDICTIONS against GROUND_TRUTH with the nuScenes detection metrics, and maps with IoU if both have them.
 
@@ -60,6 +62,7 @@ def evaluate(
         scene=scene,
         version=version,
         split=split,
+        class_map=parse_class_map(class_map),
     )
     print(json.dumps(scores.to_dict(), indent=1) if as_json else scores.table())
     for note in scores.notes:

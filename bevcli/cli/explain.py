@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
+from bevcli.cli.input_options import DeviceOption, complete_model
+
 DEFAULT_FRAME = 10
 
 
@@ -34,6 +36,7 @@ def explain(
     model: Annotated[
         str | None,
         typer.Option(
+            autocompletion=complete_model,
             help="tiny, small, base, demo, or a FILE.toml. Default: the model that fits --weights, else demo.",
             show_default=False,
         ),
@@ -48,9 +51,7 @@ def explain(
     untrained: Annotated[
         bool, typer.Option("--untrained", help="Use random weights; every figure is labelled UNTRAINED.")
     ] = False,
-    device: Annotated[
-        Literal["auto", "cpu", "cuda"], typer.Option(help="auto takes a GPU where there is one.")
-    ] = "auto",
+    device: DeviceOption = "auto",
     scene: Annotated[
         str | None, typer.Option(help="nuScenes: the scene, such as scene-0103.", show_default=False)
     ] = None,

@@ -9,6 +9,9 @@ import typer
 
 PANEL = "Input"
 
+DeviceOption = Annotated[
+    str, typer.Option(metavar="auto|cpu|cuda|cuda:N", help="auto uses a GPU if there is one; cuda:1 is the second GPU.")
+]
 SceneOption = Annotated[str | None, typer.Option(help="Only this scene, such as scene-0103.", rich_help_panel=PANEL)]
 StrictOption = Annotated[
     bool,
@@ -49,6 +52,49 @@ ExtrinsicsOption = Annotated[
         help='JSON with the "ego_from_camera" of each camera; required with --intrinsics.', rich_help_panel=PANEL
     ),
 ]
+CalibrationOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE", help="A calibration.json that replaces the calibration of the input.", rich_help_panel=PANEL
+    ),
+]
+EgoMotionOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--ego-motion",
+        metavar="FILE",
+        help="An ego_motion.csv that replaces the ego-motion of the input.",
+        rich_help_panel=PANEL,
+    ),
+]
+TopicOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="CAMERA=/TOPIC",
+        help="ROS bags: the image topic of a camera, where it is not found. Repeatable.",
+        rich_help_panel=PANEL,
+    ),
+]
+TopicsOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE.toml",
+        help="ROS bags: topics and frames of a vehicle (docs/other-inputs.md).",
+        rich_help_panel=PANEL,
+    ),
+]
+ClassMapOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME=CLASS|FILE.toml",
+        help="Rename a class of the ground truth, such as Lorry=truck. Repeatable.",
+        rich_help_panel=PANEL,
+    ),
+]
+GroundTruthOption = Annotated[
+    bool,
+    typer.Option("--ground-truth/--no-ground-truth", help="Read the ground truth, if any.", rich_help_panel=PANEL),
+]
 FramesOption = Annotated[
     str | None,
     typer.Option(metavar="A:B", help="Frame range A:B after thinning; B is excluded.", rich_help_panel=PANEL),
@@ -68,6 +114,16 @@ StaticOption = Annotated[
     bool,
     typer.Option("--static", help="The vehicle stands still; ego_motion.csv is not needed.", rich_help_panel=PANEL),
 ]
+
+
+def complete_model(incomplete: str) -> list[str]:
+    """The known models that start with a text, for completion in a shell."""
+    from importlib import resources  # not bevcli.config, which loads PyTorch: completion must be quick
+
+    files = [file.name for file in resources.files("bevcli").joinpath("configs").iterdir()]
+    return sorted(
+        file.removesuffix(".toml") for file in files if file.endswith(".toml") and file.startswith(incomplete)
+    )
 
 
 def parse_frames(text: str | None) -> slice | None:
@@ -97,6 +153,34 @@ def parse_rate(text: str | None, *, default_hz: float | None) -> float | None:
     if not 0 < rate_hz < float("inf"):
         raise typer.BadParameter(f'"{text}" (expected frames per second, such as 2, or all)', param_hint="--rate")
     return rate_hz
+
+
+def parse_pairs(texts: list[str] | None, option: str, expected: str) -> dict[str, str]:
+    """The values of a repeated option "NAME=VALUE" as a mapping. Raises click's usage error."""
+    pairs = {}
+    for text in texts or ():
+        name, equals, value = text.partition("=")
+        if not (name and equals and value):
+            raise typer.BadParameter(f'"{text}" (expected {expected})', param_hint=option)
+        pairs[name] = value
+    return pairs
+
+
+def parse_class_map(texts: list[str] | None) -> dict[str, str]:
+    """The values of --class-map: "NAME=CLASS" or TOML files. Raises click's usage error, InputError for a file."""
+    from bevcli.sequences.files.class_names import read_class_map
+
+    files = [text for text in texts or () if text.endswith(".toml") and "=" not in text]
+    pairs = parse_pairs([text for text in texts or () if text not in files], "--class-map", "NAME=CLASS or FILE.toml")
+    merged: dict[str, str] = {}
+    for file in files:
+        merged |= read_class_map(Path(file))
+    return merged | pairs
+
+
+def parse_topics(texts: list[str] | None) -> dict[str, str]:
+    """The values of --topic by camera. Raises click's usage error."""
+    return parse_pairs(texts, "--topic", "CAMERA=/TOPIC, such as CAM_FRONT=/camera/front/image_raw")
 
 
 def ego_motion_use(*, static: bool, temporal: bool) -> Literal["required", "optional", "static"]:

@@ -19,9 +19,11 @@ from bevcli.cli.demo import demo
 from bevcli.cli.eval import evaluate
 from bevcli.cli.explain import explain
 from bevcli.cli.export import export
+from bevcli.cli.export_onnx import export_onnx
 from bevcli.cli.project_debug import project_debug
 from bevcli.cli.render import render
 from bevcli.cli.run import run
+from bevcli.cli.samples import samples
 from bevcli.cli.train import train
 from bevcli.cli.validate import validate
 from bevcli.cli.viz import viz
@@ -58,9 +60,11 @@ app.command()(demo)
 app.command("eval")(evaluate)
 app.command()(explain)
 app.command()(export)
+app.command()(export_onnx)
 app.command()(project_debug)
 app.command()(render)
 app.command()(run)
+app.command()(samples)
 app.command()(train)
 app.command()(validate)
 app.command()(viz)

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     import rich.progress
 
 LINES_ON_A_PIPE = 10  # about this many progress lines for a whole run
+SLOW_S = 2.0  # work whose units take longer also gets a line after the first one, and its pace in seconds
+LONGEST_SILENCE_S = 30.0  # between two lines on a pipe, if units are done meanwhile
 
 
 def duration(seconds: float) -> str:
@@ -40,7 +42,7 @@ class Progress:
         self.stream = sys.stderr if stream is None else stream
         self.done = 0
         self.skipped = 0
-        self.started = time.perf_counter()
+        self.started = self._printed = time.perf_counter()
         self._bar: rich.progress.Progress | None = None
 
     def __enter__(self) -> Progress:
@@ -63,6 +65,7 @@ class Progress:
             self._bar.update(self._bar.task_ids[0], completed=self.done, state=self.state())
         elif self._line_is_due(count):
             print(self.state(), file=self.stream, flush=True)
+            self._printed = time.perf_counter()
 
     def skip(self, count: int) -> None:
         """Adds units of work that were done before: they do not count for the rate."""
@@ -80,12 +83,15 @@ class Progress:
         """The progress in words, such as "3/8 frames, 0.35 per second, 14 s left"."""
         if self.done == self.skipped:
             return f"{self.done}/{self.total} {self.unit}"
-        rate = (self.done - self.skipped) / max(time.perf_counter() - self.started, 1e-9)
-        left = duration((self.total - self.done) / rate)
-        return f"{self.done}/{self.total} {self.unit}, {rate:.2f} per second, {left} left"
+        each = max(time.perf_counter() - self.started, 1e-9) / (self.done - self.skipped)
+        pace = f"{1 / each:.2f} per second" if each <= SLOW_S else f"{each:.1f} s each"
+        return f"{self.done}/{self.total} {self.unit}, {pace}, {duration((self.total - self.done) * each)} left"
 
     def _line_is_due(self, count: int) -> bool:
         step = max(1, self.total // LINES_ON_A_PIPE)
+        now = time.perf_counter()
+        if (self.done == count and now - self.started >= SLOW_S) or now - self._printed >= LONGEST_SILENCE_S:
+            return True
         return self.done == self.total or self.done // step != (self.done - count) // step
 
 

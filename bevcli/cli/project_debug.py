@@ -7,11 +7,15 @@ from typing import Annotated
 
 import typer
 
+from bevcli.cli.input_options import TopicOption, TopicsOption, parse_topics
+
 ERRORS_FOUND = 3
 
 
 def project_debug(
-    calibration: Annotated[Path, typer.Argument(help="A calibration.json, or a sequence that contains one.")],
+    calibration: Annotated[
+        Path, typer.Argument(help="A calibration.json, a sequence that contains one, or a ROS bag.")
+    ],
     sequence: Annotated[
         Path | None, typer.Option(help="A sequence folder whose images and ego-motion belong to the calibration.")
     ] = None,
@@ -20,6 +24,8 @@ def project_debug(
         Path | None,
         typer.Option(help="The output folder. Default: runs/<name>-project-debug.", show_default=False),
     ] = None,
+    topic: TopicOption = None,
+    topics: TopicsOption = None,
     json: Annotated[
         bool, typer.Option("--json", help="Print the findings and the coverage as one JSON object.")
     ] = False,
@@ -34,7 +40,8 @@ def project_debug(
     """
     from bevcli.rig.check_calibration import check_calibration
 
-    check = check_calibration(calibration, sequence, frame)
+    options = {} if not (topic or topics) else {"topics": parse_topics(topic), "topics_file": topics}
+    check = check_calibration(calibration, sequence, frame, **options)
     written = check.write(out or Path("runs") / f"{check.name}-project-debug")
     if json:
         print(check.to_json())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -9,9 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from bevcli.cli.input_options import (
+    CalibrationOption,
+    ClassMapOption,
+    DeviceOption,
+    EgoMotionOption,
     EveryOption,
     ExtrinsicsOption,
     FramesOption,
+    GroundTruthOption,
     IntrinsicsOption,
     RateOption,
     SceneOption,
@@ -19,14 +25,21 @@ from bevcli.cli.input_options import (
     StaticOption,
     StrictOption,
     SweepsOption,
+    TopicOption,
+    TopicsOption,
     VersionOption,
+    complete_model,
     ego_motion_use,
+    parse_class_map,
     parse_frames,
+    parse_pairs,
     parse_rate,
+    parse_topics,
 )
 
 if TYPE_CHECKING:
     from bevcli.frame import Frame, Prediction, Sequence
+    from bevcli.geometry.transforms import Array
     from bevcli.pipeline.model_loading import Model
 
 MODEL, OUTPUT, RECORDING = "Model", "Output", "Recording"
@@ -35,11 +48,12 @@ MODEL, OUTPUT, RECORDING = "Model", "Output", "Recording"
 def run(
     sequence: Annotated[
         Path,
-        typer.Argument(help="A sequence folder, a folder with one video per camera, or a nuScenes root."),
+        typer.Argument(help="Sequence folder (images or videos), nuScenes root, .mcap file or rosbag2 folder."),
     ],
     model: Annotated[
         str | None,
         typer.Option(
+            autocompletion=complete_model,
             help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, demo, or a FILE.toml. Default: the model that "
             "WEIGHTS fit, else demo.",
             rich_help_panel=MODEL,
@@ -60,9 +74,7 @@ def run(
             "--untrained", help="Use random weights; all outputs are labelled UNTRAINED.", rich_help_panel=MODEL
         ),
     ] = False,
-    device: Annotated[
-        Literal["auto", "cpu", "cuda"], typer.Option(help="auto uses a GPU if there is one.", rich_help_panel=MODEL)
-    ] = "auto",
+    device: DeviceOption = "auto",
     precision: Annotated[
         Literal["fp32", "bf16", "fp16"] | None,
         typer.Option(
@@ -101,6 +113,12 @@ def run(
     sweeps: SweepsOption = False,
     intrinsics: IntrinsicsOption = None,
     extrinsics: ExtrinsicsOption = None,
+    calibration: CalibrationOption = None,
+    ego_motion: EgoMotionOption = None,
+    topic: TopicOption = None,
+    topics: TopicsOption = None,
+    ground_truth: GroundTruthOption = True,
+    class_map: ClassMapOption = None,
     out: Annotated[
         Path | None, typer.Option(help="Default: runs/SEQUENCE-MODEL.", rich_help_panel=OUTPUT, show_default=False)
     ] = None,
@@ -144,6 +162,13 @@ def run(
         Literal["minimal", "standard", "full"],
         typer.Option(help="How much the recording contains.", rich_help_panel=RECORDING),
     ] = "standard",
+    images: Annotated[
+        Literal["jpeg", "av1"],
+        typer.Option(
+            help="jpeg keeps the bytes of the image files; av1 makes the recording smaller and needs bevcli[video].",
+            rich_help_panel=RECORDING,
+        ),
+    ] = "jpeg",
     bev: Annotated[
         str,
         typer.Option(help="How the BEV features are drawn: norm, pca, channel:K or none.", rich_help_panel=RECORDING),
@@ -180,7 +205,7 @@ def run(
     from bevcli.recording.options import RecordingOptions
     from bevcli.sequences.open import open_sequence
 
-    recording = RecordingOptions(record, bev, score, tuple(map(parse_probe, probe or ())), vehicle_mesh)
+    recording = RecordingOptions(record, bev, score, tuple(map(parse_probe, probe or ())), vehicle_mesh, images)
     loaded = load_model(model, weights, device=device, precision=precision, untrained=untrained)
     drive = open_sequence(
         sequence,
@@ -195,9 +220,16 @@ def run(
         sweeps=sweeps,
         intrinsics=intrinsics,
         extrinsics=extrinsics,
+        calibration=calibration,
+        ego_motion_file=ego_motion,
+        topics=parse_topics(topic),
+        topics_file=topics,
+        ground_truth=ground_truth,
+        class_map=parse_class_map(class_map),
     )
     out = Path("runs") / f"{drive.name}-{loaded.name}" if out is None else out
-    options = RunOptions(temporal, track, dict(map(parse_camera, camera or ())), recording, save_bev)
+    embeddings = parse_pairs(camera, "--camera", "NAME=MODEL_CAMERA")
+    options = RunOptions(temporal, track, embeddings, recording, save_bev)
 
     view = None
     if live:
@@ -230,6 +262,7 @@ def run(
     if signals.received() and not summary.is_complete:
         print(f"stopped; `--resume` goes on with frame {summary.frames + 1} of {len(drive.stamps)}", file=sys.stderr)
         raise typer.Exit(signals.exit_code)
+    print(f"next     bevcli viz {shlex.quote(str(out))}")
 
 
 def notes(model: Model, drive: Sequence, *, live: bool = False) -> list[str]:
@@ -246,9 +279,31 @@ def notes(model: Model, drive: Sequence, *, live: bool = False) -> list[str]:
         found.append(
             f"model {model.name} looks ahead: the viewer shows a frame when {config.later_frames} more are read"
         )
+    tilt = tilt_note(drive.rig.ego_from_bev, bundled=model.bundled)
+    if tilt:
+        found.append(tilt)
     if model.bundled:
         found.append("these weights were trained on rendered streets, not on the real world (docs/model-card.md)")
     return found
+
+
+def tilt_note(ego_from_bev: Array, *, bundled: bool) -> str | None:
+    """What to tell of a bev frame that is tilted more than the one that the weights were trained with.
+
+    bundled: whether the weights are those of the package, which were trained with a level frame; published ones were
+    trained with nuScenes' LIDAR_TOP, which is tilted by up to 3°.
+    """
+    import numpy as np
+
+    tilt_deg = float(np.degrees(np.arccos(np.clip(ego_from_bev[2, 2], -1, 1))))
+    if tilt_deg <= (1.0 if bundled else 4.0):
+        return None
+    trained = "a level one" if bundled else "one tilted by up to 3°"
+    height = 30 * np.tan(np.radians(tilt_deg))
+    return (
+        f"the bev frame is tilted by {tilt_deg:.1f}°, but the weights were trained with {trained}: boxes 30 m away may "
+        f'be {height:.1f} m too high or too low (level "ego_from_bev" in the calibration)'
+    )
 
 
 def warnings(frame: Frame, prediction: Prediction) -> list[str]:
@@ -271,11 +326,3 @@ def parse_probe(text: str) -> tuple[float, float]:
             f'"{text}" is not a position (expected X,Y in metres, such as 10,-2.5)', param_hint="--probe"
         ) from None
     return x, y
-
-
-def parse_camera(text: str) -> tuple[str, str]:
-    """ "NAME=MODEL_CAMERA" -> both names. Raises click's usage error."""
-    name, equals, embedding = text.partition("=")
-    if not (name and equals and embedding):
-        raise typer.BadParameter(f'"{text}" is not an assignment (expected NAME=MODEL_CAMERA)', param_hint="--camera")
-    return name, embedding

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import signal
+import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any
 
 import typer
 
+from bevcli.cli.input_options import DeviceOption, complete_model
+
 
 def train(
-    config: Annotated[str, typer.Argument(help="A model name or a FILE.toml. Its training table holds the settings.")],
+    config: Annotated[
+        str,
+        typer.Argument(
+            autocompletion=complete_model, help="A model name or a FILE.toml. Its training table holds the settings."
+        ),
+    ],
     data: Annotated[
         list[Path] | None,
         typer.Option(metavar="DIR", help="A sequence with ground truth (see bevcli convert). Repeatable."),
@@ -35,13 +44,24 @@ def train(
         int | None,
         typer.Option(min=1, help="Number of steps. Default: as in the training table.", show_default=False),
     ] = None,
+    held_out: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            help="Hold out the last N drives for evaluation; 0 evaluates on the training drives. Default: as in the "
+            "training table.",
+            metavar="N",
+            show_default=False,
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
-    device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="auto uses a GPU if there is one.")] = "auto",
+    device: DeviceOption = "auto",
 ) -> None:
     """Train a model; write its weights, checkpoints and learning curves.
 
-    The last drives are held out for evaluation (`held_out` in the training table). An interrupted training continues
-    with --resume; on a CPU the result is the same. Run weights.safetensors with `bevcli run --weights`.
+    The last drives are held out for evaluation (--held-out). Ctrl-C and SIGTERM write a checkpoint after the current
+    step; --resume continues from it, on a CPU with the same result. Run weights.safetensors with
+    `bevcli run --weights`.
 
     `torchrun --nproc-per-node N -m bevcli train …` trains with N processes, one for each GPU or CPU core.
     """
@@ -63,6 +83,7 @@ def train(
         out=out,
         weights=weights,
         steps=steps,
+        held_out=held_out,
         seed=seed,
         resume=resume,
     )
@@ -72,7 +93,45 @@ def train(
             progress.message(
                 f"drives: {len(job.drives)} to train on, {len(job.held_out)} to evaluate on; output: {job.out}"
             )
-            trainer.run(progress.advance, lambda step, scores: progress.message(f"step {step}: {scores}"))
+            with StopRequest() as request:
+                trainer.run(progress.advance, lambda step, scores: progress.message(f"step {step}: {scores}"), request)
+            if trainer.done < job.config.steps:
+                progress.message(f"stopped after step {trainer.done}: continue with --resume --out {job.out}")
+        if trainer.done < job.config.steps:
+            raise typer.Exit(request.exit_code)
     else:
-        trainer.run()
+        with StopRequest() as request:
+            trainer.run(stop=request)
     leave_process_group(job.group)
+
+
+class StopRequest:
+    """While it is entered, Ctrl-C and SIGTERM only note that the training should stop; a second Ctrl-C ends it at once.
+
+    Calling it tells whether it should stop.
+
+    Attributes:
+        exit_code: of the process, 128 + the number of the signal.
+    """
+
+    def __init__(self) -> None:
+        self.exit_code = 0
+        self._earlier: dict[int, Any] = {}
+
+    def __enter__(self) -> StopRequest:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._earlier[number] = signal.signal(number, self._note)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for number, handler in self._earlier.items():
+            signal.signal(number, handler)
+
+    def __call__(self) -> bool:
+        return self.exit_code != 0
+
+    def _note(self, number: int, frame: object) -> None:
+        if self.exit_code:
+            raise KeyboardInterrupt
+        self.exit_code = 128 + number
+        print("stopping after this step (Ctrl-C again stops at once)", file=sys.stderr, flush=True)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
+from bevcli.cli.input_options import DeviceOption, complete_model
+
 
 def validate(
-    model: Annotated[str, typer.Argument(help="A model name or a FILE.toml.")],
+    model: Annotated[str, typer.Argument(autocompletion=complete_model, help="A model name or a FILE.toml.")],
     weights: Annotated[
         Path | None,
         typer.Option(
@@ -39,7 +41,7 @@ def validate(
         bool, typer.Option("--tracking", help="Also run the tracker and score its tracks: AMOTA, identity switches.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")] = False,
-    device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="auto uses a GPU if there is one.")] = "auto",
+    device: DeviceOption = "auto",
 ) -> None:
     """Score a model on drives with ground truth, all drives together.
 

@@ -9,7 +9,7 @@ import typer
 
 
 def viz(
-    recording: Annotated[Path, typer.Argument(help="A recording (.rrd) that `bevcli run` wrote.")],
+    recording: Annotated[Path, typer.Argument(help="A recording (.rrd), or the output folder of `bevcli run`.")],
     web: Annotated[bool, typer.Option("--web", help="Show it in the browser, even if there is a display.")] = False,
     host: Annotated[
         str, typer.Option(help="Address that the web viewer listens on. 0.0.0.0 allows access from other machines.")
@@ -18,7 +18,7 @@ def viz(
         int, typer.Option(help="Port of the web viewer. If it is in use, the next free one is taken.")
     ] = 9090,
     screenshot: Annotated[
-        Path | None, typer.Option(metavar="OUT.png", help="Write a screenshot of the viewer. Needs no screen.")
+        Path | None, typer.Option(metavar="OUT.png|.jpg", help="Write a screenshot of the viewer. Needs no screen.")
     ] = None,
     frame: Annotated[int | None, typer.Option(help="Frame index for --screenshot. Default: the first frame.")] = None,
     summary: Annotated[
@@ -26,7 +26,10 @@ def viz(
     ] = False,
     video: Annotated[
         Path | None,
-        typer.Option(metavar="OUT.mp4|.webm", help="Write a video (VP9) of all cameras and the BEV, with boxes."),
+        typer.Option(
+            metavar="OUT.mp4|.webm",
+            help="Write a video of all cameras and the BEV, with boxes: H.264 if PyAV is installed, else VP9.",
+        ),
     ] = None,
     export: Annotated[
         Path | None, typer.Option(metavar="BOXES.csv|.json", help="Write the shown boxes in the world frame.")
@@ -37,10 +40,11 @@ def viz(
     The viewer opens if none of --summary, --screenshot, --video and --export is given: in a window if there is a
     display, else in the browser at an address that only this machine can reach. Ctrl-C closes it.
     """
-    from bevcli.viewer.recording_file import open_recording
+    from bevcli.viewer.recording_file import open_recording, recording_in
 
     if frame is not None and screenshot is None:
         raise typer.BadParameter("is only valid with --screenshot", param_hint="--frame")
+    recording = recording_in(recording)
     with open_recording(recording) as file:
         if file.repaired:
             typer.echo(f"note: {recording} is incomplete (its run was stopped or is still going)")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -20,6 +20,7 @@ from bevcli.evaluation.tracking.config import TrackingConfig
 from bevcli.evaluation.tracking.report import tracking_table, tracking_to_dict
 from bevcli.evaluation.tracking.scoring import TrackingScores, evaluate_tracking
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
+from bevcli.sequences.files.class_names import count_other_classes, other_classes_note
 from bevcli.sequences.nuscenes.choice import NuScenesChoice
 
 Config = TypeVar("Config", DetectionConfig, TrackingConfig)
@@ -81,6 +82,7 @@ def evaluate(
     scene: str | None = None,
     version: str | None = None,
     split: str | None = None,
+    class_map: Mapping[str, str] | None = None,
 ) -> Scores:
     """Score predictions with the nuScenes detection metrics, and maps with IoU where both sides have them.
 
@@ -88,13 +90,15 @@ def evaluate(
         predictions: a predictions.json, the folder of a run, or a nuScenes submission (results_nusc.json).
         ground_truth: a ground_truth.json, a sequence folder that contains one, or a nuScenes root.
         max_range: distance from the ego vehicle beyond which nothing is scored, metres. Default: nuScenes' range of
-            each class, or no limit where no frame has an ego pose, as in the devkit.
+            each class, cut where the model's BEV grid ends if the predictions state it; no limit where no frame has an
+            ego pose, as in the devkit.
         count_missing: whether ground-truth frames without a prediction count as missed; they are left out by default.
         tracking: whether to score tracks, too: AMOTA and the metrics that come with it. Predictions and ground truth
             need identities ("instance").
         scene: score only this scene of the ground truth.
         version: of a nuScenes root, such as "v1.0-mini".
         split: of a nuScenes root, such as "val".
+        class_map: class names in the files -> the ten classes, such as {"Lorry": "truck"}.
 
     Returns:
         The scores. Predictions without attributes get them from class and speed.
@@ -104,19 +108,26 @@ def evaluate(
             identities.
         ConfigError: max_range is not positive.
     """
-    truth = open_ground_truth(Path(ground_truth), NuScenesChoice(version, scene, split))
-    found = open_predictions(Path(predictions))
+    truth = open_ground_truth(Path(ground_truth), NuScenesChoice(version, scene, split), class_map)
+    found = open_predictions(Path(predictions), class_map)
     pairs = pair_frames(found.boxes, truth.boxes, count_missing=count_missing)
     pairs = without_cycles_in_racks(pairs, truth.bicycle_racks)
-    config = _config(DetectionConfig(), pairs, max_range)
+    model_range = None if max_range is not None else _model_range_m(found, pairs)
+    limit = max_range if model_range is None else model_range
+    config = _config(DetectionConfig(), pairs, limit)
     detection = evaluate_detections(_with_attributes(pairs.predictions), pairs.ground_truth, config, pairs.ego_xy)
     segmentation, map_notes = _score_maps(found, truth, pairs)
-    notes = [*pairs.notes, *map_notes]
+    notes = [*pairs.notes, *map_notes, *_other_class_notes(pairs)]
     tracks, track_notes = None, list[str]()
     if tracking:
-        tracks, track_notes = _score_tracks(pairs, _config(TrackingConfig(), pairs, max_range))
+        tracks, track_notes = _score_tracks(pairs, _config(TrackingConfig(), pairs, limit))
     if max_range is None and not pairs.ego_pose_known:
         notes.append('no frame has "world_from_ego": class ranges are not applied (--max-range M applies them)')
+    if model_range is not None:
+        notes.append(
+            f"nothing beyond {model_range:g} m is scored: the BEV grid of the model that made the predictions ends "
+            "there (--max-range M sets another limit)"
+        )
     return Scores(pairs, config, detection, segmentation, tracks, (*notes, *_detection_notes(detection), *track_notes))
 
 
@@ -174,6 +185,23 @@ def _score_maps(
     classes = [name for name in true.classes if name in found.classes]
     maps = ((found.load(one), true.load(other)) for one, other in indices)
     return evaluate_segmentation(maps, classes), notes
+
+
+def _model_range_m(predictions: ScoredInput, pairs: FramePairs) -> float | None:
+    """Distance to the end of the model's BEV grid, metres; None if unknown, not applicable, or beyond all ranges."""
+    stated = predictions.boxes.extras.get("range_m")
+    farthest = max(DetectionConfig().class_ranges_m.values())
+    if not pairs.ego_pose_known or not isinstance(stated, (int, float)) or not 0 < stated < farthest:
+        return None
+    return float(stated)
+
+
+def _other_class_notes(pairs: FramePairs) -> Iterator[str]:
+    """Name the classes on each side that are not scored."""
+    for side, frames in (("the ground truth", pairs.ground_truth), ("the predictions", pairs.predictions)):
+        others = count_other_classes(frames)
+        if others:
+            yield other_classes_note(others, side)
 
 
 def _detection_notes(detection: DetectionScores) -> list[str]:

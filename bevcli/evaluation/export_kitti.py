@@ -70,7 +70,8 @@ def kitti_labels(boxes_ego: Boxes3D, camera: Camera) -> list[str]:
         rectangle, truncated = seen
         length, width, height = boxes_ego.sizes_lwh[place]
         numbers = [alphas[place], *rectangle, height, width, length, *locations[place], rotations_y[place]]
-        label = f"{KITTI_TYPES[str(boxes_ego.classes[place])]} {truncated:.2f} {OCCLUSION_UNKNOWN} "
+        kind = KITTI_TYPES.get(str(boxes_ego.classes[place]), "Misc")
+        label = f"{kind} {truncated:.2f} {OCCLUSION_UNKNOWN} "
         score = "" if boxes_ego.scores is None else f" {boxes_ego.scores[place]:.4f}"
         lines.append(label + " ".join(f"{number:.3f}" for number in numbers) + score)
     return lines

@@ -15,6 +15,7 @@ from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose, apply, rigid, rotation_about_z
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes
+from bevcli.sequences.files.class_names import ClassNames
 from bevcli.sequences.files.map_folder import MapFolder, open_maps
 from bevcli.sequences.nuscenes.cache import open_index
 from bevcli.sequences.nuscenes.choice import NuScenesChoice, chosen_scenes, is_nuscenes_root, tables_of
@@ -36,13 +37,14 @@ class ScoredInput:
     bicycle_racks: Mapping[str, Boxes3D] = field(default_factory=dict)
 
 
-def open_predictions(path: Path) -> ScoredInput:
+def open_predictions(path: Path, class_map: Mapping[str, str] | None = None) -> ScoredInput:
     """Read a boxes file with scores, the predictions.json in the folder of a run, or a nuScenes submission.
 
-    Maps are in segmentation/ next to the file. Raises InputError where it is missing or wrong, or boxes have no scores.
+    class_map: see `open_ground_truth`. Maps are in segmentation/ next to the file. Raises InputError where it is
+    missing or wrong, or boxes have no scores.
     """
     file = path / "predictions.json" if path.is_dir() else path
-    boxes = read_submission(file) if is_submission(file) else read_boxes(file)
+    boxes = read_submission(file) if is_submission(file) else read_boxes(file, ClassNames(class_map))
     for frame in boxes.frames:
         if len(frame.boxes) and frame.boxes.scores is None:
             raise InputError(
@@ -52,16 +54,19 @@ def open_predictions(path: Path) -> ScoredInput:
     return ScoredInput(boxes, _maps_next_to(file, "segmentation"))
 
 
-def open_ground_truth(path: Path, choice: NuScenesChoice = NuScenesChoice()) -> ScoredInput:
+def open_ground_truth(
+    path: Path, choice: NuScenesChoice = NuScenesChoice(), class_map: Mapping[str, str] | None = None
+) -> ScoredInput:
     """Read a boxes file, the ground_truth.json in a sequence folder, or a nuScenes root.
 
     Maps are in ground_truth_map/ next to the file. choice: the part of a nuScenes root; its scene also
-    selects frames of a boxes file. Raises InputError where the ground truth is missing or wrong.
+    selects frames of a boxes file. class_map: names in a boxes file -> the ten classes. Raises
+    InputError where the ground truth is missing or wrong.
     """
     if path.is_dir() and is_nuscenes_root(path):
         return _open_nuscenes(path, choice)
     file = path / "ground_truth.json" if path.is_dir() else path
-    boxes = read_boxes(file)
+    boxes = read_boxes(file, ClassNames(class_map))
     if choice.scene is not None:
         kept = tuple(frame for frame in boxes.frames if frame.stamp.scene == choice.scene)
         if not kept:

@@ -37,6 +37,11 @@ class BevGrid:
         y0, y1 = self.y_range_m
         return (x1 - x0) / self.columns, (y1 - y0) / self.rows
 
+    @property
+    def nearest_side_m(self) -> float:
+        """Distance from the origin of the bev frame to the nearest side of the grid, metres."""
+        return min(abs(end) for end in (*self.x_range_m, *self.y_range_m))
+
     def cell_centers(self) -> Array:
         """(rows, columns, 2) x and y of the cells' centres, metres."""
         size_x, size_y = self.cell_size_m

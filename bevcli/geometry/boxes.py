@@ -171,5 +171,9 @@ def attributes_by_speed(boxes: Boxes3D) -> NDArray[np.str_]:
     Classes without attributes get "". A box with unknown velocity counts as standing.
     """
     moving = np.linalg.norm(boxes.velocities, axis=1) > MOVING_MPS
-    names = [_MOVING_AND_STILL[str(name)][0 if fast else 1] for name, fast in zip(boxes.classes, moving, strict=True)]
+    none = ("", "")
+    names = [
+        _MOVING_AND_STILL.get(str(name), none)[0 if fast else 1]
+        for name, fast in zip(boxes.classes, moving, strict=True)
+    ]
     return np.array(names, dtype=np.str_)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,7 @@ class EgoMotion:
         accelerations: (T, 3) m/s² with gravity, ego frame.
         angular_rates: (T, 3) rad/s, ego frame.
         velocities: (T, 3) m/s, ego frame.
+        velocities_are_stated: whether they come from the input; if not, they are derived from the poses.
     """
 
     timestamps_ns: NDArray[np.int64]
@@ -48,6 +49,17 @@ class EgoMotion:
     accelerations: Array
     angular_rates: Array
     velocities: Array
+    velocities_are_stated: bool = field(default=True, kw_only=True)
+
+    @property
+    def first_ns(self) -> int:
+        """Time of the first pose."""
+        return int(self.timestamps_ns[0])
+
+    @property
+    def last_ns(self) -> int:
+        """Time of the last pose."""
+        return int(self.timestamps_ns[-1])
 
     def pose_at(self, timestamp_ns: int) -> Pose:
         """world_from_ego at a time. The pose of an exactly matching row is returned unchanged.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -80,7 +81,7 @@ def load_model(
             None takes the model that the weights fit, or "demo" where there are no weights.
         weights: an official .pth as published, or a .safetensors. None takes the weights of the package, which only
             "demo" has.
-        device: "auto" takes a GPU where there is one, else the CPU; or "cpu", "cuda".
+        device: "auto" takes a GPU where there is one, else the CPU; or "cpu", "cuda", "cuda:1".
         precision: "fp32", "bf16" or "fp16". None takes fp32 on a CPU and bf16 on a GPU.
         untrained: use random weights, always the same ones.
 
@@ -129,16 +130,22 @@ def _model_of(weights: Path) -> str:
 
 
 def choose_device(name: str | torch.device) -> torch.device:
-    """The device of a name: "auto" (a GPU where there is one), "cpu" or "cuda". Raises BevcliError."""
+    """The device of a name: "auto" (a GPU where there is one), "cpu", "cuda" or "cuda:N". Raises BevcliError."""
     if isinstance(name, torch.device):
         return name
-    if name not in ("auto", "cpu", "cuda"):
-        raise BevcliError(f'--device {name}: unknown device (expected "auto", "cpu" or "cuda")')
+    numbered = re.fullmatch(r"cuda:(\d+)", name)
+    if name not in ("auto", "cpu", "cuda") and not numbered:
+        raise BevcliError(f'--device {name}: unknown device (expected "auto", "cpu", "cuda" or "cuda:N")')
     available = torch.cuda.is_available()
-    if name == "cuda" and not available:
+    if name.startswith("cuda") and not available:
         raise BevcliError(
-            "--device cuda: PyTorch sees no CUDA GPU here (use --device cpu, or install a CUDA build of torch)"
+            f"--device {name}: PyTorch sees no CUDA GPU here (use --device cpu, or install a CUDA build of torch)"
         )
+    if numbered:
+        count = torch.cuda.device_count()
+        if int(numbered[1]) >= count:
+            raise BevcliError(f"--device {name}: there is no such GPU (found {count}: cuda:0 to cuda:{count - 1})")
+        return torch.device(name)
     return torch.device("cuda" if available and name != "cpu" else "cpu")
 
 

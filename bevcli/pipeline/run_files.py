@@ -71,7 +71,12 @@ class RunFiles:
             self._folder.add(out / name)
         past = None if resume is None else resume.recording
         recording = Recording(out / RECORDING, sequence, model, self._options, self._live, past)
-        extras = {"model": model.name, "untrained": model.untrained, "classes": list(model.config.classes)}
+        extras = {
+            "model": model.name,
+            "untrained": model.untrained,
+            "classes": list(model.config.classes),
+            "range_m": model.config.bev_grid.nearest_side_m,
+        }
         boxes_at, tracks_at = (None, None) if resume is None else (resume.predictions, resume.tracks)
         boxes = BoxesWriter(out / PREDICTIONS, self._reference, extras, resume_at=boxes_at)
         with self._stack:  # closes what is open if the next one cannot be opened

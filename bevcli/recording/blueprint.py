@@ -1,37 +1,67 @@
-"""The layout of a recording in the viewer: cameras above and below; scene, BEV, curves and events in the middle."""
+"""The layout of a recording in the viewer: cameras above and below scene and BEV; curves and texts to the right."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import rerun as rr
 import rerun.blueprint as rrb
 
+from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.cameras import CameraRig
 from bevcli.recording import entities
 from bevcli.recording.camera_layout import camera_rows
+from bevcli.recording.colors import BACKGROUND
+from bevcli.recording.legend import legend_size
 
 HIDDEN = rrb.EntityBehavior(visible=False)
 EYE_M, LOOK_AT_M = (-15.0, 0.0, 10.0), (8.0, 0.0, 0.0)  # in the ego frame: behind and above, looking ahead
-BACKGROUND = [18, 20, 25]
-VIEW_MARGIN_M = 36.0  # the BEV view first shows this much around the vehicle
+VIEW_MARGIN_M = 36.0  # the BEV view first shows this much around the vehicle, or the grid if it is smaller
+WINDOW = (1920, 960)  # pixels of a window that the views fill; in others, the images get thin black borders
+TITLE_HEIGHT = 24  # pixels of a view's title
+TEXTS_SHARE = 0.23  # of the window's width, for curves and texts
+LARGEST_CAMERAS_SHARE = 0.62  # of the window's height, for all rows of cameras
+MAP_ZOOM = 17.0
 
 
-def recording_blueprint(rig: CameraRig, note: str = "", probes: bool = False) -> rrb.Blueprint:
-    """The layout for a rig.
+@dataclass(frozen=True)
+class LayoutFacts:
+    """What the layout depends on, besides the rig.
 
-    note: is added to the titles of the main views ("untrained weights"). probes: whether probes are shown at first.
+    Attributes:
+        note: added to the titles of the main views, such as "untrained weights"; "" for none.
+        probes: whether probes are shown at first.
+        segmentation: whether the model predicts a map; then it lies on the ground, and the BEV features are hidden.
+        rate_hz: frames per second of the drive.
+        on_earth: whether there is a street map view.
+        legend_entries: number of entries of the legend.
+        grid: of the model, None if unknown.
     """
-    titled = f" ({note})" if note else ""
-    middle = rrb.Horizontal(_scene(rig, titled), _bev_tabs(titled), _curves(), column_shares=[5, 4, 3])
+
+    note: str = ""
+    probes: bool = False
+    segmentation: bool = False
+    rate_hz: float = 2.0
+    on_earth: bool = False
+    legend_entries: int = 0
+    grid: BevGrid | None = None
+
+
+def recording_blueprint(rig: CameraRig, facts: LayoutFacts) -> rrb.Blueprint:
+    """The layout for a rig."""
+    titled = f" ({facts.note})" if facts.note else ""
+    middle = rrb.Horizontal(_scene(rig, titled, facts), _bev_tabs(titled, facts), column_shares=[5, 3])
     rows = [
-        rrb.Horizontal(*(_camera(rig, name, probes=probes) for name in row), name="cameras") for row in camera_rows(rig)
+        rrb.Horizontal(*(_camera(rig, name, probes=facts.probes) for name in row), name="cameras")
+        for row in camera_rows(rig)
     ]
-    if len(rows) == 1:
-        layout = rrb.Vertical(rows[0], middle, row_shares=[2, 4])
-    else:
-        layout = rrb.Vertical(rows[0], middle, rows[1], row_shares=[3, 5, 3])
+    heights = camera_row_shares(rig)
+    shares = [*heights[:1], 1 - sum(heights), *heights[1:]]
+    views = rrb.Vertical(*rows[:1], middle, *rows[1:], row_shares=shares)
     return rrb.Blueprint(
-        layout,
-        rrb.TimePanel(state="collapsed", timeline=entities.TIME_TIMELINE),
+        rrb.Horizontal(views, _texts(facts), column_shares=[1 - TEXTS_SHARE, TEXTS_SHARE]),
+        # Playback of "time" runs at the drive's own speed; `fps` is that of the timeline "frame".
+        rrb.TimePanel(state="collapsed", timeline=entities.TIME_TIMELINE, fps=facts.rate_hz),
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
         auto_views=False,
@@ -39,53 +69,94 @@ def recording_blueprint(rig: CameraRig, note: str = "", probes: bool = False) ->
     )
 
 
-def _scene(rig: CameraRig, titled: str) -> rrb.Spatial3DView:
+def camera_row_shares(rig: CameraRig) -> list[float]:
+    """The share of the window's height of each row of cameras, so that the images fill their views."""
+    width = WINDOW[0] * (1 - TEXTS_SHARE)
+    shares = []
+    for row in camera_rows(rig):
+        aspect = min(rig[name].width / rig[name].height for name in row)
+        shares.append((width / len(row) / aspect + TITLE_HEIGHT) / WINDOW[1])
+    largest = LARGEST_CAMERAS_SHARE / len(shares) if len(shares) == 1 else LARGEST_CAMERAS_SHARE
+    factor = min(1.0, largest / sum(shares))
+    return [share * factor for share in shares]
+
+
+def _scene(rig: CameraRig, titled: str, facts: LayoutFacts) -> rrb.Spatial3DView:
     drawn_in_images = ("boxes", "ground_truth", "pillars", "probes")
     excluded = [f"- /{entities.overlay(name, kind)}/**" for name in rig.names for kind in drawn_in_images]
-    from_start = [
-        rr.VisibleTimeRange(timeline, start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative())
-        for timeline in (entities.TIME_TIMELINE, entities.FRAME_TIMELINE)
-    ]
+    hidden = [entities.PILLARS, *([entities.BEV_ON_GROUND] if facts.segmentation else [])]
     return rrb.Spatial3DView(
         origin=entities.EGO,  # drawn in the ego frame, so the view follows the vehicle
         contents=[f"/{entities.WORLD}/**", *excluded],
         name=f"3D scene{titled}",
-        background=BACKGROUND,
+        background=list(BACKGROUND),
         line_grid=False,
         eye_controls=rrb.EyeControls3D(position=EYE_M, look_target=LOOK_AT_M, eye_up=(0, 0, 1)),
         overrides={
-            entities.TRAJECTORY: [rrb.VisibleTimeRanges(from_start)],
-            entities.PILLARS: [HIDDEN],
+            entities.TRAJECTORY: [rrb.VisibleTimeRanges(_from_start())],
+            **{entity: [HIDDEN] for entity in hidden},
         },
     )
 
 
-def _bev_tabs(titled: str) -> rrb.Tabs:
-    around = rrb.VisualBounds2D(x_range=[-VIEW_MARGIN_M, VIEW_MARGIN_M], y_range=[-VIEW_MARGIN_M, VIEW_MARGIN_M])
+def _from_start() -> list[rr.VisibleTimeRange]:
+    return [
+        rr.VisibleTimeRange(timeline, start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative())
+        for timeline in (entities.TIME_TIMELINE, entities.FRAME_TIMELINE)
+    ]
+
+
+def _bev_tabs(titled: str, facts: LayoutFacts) -> rrb.Tabs:
+    grid = facts.grid
+    margin = VIEW_MARGIN_M if grid is None else min(VIEW_MARGIN_M, *map(abs, (*grid.x_range_m, *grid.y_range_m)))
+    around = rrb.VisualBounds2D(x_range=[-margin, margin], y_range=[-margin, margin])
 
     def view(name: str, *without: str) -> rrb.Spatial2DView:
         contents = [f"/{entities.BEV}/**", *(f"- /{entity}/**" for entity in without)]
         return rrb.Spatial2DView(
-            origin=entities.BEV, contents=contents, name=name, background=BACKGROUND, visual_bounds=around
+            origin=entities.BEV, contents=contents, name=name, background=list(BACKGROUND), visual_bounds=around
         )
 
     features, history, segmentation = entities.BEV_FEATURES, entities.BEV_HISTORY, entities.BEV_SEGMENTATION
-    return rrb.Tabs(
+    views: list[rrb.View] = [
         view(f"BEV{titled}", features, history),
         view("BEV features", history, segmentation),
         view("History weight", features, segmentation),
-        active_tab=0,
+    ]
+    return rrb.Tabs(*views, *([_street_map()] if facts.on_earth else []), active_tab=0)
+
+
+def _street_map() -> rrb.MapView:
+    return rrb.MapView(
+        origin=entities.MAP,
+        name="Street map",
+        zoom=MAP_ZOOM,
+        background=rrb.MapProvider.OpenStreetMap,
+        overrides={entities.MAP_ROUTE: [rrb.VisibleTimeRanges(_from_start())]},
     )
 
 
-def _curves() -> rrb.Vertical:
-    legend = rrb.PlotLegend(rrb.Corner2D.LeftTop)
-    times = rrb.TimeSeriesView(origin=entities.STAGE_CURVES, name="Seconds per stage", plot_legend=legend)
-    counts = rrb.TimeSeriesView(origin=entities.BOX_CURVES, name="Boxes per class", plot_legend=legend)
+def _texts(facts: LayoutFacts) -> rrb.Vertical:
+    corner = rrb.PlotLegend(rrb.Corner2D.LeftTop)
+    times = rrb.TimeSeriesView(origin=entities.STAGE_CURVES, name="Seconds per stage", plot_legend=corner)
+    counts = rrb.TimeSeriesView(origin=entities.BOX_CURVES, name="Boxes per class", plot_legend=corner)
+    speed = rrb.TimeSeriesView(origin=entities.SPEED_CURVE, name="Speed", plot_legend=corner)
     columns = rrb.TextLogColumns(timeline_columns=[], text_log_columns=["loglevel", "body"])
     events = rrb.TextLogView(origin=entities.EVENTS, name="Events", columns=columns)
     about = rrb.TextDocumentView(origin=entities.RUN, name="About")
-    return rrb.Vertical(rrb.Tabs(times, counts, active_tab=0), rrb.Tabs(events, about, active_tab=0), row_shares=[3, 2])
+    width, height = legend_size(facts.legend_entries)
+    legend = rrb.Spatial2DView(
+        origin=entities.LEGEND,
+        name="Legend",
+        background=list(BACKGROUND),
+        visual_bounds=rrb.VisualBounds2D(x_range=[0, width], y_range=[0, height]),
+    )
+    return rrb.Vertical(
+        rrb.Tabs(speed, counts, times, active_tab=0),
+        legend,
+        rrb.Tabs(events, about, active_tab=0),
+        row_shares=[3, 3, 4],
+    )
 
 
 def _camera(rig: CameraRig, name: str, *, probes: bool) -> rrb.Spatial2DView:
@@ -94,7 +165,7 @@ def _camera(rig: CameraRig, name: str, *, probes: bool) -> rrb.Spatial2DView:
     return rrb.Spatial2DView(
         origin=entities.camera(name),
         name=name,
-        background=BACKGROUND,
+        background=list(BACKGROUND),
         visual_bounds=rrb.VisualBounds2D(x_range=[0, camera.width], y_range=[0, camera.height]),
         overrides={entities.overlay(name, kind): HIDDEN for kind in hidden},
     )

@@ -24,19 +24,23 @@ CLASS_COLORS: dict[str, Color] = {
     "traffic_cone": (245, 222, 90),
 }
 GROUND_TRUTH_COLOR: Color = (235, 238, 245)
+OTHER_COLOR: Color = (128, 132, 140)  # ground truth of a class that is not among the model's
 MISSED_COLOR: Color = (255, 45, 85)
 FALSE_COLOR: Color = (255, 45, 85)
 EGO_COLOR: Color = (90, 200, 250)
 STAGE_COLORS: tuple[Color, ...] = (
     (96, 165, 255), (255, 158, 44), (70, 222, 190), (240, 108, 190), (245, 222, 90), (178, 130, 255), (186, 222, 92),
 )  # fmt: skip
+DUPLICATE_COLOR: Color = (150, 156, 170)
 RING_COLOR: Color = (92, 98, 112)
+# Dark and hardly coloured, so that nothing on a map looks like a box.
 MAP_COLORS: dict[str, Color] = {
-    "drivable_road": (62, 70, 84),
-    "lane_boundary": (235, 235, 225),
-    "pedestrian_crossing": (120, 150, 205),
-    "vehicle": (255, 158, 44),
+    "drivable_road": (58, 64, 75),
+    "lane_boundary": (112, 112, 100),
+    "pedestrian_crossing": (86, 76, 104),
+    "vehicle": (44, 84, 112),
 }
+BACKGROUND: Color = (18, 20, 25)
 
 
 def class_color(name: str, index: int) -> Color:

@@ -1,7 +1,8 @@
 """The entity paths of a recording. Writer, reader and blueprint share them.
 
 `world` is the sequence's world frame, moved so that the first frame's ego position is its origin (the viewer computes
-in float32). `bev` is a flat image of the bev frame in metres: x to the right, -y down.
+in float32). `bev` is a flat image of the bev frame in metres: x to the right, -y down. `map` holds latitudes and
+longitudes, where the drive states its place on Earth.
 """
 
 from __future__ import annotations
@@ -11,12 +12,16 @@ EGO = "world/ego"
 VEHICLE = "world/ego/vehicle"
 RANGE_RINGS = "world/ego/range_rings"
 BEV_ON_GROUND = "world/ego/bev_map"
+SEGMENTATION_ON_GROUND = "world/ego/segmentation"
+SPEED = "world/ego/speed"
 PILLARS = "world/ego/pillars"
 PROBES = "world/ego/probes"
 TRAJECTORY = "world/trajectory"
 BOXES = "world/boxes"
 VELOCITY = "world/boxes/velocity"
 FALSE_BOXES = "world/boxes/false"
+DUPLICATES = "world/boxes/duplicate"
+TRACKS = "world/tracks"
 GROUND_TRUTH = "world/ground_truth"
 MISSED = "world/ground_truth/missed"
 
@@ -29,12 +34,21 @@ BEV_VEHICLE = "bev/vehicle"
 BEV_BOXES = "bev/boxes"
 BEV_VELOCITY = "bev/boxes/velocity"
 BEV_FALSE = "bev/boxes/false"
+BEV_DUPLICATES = "bev/boxes/duplicate"
+BEV_TRACKS = "bev/tracks"
 BEV_GROUND_TRUTH = "bev/ground_truth"
 BEV_MISSED = "bev/ground_truth/missed"
 BEV_PROBES = "bev/probes"
 
+MAP = "map"
+MAP_EGO = "map/ego"
+MAP_ROUTE = "map/route"
+MAP_BOXES = "map/boxes"
+
 STAGE_CURVES = "curves/time_per_stage"
 BOX_CURVES = "curves/boxes_per_class"
+SPEED_CURVE = "curves/speed"
+LEGEND = "legend"
 EVENTS = "events"
 RUN = "run"
 
@@ -50,6 +64,11 @@ def camera(name: str) -> str:
 def image(name: str) -> str:
     """The entity of a camera's image."""
     return f"{camera(name)}/picture"
+
+
+def track(class_name: str, identity: str) -> str:
+    """The entity of a track, such as "world/tracks/car_12"."""
+    return f"{TRACKS}/{class_name}_{identity}"
 
 
 def overlay(name: str, kind: str) -> str:

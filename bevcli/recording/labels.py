@@ -18,11 +18,13 @@ LETTER_WIDTH, LETTER_HEIGHT = (
 
 
 def box_labels(boxes: Boxes3D) -> list[str]:
-    """The text of each label: "car 0.83", or "car" where boxes have no scores."""
-    names = [str(name).replace("_", " ") for name in boxes.classes]
+    """The text of each label: "car 0.83", "car" where boxes have no scores, "car #12 0.83" for a box of track 12."""
+    texts = [str(name).replace("_", " ") for name in boxes.classes]
+    if boxes.instances is not None:
+        texts = [f"{text} #{track}" if track else text for text, track in zip(texts, boxes.instances, strict=True)]
     if boxes.scores is None:
-        return names
-    return [f"{name} {score:.2f}" for name, score in zip(names, boxes.scores, strict=True)]
+        return texts
+    return [f"{text} {score:.2f}" for text, score in zip(texts, boxes.scores, strict=True)]
 
 
 def labels_in_scene(boxes: Boxes3D, ego_xy: Array) -> list[str]:

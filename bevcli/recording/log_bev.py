@@ -10,7 +10,7 @@ from bevcli.frame import MAP_CLASSES, BevMap, Probe
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.transforms import Array, apply
 from bevcli.recording import entities
-from bevcli.recording.colors import MAP_COLORS, colormap
+from bevcli.recording.colors import BACKGROUND, MAP_COLORS, colormap
 
 GROUND_OPACITY = 110  # of 255: boxes, rings and the trajectory stay readable on the map
 BELOW_GROUND_M = 0.06  # the map is drawn below the ground, so that it does not flicker with the range rings
@@ -22,23 +22,19 @@ def log_features(stream: rr.RecordingStream, image: NDArray[np.uint8], grid: Bev
     image: (rows, columns, 3) RGB; the first row has the largest y.
     """
     stream.log(entities.BEV_FEATURES, rr.Image(image, draw_order=-10), _placed(image, grid.x_range_m, grid.y_range_m))
-    quad = rr.Mesh3D(
-        vertex_positions=_ground_corners(grid, ego_from_bev),
-        triangle_indices=[[0, 1, 2], [0, 2, 3]],
-        vertex_texcoords=[[0, 1], [1, 1], [1, 0], [0, 0]],
-        albedo_texture=image,
-        albedo_factor=[255, 255, 255, GROUND_OPACITY],
-    )
-    stream.log(entities.BEV_ON_GROUND, quad)
+    ground = _on_ground(image, grid.x_range_m, grid.y_range_m, ego_from_bev, GROUND_OPACITY)
+    stream.log(entities.BEV_ON_GROUND, ground)
 
 
-def log_segmentation(stream: rr.RecordingStream, segmentation: BevMap) -> None:
-    """Writes a segmentation into the BEV view, in the colours of the map classes."""
-    colors = np.zeros((*segmentation.cells.shape, 3), dtype=np.uint8)
+def log_segmentation(stream: rr.RecordingStream, segmentation: BevMap, ego_from_bev: Array) -> None:
+    """Writes a segmentation into the BEV view and onto the ground of the scene, in the colours of the map classes."""
+    colors = np.full((*segmentation.cells.shape, 3), BACKGROUND, dtype=np.uint8)
     for name, bit in MAP_CLASSES.items():  # where a cell has several classes, the last one is shown
         colors[(segmentation.cells & bit) > 0] = MAP_COLORS[name]
     image = rr.Image(colors, draw_order=-5)
     stream.log(entities.BEV_SEGMENTATION, image, _placed(colors, segmentation.x_range_m, segmentation.y_range_m))
+    ground = _on_ground(colors, segmentation.x_range_m, segmentation.y_range_m, ego_from_bev, 255)
+    stream.log(entities.SEGMENTATION_ON_GROUND, ground)
 
 
 def log_history(stream: rr.RecordingStream, weight: Array | None, grid: BevGrid) -> None:
@@ -75,8 +71,21 @@ def _placed(image: NDArray[np.uint8], x_range: tuple[float, float], y_range: tup
     return rr.Transform3D(translation=[x_range[0], -y_range[1], 0], scale=cell)
 
 
-def _ground_corners(grid: BevGrid, ego_from_bev: Array) -> Array:
-    (x0, x1), (y0, y1) = grid.x_range_m, grid.y_range_m
+def _on_ground(
+    image: NDArray[np.uint8],
+    x_range: tuple[float, float],
+    y_range: tuple[float, float],
+    ego_from_bev: Array,
+    opacity: int,
+) -> rr.Mesh3D:
+    """An image of the bev frame, whose first row has the largest y, as a rectangle on the ground of the ego frame."""
+    (x0, x1), (y0, y1) = x_range, y_range
     corners = apply(ego_from_bev, [[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0]])
     corners[:, 2] = -BELOW_GROUND_M
-    return corners
+    return rr.Mesh3D(
+        vertex_positions=corners,
+        triangle_indices=[[0, 1, 2], [0, 2, 3]],
+        vertex_texcoords=[[0, 1], [1, 1], [1, 0], [0, 0]],
+        albedo_texture=image,
+        albedo_factor=[255, 255, 255, opacity],
+    )

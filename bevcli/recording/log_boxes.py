@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import rerun as rr
 
-from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.boxes import CLASSES, Boxes3D
 from bevcli.geometry.transforms import Array
 from bevcli.recording import entities
-from bevcli.recording.colors import FALSE_COLOR, GROUND_TRUTH_COLOR, MISSED_COLOR, class_color
+from bevcli.recording.colors import (
+    DUPLICATE_COLOR,
+    FALSE_COLOR,
+    GROUND_TRUTH_COLOR,
+    MISSED_COLOR,
+    OTHER_COLOR,
+    class_color,
+)
 from bevcli.recording.labels import labels_in_scene
 
 MOVING_M_S = 0.5  # slower objects get no velocity arrow
@@ -26,13 +34,25 @@ def box_colors(boxes: Boxes3D, class_names: Sequence[str]) -> np.ndarray:
     return np.array([colors[name] for name in boxes.classes], dtype=np.uint8).reshape(-1, 3)
 
 
-def log_boxes_3d(
-    stream: rr.RecordingStream, boxes: Boxes3D, false: np.ndarray, class_names: Sequence[str], ego_xy: Array
-) -> None:
-    """Writes predicted boxes into the scene: boxes, velocity arrows, crosses on false positives.
+@dataclass(frozen=True)
+class Marks:
+    """Which of N predicted boxes are marked as wrong.
 
-    boxes: in the recording's world. false: (N,) bool, the false positives. ego_xy: (2,) the vehicle's position; the
-    boxes nearest to it get labels.
+    Attributes:
+        false: (N,) bool, the false positives: crossed out in red.
+        duplicate: (N,) bool, a second box on an object: one grey diagonal.
+    """
+
+    false: np.ndarray
+    duplicate: np.ndarray
+
+
+def log_boxes_3d(
+    stream: rr.RecordingStream, boxes: Boxes3D, marks: Marks, class_names: Sequence[str], ego_xy: Array
+) -> None:
+    """Writes predicted boxes into the scene: boxes, velocity arrows, marks of false positives and duplicates.
+
+    boxes: in the recording's world. ego_xy: (2,) the vehicle's position; the boxes nearest to it get labels.
     """
     ids = [1 + list(class_names).index(name) if name in class_names else 0 for name in boxes.classes]
     labels = labels_in_scene(boxes, ego_xy)
@@ -42,6 +62,7 @@ def log_boxes_3d(
         velocity_x=boxes.velocities[:, 0],
         velocity_y=boxes.velocities[:, 1],
         name=_names(boxes),
+        **({} if boxes.instances is None else {"track": pa.array(boxes.instances.tolist(), pa.utf8())}),
     )
     stream.log(entities.BOXES, archetype, facts)
     moving = np.linalg.norm(boxes.velocities, axis=-1) > MOVING_M_S
@@ -54,21 +75,40 @@ def log_boxes_3d(
     stream.log(entities.VELOCITY, arrows)
     stream.log(
         entities.FALSE_BOXES,
-        rr.LineStrips3D(_crosses(boxes[false]).astype(np.float32), colors=FALSE_COLOR, radii=THICK),
+        rr.LineStrips3D(_crosses(boxes[marks.false]).astype(np.float32), colors=FALSE_COLOR, radii=THICK),
     )
+    diagonals = _crosses(boxes[marks.duplicate])[::2].astype(np.float32)
+    stream.log(entities.DUPLICATES, rr.LineStrips3D(diagonals, colors=DUPLICATE_COLOR, radii=THICK))
 
 
-def log_ground_truth_3d(stream: rr.RecordingStream, truth: Boxes3D, found: np.ndarray) -> None:
-    """Writes ground-truth boxes (in the recording's world) into the scene: pale where found (M,), red where missed."""
-    pale = rr.Boxes3D(**_shape(truth[found]), colors=[*GROUND_TRUTH_COLOR, 150], radii=THIN)
+def other_classes(truth: Boxes3D, class_names: Sequence[str]) -> np.ndarray:
+    """(M,) bool, whether a ground-truth box has a class that neither nuScenes nor the model has: it is never missed."""
+    return ~np.isin(truth.classes, (*CLASSES, *class_names))
+
+
+def ground_truth_colors(found: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """(M, 3) uint8 colours of ground-truth boxes: pale where found, red where missed, grey for other classes.
+
+    found: (M,) bool. other: (M,) bool, classes that are not among the model's.
+    """
+    colors = np.where(found[:, None], GROUND_TRUTH_COLOR, MISSED_COLOR)
+    return np.where(other[:, None], OTHER_COLOR, colors).astype(np.uint8).reshape(-1, 3)
+
+
+def log_ground_truth_3d(stream: rr.RecordingStream, truth: Boxes3D, found: np.ndarray, colors: np.ndarray) -> None:
+    """Writes ground-truth boxes (in the recording's world) into the scene; found and missed ones are two entities.
+
+    found: (M,) bool. colors: (M, 3) uint8.
+    """
+    pale = rr.Boxes3D(**_shape(truth[found]), colors=_with_alpha(colors[found], 150), radii=THIN)
     stream.log(entities.GROUND_TRUTH, pale, rr.AnyValues(name=_names(truth[found])))
     missed = truth[~found]
     red = rr.Boxes3D(**_shape(missed), colors=MISSED_COLOR, radii=THIN)
     stream.log(entities.MISSED, red, rr.AnyValues(name=_names(missed)))
 
 
-def log_boxes_bev(stream: rr.RecordingStream, boxes: Boxes3D, false: np.ndarray, class_names: Sequence[str]) -> None:
-    """Writes predicted boxes (in the bev frame) into the BEV view. false: (N,) bool, the false positives."""
+def log_boxes_bev(stream: rr.RecordingStream, boxes: Boxes3D, marks: Marks, class_names: Sequence[str]) -> None:
+    """Writes predicted boxes (in the bev frame) into the BEV view."""
     colors = box_colors(boxes, class_names)
     outlines, headings = footprints(boxes)
     strips = [*outlines, *headings]
@@ -83,19 +123,23 @@ def log_boxes_bev(stream: rr.RecordingStream, boxes: Boxes3D, false: np.ndarray,
         draw_order=31,
     )
     stream.log(entities.BEV_VELOCITY, arrows)
-    crosses = (_crosses(boxes[false])[..., :2] * (1, -1)).astype(np.float32)
+    crosses = (_crosses(boxes[marks.false])[..., :2] * (1, -1)).astype(np.float32)
     stream.log(entities.BEV_FALSE, rr.LineStrips2D(crosses, colors=FALSE_COLOR, radii=THIN, draw_order=32))
+    diagonals = (_crosses(boxes[marks.duplicate])[::2, :, :2] * (1, -1)).astype(np.float32)
+    stream.log(entities.BEV_DUPLICATES, rr.LineStrips2D(diagonals, colors=DUPLICATE_COLOR, radii=THIN, draw_order=32))
 
 
-def log_ground_truth_bev(stream: rr.RecordingStream, truth: Boxes3D, found: np.ndarray) -> None:
-    """Writes ground-truth boxes (in the bev frame) into the BEV view: pale where found (M,), red where missed."""
-    for entity, part, color in (
-        (entities.BEV_GROUND_TRUTH, truth[found], GROUND_TRUTH_COLOR),
-        (entities.BEV_MISSED, truth[~found], MISSED_COLOR),
-    ):
-        outlines, headings = footprints(part)
+def log_ground_truth_bev(stream: rr.RecordingStream, truth: Boxes3D, found: np.ndarray, colors: np.ndarray) -> None:
+    """Writes ground-truth boxes (in the bev frame) into the BEV view, as `log_ground_truth_3d`."""
+    for entity, chosen in ((entities.BEV_GROUND_TRUTH, found), (entities.BEV_MISSED, ~found)):
+        outlines, headings = footprints(truth[chosen])
+        doubled = np.tile(_with_alpha(colors[chosen], 200), (2, 1))
         strips = [*outlines, *headings]
-        stream.log(entity, rr.LineStrips2D(strips, colors=[*color, 200], radii=THIN, draw_order=20))
+        stream.log(entity, rr.LineStrips2D(strips, colors=doubled, radii=THIN, draw_order=20))
+
+
+def _with_alpha(colors: np.ndarray, alpha: int) -> np.ndarray:
+    return np.column_stack([colors, np.full(len(colors), alpha, dtype=np.uint8)])
 
 
 def footprints(boxes: Boxes3D) -> tuple[Array, Array]:

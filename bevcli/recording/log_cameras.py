@@ -15,9 +15,10 @@ from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.recording import entities
 from bevcli.recording.box_lines import lines_in_image
-from bevcli.recording.colors import GROUND_TRUTH_COLOR, MISSED_COLOR, colormap
+from bevcli.recording.colors import colormap
 from bevcli.recording.labels import box_labels, labels_in_image
 from bevcli.recording.log_boxes import box_colors
+from bevcli.recording.video_images import Av1Encoder
 
 JPEG_QUALITY = 85  # for images that have no encoded bytes, such as those of a video
 POINT = rr.Radius.ui_points(2.0)
@@ -46,16 +47,50 @@ class PosedCamera:
         return inverse(self.world_from_camera)
 
 
-def log_image(stream: rr.RecordingStream, posed: PosedCamera, image: CameraImage | None) -> None:
-    """Writes the pose and the encoded image. Without an image, the one of the frame before is cleared."""
-    entity = entities.camera(posed.name)
+def log_pose(stream: rr.RecordingStream, posed: PosedCamera) -> None:
+    """Writes the pose of a camera."""
     pose = posed.world_from_camera
-    stream.log(entity, rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
+    stream.log(entities.camera(posed.name), rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
+
+
+def log_image(stream: rr.RecordingStream, posed: PosedCamera, image: CameraImage | None) -> None:
+    """Writes the encoded image. Without an image, the one of the frame before is cleared."""
     if image is None:
         stream.log(entities.image(posed.name), rr.Clear(recursive=False))
         return
     contents, media_type = _encoded(image)
     stream.log(entities.image(posed.name), rr.EncodedImage(contents=contents, media_type=media_type))
+
+
+class VideoImages:
+    """Writes the images of all cameras as AV1 video streams, one for each camera."""
+
+    def __init__(self, stream: rr.RecordingStream) -> None:
+        self._stream = stream
+        self._encoders: dict[str, Av1Encoder] = {}
+
+    def log(self, posed: PosedCamera, image: CameraImage | None) -> None:
+        """Writes an image. A missing one is cleared, and the stream starts anew with the next."""
+        entity, name = entities.image(posed.name), posed.name
+        if image is None:
+            self._stream.log(entity, rr.Clear(recursive=False))
+            self._end(name)
+            return
+        if name not in self._encoders:
+            height, width = image.pixels_bgr.shape[:2]
+            self._encoders[name] = Av1Encoder(width, height)
+        data, is_keyframe = self._encoders[name].encode(image.pixels_bgr)
+        self._stream.log(entity, rr.VideoStream(codec=rr.VideoCodec.AV1, sample=data, is_keyframe=is_keyframe))
+
+    def close(self) -> None:
+        """Ends all streams."""
+        for name in list(self._encoders):
+            self._end(name)
+
+    def _end(self, name: str) -> None:
+        encoder = self._encoders.pop(name, None)
+        if encoder is not None:
+            encoder.close()
 
 
 def log_boxes_in_image(
@@ -88,11 +123,10 @@ def log_boxes_in_image(
 
 
 def log_ground_truth_in_image(
-    stream: rr.RecordingStream, posed: PosedCamera, truth: Boxes3D, found: np.ndarray
+    stream: rr.RecordingStream, posed: PosedCamera, truth: Boxes3D, colors: np.ndarray
 ) -> None:
-    """Draws ground-truth boxes (in the recording's world) into the image: pale where found (M,), red where missed."""
+    """Draws ground-truth boxes (in the recording's world) into the image. colors: (M, 3) uint8."""
     lines = lines_in_image(truth, posed.camera, posed.camera_from_world)
-    colors = np.where(found[:, None], GROUND_TRUTH_COLOR, MISSED_COLOR).astype(np.uint8).reshape(-1, 3)
     stream.log(
         entities.overlay(posed.name, "ground_truth"),
         rr.LineStrips2D(

@@ -16,24 +16,37 @@ from bevcli.recording.colors import EGO_COLOR, RING_COLOR, STAGE_COLORS, class_c
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.vehicle import VehicleMesh, default_vehicle
 
-RING_DISTANCES_M = (10, 20, 30, 40, 50)
+RING_STEP_M = 10
+DEFAULT_RANGE_M = 50.0  # of the range rings without a model
 FRUSTUM_LENGTH_M = 0.55  # longer frusta would hide the vehicle from the eye behind it
+SPEED_LABEL_M = (1.35, 0.0, 3.2)  # in the ego frame: above the vehicle
 PILLARS_PER_SIDE = 25  # more pillars than this along one side of the grid would hide the image
 HOW_TO_READ = """\
 - **Predicted boxes** have the colour of their class. The front face is crossed; from above, a line points to the front.
-- **Ground truth** is pale where a prediction matches it, and red where it was missed.
+- **Ground truth** is pale where a prediction matches it, and red where it was missed. Classes that are not scored are
+  grey.
 - **False positives** are crossed out in red: no ground truth of their class is within 2 m.
+- **Duplicates**, a second box on an object, have one grey diagonal.
+- **Tracks** have a number in their label and a trail: the last 5 s, and, fainter, the next second at the predicted
+  velocity. Each is an entity below `world/tracks`; select it there or by a click on its trail.
+- **The ground** shows the segmentation, if the model has one. For the BEV features click the eyes next to `bev_map` and
+  `segmentation`, below `ego` in the left panel.
 - **Pillars** are the 3D reference points of the BEV cells, coloured by height from blue to red. They are hidden at
   first: click the eye next to `pillars` in the left panel.
 """
 
 
 def log_scene(
-    stream: rr.RecordingStream, rig: CameraRig, class_names: Sequence[str], vehicle: VehicleMesh | None = None
+    stream: rr.RecordingStream,
+    rig: CameraRig,
+    class_names: Sequence[str],
+    vehicle: VehicleMesh | None = None,
+    grid: BevGrid | None = None,
 ) -> None:
     """Writes the class colours, the pinholes, the vehicle and the range rings.
 
-    vehicle: in the ego frame; None draws the default car.
+    vehicle: in the ego frame; None draws the default car. grid: of the model: its border is drawn, and no range ring is
+    larger; None draws rings up to 50 m.
     """
     stream.log(entities.WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     infos = [rr.AnnotationInfo(id=i + 1, label=n, color=class_color(n, i)) for i, n in enumerate(class_names)]
@@ -41,7 +54,7 @@ def log_scene(
     for camera in rig.cameras:
         _log_pinhole(stream, camera)
     _log_vehicle(stream, rig, default_vehicle() if vehicle is None else vehicle)
-    _log_rings(stream, rig)
+    _log_rings(stream, rig, grid)
 
 
 def log_about(
@@ -52,11 +65,16 @@ def log_about(
     options: RecordingOptions,
     *,
     untrained: bool,
+    note: str = "",
 ) -> None:
-    """Writes the page "About", and the facts of the run that readers of the file need."""
+    """Writes the page "About", and the facts of the run that readers of the file need.
+
+    note: what titles say about the weights, see `recording_blueprint`.
+    """
     facts = rr.AnyValues(
         title=title,
         untrained=untrained,
+        note=note,
         score=options.score,
         class_names=list(class_names),
         camera_names=list(rig.names),
@@ -82,6 +100,21 @@ def log_curve_names(stream: rr.RecordingStream, stages: Iterable[str], class_nam
     stream.log(entities.STAGE_CURVES, rr.SeriesLines(names=stages, colors=colors), static=True)
     colors = [class_color(name, i) for i, name in enumerate(class_names)]
     stream.log(entities.BOX_CURVES, rr.SeriesLines(names=list(class_names), colors=colors), static=True)
+
+
+def log_speed_style(stream: rr.RecordingStream) -> None:
+    """Writes the name and the colour of the curve of the vehicle's speed."""
+    stream.log(entities.SPEED_CURVE, rr.SeriesLines(names="km/h", colors=EGO_COLOR), static=True)
+
+
+def log_speed(stream: rr.RecordingStream, speed_m_s: float) -> None:
+    """Writes the vehicle's speed: a curve, and a label above the vehicle in the scene."""
+    km_h = 3.6 * speed_m_s
+    stream.log(entities.SPEED_CURVE, rr.Scalars(km_h))
+    label = rr.Points3D(
+        [SPEED_LABEL_M], labels=f"{km_h:.0f} km/h", colors=EGO_COLOR, radii=rr.Radius.ui_points(0.01), show_labels=True
+    )
+    stream.log(entities.SPEED, label)
 
 
 def drawn_pillars(grid: BevGrid, *, all_cells: bool = False) -> Array:
@@ -131,20 +164,34 @@ def _log_vehicle(stream: rr.RecordingStream, rig: CameraRig, vehicle: VehicleMes
     stream.log(entities.BEV_VEHICLE, rr.LineStrips2D(strips, colors=EGO_COLOR, draw_order=40), static=True)
 
 
-def _log_rings(stream: rr.RecordingStream, rig: CameraRig) -> None:
+def ring_distances_m(grid: BevGrid | None) -> list[int]:
+    """The radii of the range rings: every 10 m up to the nearest side of the grid."""
+    reach = DEFAULT_RANGE_M if grid is None else min(map(abs, (*grid.x_range_m, *grid.y_range_m)))
+    return list(range(RING_STEP_M, int(reach) + 1, RING_STEP_M))
+
+
+def _border(rig: CameraRig, grid: BevGrid) -> Array:
+    """(5, 2) the closed border of the grid in the ego frame."""
+    (x0, x1), (y0, y1) = grid.x_range_m, grid.y_range_m
+    return apply(rig.ego_from_bev, [[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0], [x0, y0, 0]])[:, :2]
+
+
+def _log_rings(stream: rr.RecordingStream, rig: CameraRig, grid: BevGrid | None) -> None:
     angles = np.linspace(0, 2 * np.pi, 121)
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    rings = [circle * distance for distance in RING_DISTANCES_M]
+    distances = ring_distances_m(grid)
+    rings = [circle * distance for distance in distances]
     width = rr.Radius.ui_points(0.6)
-    in_space = [np.column_stack([ring, np.zeros(len(ring))]) for ring in rings]
+    lines = rings if grid is None else [*rings, _border(rig, grid)]
+    in_space = [np.column_stack([line, np.zeros(len(line))]) for line in lines]
     stream.log(entities.RANGE_RINGS, rr.LineStrips3D(in_space, colors=[*RING_COLOR, 140], radii=width), static=True)
-    flat = [_bev_image_points(rig, ring) for ring in rings]
+    flat = [_bev_image_points(rig, line) for line in lines]
     stream.log(entities.BEV_RINGS, rr.LineStrips2D(flat, colors=RING_COLOR, radii=width, draw_order=5), static=True)
     # The labels are on the circles, ahead to the right, where they cover little.
     positions = [_bev_image_points(rig, ring[[105]])[0] for ring in rings]
     labels = rr.Points2D(
         positions,
-        labels=[f"{distance} m" for distance in RING_DISTANCES_M],
+        labels=[f"{distance} m" for distance in distances],
         colors=[150, 156, 170],
         radii=rr.Radius.ui_points(0.01),
         show_labels=True,

@@ -1,4 +1,4 @@
-"""True positives, false positives and missed ground truth of one frame, for display."""
+"""True positives, false positives, duplicates and missed ground truth of one frame, for display."""
 
 from __future__ import annotations
 
@@ -20,6 +20,25 @@ def detectable(ground_truth: Boxes3D, grid: BevGrid) -> Boxes3D:
     points = ground_truth.num_points
     seen = np.ones(len(ground_truth), dtype=bool) if points is None else points != 0
     return ground_truth[inside & seen]
+
+
+def false_and_duplicate(
+    predictions: Boxes3D, ground_truth: Boxes3D | None
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which predictions (N,) are false positives, and which (N,) are a second box on an object.
+
+    A duplicate is no true positive, and either the tracker marked it, or the ground truth of its class within 2 m was
+    found by a better box. Without ground truth no box is a false positive, and the tracker's marks are returned.
+    """
+    marked = predictions.duplicates if predictions.duplicates is not None else np.zeros(len(predictions), dtype=bool)
+    if ground_truth is None:
+        return np.zeros(len(predictions), dtype=bool), marked
+    true, found = true_positives(predictions, ground_truth)
+    truths = ground_truth[found]
+    away = np.linalg.norm(predictions.centers[:, None, :2] - truths.centers[:, :2], axis=-1)  # (N, M)
+    near = (away < MATCH_DISTANCE_M) & (predictions.classes[:, None] == truths.classes)
+    duplicate = ~true & (marked | near.any(-1))
+    return ~true & ~duplicate, duplicate
 
 
 def true_positives(predictions: Boxes3D, ground_truth: Boxes3D) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

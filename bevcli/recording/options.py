@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Literal
 
 from bevcli.errors import InputError
+from bevcli.recording.video_images import require_av
 
+Images = Literal["jpeg", "av1"]
 Level = Literal["minimal", "standard", "full"]
 LEVELS: tuple[Level, ...] = ("minimal", "standard", "full")
 
@@ -24,8 +26,11 @@ class RecordingOptions:
         probes: x, y in the bev frame, metres, of the cells whose attention is drawn.
         vehicle_mesh: a mesh file of the ego vehicle (`vehicle.load_vehicle` says which axes it must have);
             None draws the default car.
+        images: "jpeg": the bytes of the image files, whatever their format; images of a video as JPEG. "av1": one AV1
+            video stream for each camera, which is smaller and not lossless.
 
-    Raises InputError for an unknown level or kind of BEV image, and for a mesh file that does not exist.
+    Raises InputError for an unknown level, kind of BEV image or format of images, and for a mesh file that does not
+    exist; BevcliError for "av1" without PyAV.
     """
 
     level: Level = "standard"
@@ -33,12 +38,17 @@ class RecordingOptions:
     score: float = 0.25
     probes: tuple[tuple[float, float], ...] = ()
     vehicle_mesh: Path | None = None
+    images: Images = "jpeg"
 
     def __post_init__(self) -> None:
         if self.level not in LEVELS:
             raise InputError(f'--record: unknown level "{self.level}" (expected {", ".join(LEVELS)})')
         if self.bev not in ("norm", "pca", "none") and self.channel is None:
             raise InputError(f'--bev: unknown image "{self.bev}" (expected norm, pca, channel:K or none)')
+        if self.images not in ("jpeg", "av1"):
+            raise InputError(f'--images: unknown format "{self.images}" (expected jpeg or av1)')
+        if self.images == "av1":
+            require_av("--images av1")
         if self.vehicle_mesh is not None and not self.vehicle_mesh.is_file():
             raise InputError(f"--vehicle-mesh {self.vehicle_mesh}: there is no such file")
 

@@ -14,15 +14,18 @@ import rerun as rr
 from rerun.sinks import LogSinkLike
 
 from bevcli.errors import OutputError
-from bevcli.frame import Frame, FrameStamp, Prediction, Sequence
+from bevcli.frame import Frame, FrameStamp, Prediction, Sequence, facts_of
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, Pose, inverse, rigid
-from bevcli.recording import entities, log_bev, log_boxes, log_cameras, log_static
+from bevcli.recording import entities, log_bev, log_boxes, log_cameras, log_map, log_static
 from bevcli.recording.bev_images import BevColors, BevImages
-from bevcli.recording.blueprint import recording_blueprint
+from bevcli.recording.blueprint import LayoutFacts, recording_blueprint
 from bevcli.recording.colors import EGO_COLOR
-from bevcli.recording.log_cameras import PosedCamera
-from bevcli.recording.matching import detectable, true_positives
+from bevcli.recording.legend import legend_entries, log_legend
+from bevcli.recording.log_boxes import Marks
+from bevcli.recording.log_cameras import PosedCamera, VideoImages
+from bevcli.recording.log_tracks import TrackLog, TrackLogState
+from bevcli.recording.matching import detectable, false_and_duplicate, true_positives
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.rrd_file import RrdFile
 from bevcli.recording.vehicle import load_vehicle
@@ -33,6 +36,7 @@ if TYPE_CHECKING:
 APPLICATION = "bevcli"
 FLUSH_TIMEOUT_S = 20.0
 UNTRAINED = "untrained weights"
+FROM_RENDERED = "trained on renderings"
 PosedCameras = tuple[PosedCamera, ...]
 
 
@@ -47,6 +51,14 @@ class RecordedModel(Protocol):
     @property
     def untrained(self) -> bool:
         """Whether the weights are random. Then titles, events and the page "About" say so."""
+        ...
+
+    @property
+    def bundled(self) -> bool:
+        """Whether the weights are those of the package, trained on rendered streets.
+
+        Titles and events say so where the drive is not a rendered one.
+        """
         ...
 
 
@@ -85,6 +97,7 @@ class RecordingState:
         origin: (3,) the recording's origin in the sequence's world, metres.
         last: the last frame.
         colors: of the BEV features, None where these are not drawn.
+        tracks: the trails.
     """
 
     recording_id: str
@@ -92,6 +105,7 @@ class RecordingState:
     origin: Array
     last: LastFrame | None
     colors: BevColors | None
+    tracks: TrackLogState
 
 
 class Recording:
@@ -121,7 +135,10 @@ class Recording:
     ) -> None:
         self.path, self.rig, self.untrained = Path(path), sequence.rig, model.untrained
         self.title = f"{sequence.name} · {model.config.name}"
+        self.note = weights_note(model, sequence)
         self.class_names = tuple(model.config.classes)
+        self._config, self._geo_origin = model.config, facts_of(sequence).geo_origin
+        self._rate_hz, self._has_ego_motion = frame_rate_hz(sequence.stamps), sequence.has_ego_motion
         self.options = RecordingOptions() if options is None else options
         recording_id = str(uuid.uuid4()) if resume is None else resume.recording_id
         self._stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
@@ -132,6 +149,8 @@ class Recording:
         self._last: LastFrame | None = None
         self._early_events: list[tuple[str, str]] = []  # logged before the first frame
         self._pillars: Array | None = None
+        self._tracks = TrackLog(self._stream, self.class_names)
+        self._video = VideoImages(self._stream) if self.options.images == "av1" else None
         self._bev_images: BevImages[tuple[FrameStamp, Prediction]] | None = None
         if self.options.bev != "none" and self.options.shows_internals:
             self._bev_images = BevImages(self.options.bev)
@@ -139,8 +158,21 @@ class Recording:
     def __enter__(self) -> Recording:
         mesh = self.options.vehicle_mesh
         vehicle = None if mesh is None else load_vehicle(mesh)
-        note = UNTRAINED if self.untrained else ""
-        blueprint = recording_blueprint(self.rig, note, probes=bool(self.options.probes))
+        grid, segmentation = (
+            self._config.bev_grid,
+            "segmentation" in self._config.heads and self.options.shows_internals,
+        )
+        legend = legend_entries(self.class_names, with_map=segmentation)
+        facts = LayoutFacts(
+            note=self.note,
+            probes=bool(self.options.probes),
+            segmentation=segmentation,
+            rate_hz=self._rate_hz,
+            on_earth=self._geo_origin is not None,
+            legend_entries=len(legend),
+            grid=grid,
+        )
+        blueprint = recording_blueprint(self.rig, facts)
         self._file = RrdFile(self.path, None if self._resume is None else self._resume.size)
         sinks = [] if self._live is None else [self._live.sink]
         try:
@@ -152,8 +184,11 @@ class Recording:
         if self._live is not None:
             self._live.open()
         names, untrained = self.class_names, self.untrained
-        log_static.log_scene(self._stream, self.rig, names, vehicle)
-        log_static.log_about(self._stream, self.title, self.rig, names, self.options, untrained=untrained)
+        log_static.log_scene(self._stream, self.rig, names, vehicle, grid)
+        log_static.log_about(
+            self._stream, self.title, self.rig, names, self.options, untrained=untrained, note=self.note
+        )
+        log_legend(self._stream, legend)
         if self._resume is not None:
             self._go_on_from(self._resume)
         return self
@@ -165,6 +200,8 @@ class Recording:
         try:
             if self._bev_images is not None:
                 self._log_bev_images(self._bev_images.finish())
+            if self._video is not None:
+                self._video.close()
             self._flush()
         finally:
             self._disconnect()
@@ -180,7 +217,9 @@ class Recording:
         colors = None if self._bev_images is None else self._bev_images.colors
         if self._origin is None or self._file is None or (self._bev_images is not None and colors is None):
             return None
-        return RecordingState(self._recording_id, self._file.size, self._origin, self._last, colors)
+        return RecordingState(
+            self._recording_id, self._file.size, self._origin, self._last, colors, self._tracks.state()
+        )
 
     def is_deleted(self) -> bool:
         """Whether somebody has deleted the file that is being written."""
@@ -188,6 +227,7 @@ class Recording:
 
     def _go_on_from(self, state: RecordingState) -> None:
         self._origin, self._last = state.origin, state.last
+        self._tracks.go_on_from(state.tracks)
         if self._bev_images is not None:
             self._bev_images.colors = state.colors
 
@@ -245,11 +285,20 @@ class Recording:
             rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]),
             rr.AnyValues(scene=frame.stamp.scene, timestamp_ns=frame.stamp.timestamp_ns, pose=pose.ravel()),
         )
-        before = self._last
-        if before is not None and before.scene == frame.stamp.scene:
+        if self._has_ego_motion:
+            log_static.log_speed(self._stream, float(np.linalg.norm(frame.kinematics.velocity[:2])))
+        before = self._before(frame)
+        if self._geo_origin is not None:
+            last = None if before is None else before.world_from_ego.translation
+            log_map.log_ego_on_map(self._stream, self._geo_origin, frame.world_from_ego.translation, last)
+        if before is not None:
             poses = (before.world_from_ego, frame.world_from_ego)
             piece = [self._moved_to_origin(pose.matrix)[:3, 3] for pose in poses]
             self._stream.log(entities.TRAJECTORY, rr.LineStrips3D([piece], colors=EGO_COLOR, radii=0.06))
+
+    def _before(self, frame: Frame) -> LastFrame | None:
+        """The frame before, None where it is of another scene."""
+        return self._last if self._last is not None and self._last.scene == frame.stamp.scene else None
 
     def _moved_to_origin(self, world_from_a: Array) -> Array:
         """world_from_a (4, 4) of the sequence's world -> of the recording's world."""
@@ -262,26 +311,37 @@ class Recording:
             for c in frame.rig.cameras
         )
         for posed in cameras:
-            log_cameras.log_image(self._stream, posed, frame.images.get(posed.name))
+            log_cameras.log_pose(self._stream, posed)
+            image = frame.images.get(posed.name)
+            if self._video is None:
+                log_cameras.log_image(self._stream, posed, image)
+            else:
+                self._video.log(posed, image)
         return cameras
 
     def _log_boxes(self, frame: Frame, prediction: Prediction, cameras: PosedCameras) -> None:
         shown = shown_boxes(prediction.boxes, self.options.score)
         world_from_bev = self._moved_to_origin(prediction.world_from_ego.matrix) @ prediction.ego_from_bev
         in_world = shown.transformed(world_from_bev)
-        true = np.ones(len(shown), dtype=bool)
+        marks = Marks(*false_and_duplicate(shown, None))
         if frame.ground_truth is not None:
             in_recording = frame.ground_truth.transformed(self._moved_to_origin(np.eye(4)))
             truth = detectable(in_recording.transformed(inverse(world_from_bev)), prediction.grid)
             if self.untrained:  # random boxes match nothing: a scene all in red would be useless
                 found = np.ones(len(truth), dtype=bool)
             else:
-                true, found = true_positives(shown, truth)
+                _, found = true_positives(shown, truth)
+                found |= log_boxes.other_classes(truth, self.class_names)
+                marks = Marks(*false_and_duplicate(shown, truth))
             self._log_ground_truth(truth, found, world_from_bev, cameras)
         stream, names = self._stream, self.class_names
         ego_xy = self._moved_to_origin(prediction.world_from_ego.matrix)[:2, 3]
-        log_boxes.log_boxes_3d(stream, in_world, ~true, names, ego_xy)
-        log_boxes.log_boxes_bev(stream, shown, ~true, names)
+        log_boxes.log_boxes_3d(stream, in_world, marks, names, ego_xy)
+        log_boxes.log_boxes_bev(stream, shown, marks, names)
+        self._tracks.log(in_world, frame.stamp, inverse(world_from_bev))
+        if self._geo_origin is not None:
+            in_sequence = shown.transformed(prediction.world_from_ego.matrix @ prediction.ego_from_bev)
+            log_map.log_boxes_on_map(stream, self._geo_origin, in_sequence, names)
         for posed in cameras:
             log_cameras.log_boxes_in_image(stream, posed, in_world, names)
         counts = [float((shown.classes == name).sum()) for name in names]
@@ -291,20 +351,24 @@ class Recording:
         self, truth: Boxes3D, found: np.ndarray, world_from_bev: Array, cameras: PosedCameras
     ) -> None:
         in_world = truth.transformed(world_from_bev)
-        log_boxes.log_ground_truth_3d(self._stream, in_world, found)
-        log_boxes.log_ground_truth_bev(self._stream, truth, found)
+        colors = log_boxes.ground_truth_colors(found, log_boxes.other_classes(truth, self.class_names))
+        log_boxes.log_ground_truth_3d(self._stream, in_world, found, colors)
+        log_boxes.log_ground_truth_bev(self._stream, truth, found, colors)
         for posed in cameras:
-            log_cameras.log_ground_truth_in_image(self._stream, posed, in_world, found)
+            log_cameras.log_ground_truth_in_image(self._stream, posed, in_world, colors)
 
     def _log_curves(self, prediction: Prediction) -> None:
         stages = prediction.stage_seconds
         if self._last is None:
             log_static.log_curve_names(self._stream, stages, self.class_names)
+            log_static.log_speed_style(self._stream)
         self._stream.log(entities.STAGE_CURVES, rr.Scalars(list(stages.values())))
 
     def _log_frame_events(self, frame: Frame, prediction: Prediction) -> None:
         if self._last is None and self.untrained:
             self.event("The weights are UNTRAINED: boxes and maps are meaningless.", "WARN")
+        if self._last is None and self.note == FROM_RENDERED:
+            self.event("The weights were trained on rendered streets; these images are not rendered.", "WARN")
         where = f"frame {frame.stamp.index}"
         while self._early_events:
             self.event(*self._early_events.pop(0))
@@ -319,7 +383,7 @@ class Recording:
     def _log_internals(self, frame: Frame, prediction: Prediction, cameras: PosedCameras) -> None:
         self._log_pillars(frame, prediction, cameras)
         if prediction.segmentation is not None:
-            log_bev.log_segmentation(self._stream, prediction.segmentation)
+            log_bev.log_segmentation(self._stream, prediction.segmentation, prediction.ego_from_bev)
         if self._bev_images is not None and prediction.bev is not None:
             grid = prediction.grid
             features = prediction.bev.detach().float().cpu().numpy().reshape(grid.rows, grid.columns, -1)
@@ -357,3 +421,17 @@ class Recording:
 def shown_boxes(boxes: Boxes3D, score: float) -> Boxes3D:
     """The boxes with this score or more; all boxes where they have no scores."""
     return boxes if boxes.scores is None else boxes[boxes.scores >= score]
+
+
+def weights_note(model: RecordedModel, sequence: Sequence) -> str:
+    """What the titles of the views say about the weights; "" if there is nothing to say."""
+    if model.untrained:
+        return UNTRAINED
+    return FROM_RENDERED if model.bundled and not facts_of(sequence).rendered else ""
+
+
+def frame_rate_hz(stamps: tuple[FrameStamp, ...]) -> float:
+    """Frames per second: 1 / the median time between frames; 2 where there are less than two frames."""
+    steps = np.diff([stamp.timestamp_ns for stamp in stamps])
+    steps = steps[steps > 0]
+    return float(1e9 / np.median(steps)) if len(steps) else 2.0

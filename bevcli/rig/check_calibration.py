@@ -83,13 +83,16 @@ class CalibrationCheck:
         return [folder / name for name in ("cameras.png", "coverage.png", "recording.rrd", "findings.json")]
 
 
-def check_calibration(path: Path | str, sequence: Path | str | None = None, frame: int = 0) -> CalibrationCheck:
+def check_calibration(
+    path: Path | str, sequence: Path | str | None = None, frame: int = 0, **options: Any
+) -> CalibrationCheck:
     """Find the mistakes in a calibration.
 
     Args:
-        path: a calibration.json, a sequence folder that contains one, or a nuScenes root.
-        sequence: a sequence folder whose images, ego-motion and timestamps belong to the calibration.
+        path: a calibration.json, a sequence folder that contains one, a nuScenes root, or a ROS bag.
+        sequence: a sequence folder or bag whose images, ego-motion and timestamps belong to the calibration.
         frame: index of the frame in the sequence whose images are kept, from 0.
+        options: of `open_sequence`, for a nuScenes root or a bag, such as topics.
 
     Returns:
         The findings with what is needed to draw them. Mistakes in the calibration are findings, not exceptions.
@@ -97,7 +100,7 @@ def check_calibration(path: Path | str, sequence: Path | str | None = None, fram
     Raises:
         InputError: the file is missing or not a JSON object, or the sequence has no such frame.
     """
-    inputs = read_inputs(Path(path), None if sequence is None else Path(sequence), frame)
+    inputs = read_inputs(Path(path), None if sequence is None else Path(sequence), frame, options)
     report = with_findings(check_rig(inputs.rig, inputs.rig_findings), inputs.sequence_findings)
     return CalibrationCheck(inputs.name, inputs.rig, report, inputs.images)
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,9 @@ from bevcli.rig.sequence_checks import check_camera_times, check_ego_motion
 from bevcli.sequences.files.calibration_file import draft_calibration
 from bevcli.sequences.native.folder import FolderSequence
 from bevcli.sequences.native.frames_table import read_frames_table
+from bevcli.sequences.native.ground_truth import GroundTruthUse
 from bevcli.sequences.open import open_sequence
+from bevcli.sequences.ros.bag import is_ros_bag
 
 CALIBRATION = "calibration.json"
 
@@ -43,27 +46,33 @@ class CalibrationInputs:
     images: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
 
 
-def read_inputs(path: Path, sequence: Path | None, frame: int) -> CalibrationInputs:
+def read_inputs(
+    path: Path, sequence: Path | None, frame: int, options: Mapping[str, Any] | None = None
+) -> CalibrationInputs:
     """Read a calibration.json or a sequence with its own calibration.
+
+    options: further arguments of `open_sequence`, for a sequence that is not a native folder.
 
     sequence: a folder that gives images and ego-motion to a calibration.json elsewhere. frame: index of the frame whose
     images are read. Raises InputError where the file is missing or not a JSON object, or there is no such frame.
     """
-    if path.is_dir() and not (path / CALIBRATION).exists():
-        return _read_other_sequence(path, frame)
+    if is_ros_bag(path) or (path.is_dir() and not (path / CALIBRATION).exists()):
+        return _read_other_sequence(path, frame, options or {})
     file = path / CALIBRATION if path.is_dir() else path
     draft = draft_calibration(file)
     folder = path if path.is_dir() and sequence is None else sequence
     name = (folder or file.with_suffix("")).resolve().name
+    if folder is not None and is_ros_bag(folder):
+        return _read_other_sequence(folder, frame, {**(options or {}), "calibration": file})
     if folder is None or not draft.rig.cameras:
         return CalibrationInputs(name, draft.rig, draft.findings)
     findings, images = _read_folder(folder, draft.rig, frame)
     return CalibrationInputs(name, draft.rig, draft.findings, findings, images)
 
 
-def _read_other_sequence(path: Path, frame: int) -> CalibrationInputs:
-    """A sequence that is not a native folder, such as a nuScenes root, read as `bevcli run` reads it."""
-    sequence = open_sequence(path)
+def _read_other_sequence(path: Path, frame: int, options: Mapping[str, Any]) -> CalibrationInputs:
+    """A sequence that is not a native folder, such as a nuScenes root or a bag, read as `bevcli run` reads it."""
+    sequence = open_sequence(path, ego_motion="optional", ground_truth=False, **options)
     shown = sequence.load(_checked_index(sequence.stamps, frame, path))
     return CalibrationInputs(sequence.name, shown.rig, (), _missing_images(shown), _pixels(shown))
 
@@ -73,12 +82,14 @@ def _read_folder(
 ) -> tuple[tuple[Finding, ...], Mapping[str, NDArray[np.uint8]]]:
     """The findings about a native folder, and the images of one of its frames."""
     findings: list[Finding] = []
+    unread = GroundTruthUse(is_read=False)
     try:
-        sequence = FolderSequence(folder, rig=rig, ego_motion="optional")
+        sequence = FolderSequence(folder, rig=rig, ego_motion="optional", ground_truth=unread)
     except InputError as error:
         findings.append(_refused(error))
         try:
-            sequence = FolderSequence(folder, rig=rig, ego_motion="static")  # images may be readable without ego-motion
+            # Images may be readable without ego-motion.
+            sequence = FolderSequence(folder, rig=rig, ego_motion="static", ground_truth=unread)
         except InputError:
             return tuple(findings), {}
     if sequence.ego_motion is not None:
@@ -114,6 +125,7 @@ def _split_by_scene(ego_motion: EgoMotion, stamps: tuple[FrameStamp, ...]) -> It
                 ego_motion.accelerations[part],
                 ego_motion.angular_rates[part],
                 ego_motion.velocities[part],
+                velocities_are_stated=ego_motion.velocities_are_stated,
             )
 
 

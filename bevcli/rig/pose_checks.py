@@ -79,13 +79,37 @@ def check_poses(cameras: Sequence[Camera]) -> tuple[Finding, ...]:
     metric = [_in_metres(camera, units[camera.name]) for camera in cameras]
     affected = [camera for camera in metric if _defects(camera)]
     explained = {camera.name: [m for m in MISTAKES if _explains(m, camera)] for camera in affected}
+    common = _common_mistake(affected, explained)
     for camera in affected:
         defect, mistake = _defects(camera)[0], _best_explanation(camera, explained)
+        if common is not None and common not in explained[camera.name] and _explains(common, camera, by_name=False):
+            mistake = common  # its name contradicts the corrected pose: a second mistake, see `corrected`
         if mistake is None or (len(affected) == 1 and _is_turned_about_one_axis(camera)):
             findings.append(defect)
         else:
             findings.append(_mistake_finding(camera, mistake, defect))
     return tuple(findings)
+
+
+def corrected(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
+    """The cameras after undoing the mistake that most of them share, if there is one: for checks of further mistakes.
+
+    Cameras that it does not explain are left out.
+    """
+    affected = [camera for camera in cameras if _defects(camera)]
+    explained = {camera.name: [m for m in MISTAKES if _explains(m, camera)] for camera in affected}
+    common = _common_mistake(affected, explained)
+    if common is None:
+        return ()
+    kept = [camera for camera in affected if _explains(common, camera, by_name=False)]
+    return tuple(replace(camera, ego_from_camera=common.undo(camera.ego_from_camera)) for camera in kept)
+
+
+def _common_mistake(affected: Sequence[Camera], explained: Mapping[str, Sequence[Mistake]]) -> Mistake | None:
+    """The mistake that explains most affected cameras, at least three and more than half of them; None without one."""
+    counts = {mistake: sum(mistake in of for of in explained.values()) for mistake in MISTAKES}
+    best = max(MISTAKES, key=lambda mistake: counts[mistake])
+    return best if counts[best] >= 3 and 2 * counts[best] > len(affected) else None
 
 
 def units_per_metre(length: float) -> float:
@@ -130,12 +154,15 @@ def _defect(
     return Finding(code, "error", name, message, found, expected, advice)
 
 
-def _explains(mistake: Mistake, camera: Camera) -> bool:
-    """Whether undoing the mistake gives a plausible, level pose that fits the camera's name."""
+def _explains(mistake: Mistake, camera: Camera, *, by_name: bool = True) -> bool:
+    """Whether undoing the mistake gives a plausible, level pose that fits the camera's name.
+
+    by_name: whether it has to fit the name.
+    """
     undone = replace(camera, ego_from_camera=mistake.undo(camera.ego_from_camera))
     mounting, named = mounting_of(undone.ego_from_camera), direction_of_name(camera.name)
     level = abs(mounting.pitch_deg) <= LEVEL_DEG[0] and abs(mounting.roll_deg) <= LEVEL_DEG[1]
-    fits_name = named is None or turn_deg(named, mounting.yaw_deg) <= NAME_TURN_DEG
+    fits_name = not by_name or named is None or turn_deg(named, mounting.yaw_deg) <= NAME_TURN_DEG
     return not _defects(undone) and level and fits_name
 
 

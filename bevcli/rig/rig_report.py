@@ -13,7 +13,7 @@ from bevcli.rig.coverage import COVERAGE_GRID, Coverage, check_coverage, coverag
 from bevcli.rig.lens_checks import check_lenses
 from bevcli.rig.name_checks import check_names
 from bevcli.rig.nuscenes_comparison import Measure, check_measures, measures_of
-from bevcli.rig.pose_checks import check_poses
+from bevcli.rig.pose_checks import check_poses, corrected
 
 MERGED_FROM = 3  # cameras with the same mistake: from this many on it is one finding on the whole rig
 
@@ -44,7 +44,7 @@ def check_rig(rig: CameraRig, found_before: Sequence[Finding] = (), grid: BevGri
     """
     cameras = _without_errors(rig.cameras, found_before)
     poses, lenses = check_poses(cameras), check_lenses(cameras)
-    names = check_names(_without_errors(cameras, poses))
+    names = check_names(_without_errors(cameras, poses)) + _names_behind(poses, cameras)
     rig_has_error = any(finding.camera is None for finding in errors_of(found_before))
     bev = () if rig_has_error else check_bev_frame(rig.ego_from_bev)
     findings = [*found_before, *_merged(poses, cameras), *_merged(lenses, cameras), *names, *bev]
@@ -56,6 +56,12 @@ def check_rig(rig: CameraRig, found_before: Sequence[Finding] = (), grid: BevGri
         measures = measures_of(rig.cameras, coverage)
         findings += [*check_coverage(coverage, rig.ego_from_bev), *check_measures(measures)]
     return RigReport(_by_severity(findings), coverage, measures)
+
+
+def _names_behind(poses: Sequence[Finding], cameras: Sequence[Camera]) -> tuple[Finding, ...]:
+    """Swapped names of cameras whose poses share another mistake, such as all inverted: seen once that is undone."""
+    swapped = [one for one in check_names(corrected(cameras)) if one.code == "swapped-names"] if poses else []
+    return tuple(replace(one, advice=f"{one.advice}, after correcting the poses") for one in swapped)
 
 
 def with_findings(report: RigReport, findings: Sequence[Finding]) -> RigReport:

@@ -74,7 +74,7 @@ def check_ego_motion(ego_motion: EgoMotion) -> tuple[Finding, ...]:
     if cause is not None:
         return (cause,)
     findings = [finding for finding in (_jump(drive, ego_motion), _direction(drive)) if finding is not None]
-    speed = None if findings else _stated_speed(drive, ego_motion)
+    speed = _stated_speed(drive, ego_motion) if ego_motion.velocities_are_stated and not findings else None
     return (*findings, speed) if speed is not None else tuple(findings)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -45,6 +46,26 @@ class UnreadableImage(Exception):
     """An image is missing or broken. The message is the reason."""
 
 
+class Source(Protocol):
+    """Where one image is: an `ImageSource`, or one of another format, which reads itself.
+
+    Attributes:
+        timestamp_ns: time of the image, at least roughly.
+    """
+
+    @property
+    def timestamp_ns(self) -> int: ...
+
+
+@runtime_checkable
+class ReadableSource(Protocol):
+    """A source that reads its own image. It may be used from several threads."""
+
+    def read(self) -> CameraImage:
+        """The image. Raises UnreadableImage."""
+        ...
+
+
 class ImageReader:
     """Reads the images of frames, which should be asked for in order.
 
@@ -57,7 +78,7 @@ class ImageReader:
         self._threads = ThreadPoolExecutor(DECODING_THREADS, thread_name_prefix="decode")
 
     def read(
-        self, sources: Mapping[str, ImageSource], rig: CameraRig, dropped: Mapping[str, str]
+        self, sources: Mapping[str, Source], rig: CameraRig, dropped: Mapping[str, str]
     ) -> tuple[dict[str, CameraImage], dict[str, str]]:
         """The images by camera, and the reasons for missing images by camera.
 
@@ -80,8 +101,12 @@ class ImageReader:
                 reasons[name] = str(unreadable)
         return images, reasons
 
-    def _read_one(self, source: ImageSource, camera: Camera) -> CameraImage:
-        if source.video_index is None:
+    def _read_one(self, source: Source, camera: Camera) -> CameraImage:
+        if isinstance(source, ReadableSource):
+            image = source.read()
+        elif not isinstance(source, ImageSource):
+            raise TypeError(f"{source} is not an image source")
+        elif source.video_index is None:
             image = _read_file(source)
         else:
             image = CameraImage(source.timestamp_ns, self._read_video(source, camera.name))

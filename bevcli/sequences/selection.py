@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from collections.abc import Sequence as Indices
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.frame import Frame, FrameStamp, Sequence
+from bevcli.frame import Frame, FrameStamp, Sequence, facts_of
 
 # A scene counts as having the wanted rate if the ratio of its rate to it is in this range: keyframe times jitter.
 SLOWEST_RATIO, FASTEST_RATIO = 0.75, 1.5
@@ -25,6 +26,7 @@ class Selection:
         self.name = sequence.name
         self.rig = sequence.rig
         self.has_ego_motion = sequence.has_ego_motion
+        self.facts = facts_of(sequence)
         self.notes = (*sequence.notes, *notes)
         self.input_files: tuple[Path, ...] = getattr(sequence, "input_files", ())
 
@@ -37,6 +39,17 @@ class Selection:
     def load(self, place: int) -> Frame:
         """The frame at position `place` of the selection, with decoded images."""
         return self._sequence.load(self._indices[place])
+
+
+class WithoutGroundTruth(Selection):
+    """A sequence without its ground truth."""
+
+    def __init__(self, sequence: Sequence) -> None:
+        super().__init__(sequence, range(len(sequence.stamps)))
+
+    def load(self, place: int) -> Frame:
+        """The frame at position `place`, without boxes and map."""
+        return replace(super().load(place), ground_truth=None, ground_truth_map=None)
 
 
 def select(sequence: Sequence, indices: Indices[int], notes: tuple[str, ...] = ()) -> Sequence:

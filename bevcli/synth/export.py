@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import CameraImage, Frame
+from bevcli.frame import CameraImage, DriveFacts, Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.sequences.native.ego_motion_file import write_ego_motion
@@ -118,7 +118,7 @@ def export_drive(
     Raises OutputError where the folder contains a sequence and `force` is false, or cannot be written.
     """
     motion = drive.ego_motion(EGO_MOTION_HZ)
-    with NativeWriter(folder, with_ego_motion=True, force=force) as writer:
+    with NativeWriter(folder, with_ego_motion=True, force=force, facts=DriveFacts(rendered=True)) as writer:
         for index in range(drive.frames):
             rendered = drive.frame(index)
             kinematics = motion.kinematics_at(rendered.stamp.timestamp_ns)

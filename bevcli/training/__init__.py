@@ -15,6 +15,7 @@ In the order of a training step:
     perspective_head       BEVFormerV2's detector on the image features, in training only
     perspective_loss       its loss
     frame_losses           all losses of a frame, by name
+    clip_forward           the forward passes of a clip, with the earlier frames as history
     optimizer              AdamW and its learning rate schedule
     trainer                the loop: clips in, updates of the weights, checkpoints and curves out
     job                    the [training] table of a model file, and what a training is made from

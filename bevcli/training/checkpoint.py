@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from bevcli.errors import OutputError, WeightsError
-from bevcli.model.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormerBase
 
 FORMAT = "bevcli-training/1"
 
@@ -47,7 +47,7 @@ def load_checkpoint(path: Path, trained: nn.Module, optimizer: torch.optim.AdamW
         raise WeightsError(f"{path}: is not a checkpoint of this model: {reason}") from error
 
 
-def save_weights(path: Path, model: BEVFormer, dtype: torch.dtype) -> None:
+def save_weights(path: Path, model: BEVFormerBase, dtype: torch.dtype) -> None:
     """Writes the model's weights as .safetensors, for `bevcli run --weights`."""
     state = {
         key: (tensor.to(dtype) if tensor.is_floating_point() else tensor).contiguous().cpu()

@@ -53,16 +53,20 @@ class Clip:
     frames: tuple[int, ...]
 
 
-def draw_clips(drives: Drives, config: ClipConfig, random: np.random.Generator) -> list[Clip]:
-    """The clips of one batch, all of the same length. Raises InputError if a drive is too short."""
+def draw_clips(drives: Drives, config: ClipConfig, random: np.random.Generator, *, with_gap: bool = True) -> list[Clip]:
+    """The clips of one batch, all of the same length. Raises InputError if a drive is too short.
+
+    Args:
+        with_gap: with `learn` "last", leave out one of the earlier frames, as published for BEVFormer.
+    """
     frames = config.frames
     if frames > 1 and random.random() < config.short_share:
         frames = int(random.integers(1, frames))
     clips = []
     for _ in range(config.batch):
         drive = int(random.integers(len(drives)))
-        with_gap = config.learn == "last"
-        clips.append(Clip(drive, draw_frames(drives.open(drive), frames, random, with_gap=with_gap)))
+        leave_out = with_gap and config.learn == "last"
+        clips.append(Clip(drive, draw_frames(drives.open(drive), frames, random, with_gap=leave_out)))
     return clips
 
 

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 from torch import Tensor, nn
 
-from bevcli.model.bevformer import BEVFormer, BEVFormerInputs, BEVFormerOutputs
+from bevcli.model.bevformer import BEVFormerBase, BEVFormerInputs, BEVFormerOutputs
 from bevcli.training.dense_loss import DenseHead, DenseLossConfig, dense_loss
 from bevcli.training.detection_loss import DetectionLossConfig, detection_loss
 from bevcli.training.perspective_head import PerspectiveHead
@@ -48,7 +48,7 @@ class FrameLosses:
             are part of the checkpoint format.
     """
 
-    def __init__(self, model: BEVFormer, configs: LossConfigs) -> None:
+    def __init__(self, model: BEVFormerBase, configs: LossConfigs) -> None:
         classes = len(model.config.classes)
         self.configs = configs
         self._query_groups = model.config.decoder.training_groups
@@ -63,7 +63,7 @@ class FrameLosses:
             self.auxiliary_heads["perspective_head"] = self._perspective_head
 
     @contextlib.contextmanager
-    def watching(self, model: BEVFormer) -> Iterator[None]:
+    def watching(self, model: BEVFormerBase) -> Iterator[None]:
         """Inside, each forward pass of the model keeps its image features for the perspective loss. No hook remains."""
         if self._perspective_head is None:
             yield

@@ -12,8 +12,8 @@ import torch
 from bevcli.checkpoints import load_weights
 from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import ConfigError, OutputError
-from bevcli.model.bevformer import BEVFormer
-from bevcli.model.bevformer_v2 import BEVFormerV2Config
+from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
+from bevcli.model.bevformer_v2 import BEVFormerV2Config, build_model
 from bevcli.training.augmentation import AugmentationConfig
 from bevcli.training.clips import ClipConfig
 from bevcli.training.drives import Drives, check_training_seeds, open_drives, split_drives
@@ -74,7 +74,7 @@ class TrainingJob:
         group: the processes that train together.
     """
 
-    model: BEVFormer
+    model: BEVFormerBase
     config: TrainingConfig
     drives: Drives
     held_out: Drives
@@ -93,6 +93,7 @@ def prepare_training(
     out: Path | None = None,
     weights: Path | None = None,
     steps: int | None = None,
+    held_out: int | None = None,
     seed: int = 0,
     resume: bool = False,
 ) -> TrainingJob:
@@ -106,6 +107,7 @@ def prepare_training(
         out: the output folder, by default runs/train-MODEL.
         weights: a file to start from, in place of random weights.
         steps: replaces `steps` of the [training] table.
+        held_out: replaces `held_out` of the [training] table.
         seed: of all draws after the initial weights.
         resume: the output folder may hold a checkpoint.
 
@@ -115,17 +117,33 @@ def prepare_training(
     model_config = load_config(model_name_or_file)
     config = load_table(model_name_or_file, TRAINING, TrainingConfig)
     config = config if steps is None else replace(config, steps=steps)
+    config = config if held_out is None else replace(config, held_out=held_out)
+    check_window(model_config, config)
     out = Path("runs") / f"train-{model_config.name}" if out is None else out
     check_training_seeds(rendered_seeds or ())
     drives = open_drives(folders, rendered_seeds, out / "drives", model_config)
-    drives, held_out = split_drives(drives, config.held_out)
+    drives, evaluated = split_drives(drives, config.held_out)
     prepare_folder(out, resume=resume)
-    if isinstance(model_config, BEVFormerV2Config):
-        raise ConfigError(f"model {model_config.name} is a BEVFormerV2, which cannot be trained yet (use a BEVFormer)")
-    model = BEVFormer(model_config)
+    model = build_model(model_config)
     if weights is not None:
         load_weights(weights, model, resample=True)
-    return TrainingJob(model, config, drives, held_out, out, device, seed, join_process_group(device))
+    return TrainingJob(model, config, drives, evaluated, out, device, seed, join_process_group(device))
+
+
+def check_window(model: BEVFormerConfig, config: TrainingConfig) -> None:
+    """Raises ConfigError if clips cannot fill the window of a BEVFormerV2."""
+    if not isinstance(model, BEVFormerV2Config):
+        return
+    if model.later_frames:
+        raise ConfigError(
+            f"{model.name}: frames after the current one cannot be trained; expected frames that end with 0, "
+            f"found {list(model.frames)}"
+        )
+    if config.clips.frames <= model.past_frames:
+        raise ConfigError(
+            f"{model.name}: training.clips.frames must be at least {model.past_frames + 1}, so that a clip fills the "
+            f"window of the model, but is {config.clips.frames}"
+        )
 
 
 def prepare_folder(out: Path, *, resume: bool) -> None:

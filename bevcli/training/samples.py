@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from bevcli.errors import InputError
 from bevcli.frame import Frame
@@ -51,16 +52,19 @@ class Batch:
 
     Attributes:
         inputs: the network inputs, one a frame of the clips, each for B clips.
+        world_from_bev: (frames, B, 4, 4) float64, the poses of the bev frames, metres.
         targets: of the last frames of the clips. There are fewer than inputs if the first frames are history only.
     """
 
     inputs: tuple[BEVFormerInputs, ...]
+    world_from_bev: Tensor
     targets: tuple[Targets, ...]
 
     def to(self, device: torch.device) -> Batch:
         """A copy on a device."""
         inputs = tuple(one.to(device) for one in self.inputs)
-        return Batch(inputs, tuple(targets.to(device) for targets in self.targets))
+        targets = tuple(targets.to(device) for targets in self.targets)
+        return Batch(inputs, self.world_from_bev.to(device), targets)
 
 
 def load_batch(
@@ -89,7 +93,9 @@ def load_batch(
         mask_images(step.images, augmentation.grid_mask, random)
         inputs.append(step)
     learned = frames if learn_all else frames[-1:]
-    return Batch(tuple(inputs), tuple(_targets([one.frame for one in prepared], config) for prepared in learned))
+    poses = [[one.frame.world_from_ego.matrix @ one.frame.rig.ego_from_bev for one in prepared] for prepared in frames]
+    targets = tuple(_targets([one.frame for one in prepared], config) for prepared in learned)
+    return Batch(tuple(inputs), torch.from_numpy(np.array(poses)), targets)
 
 
 def ground_truth_boxes(frame: Frame) -> Boxes3D:

@@ -12,12 +12,13 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.errors import BevcliError
-from bevcli.model.bevformer import BEVFormer, BEVFormerInputs, BEVFormerOutputs
+from bevcli.model.bevformer_v2 import BEVFormerV2
 from bevcli.model.prepared import choose_kernels
 from bevcli.pipeline.model_loading import choose_precision
 from bevcli.pipeline.read_ahead import read_ahead
 from bevcli.pipeline.runner import Runner, StepOptions
 from bevcli.training.checkpoint import load_checkpoint, save_checkpoint, save_weights
+from bevcli.training.clip_forward import forward_clip
 from bevcli.training.clips import draw_clips
 from bevcli.training.frame_losses import FrameLosses
 from bevcli.training.job import CHECKPOINT, TrainingJob
@@ -57,27 +58,34 @@ class Trainer:
         self,
         after_step: Callable[[], None] = lambda: None,
         after_validation: Callable[[int, Validation], None] = lambda step, scores: None,
+        stop: Callable[[], bool] = lambda: False,
     ) -> None:
         """Runs the remaining steps and leaves the model in evaluation mode. Raises BevcliError if a loss is not finite.
 
         Args:
             after_step: called by the leader after each step.
             after_validation: called by the leader with the number of steps done and the scores.
+            stop: asked after each step; if it is true, a checkpoint is written and the training ends early.
         """
         config = self.job.config
         remaining = range(self.done, config.steps)
         for batches in read_ahead(self._load, remaining, depth=config.loaders, threads=config.loaders):
             row = self._step(batches)
             self.done += 1
+            stopped = stop()
             if not self.job.group.leads:
+                if stopped:
+                    break
                 continue
             self._loss_curve.add(self.done, row)
             last = self.done == config.steps
             if self.done % config.evaluate_every == 0 or last:
                 after_validation(self.done, self._validate())
-            if self.done % config.checkpoint_every == 0 or last:
+            if self.done % config.checkpoint_every == 0 or last or stopped:
                 save_checkpoint(self.job.out / CHECKPOINT, self.done, self.trained, self.optimizer)
             after_step()
+            if stopped:
+                break
         self.job.model.eval()
 
     @property
@@ -95,7 +103,7 @@ class Trainer:
         random = np.random.default_rng(self._seeds(step))
         batches = []
         for _ in range(config.clips.in_turn):
-            clips = draw_clips(job.drives, config.clips, random)
+            clips = draw_clips(job.drives, config.clips, random, with_gap=not isinstance(job.model, BEVFormerV2))
             batches.append(
                 load_batch(job.drives, clips, job.model.config, config.augmentation, random, learn_all=self._learn_all)
             )
@@ -119,9 +127,7 @@ class Trainer:
     def _clip_losses(self, batch: Batch) -> Iterator[dict[str, Tensor]]:
         """The losses of each frame to train on, lazily: the model may be updated in between."""
         job, config = self.job, self.job.config
-        outputs = forward_clip(
-            job.model, batch.inputs, learn_all=self._learn_all, freeze_batch_norm=config.freeze_batch_norm
-        )
+        outputs = forward_clip(job.model, batch, learn_all=self._learn_all, freeze_batch_norm=config.freeze_batch_norm)
         for inputs, targets in zip(batch.inputs[-len(batch.targets) :], batch.targets, strict=True):
             with torch.autocast(job.device.type, torch.bfloat16, enabled=computes_in_bfloat16(job.device)):
                 output = next(outputs)
@@ -154,35 +160,6 @@ class Trainer:
         save_weights(job.out / "weights.safetensors", job.model, dtype)
         draw_learning_curves(self._loss_curve, self._validation_curve, job.out / "curves.png")
         return scores
-
-
-def forward_clip(
-    model: BEVFormer, clip: Sequence[BEVFormerInputs], *, learn_all: bool = False, freeze_batch_norm: bool = False
-) -> Iterator[BEVFormerOutputs]:
-    """The outputs, in training mode, for the last frame of a batch of clips.
-
-    The frames before it only build its history, in evaluation mode and without gradient, as in the paper.
-
-    Args:
-        clip: the inputs of successive frames.
-        learn_all: yield the outputs for every frame. The model may be updated in between: history has no gradient.
-        freeze_batch_norm: keep batch norms in evaluation mode, for fine-tuning.
-    """
-    history: Tensor | None = None
-    history_only = () if learn_all else clip[:-1]
-    model.eval()
-    with torch.no_grad():
-        for inputs in history_only:
-            history = model.bev_map(inputs, history)
-    model.train()
-    if freeze_batch_norm:
-        for module in model.modules():
-            if isinstance(module, nn.BatchNorm2d):
-                module.eval()
-    for inputs in clip[len(history_only) :]:
-        outputs = model(inputs, history)
-        history = outputs.bev.detach()
-        yield outputs
 
 
 def alternated(iterators: Sequence[Iterator[T]]) -> Iterator[T]:

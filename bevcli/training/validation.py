@@ -17,7 +17,6 @@ from bevcli.evaluation.tracking.scoring import TrackingScores, evaluate_tracking
 from bevcli.frame import MAP_CLASSES, Frame, FrameStamp, Prediction
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.transforms import Array, inverse
-from bevcli.model.bevformer import BEVFormerConfig
 from bevcli.pipeline.preprocess import Preprocessor
 from bevcli.pipeline.runner import Runner
 from bevcli.pipeline.tracking import TrackerConfig, track
@@ -72,7 +71,7 @@ def validate(
         tracker: parameters of the tracker whose tracks are scored; None scores no tracks.
         after_frame: called after each frame.
     """
-    range_m = nearest_side_m(runner.config) if max_range_m is None else max_range_m
+    range_m = runner.config.bev_grid.nearest_side_m if max_range_m is None else max_range_m
     config = DetectionConfig().cut_at(range_m)
     predictions, truths, maps = [], [], []
     tracks: list[_TrackedFrame] = []
@@ -98,12 +97,6 @@ def validate(
         evaluate_segmentation(maps) if maps else None,
         None if tracker is None else _score_tracks(tracks, TrackingConfig().cut_at(range_m)),
     )
-
-
-def nearest_side_m(config: BEVFormerConfig) -> float:
-    """Distance from the origin to the nearest side of the BEV grid, metres."""
-    grid = config.bev_grid
-    return min(abs(end) for end in (*grid.x_range_m, *grid.y_range_m))
 
 
 def _boxes_ego(frame: Frame, ground_truth: Boxes3D, prediction: Prediction) -> tuple[Boxes3D, Boxes3D]:

@@ -19,7 +19,7 @@ from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
 
 COLUMNS = (
     "frame", "scene", "timestamp_ns", "class", "score", "x", "y", "z", "length", "width", "height", "yaw",
-    "velocity_x", "velocity_y",
+    "velocity_x", "velocity_y", "instance",
 )  # fmt: skip
 
 
@@ -67,6 +67,7 @@ def recorded_boxes(frame: RecordedFrame) -> RecordedBoxes:
         velocities=np.column_stack([frame.array(entity, f"velocity_{axis}", 1)[:, 0] for axis in "xy"]),
         classes=np.array(frame.values(entity, "name"), dtype=np.str_),
         scores=frame.array(entity, "score", 1)[:, 0],
+        instances=np.array(frame.values(entity, "track"), dtype=np.str_) if frame.has(entity, "track") else None,
     )
     return RecordedBoxes(_stamp(frame), _world_from_ego(frame, origin), boxes)
 
@@ -98,7 +99,8 @@ def _rows(frame: RecordedBoxes) -> Iterator[list[object]]:
     for i, score in enumerate(boxes.scores):
         numbers = (*boxes.centers[i], *boxes.sizes_lwh[i], boxes.yaws[i], *boxes.velocities[i])
         rounded = [f"{number:.4f}" for number in numbers]
-        yield [stamp.index, stamp.scene, stamp.timestamp_ns, boxes.classes[i], f"{score:.4f}", *rounded]
+        instance = "" if boxes.instances is None else boxes.instances[i]
+        yield [stamp.index, stamp.scene, stamp.timestamp_ns, boxes.classes[i], f"{score:.4f}", *rounded, instance]
 
 
 def _write_json(path: Path, frames: list[RecordedBoxes]) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from bevcli.errors import InputError
 from bevcli.viewer.native import viewer_binary, viewer_environment
 
+RECORDING = "recording.rrd"
 MAGIC, FOOTER = b"RRF2", b"RRF2FOOT"  # the first bytes of an .rrd file, and the bytes 12 before its end
 
 REPAIR_S, REPAIR_BYTES_PER_S = 30.0, 5e6  # time limit of a repair: it starts, and reads at least this fast
@@ -35,8 +36,11 @@ class RecordingFile:
 def open_recording(path: Path) -> Iterator[RecordingFile]:
     """The recording at a path. If its end is missing: a repaired copy, which is deleted when the context ends.
 
+    path: the recording, or the output folder of `bevcli run`.
+
     Raises InputError if the file is missing, is not a recording, or was cut off before its first frame.
     """
+    path = recording_in(path)
     if _is_whole(path):
         yield RecordingFile(path, repaired=False)
         return
@@ -46,6 +50,16 @@ def open_recording(path: Path) -> Iterator[RecordingFile]:
         if not copy.is_file() or copy.stat().st_size < 1000:
             raise InputError(f"{path}: the recording was cut off before its first frame; nothing can be shown")
         yield RecordingFile(copy, repaired=True)
+
+
+def recording_in(path: Path) -> Path:
+    """The recording of a run's folder; any other path as it is. Raises InputError for a folder without a recording."""
+    if not path.is_dir():
+        return path
+    recording = path / RECORDING
+    if not recording.is_file():
+        raise InputError(f"{path}: the folder has no {RECORDING} (expected a recording, or a folder of `bevcli run`)")
+    return recording
 
 
 def restore_index(path: Path) -> bool:
@@ -84,8 +98,6 @@ def _repair(path: Path, copy: Path) -> None:
 
 
 def _is_whole(path: Path) -> bool:
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder (expected a recording, such as {path / 'recording.rrd'})")
     try:
         with path.open("rb") as file:
             start = file.read(len(MAGIC))

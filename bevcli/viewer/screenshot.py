@@ -8,6 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
+import cv2
+import numpy as np
 from rerun.experimental import ViewerClient
 from rerun.experimental._viewer_client import ViewerState
 
@@ -17,18 +19,22 @@ from bevcli.viewer.native import LOOPBACK, free_port, start_viewer, stop
 
 Answer = TypeVar("Answer")
 START_TIMEOUT_S = 40.0
+ENDINGS = (".png", ".jpg", ".jpeg")
+JPEG_QUALITY = 90
 SETTLE_S = 2.5  # the viewer decodes images after it opened the views, and does not report when it is done
 NO_DRIVER = "the viewer cannot draw here: it needs a Vulkan driver (Debian: apt-get install mesa-vulkan-drivers)"
 
 
 def take_screenshot(recording: Path, image: Path, frame: int | None = None) -> tuple[str, ...]:
-    """Writes a PNG of the whole viewer at a frame; returns the names of the views. Takes about 6 s.
+    """Writes an image of the whole viewer at a frame; returns the names of the views. Takes about 6 s.
 
-    frame: the frame's index; None takes the first one.
+    image: a .png, .jpg or .jpeg file. frame: the frame's index; None takes the first one.
 
     Raises OutputError if the viewer cannot draw (no Vulkan driver) or the file cannot be written, InputError if the
-    recording does not have the frame.
+    file has another ending or the recording does not have the frame.
     """
+    if image.suffix.lower() not in ENDINGS:
+        raise InputError(f"--screenshot {image}: the file must end in .png, .jpg or .jpeg")
     port = free_port()
     process = start_viewer("--headless", "--bind", LOOPBACK, "--port", str(port))
     try:
@@ -82,7 +88,14 @@ def _wait(process: subprocess.Popen[bytes], attempt: Callable[[], Answer | None]
 
 
 def _write(image: Path, png: bytes) -> None:
+    data = png if image.suffix.lower() == ".png" else _jpeg(png)
     try:
-        image.write_bytes(png)
+        image.write_bytes(data)
     except OSError as error:
         raise OutputError(f"{image}: cannot be written ({error.strerror})") from error
+
+
+def _jpeg(png: bytes) -> bytes:
+    pixels = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    assert pixels is not None
+    return cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()

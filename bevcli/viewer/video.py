@@ -1,8 +1,10 @@
-"""Writes a video of a recording in VP9, which Chromium and Firefox play."""
+"""Writes a video of a recording: H.264 in MP4, which plays everywhere, if PyAV is installed; VP9 else and in WebM."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from fractions import Fraction
 from pathlib import Path
 
 import cv2
@@ -10,10 +12,13 @@ import numpy as np
 
 from bevcli.errors import InputError, OutputError
 from bevcli.recording import entities
+from bevcli.recording.video_images import has_av
+from bevcli.viewer.camera_images import CameraImages
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
 from bevcli.viewer.video_frame import HEIGHT, WIDTH, Tile, camera_rows_of, draw_frame, tiles
 
 FOURCC = {".mp4": "vp09", ".webm": "VP90"}  # VP9: OpenCV's wheels cannot write H.264
+H264_QUALITY = 21  # x264's crf
 SLOWEST, FASTEST = 1.0, 30.0  # frames a second
 
 
@@ -28,16 +33,44 @@ def write_video(recording: Path, video: Path, on_frame: Callable[[], None] = lam
     count, rate = frame_rate(recording)
     if not count:
         raise InputError(f"{recording}: the recording has no frames")
+    opened = _h264(video, rate) if video.suffix.lower() == ".mp4" and has_av() else _vp9(video, rate)
+    with opened as write:
+        for image in _images(recording):
+            write(image)
+            on_frame()
+    return count
+
+
+@contextmanager
+def _vp9(video: Path, rate: float) -> Iterator[Callable[[np.ndarray], object]]:
     writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*FOURCC[video.suffix.lower()]), rate, (WIDTH, HEIGHT))
     if not writer.isOpened():
-        raise OutputError(f"{video}: the video cannot be written (does the folder exist, and is it writable?)")
+        raise _unwritable(video)
     try:
-        for image in _images(recording):
-            writer.write(image)
-            on_frame()
+        yield writer.write
     finally:
         writer.release()
-    return count
+
+
+@contextmanager
+def _h264(video: Path, rate: float) -> Iterator[Callable[[np.ndarray], object]]:
+    import av
+
+    try:
+        container = av.open(str(video), "w", options={"movflags": "+faststart"})
+    except OSError as error:
+        raise _unwritable(video) from error
+    with container:
+        stream = container.add_stream(
+            "libx264", rate=Fraction(rate).limit_denominator(1000), options={"crf": str(H264_QUALITY)}
+        )
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        yield lambda image: container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
+        container.mux(stream.encode(None))
+
+
+def _unwritable(video: Path) -> OutputError:
+    return OutputError(f"{video}: the video cannot be written (does the folder exist, and is it writable?)")
 
 
 def frame_rate(recording: Path) -> tuple[int, float]:
@@ -63,10 +96,11 @@ def frame_times_ns(recording: Path) -> np.ndarray:
 
 def _images(recording: Path) -> Iterator[np.ndarray]:
     layout: tuple[Tile, ...] | None = None
+    images = CameraImages()
     for frame in RecordingReader(recording).frames():
         if layout is None:
             layout = tiles(camera_rows_of(frame), image_sizes(frame))
-        yield draw_frame(frame, layout)
+        yield draw_frame(frame, layout, images)
 
 
 def image_sizes(frame: RecordedFrame) -> dict[str, tuple[int, int]]:

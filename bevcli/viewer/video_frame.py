@@ -11,7 +11,8 @@ import numpy as np
 from bevcli.geometry.transforms import Array
 from bevcli.recording import entities
 from bevcli.recording.camera_layout import rows_by_yaw
-from bevcli.recording.colors import class_color
+from bevcli.recording.colors import MAP_COLORS, class_color
+from bevcli.viewer.camera_images import CameraImages
 from bevcli.viewer.flat_drawing import (
     Canvas,
     ToCanvas,
@@ -27,8 +28,12 @@ WIDTH, HEIGHT = 1920, 640
 BEV_SIDE = 640
 CAMERAS_WIDTH = WIDTH - BEV_SIDE
 CAMERAS_HEIGHT = 500
-BEV_RANGE_M = 50.0  # from the vehicle to each edge of the BEV view
+BEV_RANGE_M = 50.0  # from the vehicle to each edge of the BEV view, in recordings without range rings
+BEV_MARGIN = 1.02  # of the range rings and the border of the grid
 BACKGROUND = (25, 20, 18)  # BGR, as all colours of the video
+BELOW_BOXES = (
+    entities.BEV_GROUND_TRUTH, entities.BEV_MISSED, entities.BEV_TRACKS, entities.BEV_FALSE, entities.BEV_DUPLICATES
+)  # fmt: skip
 TEXT, WARNING = (225, 220, 215), (85, 70, 255)
 
 
@@ -68,20 +73,22 @@ def camera_rows_of(frame: RecordedFrame) -> tuple[tuple[str, ...], ...]:
     return rows_by_yaw(yaws)
 
 
-def draw_frame(frame: RecordedFrame, layout: tuple[Tile, ...]) -> Canvas:
-    """The video frame, (HEIGHT, WIDTH, 3) uint8 BGR. layout: where each camera's image goes."""
+def draw_frame(frame: RecordedFrame, layout: tuple[Tile, ...], images: CameraImages) -> Canvas:
+    """The video frame, (HEIGHT, WIDTH, 3) uint8 BGR.
+
+    layout: where each camera's image goes. images: decodes them; frames must come in order.
+    """
     canvas = np.full((HEIGHT, WIDTH, 3), BACKGROUND, dtype=np.uint8)
     for tile in layout:
-        _draw_camera(canvas[tile.top : tile.top + tile.height, tile.left : tile.left + tile.width], frame, tile)
+        image = images.image(frame, tile.camera)
+        _draw_camera(canvas[tile.top : tile.top + tile.height, tile.left : tile.left + tile.width], frame, tile, image)
     _draw_bev(canvas[:, CAMERAS_WIDTH:], frame)
     _draw_legend(canvas[CAMERAS_HEIGHT:, :CAMERAS_WIDTH], frame)
     return canvas
 
 
-def _draw_camera(canvas: Canvas, frame: RecordedFrame, tile: Tile) -> None:
-    jpeg = frame.blob(entities.image(tile.camera), "EncodedImage:blob")
+def _draw_camera(canvas: Canvas, frame: RecordedFrame, tile: Tile, image: Canvas | None) -> None:
     width, height = frame.array(entities.camera(tile.camera), "Pinhole:resolution", 2)[0]
-    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR) if jpeg else None
     if image is not None:
         canvas[:] = cv2.resize(image, (tile.width, tile.height), interpolation=cv2.INTER_AREA)
     scale = np.array([tile.width / width, tile.height / height])
@@ -104,15 +111,18 @@ def _draw_camera(canvas: Canvas, frame: RecordedFrame, tile: Tile) -> None:
 
 
 def _draw_bev(canvas: Canvas, frame: RecordedFrame) -> None:
+    rings = [np.abs(strip).max() for strip in frame.values(entities.BEV_RINGS, "LineStrips2D:strips")]
+    reach = BEV_MARGIN * max(rings) if rings else BEV_RANGE_M
+
     def to_canvas(points: Array) -> Array:
-        return (points / BEV_RANGE_M + 1) * BEV_SIDE / 2
+        return (points / reach + 1) * BEV_SIDE / 2
 
     segmentation = recorded_image(frame, entities.BEV_SEGMENTATION)
     if segmentation is not None:
         _draw_placed(canvas, frame, entities.BEV_SEGMENTATION, segmentation, to_canvas)
     draw_strips(canvas, frame, entities.BEV_RINGS, to_canvas)
     draw_labels(canvas, frame, f"{entities.BEV_RINGS}/labels", to_canvas, 0.35)
-    for entity in (entities.BEV_GROUND_TRUTH, entities.BEV_MISSED, entities.BEV_FALSE):
+    for entity in BELOW_BOXES:
         draw_strips(canvas, frame, entity, to_canvas)
     draw_strips(canvas, frame, entities.BEV_BOXES, to_canvas, 2)
     draw_arrows(canvas, frame, entities.BEV_VELOCITY, to_canvas)
@@ -132,9 +142,12 @@ def _draw_placed(canvas: Canvas, frame: RecordedFrame, entity: str, image: Canva
 def _draw_legend(canvas: Canvas, frame: RecordedFrame) -> None:
     title = "".join(frame.values(entities.RUN, "title"))
     scene = "".join(frame.values(entities.EGO, "scene"))
-    draw_text(canvas, f"{title}   {scene}   frame {frame.index}", (16, 24), TEXT, 0.6)
+    speed = "".join(frame.values(entities.SPEED, "Points3D:labels"))
+    draw_text(canvas, f"{title}   {scene}   frame {frame.index}   {speed}", (16, 24), TEXT, 0.6)
+    note = "".join(frame.values(entities.RUN, "note"))
     if any(frame.values(entities.RUN, "untrained")):
-        draw_text(canvas, "UNTRAINED WEIGHTS: boxes are meaningless", (CAMERAS_WIDTH - 480, 24), WARNING, 0.6)
+        note = "UNTRAINED WEIGHTS: boxes are meaningless"
+    draw_text(canvas, note, (CAMERAS_WIDTH - 480, 24), WARNING, 0.6)
     names = frame.values(entities.RUN, "class_names")
     counts = Counter(frame.values(entities.BOXES, "name"))
     for index, name in enumerate(names):
@@ -142,6 +155,15 @@ def _draw_legend(canvas: Canvas, frame: RecordedFrame) -> None:
         x, y = 16 + 250 * (index % 5), 60 + 32 * (index // 5)
         cv2.rectangle(canvas, (x, y - 7), (x + 14, y + 7), (blue, green, red), -1)
         draw_text(canvas, f"{name.replace('_', ' ')} {counts[name]}", (x + 24, y), TEXT)
+    if frame.has(entities.BEV_SEGMENTATION, "Image:buffer"):
+        _draw_map_legend(canvas)
+
+
+def _draw_map_legend(canvas: Canvas) -> None:
+    for index, (name, (red, green, blue)) in enumerate(MAP_COLORS.items()):
+        x, y = 16 + 250 * index, 60 + 32 * 2
+        cv2.rectangle(canvas, (x, y - 7), (x + 14, y + 7), (blue, green, red), -1)
+        draw_text(canvas, f"map: {name.replace('_', ' ')}", (x + 24, y), TEXT)
 
 
 def _rotation(frame: RecordedFrame, entity: str) -> Array:

@@ -149,7 +149,9 @@ class _Handler(BaseHTTPRequestHandler):
         host = self.headers.get("Host", "")
         url = self.source if isinstance(self.source, str) else f"http://{host}{RECORDING}"
         self.send_response(302)
-        self.send_header("Location", f"/?url={quote(url, safe='')}" + (f"&{query}" if query else ""))
+        # The labels of images and of the scene are unreadable in the light theme of a light browser.
+        theme = "" if "theme" in parse_qs(query) else "&theme=dark"
+        self.send_header("Location", f"/?url={quote(url, safe='')}{theme}" + (f"&{query}" if query else ""))
         self.send_header("Content-Length", "0")
         self.end_headers()
 

@@ -172,8 +172,8 @@ def repeat_the_frame(content: dict[str, Any]) -> None:
 
 
 MISTAKES = {
-    "unknown class": (in_box("class", "tank"), r"frame 5: box 1: unknown class 'tank' \(expected one of car"),
-    "class is a list": (in_box("class", []), "frame 5: box 1: unknown class"),
+    "class is a list": (in_box("class", []), "frame 5: box 1: class: expected a name"),
+    "class is empty": (in_box("class", ""), "frame 5: box 1: class: expected a name"),
     "unknown key": (in_box("heading", 1), 'frame 5: box 1: unknown key "heading"'),
     "two numbers": (in_box("center", [1, 2]), "frame 5: box 1: center: expected 3 numbers, found"),
     "a text": (in_box("center", [1, 2, "3"]), "frame 5: box 1: center: expected 3 numbers"),

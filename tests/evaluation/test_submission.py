@@ -141,7 +141,7 @@ def test_a_submission_is_read_back(tmp_path: Path) -> None:
     [
         ("translation", [1, 2], "sample t0: box 0: center: expected 3 numbers"),
         ("rotation", [0, 0, 0, 0], "sample t0: box 0: rotation: expected 4 numbers of norm 1"),
-        ("detection_name", "tank", "sample t0: box 0: unknown class 'tank'"),
+        ("detection_name", 3, "sample t0: box 0: class: expected a name"),
         ("detection_score", None, "sample t0: box 0: score"),
     ],
 )

@@ -1,13 +1,17 @@
 """The same drive through every way in gives the same boxes."""
 
+import json
 import shutil
 
 import cv2
+import numpy as np
 import pytest
 import torch
+from bags import drive_messages, write_mcap
 
 from bevcli.pipeline.preprocess import Preprocessor
 from bevcli.pipeline.runner import Runner
+from bevcli.sequences.native.ego_motion_file import read_ego_motion
 from bevcli.sequences.open import open_sequence
 
 
@@ -44,3 +48,30 @@ def test_a_native_folder_and_six_lossless_videos(mini_model, shared, tmp_path):
         writer.release()
     (tmp_path / "frames.csv").write_text(table)
     assert_same_boxes(mini_model, drive, tmp_path)
+
+
+def test_a_native_folder_and_an_mcap_file(mini_model, shared, tmp_path):
+    native = as_a_bag_holds_it(shared / "data/nuscenes-scene-0103", tmp_path / "native")
+    motion = read_ego_motion(native / "ego_motion.csv")
+    bag = write_mcap(tmp_path / "drive.mcap", drive_messages(open_sequence(native), motion))
+    assert_same_boxes(mini_model, native, bag)
+
+
+def as_a_bag_holds_it(source, folder):
+    """A copy with what a bag holds: no bev frame, poses without kinematics, and frames at the time of CAM_BACK."""
+    shutil.copytree(source, folder)
+    calibration = json.loads((folder / "calibration.json").read_text())
+    del calibration["ego_from_bev"]
+    (folder / "calibration.json").write_text(json.dumps(calibration))
+    motion = read_ego_motion(source / "ego_motion.csv")
+    lines = ["timestamp_ns,x,y,z,qw,qx,qy,qz"]
+    for time in np.linspace(motion.first_ns, motion.last_ns, 17).astype(np.int64).tolist():
+        pose = motion.pose_at(time)
+        lines.append(",".join(map(repr, [time, *pose.translation.tolist(), *pose.quaternion.tolist()])))
+    (folder / "ego_motion.csv").write_text("\n".join(lines) + "\n")
+    rows = [line.split(",") for line in (folder / "frames.csv").read_text().splitlines()]
+    column = rows[0].index("CAM_BACK.timestamp_ns")
+    for row in rows[1:]:
+        row[1], row[2] = "", row[column]
+    (folder / "frames.csv").write_text("\n".join(map(",".join, rows)) + "\n")
+    return folder

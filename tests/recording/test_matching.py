@@ -9,6 +9,8 @@ from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import evaluate_detections
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.recording.colors import GROUND_TRUTH_COLOR, MISSED_COLOR, OTHER_COLOR
+from bevcli.recording.log_boxes import ground_truth_colors, other_classes
 from bevcli.recording.matching import detectable, true_positives
 
 
@@ -81,3 +83,12 @@ def test_the_display_agrees_with_the_evaluation(seed):
     assert true.any()
     assert not true.all()
     assert evaluated(predicted, truth) == (true.tolist(), found.tolist())
+
+
+def test_ground_truth_of_other_classes_is_grey_and_never_missed():
+    truth = boxes([(0, 0), (5, 0), (9, 0)], ["car", "Tricycle", "bus"])
+    other = other_classes(truth, ("car", "bus"))
+    assert other.tolist() == [False, True, False]
+    assert not other_classes(truth, ("car", "bus", "Tricycle")).any()
+    colors = ground_truth_colors(np.array([True, True, False]), other)
+    assert colors.tolist() == [list(GROUND_TRUTH_COLOR), list(OTHER_COLOR), list(MISSED_COLOR)]

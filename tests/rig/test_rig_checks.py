@@ -8,6 +8,7 @@ from mistakes import (
     BEV_MISTAKES,
     LENS_MISTAKES,
     POSE_MISTAKES,
+    inverted,
     millimetres,
     pose_of,
     rounded,
@@ -197,3 +198,19 @@ def test_a_missing_ego_from_bev_is_an_info(tmp_path):
     del document["ego_from_bev"]
     findings = report_of(document, tmp_path).findings
     assert [finding.severity for finding in findings if finding.code == "bev-assumed"] == ["info"]
+
+
+def test_two_swapped_cameras_are_found_in_a_rig_whose_poses_are_all_inverted(tmp_path):
+    document = copy_of("six")
+    cameras = document["cameras"]
+    for entry in cameras.values():
+        inverted(entry["ego_from_camera"])
+    front, back = cameras["CAM_FRONT"], cameras["CAM_BACK_LEFT"]
+    front["ego_from_camera"], back["ego_from_camera"] = back["ego_from_camera"], front["ego_from_camera"]
+    errors = errors_of(report_of(document, tmp_path).findings)
+    assert {error.code for error in errors} == {"transform-inverted", "swapped-names"}
+    swapped = next(error for error in errors if error.code == "swapped-names")
+    assert "CAM_FRONT and CAM_BACK_LEFT are swapped" in swapped.message
+    assert swapped.advice.endswith("after correcting the poses")
+    inverse = next(error for error in errors if error.code == "transform-inverted")
+    assert all(name in inverse.message for name in cameras)

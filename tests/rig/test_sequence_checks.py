@@ -69,3 +69,18 @@ def test_a_camera_with_jitter_is_named():
 def test_a_camera_without_any_image_is_named():
     (finding,) = check_camera_times(FRAMES, {"front": FRAMES, "back": [None] * len(FRAMES)})
     assert (finding.code, finding.camera) == ("camera-without-pictures", "back")
+
+
+def test_velocities_that_are_derived_from_uneven_poses_are_not_blamed(tmp_path):
+    times = np.cumsum([0, *[10, 990] * 20]) * 1_000_000 + 10**18
+    speeds = np.repeat([0.5, 30.0], 20)
+    lines = ["timestamp_ns,x,y,z,qw,qx,qy,qz"]
+    places = np.concatenate([[0], np.cumsum(speeds * np.diff(times) / 1e9)])
+    lines += [f"{time},{x},0,0,1,0,0,0" for time, x in zip(times, places, strict=True)]
+    path = tmp_path / "ego_motion.csv"
+    path.write_text("\n".join(lines) + "\n")
+    motion = read_ego_motion(path)
+    assert not motion.velocities_are_stated
+    assert "ego-speed" not in [finding.code for finding in check_ego_motion(motion)]
+    path.write_text("\n".join([lines[0] + ",vx,vy,vz", *(line + ",1,0,0" for line in lines[1:])]) + "\n")
+    assert "ego-speed" in [finding.code for finding in check_ego_motion(read_ego_motion(path))]

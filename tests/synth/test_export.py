@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 
 from bevcli.cli.render import WeatherChoice, parse_resolution, render
 from bevcli.errors import InputError, OutputError
+from bevcli.frame import facts_of
 from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.sequences.open import open_sequence
 from bevcli.synth.assets.catalog import Assets
@@ -32,6 +33,7 @@ def test_reading_the_folder_gives_the_rendered_frames(written: tuple[RenderedDri
     sequence = open_sequence(folder)
     assert [stamp.index for stamp in sequence.stamps] == [0, 1]
     read, rendered = sequence.load(1), drive.frame(1)
+    assert facts_of(sequence).rendered
     assert read.stamp.timestamp_ns == rendered.stamp.timestamp_ns
     for name, image in rendered.images.items():
         assert np.abs(read.images[name].pixels_bgr.astype(int) - image).mean() < 4  # JPEG

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +13,7 @@ from painted_drives import CONFIG, PaintedDrives
 from safetensors.torch import load_file
 
 from bevcli.checkpoints import load_weights
+from bevcli.cli.train import StopRequest
 from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import BevcliError, ConfigError, InputError, OutputError, WeightsError
 from bevcli.model.bevformer import BEVFormer
@@ -68,6 +71,31 @@ def test_a_killed_and_resumed_training_equals_an_uninterrupted_one(tmp_path: Pat
     for file in ("loss.csv", "validation.csv"):
         assert (tmp_path / "whole" / file).read_text() == (tmp_path / "killed" / file).read_text()
     assert len((tmp_path / "whole" / "loss.csv").read_text().splitlines()) == 1 + 5
+
+
+def test_a_training_that_is_asked_to_stop_leaves_a_checkpoint_to_resume_from(tmp_path: Path) -> None:
+    whole = trainer(tmp_path / "whole")
+    whole.run()
+    stopped = trainer(tmp_path / "part")
+    stopped.run(stop=lambda: stopped.done == 1)  # the next regular checkpoint is after step 2
+    assert stopped.done == 1
+    resumed = trainer(tmp_path / "part", resume=True)
+    assert resumed.done == 1
+    resumed.run()
+    assert_same_weights(whole, resumed)
+
+
+@pytest.mark.parametrize(("number", "exit_code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_requests_a_stop_and_a_second_one_interrupts(number: int, exit_code: int) -> None:
+    before = signal.getsignal(number)
+    with StopRequest() as request:
+        assert not request()
+        os.kill(os.getpid(), number)
+        assert request()
+        assert request.exit_code == exit_code
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), number)
+    assert signal.getsignal(number) is before
 
 
 def test_a_seed_reproduces_and_another_one_differs(tmp_path: Path) -> None:

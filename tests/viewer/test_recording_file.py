@@ -84,7 +84,7 @@ def test_a_resumed_recording_shows_all_frames(tmp_path, bev):
         assert len(RrdReader(file.path).recordings()) == 1
 
 
-def test_a_missing_file_and_a_folder_are_errors(tmp_path):
+def test_a_missing_file_and_a_folder_without_a_recording_are_errors(tmp_path):
     with pytest.raises(InputError, match="no such recording"), open_recording(tmp_path / "none.rrd"):
         pass
     with pytest.raises(InputError, match="folder"), open_recording(tmp_path):

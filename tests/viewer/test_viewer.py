@@ -13,6 +13,8 @@ from memory_drive import MemorySequence
 from recorded_drive import NamedModel, predict, record
 
 from bevcli.errors import InputError, OutputError
+from bevcli.recording.options import RecordingOptions
+from bevcli.recording.video_images import has_av
 from bevcli.recording.writer import Recording
 from bevcli.viewer import live
 from bevcli.viewer.native import LOOPBACK, free_port, start_viewer, stop
@@ -20,7 +22,8 @@ from bevcli.viewer.recording_reader import RecordingReader
 from bevcli.viewer.screenshot import NO_DRIVER, take_screenshot
 
 VIEWS = {
-    "3D scene", "BEV", "BEV features", "History weight", "Seconds per stage", "Boxes per class", "Events", "About",
+    "3D scene", "BEV", "BEV features", "History weight", "Speed", "Seconds per stage", "Boxes per class", "Legend",
+    "Events", "About",
     "CAM_FRONT", "CAM_FRONT_LEFT", "CAM_FRONT_RIGHT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT",
 }  # fmt: skip
 
@@ -44,12 +47,30 @@ def test_the_viewer_shows_every_view(screenshot):
     assert set(views) == VIEWS
     height, width = image.shape[:2]
     assert width >= 1280
-    for place in ((0.15, 0.15), (0.15, 0.5), (0.15, 0.85), (0.85, 0.15), (0.85, 0.5), (0.85, 0.85)):
+    for place in ((0.15, 0.12), (0.15, 0.38), (0.15, 0.64), (0.85, 0.12), (0.85, 0.38), (0.85, 0.64)):
         row, column = round(place[0] * height), round(place[1] * width)
         assert image[row - 20 : row + 20, column - 20 : column + 20].std() > 10, f"no image at {place}"
     middle = image[height // 3 : 2 * height // 3]
     assert ((np.abs(middle.astype(int) - [250, 200, 90]).sum(-1) < 40).sum()) > 20  # the blue vehicle
     assert ((np.abs(middle.astype(int) - [44, 158, 255]).sum(-1) < 40).sum()) > 20  # the orange car
+
+
+@pytest.mark.slow
+def test_a_screenshot_can_be_a_jpeg_of_a_video_recording(screenshot):
+    if not has_av():
+        pytest.skip("PyAV is not installed: pip install 'bevcli[video]'")
+    *_, folder = screenshot
+    record(folder / "av1.rrd", MemorySequence(3), RecordingOptions(images="av1"))
+    take_screenshot(folder / "av1.rrd", folder / "image.jpg", 2)
+    assert (folder / "image.jpg").read_bytes().startswith(b"\xff\xd8\xff")
+    image = cv2.imread(str(folder / "image.jpg"))
+    height, width = image.shape[:2]
+    assert image[height // 8 : height // 5, width // 10 : width // 5].std() > 10  # the viewer decodes AV1
+
+
+def test_a_screenshot_needs_a_known_ending(tmp_path):
+    with pytest.raises(InputError, match=r"must end in \.png, \.jpg or \.jpeg"):
+        take_screenshot(tmp_path / "r.rrd", tmp_path / "image.webp")
 
 
 @pytest.mark.slow

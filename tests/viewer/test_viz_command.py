@@ -13,6 +13,8 @@ from typer.testing import CliRunner
 from bevcli.cli.main import app
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import apply
+from bevcli.recording.options import RecordingOptions
+from bevcli.viewer import video
 from bevcli.viewer.summary import summarise
 
 
@@ -65,21 +67,44 @@ def test_the_boxes_file_has_the_shown_boxes(drive, tmp_path):
     assert [box["class"] for box in content["frames"][0]["boxes"]] == ["car", "pedestrian"]
 
 
-@pytest.mark.parametrize("ending", ["mp4", "webm"])
-def test_the_video_has_every_frame_and_the_boxes(drive, tmp_path, ending):
+@pytest.mark.parametrize(
+    ("ending", "with_av", "codecs"),
+    [("mp4", True, (b"h264", b"avc1")), ("mp4", False, (b"vp09", b"vp90")), ("webm", True, (b"vp90", b"vp09"))],
+)
+def test_the_video_has_every_frame_and_the_boxes(drive, tmp_path, monkeypatch, ending, with_av, codecs):
+    if with_av and not video.has_av():
+        pytest.skip("PyAV is not installed: pip install 'bevcli[video]'")
+    monkeypatch.setattr(video, "has_av", lambda: with_av)
     _, path = drive
     viz(path, "--video", tmp_path / f"v.{ending}")
-    video = cv2.VideoCapture(str(tmp_path / f"v.{ending}"))
-    codec = int(video.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").lower()
-    assert codec in (b"vp90", b"vp09")
-    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(2.0)
+    written = cv2.VideoCapture(str(tmp_path / f"v.{ending}"))
+    codec = int(written.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little").lower()
+    assert codec in codecs
+    assert written.get(cv2.CAP_PROP_FPS) == pytest.approx(2.0)
     images = []
-    while (read := video.read())[0]:
+    while (read := written.read())[0]:
         images.append(read[1])
     assert len(images) == 3
     bev = images[0][:, -640:].astype(int)
     car = bev[320 - round(12 * 6.4) - 16 : 320 - round(12 * 6.4) + 16, 310:330]  # 12 m ahead, 6.4 pixels a metre
     assert (np.abs(car - [44, 158, 255]).sum(-1) < 120).any()  # the car's orange, BGR
+
+
+def test_a_video_of_av1_images_shows_them(tmp_path):
+    if not video.has_av():
+        pytest.skip("PyAV is not installed: pip install 'bevcli[video]'")
+    for images in ("jpeg", "av1"):
+        record(tmp_path / f"{images}.rrd", MemorySequence(2), RecordingOptions(images=images))
+        viz(tmp_path / f"{images}.rrd", "--video", tmp_path / f"{images}.mp4")
+    first = [cv2.VideoCapture(str(tmp_path / f"{name}.mp4")).read()[1][30:200, 20:400] for name in ("jpeg", "av1")]
+    assert first[1].std() > 0.5 * first[0].std()
+
+
+def test_the_folder_of_a_run_stands_for_its_recording(drive, tmp_path):
+    _, path = drive
+    assert viz(path.parent, "--summary") == viz(path, "--summary")
+    with pytest.raises(InputError, match=r"the folder has no recording\.rrd"):
+        viz(tmp_path, "--summary")
 
 
 def test_a_cut_off_recording_is_shown_with_a_note(drive, tmp_path):

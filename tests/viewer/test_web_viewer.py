@@ -47,9 +47,15 @@ def test_the_root_redirects_to_the_viewer_with_the_recording(viewer):
     with urllib.request.urlopen(viewer.address + "/?renderer=webgl") as answer:
         query = parse_qs(urlsplit(answer.url).query)
         assert answer.read() == PAGE["/"]
-    assert query == {"url": [f"{viewer.address}/recording.rrd"], "renderer": ["webgl"]}
+    assert query == {"url": [f"{viewer.address}/recording.rrd"], "theme": ["dark"], "renderer": ["webgl"]}
     with urllib.request.urlopen(query["url"][0]) as answer:
         assert answer.read() == b"RRF2 and so on"
+
+
+def test_the_theme_is_dark_unless_the_address_names_another(viewer):
+    for asked, theme in (("/", "dark"), ("/?theme=light", "light")):
+        with urllib.request.urlopen(viewer.address + asked) as answer:
+            assert parse_qs(urlsplit(answer.url).query)["theme"] == [theme]
 
 
 def test_the_page_may_connect_to_its_own_origin_only(viewer):
@@ -161,13 +167,14 @@ def test_a_browser_shows_the_recording(tmp_path):
         address = re.match(r"http://127\.0\.0\.1:\d+", server.stdout.readline()).group()
         with playwright.sync_playwright() as driver:
             browser = driver.chromium.launch(executable_path=CHROMIUM, args=WITHOUT_A_GPU.split())
-            page = browser.new_page(viewport={"width": 1280, "height": 800})
+            page = browser.new_page(viewport={"width": 1280, "height": 800}, color_scheme="light")
             requested: list[str] = []
             page.on("request", lambda request: requested.append(request.url))
             page.goto(f"{address}/?renderer=webgl")
             image = wait_for_image(page)
             browser.close()
         assert looks_like_views(image)
+        assert np.median(image[:20]) < 60  # the top bar is dark, in a light browser too
         assert {urlsplit(url).netloc for url in requested if url.startswith("http")} == {urlsplit(address).netloc}
         before = processor_seconds(server)
         time.sleep(3)
@@ -191,6 +198,7 @@ def wait_for_image(page, seconds: float = 90) -> np.ndarray:
 def looks_like_views(image: np.ndarray) -> bool:
     """Whether the image has noise (the camera images) above and below, and the BEV view's blue vehicle between them."""
     height = len(image)
+    image = image[:, : 3 * image.shape[1] // 4]  # curves and texts are to the right
     above, middle, below = image[: height // 4], image[height // 4 : 3 * height // 4], image[3 * height // 4 :]
     vehicle = (np.abs(middle.astype(int) - [250, 200, 90]).sum(-1) < 40).sum()
     return above.std() > 20 and below.std() > 20 and vehicle > 20

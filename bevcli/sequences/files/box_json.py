@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.geometry.boxes import CLASSES, Boxes3D
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
+from bevcli.sequences.files.class_names import ClassNames
 
 KEYS = frozenset(
     (
@@ -20,12 +21,14 @@ KEYS = frozenset(
     )
 )  # fmt: skip
 _UNKNOWN_VELOCITY = [None, None]
+_OWN_NAMES = ClassNames()
 
 
-def boxes_from_json(objects: Any, where: str) -> Boxes3D:
+def boxes_from_json(objects: Any, where: str, class_names: ClassNames = _OWN_NAMES) -> Boxes3D:
     """N boxes from a list of N JSON objects. A missing or null velocity becomes NaN.
 
-    where: start of an error message, such as "boxes.json: frame 3".
+    where: start of an error message, such as "boxes.json: frame 3". class_names: maps the classes; names that it does
+    not know are kept.
     Raises InputError that names the first invalid box by its index in the list.
     """
     if not isinstance(objects, list):
@@ -38,7 +41,7 @@ def boxes_from_json(objects: Any, where: str) -> Boxes3D:
         sizes_lwh=_numbers([box["size_lwh"] for box in objects], 3, f"{where}: box", "size_lwh"),
         yaws=_numbers([box["yaw"] for box in objects], 1, f"{where}: box", "yaw"),
         velocities=_velocities([box.get("velocity") for box in objects], where),
-        classes=np.array([box["class"] for box in objects]),
+        classes=np.array([class_names[box["class"]] for box in objects]),
         scores=_scores(objects, where),
         attributes=_names(objects, "attribute", where),
         instances=_names(objects, "instance", where),
@@ -93,10 +96,8 @@ def _check_keys(objects: Sequence[Any], where: str) -> None:
         for key in ("class", "center", "size_lwh", "yaw"):
             if key not in box:
                 raise InputError(f'{where}: box {place}: "{key}" is missing (found: {", ".join(box)})')
-        if box["class"] not in CLASSES:  # `in` a tuple, because an invalid class may be a list, which has no hash
-            raise InputError(
-                f"{where}: box {place}: unknown class {box['class']!r:.40} (expected one of {', '.join(CLASSES)})"
-            )
+        if not isinstance(box["class"], str) or not box["class"]:
+            raise InputError(f"{where}: box {place}: class: expected a name, found {box['class']!r:.40}")
         if not KEYS.issuperset(box):
             unknown = next(key for key in box if key not in KEYS)
             raise InputError(f'{where}: box {place}: unknown key "{unknown}" (known: {", ".join(sorted(KEYS))})')

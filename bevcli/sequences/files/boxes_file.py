@@ -17,6 +17,7 @@ from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
 from bevcli.sequences.files.box_json import boxes_from_json, boxes_to_json
+from bevcli.sequences.files.class_names import ClassNames
 from bevcli.sequences.files.incremental_json import IncrementalJson, read_entries
 from bevcli.sequences.files.transform_json import pose_from_json, pose_to_json
 from bevcli.sequences.garbage_collection import without_garbage_collection
@@ -62,11 +63,12 @@ class BoxesFile:
     extras: Mapping[str, Any] = field(default_factory=dict)
 
 
-def read_boxes(path: Path) -> BoxesFile:
+def read_boxes(path: Path, class_names: ClassNames | None = None) -> BoxesFile:
     """Read a boxes file. Of a writer that was killed, the partial file (`incremental_json`) is read.
 
+    class_names: maps the classes. None: names are compared without case. Unknown names are kept.
     Raises InputError if the file is missing, not JSON or of another format, or has a missing key, an invalid value,
-    an unknown class, or two frames of a scene with the same time. The message names the file, the frame and the box.
+    or two frames of a scene with the same time. The message names the file, the frame and the box.
     """
     with without_garbage_collection():
         content = _load(path)
@@ -77,8 +79,8 @@ def read_boxes(path: Path) -> BoxesFile:
             )
         if not isinstance(content.get("frames"), list):
             raise InputError(f'{path}: "frames" is missing or not a list (expected one object per frame)')
-        rows = content["frames"]
-        frames = tuple(_frame(path, place, row, frame_of_reference) for place, row in enumerate(rows))
+        rows, names = content["frames"], class_names or ClassNames()
+        frames = tuple(_frame(path, place, row, frame_of_reference, names) for place, row in enumerate(rows))
     _check_unique(path, frames)
     ego_from_bev = content.get("ego_from_bev")
     return BoxesFile(
@@ -161,7 +163,7 @@ def _load(path: Path) -> dict[str, Any]:
     return content
 
 
-def _frame(path: Path, place: int, row: Any, frame_of_reference: str) -> FrameBoxes:
+def _frame(path: Path, place: int, row: Any, frame_of_reference: str, class_names: ClassNames) -> FrameBoxes:
     where = f"{path}: entry {place} of frames"
     if not isinstance(row, dict):
         raise InputError(f"{where}: expected an object, found {row!r:.40}")
@@ -178,7 +180,7 @@ def _frame(path: Path, place: int, row: Any, frame_of_reference: str) -> FrameBo
     return FrameBoxes(
         FrameStamp(index, scene, timestamp_ns),
         None if stated is None else pose_from_json(stated, "world_from_ego", where),
-        boxes_from_json(row["boxes"], where),
+        boxes_from_json(row["boxes"], where, class_names),
         _others(row, _FRAME_KEYS),
     )
 

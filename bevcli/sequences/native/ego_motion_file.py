@@ -34,7 +34,7 @@ def read_ego_motion(path: Path) -> EgoMotion:
     derived = derive_kinematics(times, translations, quaternions)
     stated = [_group(table, names) for names in (ACCELERATION, ANGULAR_RATE, VELOCITY)]
     kinematics = [from_poses if own is None else own for own, from_poses in zip(stated, derived, strict=True)]
-    return EgoMotion(times, translations, quaternions, *kinematics)
+    return EgoMotion(times, translations, quaternions, *kinematics, velocities_are_stated=stated[2] is not None)
 
 
 def write_ego_motion(path: Path, ego_motion: EgoMotion) -> None:

@@ -5,18 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
 from bevcli.errors import InputError
-from bevcli.frame import Frame, FrameStamp
+from bevcli.frame import DriveFacts, Frame, FrameStamp
 from bevcli.geometry.cameras import CameraRig
-from bevcli.geometry.ego_motion import GRAVITY, TOLERANCE_NS, EgoMotion, Kinematics
-from bevcli.geometry.transforms import Pose
-from bevcli.sequences.files.calibration_file import read_calibration
+from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
+from bevcli.sequences.files.calibration_file import read_calibration, read_facts
+from bevcli.sequences.frame_reading import read_frame
 from bevcli.sequences.images import ImageReader
 from bevcli.sequences.native.ego_motion_file import read_ego_motion
 from bevcli.sequences.native.frames_table import FrameEntry, check_times, read_frames_table
-from bevcli.sequences.native.ground_truth import FolderGroundTruth
+from bevcli.sequences.native.ground_truth import FolderGroundTruth, GroundTruthUse
 from bevcli.sequences.native.unlisted_frames import find_frames
 
 # required: ego_motion.csv must exist. optional: without the file there are no poses.
@@ -24,7 +22,6 @@ from bevcli.sequences.native.unlisted_frames import find_frames
 EgoMotionUse = Literal["required", "optional", "static"]
 # Any of these makes a folder a native sequence, so that an incomplete one gets an error that names the missing file.
 MARKERS = ("calibration.json", "frames.csv", "ego_motion.csv", "images", "videos")
-AT_REST = Kinematics(np.array([0.0, 0.0, GRAVITY]), np.zeros(3), np.zeros(3))
 
 
 def is_native_folder(path: Path) -> bool:
@@ -35,7 +32,8 @@ def is_native_folder(path: Path) -> bool:
 class FolderSequence:
     """A native sequence folder as a `Sequence`.
 
-    rig: used in place of calibration.json, if given.
+    rig: used in place of calibration.json, if given. ego_motion_file: used in place of ego_motion.csv, if given.
+    ground_truth: see `GroundTruthUse`.
     Raises InputError if a file of the folder is missing or invalid.
     """
 
@@ -46,17 +44,23 @@ class FolderSequence:
         ego_motion: EgoMotionUse = "required",
         strict: bool = False,
         rig: CameraRig | None = None,
+        ego_motion_file: Path | None = None,
+        ground_truth: GroundTruthUse = GroundTruthUse(),
     ) -> None:
         if not path.is_dir():
             raise InputError(f"{path}: the sequence folder is missing")
         self.path = path
         self.name = path.resolve().name
-        self.rig = read_calibration(path / "calibration.json") if rig is None else rig
+        calibration = path / "calibration.json"
+        self.rig = read_calibration(calibration) if rig is None else rig
+        self.facts = read_facts(calibration) if calibration.is_file() and rig is None else DriveFacts()
         self._entries, notes = _read_entries(path, self.rig)
-        self.ego_motion, motion_notes = _read_motion(path, ego_motion, self._entries)
+        self.ego_motion, motion_notes = _read_motion(
+            ego_motion_file or path / "ego_motion.csv", ego_motion, self._entries
+        )
         self.has_ego_motion = self.ego_motion is not None
-        self.notes = (*_rig_notes(self.rig), *notes, *motion_notes)
-        self._truth = FolderGroundTruth(path)
+        self._truth = FolderGroundTruth(path, ground_truth)
+        self.notes = (*rig_notes(self.rig), *notes, *motion_notes, *self._truth.notes)
         self._images = ImageReader(strict=strict)
 
     @property
@@ -72,27 +76,11 @@ class FolderSequence:
     def load(self, place: int) -> Frame:
         """The frame at position `place`, with decoded images. Raises InputError as `ImageReader.read`."""
         entry = self._entries[place]
-        images, dropped = self._images.read(entry.sources, self.rig, entry.dropped)
-        times = _camera_times(entry, self.rig)
-        index, world_from_ego = entry.stamp.index, self._pose_at(entry.stamp.timestamp_ns)
-        truth_pose = world_from_ego if self.has_ego_motion else None
-        return Frame(
-            stamp=entry.stamp,
-            rig=self.rig,
-            images=images,
-            world_from_ego=world_from_ego,
-            world_from_ego_at={name: self._pose_at(time) for name, time in times.items()},
-            kinematics=self._kinematics_at(entry.stamp.timestamp_ns),
-            dropped=dropped,
-            ground_truth=self._truth.boxes(index, truth_pose, self.rig.ego_from_bev),
-            ground_truth_map=self._truth.bev_map(index),
-        )
-
-    def _pose_at(self, timestamp_ns: int) -> Pose:
-        return self.ego_motion.pose_at(timestamp_ns) if self.ego_motion else Pose.identity()
-
-    def _kinematics_at(self, timestamp_ns: int) -> Kinematics:
-        return self.ego_motion.kinematics_at(timestamp_ns) if self.ego_motion else AT_REST
+        stamp = entry.stamp
+        pose = self.ego_motion.pose_at(stamp.timestamp_ns) if self.ego_motion else None
+        boxes = self._truth.boxes(stamp.index, pose, self.rig.ego_from_bev)
+        bev_map = self._truth.bev_map(stamp.index)
+        return read_frame(entry, self.rig, self._images, self.ego_motion, boxes, bev_map)
 
 
 def _read_entries(path: Path, rig: CameraRig) -> tuple[tuple[FrameEntry, ...], tuple[str, ...]]:
@@ -104,18 +92,11 @@ def _read_entries(path: Path, rig: CameraRig) -> tuple[tuple[FrameEntry, ...], t
     return found.entries, (found.note,)
 
 
-def _camera_times(entry: FrameEntry, rig: CameraRig) -> dict[str, int]:
-    """Time of each camera's image, ns; the frame's time for a camera without an image."""
-    frame_ns = entry.stamp.timestamp_ns
-    return {name: entry.sources[name].timestamp_ns if name in entry.sources else frame_ns for name in rig.names}
-
-
 def _read_motion(
-    path: Path, use: EgoMotionUse, entries: tuple[FrameEntry, ...]
+    file: Path, use: EgoMotionUse, entries: tuple[FrameEntry, ...]
 ) -> tuple[EgoMotion | None, tuple[str, ...]]:
-    file = path / "ego_motion.csv"
     if use == "static":
-        unread = " (ego_motion.csv is not read)" if file.is_file() else ""
+        unread = f" ({file.name} is not read)" if file.is_file() else ""
         return None, (f"the vehicle is assumed to stand still{unread}",)
     if file.is_file():
         motion = read_ego_motion(file)
@@ -144,7 +125,8 @@ def _check_coverage(file: Path, motion: EgoMotion, entries: tuple[FrameEntry, ..
                 )
 
 
-def _rig_notes(rig: CameraRig) -> tuple[str, ...]:
+def rig_notes(rig: CameraRig, source: str = "calibration.json") -> tuple[str, ...]:
+    """Tells the user that the bev frame is the default, if it is. source: what does not state it."""
     if not rig.ego_from_bev_assumed:
         return ()
-    return ('calibration.json has no "ego_from_bev": the default is used, a level frame at (0.94, 0, 1.84) m in ego',)
+    return (f'{source} has no "ego_from_bev": the default is used, a level frame at (0.94, 0, 1.84) m in ego',)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
-from bevcli.sequences.images import ImageSource
+from bevcli.sequences.images import ImageSource, Source
 from bevcli.sequences.native.csv_table import CsvRow, CsvTable, read_csv
 
 VIDEO_CELL = re.compile(r"(?P<path>.+)#(?P<index>\d+)")
@@ -28,7 +28,7 @@ class FrameEntry:
     """
 
     stamp: FrameStamp
-    sources: Mapping[str, ImageSource]
+    sources: Mapping[str, Source]
     dropped: Mapping[str, str]
     origin: str
 

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from bevcli.errors import InputError, OutputError
-from bevcli.frame import CameraImage, Frame
+from bevcli.frame import CameraImage, DriveFacts, Frame
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
 from bevcli.geometry.transforms import Pose
@@ -38,13 +38,15 @@ class NativeWriter:
     Image files are copied byte for byte; images of a video become PNG. ego_motion.csv gets the pose at the time of
     every frame and image. calibration.json is written last, so an unfinished folder is not a valid sequence.
 
-    with_ego_motion: whether the frames have poses. force: replace a sequence in the folder.
+    with_ego_motion: whether the frames have poses. force: replace a sequence in the folder. facts: of the drive.
     Raises OutputError if the folder exists and `force` is false, or it cannot be written. Raises InputError for a
     frame with another calibration than the first or a repeated index, and for scenes that overlap in time.
     """
 
-    def __init__(self, folder: Path, *, with_ego_motion: bool, force: bool = False) -> None:
-        self.folder = folder
+    def __init__(
+        self, folder: Path, *, with_ego_motion: bool, force: bool = False, facts: DriveFacts | None = None
+    ) -> None:
+        self.folder, self._facts = folder, facts
         _make_room(folder, force)
         self._with_ego_motion = with_ego_motion
         self._rig: CameraRig | None = None
@@ -87,7 +89,7 @@ class NativeWriter:
         if self._with_ego_motion:
             self._check_scenes()
             write_ego_motion(self.folder / "ego_motion.csv", _ego_motion(self._motion))
-        write_calibration(self.folder / "calibration.json", self._rig)
+        write_calibration(self.folder / "calibration.json", self._rig, self._facts)
 
     def _check(self, frame: Frame) -> None:
         stamp = frame.stamp

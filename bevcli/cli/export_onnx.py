@@ -1,0 +1,68 @@
+"""`bevcli export-onnx`: one step of a model as an ONNX file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+
+def export_onnx(
+    model: Annotated[str, typer.Argument(help="tiny, small, base, demo, or a FILE.toml.")],
+    weights: Annotated[
+        Path | None,
+        typer.Option(
+            help="An official .pth or a .safetensors file. Default: the weights in the package (demo only).",
+            show_default=False,
+        ),
+    ] = None,
+    untrained: Annotated[bool, typer.Option("--untrained", help="Use random weights.")] = False,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Default: MODEL.onnx.", show_default=False)] = None,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite the file if it exists.")] = False,
+    opset: Annotated[int, typer.Option(min=17, help="Version of the ONNX operators.")] = 19,
+    deformable_convolution: Annotated[
+        Literal["operator", "gridsample"],
+        typer.Option(help="operator: DeformConv (opset 19). gridsample: for runtimes without DeformConv."),
+    ] = "operator",
+    cameras: Annotated[
+        int | None, typer.Option(min=1, help="Number of cameras. Default: the model's.", show_default=False)
+    ] = None,
+    decode: Annotated[bool, typer.Option("--decode", help="Add the outputs boxes, scores and classes.")] = False,
+    check: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="SEQUENCE",
+            help="Run this drive through the file and through our model, and print the largest differences.",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Write one recurrent step of MODEL as an ONNX file of standard operators, without plugins.
+
+    The number of cameras is fixed, the batch is one; calibrations are inputs. The file's metadata documents every
+    input and output. docs/deploy.md shows how to run it. Needs pip install 'bevcli[onnx]'.
+    """
+    from bevcli.engines.check import check_exported, difference_lines
+    from bevcli.engines.export_onnx import export_onnx as write_onnx
+    from bevcli.errors import OutputError
+    from bevcli.pipeline.model_loading import load_model
+    from bevcli.sequences.open import open_sequence
+
+    loaded = load_model(model, weights, device="cpu", untrained=untrained)
+    target = Path(f"{loaded.name}.onnx") if out is None else out
+    if target.exists() and not force:
+        raise OutputError(f"{target}: already exists; choose another name, or pass --force to overwrite it")
+    drive = None if check is None else open_sequence(check, rate_hz=loaded.config.rate_hz)
+    write_onnx(
+        loaded.network,
+        target,
+        opset=opset,
+        deformable_convolution=deformable_convolution,
+        cameras=cameras,
+        decode=decode,
+    )
+    typer.echo(f"{target}: {target.stat().st_size / 1e6:.1f} MB")
+    if drive is not None:
+        differences = list(check_exported(target, loaded, drive))
+        typer.echo("\n".join(difference_lines(differences)))

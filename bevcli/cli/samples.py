@@ -1,0 +1,39 @@
+"""`bevcli samples`: copy the sample drive of the package into the current folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+NAME = "street"
+
+
+def samples(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="The folder that gets the sample.")] = Path("samples"),
+) -> None:
+    """Copy the sample drive, a rendered street, to DIR/street. It is a complete sequence folder.
+
+    An existing DIR/street is left as it is.
+    """
+    import shutil
+
+    from bevcli.errors import OutputError
+
+    target = out / NAME
+    if target.exists():
+        typer.echo(f"{target}: exists already")
+        return
+    try:
+        shutil.copytree(_source(), target)
+    except OSError as error:
+        raise OutputError(f"{target}: cannot be written ({error.strerror or error})") from None
+    typer.echo(f"{target}: copied; run `bevcli run {target}`")
+
+
+def _source() -> Path:
+    """The sample in an installed package, or in the clone that an editable installation refers to."""
+    package = Path(__file__).parents[1]
+    installed = package / "samples" / NAME
+    return installed if installed.is_dir() else package.parent / "samples" / NAME

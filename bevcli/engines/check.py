@@ -1,0 +1,113 @@
+"""`check_exported`: runs a drive through an exported file and through our model, and compares what they compute."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from bevcli.engines.onnx_runtime import OnnxBEVFormer
+from bevcli.frame import Sequence
+from bevcli.model.bevformer import BEVFormerOutputs
+from bevcli.model.prepared import prepare_for_inference
+from bevcli.pipeline.model_loading import Model
+from bevcli.pipeline.preprocess import Preprocessor
+from bevcli.pipeline.runner import Runner
+
+
+@dataclass(frozen=True)
+class FrameDifference:
+    """The largest differences between the two runs in one frame.
+
+    Attributes:
+        frame: index of the frame.
+        bev: of the BEV map.
+        logits: of the class logits.
+        box_m: of the box centres, metres.
+        code: of the other numbers of the box codes: logarithms of sizes, sine and cosine, m/s.
+        masks: of the probabilities of the map's cells; 0 without segmentation.
+    """
+
+    frame: int
+    bev: float
+    logits: float
+    box_m: float
+    code: float
+    masks: float
+
+
+def check_exported(file: Path, model: Model, sequence: Sequence) -> Iterator[FrameDifference]:
+    """Runs both over a drive, each with the state of its own last frame, and yields the differences frame by frame.
+
+    Args:
+        file: an exported file of the model.
+        model: the model; it runs on the CPU in float32.
+        sequence: the drive. Frames without any image are left out.
+
+    Raises:
+        WeightsError: the file cannot be loaded, or holds another model.
+        InputError: a frame cannot be read.
+    """
+    cpu = torch.device("cpu")
+    networks = (prepare_for_inference(model.network, cpu), OnnxBEVFormer(file, model.config))
+    outputs = [_Latest(network) for network in networks]
+    runners = [Runner(network, cpu) for network in networks]
+    states = [None, None]
+    preprocess = Preprocessor(model.config)
+    for place, stamp in enumerate(sequence.stamps):
+        prepared = preprocess(sequence.load(place))
+        if not prepared.frame.images:
+            continue
+        states = [runner.step(state, prepared)[0] for runner, state in zip(runners, states, strict=True)]  # type: ignore[misc]
+        yield compare_outputs(stamp.index, *(latest.outputs for latest in outputs))
+
+
+def compare_outputs(frame: int, ours: BEVFormerOutputs, theirs: BEVFormerOutputs) -> FrameDifference:
+    """The largest differences of the last decoder layer, the BEV map and the segmentation of a frame."""
+    codes = (ours.box_codes[-1] - theirs.box_codes[-1]).abs()
+    center = [0, 1, 4]
+    others = [index for index in range(codes.shape[-1]) if index not in center]
+    masks = 0.0
+    if ours.segmentation is not None and theirs.segmentation is not None:
+        masks = _largest(*(_probabilities(outputs) for outputs in (ours, theirs)))
+    return FrameDifference(
+        frame=frame,
+        bev=_largest(ours.bev, theirs.bev),
+        logits=_largest(ours.class_logits[-1], theirs.class_logits[-1]),
+        box_m=codes[..., center].norm(dim=-1).max().item(),
+        code=codes[..., others].max().item(),
+        masks=masks,
+    )
+
+
+def difference_lines(differences: list[FrameDifference]) -> list[str]:
+    """A table, one line a frame, and the largest of each column."""
+    columns = ("bev", "logits", "box_m", "code", "masks")
+    rows = [(str(row.frame), *(f"{getattr(row, name):.1e}" for name in columns)) for row in differences]
+    largest = ("largest", *(f"{max(getattr(row, name) for row in differences):.1e}" for name in columns))
+    heads = ("frame", "BEV map", "logits", "centres m", "codes", "masks")
+    return ["  ".join(f"{text:>9}" for text in row) for row in (heads, *rows, largest)]
+
+
+class _Latest:
+    """Keeps the outputs of a network's last call."""
+
+    outputs: BEVFormerOutputs
+
+    def __init__(self, network: nn.Module) -> None:
+        network.register_forward_hook(self._keep)
+
+    def _keep(self, network: nn.Module, inputs: object, outputs: BEVFormerOutputs) -> None:
+        self.outputs = outputs
+
+
+def _probabilities(outputs: BEVFormerOutputs) -> Tensor:
+    assert outputs.segmentation is not None
+    return outputs.segmentation.mask_logits[-1].sigmoid() * outputs.segmentation.class_logits[-1].sigmoid()[..., None]
+
+
+def _largest(one: Tensor, other: Tensor) -> float:
+    return (one - other).abs().max().item()

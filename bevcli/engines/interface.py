@@ -1,0 +1,174 @@
+"""The inputs and outputs of an exported file: their names, shapes and units, as its metadata states them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from bevcli import __version__
+from bevcli.model.bevformer import BEVFormerConfig
+from bevcli.model.segmentation import STUFF_CLASSES
+
+
+@dataclass(frozen=True)
+class Port:
+    """An input or an output of an exported file.
+
+    Attributes:
+        name: in the file.
+        shape: of the tensor.
+        dtype: of the tensor.
+        meaning: axes, units and frames, for the file's metadata.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    dtype: torch.dtype
+    meaning: str
+
+    def example(self) -> Tensor:
+        """Zeros of the shape and type."""
+        return torch.zeros(self.shape, dtype=self.dtype)
+
+
+def input_ports(config: BEVFormerConfig, cameras: int) -> tuple[Port, ...]:
+    """The inputs, in the order of the arguments of `ExportedStep.forward`. cameras: N."""
+    image, grid = config.image, config.bev_grid
+    width, height = image.padded_size
+    cells = grid.rows * grid.columns
+    pad = ", ".join(f"{value:g}" for value in pad_value_bgr(config))
+    quaternion = "quaternion w x y z" if config.ego_motion.can_bus_quaternion == "wxyz" else "quaternion w w w w"
+    names = ", ".join(f"{index} {name}" for index, name in enumerate(config.cameras))
+    return (
+        Port(
+            "images",
+            (1, cameras, height, width, 3),
+            torch.float32,
+            f"(1, N, H, W, 3): undistorted images, channels B G R, 0 to 255, not normalised. Each image is resized by "
+            f"min({image.size[0]} / width, {image.size[1]} / height) as float32 and written to the top left corner; "
+            f"all other pixels are {pad}.",
+        ),
+        Port(
+            "image_from_bev",
+            (1, cameras, 4, 4),
+            torch.float32,
+            "(1, N, 4, 4): from (x, y, z, 1) in metres of the bev frame to (u d, v d, d, 1), with pixel (u, v) of the "
+            "resized image and depth d in metres. Bev frame: x to the right, y ahead, z up.",
+        ),
+        Port("camera_index", (cameras,), torch.int64, f"(N,): the camera embedding of each image: {names}."),
+        Port(
+            "has_image",
+            (1, cameras),
+            torch.bool,
+            "(1, N): false for a camera without an image, which then sees nothing.",
+        ),
+        Port(
+            "can_bus",
+            (1, 18),
+            torch.float32,
+            "(1, 18): 0-2 translation since the previous frame, metres, world frame; 3-6 "
+            f"{quaternion} of world_from_ego; 7-9 acceleration with gravity, m/s^2; 10-12 angular rate, rad/s; "
+            "13-15 velocity, m/s, ego frame; 16 yaw in radians, 0 to 2 pi; 17 change of yaw since the previous "
+            "frame, degrees. 0-2 and 17 are zero without a previous frame.",
+        ),
+        Port(
+            "shift",
+            (1, 2),
+            torch.float32,
+            "(1, 2): translation since the previous frame to the right and ahead, as fractions of the extent of the "
+            "BEV map in x and y.",
+        ),
+        Port("rotation", (1,), torch.float32, "(1,): change of yaw since the previous frame, degrees."),
+        Port(
+            "previous_bev",
+            (1, cells, config.channels),
+            torch.float32,
+            "(1, Y*X, C): the output bev of the previous frame; ignored where use_previous is false.",
+        ),
+        Port("use_previous", (1,), torch.bool, "(1,): false in the first frame of a scene and after a gap in time."),
+    )
+
+
+def output_ports(config: BEVFormerConfig, *, decode: bool) -> tuple[Port, ...]:
+    """The outputs, in the order of the results of `ExportedStep.forward`."""
+    cells = config.bev_grid.rows * config.bev_grid.columns
+    queries, classes = config.decoder.queries, len(config.classes)
+    ports = [
+        Port(
+            "bev",
+            (1, cells, config.channels),
+            torch.float32,
+            "(1, Y*X, C): the BEV map; cell row * columns + column, rows by rising y, columns by rising x.",
+        ),
+        Port("class_logits", (1, queries, classes), torch.float32, "(1, Q, classes): of the last decoder layer."),
+        Port(
+            "box_codes",
+            (1, queries, 10),
+            torch.float32,
+            "(1, Q, 10): cx, cy, log w, log l, cz, log h, sin, cos, vx, vy; metres and m/s, bev frame; "
+            "yaw = -atan2(sin, cos) - pi / 2.",
+        ),
+    ]
+    if "segmentation" in config.heads:
+        masks = len(STUFF_CLASSES) + config.segmentation.thing_queries
+        stuff = ", ".join(STUFF_CLASSES)
+        ports += [
+            Port("mask_logits", (1, masks, cells), torch.float32, f"(1, Q, Y*X): masks of {stuff}, then of vehicles."),
+            Port(
+                "mask_class_logits",
+                (1, masks),
+                torch.float32,
+                "(1, Q): that the object exists. A cell's probability is sigmoid(mask) * sigmoid(class).",
+            ),
+        ]
+    if decode:
+        count = min(config.decoder.max_boxes, queries * classes)
+        ports += [
+            Port(
+                "boxes",
+                (1, count, 9),
+                torch.float32,
+                "(1, K, 9): centre x, y, z, length, width, height in metres, yaw in radians counter-clockwise from x, "
+                "velocity x, y in m/s; bev frame.",
+            ),
+            Port("scores", (1, count), torch.float32, "(1, K): 0 to 1, falling."),
+            Port("classes", (1, count), torch.int64, "(1, K): index into the metadata's classes."),
+        ]
+    return tuple(ports)
+
+
+def pad_value_bgr(config: BEVFormerConfig) -> tuple[float, ...]:
+    """What the pixels outside the resized image hold: the mean, which normalisation turns into zero."""
+    mean = config.image.mean
+    return mean[::-1] if config.image.color_order == "rgb" else mean
+
+
+def metadata(config: BEVFormerConfig, inputs: tuple[Port, ...], outputs: tuple[Port, ...]) -> dict[str, str]:
+    """The metadata of a file: text, or JSON where a value is not a name."""
+    image, grid = config.image, config.bev_grid
+    facts = {
+        "inputs": {port.name: port.meaning for port in inputs},
+        "outputs": {port.name: port.meaning for port in outputs},
+        "classes": config.classes,
+        "cameras": config.cameras,
+        "image_size": image.size,
+        "padded_size": image.padded_size,
+        "pad_value_bgr": pad_value_bgr(config),
+        "x_range_m": grid.x_range_m,
+        "y_range_m": grid.y_range_m,
+        "bev_rows_columns": (grid.rows, grid.columns),
+        "rate_hz": config.rate_hz,
+        "max_gap_s": config.max_gap_s,
+        "use_shift": config.ego_motion.shift,
+        "use_rotation": config.ego_motion.rotation,
+    }
+    names = {
+        "model": config.name,
+        "bevcli_version": __version__,
+        "resize": image.resize,
+        "can_bus_quaternion": config.ego_motion.can_bus_quaternion,
+    }
+    return names | {key: json.dumps(value) for key, value in facts.items()}

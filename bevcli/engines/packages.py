@@ -1,0 +1,14 @@
+"""The packages of the extra `bevcli[onnx]`, which a plain installation lacks."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+from bevcli.errors import BevcliError
+
+
+def require(*names: str) -> None:
+    """Raises BevcliError where one of these packages is not installed."""
+    missing = [name for name in names if find_spec(name) is None]
+    if missing:
+        raise BevcliError(f"{', '.join(missing)}: not installed; run pip install 'bevcli[onnx]'")

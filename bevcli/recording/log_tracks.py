@@ -1,0 +1,150 @@
+"""Writes tracks into a recording: each has an entity of its own with its past, its footprint and the next second."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import dataclass, field
+
+import numpy as np
+import rerun as rr
+
+from bevcli.frame import FrameStamp
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.transforms import Array, apply
+from bevcli.recording import entities
+from bevcli.recording.log_boxes import THIN, box_colors
+
+PAST_S = 5.0  # length of a trail
+AHEAD_S = 1.0  # how far ahead a trail shows where the object will be at its present velocity
+LOST_S = 3.0  # the trail of a track that had no box for so long is forgotten
+PAST_OPACITY, AHEAD_OPACITY = 220, 110  # of 255
+ABOVE_GROUND_M = 0.05
+WIDTH = rr.Radius.ui_points(1.2)
+
+
+@dataclass
+class TrackHistory:
+    """Where each track was: positions on the ground, kept for PAST_S.
+
+    Attributes:
+        scene: the scene of the last frame; a new scene has new tracks.
+        times_ns: by track, the times of its positions.
+        positions: by track, positions (3,) in the recording's world.
+    """
+
+    scene: str = ""
+    times_ns: dict[str, list[int]] = field(default_factory=dict)
+    positions: dict[str, list[Array]] = field(default_factory=dict)
+
+    def add(self, boxes: Boxes3D, stamp: FrameStamp) -> None:
+        """Adds the boxes of a frame, in the recording's world; forgets what is too old."""
+        if stamp.scene != self.scene:
+            self.times_ns, self.positions = {}, {}
+        self.scene = stamp.scene
+        for name, foot in zip(track_names(boxes), _feet(boxes), strict=True):
+            if name:
+                self.times_ns.setdefault(name, []).append(stamp.timestamp_ns)
+                self.positions.setdefault(name, []).append(foot)
+        for name, times in list(self.times_ns.items()):
+            kept = sum(stamp.timestamp_ns - time <= PAST_S * 1e9 for time in times)
+            self.times_ns[name], self.positions[name] = times[len(times) - kept :], self.positions[name][-kept:]
+            if not kept or stamp.timestamp_ns - times[-1] > LOST_S * 1e9:
+                del self.times_ns[name], self.positions[name]
+
+    def past(self, name: str) -> Array:
+        """(K, 3) the positions of a track, the oldest first."""
+        return np.array(self.positions.get(name, [])).reshape(-1, 3)
+
+
+def track_names(boxes: Boxes3D) -> list[str]:
+    """The identity of each box's track, "" for a box without one."""
+    if boxes.instances is None:
+        return [""] * len(boxes)
+    return [str(instance) for instance in boxes.instances]
+
+
+@dataclass(frozen=True)
+class TrackLogState:
+    """What the tracks of an interrupted recording need to go on.
+
+    Attributes:
+        history: where each track was.
+        shown: the entities that show a track now.
+        known: the entities that have their style.
+    """
+
+    history: TrackHistory
+    shown: tuple[str, ...]
+    known: tuple[str, ...]
+
+
+class TrackLog:
+    """Writes the tracks of each frame, and clears the entities of tracks without a box."""
+
+    def __init__(self, stream: rr.RecordingStream, class_names: Sequence[str]) -> None:
+        self._stream, self._class_names = stream, class_names
+        self._history = TrackHistory()
+        self._shown: set[str] = set()
+        self._known: set[str] = set()
+
+    def state(self) -> TrackLogState:
+        """What `go_on_from` needs."""
+        return TrackLogState(deepcopy(self._history), tuple(sorted(self._shown)), tuple(sorted(self._known)))
+
+    def go_on_from(self, state: TrackLogState) -> None:
+        """Continues the tracks of an interrupted recording."""
+        self._history, self._shown, self._known = deepcopy(state.history), set(state.shown), set(state.known)
+
+    def log(self, boxes: Boxes3D, stamp: FrameStamp, bev_from_world: Array) -> None:
+        """Writes the tracks of boxes in the recording's world. bev_from_world: (4, 4). Without tracks: nothing."""
+        if boxes.instances is None:
+            return
+        self._history.add(boxes, stamp)
+        ahead, outlines, colors = _ahead(boxes), _footprints(boxes), box_colors(boxes, self._class_names)
+        shown: set[str] = set()
+        flat, flat_colors = [], []
+        for i, name in enumerate(track_names(boxes)):
+            if not name:
+                continue
+            entity = entities.track(str(boxes.classes[i]), name)
+            past = self._history.past(name)
+            trail = [past] if len(past) > 1 else []
+            own_colors = [(*colors[i], opacity) for opacity in (AHEAD_OPACITY, PAST_OPACITY, PAST_OPACITY)]
+            self._log_style(entity, name, own_colors)
+            self._stream.log(entity, rr.LineStrips3D.from_fields(strips=[ahead[i], outlines[i], *trail]))
+            shown.add(entity)
+            flat += [apply(bev_from_world, strip)[:, :2] * (1, -1) for strip in (ahead[i], *trail)]
+            flat_colors += own_colors[:: 2 if trail else 3]
+        self._stream.log(
+            entities.BEV_TRACKS, rr.LineStrips2D(flat, colors=flat_colors or None, radii=THIN, draw_order=25)
+        )
+        for entity in self._shown - shown:
+            self._stream.log(entity, rr.Clear(recursive=False))
+        self._shown = shown
+
+    def _log_style(self, entity: str, name: str, colors: list[tuple[int, int, int, int]]) -> None:
+        """Writes what does not change, once for each track: a message costs more bytes than its numbers."""
+        if entity not in self._known:
+            self._known.add(entity)
+            style = rr.LineStrips3D.from_fields(colors=colors, radii=WIDTH)
+            self._stream.log(entity, style, rr.AnyValues(track=name), static=True)
+
+
+def _feet(boxes: Boxes3D) -> Array:
+    """(N, 3) the points on the ground below the centres."""
+    heights = boxes.centers[:, 2] - boxes.sizes_lwh[:, 2] / 2 + ABOVE_GROUND_M
+    return np.column_stack([boxes.centers[:, :2], heights])
+
+
+def _ahead(boxes: Boxes3D) -> Array:
+    """(N, 2, 3) from the place on the ground to the one a second later."""
+    feet = _feet(boxes)
+    steps = np.column_stack([np.nan_to_num(boxes.velocities), np.zeros(len(boxes))]) * AHEAD_S
+    return np.stack([feet, feet + steps], axis=1)
+
+
+def _footprints(boxes: Boxes3D) -> Array:
+    """(N, 5, 3) the closed outlines on the ground."""
+    bottoms = boxes.corners()[:, :4] + [0, 0, ABOVE_GROUND_M]
+    return np.concatenate([bottoms, bottoms[:, :1]], axis=1)

@@ -1,0 +1,87 @@
+"""Camera images as an AV1 video stream, for recordings that stay small. Needs PyAV, the extra `bevcli[video]`."""
+
+from __future__ import annotations
+
+import os
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.errors import BevcliError
+
+QUALITY = 30  # SVT-AV1's crf: 0 to 63, lower is better
+PRESET = 9  # SVT-AV1's speed: 0 to 13, higher is faster
+KEYFRAME_EVERY = 10  # frames; the viewer decodes from a keyframe on when it jumps to a frame
+INSTALL = "PyAV is not installed: pip install 'bevcli[video]'"
+
+
+def require_av(purpose: str) -> None:
+    """Raises BevcliError, which says how to install it, if PyAV is missing. purpose: begins the message."""
+    if not has_av():
+        raise BevcliError(f"{purpose}: {INSTALL}")
+
+
+def has_av() -> bool:
+    """Whether PyAV can be imported."""
+    try:
+        import av  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+class Av1Encoder:
+    """Encodes the images of one camera, in order; the data of each image is complete when `encode` returns.
+
+    An image with an odd width or height gets another row or column that repeats its last one.
+    """
+
+    def __init__(self, width: int, height: int) -> None:
+        import av
+
+        os.environ.setdefault("SVT_LOG", "1")  # the encoder writes its settings to stderr otherwise
+        self._pad = height % 2, width % 2
+        self._context = av.CodecContext.create("libsvtav1", "w")
+        assert isinstance(self._context, av.VideoCodecContext)
+        self._context.width, self._context.height = width + self._pad[1], height + self._pad[0]
+        self._context.pix_fmt = "yuv420p"
+        self._context.time_base, self._context.framerate = Fraction(1, 1), Fraction(1, 1)
+        self._context.gop_size = KEYFRAME_EVERY
+        low_delay = "pred-struct=1:lookahead=0:rtc=1:lp=2"
+        self._context.options = {"preset": str(PRESET), "crf": str(QUALITY), "svtav1-params": low_delay}
+        self._count = 0
+
+    def encode(self, pixels_bgr: NDArray[np.uint8]) -> tuple[bytes, bool]:
+        """The data of an image (H, W, 3), and whether it can be decoded without the images before it."""
+        import av
+
+        if any(self._pad):
+            pixels_bgr = np.pad(pixels_bgr, ((0, self._pad[0]), (0, self._pad[1]), (0, 0)), mode="edge")
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels_bgr), format="bgr24")
+        frame = frame.reformat(format="yuv420p")
+        frame.pts, self._count = self._count, self._count + 1
+        (packet,) = self._context.encode(frame)
+        return bytes(packet), bool(packet.is_keyframe)
+
+    def close(self) -> None:
+        """Ends the stream and frees the encoder."""
+        self._context.encode(None)
+
+
+class Av1Decoder:
+    """Decodes the images that an `Av1Encoder` made, in order."""
+
+    def __init__(self) -> None:
+        import av
+
+        self._context = av.CodecContext.create("libdav1d", "r")
+        self._context.options = {"max_frame_delay": "1", "threads": "1"}
+
+    def decode(self, data: bytes) -> NDArray[np.uint8] | None:
+        """The next image, (H, W, 3) uint8 BGR; None before the first keyframe."""
+        import av
+
+        assert isinstance(self._context, av.VideoCodecContext)
+        images = self._context.decode(av.Packet(data))
+        return images[-1].to_ndarray(format="bgr24").astype(np.uint8, copy=False) if images else None

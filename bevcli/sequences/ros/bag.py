@@ -1,0 +1,176 @@
+"""The files of one recording as topics with indexed messages."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import threading
+from collections.abc import Sequence as Indices
+from itertools import groupby
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from bevcli.errors import InputError
+from bevcli.sequences.ros.decoding import Decode, Topic, decoder
+
+SUFFIXES = (".mcap", ".db3")
+METADATA = "metadata.yaml"
+SPLIT_NAME = re.compile(r"(?P<stem>.*?)_\d+")  # rosbag2 numbers the files of a recording: drive_0.mcap, drive_1.mcap
+PACKAGES = ("mcap", "rosbags", "google.protobuf")
+
+
+class BagFile(Protocol):
+    """One file of a bag: `McapFile` or `SqliteFile`."""
+
+    topics: dict[str, Topic]
+    notes: tuple[str, ...]
+
+    def times(self, topic: str) -> NDArray[np.int64]:
+        """(N,) log times of a topic's messages in order, ns."""
+        ...
+
+    def read(self, topic: str, index: int) -> bytes:
+        """The bytes of a message."""
+        ...
+
+
+class Bag:
+    """A recording of one or more files. Messages are numbered by topic, in order of time. Safe to use from threads.
+
+    Raises InputError if a file is missing or broken, or the packages of the extra `ros` are not installed.
+
+    Attributes:
+        path: the file or the folder, as it was given.
+        topics: the topics, by name.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._lock = threading.RLock()
+        self._compression = ""
+        self._files = [_open_file(file) for file in self._file_paths()]
+        self.topics = {name: topic for file in self._files for name, topic in sorted(file.topics.items())}
+        self._decoders: dict[str, Decode] = {}
+        self._starts: dict[str, NDArray[np.int64]] = {}
+        self._times: dict[str, NDArray[np.int64]] = {}
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the user should be told about the files."""
+        return tuple(note for file in self._files for note in file.notes)
+
+    def times(self, topic: str) -> NDArray[np.int64]:
+        """(N,) log times of a topic's messages, ns. They come from the index."""
+        if topic not in self._times:
+            with self._lock:
+                parts = [file.times(topic) for file in self._files if topic in file.topics]
+            self._times[topic] = np.concatenate([np.zeros(0, dtype=np.int64), *parts])
+        return self._times[topic]
+
+    def message(self, topic: str, index: int) -> Any:
+        """Message `index` of a topic, from 0. Raises InputError if it is broken."""
+        data = self._bytes(topic, index)
+        with self._lock:
+            if topic not in self._decoders:
+                self._decoders[topic] = decoder(self.topics[topic])
+            decode = self._decoders[topic]
+        try:
+            return decode(data)
+        except Exception as error:  # the decoders of the packages raise errors of many types for broken bytes
+            raise InputError(f"{self.path}: {topic}: message {index} cannot be decoded ({error})") from None
+
+    def _bytes(self, topic: str, index: int) -> bytes:
+        with self._lock:
+            for file in self._files:
+                count = len(file.times(topic)) if topic in file.topics else 0
+                if index < count:
+                    data = file.read(topic, index)
+                    return _decompressed(data) if self._compression == "message" else data
+                index -= count
+        raise IndexError(f"{topic} has no message {index}")
+
+    def _file_paths(self) -> list[Path]:
+        """The files in order. Also notes whether rosbag2 compressed single messages."""
+        if self.path.is_file():
+            return [self.path]
+        found = sorted(file for file in self.path.iterdir() if file.suffix in SUFFIXES)
+        stated = _metadata(self.path / METADATA)
+        listed = [self.path / Path(name).name for name in stated.get("relative_file_paths", [])]
+        mode = str(stated.get("compression_mode", "")).lower()
+        if mode == "file" and not found:
+            raise InputError(f"{self.path}: its files are compressed: decompress them first (zstd -d *.zstd)")
+        self._compression = mode
+        paths = [file for file in listed if file.suffix in SUFFIXES and file.is_file()] or found
+        if not listed and len({_stem(file) for file in paths}) > 1:
+            names = ", ".join(file.name for file in paths[:4])
+            raise InputError(f"{self.path}: has several bags and no {METADATA}: pass one of them ({names})")
+        if not paths:
+            raise InputError(f"{self.path}: has no .mcap or .db3 file (expected those listed in {METADATA})")
+        return sorted(paths, key=_number) if not listed else paths
+
+
+def is_ros_bag(path: Path) -> bool:
+    """Whether a path is an .mcap or .db3 file, or a folder with some."""
+    if path.is_dir():
+        return any(file.suffix in SUFFIXES for file in path.iterdir()) or _is_rosbag_metadata(path / METADATA)
+    return path.suffix in SUFFIXES
+
+
+def _is_rosbag_metadata(path: Path) -> bool:
+    return path.is_file() and "rosbag2_bagfile_information" in path.read_text(encoding="utf-8", errors="replace")[:4096]
+
+
+def _metadata(path: Path) -> dict[str, Any]:
+    """What metadata.yaml states; empty without the file, which a recording that was cut off does not have."""
+    if not path.is_file():
+        return {}
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        return {}
+    found = document.get("rosbag2_bagfile_information") if isinstance(document, dict) else None
+    return found if isinstance(found, dict) else {}
+
+
+def _open_file(path: Path) -> BagFile:
+    missing = [name for name in PACKAGES if not _is_installed(name)]
+    if missing:
+        raise InputError(f"{path}: ROS bags need the packages of an extra: run pip install 'bevcli[ros]'")
+    from bevcli.sequences.ros.mcap_file import McapFile
+    from bevcli.sequences.ros.sqlite_file import SqliteFile
+
+    if not path.stat().st_size:
+        raise InputError(f"{path}: the file is empty")
+    return McapFile(path) if path.suffix == ".mcap" else SqliteFile(path)
+
+
+def _is_installed(name: str) -> bool:
+    try:
+        return importlib.util.find_spec(name) is not None
+    except ModuleNotFoundError:  # the package around it
+        return False
+
+
+def _decompressed(data: bytes) -> bytes:
+    import zstandard
+
+    return zstandard.ZstdDecompressor().decompressobj().decompress(data)
+
+
+def _stem(file: Path) -> str:
+    numbered = SPLIT_NAME.fullmatch(file.stem)
+    return numbered["stem"] if numbered else file.stem
+
+
+def _number(file: Path) -> tuple[int, str]:
+    digits = file.stem.rpartition("_")[2]
+    return (int(digits) if digits.isdigit() else 0, file.name)
+
+
+def spread(count: int, wanted: int) -> Indices[int]:
+    """Up to `wanted` different indices below `count`, evenly spread, with the first and the last."""
+    return [key for key, _ in groupby(np.linspace(0, count - 1, min(count, wanted)).astype(int).tolist())]

@@ -1,0 +1,209 @@
+"""An MCAP file: its topics, the times of their messages from the index, and single messages on demand."""
+
+from __future__ import annotations
+
+import struct
+from collections import OrderedDict
+from collections.abc import Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
+from mcap.records import Channel, Chunk, ChunkIndex, Schema
+from mcap.stream_reader import get_chunk_data_stream
+from mcap.summary import Summary
+from numpy.typing import NDArray
+
+from bevcli.errors import InputError
+from bevcli.sequences.ros.decoding import Encoding, Topic
+
+MAGIC = b"\x89MCAP0\r\n"
+RECORD_HEAD = struct.Struct("<BQ")  # opcode, length of what follows
+MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence number, log time, publish time
+CACHE_BYTES = 256 * 2**20  # of decompressed chunks
+NO_CHUNK = -1  # the message lies outside of chunks
+Entries = list[tuple[int, int, int]]  # log time ns, start of the chunk in the file or NO_CHUNK, offset
+
+
+class McapFile:
+    """An MCAP file.
+
+    Opening it reads the summary at its end. A file without one (its recording was cut off) is scanned up to its end.
+    Raises InputError if it is not an MCAP file.
+
+    Attributes:
+        topics: the topics, by name.
+        notes: what the user should be told about the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.notes: tuple[str, ...] = ()
+        try:
+            self._file: BinaryIO = path.open("rb")
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+        if self._file.read(len(MAGIC)) != MAGIC:
+            raise InputError(f"{path}: is not an MCAP file (its first bytes are different)")
+        self._chunks: OrderedDict[int, bytes] = OrderedDict()
+        self._chunk_indexes: list[ChunkIndex] = []
+        self._scanned: dict[int, Entries] | None = None  # by channel, if the file has no index
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        summary = self._summary()
+        if summary is None:
+            self._scan()
+        else:
+            self._schemas, self._channels = summary.schemas, summary.channels
+            self._chunk_indexes = sorted(summary.chunk_indexes, key=lambda chunk: chunk.chunk_start_offset)
+        self.topics = {topic.name: topic for topic in self._topics()}
+        self._references: dict[str, NDArray[np.int64]] = {}
+
+    def times(self, topic: str) -> NDArray[np.int64]:
+        """(N,) log times of a topic's messages in order, ns. Only the index is read."""
+        return self._references_of(topic)[:, 0]
+
+    def read(self, topic: str, index: int) -> bytes:
+        """The bytes of message `index` of a topic. Raises InputError if they are broken."""
+        _, chunk, offset = (int(number) for number in self._references_of(topic)[index])
+        try:
+            return self._message(chunk, offset)
+        except (McapError, ValueError, EOFError, struct.error, RuntimeError) as error:
+            raise InputError(f"{self.path}: {topic}: message {index} is broken ({error})") from None
+
+    def _summary(self) -> Summary | None:
+        """The summary, None if the file has none, or one that does not list all messages."""
+        try:
+            summary = SeekingReader(self._file).get_summary()
+        except (McapError, ValueError, EOFError, OSError, struct.error, StopIteration):
+            return None
+        if summary is None or not summary.chunk_indexes or not summary.channels:
+            return None
+        unindexed = any(not chunk.message_index_length for chunk in summary.chunk_indexes)
+        return None if unindexed else summary
+
+    def _topics(self) -> Iterator[Topic]:
+        for channel in self._channels.values():
+            schema = self._schemas.get(channel.schema_id)
+            if schema is not None:
+                encoding = Encoding(channel.message_encoding, schema.encoding, schema.data)
+                yield Topic(channel.topic, schema.name, encoding)
+
+    def _references_of(self, topic: str) -> NDArray[np.int64]:
+        """(N, 3) log time, start of the chunk or NO_CHUNK, and offset of a topic's messages, in order of time."""
+        if topic not in self._references:
+            channels = [number for number, channel in self._channels.items() if channel.topic == topic]
+            if self._scanned is not None:
+                parts = [np.array(self._scanned.get(n, []), dtype=np.int64).reshape(-1, 3) for n in channels]
+            else:
+                parts = [part for n in channels for part in self._indexed(n)]
+            rows = np.concatenate([np.zeros((0, 3), dtype=np.int64), *parts])
+            self._references[topic] = rows[np.argsort(rows[:, 0], kind="stable")]
+        return self._references[topic]
+
+    def _indexed(self, channel: int) -> Iterator[NDArray[np.int64]]:
+        for chunk in self._chunk_indexes:
+            if channel not in chunk.message_index_offsets:
+                continue
+            content = self._record(chunk.message_index_offsets[channel], Opcode.MESSAGE_INDEX)
+            pairs = np.frombuffer(content[6:], dtype="<u8").reshape(-1, 2).astype(np.int64)
+            starts = np.full(len(pairs), chunk.chunk_start_offset, dtype=np.int64)
+            yield np.column_stack([pairs[:, 0], starts, pairs[:, 1]])
+
+    def _record(self, position: int, opcode: int) -> bytes:
+        self._file.seek(position)
+        found, length = RECORD_HEAD.unpack(self._file.read(RECORD_HEAD.size))
+        if found != opcode:
+            raise InputError(f"{self.path}: the index is broken (at byte {position})")
+        return self._file.read(length)
+
+    def _message(self, chunk: int, offset: int) -> bytes:
+        if chunk == NO_CHUNK:
+            return self._record(offset, Opcode.MESSAGE)[MESSAGE_HEAD.size :]
+        content = self._chunk(chunk)
+        opcode, length = RECORD_HEAD.unpack_from(content, offset)
+        start = offset + RECORD_HEAD.size
+        if opcode != Opcode.MESSAGE or start + length > len(content):
+            raise ValueError("the index does not fit the chunk")
+        return content[start + MESSAGE_HEAD.size : start + length]
+
+    def _chunk(self, position: int) -> bytes:
+        """The decompressed records of a chunk, from a cache of the chunks used last."""
+        content = self._chunks.get(position)
+        if content is None:
+            content = _decompressed(self._record(position, Opcode.CHUNK))
+            self._chunks[position] = content
+            while len(self._chunks) > 1 and sum(map(len, self._chunks.values())) > CACHE_BYTES:
+                self._chunks.popitem(last=False)
+        self._chunks.move_to_end(position)
+        return content
+
+    def _scan(self) -> None:
+        """Find schemas, channels and messages by reading the file from its start, as far as its records are whole."""
+        self._scanned = {}
+        end = self.path.stat().st_size
+        position = len(MAGIC)
+        is_whole = False
+        while position + RECORD_HEAD.size <= end:
+            self._file.seek(position)
+            opcode, length = RECORD_HEAD.unpack(self._file.read(RECORD_HEAD.size))
+            if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+                is_whole = True
+                break
+            if position + RECORD_HEAD.size + length > end or not self._scan_record(opcode, length, position):
+                break
+            position += RECORD_HEAD.size + length
+        if not is_whole:
+            share = f"{position / 2**20:.1f} of {end / 2**20:.1f} MiB"
+            self.notes = (f"{self.path.name} is cut off: its first {share} are read",)
+
+    def _scan_record(self, opcode: int, length: int, position: int) -> bool:
+        """Note what a record has. Whether it is intact."""
+        if opcode == Opcode.CHUNK:
+            try:
+                content = _decompressed(self._file.read(length))
+            except (McapError, ValueError, EOFError, struct.error, RuntimeError):
+                return False
+            self._scan_chunk(content, position)
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            self._learn(opcode, self._file.read(length))
+        elif opcode == Opcode.MESSAGE:
+            self._note_message(self._file.read(MESSAGE_HEAD.size), NO_CHUNK, position)
+        return True
+
+    def _scan_chunk(self, content: bytes, chunk: int) -> None:
+        offset = 0
+        while offset + RECORD_HEAD.size <= len(content):
+            opcode, length = RECORD_HEAD.unpack_from(content, offset)
+            start = offset + RECORD_HEAD.size
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self._learn(opcode, content[start : start + length])
+            elif opcode == Opcode.MESSAGE:
+                self._note_message(content[start : start + MESSAGE_HEAD.size], chunk, offset)
+            offset = start + length
+
+    def _learn(self, opcode: int, content: bytes) -> None:
+        stream = ReadDataStream(BytesIO(content))
+        if opcode == Opcode.SCHEMA:
+            schema = Schema.read(stream)
+            self._schemas[schema.id] = schema
+        else:
+            channel = Channel.read(stream)
+            self._channels[channel.id] = channel
+
+    def _note_message(self, head: bytes, chunk: int, offset: int) -> None:
+        assert self._scanned is not None
+        channel, _, log_time, _ = MESSAGE_HEAD.unpack(head)
+        self._scanned.setdefault(channel, []).append((log_time, chunk, offset))
+
+
+def _decompressed(content: bytes) -> bytes:
+    stream: Any = ReadDataStream(BytesIO(content))
+    chunk = Chunk.read(stream)
+    data, length = get_chunk_data_stream(chunk)
+    return data.read(length)

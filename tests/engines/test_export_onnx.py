@@ -1,0 +1,145 @@
+"""An exported file computes what the model computes, from standard operators only."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from bevcli.config import load_config
+from bevcli.engines.check import check_exported
+from bevcli.engines.export_onnx import export_onnx
+from bevcli.engines.onnx_runtime import OnnxBEVFormer
+from bevcli.errors import BevcliError, WeightsError
+from bevcli.model.box_coding import decode
+from bevcli.pipeline.model_loading import Model, load_model
+from bevcli.pipeline.run import run
+from bevcli.sequences.open import open_sequence
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
+import original_reference as original
+from small_model import small_inputs, small_model
+
+onnx = pytest.importorskip("onnx")
+onnxruntime = pytest.importorskip("onnxruntime")
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module", params=["operator", pytest.param("gridsample", marks=pytest.mark.slow)])
+def small_file(request, tmp_path_factory) -> Path:
+    """A small model with deformable convolutions."""
+    file = tmp_path_factory.mktemp("small") / "small.onnx"
+    export_onnx(small_model(), file, deformable_convolution=request.param, decode=True)
+    return file
+
+
+@pytest.fixture(scope="module")
+def demo_file(tmp_path_factory) -> Path:
+    file = tmp_path_factory.mktemp("demo") / "demo.onnx"
+    export_onnx(load_model("demo").network, file, decode=True)
+    return file
+
+
+def test_a_file_equals_the_model_with_and_without_history(small_file):
+    model = small_model()
+    exported = OnnxBEVFormer(small_file, model.config)
+    history = torch.randn(1, 48, 32, generator=torch.Generator().manual_seed(1))
+    for previous in (None, history):
+        with torch.inference_mode():
+            expected, found = model(small_inputs(), previous), exported(small_inputs(), previous)
+        torch.testing.assert_close(found.bev, expected.bev, rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(found.class_logits[-1], expected.class_logits[-1], rtol=1e-4, atol=1e-3)
+        torch.testing.assert_close(found.box_codes[-1], expected.box_codes[-1], rtol=1e-4, atol=1e-3)
+
+
+def test_a_camera_without_an_image_sees_nothing(small_file):
+    model = small_model()
+    exported = OnnxBEVFormer(small_file, model.config)
+    inputs = small_inputs()
+    inputs.has_image[:] = False
+    with torch.inference_mode():
+        torch.testing.assert_close(exported(inputs).bev, model(inputs).bev, rtol=1e-4, atol=1e-4)
+
+
+def test_decoded_boxes_equal_the_decoder_of_the_library(small_file):
+    model = small_model()
+    exported = OnnxBEVFormer(small_file, model.config)
+    feed = exported._feed(small_inputs(), None)
+    boxes, scores, classes = exported.session.run(["boxes", "scores", "classes"], feed)
+    with torch.inference_mode():
+        [expected] = decode(exported(small_inputs()), model.config)
+    np.testing.assert_allclose(scores[0], expected.scores, atol=1e-6)
+    np.testing.assert_allclose(boxes[0, :, :3], expected.centers, atol=1e-5)
+    np.testing.assert_allclose(boxes[0, :, 3:6], expected.sizes_lwh, rtol=1e-5)
+    np.testing.assert_allclose(np.exp(1j * boxes[0, :, 6]), np.exp(1j * expected.yaws), atol=1e-5)
+    np.testing.assert_allclose(boxes[0, :, 7:], expected.velocities, atol=1e-6)
+    assert [model.config.classes[index] for index in classes[0]] == list(expected.classes)
+
+
+def test_a_file_holds_standard_operators_only_and_documents_every_input_and_output(small_file):
+    proto = onnx.load(small_file)
+    assert {node.domain for node in proto.graph.node} <= {"", "ai.onnx"}
+    assert [(entry.domain, entry.version) for entry in proto.opset_import] == [("", 19)]
+    operators = {node.op_type for node in proto.graph.node}
+    assert "GridSample" in operators
+    documented = {entry.key: entry.value for entry in proto.metadata_props}
+    for values, key in ((proto.graph.input, "inputs"), (proto.graph.output, "outputs")):
+        assert json.loads(documented[key]) == {value.name: value.doc_string for value in values}
+        assert all(value.doc_string.startswith("(") for value in values)
+
+
+@pytest.mark.slow
+def test_demo_equals_our_model_over_a_real_drive(demo_file, shared):
+    drive = open_sequence(shared / "data" / "nuscenes-scene-0103", rate_hz=2.0, frames=slice(0, 4))
+    agree(demo_file, load_model("demo"), drive)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["tiny", "small", "base"])
+def test_published_models_equal_ours_over_a_real_drive(name, shared, tmp_path):
+    drive = open_sequence(shared / "data" / "nuscenes-scene-0103", rate_hz=2.0, frames=slice(0, 4))
+    model = Model(original.rule_model(name, "both"))
+    export_onnx(model.network, tmp_path / "model.onnx")
+    agree(tmp_path / "model.onnx", model, drive)
+
+
+def agree(file: Path, model: Model, drive) -> None:
+    differences = list(check_exported(file, model, drive))
+    assert len(differences) == 4
+    assert max(row.logits for row in differences) < 1e-3
+    assert max(row.box_m for row in differences) < 0.01
+    assert max(row.masks for row in differences) < 1e-3
+
+
+@pytest.mark.slow
+def test_the_program_of_the_deployment_page_finds_the_boxes_of_bevcli(demo_file, tmp_path):
+    page = (ROOT / "docs" / "deploy.md").read_text()
+    program = page.split("```python\n")[1].split("```")[0]
+    street = ROOT / "samples" / "street"
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(demo_file), str(street)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    model = load_model("demo", device="cpu")
+    expected = [prediction.boxes for _, prediction in run(model, open_sequence(street))]
+    lines = done.stdout.splitlines()
+    assert len(lines) == len(expected)
+    for line, boxes in zip(lines, expected, strict=True):
+        _, count, best = line.split(maxsplit=2)
+        assert int(count) == (boxes.scores > 0.3).sum()
+        np.testing.assert_allclose(json.loads(best)[:3], boxes.centers[0], atol=0.02)
+
+
+def test_mistakes_are_named(small_file, tmp_path):
+    with pytest.raises(BevcliError, match="expected 19 or newer"):
+        export_onnx(small_model(), tmp_path / "old.onnx", opset=18)
+    with pytest.raises(WeightsError, match="holds the model small-for-tests, expected demo"):
+        OnnxBEVFormer(small_file, load_config("demo"))
+    (tmp_path / "broken.onnx").write_bytes(b"no model")
+    with pytest.raises(WeightsError, match="cannot load it"):
+        OnnxBEVFormer(tmp_path / "broken.onnx", small_model().config)

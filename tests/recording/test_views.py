@@ -1,0 +1,153 @@
+"""The views: legend, colours of maps, range rings, size of the camera views, titles, speed, street map."""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import pytest
+from memory_drive import MemorySequence, make_camera, make_rig
+from recorded_drive import GRID, TINY, NamedModel, predict, record
+
+from bevcli.frame import MAP_CLASSES, BevMap, DriveFacts
+from bevcli.geometry.bev_grid import BevGrid
+from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
+from bevcli.geometry.geographic import GeoOrigin
+from bevcli.recording import entities
+from bevcli.recording.blueprint import TEXTS_SHARE, TITLE_HEIGHT, WINDOW, camera_row_shares
+from bevcli.recording.colors import CLASS_COLORS, GROUND_TRUTH_COLOR, MAP_COLORS, MISSED_COLOR
+from bevcli.recording.legend import legend_entries
+from bevcli.recording.log_static import ring_distances_m
+from bevcli.recording.writer import FROM_RENDERED, UNTRAINED, Recording, frame_rate_hz, weights_note
+from bevcli.viewer.recording_reader import RecordingReader
+
+
+class Drive(MemorySequence):
+    """A drive that states facts."""
+
+    def __init__(self, count: int = 2, rendered: bool = False, geo_origin: GeoOrigin | None = None):
+        super().__init__(count)
+        self.facts = DriveFacts(rendered, geo_origin)
+
+
+def lab(color) -> np.ndarray:
+    return cv2.cvtColor(np.float32([[color]]) / 255, cv2.COLOR_RGB2LAB)[0, 0]
+
+
+@pytest.mark.parametrize("name", MAP_COLORS)
+def test_a_map_colour_cannot_be_taken_for_a_box(name):
+    of_boxes = [*CLASS_COLORS.values(), GROUND_TRUTH_COLOR, MISSED_COLOR]
+    nearest = min(np.linalg.norm(lab(MAP_COLORS[name]) - lab(color)) for color in of_boxes)
+    assert nearest > 22  # 2 is the smallest difference that people see side by side
+    others = [np.linalg.norm(lab(MAP_COLORS[name]) - lab(MAP_COLORS[other])) for other in MAP_COLORS if other != name]
+    assert min(others) > 12
+
+
+def test_the_legend_names_every_class_and_map_class():
+    names = [text for text, _ in legend_entries(TINY.classes, with_map=True)]
+    assert set(TINY.classes) <= {name.replace(" ", "_") for name in names}
+    assert {f"map: {name.replace('_', ' ')}" for name in MAP_CLASSES} <= set(names)
+    assert not any(text.startswith("map") for text, _ in legend_entries(TINY.classes, with_map=False))
+
+
+def test_the_legend_is_in_the_recording(tmp_path):
+    record(tmp_path / "r.rrd", MemorySequence(1))
+    (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
+    assert "traffic cone" in frame.values(f"{entities.LEGEND}/texts", "Points2D:labels")
+
+
+def test_range_rings_end_with_the_grid():
+    assert ring_distances_m(BevGrid(64, 64, (-32.0, 32.0), (-32.0, 32.0))) == [10, 20, 30]
+    assert ring_distances_m(BevGrid(64, 64, (-51.2, 51.2), (-51.2, 51.2))) == [10, 20, 30, 40, 50]
+    assert ring_distances_m(BevGrid(64, 64, (-30.0, 30.0), (-15.0, 45.0))) == [10]
+
+
+@pytest.mark.parametrize("size", [(1600, 900), (1920, 1208), (1280, 720)])
+def test_images_of_six_cameras_fill_most_of_their_views(size):
+    cameras = tuple(make_camera(c.name, np.degrees(c.yaw), *size) for c in make_rig().cameras)
+    shares = camera_row_shares(CameraRig(cameras, default_ego_from_bev()))
+    view = WINDOW[0] * (1 - TEXTS_SHARE) / 3, shares[0] * WINDOW[1] - TITLE_HEIGHT
+    scale = min(view[0] / size[0], view[1] / size[1])
+    assert size[0] * size[1] * scale**2 > 0.85 * view[0] * view[1]
+    assert sum(shares) < 0.7
+
+
+@pytest.mark.parametrize("yaws", [{"only": 0}, {"front": 0, "back": 180}, {f"c{i}": 20 * i - 60 for i in range(7)}])
+def test_the_middle_keeps_room_with_any_rig(yaws):
+    assert 0.1 < sum(camera_row_shares(make_rig(yaws))) < 0.7
+
+
+@dataclass(frozen=True)
+class Weights(NamedModel):
+    """A model with the weights of the package."""
+
+    bundled: bool = True
+
+
+def test_titles_say_when_the_weights_do_not_know_such_images():
+    assert weights_note(Weights(), Drive(rendered=False)) == FROM_RENDERED
+    assert weights_note(Weights(), Drive(rendered=True)) == ""
+    assert weights_note(NamedModel(), Drive(rendered=False)) == ""
+    assert weights_note(NamedModel(untrained=True), Drive(rendered=True)) == UNTRAINED
+
+
+def test_the_note_is_an_event_and_in_the_file(tmp_path):
+    drive = Drive()
+    with Recording(tmp_path / "r.rrd", drive, Weights()) as recording:
+        recording.log(drive.load(0), predict(drive.load(0)))
+    (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
+    assert frame.values(entities.RUN, "note") == [FROM_RENDERED]
+    chunks = [c.to_record_batch() for c in RecordingReader(tmp_path / "r.rrd").chunks() if c.entity_path == "/events"]
+    texts = [text for batch in chunks for (text,) in batch.column("TextLog:text").to_pylist()]
+    assert "The weights were trained on rendered streets; these images are not rendered." in texts
+
+
+def test_the_speed_is_a_curve_and_a_label(tmp_path):
+    record(tmp_path / "r.rrd", MemorySequence(1))
+    (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
+    assert frame.array(entities.SPEED_CURVE, "Scalars:scalars", 1)[0, 0] == pytest.approx(6.0 * 3.6)
+    assert frame.values(entities.SPEED, "Points3D:labels") == ["22 km/h"]
+
+
+def test_a_drive_without_poses_shows_no_speed(tmp_path):
+    drive = MemorySequence(1)
+    drive.has_ego_motion = False
+    record(tmp_path / "r.rrd", drive)
+    (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
+    assert entities.SPEED not in frame.rows
+
+
+def test_the_segmentation_lies_on_the_ground(tmp_path):
+    drive = MemorySequence(1)
+    cells = np.zeros((20, 20), dtype=np.uint8)
+    cells[0, 0] = MAP_CLASSES["vehicle"]  # the first row has the largest y
+    maps = BevMap(cells, GRID.x_range_m, GRID.y_range_m)
+    with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
+        recording.log(drive.load(0), replace(predict(drive.load(0)), segmentation=maps))
+    (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
+    texture = frame.blob(entities.SEGMENTATION_ON_GROUND, "Mesh3D:albedo_texture_buffer")
+    assert tuple(texture[:3]) == MAP_COLORS["vehicle"]
+    corners = frame.array(entities.SEGMENTATION_ON_GROUND, "Mesh3D:vertex_positions", 3)
+    left_ahead = corners[3]  # bev x smallest, y largest
+    assert left_ahead[0] == pytest.approx(51.2 + 0.94, abs=1e-3)  # in ego: forward
+    assert left_ahead[1] == pytest.approx(51.2, abs=1e-3)
+
+
+def test_a_drive_with_a_place_on_earth_has_a_street_map(tmp_path):
+    drive = Drive(3, geo_origin=GeoOrigin(48.1374, 11.5755, 90.0))
+    record(tmp_path / "r.rrd", drive)
+    frames = list(RecordingReader(tmp_path / "r.rrd").frames())
+    for place, frame in enumerate(frames):
+        latitude, longitude = frame.array(entities.MAP_EGO, "GeoPoints:positions", 2)[0]
+        east, north = drive.pose(place).translation[:2]
+        assert (latitude - 48.1374) * 111_200 == pytest.approx(north, abs=0.05)
+        assert (longitude - 11.5755) * 111_320 * np.cos(np.radians(48.1374)) == pytest.approx(east, abs=0.1)
+        assert len(frame.array(entities.MAP_BOXES, "GeoPoints:positions", 2)) == 2
+    record(tmp_path / "none.rrd", Drive(1))
+    (frame,) = RecordingReader(tmp_path / "none.rrd").frames()
+    assert not {entities.MAP_EGO, entities.MAP_BOXES} & set(frame.rows)
+
+
+def test_the_rate_of_the_time_panel_is_that_of_the_drive():
+    assert frame_rate_hz(MemorySequence(5, step_s=0.5).stamps) == pytest.approx(2)
+    assert frame_rate_hz(MemorySequence(5, step_s=1 / 12).stamps) == pytest.approx(12)
+    assert frame_rate_hz(MemorySequence(1).stamps) == 2

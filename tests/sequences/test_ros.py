@@ -1,0 +1,592 @@
+"""Bags written with the packages of ROS and MCAP, read as sequences."""
+
+import base64
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from bags import (
+    Message,
+    camera_info,
+    drive_messages,
+    header,
+    odometry,
+    transform,
+    write_json_mcap,
+    write_mcap,
+    write_protobuf_mcap,
+    write_rosbag2,
+    xyz,
+)
+
+from bevcli.errors import InputError
+from bevcli.frame import Sequence
+from bevcli.geometry.cameras import Distortion
+from bevcli.geometry.ego_motion import EgoMotion
+from bevcli.geometry.transforms import Pose, rotation_about_z
+from bevcli.sequences.native.ego_motion_file import read_ego_motion
+from bevcli.sequences.open import open_sequence
+
+
+@pytest.fixture
+def native(drive: Path) -> Sequence:
+    """The small drive as the native folder that the bags are written from."""
+    return open_sequence(drive)
+
+
+@pytest.fixture
+def motion(drive: Path) -> EgoMotion:
+    """The ego-motion of the small drive."""
+    return read_ego_motion(drive / "ego_motion.csv")
+
+
+def messages_of(native: Sequence, motion: EgoMotion | None, **options) -> list[Message]:
+    return list(drive_messages(native, motion, **options))
+
+
+def write(folder: Path, form: str, messages: list[Message]) -> Path:
+    if form == "mcap":
+        return write_mcap(folder / "bag.mcap", messages)
+    return write_rosbag2(folder / "bag", messages, form.removeprefix("rosbag2 "))
+
+
+@pytest.mark.parametrize("form", ["mcap", "rosbag2 sqlite3", "rosbag2 mcap"])
+@pytest.mark.parametrize("poses_in", ["odometry", "tf"])
+def test_a_bag_gives_the_frames_it_was_written_from(
+    tmp_path: Path, native: Sequence, motion: EgoMotion, form: str, poses_in: str
+) -> None:
+    sequence = open_sequence(write(tmp_path, form, messages_of(native, motion, poses_in=poses_in)))
+    assert set(sequence.rig.names) == set(native.rig.names)
+    for camera in native.rig.cameras:
+        np.testing.assert_allclose(sequence.rig[camera.name].ego_from_camera, camera.ego_from_camera, atol=1e-12)
+        np.testing.assert_array_equal(sequence.rig[camera.name].intrinsics, camera.intrinsics)
+    assert len(sequence.stamps) == len(native.stamps)
+    for place in range(len(native.stamps)):
+        found, true = sequence.load(place), native.load(place)
+        assert not found.dropped
+        for name, image in true.images.items():
+            assert found.images[name].timestamp_ns == image.timestamp_ns
+            np.testing.assert_array_equal(found.images[name].pixels_bgr, image.pixels_bgr)
+            np.testing.assert_allclose(
+                found.world_from_ego_at[name].matrix, true.world_from_ego_at[name].matrix, atol=1e-9
+            )
+        np.testing.assert_allclose(found.kinematics.velocity, [10, 0, 0], atol=1e-6)
+
+
+def test_the_time_of_an_image_is_its_stated_time_not_that_of_its_recording(
+    tmp_path: Path, native: Sequence, motion: EgoMotion
+) -> None:
+    path = write_mcap(tmp_path / "bag.mcap", messages_of(native, motion, delay_ns=180_000_000))
+    sequence = open_sequence(path)
+    times = [stamp.timestamp_ns for stamp in sequence.stamps]
+    assert times == [native.load(place).images["CAM_BACK"].timestamp_ns for place in range(4)]
+    assert sequence.load(0).images["CAM_FRONT"].timestamp_ns == native.stamps[0].timestamp_ns
+
+
+def test_a_replayed_bag_with_changing_delays_keeps_the_stated_times(
+    tmp_path: Path, native: Sequence, motion: EgoMotion
+) -> None:
+    messages = [
+        (topic, kind, time + 3 * (time - 10**9), fields) for topic, kind, time, fields in messages_of(native, motion)
+    ]
+    sequence = open_sequence(write_mcap(tmp_path / "bag.mcap", messages))
+    assert sequence.stamps[3].timestamp_ns == native.load(3).images["CAM_BACK"].timestamp_ns
+    np.testing.assert_allclose(
+        sequence.load(2).world_from_ego_at["CAM_FRONT"].matrix, native.load(2).world_from_ego.matrix, atol=1e-9
+    )
+
+
+def test_opening_a_bag_reads_no_image(
+    tmp_path: Path, native: Sequence, motion: EgoMotion, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from bevcli.sequences.ros.mcap_file import McapFile
+
+    messages = messages_of(native, motion)
+    images = [message for message in messages if "image" in message[0]]
+    for repeat in range(1, 50):
+        shift = repeat * 2 * 10**9
+        messages += [(t, k, time + shift, {**f, "header": header(time + shift, "")}) for t, k, time, f in images]
+    path = write_mcap(tmp_path / "bag.mcap", messages, chunk_size=2_000)
+    read: list[int] = []
+    chunk_of = McapFile._chunk
+
+    def counted(self: McapFile, position: int) -> bytes:
+        read.append(position)
+        return chunk_of(self, position)
+
+    monkeypatch.setattr(McapFile, "_chunk", counted)
+    sequence = open_sequence(path, ego_motion="static")
+    assert len(sequence.stamps) == 200
+    assert len(set(read)) < 20
+
+
+@pytest.mark.parametrize("share", [0.5, 0.8, 0.999])
+def test_a_bag_that_was_cut_off_is_read_as_far_as_it_goes(
+    tmp_path: Path, native: Sequence, motion: EgoMotion, share: float
+) -> None:
+    path = write_mcap(tmp_path / "bag.mcap", messages_of(native, motion), chunk_size=1_000)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * share)])
+    sequence = open_sequence(path)
+    assert 1 <= len(sequence.stamps) <= 4
+    np.testing.assert_array_equal(
+        sequence.load(0).images["CAM_FRONT"].pixels_bgr, native.load(0).images["CAM_FRONT"].pixels_bgr
+    )
+    if share < 0.6:  # of this small file, the index at its end is the rest
+        assert any("is cut off" in note for note in sequence.notes)
+
+
+def test_a_file_without_a_message_says_which_topics_it_has(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
+    others = [("/chatter", "std_msgs/String", 1, {"data": "hello"})]
+    path = write_mcap(tmp_path / "bag.mcap", others)
+    with pytest.raises(InputError, match=r"has no image topic \(topics: /chatter \(std_msgs/String\)\)"):
+        open_sequence(path)
+    path.write_bytes(b"something else")
+    with pytest.raises(InputError, match="is not an MCAP file"):
+        open_sequence(path)
+
+
+def test_missing_poses_and_extrinsics_are_named(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
+    path = write_mcap(tmp_path / "bag.mcap", messages_of(native, None))
+    with pytest.raises(InputError, match=r"has no poses of the vehicle.*/tf_static.*--ego-motion FILE"):
+        open_sequence(path)
+    assert open_sequence(path, ego_motion="static").load(0).images
+    messages = [message for message in messages_of(native, motion) if message[0] != "/tf_static"]
+    path = write_mcap(tmp_path / "bag.mcap", messages)
+    with pytest.raises(
+        InputError, match=r'no transform leads from its frame "CAM_BACK_optical" to "base_link"'
+    ) as found:
+        open_sequence(path)
+    assert "/odom (nav_msgs/Odometry)" in str(found.value)
+    assert "\n" not in str(found.value)
+
+
+def test_files_beside_the_bag_replace_its_calibration_and_poses(
+    tmp_path: Path, drive: Path, native: Sequence, motion: EgoMotion
+) -> None:
+    messages = [message for message in messages_of(native, None) if "image" in message[0]]
+    path = write_mcap(tmp_path / "bag.mcap", messages)
+    given = {"calibration": drive / "calibration.json", "ego_motion_file": drive / "ego_motion.csv"}
+    by_option = open_sequence(path, **given)
+    assert by_option.rig.names == native.rig.names
+    for name in ("calibration.json", "ego_motion.csv"):
+        shutil.copy(drive / name, tmp_path)
+    sequence = open_sequence(path)
+    assert sum("is used in place of" in note for note in sequence.notes) == 2
+    frame = sequence.load(1)
+    np.testing.assert_allclose(
+        frame.world_from_ego_at["CAM_BACK"].matrix, native.load(1).world_from_ego_at["CAM_BACK"].matrix
+    )
+    np.testing.assert_array_equal(frame.rig.ego_from_bev, native.rig.ego_from_bev)
+
+
+def renamed(messages: list[Message], names: dict[str, str]) -> list[Message]:
+    return [(names.get(topic, topic), kind, time, fields) for topic, kind, time, fields in messages]
+
+
+AUTOWARE = {
+    "/CAM_FRONT/image/compressed": "/sensing/camera/camera0/image_rect_color/compressed",
+    "/CAM_FRONT/camera_info": "/sensing/camera/camera0/camera_info",
+    "/CAM_BACK/image/compressed": "/sensing/camera/camera1/image_rect_color/compressed",
+    "/CAM_BACK/camera_info": "/sensing/camera/camera1/camera_info",
+    "/odom": "/localization/kinematic_state",
+}
+
+
+def test_autoware_topics_are_found(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
+    messages = renamed(messages_of(native, motion), AUTOWARE)
+    wrong = [("/sensing/gnss/pose", "geometry_msgs/PoseStamped", 1, pose_stamped(1))]
+    path = write_mcap(tmp_path / "bag.mcap", messages + wrong)
+    sequence = open_sequence(path)
+    assert sequence.rig.names == ("camera0", "camera1")
+    assert "ego-motion     /localization/kinematic_state" in sequence.notes[0]
+    stated = {"CAM_FRONT": AUTOWARE["/CAM_FRONT/image/compressed"]}
+    assert set(open_sequence(path, topics=stated).rig.names) == {"CAM_FRONT", "camera1"}
+
+
+def pose_stamped(time: int) -> dict:
+    pose = {"position": xyz(np.zeros(3)), "orientation": {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}}
+    return {"header": header(time, "map"), "pose": pose}
+
+
+def test_a_topics_file_states_cameras_frames_and_poses(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
+    names = {
+        "/CAM_FRONT/image/compressed": "/a/first",
+        "/CAM_FRONT/camera_info": "/b/one",
+        "/CAM_BACK/image/compressed": "/a/second",
+        "/CAM_BACK/camera_info": "/b/two",
+    }
+    messages = renamed(messages_of(native, motion), names)
+    path = write_mcap(tmp_path / "bag.mcap", messages)
+    topics = tmp_path / "topics.toml"
+    topics.write_text(
+        'ego_motion = "/odom"\n[cameras]\nCAM_BACK = "/a/second"\n[calibration]\nCAM_BACK = "/b/two"\n'
+        '[frames]\nCAM_BACK = "CAM_BACK_optical"\n'
+    )
+    sequence = open_sequence(path, topics_file=topics)
+    assert sequence.rig.names == ("CAM_BACK",)
+    np.testing.assert_allclose(
+        sequence.rig["CAM_BACK"].ego_from_camera, native.rig["CAM_BACK"].ego_from_camera, atol=1e-12
+    )
+    topics.write_text("camera = 1\n")
+    with pytest.raises(InputError, match=r'topics\.toml: unknown key "camera"'):
+        open_sequence(path, topics_file=topics)
+    with pytest.raises(InputError, match="has no topic /nothing"):
+        open_sequence(path, topics={"CAM_FRONT": "/nothing"})
+
+
+def test_a_calibration_whose_cameras_are_not_found_names_the_option(
+    tmp_path: Path, drive: Path, native: Sequence, motion: EgoMotion
+) -> None:
+    path = write_mcap(tmp_path / "bag.mcap", renamed(messages_of(native, motion), AUTOWARE))
+    with pytest.raises(InputError, match=r"camera CAM_FRONT of the calibration.*--topic CAM_FRONT=/TOPIC"):
+        open_sequence(path, calibration=drive / "calibration.json")
+    topics = {
+        "CAM_FRONT": AUTOWARE["/CAM_FRONT/image/compressed"],
+        "CAM_BACK": AUTOWARE["/CAM_BACK/image/compressed"],
+    }
+    sequence = open_sequence(path, calibration=drive / "calibration.json", topics=topics)
+    assert sequence.rig.names == native.rig.names
+
+
+def test_frames_before_the_first_pose_are_left_out(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
+    late = 1_400_000_000
+    messages = [m for m in messages_of(native, motion) if m[0] != "/odom" or m[2] >= late]
+    sequence = open_sequence(write_mcap(tmp_path / "bag.mcap", messages))
+    assert len(sequence.stamps) == 3
+    assert any("1 of 4 frames are left out" in note for note in sequence.notes)
+
+
+def test_poses_of_another_part_of_the_vehicle_are_moved_to_the_ego_frame(
+    tmp_path: Path, native: Sequence, motion: EgoMotion
+) -> None:
+    base_from_imu = Pose.from_matrix(np.eye(4))
+    base_from_imu = replace(base_from_imu, translation=np.array([1.0, 2.0, 3.0]))
+    messages = [m for m in messages_of(native, None) if m[0] != "/odom"]
+    messages.append(("/tf_static", "tf2_msgs/TFMessage", 10**9, {"transforms": [
+        transform(10**9, "base_link", "imu", base_from_imu)
+    ]}))  # fmt: skip
+    for time in motion.timestamps_ns.tolist():
+        pose = motion.pose_at(time)
+        world_from_imu = Pose.from_matrix(pose.matrix @ base_from_imu.matrix)
+        messages.append(("/odom", "nav_msgs/Odometry", time, odometry(time, "map", "imu", world_from_imu)))
+    topics = tmp_path / "topics.toml"
+    topics.write_text('ego_frame = "base_link"\n')
+    sequence = open_sequence(write_mcap(tmp_path / "bag.mcap", messages), topics_file=topics)
+    np.testing.assert_allclose(
+        sequence.load(2).world_from_ego_at["CAM_FRONT"].matrix, native.load(2).world_from_ego.matrix, atol=1e-9
+    )
+
+
+def test_a_chain_of_moving_transforms_is_multiplied(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
+    map_from_odom = Pose(np.array([5.0, 0.0, 0.0]), Pose.from_matrix(np.eye(4)).quaternion)
+    messages = messages_of(native, None)
+    for time in motion.timestamps_ns.tolist():
+        odom_from_base = replace(
+            motion.pose_at(time), translation=motion.pose_at(time).translation - map_from_odom.translation
+        )
+        fields = {"transforms": [transform(time, "odom", "base_link", odom_from_base)]}
+        messages.append(("/tf", "tf2_msgs/TFMessage", time, fields))
+    for time in motion.timestamps_ns[::6].tolist():
+        fields = {"transforms": [transform(time, "map", "odom", map_from_odom)]}
+        messages.append(("/tf", "tf2_msgs/TFMessage", time, fields))
+    sequence = open_sequence(write_mcap(tmp_path / "bag.mcap", messages))
+    np.testing.assert_allclose(
+        sequence.load(2).world_from_ego_at["CAM_FRONT"].matrix, native.load(2).world_from_ego.matrix, atol=1e-9
+    )
+
+
+LENSES = {
+    "plumb_bob": Distortion("brown_conrady", (0.1, -0.02, 0.001, 0.002, 0.01)),
+    "rational_polynomial": Distortion("brown_conrady", (0.1, -0.02, 0.001, 0.002, 0.01, 0.02, 0.03, 0.04)),
+    "equidistant": Distortion("kannala_brandt", (0.1, -0.02, 0.003, -0.001)),
+}
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_the_distortion_models_of_camera_info(tmp_path: Path, native: Sequence, motion: EgoMotion, model: str) -> None:
+    camera = replace(native.rig["CAM_FRONT"], distortion=LENSES[model])
+    info = camera_info(camera, 10**9, "CAM_FRONT_optical")
+    assert info["distortion_model"] == model
+    messages = [
+        (t, k, time, info if t == "/CAM_FRONT/camera_info" else f) for t, k, time, f in messages_of(native, motion)
+    ]
+    sequence = open_sequence(write_mcap(tmp_path / "bag.mcap", messages))
+    assert sequence.rig["CAM_FRONT"].distortion == LENSES[model]
+    assert sequence.rig["CAM_BACK"].distortion is None
+
+
+def test_a_rectified_image_has_the_intrinsics_and_rotation_of_the_rectification(
+    tmp_path: Path, native: Sequence, motion: EgoMotion
+) -> None:
+    camera = replace(native.rig["CAM_FRONT"], distortion=LENSES["plumb_bob"])
+    info = camera_info(camera, 10**9, "CAM_FRONT_optical")
+    projection = np.array([[40.0, 0, 30, 0], [0, 41, 16, 0], [0, 0, 1, 0]])
+    rotation = rotation_about_z(0.1)
+    info |= {"p": projection.ravel().tolist(), "r": rotation.ravel().tolist()}
+    messages = renamed(messages_of(native, motion), {"/CAM_FRONT/image/compressed": "/CAM_FRONT/image_rect/compressed"})
+    messages = [(t, k, time, info if t == "/CAM_FRONT/camera_info" else f) for t, k, time, f in messages]
+    found = open_sequence(write_mcap(tmp_path / "bag.mcap", messages)).rig["CAM_FRONT"]
+    assert found.distortion is None
+    np.testing.assert_array_equal(found.intrinsics, projection[:, :3])
+    # A point's rectified ray is R times its ray in the camera.
+    point_ego = np.array([10.0, 1.0, 2.0])
+    in_camera = camera.camera_from_ego[:3, :3] @ point_ego + camera.camera_from_ego[:3, 3]
+    in_rectified = found.camera_from_ego[:3, :3] @ point_ego + found.camera_from_ego[:3, 3]
+    np.testing.assert_allclose(in_rectified, rotation @ in_camera, atol=1e-12)
+
+
+def encode(pixels: np.ndarray, encoding: str) -> tuple[np.ndarray, int]:
+    """The rows of an image in an encoding, and the bytes a row."""
+    if encoding == "bgr8":
+        rows = pixels.reshape(len(pixels), -1)
+    elif encoding == "rgb8":
+        rows = pixels[..., ::-1].reshape(len(pixels), -1)
+    elif encoding == "bgra8":
+        rows = np.concatenate([pixels, np.full_like(pixels[..., :1], 255)], axis=-1).reshape(len(pixels), -1)
+    else:
+        rows = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
+    padded = np.pad(rows, ((0, 0), (0, 3)))  # a step that is larger than the row
+    return padded, padded.shape[1]
+
+
+@pytest.mark.parametrize("encoding", ["bgr8", "rgb8", "bgra8", "mono8"])
+def test_raw_images(tmp_path: Path, native: Sequence, motion: EgoMotion, encoding: str) -> None:
+    messages = raw_messages(native, motion, lambda pixels: encode(pixels, encoding), encoding)
+    frame = open_sequence(write_mcap(tmp_path / "bag.mcap", messages)).load(1)
+    for name, image in native.load(1).images.items():
+        true = image.pixels_bgr
+        if encoding == "mono8":
+            true = cv2.cvtColor(cv2.cvtColor(true, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
+        np.testing.assert_array_equal(frame.images[name].pixels_bgr, true)
+
+
+def raw_messages(native: Sequence, motion: EgoMotion, encoded, encoding: str) -> list[Message]:
+    messages = []
+    for topic, kind, time, fields in messages_of(native, motion):
+        if kind == "sensor_msgs/CompressedImage":
+            pixels = cv2.imdecode(np.frombuffer(fields["data"], np.uint8), cv2.IMREAD_COLOR)
+            rows, step = encoded(pixels)
+            fields = {
+                "header": fields["header"], "height": pixels.shape[0], "width": pixels.shape[1], "encoding": encoding,
+                "is_bigendian": 0, "step": step, "data": rows.tobytes(),
+            }  # fmt: skip
+            topic, kind = topic.replace("image/compressed", "image_raw"), "sensor_msgs/Image"
+        messages.append((topic, kind, time, fields))
+    return messages
+
+
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+def test_a_bayer_image_of_one_colour_has_that_colour(
+    tmp_path: Path, native: Sequence, motion: EgoMotion, pattern: str
+) -> None:
+    levels = {"r": 200, "g": 120, "b": 40}
+
+    def mosaic(pixels: np.ndarray) -> tuple[np.ndarray, int]:
+        height, width = pixels.shape[:2]
+        tile = np.array([levels[letter] for letter in pattern], dtype=np.uint8).reshape(2, 2)
+        rows = np.tile(tile, (height // 2 + 1, width // 2 + 1))[:height, :width]
+        return np.ascontiguousarray(rows), width
+
+    messages = raw_messages(native, motion, mosaic, f"bayer_{pattern}8")
+    image = open_sequence(write_mcap(tmp_path / "bag.mcap", messages)).load(0).images["CAM_FRONT"]
+    np.testing.assert_array_equal(image.pixels_bgr[10, 10], [40, 120, 200])
+
+
+def test_an_unknown_encoding_is_an_error_and_a_broken_image_is_a_gap(
+    tmp_path: Path, native: Sequence, motion: EgoMotion
+) -> None:
+    messages = raw_messages(native, motion, lambda pixels: encode(pixels, "bgr8"), "32FC1")
+    with pytest.raises(InputError, match="encoding 32FC1 is not supported"):
+        open_sequence(write_mcap(tmp_path / "bag.mcap", messages)).load(0)
+    messages = messages_of(native, motion)
+    place = next(i for i, message in enumerate(messages) if message[0] == "/CAM_FRONT/image/compressed")
+    topic, kind, time, fields = messages[place]
+    messages[place] = (topic, kind, time, {**fields, "data": fields["data"][:40]})
+    path = write_mcap(tmp_path / "bag.mcap", messages)
+    assert "is not a complete image" in open_sequence(path).load(0).dropped["CAM_FRONT"]
+    with pytest.raises(InputError, match="--strict"):
+        open_sequence(path, strict=True).load(0)
+
+
+def foxglove_messages(native: Sequence, motion: EgoMotion, time_of) -> list[Message]:
+    """The drive in Foxglove's schemas. time_of: nanoseconds -> the schema's time."""
+    messages: list[Message] = []
+    for topic, kind, time, fields in messages_of(native, motion, poses_in="tf"):
+        if kind == "tf2_msgs/TFMessage":
+            parts = [
+                {
+                    "timestamp": time_of(time),
+                    "parent_frame_id": one["header"]["frame_id"],
+                    "child_frame_id": one["child_frame_id"],
+                    **one["transform"],
+                }
+                for one in fields["transforms"]
+            ]
+            messages.append((topic, "foxglove.FrameTransforms", time, {"transforms": parts}))
+        elif kind == "sensor_msgs/CameraInfo":
+            info = {key: fields[key] for key in ("width", "height", "distortion_model")}
+            info |= {key.upper(): fields[key] for key in "dkrp"}
+            info |= {"timestamp": time_of(time), "frame_id": fields["header"]["frame_id"]}
+            messages.append((topic, "foxglove.CameraCalibration", time, info))
+        else:
+            image = {"timestamp": time_of(time), "frame_id": fields["header"]["frame_id"]}
+            image |= {"data": fields["data"], "format": fields["format"]}
+            messages.append((topic, "foxglove.CompressedImage", time, image))
+    return messages
+
+
+def foxglove_files():
+    """The Protobuf definitions of the Foxglove schemas that are written here."""
+    from google.protobuf import descriptor_pb2, timestamp_pb2
+
+    file = descriptor_pb2.FileDescriptorProto(name="foxglove.proto", package="foxglove", syntax="proto3")
+    file.dependency.append("google/protobuf/timestamp.proto")
+    kinds = {"double": 1, "uint32": 13, "string": 9, "bytes": 12}
+    types = {
+        "Vector3": "double x,double y,double z",
+        "Quaternion": "double x,double y,double z,double w",
+        "FrameTransform": ".google.protobuf.Timestamp timestamp,string parent_frame_id,string child_frame_id,"
+        ".foxglove.Vector3 translation,.foxglove.Quaternion rotation",
+        "FrameTransforms": "*.foxglove.FrameTransform transforms",
+        "CompressedImage": ".google.protobuf.Timestamp timestamp,string frame_id,bytes data,string format",
+        "CameraCalibration": ".google.protobuf.Timestamp timestamp,string frame_id,uint32 width,uint32 height,"
+        "string distortion_model,*double D,*double K,*double R,*double P",
+    }
+    for name, text in types.items():
+        message = file.message_type.add(name=name)
+        for number, field in enumerate(text.split(","), start=1):
+            kind, key = field.split(" ")
+            repeated, kind = kind.startswith("*"), kind.removeprefix("*")
+            added = message.field.add(name=key, number=number, label=3 if repeated else 1, type=kinds.get(kind, 11))
+            if kind not in kinds:
+                added.type_name = kind
+    files = descriptor_pb2.FileDescriptorSet()
+    files.file.add().CopyFrom(descriptor_pb2.FileDescriptorProto.FromString(timestamp_pb2.DESCRIPTOR.serialized_pb))
+    files.file.append(file)
+    return files
+
+
+@pytest.mark.parametrize("form", ["json", "protobuf"])
+def test_foxglove_schemas(tmp_path: Path, native: Sequence, motion: EgoMotion, form: str) -> None:
+    path = tmp_path / "bag.mcap"
+    if form == "json":
+        write_json_mcap(path, foxglove_messages(native, motion, lambda t: {"sec": t // 10**9, "nsec": t % 10**9}))
+    else:
+        times = lambda t: f"1970-01-01T00:00:{t // 10**9:02d}.{t % 10**9:09d}Z"  # noqa: E731
+        write_protobuf_mcap(path, foxglove_messages(native, motion, times), foxglove_files())
+    sequence = open_sequence(path)
+    found, true = sequence.load(2), native.load(2)
+    for name, image in true.images.items():
+        np.testing.assert_array_equal(found.images[name].pixels_bgr, image.pixels_bgr)
+        np.testing.assert_allclose(found.world_from_ego_at[name].matrix, true.world_from_ego_at[name].matrix, atol=1e-9)
+        np.testing.assert_allclose(sequence.rig[name].ego_from_camera, native.rig[name].ego_from_camera, atol=1e-12)
+
+
+def test_a_folder_without_metadata_and_a_ros1_bag(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
+    bag = write_rosbag2(tmp_path / "bag", messages_of(native, motion))
+    (bag / "metadata.yaml").unlink()  # a recording that was cut off has none
+    assert len(open_sequence(bag).stamps) == 4
+    (tmp_path / "old.bag").write_bytes(b"#ROSBAG V2.0\n")
+    with pytest.raises(InputError, match="is a bag of ROS 1: convert it"):
+        open_sequence(tmp_path / "old.bag")
+
+
+def test_options_for_other_inputs_are_refused(tmp_path: Path, drive: Path, native: Sequence, motion: EgoMotion) -> None:
+    path = write_mcap(tmp_path / "bag.mcap", messages_of(native, motion))
+    with pytest.raises(InputError, match="are not for ROS bags"):
+        open_sequence(path, scene="one")
+    with pytest.raises(InputError, match="are for MCAP files and ROS bags"):
+        open_sequence(drive, topics={"CAM_FRONT": "/a"})
+
+
+def vp9_packets(folder: Path) -> list[bytes]:
+    """12 images of 64x48 in grey levels 10, 30, ..., written by OpenCV into an IVF container."""
+    path = folder / "video.ivf"
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"VP90"), 10, (64, 48))
+    for level in range(10, 250, 20):
+        writer.write(np.full((48, 64, 3), level, dtype=np.uint8))
+    writer.release()
+    data, at, packets = path.read_bytes(), 32, []
+    while at < len(data):
+        size = int.from_bytes(data[at : at + 4], "little")
+        packets.append(data[at + 12 : at + 12 + size])
+        at += 12 + size
+    return packets
+
+
+def video_bag(folder: Path, native: Sequence, packets: list[bytes], video_format: str) -> Path:
+    """The small drive with CAM_FRONT as a video of ten images per second."""
+    messages = [m for m in messages_of(native, None) if m[0] != "/CAM_FRONT/image/compressed"]
+    camera = replace(native.rig["CAM_FRONT"], width=64, height=48)
+    messages = [
+        (t, k, time, camera_info(camera, time, "CAM_FRONT_optical") if t == "/CAM_FRONT/camera_info" else fields)
+        for t, k, time, fields in messages
+    ]
+    for number, packet in enumerate(packets):
+        time = 10**9 + number * 100_000_000
+        timestamp = {"sec": time // 10**9, "nanosec": time % 10**9}
+        fields = {"timestamp": timestamp, "frame_id": "CAM_FRONT_optical", "data": packet, "format": video_format}
+        messages.append(("/CAM_FRONT/video", "foxglove_msgs/CompressedVideo", time, fields))
+    return write_mcap(folder / "bag.mcap", messages)
+
+
+@pytest.mark.parametrize("video_format", ["h264", "h265", "vp9"])
+def test_video_packets_are_decoded_in_any_order(tmp_path: Path, native: Sequence, video_format: str) -> None:
+    stored = json.loads((Path(__file__).parents[1] / "data/video_packets.json").read_text())
+    if video_format == "vp9":
+        packets = vp9_packets(tmp_path)
+    else:
+        packets = [base64.b64decode(text) for text in stored[video_format]]
+    sequence = open_sequence(video_bag(tmp_path, native, packets, video_format), ego_motion="static")
+    assert "/CAM_FRONT/video" in sequence.notes[0]
+    for place in (1, 0, 2):  # at 1.5, 1.0 and 2.0 s; CAM_BACK, which leads, is 20 ms late
+        image = sequence.load(place).images["CAM_FRONT"]
+        assert image.timestamp_ns == 10**9 + place * 500_000_000
+        assert image.pixels_bgr.mean() == pytest.approx(10 + 20 * 5 * place, abs=5)
+
+
+def test_an_unknown_video_format_is_an_error(tmp_path: Path, native: Sequence) -> None:
+    path = video_bag(tmp_path, native, [b"abc"], "theora")
+    with pytest.raises(InputError, match="video format theora is not supported"):
+        open_sequence(path, ego_motion="static")
+
+
+def test_without_the_extra_the_error_names_it(
+    tmp_path: Path, native: Sequence, motion: EgoMotion, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_mcap(tmp_path / "bag.mcap", messages_of(native, motion))
+    monkeypatch.setattr("bevcli.sequences.ros.bag.PACKAGES", ("rosbags", "a_package.that_is_missing"))
+    with pytest.raises(InputError, match=r"run pip install 'bevcli\[ros\]'"):
+        open_sequence(path)
+
+
+def nav_sat_fix(time: int, latitude: float, longitude: float, status: int = 0) -> Message:
+    fields = {
+        "header": header(time, "gnss"),
+        "status": {"status": status, "service": 1},
+        "latitude": latitude,
+        "longitude": longitude,
+        "altitude": 0.0,
+        "position_covariance": [0.0] * 9,
+        "position_covariance_type": 0,
+    }
+    return "/gnss/fix", "sensor_msgs/NavSatFix", time, fields
+
+
+def test_the_first_valid_satellite_position_places_the_drive_on_earth(native, motion, tmp_path):
+    times = [stamp.timestamp_ns for stamp in native.stamps]
+    fixes = [nav_sat_fix(times[0], 0.0, 0.0, status=-1), nav_sat_fix(times[1], 48.137, 11.575)]
+    path = write_mcap(tmp_path / "drive.mcap", [*messages_of(native, motion), *fixes])
+    opened = open_sequence(path)
+    vehicle = opened.load(1).world_from_ego.translation
+    assert opened.facts.geo_origin.latitude_longitude(vehicle) == pytest.approx([48.137, 11.575], abs=1e-5)  # a metre
+
+
+def test_a_bag_without_satellite_positions_has_no_geo_origin(native, motion, tmp_path):
+    opened = open_sequence(write_mcap(tmp_path / "drive.mcap", messages_of(native, motion)))
+    assert opened.facts.geo_origin is None

@@ -1,0 +1,168 @@
+"""The forward passes of a clip: they equal inference, and a BEVFormerV2 can be trained with its window."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from painted_drives import CONFIG, PaintedDrives
+
+from bevcli.config import TRAINING, known_models, load_config, load_table
+from bevcli.errors import ConfigError
+from bevcli.model.bev_fusion import BevFusionConfig
+from bevcli.model.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config, build_model
+from bevcli.model.fpn import FPNConfig
+from bevcli.pipeline.preprocess import Preprocessor
+from bevcli.pipeline.temporal import temporal_model
+from bevcli.training.augmentation import AugmentationConfig
+from bevcli.training.clip_forward import forward_clip
+from bevcli.training.clips import Clip, ClipConfig
+from bevcli.training.job import TrainingConfig, TrainingJob, check_window, prepare_training
+from bevcli.training.optimizer import OptimizerConfig
+from bevcli.training.perspective_loss import PerspectiveLossConfig
+from bevcli.training.samples import Batch, load_batch
+from bevcli.training.trainer import Trainer
+
+V1 = replace(CONFIG, heads=("detection",))
+WINDOW = BEVFormerV2Config(
+    **{field.name: getattr(V1, field.name) for field in fields(V1)}
+    | {"ego_motion": NO_EGO_MOTION, "neck": FPNConfig(2)},  # the second level is for the perspective head only
+    frames=(-1, 0),
+    fusion=BevFusionConfig(blocks=1, width=64),
+)
+CPU = torch.device("cpu")
+
+
+def batch_of(config: BEVFormerV2Config, frames: int = 2) -> Batch:
+    """Clips of three drives, which is not the number of cameras."""
+    clips = [Clip(drive, tuple(range(2 - frames, 2))) for drive in range(3)]
+    drives = PaintedDrives(3, all_labelled=True)
+    return load_batch(drives, clips, config, AugmentationConfig(0, 0), np.random.default_rng(0), learn_all=True)
+
+
+@pytest.mark.parametrize("config", [V1, WINDOW], ids=["BEVFormer", "BEVFormerV2"])
+@pytest.mark.parametrize("learn_all", [False, True])
+def test_a_clip_gives_the_outputs_of_inference(config: BEVFormerV2Config, *, learn_all: bool) -> None:
+    """With batch norms in evaluation mode, and without dropout."""
+    torch.manual_seed(0)
+    model = build_model(config).eval()
+    outputs = list(forward_clip(model, batch_of(config), learn_all=learn_all, freeze_batch_norm=True))
+    assert len(outputs) == (2 if learn_all else 1)
+    model.eval()
+    drives = PaintedDrives(3, all_labelled=True)
+    for drive in range(3):
+        running, memory = temporal_model(model, CPU), None
+        for index in range(2):
+            prepared = Preprocessor(config)(drives.open(drive).load(index))
+            with torch.no_grad():
+                expected, memory = running.step(prepared, memory, ())
+            place = index if learn_all else index - 1
+            if place >= 0:
+                torch.testing.assert_close(outputs[place].bev[drive], expected.bev[0], atol=2e-4, rtol=0)
+                torch.testing.assert_close(
+                    outputs[place].box_codes[:, drive], expected.box_codes[:, 0], atol=2e-3, rtol=0
+                )
+
+
+def test_the_earlier_frame_of_a_window_changes_the_output_and_has_no_gradient() -> None:
+    torch.manual_seed(0)
+    model, batch = build_model(WINDOW), batch_of(WINDOW)
+    black = replace(batch.inputs[0], images=torch.zeros_like(batch.inputs[0].images))
+    moved = batch.world_from_bev.clone()
+    moved[0, :, 0, 3] += 5
+    with torch.no_grad():
+        whole, changed, elsewhere = (
+            next(forward_clip(model, one, freeze_batch_norm=True)).bev
+            for one in (batch, replace(batch, inputs=(black, batch.inputs[1])), replace(batch, world_from_bev=moved))
+        )
+    assert (whole - changed).abs().max() > 1e-3
+    assert (whole - elsewhere).abs().max() > 1e-3
+    batch.inputs[0].images.requires_grad_()
+    batch.inputs[1].images.requires_grad_()
+    next(forward_clip(model, batch)).bev.square().sum().backward()
+    assert batch.inputs[0].images.grad is None
+    assert batch.inputs[1].images.grad.any()
+
+
+def trained(out: Path, settings: TrainingConfig, *, resume: bool = False) -> Trainer:
+    """A training of a BEVFormerV2."""
+    out.mkdir(exist_ok=True)
+    torch.manual_seed(0)
+    # With "last", only the second frame of a drive is trained on, so that only it may be scored.
+    drives = PaintedDrives(settings.clips.batch, all_labelled=settings.clips.learn == "all")
+    return Trainer(TrainingJob(BEVFormerV2(WINDOW), settings, drives, drives, out, CPU), resume=resume)
+
+
+SHORT = TrainingConfig(
+    steps=3,
+    held_out=0,
+    evaluate_every=3,
+    checkpoint_every=1,
+    clips=ClipConfig(2, 2, 0.0),
+    perspective_loss=PerspectiveLossConfig(1.0),
+)
+
+
+@pytest.mark.parametrize("learn", ["last", "all"])
+def test_a_resumed_training_with_a_window_equals_an_uninterrupted_one(tmp_path: Path, learn: str) -> None:
+    settings = replace(SHORT, clips=replace(SHORT.clips, learn=learn))
+    whole = trained(tmp_path / "whole", settings)
+    whole.run()
+    named = dict(whole.trained.named_parameters())
+    assert [name for name, one in named.items() if one.grad is None or not one.grad.any()] == []
+
+    class Killed(Exception):
+        pass
+
+    killed = trained(tmp_path / "killed", settings)
+
+    def kill() -> None:
+        raise Killed
+
+    with pytest.raises(Killed):
+        killed.run(kill)
+    resumed = trained(tmp_path / "killed", settings, resume=True)
+    assert resumed.done == 1
+    resumed.run()
+    pairs = zip(whole.trained.state_dict().values(), resumed.trained.state_dict().values(), strict=True)
+    assert all(torch.equal(one, other) for one, other in pairs)
+
+
+def test_a_window_that_clips_cannot_fill_is_rejected(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"training.clips.frames must be at least 2, .* but is 1"):
+        check_window(WINDOW, replace(SHORT, clips=ClipConfig(1)))
+    with pytest.raises(ConfigError, match=r"frames after the current one cannot be trained; .* found \[0, 1\]"):
+        check_window(replace(WINDOW, frames=(0, 1)), SHORT)
+    check_window(V1, replace(SHORT, clips=ClipConfig(1)))
+
+
+@pytest.mark.parametrize("name", [name for name in known_models() if name.startswith("v2-")])
+def test_the_published_windows_can_be_trained_with_perspective_supervision(name: str) -> None:
+    settings = load_table(name, TRAINING, TrainingConfig)
+    check_window(load_config(name), settings)
+    assert settings.perspective_loss.weight > 0
+
+
+def test_a_job_of_a_window_is_prepared_from_a_model_file(tmp_path: Path) -> None:
+    job = prepare_training("v2-t1", CPU, rendered_seeds=range(4), out=tmp_path / "out")
+    assert isinstance(job.model, BEVFormerV2)
+
+
+@pytest.mark.slow
+def test_four_clips_can_be_overfitted_with_a_window(tmp_path: Path) -> None:
+    settings = replace(
+        SHORT,
+        steps=350,
+        evaluate_every=350,
+        checkpoint_every=350,
+        clips=ClipConfig(frames=2, batch=4, short_share=0.0),
+        augmentation=AugmentationConfig(0, 0),
+        optimizer=OptimizerConfig(learning_rate=1e-3, backbone_share=1.0, warm_up_steps=50),
+    )
+    trained(tmp_path, settings).run()
+    header, last = (tmp_path / "validation.csv").read_text().splitlines()
+    scores = dict(zip(header.split(","), map(float, last.split(",")), strict=True))
+    assert scores["mAP"] > 0.8
