@@ -40,7 +40,7 @@ def test_a_state_comes_back_exactly(tmp_path):
     pose = Pose(np.array([1 / 3, -2.0, 1e300]), np.array([-1.0, 0, 0, 0]))
     stamp = FrameStamp(7, "straße", 1_533_151_603_547_590_001)
     bev = BevState(BevHistory(torch.randn(1, 12, 4), pose), stamp)
-    half = torch.randn(3).to(torch.bfloat16).T
+    half = torch.randn(3, 2).to(torch.bfloat16).T
     tree = (bev, {"a": 1, 3: None}, [True, 0.1, float("inf"), -(10**30)], half, torch.tensor(5), np.zeros((0, 3)))
     tree = (*tree, Boxes3D.empty(), np.array(["car", "bus"]), (), {})
     save_state(tmp_path / "state", tree)
