@@ -70,10 +70,16 @@ def with_truth(frame: Frame) -> Frame:
 
 
 def record(
-    path: Path, sequence: MemorySequence, options: RecordingOptions | None = None, *, untrained: bool = False
+    path: Path,
+    sequence: MemorySequence,
+    options: RecordingOptions | None = None,
+    *,
+    untrained: bool = False,
+    truth: bool = True,
 ) -> list[Frame]:
-    """Writes a recording of the whole sequence; returns its frames."""
-    frames = [with_truth(sequence.load(place)) for place in range(len(sequence.stamps))]
+    """Writes a recording of the whole sequence, by default with ground truth; returns its frames."""
+    frames = [sequence.load(place) for place in range(len(sequence.stamps))]
+    frames = [with_truth(frame) for frame in frames] if truth else frames
     with Recording(path, sequence, NamedModel(untrained), options) as recording:
         for frame in frames:
             recording.log(frame, predict(frame))

@@ -1,7 +1,7 @@
 """`bevcli`: the commands and the exit codes.
 
-Exit codes: 0 success, 1 a mistake in the input, 2 a mistake in usage (click's own), 130 interrupted; a command
-may have one of its own. No command module imports torch, OpenCV or rerun before it is called.
+Exit codes: 0 success, 1 a mistake in the input, 2 a mistake in usage (click's own), 130 stopped by Ctrl-C,
+143 by SIGTERM; a command may have one of its own. No command module imports torch, OpenCV or rerun before it is called.
 """
 
 from __future__ import annotations

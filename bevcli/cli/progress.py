@@ -33,6 +33,7 @@ class Progress:
         self.total, self.unit = total, unit
         self.stream = sys.stderr if stream is None else stream
         self.done = 0
+        self.skipped = 0
         self.started = self._printed = time.perf_counter()
         self._bar: rich.progress.Progress | None = None
 
@@ -58,6 +59,11 @@ class Progress:
             print(self.state(), file=self.stream, flush=True)
             self._printed = time.perf_counter()
 
+    def skip(self, count: int) -> None:
+        """Adds units of work that were done before: they do not count for the rate."""
+        self.skipped = count
+        self.advance(count)
+
     def message(self, text: str) -> None:
         """Prints a line, above the bar if there is one."""
         if self._bar is not None:
@@ -67,9 +73,9 @@ class Progress:
 
     def state(self) -> str:
         """The progress in words, such as "3/8 frames, 0.35 per second, 14 s left"."""
-        if not self.done:
+        if self.done == self.skipped:
             return f"{self.done}/{self.total} {self.unit}"
-        each = max(time.perf_counter() - self.started, 1e-9) / self.done
+        each = max(time.perf_counter() - self.started, 1e-9) / (self.done - self.skipped)
         pace = f"{1 / each:.2f} per second" if each <= SLOW_S else f"{each:.1f} s each"
         return f"{self.done}/{self.total} {self.unit}, {pace}, {duration((self.total - self.done) * each)} left"
 

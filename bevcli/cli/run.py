@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -130,6 +131,15 @@ def run(
             "--force", help="Replace the files of an earlier run in the output folder.", rich_help_panel=OUTPUT
         ),
     ] = False,
+    resume: Annotated[
+        bool,
+        typer.Option(
+            "--resume",
+            help="Go on with an interrupted run in the output folder, after its last saved frame. The model, the "
+            "options and the input must be the same.",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = False,
     score: Annotated[
         float,
         typer.Option(
@@ -189,8 +199,10 @@ def run(
 
     The output folder gets recording.rrd (open it with `bevcli viz`), predictions.json (all boxes of all frames),
     tracks.csv (one row a box with its track), summary.json and, for models with a segmentation head, segmentation/.
+    Ctrl-C or SIGTERM finish the current frame; a second one ends the program at once.
     """
     from bevcli.cli.progress import Progress
+    from bevcli.cli.stop_signals import StopSignals
     from bevcli.pipeline.model_loading import load_model
     from bevcli.pipeline.run import RunOptions, run_into_folder
     from bevcli.recording.options import RecordingOptions
@@ -238,8 +250,23 @@ def run(
     with Progress(len(drive.stamps), "frames") as progress:
         for note in notes(loaded, drive, live=live):
             progress.message(f"note: {note}")
-        summary = run_into_folder(loaded, drive, out, options, live=view, force=force, after_frame=show)
+        with StopSignals() as signals:
+            summary = run_into_folder(
+                loaded,
+                drive,
+                out,
+                options,
+                live=view,
+                force=force,
+                resume=resume,
+                after_frame=show,
+                resumed=progress.skip,
+                should_stop=signals.received,
+            )
     print(summary.table())
+    if signals.received() and not summary.is_complete:
+        print(f"stopped; `--resume` goes on with frame {summary.frames + 1} of {len(drive.stamps)}", file=sys.stderr)
+        raise typer.Exit(signals.exit_code)
     print(f"next     bevcli viz {shlex.quote(str(out))}")
 
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from bevcli.errors import OutputError
 from bevcli.sequences.files.box_json import boxes_to_json
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
+from bevcli.sequences.files.growing_file import GrowingFile
 
 COLUMNS = (
     "frame", "scene", "timestamp_ns", "frame_of_reference", "class", "score", "x", "y", "z", "length", "width",
@@ -24,24 +25,20 @@ class CsvWriter:
     Metres and radians; a cell is empty where a value is unknown. Raises OutputError where the file cannot be written.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        try:
-            self._file = path.open("w", newline="", encoding="utf-8")
-            self._writer = csv.DictWriter(self._file, COLUMNS, lineterminator="\n")
-            self._writer.writeheader()
-            self._file.flush()
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
+    def __init__(self, path: Path, resume_at: int | None = None) -> None:
+        """resume_at: `file.size` of an earlier writer of this file, to go on from there."""
+        self.file = GrowingFile(path, resume_at)
+        if resume_at is None:
+            header = io.StringIO()
+            csv.DictWriter(header, COLUMNS, lineterminator="\n").writeheader()
+            self.file.append(header.getvalue().encode())
 
     def write(self, frame: FrameBoxes, frame_of_reference: str) -> int:
         """Adds a row for each box of a frame, and returns their number."""
         rows = list(_rows(frame, frame_of_reference))
-        try:
-            self._writer.writerows(rows)
-            self._file.flush()
-        except OSError as error:
-            raise OutputError(f"{self._path}: cannot be written ({error.strerror})") from None
+        text = io.StringIO()
+        csv.DictWriter(text, COLUMNS, lineterminator="\n").writerows(rows)
+        self.file.append(text.getvalue().encode())
         return len(rows)
 
     def __enter__(self) -> CsvWriter:
@@ -50,7 +47,7 @@ class CsvWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._file.close()
+        self.file.close()
 
 
 def write_csv(boxes: BoxesFile, path: Path) -> int:

@@ -14,32 +14,33 @@ from bevcli.evaluation.tracking.config import TRACKING_CLASSES
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.transforms import rotation_from_quaternion, yaw_of_rotation
-from bevcli.parsing.documents import read_json
 from bevcli.parsing.files import open_regular
 from bevcli.sequences.files.box_json import boxes_from_json
 from bevcli.sequences.files.boxes_file import LARGEST_BYTES, BoxesFile, FrameBoxes
-from bevcli.sequences.files.incremental_json import IncrementalJson
+from bevcli.sequences.files.incremental_json import IncrementalJson, existing, read_entries
 
 MAX_BOXES = 500  # per sample, by the rules of the benchmark; the best by score are kept
 META = {"use_camera": True, "use_lidar": False, "use_radar": False, "use_map": False, "use_external": False}
+_TAIL = "}}"
 _PEEK_BYTES = 2048  # the kind of a file can be read from its beginning
 
 
 class SubmissionWriter:
-    """`with SubmissionWriter(path) as writer: writer.write(frame)`; the file is valid after every frame.
+    """`with SubmissionWriter(path) as writer: writer.write(frame)`; the file gets its name when the writer is closed.
 
+    resume_at: `file.size` of an earlier writer of this file, to go on from there.
     Raises OutputError where the file cannot be written.
     """
 
-    def __init__(self, path: Path, *, tracking: bool = False) -> None:
+    def __init__(self, path: Path, resume_at: int | None = None, *, tracking: bool = False) -> None:
         self._objects = tracking_submission_boxes if tracking else submission_boxes
-        self._file = IncrementalJson(path, json.dumps({"meta": META})[:-1] + ', "results": {', "}}")
+        self.file = IncrementalJson(path, json.dumps({"meta": META})[:-1] + ', "results": {', _TAIL, resume_at)
 
     def write(self, frame: FrameBoxes) -> None:
         """Add a frame, its boxes in the world frame. A frame without a sample token (no keyframe) is left out."""
         token = frame.extras.get("sample_token")
         if token is not None:
-            self._file.append(self._objects(frame.boxes, token), f"frame {frame.stamp.index}", key=token)
+            self.file.append(self._objects(frame.boxes, token), f"frame {frame.stamp.index}", key=token)
 
     def __enter__(self) -> SubmissionWriter:
         return self
@@ -47,7 +48,7 @@ class SubmissionWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._file.close()
+        self.file.close()
 
 
 def submission_boxes(boxes: Boxes3D, sample_token: str) -> list[dict[str, Any]]:
@@ -138,7 +139,7 @@ def write_submission(boxes: BoxesFile, path: Path, *, tracking: bool = False) ->
 def is_submission(path: Path) -> bool:
     """Whether the beginning of a file is that of a submission; False where it cannot be read."""
     try:
-        with open_regular(path) as file:
+        with open_regular(existing(path)) as file:
             head = file.read(_PEEK_BYTES)
     except (InputError, OSError):
         return False
@@ -150,7 +151,7 @@ def read_submission(path: Path) -> BoxesFile:
 
     A submission has no scenes, timestamps and ego poses.
     """
-    content = read_json(path, largest=LARGEST_BYTES)
+    content = read_entries(path, _TAIL, LARGEST_BYTES)
     results = content.get("results") if isinstance(content, dict) else None
     if not isinstance(results, dict):
         raise InputError(f'{path}: "results" must be an object of sample tokens, as in a nuScenes submission')

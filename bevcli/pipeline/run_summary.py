@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 from collections import Counter, defaultdict
+from collections.abc import Mapping
 from pathlib import Path
-from statistics import median
+from typing import Any
 
 from bevcli import __version__
 from bevcli.duration import duration
+from bevcli.errors import OutputError
 from bevcli.frame import Frame, Prediction, Sequence
+from bevcli.pipeline.medians import RunningMedian
 from bevcli.pipeline.model_loading import Model
+from bevcli.pipeline.run_folder import SUMMARY
 
-SUMMARY = "summary.json"
+_COUNTS = ("seconds", "whole", "boxes", "tracks", "dropped", "skipped", "started_anew", "embeddings")
 
 
 class RunSummary:
@@ -25,8 +31,8 @@ class RunSummary:
     def __init__(self, model: Model, sequence: Sequence, score: float, *, temporal: bool) -> None:
         self.files: tuple[Path, ...] = ()
         self._model, self._sequence, self._score, self._temporal = model, sequence, score, temporal
-        self._seconds: dict[str, list[float]] = defaultdict(list)
-        self._whole: list[float] = []
+        self._seconds: dict[str, RunningMedian] = defaultdict(RunningMedian)
+        self._whole = RunningMedian()
         self._boxes: Counter[str] = Counter()
         self._tracks: dict[str, str] | None = None  # identity -> class
         self._dropped: list[dict[str, object]] = []
@@ -45,9 +51,9 @@ class RunSummary:
             whole_s: seconds since the frame before was done.
         """
         self._embeddings = self._embeddings or dict(prediction.camera_embeddings)
-        self._whole.append(whole_s)
+        self._whole.add(whole_s)
         for stage, seconds in {**prediction.stage_seconds, "recording": recording_s}.items():
-            self._seconds[stage].append(seconds)
+            self._seconds[stage].add(seconds)
         scores = prediction.boxes.scores
         if scores is not None:
             shown = prediction.boxes[scores >= self._score]
@@ -65,6 +71,27 @@ class RunSummary:
         if prediction.started_anew:
             self._started_anew.append({"frame": index, "reason": prediction.started_anew})
 
+    @property
+    def frames(self) -> int:
+        """The number of frames that are done."""
+        return self._whole.count
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all frames are done."""
+        return self.frames == len(self._sequence.stamps)
+
+    def state(self) -> dict[str, Any]:
+        """What `restore` needs to count on."""
+        return {name: getattr(self, f"_{name}") for name in _COUNTS}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Goes on from the `state` of the summary of an interrupted run."""
+        for name in _COUNTS:
+            setattr(self, f"_{name}", state[name])
+        self._boxes = Counter(self._boxes)
+        self._seconds = defaultdict(RunningMedian, self._seconds)
+
     def to_dict(self) -> dict[str, object]:
         """The contents of summary.json."""
         model = self._model
@@ -77,7 +104,7 @@ class RunSummary:
             "device": model.device.type,
             "precision": model.precision,
             "temporal": self._temporal,
-            "frames": len(self._whole),
+            "frames": self._whole.count,
             "frames_asked_for": len(self._sequence.stamps),
             "score": self._score,
             "boxes": sum(self._boxes.values()),
@@ -85,7 +112,7 @@ class RunSummary:
             "tracks": None if self._tracks is None else len(self._tracks),
             "tracks_by_class": dict(Counter((self._tracks or {}).values())),
             "frames_per_second": self._rate(),
-            "stage_ms": {stage: round(1000 * median(s), 3) for stage, s in self._seconds.items()},
+            "stage_ms": {stage: round(1000 * s.value(), 3) for stage, s in self._seconds.items()},
             "camera_embeddings": self._embeddings,
             "dropped_pictures": self._dropped,
             "skipped_frames": self._skipped,
@@ -96,17 +123,24 @@ class RunSummary:
         }
 
     def write(self, folder: Path) -> None:
-        """Writes summary.json into a folder, and adds it to `files`."""
+        """Writes summary.json into a folder, and adds it to `files`. Raises OutputError."""
         path = folder / SUMMARY
+        fresh = path.with_name(SUMMARY + ".new")
         self.files = (*self.files, path)
-        path.write_text(json.dumps(self.to_dict(), indent=1) + "\n")
+        try:
+            fresh.write_text(json.dumps(self.to_dict(), indent=1) + "\n")
+            os.replace(fresh, path)
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                fresh.unlink()
+            raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
 
     def table(self) -> str:
         """The summary as a few aligned lines."""
         guessed = [f"{name} as {given}" for name, given in self._embeddings.items() if name != given]
-        stages = ", ".join(f"{stage} {1000 * median(s):.0f} ms" for stage, s in self._seconds.items())
+        stages = ", ".join(f"{stage} {1000 * s.value():.0f} ms" for stage, s in self._seconds.items())
         rows = [
-            ("frames", f"{len(self._whole)} in {duration(sum(self._whole))}, {self._rate():.2f} per second"),
+            ("frames", f"{self._whole.count} in {duration(self._whole.total_s)}, {self._rate():.2f} per second"),
             ("boxes", f"{sum(self._boxes.values())} with a score of {self._score:g} or more"),
             ("stages", f"{stages} (medians)"),
         ]
@@ -125,4 +159,4 @@ class RunSummary:
         return "\n".join(f"{name:<8} {text}" for name, text in rows)
 
     def _rate(self) -> float:
-        return len(self._whole) / sum(self._whole) if self._whole else 0.0
+        return self._whole.count / self._whole.total_s if self._whole.count else 0.0

@@ -69,11 +69,15 @@ def fit_colors(kind: str, features: Features) -> BevColors:
 
 
 class BevImages(Generic[Stamp]):
-    """Takes the features of each frame; returns the images that are ready, each with the stamp of its frame."""
+    """Takes the features of each frame; returns the images that are ready, each with the stamp of its frame.
+
+    Attributes:
+        colors: fitted on the first frames, None before. Setting them continues an interrupted recording.
+    """
 
     def __init__(self, kind: str) -> None:
         self.kind = kind
-        self._colors: BevColors | None = None
+        self.colors: BevColors | None = None
         self._waiting: list[tuple[Stamp, Features]] = []
 
     def push(self, stamp: Stamp, features: Features) -> list[tuple[Stamp, NDArray[np.uint8]]]:
@@ -83,7 +87,7 @@ class BevImages(Generic[Stamp]):
         their first row has the largest y.
         """
         self._waiting.append((stamp, features))
-        if self._colors is None and len(self._waiting) < FITTED_ON:
+        if self.colors is None and len(self._waiting) < FITTED_ON:
             return []
         return self.finish()
 
@@ -91,9 +95,9 @@ class BevImages(Generic[Stamp]):
         """The images that are not returned yet: that of the first frame, where there was no second one."""
         if not self._waiting:
             return []
-        if self._colors is None:
-            self._colors = fit_colors(self.kind, np.concatenate([_thinned(f) for _, f in self._waiting]))
-        colors = self._colors
+        if self.colors is None:
+            self.colors = fit_colors(self.kind, np.concatenate([_thinned(f) for _, f in self._waiting]))
+        colors = self.colors
         ready = [(stamp, np.ascontiguousarray(colors.paint(f)[::-1])) for stamp, f in self._waiting]
         self._waiting = []
         return ready

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -63,6 +64,21 @@ def track_names(boxes: Boxes3D) -> list[str]:
     return [str(instance) for instance in boxes.instances]
 
 
+@dataclass(frozen=True)
+class TrackLogState:
+    """What the tracks of an interrupted recording need to go on.
+
+    Attributes:
+        history: where each track was.
+        shown: the entities that show a track now.
+        known: the entities that have their style.
+    """
+
+    history: TrackHistory
+    shown: tuple[str, ...]
+    known: tuple[str, ...]
+
+
 class TrackLog:
     """Writes the tracks of each frame, and clears the entities of tracks without a box."""
 
@@ -71,6 +87,14 @@ class TrackLog:
         self._history = TrackHistory()
         self._shown: set[str] = set()
         self._known: set[str] = set()
+
+    def state(self) -> TrackLogState:
+        """What `go_on_from` needs."""
+        return TrackLogState(deepcopy(self._history), tuple(sorted(self._shown)), tuple(sorted(self._known)))
+
+    def go_on_from(self, state: TrackLogState) -> None:
+        """Continues the tracks of an interrupted recording."""
+        self._history, self._shown, self._known = deepcopy(state.history), set(state.shown), set(state.known)
 
     def log(self, boxes: Boxes3D, stamp: FrameStamp, bev_from_world: Array) -> None:
         """Writes the tracks of boxes in the recording's world. bev_from_world: (4, 4). Without tracks: nothing."""

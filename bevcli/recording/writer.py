@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+import uuid
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Protocol
@@ -13,17 +16,18 @@ from rerun.sinks import LogSinkLike
 from bevcli.errors import OutputError
 from bevcli.frame import Frame, FrameStamp, Prediction, Sequence, facts_of
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.transforms import Array, inverse, rigid
+from bevcli.geometry.transforms import Array, Pose, inverse, rigid
 from bevcli.recording import entities, log_bev, log_boxes, log_cameras, log_map, log_static
-from bevcli.recording.bev_images import BevImages
+from bevcli.recording.bev_images import BevColors, BevImages
 from bevcli.recording.blueprint import LayoutFacts, recording_blueprint
 from bevcli.recording.colors import EGO_COLOR
 from bevcli.recording.legend import legend_entries, log_legend
 from bevcli.recording.log_boxes import Marks
 from bevcli.recording.log_cameras import PosedCamera, VideoImages
-from bevcli.recording.log_tracks import TrackLog
+from bevcli.recording.log_tracks import TrackLog, TrackLogState
 from bevcli.recording.matching import detectable, false_and_duplicate, true_positives
 from bevcli.recording.options import RecordingOptions
+from bevcli.recording.rrd_file import RrdFile
 from bevcli.recording.vehicle import load_vehicle
 
 if TYPE_CHECKING:
@@ -75,6 +79,35 @@ class LiveSink(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class LastFrame:
+    """The frame that was written last. `world_from_ego`: its pose in the sequence's world."""
+
+    scene: str
+    world_from_ego: Pose
+
+
+@dataclass(frozen=True)
+class RecordingState:
+    """What an interrupted recording needs to go on.
+
+    Attributes:
+        recording_id: rerun's id of the recording.
+        size: bytes of the file that are kept.
+        origin: (3,) the recording's origin in the sequence's world, metres.
+        last: the last frame.
+        colors: of the BEV features, None where these are not drawn.
+        tracks: the trails.
+    """
+
+    recording_id: str
+    size: int
+    origin: Array
+    last: LastFrame | None
+    colors: BevColors | None
+    tracks: TrackLogState
+
+
 class Recording:
     """Writes a recording: `with Recording(...) as recording: recording.log(frame, prediction)`, frames in order.
 
@@ -86,6 +119,7 @@ class Recording:
         model: the class names, the name and whether it is trained are taken from it.
         options: how much is written; the defaults of RecordingOptions if None.
         live: a viewer that follows the recording; None for no viewer.
+        resume: `state()` of the recording that was interrupted; the file is cut to its size and goes on from there.
 
     Raises OutputError when the file cannot be written, and InputError when the vehicle's mesh cannot be read.
     """
@@ -97,6 +131,7 @@ class Recording:
         model: RecordedModel,
         options: RecordingOptions | None = None,
         live: LiveSink | None = None,
+        resume: RecordingState | None = None,
     ) -> None:
         self.path, self.rig, self.untrained = Path(path), sequence.rig, model.untrained
         self.title = f"{sequence.name} · {model.config.name}"
@@ -105,10 +140,13 @@ class Recording:
         self._config, self._geo_origin = model.config, facts_of(sequence).geo_origin
         self._rate_hz, self._has_ego_motion = frame_rate_hz(sequence.stamps), sequence.has_ego_motion
         self.options = RecordingOptions() if options is None else options
-        self._stream = rr.RecordingStream(APPLICATION)
+        recording_id = str(uuid.uuid4()) if resume is None else resume.recording_id
+        self._stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
+        self._recording_id, self._resume = recording_id, resume
+        self._file: RrdFile | None = None
         self._live = live
         self._origin: Array | None = None  # (3,) position of the first frame's ego vehicle in the world
-        self._last: Frame | None = None
+        self._last: LastFrame | None = None
         self._early_events: list[tuple[str, str]] = []  # logged before the first frame
         self._pillars: Array | None = None
         self._tracks = TrackLog(self._stream, self.class_names)
@@ -135,12 +173,14 @@ class Recording:
             grid=grid,
         )
         blueprint = recording_blueprint(self.rig, facts)
+        self._file = RrdFile(self.path, None if self._resume is None else self._resume.size)
         sinks = [] if self._live is None else [self._live.sink]
         try:
-            self._stream.set_sinks(rr.FileSink(self.path), *sinks, default_blueprint=blueprint)
+            self._stream.set_sinks(self._file.sink(), *sinks, default_blueprint=blueprint)
         except RuntimeError as error:
             raise OutputError(f"{self.path}: the recording cannot be written ({error})") from error
-        self._stream.__enter__()
+        finally:
+            self._file.opened()
         if self._live is not None:
             self._live.open()
         names, untrained = self.class_names, self.untrained
@@ -149,18 +189,47 @@ class Recording:
             self._stream, self.title, self.rig, names, self.options, untrained=untrained, note=self.note
         )
         log_legend(self._stream, legend)
+        if self._resume is not None:
+            self._go_on_from(self._resume)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        assert self._file is not None
+        try:
+            if self._bev_images is not None:
+                self._log_bev_images(self._bev_images.finish())
+            if self._video is not None:
+                self._video.close()
+            self._flush()
+        finally:
+            self._disconnect()
+            if self._live is not None:
+                self._live.close()
+            self._file.close()
+
+    def state(self) -> RecordingState | None:
+        """What a later Recording needs to go on after the last frame. None as long as it cannot be resumed.
+
+        BEV colours are fitted on the first two frames, and are part of the state.
+        """
+        colors = None if self._bev_images is None else self._bev_images.colors
+        if self._origin is None or self._file is None or (self._bev_images is not None and colors is None):
+            return None
+        return RecordingState(
+            self._recording_id, self._file.size, self._origin, self._last, colors, self._tracks.state()
+        )
+
+    def is_deleted(self) -> bool:
+        """Whether somebody has deleted the file that is being written."""
+        return self._file is not None and self._file.is_deleted()
+
+    def _go_on_from(self, state: RecordingState) -> None:
+        self._origin, self._last = state.origin, state.last
+        self._tracks.go_on_from(state.tracks)
         if self._bev_images is not None:
-            self._log_bev_images(self._bev_images.finish())
-        if self._video is not None:
-            self._video.close()
-        self._stream.__exit__(kind, error, trace)
-        if self._live is not None:
-            self._live.close()
+            self._bev_images.colors = state.colors
 
     def log(self, frame: Frame, prediction: Prediction) -> None:
         """Writes one frame: images, shown boxes, ground truth, curves, events and the model's internals."""
@@ -171,7 +240,7 @@ class Recording:
         self._log_frame_events(frame, prediction)
         if self.options.shows_internals:
             self._log_internals(frame, prediction, cameras)
-        self._last = frame
+        self._last = LastFrame(frame.stamp.scene, frame.world_from_ego)
         self._flush()
 
     def event(self, text: str, level: str = "INFO") -> None:
@@ -184,13 +253,23 @@ class Recording:
         else:
             self._stream.log(entities.EVENTS, rr.TextLog(text, level=level))
 
+    def _disconnect(self) -> None:
+        """Closes rerun's sinks, within FLUSH_TIMEOUT_S: rerun itself waits without a limit."""
+        closing = threading.Thread(target=self._stream.disconnect, name="close-recording", daemon=True)
+        closing.start()
+        closing.join(FLUSH_TIMEOUT_S)
+        if closing.is_alive():
+            raise OutputError(f"{self.path}: the recording could not be closed within {FLUSH_TIMEOUT_S:.0f} s")
+
     def _at(self, stamp: FrameStamp) -> None:
         self._stream.set_time(entities.FRAME_TIMELINE, sequence=stamp.index)
         self._stream.set_time(entities.TIME_TIMELINE, timestamp=np.datetime64(stamp.timestamp_ns, "ns"))
 
     def _flush(self) -> None:
+        assert self._file is not None
         try:
             self._stream.flush(timeout_sec=FLUSH_TIMEOUT_S)
+            self._file.sync()
         except (RuntimeError, ValueError, TimeoutError) as error:
             raise OutputError(f"{self.path}: the recording cannot be written ({error})") from error
 
@@ -213,12 +292,13 @@ class Recording:
             last = None if before is None else before.world_from_ego.translation
             log_map.log_ego_on_map(self._stream, self._geo_origin, frame.world_from_ego.translation, last)
         if before is not None:
-            piece = [self._moved_to_origin(f.world_from_ego.matrix)[:3, 3] for f in (before, frame)]
+            poses = (before.world_from_ego, frame.world_from_ego)
+            piece = [self._moved_to_origin(pose.matrix)[:3, 3] for pose in poses]
             self._stream.log(entities.TRAJECTORY, rr.LineStrips3D([piece], colors=EGO_COLOR, radii=0.06))
 
-    def _before(self, frame: Frame) -> Frame | None:
+    def _before(self, frame: Frame) -> LastFrame | None:
         """The frame before, None where it is of another scene."""
-        return self._last if self._last is not None and self._last.stamp.scene == frame.stamp.scene else None
+        return self._last if self._last is not None and self._last.scene == frame.stamp.scene else None
 
     def _moved_to_origin(self, world_from_a: Array) -> Array:
         """world_from_a (4, 4) of the sequence's world -> of the recording's world."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from collections.abc import Sequence as Indices
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -27,6 +28,7 @@ class Selection:
         self.has_ego_motion = sequence.has_ego_motion
         self.facts = facts_of(sequence)
         self.notes = (*sequence.notes, *notes)
+        self.input_files: tuple[Path, ...] = getattr(sequence, "input_files", ())
 
     @property
     def stamps(self) -> tuple[FrameStamp, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import socket
@@ -48,7 +49,8 @@ def stop(process: subprocess.Popen[bytes]) -> None:
             process.wait(timeout=3)
         except subprocess.TimeoutExpired:
             process.kill()
-            process.wait()
+            with contextlib.suppress(subprocess.TimeoutExpired):  # it hangs in the kernel: leave it
+                process.wait(timeout=5)
 
 
 def free_port(preferred: int | None = None, host: str = LOOPBACK) -> int:

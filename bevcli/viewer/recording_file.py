@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import tempfile
@@ -30,7 +31,7 @@ except Exception as error:
     sys.exit(" ".join(str(error).split()))
 """
 CHECK_MEMORY = 4 << 30  # bytes of address space, most of it never used, beside a multiple of the file's size
-SECONDS, BYTES_PER_SECOND = 20.0, 10e6  # time limit of a process that reads a recording
+SECONDS, BYTES_PER_SECOND = 30.0, 5e6  # time limit of a process that reads a recording
 RECORDING = "recording.rrd"
 MAGIC, FOOTER = b"RRF2", b"RRF2FOOT"  # the first bytes of an .rrd file, and the bytes 12 before its end
 
@@ -63,8 +64,7 @@ def open_recording(path: Path) -> Iterator[RecordingFile]:
         return
     with tempfile.TemporaryDirectory(prefix="bevcli-") as folder:
         copy = Path(folder) / path.name
-        command = [str(viewer_binary()), "rrd", "filter", "--continue-on-error", str(path), "-o", str(copy)]
-        _run(command, path)
+        _repair(path, copy)
         if not copy.is_file() or copy.stat().st_size < 1000:
             raise InputError(f"{path}: the recording was cut off before its first frame; nothing can be shown")
         _check(copy, path)
@@ -89,6 +89,29 @@ def _check(file: Path, path: Path) -> None:
         lines = done.stderr.decode(errors="replace").strip().splitlines() if done.returncode == 1 else []
         reason = lines[-1].replace(str(file), path.name) if lines else "rerun ends when it reads it"
         raise InputError(f"{path}: the recording cannot be read: it is damaged ({reason:.200})")
+
+
+def restore_index(path: Path) -> bool:
+    """Gives a recording that lacks its end an index, in place. False if it stays as it is, such as on a full disk.
+
+    Every reader of this package reads a recording without an index too; it then works on a repaired copy.
+    """
+    copy = path.with_name(path.name + ".repaired")
+    try:
+        _repair(path, copy)
+        if not _is_whole(copy):
+            return False
+        os.replace(copy, path)
+    except (OSError, InputError):
+        return False
+    finally:
+        copy.unlink(missing_ok=True)
+    return True
+
+
+def _repair(path: Path, copy: Path) -> None:
+    """Copies all messages of a recording that can be read. Raises InputError if this takes too long."""
+    _run([str(viewer_binary()), "rrd", "filter", "--continue-on-error", str(path), "-o", str(copy)], path)
 
 
 def _run(command: list[str], path: Path) -> subprocess.CompletedProcess[bytes]:

@@ -7,14 +7,20 @@ lets the pages connect to that origin only; so the viewer in the browser cannot 
 
 from __future__ import annotations
 
+import ipaddress
 import re
 import shutil
+import socket
+import sys
+import threading
 import time
 import urllib.error
 import urllib.request
+from collections.abc import Callable
 from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 from urllib.parse import parse_qs, quote, urlsplit
 
 from bevcli.errors import OutputError
@@ -28,6 +34,9 @@ ASSETS = {
 }
 RECORDING = "/recording.rrd"
 START_TIMEOUT_S = 15.0
+STOP_TIMEOUT_S = 5.0
+CONNECTION_TIMEOUT_S = 60.0
+MOST_CONNECTIONS = 64
 FONT_LINKS = re.compile(rb"<link[^>]*https://fonts[^>]*>", re.DOTALL)  # links to Google's fonts; removed
 
 
@@ -59,8 +68,7 @@ class WebViewer:
     ) -> None:
         self.host, self.port = host, free_port(port, host)
         handler = partial(_Handler, assets, source)
-        self._server = ThreadingHTTPServer((host, self.port), handler)
-        self._server.daemon_threads = True
+        self._server = _Server((host, self.port), handler)
 
     @property
     def address(self) -> str:
@@ -73,12 +81,47 @@ class WebViewer:
 
     def close(self) -> None:
         """Stops `serve`, and frees the port."""
-        self._server.shutdown()
+        # shutdown waits until `serve` has ended, without a limit.
+        stopping = threading.Thread(target=self._server.shutdown, daemon=True)
+        stopping.start()
+        stopping.join(STOP_TIMEOUT_S)
         self._server.server_close()
+
+
+class _Server(ThreadingHTTPServer):
+    """A thread for each connection, MOST_CONNECTIONS at a time. A connection that breaks is no error."""
+
+    daemon_threads = True
+
+    def __init__(self, address: tuple[str, int], handler: Callable[..., BaseHTTPRequestHandler]) -> None:
+        if ":" in address[0]:
+            self.address_family = socket.AF_INET6
+        self._free = threading.BoundedSemaphore(MOST_CONNECTIONS)
+        super().__init__(address, handler)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Starts the thread of a connection; closes the connection if there are too many."""
+        if not self._free.acquire(blocking=False):
+            self.shutdown_request(request)
+            return
+        super().process_request(request, client_address)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Runs in the thread of a connection."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._free.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Prints nothing if the browser has gone or is silent."""
+        if not isinstance(sys.exception(), (ConnectionError, TimeoutError)):
+            super().handle_error(request, client_address)
 
 
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
+    timeout = CONNECTION_TIMEOUT_S  # of each read and write
 
     def __init__(self, assets: dict[str, bytes], source: Path | str, *request: object) -> None:
         self.assets, self.source = assets, source
@@ -87,7 +130,9 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         """Serves the viewer's files and the recording; "/" redirects to the viewer with the recording."""
         parts = urlsplit(self.path)
-        if parts.path == RECORDING and isinstance(self.source, Path):
+        if not _is_own_name(self.headers.get("Host", "")):
+            self._send_head(403, "text/plain", 0)
+        elif parts.path == RECORDING and isinstance(self.source, Path):
             self._send_recording(self.source)
         elif parts.path == "/" and "url" not in parse_qs(parts.query):
             self._redirect(parts.query)
@@ -122,6 +167,24 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Length", str(length))
         self.send_header("Content-Security-Policy", f"connect-src 'self' blob: data: {live}".strip())
         self.end_headers()
+
+
+def _is_own_name(host: str) -> bool:
+    """Whether a Host header names this machine: an IP address, localhost or the machine's own name.
+
+    Another name could be that of a foreign page which its owner has pointed to this machine (DNS rebinding), so that
+    the browser lets the page read the recording.
+    """
+    try:
+        name = (urlsplit(f"//{host}").hostname or "").rstrip(".").lower()
+    except ValueError:
+        return False
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        own = socket.gethostname().lower()
+        return name in ("localhost", own, own.partition(".")[0])
+    return True
 
 
 def _fetch(address: str) -> bytes:

@@ -71,7 +71,13 @@ def test_the_command_runs_the_sample_and_says_that_it_is_untrained(tmp_path):
     done = command(tmp_path, "run", str(SAMPLE), "--model", "mini.toml", "--untrained", "--frames", "0:2")
     assert done.returncode == 0, done.stderr
     out = tmp_path / "runs/street-mini"
-    assert {path.name for path in out.iterdir()} == {"recording.rrd", "predictions.json", "summary.json", "tracks.csv"}
+    assert {path.name for path in out.iterdir()} == {
+        "recording.rrd",
+        "predictions.json",
+        "summary.json",
+        "tracks.csv",
+        ".bevcli",
+    }
     boxes = read_boxes(out / "predictions.json")
     assert [len(frame.boxes) for frame in boxes.frames] == [20, 20]
     assert boxes.extras["untrained"] is True

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import json
+import os
+import resource
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +81,55 @@ def test_a_number_that_is_not_finite_is_refused_and_leaves_the_file_whole(tmp_pa
         with pytest.raises(OutputError, match="frame 1: a box or pose has a number that is not finite"):
             writer.write(frame(1, broken))
     assert len(read_boxes(path).frames) == 1
+
+
+@pytest.mark.parametrize("frames", [0, 1, 2])
+@pytest.mark.parametrize("cut", [0, 1, 2, 20])
+def test_a_writer_that_was_killed_leaves_its_finished_frames(tmp_path: Path, frames: int, cut: int) -> None:
+    writer = BoxesWriter(tmp_path / "predictions.json", "world", {"model": "tiny"})
+    for index in range(frames):
+        writer.write(frame(index, some_boxes()))
+    size = writer.file.size
+    writer.write(frame(frames, some_boxes()))
+    partial = tmp_path / "predictions.json.partial"
+    os.truncate(partial, size + cut)  # the kernel had taken so many bytes of the last frame
+    for path in (tmp_path / "predictions.json", partial):
+        assert [f.stamp.index for f in read_boxes(path).frames] == list(range(frames))
+
+
+def test_a_resumed_file_equals_one_that_was_written_at_once(tmp_path: Path) -> None:
+    with BoxesWriter(tmp_path / "whole.json", "world") as writer:
+        for index in range(3):
+            writer.write(frame(index, some_boxes()))
+    for first in range(3):  # the frames before the end; one more frame was written and is written again
+        path = tmp_path / f"resumed-{first}.json"
+        with BoxesWriter(path, "world") as writer:
+            for index in range(first):
+                writer.write(frame(index, some_boxes()))
+            size = writer.file.size
+            writer.write(frame(first, some_boxes()))
+        with BoxesWriter(path, "world", resume_at=size) as writer:
+            for index in range(first, 3):
+                writer.write(frame(index, some_boxes()))
+        assert path.read_bytes() == (tmp_path / "whole.json").read_bytes()
+
+
+def test_a_full_disk_keeps_the_frames_before_it(tmp_path: Path) -> None:
+    path = tmp_path / "predictions.json"
+    writer = BoxesWriter(path, "world")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))
+        written = 0
+        with contextlib.suppress(OutputError):
+            for index in itertools.count():
+                writer.write(frame(index, some_boxes()))
+                written += 1
+        assert len(read_boxes(path).frames) == written
+        writer.file.close()  # the end still fits
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert len(json.loads(path.read_bytes())["frames"]) == written > 0
 
 
 def good_file() -> dict[str, Any]:

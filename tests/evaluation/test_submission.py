@@ -90,8 +90,10 @@ def test_a_submission_is_valid_after_every_frame(tmp_path: Path) -> None:
     path = tmp_path / "results_nusc.json"
     with SubmissionWriter(path) as writer:
         for count in range(3):
-            assert_valid(json.loads(path.read_text()), {f"t{place}" for place in range(count)})
+            assert [f.extras["sample_token"] for f in read_submission(path).frames] == [f"t{i}" for i in range(count)]
+            assert is_submission(path)
             writer.write(frame(count, many_boxes(5), sample_token=f"t{count}"))
+    assert_valid(json.loads(path.read_text()), {"t0", "t1", "t2"})
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,9 @@ from bevcli.model.bev_fusion import BevFusionConfig
 from bevcli.model.bevformer import BEVFormerConfig
 from bevcli.model.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config, fill_window
 from bevcli.model.fpn import FPNConfig
+from bevcli.pipeline.model_loading import Model
 from bevcli.pipeline.preprocess import Preprocessor
+from bevcli.pipeline.run import run_into_folder
 from bevcli.pipeline.runner import Runner
 from bevcli.pipeline.temporal import other_bev_from_bev
 
@@ -212,3 +214,12 @@ def test_the_bev_frame_moves_with_the_vehicle():
         )
         expected = inverse(then.matrix @ ego_from_bev) @ now.matrix @ ego_from_bev
         assert other_bev_from_bev(now, then, ego_from_bev) == pytest.approx(expected, abs=1e-5)
+
+
+def test_an_interrupted_run_is_resumed_with_its_window(window_model, tmp_path):
+    model = Model(window_model(-1, 0, 1))
+    run_into_folder(model, MemorySequence(5), tmp_path / "whole")
+    run_into_folder(model, MemorySequence(5), tmp_path / "cut", should_stop=iter([False, False, True]).__next__)
+    run_into_folder(model, MemorySequence(5), tmp_path / "cut", resume=True)
+    for name in ("predictions.json", "tracks.csv"):
+        assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()

@@ -2,10 +2,14 @@
 
 import pytest
 from memory_drive import MemorySequence
-from recorded_drive import record
+from recorded_drive import NamedModel, predict, record
+from rerun.chunk import RrdReader
 
 from bevcli.errors import InputError
-from bevcli.viewer.recording_file import open_recording
+from bevcli.recording import entities
+from bevcli.recording.options import RecordingOptions
+from bevcli.recording.writer import Recording
+from bevcli.viewer.recording_file import open_recording, restore_index
 from bevcli.viewer.recording_reader import RecordingReader
 
 
@@ -47,6 +51,37 @@ def test_a_file_that_is_not_a_recording_is_an_error_of_one_line(tmp_path, conten
         pass
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("bev", ["pca", "none"])
+def test_a_resumed_recording_shows_all_frames(tmp_path, bev):
+    path, sequence, options = tmp_path / "recording.rrd", MemorySequence(6), RecordingOptions(bev=bev)
+    frames = [sequence.load(place) for place in range(6)]
+    with Recording(path, sequence, NamedModel(), options) as first:
+        for frame in frames[:3]:
+            first.log(frame, predict(frame))
+        state = first.state()
+        first.log(frames[3], predict(frames[3]))  # lost: the state is older
+    with Recording(path, sequence, NamedModel(), options, resume=state) as second:
+        for frame in frames[3:]:
+            second.log(frame, predict(frame))
+    restored = tmp_path / "restored.rrd"
+    restored.write_bytes(path.read_bytes())
+    assert restore_index(restored)
+    record(tmp_path / "whole.rrd", sequence, options, truth=False)
+    expected = list(RecordingReader(tmp_path / "whole.rrd").frames())
+    with open_recording(path) as repaired:
+        assert repaired.repaired
+        for file in (repaired.path, restored):
+            found = list(RecordingReader(file).frames())
+            assert [frame.index for frame in found] == [0, 1, 2, 3, 4, 5]
+            for one, other in zip(found, expected, strict=True):
+                assert one.rows.keys() == other.rows.keys()
+                for entity in (entities.EGO, entities.BOXES, entities.TRAJECTORY):
+                    assert one.rows.get(entity) == other.rows.get(entity)
+    with open_recording(restored) as file:
+        assert not file.repaired
+        assert len(RrdReader(file.path).recordings()) == 1
 
 
 def test_a_missing_file_and_a_folder_without_a_recording_are_errors(tmp_path):

@@ -1,10 +1,12 @@
 """The web viewer's server: loopback only, one origin, any free port; and in a real browser."""
 
+import http.client
 import os
 import re
 import shutil
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -20,6 +22,7 @@ import pytest
 from memory_drive import MemorySequence
 from recorded_drive import record
 
+from bevcli.viewer import web
 from bevcli.viewer.web import WebViewer, web_viewer_assets
 
 PAGE = {"/": b"<html>viewer</html>", "/re_viewer.js": b"js", "/re_viewer_bg.wasm": b"wasm", "/favicon.ico": b""}
@@ -74,6 +77,62 @@ def test_only_loopback_can_reach_it(viewer):
 def test_other_paths_are_not_served(viewer):
     with pytest.raises(urllib.error.HTTPError, match="404"):
         urllib.request.urlopen(viewer.address + "/etc/passwd")
+
+
+def get(viewer, **headers) -> int:
+    connection = http.client.HTTPConnection(viewer.host, viewer.port, timeout=5)
+    connection.request("GET", "/recording.rrd", headers=headers)
+    return connection.getresponse().status
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "evil.example:{}", "127.0.0.1.evil.example", "", "[::1", "localhost.x"]
+)
+def test_a_page_that_was_pointed_here_by_its_name_service_reads_nothing(viewer, host):
+    assert get(viewer, Host=host.format(viewer.port)) == 403
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:{}", "localhost:{}", "LOCALHOST", "[::1]:{}", "192.168.1.7:{}"])
+def test_addresses_and_the_name_of_this_machine_are_served(viewer, host):
+    assert get(viewer, Host=host.format(viewer.port)) == 200
+
+
+def test_connections_beyond_the_limit_are_closed_and_silent_ones_end(tmp_path, monkeypatch):
+    monkeypatch.setattr(web, "MOST_CONNECTIONS", 3)
+    monkeypatch.setattr(web._Handler, "timeout", 1.0)
+    (tmp_path / "recording.rrd").write_bytes(b"RRF2")
+    viewer = WebViewer(PAGE, tmp_path / "recording.rrd")
+    threading.Thread(target=viewer.serve, daemon=True).start()
+    silent = [socket.create_connection((viewer.host, viewer.port)) for _ in range(3)]
+    time.sleep(0.3)
+    with socket.create_connection((viewer.host, viewer.port), timeout=5) as refused:
+        assert refused.recv(1) == b""
+    for connection in silent:
+        connection.settimeout(5)
+        assert connection.recv(1) == b""
+    assert get(viewer) == 200
+    viewer.close()
+
+
+def test_a_reset_connection_prints_nothing(tmp_path, capfd):
+    recording = tmp_path / "recording.rrd"
+    recording.write_bytes(bytes(50_000_000))
+    viewer = WebViewer(PAGE, recording)
+    threading.Thread(target=viewer.serve, daemon=True).start()
+    for request in (b"GET /recording.rrd HTTP/1.1\r\nHost: localhost\r\n\r\n", b"GET /rec"):
+        connection = socket.create_connection((viewer.host, viewer.port))
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # close by a reset
+        connection.sendall(request)
+        time.sleep(0.3)
+        connection.close()
+    time.sleep(0.5)
+    viewer.close()
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_server_that_never_served_can_be_closed(tmp_path, monkeypatch):
+    monkeypatch.setattr(web, "STOP_TIMEOUT_S", 0.2)
+    WebViewer(PAGE, tmp_path / "recording.rrd").close()
 
 
 def test_a_port_in_use_is_replaced_by_another(viewer, tmp_path):

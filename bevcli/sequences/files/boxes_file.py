@@ -16,16 +16,16 @@ from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
-from bevcli.parsing.documents import read_json
 from bevcli.sequences.files.box_json import boxes_from_json, boxes_to_json
 from bevcli.sequences.files.class_names import ClassNames
-from bevcli.sequences.files.incremental_json import IncrementalJson
+from bevcli.sequences.files.incremental_json import IncrementalJson, read_entries
 from bevcli.sequences.files.transform_json import pose_from_json, pose_to_json
 from bevcli.sequences.garbage_collection import without_garbage_collection
 
 FORMAT = "bevcli-boxes/1"
 LARGEST_BYTES = 4 << 30
 FRAMES_OF_REFERENCE = ("world", "ego", "bev")
+_TAIL = "]}"
 _FILE_KEYS = ("format", "frame_of_reference", "ego_from_bev", "frames")
 _FRAME_KEYS = ("frame", "scene", "timestamp_ns", "world_from_ego", "boxes")
 
@@ -65,7 +65,7 @@ class BoxesFile:
 
 
 def read_boxes(path: Path, class_names: ClassNames | None = None) -> BoxesFile:
-    """Read a boxes file.
+    """Read a boxes file. Of a writer that was killed, the partial file (`incremental_json`) is read.
 
     class_names: maps the classes. None: names are compared without case. Unknown names are kept.
     Raises InputError if the file is missing, not JSON or of another format, or has a missing key, an invalid value,
@@ -105,8 +105,8 @@ def above_score(boxes: BoxesFile, score: float) -> BoxesFile:
 class BoxesWriter:
     """Writes a boxes file frame by frame.
 
-    The file is valid JSON after every frame, so an interrupted run leaves its finished frames. Boxes are not kept in
-    memory. Raises OutputError if the file cannot be written.
+    The file gets its name when the writer is closed; until then `read_boxes` reads all finished frames from its partial
+    file, also if the program is killed. Boxes are not kept in memory. Raises OutputError if the file cannot be written.
 
         with BoxesWriter(path, "world", {"model": "tiny"}) as writer:
             writer.write(frame_boxes)
@@ -118,12 +118,14 @@ class BoxesWriter:
         frame_of_reference: str,
         extras: Mapping[str, Any] | None = None,
         ego_from_bev: Pose | None = None,
+        resume_at: int | None = None,
     ) -> None:
+        """resume_at: `file.size` of an earlier writer of this file, to go on from there."""
         assert frame_of_reference in FRAMES_OF_REFERENCE
         head: dict[str, Any] = {"format": FORMAT, "frame_of_reference": frame_of_reference, **(extras or {})}
         if ego_from_bev is not None:
             head["ego_from_bev"] = pose_to_json(ego_from_bev)
-        self._file = IncrementalJson(path, json.dumps(head)[:-1] + ', "frames": [', "]}")
+        self.file = IncrementalJson(path, json.dumps(head)[:-1] + ', "frames": [', _TAIL, resume_at)
 
     def write(self, frame: FrameBoxes) -> None:
         """Append a frame. Its boxes must be in the file's frame of reference."""
@@ -136,7 +138,7 @@ class BoxesWriter:
         if frame.world_from_ego is not None:
             row["world_from_ego"] = pose_to_json(frame.world_from_ego)
         row["boxes"] = boxes_to_json(frame.boxes)
-        self._file.append(row, f"frame {frame.stamp.index}")
+        self.file.append(row, f"frame {frame.stamp.index}")
 
     def __enter__(self) -> BoxesWriter:
         return self
@@ -144,12 +146,12 @@ class BoxesWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._file.close()
+        self.file.close()
 
 
 def _load(path: Path) -> dict[str, Any]:
     missing = f'the file is missing (expected a boxes file, "format": "{FORMAT}")'
-    content = read_json(path, largest=LARGEST_BYTES, missing=missing)
+    content = read_entries(path, _TAIL, LARGEST_BYTES, missing=missing)
     found = content.get("format") if isinstance(content, dict) else type(content).__name__
     if found != FORMAT:
         raise InputError(f'{path}: is not a boxes file: "format" must be "{FORMAT}", found {found!r:.40}')

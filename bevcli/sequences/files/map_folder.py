@@ -39,11 +39,11 @@ class MapFolder:
 
     def has(self, frame: int) -> bool:
         """Whether the folder has a map of this frame."""
-        return _image(self.path, frame).is_file()
+        return map_path(self.path, frame).is_file()
 
     def load(self, frame: int) -> BevMap:
         """The map of a frame. Raises InputError if it is missing, unreadable or has an unknown bit."""
-        path = _image(self.path, frame)
+        path = map_path(self.path, frame)
         if not path.is_file():
             raise InputError(f"{path}: the map of frame {frame} is missing")
         cells = decode_image(read_bytes(path, LARGEST_BYTES), cv2.IMREAD_UNCHANGED, LARGEST_CELLS)
@@ -78,7 +78,7 @@ def write_map(folder: Path, frame: int, bev_map: BevMap) -> None:
         if not (folder / LEGEND).exists():
             (folder / LEGEND).write_text(json.dumps(_legend(bev_map), indent=1) + "\n")
         _check_extent(open_maps(folder), bev_map)
-        _image(folder, frame).write_bytes(cv2.imencode(".png", bev_map.cells)[1].tobytes())
+        map_path(folder, frame).write_bytes(cv2.imencode(".png", bev_map.cells)[1].tobytes())
     except OSError as error:
         raise OutputError(f"{folder}: the map cannot be written ({error.strerror})") from None
 
@@ -91,7 +91,8 @@ def _check_extent(folder: MapFolder, bev_map: BevMap) -> None:
         )
 
 
-def _image(folder: Path, frame: int) -> Path:
+def map_path(folder: Path, frame: int) -> Path:
+    """The file of a frame's map in a folder of maps."""
     return folder / f"{frame:06d}.png"
 
 

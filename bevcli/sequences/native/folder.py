@@ -70,6 +70,11 @@ class FolderSequence:
         """Index, scene and time of each frame, in order."""
         return tuple(entry.stamp for entry in self._entries)
 
+    @property
+    def input_files(self) -> tuple[Path, ...]:
+        """Tables and videos: the files in the folder itself. A run can be resumed only if they are the same."""
+        return tuple(sorted(path for path in self.path.iterdir() if path.is_file()))
+
     def load(self, place: int) -> Frame:
         """The frame at position `place`, with decoded images. Raises InputError as `ImageReader.read`."""
         entry = self._entries[place]

@@ -11,6 +11,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, Pose, inverse
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes
 from bevcli.sequences.files.class_names import ClassNames, count_other_classes, other_classes_note
+from bevcli.sequences.files.incremental_json import existing
 from bevcli.sequences.files.map_folder import open_maps
 
 BOXES_FILE = "ground_truth.json"
@@ -41,7 +42,7 @@ class FolderGroundTruth:
 
     def __init__(self, folder: Path, use: GroundTruthUse = GroundTruthUse()) -> None:
         boxes_path, maps_path = folder / BOXES_FILE, folder / MAPS_FOLDER
-        is_read = use.is_read and boxes_path.is_file()
+        is_read = use.is_read and existing(boxes_path).is_file()
         self._boxes: BoxesFile | None = read_boxes(boxes_path, ClassNames(use.class_map)) if is_read else None
         self.notes = _notes(boxes_path, self._boxes)
         self._frames = {frame.stamp.index: frame for frame in self._boxes.frames} if self._boxes else {}

@@ -70,6 +70,11 @@ class NuScenesSequence:
         """Index, scene and time of each frame, in order."""
         return tuple(entry.stamp for entry in self._frames)
 
+    @property
+    def input_files(self) -> tuple[Path, ...]:
+        """The tables. A run can be resumed only if they are the same."""
+        return tuple(sorted(self.tables.glob("*.json")))
+
     def load(self, place: int) -> Frame:
         """The frame at position `place`, with decoded images. Raises InputError as `ImageReader.read`."""
         entry = self._frames[place]
