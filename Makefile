@@ -18,7 +18,7 @@ install: $(INSTALLED)
 
 $(INSTALLED): pyproject.toml constraints.txt
 	test -x $(BIN)/python || python3 -m venv $(VENV)
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev,onnx]'
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev,onnx,openvino]'
 	touch $@
 
 demo: $(INSTALLED)
@@ -31,7 +31,7 @@ test-all: $(VENV)/.viewers
 	$(BIN)/pytest
 
 $(VENV)/.viewers: $(INSTALLED)
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev,notebook,onnx]' playwright
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev,notebook,onnx,openvino]' playwright
 	.ci/install-viewers
 	touch $@
 

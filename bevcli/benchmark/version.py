@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 from bevcli.benchmark.limits import wait_for
+from bevcli.engines.exported import ExportedBEVFormer
 from bevcli.frame import Prediction
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerOutputs
 from bevcli.pipeline.preprocess import PreparedFrame
@@ -62,6 +63,8 @@ class Version:
 
 def fine_stages(model: BEVFormerBase) -> tuple[dict[str, str], dict[str, str]]:
     """The `stages` and `starts` of a StageClock that tells the parts of the encoder apart."""
+    if isinstance(model, ExportedBEVFormer):
+        return {"engine": "engine"}, {"engine": "input"}
     stages = {"backbone": "backbone", "neck": "neck", "decoder": "decoder and head"}
     parts = {
         "temporal_self_attention": "temporal attention",

@@ -7,17 +7,19 @@ from typing import Annotated, Literal
 
 import typer
 
-from bevcli.cli.input_options import DeviceOption, complete_model
+from bevcli.cli.input_options import DeviceOption, EngineOption, complete_model
 
 
 def bench(
     model: Annotated[
         str,
         typer.Option(
-            autocompletion=complete_model, help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, or a FILE.toml."
+            autocompletion=complete_model,
+            help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, a FILE.toml or a FILE.onnx.",
         ),
     ] = "tiny",
     device: DeviceOption = "auto",
+    engine: EngineOption = None,
     precision: Annotated[
         Literal["fp32", "bf16", "fp16"] | None,
         typer.Option(help="Default: fp32 on the CPU, bf16 on a GPU.", show_default=False),

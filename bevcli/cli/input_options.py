@@ -12,6 +12,10 @@ PANEL = "Input"
 DeviceOption = Annotated[
     str, typer.Option(metavar="auto|cpu|cuda|cuda:N", help="auto uses a GPU if there is one; cuda:1 is the second GPU.")
 ]
+EngineOption = Annotated[
+    Literal["onnxruntime", "openvino"] | None,
+    typer.Option(help="Program that runs a FILE.onnx. Default: onnxruntime.", show_default=False),
+]
 SceneOption = Annotated[str | None, typer.Option(help="Only this scene, such as scene-0103.", rich_help_panel=PANEL)]
 StrictOption = Annotated[
     bool,

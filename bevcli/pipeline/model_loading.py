@@ -6,11 +6,14 @@ import re
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any, Literal
 
 import torch
 
 from bevcli.checkpoints import bundled_weights, inspect, load_weights
-from bevcli.config import TRACKING, known_models, load_config, load_table
+from bevcli.config import TRACKING, as_table, known_models, load_config, load_table, settings_of_table
+from bevcli.engines.engine import EngineName
+from bevcli.engines.exported import SUFFIX, ExportedBEVFormer
 from bevcli.errors import BevcliError, WeightsError
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
 from bevcli.model.bevformer_v2 import build_model
@@ -26,24 +29,26 @@ class Model:
     """A model with its weights, and the device that it runs on.
 
     Attributes:
-        network: the plain BEVFormer or BEVFormerV2, as in its paper, on the CPU.
+        network: the plain BEVFormer or BEVFormerV2, as in its paper, on the CPU; or an exported file.
         device: where it runs.
-        precision: of the image features; the rest of the network computes in float32.
+        precision: of the image features; the rest of the network computes in float32. Only exported files have "int8".
         weights: the file that the weights came from, None for random weights.
         bundled: whether that file is part of the package.
         left_out: what of that file is for training only and was left out; "" for nothing.
         tracker: the parameters of the tracker, the table [tracking] of the model's TOML file.
         not_read: classes and functions in the weights file whose objects were not read.
+        engine: the program that computes it: "torch", or for an exported file "onnxruntime" or "openvino".
     """
 
     network: BEVFormerBase
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
-    precision: Precision = "fp32"
+    precision: Precision | Literal["int8"] = "fp32"
     weights: Path | None = None
     bundled: bool = False
     left_out: str = ""
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     not_read: tuple[str, ...] = ()
+    engine: Literal["torch"] | EngineName = "torch"
 
     @property
     def config(self) -> BEVFormerConfig:
@@ -60,9 +65,28 @@ class Model:
         """Whether the weights are random: boxes and maps are then meaningless."""
         return self.weights is None
 
+    @property
+    def is_exported(self) -> bool:
+        """Whether the network is an exported file, whose parts cannot be observed, trained or exported again."""
+        return self.engine != "torch"
+
+    def require_parts(self, what: str) -> None:
+        """Raises BevcliError for an exported file. what: needs the network's parts, such as "--probe"."""
+        if isinstance(self.network, ExportedBEVFormer):
+            raise BevcliError(
+                f"{what}: not available for {self.network.file}, an exported file: use {self.name} by its name"
+            )
+
+    def contents(self) -> dict[str, Any]:
+        """The contents of the model's TOML file, [training] excluded."""
+        return as_table(self.config, self.tracker)
+
     @cached_property
     def prepared(self) -> BEVFormerBase:
         """The network on its device, made ready for inference on the first use: same results, faster."""
+        if isinstance(self.network, ExportedBEVFormer):
+            return self.network
+        assert self.precision != "int8"
         return prepare_for_inference(self.network, self.device, self.precision)
 
 
@@ -73,25 +97,35 @@ def load_model(
     device: str | torch.device = "auto",
     precision: Precision | None = None,
     untrained: bool = False,
+    engine: EngineName | None = None,
 ) -> Model:
     """Loads a model and its weights.
 
         model = bevcli.load_model("tiny", weights="bevformer_tiny_epoch_24.pth", device="cuda")
 
     Args:
-        name: a known model ("tiny", "small", "base", "v2-t1-base", "v2-t1", "v2-t2", "v2-t8", "demo") or a FILE.toml.
-            None takes the model that the weights fit, or "demo" where there are no weights.
+        name: a known model ("tiny", "small", "base", "v2-t1-base", "v2-t1", "v2-t2", "v2-t8", "demo"), a FILE.toml,
+            or an exported FILE.onnx, which holds its weights and runs on the CPU in the precision of the file. None
+            takes the model that the weights fit, or "demo" where there are no weights.
         weights: an official .pth as published, or a .safetensors. None takes the weights of the package, which only
             "demo" has.
         device: "auto" takes a GPU where there is one, else the CPU; or "cpu", "cuda", "cuda:1".
         precision: "fp32", "bf16" or "fp16". None takes fp32 on a CPU and bf16 on a GPU.
         untrained: use random weights, always the same ones.
+        engine: the program that runs a FILE.onnx: "onnxruntime" (the default) or "openvino".
 
     Raises:
         ConfigError: the model's TOML file is missing or wrong.
         WeightsError: there are no weights, they do not fit, or both weights and `untrained` are given.
-        BevcliError: the device is not there.
+        BevcliError: the device is not there, the engine is not installed, or an option does not apply to the model.
     """
+    if name is not None and str(name).endswith(SUFFIX):
+        return _load_exported(Path(name), weights, device, precision, engine or "onnxruntime", untrained=untrained)
+    if engine is not None:
+        model = "tiny" if name is None else name
+        raise BevcliError(
+            f"--engine {engine}: runs exported files only: bevcli export-onnx {model}, then --model {model}.onnx"
+        )
     weights = None if weights is None else Path(weights)
     if weights is not None and untrained:
         raise WeightsError(f"--weights {weights} and --untrained exclude each other: give one of them")
@@ -119,6 +153,39 @@ def load_model(
         left_out="" if loaded is None else loaded.left_out,
         tracker=tracker,
         not_read=() if loaded is None else loaded.not_read,
+    )
+
+
+def _load_exported(
+    file: Path,
+    weights: str | Path | None,
+    device: str | torch.device,
+    precision: Precision | None,
+    engine: EngineName,
+    *,
+    untrained: bool,
+) -> Model:
+    """The model of a file of `bevcli export-onnx` or `bevcli quantize`."""
+    if weights is not None or untrained:
+        option = "--untrained" if untrained else f"--weights {weights}"
+        raise WeightsError(f"{file}: an exported file holds its weights: leave out {option}")
+    if precision is not None:
+        raise BevcliError(
+            f"--precision {precision}: {file} has a fixed precision: leave out the option "
+            "(bevcli quantize writes files with INT8)"
+        )
+    if str(device) not in ("auto", "cpu"):
+        raise BevcliError(f"--device {device}: {file} runs on the CPU: leave out the option")
+    network = ExportedBEVFormer(file, engine)
+    found = network.metadata
+    return Model(
+        network,
+        torch.device("cpu"),
+        found.precision,
+        None if found.untrained else file,
+        bundled=found.bundled,
+        tracker=settings_of_table(found.contents, TRACKING, TrackerConfig, str(file)),
+        engine=engine,
     )
 
 

@@ -18,6 +18,7 @@ STAGES = {
     "fusion": "fusion",
     "decoder": "decoder",
     "segmentation_head": "segmentation_head",
+    "engine": "engine",  # of an exported file: all of the above
 }
 
 
