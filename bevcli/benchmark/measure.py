@@ -44,6 +44,7 @@ class BenchmarkSettings:
         frames: number of timed frames, after the warm-up.
         against_plain: whether the plain version is timed too, and the results compared.
         profile: where to write PyTorch's profile of one frame (Chrome's trace format), None for no profile.
+        exported: an exported file of the model, which is timed with its own weights and precision; None for PyTorch.
     """
 
     config: BEVFormerConfig
@@ -52,6 +53,7 @@ class BenchmarkSettings:
     frames: int = 5
     against_plain: bool = False
     profile: Path | None = None
+    exported: Model | None = None
 
 
 def run_benchmark(settings: BenchmarkSettings) -> BenchmarkResult:
@@ -59,7 +61,9 @@ def run_benchmark(settings: BenchmarkSettings) -> BenchmarkResult:
     config, device = settings.config, settings.device
     limits = measure_limits(device, settings.precision)
     model = made_up_model(config)
-    fast = Version(prepare_for_inference(model, device, settings.precision), device)
+    exported = settings.exported
+    network = prepare_for_inference(model, device, settings.precision) if exported is None else exported.prepared
+    fast = Version(network, device)
     drive = MadeUpDrive(max(warm_up_frames(config) + settings.frames, MIN_RUN_FRAMES))
     stages = _time_stages(fast, drive, settings.frames)
     frame_s, peak = tuple(fast.seconds), _peak_memory(device)
@@ -73,7 +77,8 @@ def run_benchmark(settings: BenchmarkSettings) -> BenchmarkResult:
     return BenchmarkResult(
         model=config.name,
         device=device.type,
-        precision=settings.precision,
+        precision=settings.precision if exported is None else exported.precision,
+        engine="torch" if exported is None else exported.engine,
         machine=describe_machine(device),
         stages_s=stages,
         frame_s=frame_s,

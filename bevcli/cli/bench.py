@@ -49,15 +49,29 @@ def bench(
     from bevcli.benchmark.measure import BenchmarkSettings, run_benchmark
     from bevcli.benchmark.table import write_table
     from bevcli.config import load_config
-    from bevcli.pipeline.model_loading import choose_device, choose_precision
+    from bevcli.engines.exported import SUFFIX
+    from bevcli.pipeline.model_loading import choose_device, choose_precision, load_model, needs_exported_file
 
     target = choose_device(device)
     if table is not None:
         write_table(table, target, frames)
         typer.echo(f"wrote {table}", err=True)
         return
+    exported = None
+    if model.endswith(SUFFIX):
+        exported = load_model(model, device=device, precision=precision, engine=engine)
+        if against is not None or profile is not None:
+            exported.require_parts("--against" if profile is None else "--profile")
+    elif engine is not None:
+        raise needs_exported_file(engine, model)
     settings = BenchmarkSettings(
-        load_config(model), target, choose_precision(precision, target), frames, against == "plain", profile
+        load_config(model) if exported is None else exported.config,
+        target if exported is None else exported.device,
+        choose_precision(precision, target),
+        frames,
+        against == "plain",
+        profile,
+        exported,
     )
     result = run_benchmark(settings)
     print(json.dumps(result.as_data(), indent=1) if as_json else result.text())

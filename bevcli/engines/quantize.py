@@ -22,8 +22,8 @@ from bevcli.errors import OutputError, WeightsError
 
 QUANTIZED_PARTS = ("backbone", "neck")
 QUANTIZED_OPERATORS = ("Conv", "Add", "MaxPool")
-# The convolution that predicts where a deformable convolution samples: rounding would move the samples.
-KEPT_PART = "offset_and_mask"
+# Deformable convolutions stay in float32: rounding would move their samples.
+DEFORMABLE = {"convolution", "offset_and_mask"}
 
 
 def quantize(file: Path, images: Iterable[np.ndarray], out: Path) -> None:
@@ -51,7 +51,7 @@ def quantize(file: Path, images: Iterable[np.ndarray], out: Path) -> None:
     metadata = {entry.key: entry.value for entry in proto.metadata_props}
     if read_metadata(metadata, file).precision != "fp32":
         raise WeightsError(f"{file}: is quantised already (expected a file of bevcli export-onnx)")
-    nodes = [node.name for node in proto.graph.node if _is_quantized(node)]
+    nodes = quantized_nodes(proto.graph)
     level, logger = logging.ERROR, logging.getLogger()
     before = logger.level
     logger.setLevel(level)  # its advice about models that have not been simplified
@@ -81,14 +81,21 @@ def quantize(file: Path, images: Iterable[np.ndarray], out: Path) -> None:
         logger.setLevel(before)
 
 
-def _is_quantized(node: Any) -> bool:
-    """Whether a node, named "part.of.the.network/operator", computes in INT8."""
-    part = node.name.partition("/")[0]
-    return (
-        node.op_type in QUANTIZED_OPERATORS
-        and part.split(".")[0] in QUANTIZED_PARTS
-        and KEPT_PART not in part.split(".")
-    )
+def quantized_nodes(graph: Any) -> list[str]:
+    """The names of the nodes of a file that compute in INT8. A name is "part.of.the.network/operator"."""
+    constants = {value.name for value in graph.initializer}
+    constants |= {name for node in graph.node if node.op_type == "Constant" for name in node.output}
+    found = []
+    for node in graph.node:
+        parts = node.name.partition("/")[0].split(".")
+        is_sum_of_maps = node.op_type == "Add" and not constants.intersection(node.input)
+        if (
+            parts[0] in QUANTIZED_PARTS
+            and not DEFORMABLE.intersection(parts)
+            and (node.op_type in ("Conv", "MaxPool") or is_sum_of_maps)
+        ):
+            found.append(node.name)
+    return found
 
 
 class _Frames:

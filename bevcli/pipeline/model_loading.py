@@ -122,10 +122,7 @@ def load_model(
     if name is not None and str(name).endswith(SUFFIX):
         return _load_exported(Path(name), weights, device, precision, engine or "onnxruntime", untrained=untrained)
     if engine is not None:
-        model = "tiny" if name is None else name
-        raise BevcliError(
-            f"--engine {engine}: runs exported files only: bevcli export-onnx {model}, then --model {model}.onnx"
-        )
+        raise needs_exported_file(engine, "tiny" if name is None else str(name))
     weights = None if weights is None else Path(weights)
     if weights is not None and untrained:
         raise WeightsError(f"--weights {weights} and --untrained exclude each other: give one of them")
@@ -153,6 +150,13 @@ def load_model(
         left_out="" if loaded is None else loaded.left_out,
         tracker=tracker,
         not_read=() if loaded is None else loaded.not_read,
+    )
+
+
+def needs_exported_file(engine: EngineName, model: str) -> BevcliError:
+    """The error for an engine that is to run a model by its name."""
+    return BevcliError(
+        f"--engine {engine}: runs exported files only: bevcli export-onnx {model}, then --model {model}.onnx"
     )
 
 
