@@ -92,7 +92,7 @@ def test_int8_is_close_to_float32_and_only_the_image_features_are_rounded(small_
     readers = [node for node in proto.graph.node if node.op_type == "Conv"]
     assert len(quantizers) > 10
     assert all(name.endswith("DequantizeLinear_Output") for node in readers for name in node.input[:2])
-    weights = [value.name for value in proto.graph.initializer if value.name.endswith("_quantized")]
+    weights = [value.name for value in proto.graph.initializer if value.name.endswith("weight_quantized")]
     assert len(weights) == len(readers)  # of the convolutions, and no others
 
 
