@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from torch import nn
 
-from bevcli.engines.packages import require
+from bevcli.engines.packages import import_openvino, require
 from bevcli.errors import WeightsError
 
 EngineName = Literal["onnxruntime", "openvino"]
@@ -72,8 +72,8 @@ class OpenVinoEngine(Engine):
         super().__init__()
         require("openvino", "onnx", extra="openvino")
         import onnx
-        import openvino
 
+        openvino = import_openvino()
         settings: dict[str, Any] = {
             # By default OpenVINO rounds everything to bfloat16 where the CPU has it, which moves boxes by decimetres.
             "INFERENCE_PRECISION_HINT": "f32",
