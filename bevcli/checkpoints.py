@@ -15,7 +15,7 @@ from torch import Tensor
 from bevcli.config import known_models, load_config
 from bevcli.errors import WeightsError
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
-from bevcli.model.bevformer_v2 import build_model
+from bevcli.model.build import build_model
 from bevcli.model.official_keys import from_official, is_official
 from bevcli.parsing.pickles import Placeholder
 from bevcli.parsing.pth import StoredTensor, read_pth

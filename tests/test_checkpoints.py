@@ -27,7 +27,7 @@ from bevcli.cli.main import app
 from bevcli.config import known_models, load_config
 from bevcli.errors import WeightsError
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.bevformer_v2 import build_model
+from bevcli.model.build import build_model
 from bevcli.model.official_keys import from_official
 from bevcli.model.parts import model_parts
 

@@ -13,7 +13,8 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
-from bevcli.model.bevformer_v2 import BEVFormerV2, build_model
+from bevcli.model.bevformer_v2 import BEVFormerV2
+from bevcli.model.build import build_model
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.prepared import DTYPES, Precision

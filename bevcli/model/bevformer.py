@@ -200,7 +200,7 @@ class BEVFormerBase(nn.Module):
         self.image_tokens = ImageTokens(len(config.cameras), channels, config.image_tokens)
         self.bev_queries = BevQueries(grid, channels, config.ego_motion.can_bus)
         self.pillars = Pillars(grid)
-        self.encoder = Encoder(config.encoder, channels, levels, grid, config.ego_motion.history_shift)
+        self.encoder = Encoder(config.encoder, channels, levels, grid, config.ego_motion)
         self.decoder = Decoder(config.decoder, channels, bev_shape)
         self.detection_head = DetectionHead(config.decoder.layers, channels, len(config.classes), grid)
         segments = "segmentation" in config.heads
@@ -220,7 +220,7 @@ class BEVFormerBase(nn.Module):
         """What the decoder and the heads find in the BEV map (B, Y·X, C)."""
         # In float32: half precision is too coarse for the refinement of boxes.
         with torch.autocast(bev.device.type, enabled=False):
-            class_logits, box_codes = self.decoder(bev.float(), self.detection_head)
+            class_logits, box_codes, _ = self.decoder(bev.float(), self.detection_head)
             segmentation = None
             if self.segmentation_head is not None:
                 segmentation = self.segmentation_head(bev.float(), self.bev_queries.position())

@@ -48,6 +48,21 @@ class DecoderConfig:
             )
 
 
+@dataclass(frozen=True)
+class ObjectQueries:
+    """Queries as they enter the first decoder layer.
+
+    Attributes:
+        position: (B, Q, C).
+        content: (B, Q, C).
+        reference_points: (B, Q, 3) x, y, z, 0 to 1 over the range.
+    """
+
+    position: Tensor
+    content: Tensor
+    reference_points: Tensor
+
+
 class Decoder(nn.Module):
     """Object queries that attend to the BEV map and move their reference points to the objects."""
 
@@ -61,28 +76,37 @@ class Decoder(nn.Module):
         nn.init.xavier_uniform_(self.reference_points.weight)
         nn.init.zeros_(self.reference_points.bias)
 
-    def forward(self, bev: Tensor, head: DetectionHead) -> tuple[Tensor, Tensor]:
-        """bev: (B, Y·X, C) -> class logits (L, B, Q, classes) and box codes (L, B, Q, 10) of all L layers.
+    def forward(
+        self, bev: Tensor, head: DetectionHead, queries: ObjectQueries | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """What the queries find in the BEV map.
 
-        In training mode the Q queries are those of all groups, one group after another.
+        Args:
+            bev: (B, Y·X, C).
+            head: class and box branches of the layers.
+            queries: None takes the learned ones, in training mode those of all groups, one group after another.
+
+        Returns:
+            Class logits (L, B, Q, classes) and box codes (L, B, Q, 10) of all L layers; the queries (B, Q, C) after
+            the last layer.
         """
         groups = self.training_groups if self.training else 1
-        position, query = self.object_queries(len(bev), groups)
-        reference_points = self.reference_points(position).float().sigmoid()  # (B, Q, 3)
+        queries = self.object_queries(len(bev), groups) if queries is None else queries
+        query, reference_points = queries.content, queries.reference_points
         class_logits, box_codes = [], []
         for index, layer in enumerate(self.layers):
-            query = layer(query, position, reference_points[..., :2], bev, groups)
+            query = layer(query, queries.position, reference_points[..., :2], bev, groups)
             logits, codes, refined = head(index, query, reference_points)
             class_logits.append(logits)
             box_codes.append(codes)
             reference_points = refined.detach()
-        return torch.stack(class_logits), torch.stack(box_codes)
+        return torch.stack(class_logits), torch.stack(box_codes), query
 
-    def object_queries(self, batch: int, groups: int = 1) -> tuple[Tensor, Tensor]:
-        """Position and content, each (batch, Q, C), of the learned queries of the first groups."""
+    def object_queries(self, batch: int, groups: int = 1) -> ObjectQueries:
+        """The learned queries of the first groups, the same for each batch element."""
         count = len(self.query_embedding) // self.training_groups * groups
         position, content = self.query_embedding[:count].expand(batch, -1, -1).chunk(2, dim=-1)
-        return position, content
+        return ObjectQueries(position, content, self.reference_points(position).float().sigmoid())
 
 
 class DecoderLayer(nn.Module):

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import torch
 
 from bevcli.model.bevformer import BEVFormerConfig
-from bevcli.model.bevformer_v2 import BEVFormerV2Config, build_model
+from bevcli.model.bevformer_v2 import BEVFormerV2Config
+from bevcli.model.build import build_model
 
 Shape = tuple[int, ...]
 

@@ -13,7 +13,7 @@ from bevcli.checkpoints import bundled_weights, inspect, load_weights
 from bevcli.config import TRACKING, known_models, load_config, load_table
 from bevcli.errors import BevcliError, WeightsError
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
-from bevcli.model.bevformer_v2 import build_model
+from bevcli.model.build import build_model
 from bevcli.model.prepared import Precision, prepare_for_inference
 from bevcli.pipeline.tracking import TrackerConfig
 

@@ -17,6 +17,7 @@ STAGES = {
     "encoder": "encoder",
     "fusion": "fusion",
     "decoder": "decoder",
+    "query_interaction": "tracks",
     "segmentation_head": "segmentation_head",
 }
 
