@@ -8,6 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from bevcli.frame import MAP_CLASSES
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.bev_queries import BevQueries
 from bevcli.model.decoder import Decoder, DecoderConfig, DetectionHead
@@ -132,6 +133,11 @@ class BEVFormerConfig:
     def encoder_levels(self) -> int:
         """Number of the neck's levels that the BEV encoder attends to, the finest ones."""
         return min(self.neck.levels, self.image_tokens.level_embeddings)
+
+    @property
+    def map_classes(self) -> tuple[str, ...]:
+        """The classes of the map that the model predicts, in the order of their bits; empty without a map."""
+        return tuple(MAP_CLASSES) if "segmentation" in self.heads else ()
 
     def _most_neck_levels(self) -> int:
         return self.image_tokens.level_embeddings

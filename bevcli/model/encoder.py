@@ -62,7 +62,7 @@ class Encoder(nn.Module):
         self.layers = nn.ModuleList(EncoderLayer(config, channels, levels, bev_shape) for _ in range(config.layers))
         self.history_shift = ego_motion.history_shift
         self.shift_without_history = ego_motion.first_frame == "original"
-        self.register_buffer("cell_centers", _normalized_centers(grid), persistent=False)
+        self.register_buffer("cell_centers", normalized_centers(grid), persistent=False)
 
     def forward(
         self,
@@ -233,7 +233,7 @@ class SpatialCrossAttention(nn.Module):
         return sampling_locations(reference[:, None, None], offsets, level_shapes), weights
 
 
-def _normalized_centers(grid: BevGrid) -> Tensor:
+def normalized_centers(grid: BevGrid) -> Tensor:
     """(Y·X, 2) float32 centres of the cells, x and y, 0 to 1 over the map."""
     x = (torch.arange(grid.columns, dtype=torch.float32) + 0.5) / grid.columns
     y = (torch.arange(grid.rows, dtype=torch.float32) + 0.5) / grid.rows

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -10,6 +10,7 @@ from torch import Tensor
 from bevcli.model.bevformer import BEVFormer, BEVFormerConfig, BEVFormerInputs, BEVFormerOutputs
 from bevcli.model.decoder import ObjectQueries
 from bevcli.model.ego_motion import EgoMotionConfig
+from bevcli.model.map_head import MapHead, MapHeadConfig, MapOutputs
 from bevcli.model.memory_bank import Memories, MemoryBank
 from bevcli.model.query_interaction import QueryInteraction
 from bevcli.model.track_queries import (
@@ -29,10 +30,12 @@ class UniADConfig(BEVFormerConfig):
 
     Attributes:
         track_queries: the life of tracks, and the modules that update their queries.
+        map_head: the map head.
     """
 
     ego_motion: EgoMotionConfig = field(default_factory=lambda: EgoMotionConfig(first_frame="original"))
     track_queries: TrackQueryConfig = field(default_factory=TrackQueryConfig)
+    map_head: MapHeadConfig = field(default_factory=MapHeadConfig)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -40,8 +43,13 @@ class UniADConfig(BEVFormerConfig):
             raise ValueError('heads must be ["detection"]: UniAD has a map head of its own')
         if self.decoder.queries < 2 or self.decoder.training_groups != 1:
             raise ValueError("decoder.queries must be at least 2, one object and the ego query; training_groups 1")
-        if self.channels % self.track_queries.attention_heads:
-            raise ValueError(f"channels is {self.channels}; it must be a multiple of track_queries.attention_heads")
+        if self.channels % self.track_queries.attention_heads or self.channels % self.map_head.attention_heads:
+            raise ValueError(f"channels is {self.channels}; it must be a multiple of the attention_heads")
+
+    @property
+    def map_classes(self) -> tuple[str, ...]:
+        """See `BEVFormerConfig.map_classes`."""
+        return self.map_head.classes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,11 +60,13 @@ class UniADOutputs(BEVFormerOutputs):
         ids: (N,) int64 identities after births and deaths; NO_TRACK and EGO for queries without one.
         scores: (N,) the highest class score of each query.
         tracks: what the next frame needs.
+        map: of the map head; None where it was not asked for.
     """
 
     ids: Tensor
     scores: Tensor
     tracks: TrackQueries
+    map: MapOutputs | None = None
 
 
 class UniAD(BEVFormer):
@@ -69,6 +79,7 @@ class UniAD(BEVFormer):
         tracks = config.track_queries
         self.memory_bank = MemoryBank(config.channels, tracks.attention_heads, tracks.memory_interval)
         self.query_interaction = QueryInteraction(config.channels, tracks.attention_heads)
+        self.map_head = MapHead(config.map_head, config.channels, config.bev_grid)
 
     def forward(
         self,
@@ -85,10 +96,13 @@ class UniAD(BEVFormer):
             tracks: of the previous frame; None for the first frame of all.
             motion: since the previous frame; needed with tracks.
         """
-        return self.track(self.bev_map(inputs, history), tracks, motion)
+        bev = self.bev_map(inputs, history)
+        outputs = self.track(bev, tracks, motion)
+        with torch.autocast(bev.device.type, enabled=False):
+            return replace(outputs, map=self.map_head(bev.float()))
 
     def track(self, bev: Tensor, tracks: TrackQueries | None, motion: FrameMotion | None) -> UniADOutputs:
-        """The tracks and objects in the BEV map (1, Y·X, C): the part of `forward` after the encoder."""
+        """The tracks and objects in the BEV map (1, Y·X, C): the part of `forward` after the encoder, without the map."""
         # In float32, as the decoder of BEVFormer.
         with torch.autocast(bev.device.type, enabled=False):
             queries = self._queries(tracks, motion)

@@ -17,6 +17,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerOutputs
 from bevcli.model.box_coding import decode
 from bevcli.model.prepared import Precision
+from bevcli.model.map_merging import merge_map
 from bevcli.model.segmentation import decode_maps
 from bevcli.model.track_boxes import decode_tracks
 from bevcli.model.uniad import UniAD, UniADConfig, UniADOutputs
@@ -178,10 +179,15 @@ class Runner:
         return AttentionProbe(self.model, self.config.encoder.layers - 1, cells.to(self.device))
 
     def _segmentation(self, outputs: BEVFormerOutputs) -> BevMap | None:
-        if outputs.segmentation is None:
-            return None
         grid = self.config.bev_grid
-        bev_map = decode_maps(outputs.segmentation, self.config.segmentation, grid)[0].bev_map(grid)
+        if isinstance(outputs, UniADOutputs) and outputs.map is not None:
+            assert isinstance(self.config, UniADConfig)
+            head = self.config.map_head
+            bev_map = merge_map(outputs.map, head, grid)[0].bev_map(grid, head)
+        elif outputs.segmentation is not None:
+            bev_map = decode_maps(outputs.segmentation, self.config.segmentation, grid)[0].bev_map(grid)
+        else:
+            return None
         self.clock.mark("map_merging")
         return bev_map
 

@@ -18,6 +18,7 @@ STAGES = {
     "fusion": "fusion",
     "decoder": "decoder",
     "query_interaction": "tracks",
+    "map_head": "map_head",
     "segmentation_head": "segmentation_head",
 }
 
