@@ -92,16 +92,31 @@ _RENAMES = (
 # In the official files, but used in training only.
 _TRAINING_ONLY = ("pts_bbox_head.code_weights",)
 
+# Keys of the official UniAD files without effect at inference. The file of its first stage has its own object queries
+# at the top level, beside those of BEVFormer.
+_UNIAD_QUERIES = "query_embedding.weight"
+_UNIAD_UNUSED = re.compile(
+    r"^(pts_bbox_head\.(past_traj_reg_branches|query_embedding|transformer\.reference_points)\.|criterion\.|bbox_size_fc\."
+    r"|seg_head\.(bev_embedding|reg_branches2|cls_thing_branches|cls_stuff_branches|cls_branches\.[0-4])\."
+    r"|seg_head\.(things|stuff)_mask_head\.blocks\.\d+\.attn\.linear)"
+)
+
 
 def is_official(state: Mapping[str, Tensor]) -> bool:
     """Whether a state dict uses the official key names."""
     return any(key.startswith(_PREFIXES) for key in state)
 
 
+def unused_keys(state: Mapping[str, Tensor]) -> list[str]:
+    """The keys of an official UniAD file that have no effect at inference; none for other files."""
+    return [key for key in state if _UNIAD_UNUSED.match(key)] if _UNIAD_QUERIES in state else []
+
+
 def from_official(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """An official state dict with our key names. A key that no rule matches stays unchanged."""
+    unused = {*_TRAINING_ONLY, *unused_keys(state)}
     first_extra = sum(key.startswith("img_neck.lateral_convs.") and key.endswith(".weight") for key in state)
-    return {_our_name(key, first_extra): tensor for key, tensor in state.items() if key not in _TRAINING_ONLY}
+    return {_our_name(key, first_extra): tensor for key, tensor in state.items() if key not in unused}
 
 
 def _our_name(key: str, first_extra: int) -> str:
