@@ -102,7 +102,7 @@ class UniAD(BEVFormer):
             return replace(outputs, map=self.map_head(bev.float()))
 
     def track(self, bev: Tensor, tracks: TrackQueries | None, motion: FrameMotion | None) -> UniADOutputs:
-        """The tracks and objects in the BEV map (1, Y·X, C): the part of `forward` after the encoder, without the map."""
+        """The tracks and objects in the BEV map (1, Y·X, C): `forward` after the encoder, without the map."""
         # In float32, as the decoder of BEVFormer.
         with torch.autocast(bev.device.type, enabled=False):
             queries = self._queries(tracks, motion)

@@ -16,8 +16,8 @@ from bevcli.frame import AttentionView, BevMap, Frame, FrameStamp, Prediction, S
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerOutputs
 from bevcli.model.box_coding import decode
-from bevcli.model.prepared import Precision
 from bevcli.model.map_merging import merge_map
+from bevcli.model.prepared import Precision
 from bevcli.model.segmentation import decode_maps
 from bevcli.model.track_boxes import decode_tracks
 from bevcli.model.uniad import UniAD, UniADConfig, UniADOutputs

@@ -132,9 +132,8 @@ def test_the_newest_memory_is_the_last_one_and_the_oldest_is_dropped(bank: Memor
 
 def test_a_track_without_memories_keeps_its_embedding(bank: MemoryBank) -> None:
     embedding = torch.randn(2, 8)
-    memories = Memories.empty(embedding, length=4)
-    _, after = bank(embedding, memories)
-    memories = Memories(*(torch.cat([one[:1], other[1:]]) for one, other in zip(vars(memories).values(), vars(after).values(), strict=True)))  # fmt: skip
+    _, after = bank(embedding, Memories.empty(embedding, length=4))
+    memories = Memories.empty(embedding[:1], length=4).followed_by(after[1:])
     attended, _ = bank(embedding, memories)
     assert torch.equal(attended[0], embedding[0])
     assert not torch.allclose(attended[1], embedding[1])

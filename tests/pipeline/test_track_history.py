@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -73,7 +74,7 @@ def whole(model):
 def test_tracks_are_born_go_on_and_end(whole):
     found = [identities(prediction) for prediction in whole]
     assert all(found)
-    assert all(before & now for before, now in zip(found, found[1:], strict=False))
+    assert all(before & now for before, now in pairwise(found))
     assert max(found[-1]) > max(found[0])
     assert found[0] - found[-1]
 
@@ -146,7 +147,7 @@ def test_a_first_frame_sees_the_motion_since_the_last_frame_of_another_scene(mod
     """As in the released code. With first_frame = "zero" it sees none: the two runs differ from there on."""
     sequence = MemorySequence(4, scenes="aabb")
     with_motion, without = (run(network, sequence)[0] for network in (model, zero_first_frame(model)))
-    assert np.abs(with_motion[2].bev - without[2].bev).max() > 1e-3
+    assert (with_motion[2].bev - without[2].bev).abs().max() > 1e-3
 
 
 def test_a_gap_in_time_starts_anew(model):
