@@ -64,12 +64,14 @@ def log_about(
     class_names: Sequence[str],
     options: RecordingOptions,
     *,
+    map_classes: Sequence[str] = (),
     untrained: bool,
     note: str = "",
 ) -> None:
     """Writes the page "About", and the facts of the run that readers of the file need.
 
-    note: what titles say about the weights, see `recording_blueprint`.
+    map_classes: of the map that the recording shows; empty for none. note: what titles say about the weights, see
+    `recording_blueprint`.
     """
     facts = rr.AnyValues(
         title=title,
@@ -78,6 +80,7 @@ def log_about(
         score=options.score,
         class_names=list(class_names),
         camera_names=list(rig.names),
+        map_classes=list(map_classes),
     )
     text = about_text(title, rig, options, untrained=untrained)
     stream.log(entities.RUN, rr.TextDocument(text, media_type="text/markdown"), facts, static=True)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bevcli.errors import InputError
-from bevcli.frame import MAP_CLASSES, BevMap
+from bevcli.frame import BevMap
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.segmentation import STUFF_CLASSES
@@ -65,8 +65,8 @@ def _stuff(bev_map: BevMap, grid: BevGrid) -> NDArray[np.bool_]:
     rows, columns = bev_map.cells.shape
     map_grid = BevGrid(rows, columns, bev_map.x_range_m, bev_map.y_range_m)
     map_cells = map_grid.cell_of(fine.cell_centers())  # (Y · SAMPLES, X · SAMPLES, 2)
-    bits = bev_map.cells[::-1][map_cells[..., 0], map_cells[..., 1]]  # the map's rows start at the largest y
-    layers = np.stack([(bits & MAP_CLASSES[name]) > 0 for name in STUFF_CLASSES])
+    on_map = np.stack([bev_map.layer(name)[::-1] for name in STUFF_CLASSES])  # the map's rows start at the largest y
+    layers = on_map[:, map_cells[..., 0], map_cells[..., 1]]
     shares = layers.reshape(len(layers), grid.rows, SAMPLES, grid.columns, SAMPLES).mean((2, 4))
     min_shares = np.array([MIN_SHARES[name] for name in STUFF_CLASSES])
     return (shares >= min_shares[:, None, None]).reshape(len(layers), -1)
