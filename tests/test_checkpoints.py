@@ -93,6 +93,26 @@ def test_parts_of_official_v2_files_for_training_only_are_named_and_left_out(mod
     assert summary.left_out == f"363 keys fcos3d_bbox_head.*{groups}"
 
 
+def official_uniad(tmp_path: Path, *, version_1_0: bool) -> Path:
+    """An official file of UniAD's first stage of zeros that takes no space, with all keys of its training."""
+    file = json.loads((Path(__file__).parent / "data" / "golden_keys_uniad.json").read_text())
+    shapes = {**KEYS["base"], **file["keys"], **file["unused"]}
+    old = ("pts_bbox_head.query_embedding.", "pts_bbox_head.transformer.reference_points.", "bbox_size_fc.")
+    shapes = {key: shape for key, shape in shapes.items() if version_1_0 or not key.startswith(old)}
+    path = tmp_path / "uniad_base_track_map.pth"
+    torch.save({"state_dict": {key: torch.zeros(()).expand(shape) for key, shape in shapes.items()}}, path)
+    return path
+
+
+@pytest.mark.parametrize(("version_1_0", "left_out"), [(False, 132), (True, 137)])
+def test_keys_of_official_uniad_files_without_effect_are_left_out(
+    version_1_0: bool, left_out: int, tmp_path: Path
+) -> None:
+    summary = inspect(official_uniad(tmp_path, version_1_0=version_1_0))
+    assert summary.models == ("uniad-track-map",)
+    assert summary.left_out.startswith(f"{left_out} keys, such as ")
+
+
 def test_other_differences_of_v2_files_are_refused(tmp_path: Path) -> None:
     path = official_v2("v2-t2", tmp_path, level_embeds=(5, 256))
     with pytest.raises(WeightsError, match=r"does not fit model v2-t2 .*1 misshapen: image_tokens\.level_embedding"):

@@ -16,6 +16,7 @@ import original_reference as original
 import pytest
 import torch
 import uniad_reference as reference
+from uniad_rule import rule_bev
 
 from bevcli.geometry.transforms import Array, inverse, rigid, rotation_from_quaternion
 from bevcli.model.map_merging import merge_map
@@ -38,7 +39,7 @@ def tracked(model: UniAD) -> Iterator[UniADOutputs]:
             seconds = reference.SECONDS[frame] - reference.SECONDS[frame - 1]
             motion = FrameMotion(torch.from_numpy(moved).float(), seconds)
         with torch.inference_mode():
-            outputs = model.track(reference.rule_bev(frame), tracks, motion)
+            outputs = model.track(rule_bev(frame), tracks, motion)
         tracks = outputs.tracks
         yield outputs
 
