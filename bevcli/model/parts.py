@@ -103,6 +103,12 @@ def _names_and_modules(config: BEVFormerConfig) -> Iterator[tuple[str, ...]]:
     yield "segmentation: location decoder", "segmentation_head.location_decoder"
     for layer in range(config.segmentation.mask_layers):
         yield f"segmentation: mask decoder layer {layer}", f"segmentation_head.mask_layers.{layer}"
+    yield "map head: encoder", "map_head.encoder"
+    yield "map head: location decoder", "map_head.location_decoder"
+    yield "map head: class branch", "map_head.class_branch"
+    yield "map head: stuff queries", "map_head.stuff_queries"
+    yield "map head: mask decoder of things", "map_head.thing_masks"
+    yield "map head: mask decoder of stuff", "map_head.stuff_masks"
 
 
 def _size(shape: Shape) -> tuple[int, Shape]:
