@@ -92,7 +92,9 @@ def run(
     track: Annotated[
         bool,
         typer.Option(
-            "--track/--no-track", help="Give boxes identities over time, and write tracks.csv.", rich_help_panel=MODEL
+            "--track/--no-track",
+            help="Give boxes identities over time, and write tracks.csv. A UniAD with history gives its own.",
+            rich_help_panel=MODEL,
         ),
     ] = True,
     camera: Annotated[
