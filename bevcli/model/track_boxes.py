@@ -25,12 +25,12 @@ def decode_tracks(outputs: UniADOutputs, config: UniADConfig) -> Boxes3D:
     tracks = config.track_queries
     scores, best = outputs.scores.topk(min(config.decoder.max_boxes, len(outputs.scores)))
     labels = outputs.class_logits[-1, 0, best].argmax(-1)
-    codes = outputs.box_codes[-1, 0, best].double()
-    inside = (codes[:, [0, 1, 4]].abs() <= torch.tensor(tracks.center_range_m, device=codes.device)).all(-1)
-    followed = (outputs.ids[best] >= 0) & (scores >= tracks.keep_score)
-    columns = (codes, scores.double(), labels, outputs.ids[best], followed)
-    codes, scores, labels, ids, followed = (column[inside].cpu().numpy() for column in columns)
-    boxes = boxes_of_codes(codes, np.asarray(config.classes)[labels], scores)
+    all_codes = outputs.box_codes[-1, 0, best].double()
+    inside = (all_codes[:, [0, 1, 4]].abs() <= torch.tensor(tracks.center_range_m, device=scores.device)).all(-1)
+    has_track = (outputs.ids[best] >= 0) & (scores >= tracks.keep_score)
+    columns = (all_codes, scores.double(), labels, outputs.ids[best], has_track)
+    codes, box_scores, classes, ids, followed = (column[inside].cpu().numpy() for column in columns)
+    boxes = boxes_of_codes(codes, np.asarray(config.classes)[classes], box_scores)
     centers = boxes.centers
     if tracks.box_z == "bottom":
         centers = centers + boxes.sizes_lwh * (0, 0, 0.5)
@@ -38,6 +38,6 @@ def decode_tracks(outputs: UniADOutputs, config: UniADConfig) -> Boxes3D:
         boxes,
         centers=centers,
         instances=np.where(followed, ids.astype("<U20"), ""),
-        track_scores=np.where(followed, scores, np.nan),
+        track_scores=np.where(followed, box_scores, np.nan),
         duplicates=np.zeros(len(boxes), dtype=bool),
     )

@@ -76,19 +76,26 @@ class TrackQueries:
         """No track; the identities go on where they are."""
         none = slice(0, 0)
         return TrackQueries(
-            self.position[none],
-            self.content[none],
-            self.box_codes[none],
-            self.ids[none],
-            self.misses[none],
-            self.memories[none],
-            self.next_id,
+            position=self.position[none],
+            content=self.content[none],
+            box_codes=self.box_codes[none],
+            ids=self.ids[none],
+            misses=self.misses[none],
+            memories=self.memories[none],
+            next_id=self.next_id,
         )
 
     def to(self, device: torch.device) -> TrackQueries:
         """The same tracks on a device."""
-        tensors = (self.position, self.content, self.box_codes, self.ids, self.misses)
-        return TrackQueries(*(tensor.to(device) for tensor in tensors), self.memories.to(device), self.next_id)
+        return TrackQueries(
+            position=self.position.to(device),
+            content=self.content.to(device),
+            box_codes=self.box_codes.to(device),
+            ids=self.ids.to(device),
+            misses=self.misses.to(device),
+            memories=self.memories.to(device),
+            next_id=self.next_id,
+        )
 
 
 @dataclass(frozen=True)
