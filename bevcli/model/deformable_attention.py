@@ -72,11 +72,11 @@ class DeformableAttention(nn.Module):
     def attend(self, query: Tensor, reference_points: Tensor, tokens: Tensor, level_shapes: LevelShapes) -> Tensor:
         """The attended values of queries that sample one map each.
 
-        A module that was built for more levels than the map has reads offsets and weights as
-        the CUDA kernel of the released code does: as if they had been predicted for the map's L levels. Of the flat
-        list (query, head, level) of samples, query n takes the entries n · heads · L and following. These belong to
-        query n · L / (predicted levels), whose reference points they lie around, and their weights are not normalised
-        again. The published UniAD weights were trained so.
+        A module that was built for more levels than the map has reads locations and weights as the CUDA kernel of the
+        released code does: it takes the flat list of all (query, head, level) for a list of the map's L levels. Query n
+        then gets the heads · L entries from n · heads · L on. They were predicted by query n · L / (predicted levels),
+        rounded down, and lie around that query's reference point. Their weights are not normalised again. The published
+        UniAD weights were trained in this way.
 
         Args:
             query: (B, Q, query_channels).

@@ -43,7 +43,7 @@ class SegmentationTargets:
 
 
 def segmentation_targets(boxes: Boxes3D, bev_map: BevMap | None, grid: BevGrid) -> SegmentationTargets:
-    """Masks on the BEV grid. Raises InputError if the map does not cover the grid.
+    """Masks on the BEV grid. Raises InputError if the map does not cover the grid, or has none of STUFF_CLASSES.
 
     Args:
         boxes: the frame's ground truth boxes, bev frame.
@@ -60,7 +60,7 @@ def segmentation_targets(boxes: Boxes3D, bev_map: BevMap | None, grid: BevGrid) 
 
 def _stuff(bev_map: BevMap, grid: BevGrid) -> NDArray[np.bool_]:
     """(S, Y·X): whether a class covers enough of a cell."""
-    _check_coverage(bev_map, grid)
+    _check_map(bev_map, grid)
     fine = BevGrid(grid.rows * SAMPLES, grid.columns * SAMPLES, grid.x_range_m, grid.y_range_m)
     rows, columns = bev_map.cells.shape
     map_grid = BevGrid(rows, columns, bev_map.x_range_m, bev_map.y_range_m)
@@ -72,7 +72,12 @@ def _stuff(bev_map: BevMap, grid: BevGrid) -> NDArray[np.bool_]:
     return (shares >= min_shares[:, None, None]).reshape(len(layers), -1)
 
 
-def _check_coverage(bev_map: BevMap, grid: BevGrid) -> None:
+def _check_map(bev_map: BevMap, grid: BevGrid) -> None:
+    if not set(STUFF_CLASSES) & set(bev_map.classes):
+        raise InputError(
+            f"a ground truth map has the classes {', '.join(bev_map.classes)}, but the segmentation head learns "
+            f"{', '.join(STUFF_CLASSES)}: write other maps, or train without the segmentation head"
+        )
     for axis, found, needed in (("x", bev_map.x_range_m, grid.x_range_m), ("y", bev_map.y_range_m, grid.y_range_m)):
         if found[0] > needed[0] or found[1] < needed[1]:
             raise InputError(

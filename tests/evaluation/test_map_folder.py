@@ -79,6 +79,7 @@ def test_a_missing_or_wrong_image_is_named(tmp_path: Path) -> None:
         ("classes", {"256": "drivable_road"}, '"classes" must name bits'),
         ("classes", {"1": "road", "2": "road"}, '"classes" must name bits'),
         ("classes", {"1": ""}, '"classes" must name bits'),
+        ("classes", {"1": "road\x1b[2J"}, '"classes" must name bits'),
         ("classes", {"1": ["road"]}, '"classes" must name bits'),
         ("classes", {}, '"classes" must name bits'),
     ],

@@ -135,6 +135,6 @@ def _classes(legend: dict[str, Any], path: Path) -> dict[str, int]:
 
 
 def _are_names(values: Collection[Any]) -> bool:
-    """Whether these are different names of up to LONGEST_NAME characters."""
-    texts = {value for value in values if isinstance(value, str) and 0 < len(value) <= LONGEST_NAME}
+    """Whether these are different names of up to LONGEST_NAME printable characters."""
+    texts = {text for text in values if isinstance(text, str) and 0 < len(text) <= LONGEST_NAME and text.isprintable()}
     return len(texts) == len(values)
