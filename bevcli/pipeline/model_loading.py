@@ -13,7 +13,7 @@ from bevcli.checkpoints import bundled_weights, inspect, load_weights
 from bevcli.config import TRACKING, known_models, load_config, load_table
 from bevcli.errors import BevcliError, WeightsError
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
-from bevcli.model.bevformer_v2 import build_model
+from bevcli.model.build import build_model
 from bevcli.model.prepared import Precision, prepare_for_inference
 from bevcli.pipeline.tracking import TrackerConfig
 
@@ -26,7 +26,7 @@ class Model:
     """A model with its weights, and the device that it runs on.
 
     Attributes:
-        network: the plain BEVFormer or BEVFormerV2, as in its paper, on the CPU.
+        network: the plain BEVFormer, BEVFormerV2 or UniAD, as in its paper, on the CPU.
         device: where it runs.
         precision: of the image features; the rest of the network computes in float32.
         weights: the file that the weights came from, None for random weights.
@@ -79,8 +79,8 @@ def load_model(
         model = bevcli.load_model("tiny", weights="bevformer_tiny_epoch_24.pth", device="cuda")
 
     Args:
-        name: a known model ("tiny", "small", "base", "v2-t1-base", "v2-t1", "v2-t2", "v2-t8", "demo") or a FILE.toml.
-            None takes the model that the weights fit, or "demo" where there are no weights.
+        name: a known model ("tiny", "small", "base", "v2-t1-base", "v2-t1", "v2-t2", "v2-t8", "uniad-track-map",
+            "demo") or a FILE.toml. None takes the model that the weights fit, or "demo" where there are no weights.
         weights: an official .pth as published, or a .safetensors. None takes the weights of the package, which only
             "demo" has.
         device: "auto" takes a GPU where there is one, else the CPU; or "cpu", "cuda", "cuda:1".
