@@ -5,6 +5,7 @@ The plain model knows nothing of this. A prepared model is a copy whose parts ar
 
 from __future__ import annotations
 
+import atexit
 import copy
 import threading
 from collections.abc import Sequence
@@ -29,6 +30,7 @@ from bevcli.model.pillar_projection import PillarHits, Pillars
 from bevcli.model.resnet import Bottleneck, ResNet
 
 Precision = Literal["fp32", "bf16", "fp16"]
+LOADING_TIMEOUT_S = 120.0  # the compilation takes half a minute where there is no cache
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 
 
@@ -45,7 +47,9 @@ def prepare_for_inference(
     if device.type == "cpu":
         # Runs beside the first frame's backbone, which needs no Python. Started any earlier, it would slow down the
         # copying of the model.
-        threading.Thread(target=load_compiled, args=(DTYPES[precision],), name="load-compiled").start()
+        loading = threading.Thread(target=load_compiled, args=(DTYPES[precision],), name="load-compiled", daemon=True)
+        loading.start()
+        atexit.register(loading.join, LOADING_TIMEOUT_S)  # Python cannot end in the middle of a compilation
     return prepared
 
 
