@@ -71,7 +71,7 @@ def _hash(text: str, tensors: dict[str, Tensor]) -> str:
     for name in sorted(tensors, key=lambda name: (len(name), name)):
         tensor = tensors[name]
         found.update(f"{tensor.dtype}{list(tensor.shape)}".encode())
-        found.update(tensor.reshape(-1).view(torch.uint8).numpy())
+        found.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
     return found.hexdigest()
 
 

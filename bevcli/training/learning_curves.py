@@ -88,7 +88,9 @@ def _read(path: Path) -> list[Row]:
         return []
     text = read_text(path, LARGEST_BYTES)
     try:
-        rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(io.StringIO(text))]
+        rows: list[Row] = [
+            {name: float(value) for name, value in row.items()} for row in csv.DictReader(io.StringIO(text))
+        ]
     except (ValueError, TypeError, csv.Error) as error:  # no number, a missing or an additional one, a null byte
         raise InputError(f"{path}: is damaged ({error}): move it away, or start a new training") from None
     if rows and "step" not in rows[0]:
