@@ -1,5 +1,6 @@
 """A recording that was cut off is repaired; a file that is not a recording is an error of one line."""
 
+import sys
 import warnings
 
 import pytest
@@ -11,6 +12,7 @@ from bevcli.errors import InputError
 from bevcli.recording import entities, writer
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.writer import Recording
+from bevcli.viewer import recording_file
 from bevcli.viewer.recording_file import open_recording, restore_index
 from bevcli.viewer.recording_reader import RecordingReader
 
@@ -134,3 +136,11 @@ def test_damaged_data_never_ends_the_process(recording, tmp_path, place):
         message = str(error)
     assert message.startswith(f"{damaged}: ")
     assert "\n" not in message
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not limit the memory of a process")
+def test_the_process_that_reads_a_recording_first_has_one_gigabyte(recording):
+    greedy = recording_file.CHECK.replace("try:\n    for", "bytearray(1200 << 20)\ntry:\n    for")
+    done = recording_file._run([sys.executable, "-c", greedy, str(recording), str(1 << 30)], recording)
+    assert done.returncode == 1
+    assert b"MemoryError" in done.stderr
