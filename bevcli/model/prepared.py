@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_weights
 
+from bevcli.errors import WeightsError
 from bevcli.model.bev_fusion import FusionBlock
 from bevcli.model.bevformer import BEVFormer, BEVFormerBase, BEVFormerInputs, BEVFormerOutputs
 from bevcli.model.bevformer_v2 import BEVFormerV2, WindowFrame
@@ -37,7 +38,10 @@ DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 def prepare_for_inference(
     model: BEVFormerBase, device: torch.device, precision: Precision = "fp32"
 ) -> PreparedBEVFormer | PreparedBEVFormerV2:
-    """A copy of the model on the device, for inference only; the model itself stays unchanged."""
+    """A copy of the model on the device, for inference only; the model itself stays unchanged.
+
+    Raises WeightsError where a prepared weight is not finite, as with a batch norm of negative variance.
+    """
     prepared: PreparedBEVFormer | PreparedBEVFormerV2
     if isinstance(model, BEVFormerV2):
         prepared = PreparedBEVFormerV2(model, device, precision)
@@ -114,8 +118,19 @@ def _prepare(model: BEVFormerBase, device: torch.device, images_dtype: torch.dty
     for module in model.encoder.modules():
         if isinstance(module, SpatialCrossAttention):
             module.attention.value_projection.to(images_dtype)
+    _check_finite(model)
     if device.type == "cpu":
         use_onednn(model)
+
+
+def _check_finite(model: nn.Module) -> None:
+    """Raises WeightsError for a folded or cast weight with NaN or infinity: oneDNN's ReLU would turn it into zeros."""
+    for name, parameter in model.named_parameters():
+        if not torch.isfinite(parameter).all():
+            raise WeightsError(
+                f"{name}: has NaN or infinity after batch norms were folded into it and it was cast to "
+                f"{str(parameter.dtype).removeprefix('torch.')}: the weights are damaged, or need --precision fp32"
+            )
 
 
 class CachedPillars(Pillars):
