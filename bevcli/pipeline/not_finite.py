@@ -19,9 +19,9 @@ def is_finite(outputs: BEVFormerOutputs, images: Tensor) -> bool:
     Weights are checked when they are read and when they are prepared. What is not seen: numbers inside of the backbone
     that grow beyond the range of their type and that ReLU then turns into zeros.
     """
-    checked = (outputs.bev, outputs.class_logits[-1], outputs.box_codes[-1])
+    checked = [outputs.bev, outputs.class_logits[-1], outputs.box_codes[-1]]
     if outputs.bev.device.type == "cpu":
-        checked = (images, *checked)
+        checked.append(images)
     extremes = torch.stack([end.float() for tensor in checked for end in torch.aminmax(tensor)])
     return bool(torch.isfinite(extremes).all())
 
