@@ -62,11 +62,12 @@ class RrdFile:
 
         Call `sync` before the second one: all that comes through an earlier sink afterwards, its index, is left out.
         """
-        self._is_joined |= self._pipe >= 0
-        self._to_skip = HEADER if self.size else 0  # the file has its header already
         pipe, self._pipe_in = os.pipe()
         os.set_blocking(pipe, False)
-        self._pipe = pipe
+        with self._busy:
+            self._is_joined |= self._pipe >= 0
+            self._to_skip = HEADER if self.size else 0  # the file has its header already
+            self._pipe = pipe
         self._thread = threading.Thread(target=self._move_all, args=(pipe,), name="rrd-file", daemon=True)
         self._thread.start()
         return rr.FileSink(f"/dev/fd/{self._pipe_in}")
