@@ -5,6 +5,7 @@ The plain model knows nothing of this. A prepared model is a copy whose parts ar
 
 from __future__ import annotations
 
+import atexit
 import copy
 import threading
 from collections.abc import Sequence
@@ -16,6 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_weights
 
+from bevcli.errors import WeightsError
 from bevcli.model.bev_fusion import FusionBlock
 from bevcli.model.bevformer import BEVFormer, BEVFormerBase, BEVFormerInputs, BEVFormerOutputs
 from bevcli.model.bevformer_v2 import BEVFormerV2, WindowFrame
@@ -31,13 +33,17 @@ from bevcli.model.track_queries import FrameMotion, TrackQueries
 from bevcli.model.uniad import UniAD, UniADOutputs
 
 Precision = Literal["fp32", "bf16", "fp16"]
+LOADING_TIMEOUT_S = 120.0  # the compilation takes half a minute where there is no cache
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 
 
 def prepare_for_inference(
     model: BEVFormerBase, device: torch.device, precision: Precision = "fp32"
 ) -> PreparedBEVFormer | PreparedBEVFormerV2 | PreparedUniAD:
-    """A copy of the model on the device, for inference only; the model itself stays unchanged."""
+    """A copy of the model on the device, for inference only; the model itself stays unchanged.
+
+    Raises WeightsError where a prepared weight is not finite, as with a batch norm of negative variance.
+    """
     prepared: PreparedBEVFormer | PreparedBEVFormerV2 | PreparedUniAD
     if isinstance(model, BEVFormerV2):
         prepared = PreparedBEVFormerV2(model, device, precision)
@@ -49,7 +55,9 @@ def prepare_for_inference(
     if device.type == "cpu":
         # Runs beside the first frame's backbone, which needs no Python. Started any earlier, it would slow down the
         # copying of the model.
-        threading.Thread(target=load_compiled, args=(DTYPES[precision],), name="load-compiled").start()
+        loading = threading.Thread(target=load_compiled, args=(DTYPES[precision],), name="load-compiled", daemon=True)
+        loading.start()
+        atexit.register(loading.join, LOADING_TIMEOUT_S)  # Python cannot end in the middle of a compilation
     return prepared
 
 
@@ -136,8 +144,19 @@ def _prepare(model: BEVFormerBase, device: torch.device, images_dtype: torch.dty
     for module in model.encoder.modules():
         if isinstance(module, SpatialCrossAttention):
             module.attention.value_projection.to(images_dtype)
+    _check_finite(model)
     if device.type == "cpu":
         use_onednn(model)
+
+
+def _check_finite(model: nn.Module) -> None:
+    """Raises WeightsError for a folded or cast weight with NaN or infinity: oneDNN's ReLU would turn it into zeros."""
+    for name, parameter in model.named_parameters():
+        if not torch.isfinite(parameter).all():
+            raise WeightsError(
+                f"{name}: has NaN or infinity after batch norms were folded into it and it was cast to "
+                f"{str(parameter.dtype).removeprefix('torch.')}: the weights are damaged, or need --precision fp32"
+            )
 
 
 class CachedPillars(Pillars):

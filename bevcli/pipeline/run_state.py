@@ -14,6 +14,7 @@ import torch
 from bevcli import __version__
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import Sequence
+from bevcli.parsing.files import read_bytes
 from bevcli.pipeline.model_loading import Model
 from bevcli.pipeline.run_files import FilesState
 from bevcli.pipeline.run_folder import RunFolder
@@ -147,9 +148,11 @@ def _file_facts(path: Path) -> tuple[str, int, str]:
         facts = path.stat()
         if facts.st_size > HASHED_BYTES:
             return path.name, facts.st_size, str(facts.st_mtime_ns)
-        return path.name, facts.st_size, hashlib.sha256(path.read_bytes()).hexdigest()
+        return path.name, facts.st_size, hashlib.sha256(read_bytes(path, HASHED_BYTES)).hexdigest()
     except OSError as error:
         return path.name, -1, str(error.strerror)
+    except InputError as error:
+        return path.name, -1, str(error)
 
 
 def _short(hexdigest: str) -> str:

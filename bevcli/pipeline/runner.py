@@ -101,7 +101,7 @@ class Runner:
             with self._autocast(), probe or contextlib.nullcontext():
                 before, later = None if state is None else state.memory, self._usable(prepared, upcoming)
                 outputs, memory = self.temporal_model.step(prepared, before, later)
-                if not is_finite(outputs):
+                if not is_finite(outputs, prepared.images):
                     where = origin(self.model, lambda: self.temporal_model.step(prepared, before, later))
                     lost = self._prediction(prepared, started_anew, Boxes3D.empty(), None, not_finite=where)
                     return self._restarted(state), lost
