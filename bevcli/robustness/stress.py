@@ -102,7 +102,8 @@ def stress(
         model: of `load_model`.
         drives: of `open_sequence`, with ground truth.
         conditions: of `choose_conditions`. Results of an earlier, resumed test are kept.
-        out: the folder for stress.json, stress.png and corruptions.png, made where it is missing.
+        out: the folder for stress.json and, when the test is complete, stress.png and corruptions.png; made where it is
+            missing.
         options: see `StressOptions`.
         against: another run's results, for corruption errors.
         force: remove the files that an earlier test wrote into `out`.
@@ -144,8 +145,9 @@ def stress(
             is_complete = False
         results = StressResults(header, state.scores, is_complete)
         _write_results(folder, results, against)
-        shown = [each for each in choose_conditions() if each in conditions or _is_done(each, state)]
-        _write_figures(folder, results, against, scenes[0], shown, options)
+        if is_complete:
+            shown = [each for each in choose_conditions() if _is_done(each, state)]
+            _write_figures(folder, results, against, scenes[0], shown, options)
     return results
 
 
