@@ -18,6 +18,7 @@ What they share, and the output:
     draws               random numbers that depend on the seed and on names only
     conditions          the list of corruptions with their severities
     results             scores by condition, resilience rates and corruption errors; stress.json
+    stress_files        the state for --resume, stress.json and the figures
     report              the table for the terminal and the plot
     contact_sheet       one image of every corruption
 """

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Callable
 from collections.abc import Sequence as Items
 from dataclasses import dataclass
@@ -18,18 +16,15 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.pipeline.model_loading import Model
 from bevcli.pipeline.preprocess import Preprocessor
 from bevcli.pipeline.run_folder import RunFolder
-from bevcli.pipeline.run_state import check_same_run, run_facts
 from bevcli.pipeline.runner import Runner, StepOptions
-from bevcli.pipeline.state_file import digest, load_state, save_state
+from bevcli.pipeline.state_file import load_state, save_state
 from bevcli.robustness.conditions import CORRUPTIONS, Condition, choose_conditions
-from bevcli.robustness.contact_sheet import SheetOptions, write_contact_sheet
+from bevcli.robustness.contact_sheet import SheetOptions
 from bevcli.robustness.lost_images import LostImage
 from bevcli.robustness.results import ConditionScores, StressResults
 from bevcli.robustness.sequences import FrameStore, KeptFrames, split_scenes
+from bevcli.robustness.stress_files import StressState, open_stress_state, stress_facts, write_figures, write_results
 from bevcli.training.validation import boxes_ego
-
-RESULTS, SHEET, PLOT = "stress.json", "corruptions.png", "stress.png"
-_INPUT_FACTS = ("frames of the input", "calibration", "files of the input")
 
 
 @dataclass(frozen=True)
@@ -60,19 +55,6 @@ class SceneBoxes:
 
     predictions: tuple[Boxes3D, ...]
     ground_truth: tuple[Boxes3D, ...]
-
-
-@dataclass(frozen=True)
-class StressState:
-    """A test after a number of finished conditions, for --resume.
-
-    Attributes:
-        facts: what the results depend on, see `run_facts`.
-        scores: of the finished conditions.
-    """
-
-    facts: dict[str, str]
-    scores: tuple[ConditionScores, ...] = ()
 
 
 class _Stopped(Exception):
@@ -121,9 +103,9 @@ def stress(
         raise OutputError("--force and --resume exclude each other: pass one of them")
     store = FrameStore()
     scenes = [KeptFrames(scene, store) for drive in drives for scene in split_scenes(drive)]
-    facts = _facts(model, drives, options)
+    facts = stress_facts(model, drives, options)
     with RunFolder(out, force=force, resume=resume) as folder:
-        state = _open_state(folder, facts) if resume else None
+        state = open_stress_state(folder, facts) if resume else None
         if state is None:
             folder.remove_written()
             state = StressState(facts)
@@ -136,18 +118,19 @@ def stress(
         is_complete = True
         try:
             for condition in conditions:
-                if not _is_done(condition, state):
+                if not state.has(condition):
                     state = StressState(facts, _in_order((*state.scores, test.run(condition))))
                     save_state(folder.state_path, state)
-                    _write_results(folder, StressResults(header, state.scores, is_complete=False), against)
+                    write_results(folder, StressResults(header, state.scores, is_complete=False), against)
                     test.remove_boxes(condition)
         except _Stopped:
             is_complete = False
         results = StressResults(header, state.scores, is_complete)
-        _write_results(folder, results, against)
+        write_results(folder, results, against)
         if is_complete:
-            shown = [each for each in choose_conditions() if _is_done(each, state)]
-            _write_figures(folder, results, against, scenes[0], shown, options)
+            shown = [each for each in choose_conditions() if state.has(each)]
+            sheet = SheetOptions(options.seed, options.lost_images, place=len(scenes[0].stamps) // 2)
+            write_figures(folder, results, against, scenes[0], shown, sheet)
     return results
 
 
@@ -193,8 +176,8 @@ class _Test:
     def done_frames(self, conditions: Items[Condition], state: StressState) -> int:
         """The number of frames of these conditions that need not be run again."""
         each = [len(scene.stamps) for scene in self._scenes]
-        finished = sum(_is_done(condition, state) for condition in conditions) * sum(each)
-        kept = next((condition for condition in conditions if not _is_done(condition, state)), None)
+        finished = sum(state.has(condition) for condition in conditions) * sum(each)
+        kept = next((condition for condition in conditions if not state.has(condition)), None)
         if kept is None:
             return finished
         return finished + sum(n for place, n in enumerate(each) if self._boxes_path(kept, place).exists())
@@ -255,10 +238,6 @@ class _Test:
         return SceneBoxes(tuple(predictions), tuple(truths))
 
 
-def _is_done(condition: Condition, state: StressState) -> bool:
-    return any((scores.corruption, scores.severity) == (condition.name, condition.severity) for scores in state.scores)
-
-
 def _in_order(scores: Items[ConditionScores]) -> tuple[ConditionScores, ...]:
     """Clean first, then as in CORRUPTIONS."""
     order = {("clean", ""): -1}
@@ -266,60 +245,3 @@ def _in_order(scores: Items[ConditionScores]) -> tuple[ConditionScores, ...]:
         for severity in corruption.levels:
             order[corruption.name, severity] = len(order)
     return tuple(sorted(scores, key=lambda each: order[each.corruption, each.severity]))
-
-
-def _facts(model: Model, drives: Items[Sequence], options: StressOptions) -> dict[str, str]:
-    """What the results depend on, apart from the conditions."""
-    each = [run_facts(model, drive, options) for drive in drives]
-    facts = dict(each[0])
-    if len(each) > 1:
-        facts |= {name: digest(tuple(one[name] for one in each))[:12] for name in _INPUT_FACTS}
-    return facts | {"drives": ", ".join(drive.name for drive in drives)}
-
-
-def _open_state(folder: RunFolder, facts: dict[str, str]) -> StressState | None:
-    """The state to go on from, None if there is none. Raises OutputError if the test was another one."""
-    path = folder.state_path
-    if not path.exists():
-        return None
-    try:
-        state = load_state(path)
-    except InputError as error:
-        raise OutputError(f"--resume: {error}; pass --force to start anew") from None
-    if not isinstance(state, StressState):
-        raise OutputError(f"--resume: {path}: is not the state of a stress test; pass --force to start anew")
-    check_same_run(folder.path, state.facts, facts)
-    return state
-
-
-def _write_results(folder: RunFolder, results: StressResults, against: StressResults | None) -> None:
-    """Writes stress.json; the file is replaced at once."""
-    path = folder.path / RESULTS
-    folder.add(path)
-    fresh = path.with_name(path.name + ".new")
-    try:
-        fresh.write_text(json.dumps(results.to_dict(against), indent=1) + "\n")
-        os.replace(fresh, path)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
-
-
-def _write_figures(
-    folder: RunFolder,
-    results: StressResults,
-    against: StressResults | None,
-    scene: Sequence,
-    conditions: Items[Condition],
-    options: StressOptions,
-) -> None:
-    """Writes the plot, and a contact sheet of the first scene's middle frame."""
-    from bevcli.evaluation.plots import save_figures  # only plots need matplotlib
-    from bevcli.robustness.report import draw_stress
-
-    place = len(scene.stamps) // 2
-    folder.add(folder.path / SHEET)
-    sheet_options = SheetOptions(options.seed, options.lost_images, place)
-    write_contact_sheet(folder.path / SHEET, scene, conditions, sheet_options)
-    if results.tested():
-        folder.add(folder.path / PLOT)
-        save_figures({PLOT: draw_stress(results, against)}, folder.path)
