@@ -22,6 +22,7 @@ LAYERS = (
     {"pipeline"},
     {"rig", "synth", "engines"},
     {"training", "benchmark", "explain"},
+    {"robustness"},
     {"cli"},
     {"__main__"},
 )

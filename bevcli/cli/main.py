@@ -24,6 +24,7 @@ from bevcli.cli.project_debug import project_debug
 from bevcli.cli.render import render
 from bevcli.cli.run import run
 from bevcli.cli.samples import samples
+from bevcli.cli.stress import stress
 from bevcli.cli.train import train
 from bevcli.cli.validate import validate
 from bevcli.cli.viz import viz
@@ -65,6 +66,7 @@ app.command()(project_debug)
 app.command()(render)
 app.command()(run)
 app.command()(samples)
+app.command()(stress)
 app.command()(train)
 app.command()(validate)
 app.command()(viz)

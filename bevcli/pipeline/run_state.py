@@ -94,14 +94,22 @@ def open_state(folder: RunFolder, facts: Mapping[str, str]) -> RunState | None:
         raise OutputError(f"--resume: {error}; pass --force to start anew") from None
     if not isinstance(state, RunState):
         raise OutputError(f"--resume: {path}: is not the state of a run; pass --force to start anew")
-    names = [name for name in {**state.facts, **facts} if state.facts.get(name) != facts.get(name)]
+    check_same_run(folder.path, state.facts, facts)
+    return state
+
+
+def check_same_run(out: Path, saved: Mapping[str, str], facts: Mapping[str, str]) -> None:
+    """Raises OutputError if a saved run was made of something else than this one.
+
+    saved: the facts of the run in `out`, see `run_facts`. facts: those of the run that wants to go on.
+    """
+    names = [name for name in {**saved, **facts} if saved.get(name) != facts.get(name)]
     if names:
-        pairs = (f"{name}: was {state.facts.get(name)}, is {facts.get(name)}" for name in names)
+        pairs = (f"{name}: was {saved.get(name)}, is {facts.get(name)}" for name in names)
         raise OutputError(
-            f"{folder.path}: --resume: the interrupted run differs from this one ({'; '.join(pairs)}): "
+            f"{out}: --resume: the interrupted run differs from this one ({'; '.join(pairs)}): "
             "pass the same model, options and input, or --force to start anew"
         )
-    return state
 
 
 class StateSaver:
