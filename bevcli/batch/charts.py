@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 WIDTH, HEIGHT = 420, 180
-_LEFT, _RIGHT, _TOP, _BOTTOM = 44, 12, 10, 36
+_LEFT, _RIGHT, _TOP, _BOTTOM = 44, 24, 10, 36
 
 
 def histogram(values: ArrayLike, label: str, bins: int = 24) -> str:
@@ -20,7 +20,7 @@ def histogram(values: ArrayLike, label: str, bins: int = 24) -> str:
         return '<p class="none">no values</p>'
     low, high = float(numbers.min()), float(numbers.max())
     if low == high:
-        low, high = low - 0.5, high + 0.5
+        low, high = (max(low - 0.5, 0) if low >= 0 else low - 0.5), high + 0.5
     counts, edges = np.histogram(numbers, bins, (low, high))
     return bars(counts.tolist(), edges, label)
 

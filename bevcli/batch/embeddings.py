@@ -50,9 +50,10 @@ class FramePooling:
 
     def write(self, folder: Path) -> None:
         """Writes embeddings.safetensors into a folder. Raises OutputError."""
-        vectors = np.array([vector for _, _, vector in self._rows], dtype=np.float32)
-        frames, times = (np.array([row[i] for row in self._rows], dtype=np.int64) for i in range(2))
-        save_state(folder / EMBEDDINGS, Embeddings(frames, times, vectors.reshape(len(frames), -1), self._model))
+        rows = self._rows
+        vectors = np.array([vector for _, _, vector in rows]) if rows else np.zeros((0, 0), dtype=np.float32)
+        frames, times = (np.array([row[i] for row in rows], dtype=np.int64) for i in range(2))
+        save_state(folder / EMBEDDINGS, Embeddings(frames, times, vectors, self._model))
 
 
 def read_embeddings(path: Path) -> Embeddings:

@@ -24,12 +24,16 @@ from bevcli.pipeline.cpu_memory import keep_freed_memory
 
 # Ray Data holds only one line of text per drive in its object store.
 OBJECT_STORE_BYTES = 100 << 20
+# Settings that Ray reads from the environment: no telemetry, no logs on the terminal.
 _ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_DATA_DISABLE_PROGRESS_BARS": "1",
-    "RAY_DEDUP_LOGS": "0",
+    "RAY_DATA_LOG_LEVEL": "CRITICAL",
+    "RAY_BACKEND_LOG_LEVEL": "fatal",
     "OMP_WAIT_POLICY": "PASSIVE",
 }
+# On this machine, Ray's processes then listen on 127.0.0.1 only.
+_LOOPBACK = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
 
 
 @dataclass(frozen=True)
@@ -64,7 +68,9 @@ def run_on_ray(job: Job, job_hash: str, drives: Sequence[Drive], workers: Worker
     """
     if not is_installed():
         raise BevcliError("Ray is not installed: run pip install 'bevcli[ray]', or pass --workers 1")
-    os.environ.update({name: os.environ.get(name, value) for name, value in _ENVIRONMENT.items()})
+    settings = _ENVIRONMENT if workers.address else _ENVIRONMENT | _LOOPBACK
+    for name, value in settings.items():
+        os.environ.setdefault(name, value)
     with _ray(workers) as ray:
         count, threads, gpus = _sizes(ray, job, workers, len(drives))
         if not gpus and job.device == "auto":
@@ -118,6 +124,7 @@ class _RayWorker:
 def _ray(workers: Workers) -> Iterator[Any]:
     """Ray, connected to the cluster or started for this batch: on the loopback interface, without dashboard."""
     import ray
+    import ray._private.worker as ray_worker
     import ray.data
 
     local = {"num_cpus": _cores(), "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
@@ -131,15 +138,15 @@ def _ray(workers: Workers) -> Iterator[Any]:
         raise BevcliError(f"Ray: {where} ({_first_line(error)})") from None
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, on_terminate)  # Ray installs its own handler
-    for name in ("ray", "ray.data"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)
-    context = ray.data.DataContext.get_current()
-    context.enable_progress_bars = False
-    context.print_on_execution_start = False
+    ray.data.DataContext.get_current().enable_progress_bars = False
+    printing = getattr(ray_worker, "print_to_stdstream", None)
+    # Ray prints on stdout that a worker died. The record of its drive says it, if it cannot be run at all.
+    ray_worker.print_to_stdstream = lambda *_, **__: None
     try:
         yield ray
     finally:
         ray.shutdown()
+        ray_worker.print_to_stdstream = printing
 
 
 def _sizes(ray: Any, job: Job, workers: Workers, drives: int) -> tuple[int, int, float]:

@@ -28,18 +28,20 @@ body { font: 15px/1.5 system-ui, sans-serif; margin: 0 auto; padding: 24px; max-
 h1 { font-size: 24px; margin: 0 0 4px; } h2 { font-size: 17px; margin: 32px 0 8px; }
 p { margin: 4px 0; } .soft, .none { color: var(--soft); } .bad { color: var(--bad); }
 a { color: var(--bar); } code { font-size: 13px; }
-.cards { display: grid; grid-template-columns: repeat(auto-fill, minmax(130px, 1fr)); gap: 12px; margin-top: 16px; }
+.cards { display: grid; grid-template-columns: repeat(auto-fill, minmax(116px, 1fr)); gap: 12px; margin-top: 16px; }
 .card { background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: 10px 14px; }
 .card b { display: block; font-size: 22px; font-weight: 600; }
 .charts { display: grid; grid-template-columns: repeat(auto-fill, minmax(320px, 1fr)); gap: 16px; }
 figure { margin: 0; background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: 10px; }
 figcaption { font-weight: 600; margin-bottom: 4px; }
+table.narrow { width: auto; } table.narrow td, table.narrow th { padding-right: 32px; }
 svg rect { fill: var(--bar); } svg line { stroke: var(--soft); } svg text { fill: var(--soft); font-size: 11px; }
 .scroll { overflow-x: auto; } table { border-collapse: collapse; width: 100%; font-size: 14px; }
 th, td { text-align: left; padding: 5px 10px 5px 0; border-bottom: 1px solid var(--line); vertical-align: top; }
 td.number, th.number { text-align: right; font-variant-numeric: tabular-nums; }
-td.text { overflow-wrap: anywhere; } img { max-width: 100%; border-radius: 4px; display: block; }
+td:first-child { white-space: nowrap; } img { max-width: 100%; border-radius: 4px; display: block; }
 """
+_ERROR_TITLES = {"trans_err": "Translation errors", "orient_err": "Orientation errors", "vel_err": "Velocity errors"}
 _ERROR_LABELS = {
     "trans_err": "translation error of a drive, metres",
     "orient_err": "orientation error of a drive, radians",
@@ -107,7 +109,7 @@ def _distributions(done: Sequence[Record]) -> str:
     if scored:
         figures.append(("mAP", histogram(_known(scored, "mean_ap"), "mAP of a drive, classes with ground truth")))
         figures += [
-            (name.removesuffix("_err") + " errors", histogram(_known(scored, name), label))
+            (_ERROR_TITLES[name], histogram(_known(scored, name), label))
             for name, label in _ERROR_LABELS.items()
         ]
     charts = "".join(f"<figure><figcaption>{escape(n)}</figcaption>{svg}</figure>" for n, svg in figures)
@@ -124,7 +126,7 @@ def _classes(done: Sequence[Record]) -> str:
         counts.update(record["boxes_by_class"])
     names = [*CLASSES, *sorted(counts.keys() - set(CLASSES))]
     rows = [(name, f"{counts[name]:,}") for name in names]
-    return f"<h2>Boxes by class</h2>{_table(('class', 'boxes'), rows, numbers=(1,))}"
+    return f"<h2>Boxes by class</h2>{_table(('class', 'boxes'), rows, numbers=(1,), is_narrow=True)}"
 
 
 def worst_drives(done: Sequence[Record]) -> tuple[list[Record], str]:
@@ -161,7 +163,7 @@ def _worst(done: Sequence[Record]) -> str:
         rows.append((*row, f"{link} <code>bevcli viz {escape(path)}</code>"))
     head = ("drive", "mAP", "NDS", "ATE m", "mean score", "missing images, NaN", "frames", "")
     table = _table(head, rows, numbers=range(1, 7), is_html=True)
-    return f'<h2>The {len(worst)} worst drives</h2><p class="soft">{meaning}</p>{table}'
+    return f'<h2>Worst drives</h2><p class="soft">{meaning}</p>{table}'
 
 
 def _errors(failed: Sequence[Record]) -> str:
@@ -171,13 +173,21 @@ def _errors(failed: Sequence[Record]) -> str:
     more = len(failed) - MOST_ERRORS
     note = f'<p class="soft">{more:,} more are in batch.csv</p>' if more > 0 else ""
     table = _table(("drive", "input", "attempts", "error"), rows, numbers=(2,))
-    return f"<h2>Errors</h2><p>{len(failed):,} drives have failed.</p>{table}{note}"
+    return f"<h2>Errors</h2><p>Failed drives: {len(failed):,}</p>{table}{note}"
 
 
 def _table(
-    head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int] = (), *, is_html: bool = False
+    head: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    numbers: Sequence[int] = (),
+    *,
+    is_html: bool = False,
+    is_narrow: bool = False,
 ) -> str:
-    """A table. numbers: columns with numbers. is_html: whether the cells are HTML already."""
+    """A table.
+
+    numbers: columns with numbers. is_html: whether the cells are HTML already. is_narrow: only as wide as its cells.
+    """
 
     def cell(kind: str, place: int, text: str) -> str:
         return f'<{kind} class="{"number" if place in numbers else "text"}">{text}</{kind}>'
@@ -185,7 +195,8 @@ def _table(
     lines = ["".join(cell("th", place, escape(text)) for place, text in enumerate(head))]
     for row in rows:
         lines.append("".join(cell("td", place, text if is_html else escape(text)) for place, text in enumerate(row)))
-    return '<div class="scroll"><table>' + "".join(f"<tr>{line}</tr>" for line in lines) + "</table></div>"
+    kind = "narrow" if is_narrow else "wide"
+    return f'<div class="scroll"><table class="{kind}">' + "".join(f"<tr>{line}</tr>" for line in lines) + "</table></div>"
 
 
 def _number(value: float | None) -> str:
