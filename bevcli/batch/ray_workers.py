@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import importlib
 import importlib.util
 import json
 import logging
@@ -18,7 +19,7 @@ import numpy as np
 
 from bevcli.batch.drives import Drive
 from bevcli.batch.job import Job
-from bevcli.batch.worker import Record, Worker
+from bevcli.batch.worker import Record, Worker, use_threads
 from bevcli.errors import BevcliError
 from bevcli.pipeline.cpu_memory import keep_freed_memory
 
@@ -98,13 +99,10 @@ class _RayWorker:
     """A `Worker` in the form that Ray Data calls: a batch of one drive in, its record out."""
 
     def __init__(self, job: Job, job_hash: str, threads: int) -> None:
-        import cv2
-        import torch
-
         keep_freed_memory()
-        torch.set_num_threads(threads)
-        cv2.setNumThreads(threads)
-        self._worker, self._problem = None, ""
+        use_threads(threads)
+        self._worker: Worker | None = None
+        self._problem = ""
         try:
             self._worker = Worker(job, job_hash)
         except BevcliError as error:  # an exception here would make Ray start the worker again and again
@@ -124,8 +122,9 @@ class _RayWorker:
 def _ray(workers: Workers) -> Iterator[Any]:
     """Ray, connected to the cluster or started for this batch: on the loopback interface, without dashboard."""
     import ray
-    import ray._private.worker as ray_worker
     import ray.data
+
+    ray_worker: Any = importlib.import_module("ray._private.worker")
 
     local = {"num_cpus": _cores(), "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
     local |= {"object_store_memory": OBJECT_STORE_BYTES}
@@ -139,7 +138,7 @@ def _ray(workers: Workers) -> Iterator[Any]:
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, on_terminate)  # Ray installs its own handler
     ray.data.DataContext.get_current().enable_progress_bars = False
-    printing = getattr(ray_worker, "print_to_stdstream", None)
+    printing = ray_worker.print_to_stdstream
     # Ray prints on stdout that a worker died. The record of its drive says it, if it cannot be run at all.
     ray_worker.print_to_stdstream = lambda *_, **__: None
     try:

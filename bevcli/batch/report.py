@@ -109,8 +109,7 @@ def _distributions(done: Sequence[Record]) -> str:
     if scored:
         figures.append(("mAP", histogram(_known(scored, "mean_ap"), "mAP of a drive, classes with ground truth")))
         figures += [
-            (_ERROR_TITLES[name], histogram(_known(scored, name), label))
-            for name, label in _ERROR_LABELS.items()
+            (_ERROR_TITLES[name], histogram(_known(scored, name), label)) for name, label in _ERROR_LABELS.items()
         ]
     charts = "".join(f"<figure><figcaption>{escape(n)}</figcaption>{svg}</figure>" for n, svg in figures)
     return f'<h2>Distributions over drives</h2><div class="charts">{charts}</div>'
@@ -196,7 +195,9 @@ def _table(
     for row in rows:
         lines.append("".join(cell("td", place, text if is_html else escape(text)) for place, text in enumerate(row)))
     kind = "narrow" if is_narrow else "wide"
-    return f'<div class="scroll"><table class="{kind}">' + "".join(f"<tr>{line}</tr>" for line in lines) + "</table></div>"
+    return (
+        f'<div class="scroll"><table class="{kind}">' + "".join(f"<tr>{line}</tr>" for line in lines) + "</table></div>"
+    )
 
 
 def _number(value: float | None) -> str:

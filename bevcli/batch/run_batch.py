@@ -31,7 +31,7 @@ class BatchSummary:
     Attributes:
         records: of all drives that are done or have failed, in the order of the drives.
         drives: number of drives of the batch.
-        skipped: number of drives that were done before.
+        skipped: number of drives that were done or had failed before.
         stopped: whether the batch was stopped before its end.
         files: paths or URLs of the files of the batch.
     """
@@ -54,9 +54,9 @@ class BatchSummary:
         for record in done:
             classes.update(record["boxes_by_class"])
         boxes = ", ".join(f"{count} {name}" for name, count in classes.most_common(4))
-        before = f", {self.skipped} of them before" if self.skipped else ""
+        before = f"; {self.skipped} were done or had failed before" if self.skipped else ""
         rows = [
-            ("drives", f"{len(done)} of {self.drives} done{before}, {self.failed} failed"),
+            ("drives", f"{len(done)} of {self.drives} done, {self.failed} failed{before}"),
             ("frames", str(sum(record["frames"] for record in done))),
             ("boxes", f"{sum(classes.values())}" + (f" ({boxes})" if boxes else "")),
             *(("written", path) for path in self.files),

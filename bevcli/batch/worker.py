@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 
@@ -182,6 +183,12 @@ class Worker:
                 torch.zeros(1, device=self._model.device).cpu()
             except RuntimeError:
                 os._exit(1)
+
+
+def use_threads(count: int) -> None:
+    """Sets the number of CPU threads of this process."""
+    torch.set_num_threads(count)
+    cv2.setNumThreads(count)
 
 
 class _Counts:

@@ -91,7 +91,7 @@ def batch(
         typer.Option(
             min=1,
             metavar="N",
-            help="CPU threads of each worker. Default: cores / workers; 1 on a cluster.",
+            help="CPU threads of each worker. Default: cores / workers, 1 on a cluster; without Ray all cores.",
             rich_help_panel=WORKERS,
             show_default=False,
         ),
@@ -229,6 +229,7 @@ def batch(
     from bevcli.batch.ray_workers import Workers, is_installed
     from bevcli.batch.run_batch import run_batch
     from bevcli.batch.storage import is_url
+    from bevcli.batch.worker import use_threads
     from bevcli.cli.progress import Progress
     from bevcli.pipeline.model_loading import choose_device
     from bevcli.pipeline.run import RunOptions
@@ -259,6 +260,8 @@ def batch(
         evaluate=evaluate,
         retries=retries,
     )
+    if in_this_process and threads is not None:
+        use_threads(threads)
     if ray is None:
         choose_device(device)
     # Loaded here, so that a mistake in the model ends the batch at once. Its hash is needed; only one worker runs it.

@@ -225,6 +225,8 @@ def test_the_hash_of_a_job_follows_model_weights_and_options(fleet, tmp_path):
         replace(job, run=replace(job.run, track=False)),
         replace(job, precision="bf16"),
     ]
-    hashes = [each.hash(model) for each in jobs] + [replace(job, model=str(other)).hash(replace(job, model=str(other)).load_model())]
+    hashes = [each.hash(model) for each in jobs] + [
+        replace(job, model=str(other)).hash(replace(job, model=str(other)).load_model())
+    ]
     assert len(set(hashes)) == 5
     assert replace(job, out="elsewhere", retries=0).hash(model) == job.hash(model)
