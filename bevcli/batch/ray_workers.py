@@ -10,6 +10,7 @@ import json
 import logging
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -131,7 +132,8 @@ def _ray(workers: Workers) -> Iterator[Any]:
     options: dict[str, Any] = {"address": workers.address} if workers.address else {"address": "local", **local}
     on_terminate = signal.getsignal(signal.SIGTERM)
     try:
-        ray.init(log_to_driver=False, logging_level=logging.ERROR, **options)
+        with _without_stderr():
+            ray.init(log_to_driver=False, logging_level=logging.ERROR, **options)
     except Exception as error:  # Ray raises errors of many types where it cannot start or connect
         where = f"the cluster {workers.address} cannot be reached" if workers.address else "cannot be started"
         raise BevcliError(f"Ray: {where} ({_first_line(error)})") from None
@@ -146,6 +148,20 @@ def _ray(workers: Workers) -> Iterator[Any]:
     finally:
         ray.shutdown()
         ray_worker.print_to_stdstream = printing
+
+
+@contextlib.contextmanager
+def _without_stderr() -> Iterator[None]:
+    """Discards what this process writes to stderr: Ray's C++ code reports its log level there."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    try:
+        with open(os.devnull, "wb") as nothing:
+            os.dup2(nothing.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
 
 
 def _sizes(ray: Any, job: Job, workers: Workers, drives: int) -> tuple[int, int, float]:

@@ -72,12 +72,12 @@ def test_the_page_shows_a_thumbnail_of_every_frame(batch):
 
 def test_what_cannot_be_searched_is_named(batch, tmp_path):
     storage = open_storage(str(batch))
-    with pytest.raises(InputError, match="--frame 9: one-.* has no vector of this frame .found frames 0 to 2."):
+    with pytest.raises(InputError, match=r"--frame 9: one-.* has no vector of this frame \(found frames 0 to 2\)"):
         find_like(open_query("one", 9, storage), storage)
     with pytest.raises(InputError, match="nobody: is not a drive of the batch"):
         open_query("nobody", 0, storage)
     query = open_query("one", 0, storage)
-    with pytest.raises(InputError, match="no drive has embeddings.safetensors"):
+    with pytest.raises(InputError, match=r"no drive has embeddings\.safetensors"):
         find_like(query, open_storage(str(tmp_path)))
     result = tmp_path / "drives/x-0"
     result.mkdir(parents=True)

@@ -25,19 +25,19 @@ BATCH = ("batch", "drives/*", "--out", "out", *OPTIONS, "--threads", "1")
 pytestmark = pytest.mark.slow
 
 
+def family_of(pid: int) -> dict[int, str]:
+    """A process and all processes below it, with their command lines."""
+    table = subprocess.run(["ps", "-e", "-o", "pid=,ppid=,args="], capture_output=True, text=True, check=True).stdout
+    rows = [(int(row[0]), int(row[1]), row[2]) for row in (line.split(None, 2) for line in table.splitlines())]
+    family = {pid}
+    while more := {child for child, parent, _ in rows if parent in family} - family:
+        family |= more
+    return {child: args for child, _, args in rows if child in family}
+
+
 def workers_of(process: subprocess.Popen) -> list[int]:
     """The processes of Ray's workers that run drives."""
-    found = subprocess.run(["ps", "-e", "-o", "pid=,args="], capture_output=True, text=True, check=True).stdout
-    own = subprocess.run(["ps", "-e", "-o", "pid=,ppid="], capture_output=True, text=True, check=True).stdout
-    parents = {int(pid): int(parent) for pid, parent in (line.split() for line in own.splitlines())}
-
-    def is_below(pid: int) -> bool:
-        while pid in parents and pid != process.pid:
-            pid = parents[pid]
-        return pid == process.pid
-
-    lines = (line.strip().partition(" ") for line in found.splitlines())
-    return [int(pid) for pid, _, args in lines if "ray::" in args and "MapWorker" in args and is_below(int(pid))]
+    return [pid for pid, args in family_of(process.pid).items() if args.startswith("ray::") and "MapWorker" in args]
 
 
 def wait_for_results(process: subprocess.Popen, out: Path, count: int) -> None:
@@ -217,11 +217,13 @@ def test_a_local_batch_listens_on_this_machine_only(tmp_path):
     process = start(tmp_path, *BATCH, "--workers", "2")
     wait_for_results(process, tmp_path / "out", 1)
     inodes = inodes_below(process.pid)
+    dashboards = [args for args in family_of(process.pid).values() if "dashboard/dashboard.py" in args]
     lines = [line for name in ("tcp", "tcp6") for line in Path("/proc/net", name).read_text().splitlines()[1:]]
     addresses = {line.split()[1].partition(":")[0] for line in lines if listens(line) and line.split()[9] in inodes}
     process.communicate(timeout=200)
     ipv4, mapped, ipv6 = "0100007F", "0000000000000000FFFF00000100007F", "00000000000000000000000001000000"
     assert addresses
+    assert not dashboards
     assert addresses <= {ipv4, mapped, ipv6}  # 127.0.0.1, the same as IPv6, ::1
 
 
@@ -231,13 +233,8 @@ def listens(line: str) -> bool:
 
 def inodes_below(pid: int) -> set[str]:
     """The sockets of a process and of all processes below it."""
-    table = subprocess.run(["ps", "-e", "-o", "pid=,ppid="], capture_output=True, text=True, check=True).stdout
-    pairs = [tuple(map(int, line.split())) for line in table.splitlines()]
-    family = {pid}
-    while more := {child for child, parent in pairs if parent in family} - family:
-        family |= more
     found = set()
-    for member in family:
+    for member in family_of(pid):
         try:
             links = [os.readlink(path) for path in Path(f"/proc/{member}/fd").iterdir()]
         except OSError:
