@@ -3,8 +3,8 @@
 import shutil
 
 import pytest
-from fleet import write_drive
 from sequences.nuscenes_tables import Size, write_tables
+from small_fleet import write_drive
 
 from bevcli.batch.drives import find_drives, read_list
 from bevcli.batch.storage import open_storage

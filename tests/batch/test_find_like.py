@@ -5,9 +5,9 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from fleet import MINI_TOML, make_job, results_of, write_drive
 from memory_drive import MemorySequence
 from recorded_drive import predict
+from small_fleet import MINI_TOML, make_job, results_of, write_drive
 
 from bevcli.batch.drives import find_drives
 from bevcli.batch.embeddings import EMBEDDINGS, FramePooling, read_embeddings

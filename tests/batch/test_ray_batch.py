@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
-from fleet import MINI_TOML, command, results_of, start, write_drive, write_fleet
+from small_fleet import MINI_TOML, command, results_of, start, write_drive, write_fleet
 
 from bevcli.sequences.native.writer import NativeWriter
 from bevcli.sequences.open import open_sequence

@@ -9,7 +9,7 @@ from dataclasses import replace
 import fsspec
 import pyarrow.parquet as pq
 import pytest
-from fleet import MINI_TOML, make_job, results_of, write_drive, write_fleet
+from small_fleet import MINI_TOML, make_job, results_of, write_drive, write_fleet
 
 from bevcli.batch import worker as worker_module
 from bevcli.batch.drives import find_drives

@@ -1,12 +1,7 @@
 """`bevcli batch` and `bevcli find-like` as commands: exit codes, messages and the files that they name."""
 
-import sys
-from pathlib import Path
-
 import pytest
-
-sys.path.append(str(Path(__file__).parents[1] / "batch"))
-from fleet import MINI_TOML, command, make_job, write_fleet
+from small_fleet import MINI_TOML, command, make_job, write_fleet
 
 from bevcli.batch import ray_workers
 from bevcli.batch.ray_workers import Workers, run_on_ray
