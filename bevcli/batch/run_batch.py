@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -111,11 +111,14 @@ def run_batch(
                 out.remove(f"{ATTEMPTS}/{drive.result(job_hash)}.json")
         records, stopped = dict(known), False
         try:
-            for record in _run(job, job_hash, model, pending, workers, should_stop):
-                records[record["result"]] = record
-                after_drive(record)
+            with contextlib.closing(_run(job, job_hash, model, pending, workers, should_stop)) as running:
+                for record in running:
+                    records[record["result"]] = record
+                    after_drive(record)
         except (KeyboardInterrupt, StoppedError):
             stopped = True
+            for name in out.names(ATTEMPTS):  # an attempt that the user ended does not count
+                out.remove(f"{ATTEMPTS}/{name}")
         ordered = [records[name] for name in (drive.result(job_hash) for drive in drives) if name in records]
         files = _write_tables(out, ordered, model)
     return BatchSummary(tuple(ordered), len(drives), len(known), stopped, files)
@@ -128,7 +131,7 @@ def _run(
     drives: Sequence[Drive],
     workers: Workers | None,
     should_stop: Callable[[], bool],
-) -> Iterator[Record]:
+) -> Generator[Record, None, None]:
     if not drives:
         return
     if workers is not None:

@@ -117,6 +117,20 @@ def test_200_drives_with_a_killed_worker_and_a_killed_batch(tmp_path):
             assert (results[name] / file).read_bytes() == (tmp_path / "alone" / name / file).read_bytes(), name
 
 
+def test_ctrl_c_ends_a_batch_and_counts_no_attempt(tmp_path):
+    (tmp_path / "mini.toml").write_text(MINI_TOML)
+    write_fleet(tmp_path / "drives", 40, frames=4)
+    process = start(tmp_path, *BATCH, "--workers", "2")
+    wait_for_results(process, tmp_path / "out", 1)
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=120)
+    assert process.returncode == 130, stderr
+    assert stderr.splitlines()[-1] == "stopped; `--resume` goes on with the drives that are left"
+    assert "Traceback" not in stderr
+    assert not list((tmp_path / "out/.bevcli/attempts").iterdir())
+    assert (tmp_path / "out/batch.parquet").exists()
+
+
 def test_a_drive_that_kills_its_worker_each_time_is_given_up(tmp_path):
     (tmp_path / "mini.toml").write_text(MINI_TOML)
     write_fleet(tmp_path / "drives", 4, frames=2)
