@@ -10,6 +10,7 @@ import json
 import logging
 import os
 import signal
+import socket
 import sys
 import threading
 from collections.abc import Iterator, Sequence
@@ -26,6 +27,7 @@ from bevcli.pipeline.cpu_memory import keep_freed_memory
 
 # Ray Data holds only one line of text per drive in its object store.
 OBJECT_STORE_BYTES = 100 << 20
+CONNECT_S = 15.0  # for the connection to a cluster
 # Settings that Ray reads from the environment: no telemetry, no logs on the terminal.
 _ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",
@@ -127,6 +129,8 @@ def _ray(workers: Workers) -> Iterator[Any]:
 
     ray_worker: Any = importlib.import_module("ray._private.worker")
 
+    if workers.address is not None:
+        _check_reachable(workers.address)
     local = {"num_cpus": _cores(), "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
     local |= {"object_store_memory": OBJECT_STORE_BYTES}
     options: dict[str, Any] = {"address": workers.address} if workers.address else {"address": "local", **local}
@@ -148,6 +152,17 @@ def _ray(workers: Workers) -> Iterator[Any]:
     finally:
         ray.shutdown()
         ray_worker.print_to_stdstream = printing
+
+
+def _check_reachable(address: str) -> None:
+    """Raises BevcliError where nothing listens at HOST:PORT. Ray itself would wait for minutes. "auto" is not checked."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not (host and port.isdecimal()):
+        return
+    try:
+        socket.create_connection((host, int(port)), timeout=CONNECT_S).close()
+    except (OSError, OverflowError) as error:
+        raise BevcliError(f"Ray: the cluster {address} cannot be reached ({_first_line(error)})") from None
 
 
 @contextlib.contextmanager

@@ -162,7 +162,7 @@ def test_a_worker_that_cannot_start_ends_the_batch_with_one_line(tmp_path):
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1].startswith("error: --gpus-per-worker 1: Ray has 0 GPUs")
     shutil.rmtree(tmp_path / "out")
-    done = command(tmp_path, *BATCH, "--ray", "127.0.0.1:1")
+    done = command(tmp_path, *BATCH, "--ray", "127.0.0.1:1")  # nothing listens there
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1].startswith("error: Ray: the cluster 127.0.0.1:1 cannot be reached")
 
