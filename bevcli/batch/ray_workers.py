@@ -155,7 +155,7 @@ def _ray(workers: Workers) -> Iterator[Any]:
 
 
 def _check_reachable(address: str) -> None:
-    """Raises BevcliError where nothing listens at HOST:PORT, for which Ray would wait minutes. "auto" is not checked."""
+    """Raises BevcliError where nothing listens at HOST:PORT; Ray would wait for minutes. "auto" is not checked."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not (host and port.isdecimal()):
         return
