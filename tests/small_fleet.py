@@ -103,8 +103,11 @@ def start(folder: Path, *arguments: str) -> subprocess.Popen:
     )
 
 
-def command(folder: Path, *arguments: str, timeout: float = 120) -> subprocess.CompletedProcess:
+def command(folder: Path, *arguments: str, timeout: float = 300) -> subprocess.CompletedProcess:
     """The finished `bevcli …`."""
     process = start(folder, *arguments)
-    out, err = process.communicate(timeout=timeout)
+    try:
+        out, err = process.communicate(timeout=timeout)
+    finally:
+        process.kill()
     return subprocess.CompletedProcess(process.args, process.returncode, out, err)

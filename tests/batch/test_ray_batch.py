@@ -41,7 +41,7 @@ def workers_of(process: subprocess.Popen) -> list[int]:
 
 
 def wait_for_results(process: subprocess.Popen, out: Path, count: int) -> None:
-    deadline = time.monotonic() + 200
+    deadline = time.monotonic() + 400
     while time.monotonic() < deadline:
         if (out / "drives").is_dir() and len(list((out / "drives").iterdir())) >= count:
             return
@@ -100,7 +100,7 @@ def test_200_drives_with_a_killed_worker_and_a_killed_batch(tmp_path):
     assert {name for name, row in rows.items() if row["error"]} == {"corrupt", "empty"}
     assert not list((tmp_path / "out/.bevcli/attempts").iterdir())
 
-    again = command(tmp_path, *BATCH, "--workers", "2", "--resume", timeout=100)
+    again = command(tmp_path, *BATCH, "--workers", "2", "--resume")
     assert "198 of 200 done, 2 failed; 200 were done or had failed before" in again.stdout
     assert landed(tmp_path / "out") == after
 
@@ -202,6 +202,7 @@ def s3(tmp_path, monkeypatch):
         server.wait(20)
 
 
+@pytest.mark.timeout(1200)
 def test_drives_and_results_in_s3(s3, tmp_path):
     (tmp_path / "mini.toml").write_text(MINI_TOML)
     write_fleet(tmp_path / "drives", 3, frames=2, truth=True)
@@ -234,7 +235,7 @@ def test_a_local_batch_listens_on_this_machine_only(tmp_path):
     dashboards = [args for args in family_of(process.pid).values() if "dashboard/dashboard.py" in args]
     lines = [line for name in ("tcp", "tcp6") for line in Path("/proc/net", name).read_text().splitlines()[1:]]
     addresses = {line.split()[1].partition(":")[0] for line in lines if listens(line) and line.split()[9] in inodes}
-    process.communicate(timeout=200)
+    process.communicate(timeout=400)
     ipv4, mapped, ipv6 = "0100007F", "0000000000000000FFFF00000100007F", "00000000000000000000000001000000"
     assert addresses
     assert not dashboards
