@@ -207,11 +207,23 @@ def test_drives_and_results_in_s3(s3, tmp_path):
     (tmp_path / "mini.toml").write_text(MINI_TOML)
     write_fleet(tmp_path / "drives", 3, frames=2, truth=True)
     s3.put(str(tmp_path / "drives") + "/", "fleet/drives/", recursive=True)
-    arguments = ("batch", "s3://fleet/drives/*", "--out", "s3://fleet/out", *OPTIONS, "--workers", "2")
+    arguments = (
+        "batch",
+        "s3://fleet/drives/*",
+        "--out",
+        "s3://fleet/out",
+        *OPTIONS,
+        "--workers",
+        "2",
+        "--threads",
+        "1",
+    )
     arguments += ("--eval", "--embed")
     done = command(tmp_path, *arguments)
     assert done.returncode == 0, done.stderr
-    local = command(tmp_path, "batch", "drives/*", "--out", "out", *OPTIONS, "--workers", "1", "--eval")
+    local = command(
+        tmp_path, "batch", "drives/*", "--out", "out", *OPTIONS, "--workers", "1", "--threads", "1", "--eval"
+    )
     assert local.returncode == 0, local.stderr
     s3.invalidate_cache()
     remote = {path.rpartition("/")[2].rpartition("-")[0]: path for path in s3.ls("fleet/out/drives", detail=False)}
