@@ -20,7 +20,7 @@ LAYERS = (
     {"recording"},
     {"viewer"},
     {"pipeline"},
-    {"rig", "synth", "engines"},
+    {"rig", "synth", "engines", "batch"},
     {"training", "benchmark", "explain"},
     {"robustness"},
     {"cli"},

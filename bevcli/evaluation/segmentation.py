@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
@@ -16,12 +17,19 @@ class SegmentationScores:
     """The scores of maps.
 
     Attributes:
-        iou: by class, 0 to 1; NaN where neither predictions nor ground truth have the class.
+        intersection: by class, cells that have the class in prediction and ground truth, over all maps.
+        union: by class, cells that have it in prediction or ground truth, over all maps.
         frame_count: number of pairs of maps.
     """
 
-    iou: Mapping[str, float]
+    intersection: Mapping[str, float]
+    union: Mapping[str, float]
     frame_count: int
+
+    @property
+    def iou(self) -> dict[str, float]:
+        """By class, 0 to 1; NaN where neither predictions nor ground truth have the class."""
+        return {name: self.intersection[name] / union if union else math.nan for name, union in self.union.items()}
 
 
 def evaluate_segmentation(
@@ -42,8 +50,8 @@ def evaluate_segmentation(
         intersection += (found_is & true_is).sum(axis=0)
         union += (found_is | true_is).sum(axis=0)
         count += 1
-    iou = {name: float(i / u) if u else float("nan") for name, i, u in zip(names, intersection, union, strict=True)}
-    return SegmentationScores(iou, count)
+    both, either = (dict(zip(names, counts.tolist(), strict=True)) for counts in (intersection, union))
+    return SegmentationScores(both, either, count)
 
 
 def _bits(bev_map: BevMap, names: tuple[str, ...]) -> NDArray[np.uint8]:

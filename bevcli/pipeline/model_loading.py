@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -59,6 +60,20 @@ class Model:
     def untrained(self) -> bool:
         """Whether the weights are random: boxes and maps are then meaningless."""
         return self.weights is None
+
+    @cached_property
+    def config_hash(self) -> str:
+        """SHA-256 of the configurations of network and tracker."""
+        return hashlib.sha256(repr((self.config, self.tracker)).encode()).hexdigest()
+
+    @cached_property
+    def weights_hash(self) -> str:
+        """SHA-256 of names, types, shapes and values of all weights."""
+        found = hashlib.sha256()
+        for name, tensor in self.network.state_dict().items():
+            found.update(f"{name}{tensor.dtype}{list(tensor.shape)}".encode())
+            found.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
+        return found.hexdigest()
 
     @cached_property
     def prepared(self) -> BEVFormerBase:

@@ -64,14 +64,10 @@ def run_facts(model: Model, sequence: Sequence, options: object) -> dict[str, st
 
     options: the dataclass of the run's options; each of its fields is a fact.
     """
-    weights = hashlib.sha256()
-    for name, tensor in model.network.state_dict().items():
-        weights.update(f"{name}{tensor.dtype}{list(tensor.shape)}".encode())
-        weights.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
     return {
         "version of bevcli": __version__,
-        "model": f"{model.name}, {_short(hashlib.sha256(repr((model.config, model.tracker)).encode()).hexdigest())}",
-        "weights": f"{model.weights or 'random'}, {_short(weights.hexdigest())}",
+        "model": f"{model.name}, {_short(model.config_hash)}",
+        "weights": f"{model.weights or 'random'}, {_short(model.weights_hash)}",
         "device": model.device.type,
         "precision": model.precision,
         **{f"option {name.replace('_', '-')}": repr(value) for name, value in vars(options).items()},
