@@ -9,7 +9,7 @@ ROOT = Path(bevcli.__file__).parent
 # From the lowest to the highest; names in one set may not import each other.
 LAYERS = (
     {"duration", "errors", "findings"},
-    {"parsing", "jit"},
+    {"parsing", "jit", "waiting"},
     {"geometry"},
     {"frame"},
     {"model"},
@@ -21,8 +21,9 @@ LAYERS = (
     {"recording"},
     {"viewer"},
     {"pipeline"},
-    {"rig", "synth"},
+    {"rig", "synth", "batch"},
     {"training", "benchmark", "explain"},
+    {"robustness"},
     {"cli"},
     {"__main__"},
 )

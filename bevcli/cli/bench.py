@@ -15,7 +15,7 @@ def bench(
         str,
         typer.Option(
             autocompletion=complete_model,
-            help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, a FILE.toml or a FILE.onnx.",
+            help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, uniad-track-map, a FILE.toml or a FILE.onnx.",
         ),
     ] = "tiny",
     device: DeviceOption = "auto",
