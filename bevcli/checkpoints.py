@@ -14,8 +14,8 @@ from torch import Tensor
 from bevcli.config import known_models, load_config
 from bevcli.errors import WeightsError
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
-from bevcli.model.bevformer_v2 import build_model
-from bevcli.model.official_keys import from_official, is_official
+from bevcli.model.build import build_model
+from bevcli.model.official_keys import from_official, is_official, unused_keys
 from bevcli.parsing.pickles import Placeholder
 from bevcli.parsing.pth import StoredTensor, read_pth
 from bevcli.parsing.safetensors_file import read_safetensors
@@ -189,7 +189,10 @@ def read_checkpoint(path: Path) -> Checkpoint:
     _check_numbers(path, state)
     if not is_official(state):
         return Checkpoint(path, state, official=False, facts=facts, not_read=not_read)
+    unused = unused_keys(state)
     state, left_out = _without_training_parts(from_official(state))
+    if unused:
+        left_out = f"{len(unused)} keys, such as {unused[0]}"
     return Checkpoint(path, state, official=True, facts=facts, left_out=left_out, not_read=not_read)
 
 

@@ -20,8 +20,9 @@ LAYERS = (
     {"recording"},
     {"viewer"},
     {"pipeline"},
-    {"rig", "synth", "engines"},
+    {"rig", "synth", "engines", "batch"},
     {"training", "benchmark", "explain"},
+    {"robustness"},
     {"cli"},
     {"__main__"},
 )

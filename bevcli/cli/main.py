@@ -13,6 +13,7 @@ from typing import Annotated
 import typer
 
 from bevcli import __version__
+from bevcli.cli.batch import batch
 from bevcli.cli.bench import bench
 from bevcli.cli.convert import convert
 from bevcli.cli.demo import demo
@@ -20,10 +21,12 @@ from bevcli.cli.eval import evaluate
 from bevcli.cli.explain import explain
 from bevcli.cli.export import export
 from bevcli.cli.export_onnx import export_onnx
+from bevcli.cli.find_like import find_like
 from bevcli.cli.project_debug import project_debug
 from bevcli.cli.render import render
 from bevcli.cli.run import run
 from bevcli.cli.samples import samples
+from bevcli.cli.stress import stress
 from bevcli.cli.train import train
 from bevcli.cli.validate import validate
 from bevcli.cli.viz import viz
@@ -54,6 +57,7 @@ def root(
     """Run BEVFormer on sequences from any camera rig, and look at the results."""
 
 
+app.command()(batch)
 app.command()(bench)
 app.command()(convert)
 app.command()(demo)
@@ -61,10 +65,12 @@ app.command("eval")(evaluate)
 app.command()(explain)
 app.command()(export)
 app.command()(export_onnx)
+app.command()(find_like)
 app.command()(project_debug)
 app.command()(render)
 app.command()(run)
 app.command()(samples)
+app.command()(stress)
 app.command()(train)
 app.command()(validate)
 app.command()(viz)

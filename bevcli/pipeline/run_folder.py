@@ -112,10 +112,28 @@ class RunFolder:
 
     def _unlock(self) -> None:
         if self._lock is not None:
-            with contextlib.suppress(OSError):
-                os.unlink(self._lock.name)
-            self._lock.close()
+            _release(self._lock)
             self._lock = None
+
+
+@contextlib.contextmanager
+def folder_lock(out: Path) -> Iterator[None]:
+    """Locks a folder, made if it is missing, against other runs. Raises OutputError where it is locked already."""
+    try:
+        (out / OWN).mkdir(parents=True, exist_ok=True)
+        lock = _locked(out / OWN / "lock", out)
+    except OSError as error:
+        raise OutputError(f"{out}: cannot be written ({error.strerror})") from None
+    try:
+        yield
+    finally:
+        _release(lock)
+
+
+def _release(lock: IO[str]) -> None:
+    with contextlib.suppress(OSError):
+        os.unlink(lock.name)
+    lock.close()
 
 
 def _locked(path: Path, out: Path) -> IO[str]:

@@ -161,15 +161,13 @@ class Recording:
     def __enter__(self) -> Recording:
         mesh = self.options.vehicle_mesh
         vehicle = None if mesh is None else load_vehicle(mesh)
-        grid, segmentation = (
-            self._config.bev_grid,
-            "segmentation" in self._config.heads and self.options.shows_internals,
-        )
-        legend = legend_entries(self.class_names, with_map=segmentation)
+        grid = self._config.bev_grid
+        map_classes = self._config.map_classes if self.options.shows_internals else ()
+        legend = legend_entries(self.class_names, map_classes)
         facts = LayoutFacts(
             note=self.note,
             probes=bool(self.options.probes),
-            segmentation=segmentation,
+            segmentation=bool(map_classes),
             rate_hz=self._rate_hz,
             on_earth=self._geo_origin is not None,
             legend_entries=len(legend),
@@ -183,7 +181,14 @@ class Recording:
         names, untrained = self.class_names, self.untrained
         log_static.log_scene(self._stream, self.rig, names, vehicle, grid)
         log_static.log_about(
-            self._stream, self.title, self.rig, names, self.options, untrained=untrained, note=self.note
+            self._stream,
+            self.title,
+            self.rig,
+            names,
+            self.options,
+            map_classes=map_classes,
+            untrained=untrained,
+            note=self.note,
         )
         log_legend(self._stream, legend)
         if self._resume is not None:
