@@ -14,6 +14,7 @@ import torch
 from bevcli import __version__
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import Sequence
+from bevcli.parsing.files import read_bytes
 from bevcli.pipeline.model_loading import Model
 from bevcli.pipeline.run_files import FilesState
 from bevcli.pipeline.run_folder import RunFolder
@@ -63,14 +64,10 @@ def run_facts(model: Model, sequence: Sequence, options: object) -> dict[str, st
 
     options: the dataclass of the run's options; each of its fields is a fact.
     """
-    weights = hashlib.sha256()
-    for name, tensor in model.network.state_dict().items():
-        weights.update(f"{name}{tensor.dtype}{list(tensor.shape)}".encode())
-        weights.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
     return {
         "version of bevcli": __version__,
-        "model": f"{model.name}, {_short(hashlib.sha256(repr((model.config, model.tracker)).encode()).hexdigest())}",
-        "weights": f"{model.weights or 'random'}, {_short(weights.hexdigest())}",
+        "model": f"{model.name}, {_short(model.config_hash)}",
+        "weights": f"{model.weights or 'random'}, {_short(model.weights_hash)}",
         "device": model.device.type,
         "precision": model.precision,
         **{f"option {name.replace('_', '-')}": repr(value) for name, value in vars(options).items()},
@@ -155,9 +152,11 @@ def _file_facts(path: Path) -> tuple[str, int, str]:
         facts = path.stat()
         if facts.st_size > HASHED_BYTES:
             return path.name, facts.st_size, str(facts.st_mtime_ns)
-        return path.name, facts.st_size, hashlib.sha256(path.read_bytes()).hexdigest()
+        return path.name, facts.st_size, hashlib.sha256(read_bytes(path, HASHED_BYTES)).hexdigest()
     except OSError as error:
         return path.name, -1, str(error.strerror)
+    except InputError as error:
+        return path.name, -1, str(error)
 
 
 def _short(hexdigest: str) -> str:
