@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.bev_queries import BevQueries
+from bevcli.model.calibration_embedding import CalibrationEmbedding
 from bevcli.model.decoder import Decoder, DecoderConfig, DetectionHead
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.ego_motion import EgoMotionConfig, rotate_history
@@ -66,6 +67,20 @@ class ImageConfig:
 
 
 @dataclass(frozen=True)
+class BevFrameConfig:
+    """The bev frame that a model was trained in, relative to the ego frame, whose origin is on the ground.
+
+    Attributes:
+        level: whether the z axis of the bev frame must be vertical. The bev frame of every drive is then replaced by a
+            level one with the same heading and origin, at the height `height_m`. If false, the drive's is used.
+        height_m: height of the origin above the ground, metres; nuScenes' LIDAR_TOP has 1.84.
+    """
+
+    level: bool = False
+    height_m: float = 1.84
+
+
+@dataclass(frozen=True)
 class BEVFormerConfig:
     """A whole model. `bevcli.config.load_config` reads it from a TOML file.
 
@@ -75,6 +90,7 @@ class BEVFormerConfig:
         cameras: names of the camera embeddings, in their order.
         image: how images become the network's input.
         bev_grid: the cells of the BEV map and their pillars.
+        bev_frame: the frame in which the grid lies.
         rate_hz: frame rate of the training data.
         max_gap_s: after a longer time between two frames the history is dropped.
         channels: C, of all tokens and queries.
@@ -93,6 +109,7 @@ class BEVFormerConfig:
     cameras: tuple[str, ...]
     image: ImageConfig
     bev_grid: BevGrid
+    bev_frame: BevFrameConfig = field(default_factory=BevFrameConfig)
     rate_hz: float = 2.0
     max_gap_s: float = 2.0
     channels: int = 256
@@ -144,7 +161,7 @@ class BEVFormerInputs:
     Attributes:
         images: (B, N, 3, H, W), normalised and padded.
         image_from_bev: (B, N, 4, 4) float32, bev metres to pixels of the network's input (rows u·d, v·d, d, 1).
-        camera_index: (N,) int64, the camera embedding of each image.
+        camera_index: (N,) int64, the camera embedding of each image; (B, N) where the sequences differ.
         has_image: (B, N) bool; a camera without an image sees no BEV cell.
         can_bus: (B, 18) float32, the translation and the change of heading since the previous frame included.
         shift: (B, 2) float32, translation of the history (x, y) in normalised BEV coordinates; zero without history.
@@ -198,6 +215,8 @@ class BEVFormerBase(nn.Module):
         self.backbone = ResNet(config.backbone)
         self.neck = FPN(config.backbone.output_channels(), channels, config.neck)
         self.image_tokens = ImageTokens(len(config.cameras), channels, config.image_tokens)
+        embeds_rays = config.image_tokens.calibration_embedding
+        self.calibration_embedding = CalibrationEmbedding(channels, config.bev_frame.height_m) if embeds_rays else None
         self.bev_queries = BevQueries(grid, channels, config.ego_motion.can_bus)
         self.pillars = Pillars(grid)
         self.encoder = Encoder(config.encoder, channels, levels, grid, config.ego_motion.history_shift)
@@ -211,7 +230,7 @@ class BEVFormerBase(nn.Module):
 
         Args:
             images: (B, N, 3, H, W), normalised and padded.
-            camera_index: (N,) int64, the camera embedding of each image.
+            camera_index: (N,) or (B, N) int64, the camera embedding of each image.
         """
         feature_maps = self.neck(self.backbone(images.flatten(0, 1)))
         return self.image_tokens(feature_maps[: self.config.encoder_levels], camera_index)
@@ -237,6 +256,8 @@ class BEVFormer(BEVFormerBase):
     def bev_map(self, inputs: BEVFormerInputs, history: Tensor | None) -> Tensor:
         """The BEV map (B, Y·X, C): the part of `forward` before the decoder and the heads."""
         image_features = self.image_features(inputs.images, inputs.camera_index)
+        if self.calibration_embedding is not None:
+            image_features = self.calibration_embedding(image_features, inputs.image_from_bev, inputs.image_size)
         return self.encoder(
             bev_query=self.bev_queries(inputs.can_bus),
             position=self.bev_queries.position(),

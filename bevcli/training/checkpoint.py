@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import safetensors.torch
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from bevcli.errors import OutputError, WeightsError
 from bevcli.model.bevformer import BEVFormerBase
@@ -19,18 +19,32 @@ FORMAT = "bevcli-training/1"
 _DAMAGE = (pickle.UnpicklingError, RuntimeError, ValueError, LookupError, TypeError, AttributeError, EOFError)
 
 
-def save_checkpoint(path: Path, step: int, trained: nn.Module, optimizer: torch.optim.AdamW) -> None:
+def save_checkpoint(
+    path: Path,
+    step: int,
+    trained: nn.Module,
+    optimizer: torch.optim.AdamW,
+    average: Mapping[str, Tensor] | None = None,
+) -> None:
     """Writes what is needed to resume after `step` steps. Random numbers are drawn from seed and step, not stored.
 
     Args:
         trained: the model and its auxiliary heads.
+        average: the running average of the model's weights, None without one.
     """
     contents = {"format": FORMAT, "step": step, "model": trained.state_dict(), "optimizer": optimizer.state_dict()}
+    if average is not None:
+        contents["average"] = dict(average)
     replace_file(path, lambda unfinished: torch.save(contents, unfinished))
 
 
-def load_checkpoint(path: Path, trained: nn.Module, optimizer: torch.optim.AdamW) -> int:
-    """Restores model, auxiliary heads and optimizer; returns the number of steps done. Raises WeightsError."""
+def load_checkpoint(
+    path: Path, trained: nn.Module, optimizer: torch.optim.AdamW, average: dict[str, Tensor] | None = None
+) -> int:
+    """Restores model, auxiliary heads, optimizer and, in place, the running average of the weights.
+
+    Returns the number of steps done. Raises WeightsError.
+    """
     try:
         contents = torch.load(path, map_location="cpu", weights_only=True)
         if contents["format"] != FORMAT:
@@ -42,6 +56,8 @@ def load_checkpoint(path: Path, trained: nn.Module, optimizer: torch.optim.AdamW
             )
         trained.load_state_dict(contents["model"])
         optimizer.load_state_dict(contents["optimizer"])
+        for key, value in {} if average is None else average.items():
+            value.copy_(contents["average"][key])
         return int(contents["step"])
     except FileNotFoundError:
         raise WeightsError(f"{path}: no checkpoint to resume from; leave out --resume to start a training") from None
