@@ -81,6 +81,30 @@ class BevFrameConfig:
 
 
 @dataclass(frozen=True)
+class TrainingRigsConfig:
+    """The rigs that a model's weights were trained on. It changes no result: a drive's rig is compared with it.
+
+    Attributes:
+        cameras: smallest and largest number of cameras; 0 and 0 where the rigs are not known.
+        fov_deg: smallest and largest horizontal field of view.
+        height_m: smallest and largest height of a camera above the ground.
+        tilt_deg: largest pitch or roll of a camera.
+        cost: what other rigs were measured to cost, in words.
+    """
+
+    cameras: tuple[int, int] = (0, 0)
+    fov_deg: tuple[float, float] = (0.0, 180.0)
+    height_m: tuple[float, float] = (0.0, 10.0)
+    tilt_deg: float = 90.0
+    cost: str = ""
+
+    @property
+    def known(self) -> bool:
+        """Whether the model's file states the rigs."""
+        return self.cameras[1] > 0
+
+
+@dataclass(frozen=True)
 class BEVFormerConfig:
     """A whole model. `bevcli.config.load_config` reads it from a TOML file.
 
@@ -91,6 +115,7 @@ class BEVFormerConfig:
         image: how images become the network's input.
         bev_grid: the cells of the BEV map and their pillars.
         bev_frame: the frame in which the grid lies.
+        training_rigs: the rigs that the weights were trained on.
         rate_hz: frame rate of the training data.
         max_gap_s: after a longer time between two frames the history is dropped.
         channels: C, of all tokens and queries.
@@ -110,6 +135,7 @@ class BEVFormerConfig:
     image: ImageConfig
     bev_grid: BevGrid
     bev_frame: BevFrameConfig = field(default_factory=BevFrameConfig)
+    training_rigs: TrainingRigsConfig = field(default_factory=TrainingRigsConfig)
     rate_hz: float = 2.0
     max_gap_s: float = 2.0
     channels: int = 256

@@ -19,9 +19,9 @@ class CalibrationEmbedding(nn.Module):
     """Scales and shifts every image feature by functions of its viewing ray.
 
     A small network sees the ray of the feature in the bev frame, the camera's position, its focal length in cells of
-    the feature map, and the depth at which the ray meets the ground. With these the model can turn the size of an object
-    in the image into a distance, for any camera. BEVDepth's camera-aware depth network and PETR's position embedding of
-    rays have the same purpose. The last layer starts at zero, so that an untrained embedding changes nothing.
+    the feature map, and the depth at which the ray meets the ground. With these the model can turn the size of an
+    object in the image into a distance, for any camera. BEVDepth's camera-aware depth network and PETR's position
+    embedding of rays have the same purpose. The last layer starts at zero: an untrained embedding changes nothing.
     """
 
     def __init__(self, channels: int, height_m: float) -> None:

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from bevcli.errors import OutputError, WeightsError
 from bevcli.model.bevformer import BEVFormerBase
+from bevcli.pipeline.training_rigs import weights_facts
 
 FORMAT = "bevcli-training/1"
 # The exceptions for a file that PyTorch cannot read, or whose contents belong to another model.
@@ -67,12 +68,12 @@ def load_checkpoint(
 
 
 def save_weights(path: Path, model: BEVFormerBase, dtype: torch.dtype) -> None:
-    """Writes the model's weights as .safetensors, for `bevcli run --weights`."""
+    """Writes the model's weights as .safetensors, for `bevcli run --weights`, with the frame and rigs they expect."""
     state = {
         key: (tensor.to(dtype) if tensor.is_floating_point() else tensor).contiguous().cpu()
         for key, tensor in model.state_dict().items()
     }
-    replace_file(path, lambda unfinished: safetensors.torch.save_file(state, unfinished, {"model": model.config.name}))
+    replace_file(path, lambda unfinished: safetensors.torch.save_file(state, unfinished, weights_facts(model.config)))
 
 
 def replace_file(path: Path, write: Callable[[Path], object]) -> None:
