@@ -105,8 +105,14 @@ def network_from_image(camera: Camera, image: ImageConfig) -> Array:
     scale = network_scale(camera, image)
     left, top = image.crop_box[:2]
     matrix = np.diag([scale, scale, 1.0, 1.0])
-    matrix[:2, 2] = -left, -top
+    shift = resize_shift(scale, image)
+    matrix[:2, 2] = shift - left, shift - top
     return matrix
+
+
+def resize_shift(scale: float, image: ImageConfig) -> float:
+    """Pixels of the resized image that are added to the scaled pixel coordinates, see `ImageConfig.half_pixel_shift`."""
+    return (scale - 1) / 2 if image.half_pixel_shift else 0.0
 
 
 def write_network_image(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: NDArray[np.float32]) -> None:
