@@ -111,7 +111,7 @@ def network_from_image(camera: Camera, image: ImageConfig) -> Array:
 
 
 def resize_shift(scale: float, image: ImageConfig) -> float:
-    """Pixels of the resized image that are added to the scaled pixel coordinates, see `ImageConfig.half_pixel_shift`."""
+    """Pixels of the resized image that are added to scaled pixel coordinates: see `ImageConfig.half_pixel_shift`."""
     return (scale - 1) / 2 if image.half_pixel_shift else 0.0
 
 
