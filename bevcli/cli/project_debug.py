@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -49,6 +50,7 @@ def project_debug(
     from bevcli.config import load_config
     from bevcli.pipeline.training_rigs import rig_notes
     from bevcli.rig.check_calibration import check_calibration
+    from bevcli.rig.report_text import INDENT, WIDTH
 
     options: dict[str, Any] = {"topics": parse_topics(topic), "topics_file": topics} if topic or topics else {}
     check = check_calibration(calibration, sequence, frame, allow_outside=allow_outside, **options)
@@ -56,7 +58,10 @@ def project_debug(
     if json:
         print(check.to_json())
     else:
-        notes = [f"model {model}: {note}" for note in rig_notes(check.rig, load_config(model))]
+        notes = [
+            textwrap.fill(f"Model {model}: {note}.", WIDTH, subsequent_indent=INDENT) + "\n"
+            for note in rig_notes(check.rig, load_config(model))
+        ]
         print(check.text(), "", *notes, "Written: " + ", ".join(map(str, written)), sep="\n")
     if check.errors:
         raise typer.Exit(ERRORS_FOUND)
