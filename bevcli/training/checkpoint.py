@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pickle
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -13,11 +12,12 @@ from torch import Tensor, nn
 
 from bevcli.errors import OutputError, WeightsError
 from bevcli.model.bevformer import BEVFormerBase
+from bevcli.parsing.pth import read_pth
 from bevcli.pipeline.training_rigs import weights_facts
 
 FORMAT = "bevcli-training/1"
-# The exceptions for a file that PyTorch cannot read, or whose contents belong to another model.
-_DAMAGE = (pickle.UnpicklingError, RuntimeError, ValueError, LookupError, TypeError, AttributeError, EOFError)
+# What PyTorch raises for contents that belong to another model.
+_DAMAGE = (RuntimeError, ValueError, LookupError, TypeError, AttributeError, OverflowError)
 
 
 def save_checkpoint(
@@ -46,8 +46,13 @@ def load_checkpoint(
 
     Returns the number of steps done. Raises WeightsError.
     """
+    if not path.exists():
+        raise WeightsError(f"{path}: no checkpoint to resume from; leave out --resume to start a training")
+    file = read_pth(path)
+    if file.left_out:
+        raise WeightsError(f"{path}: is not a checkpoint of this model: it holds objects ({file.left_out[0]:.100})")
     try:
-        contents = torch.load(path, map_location="cpu", weights_only=True)
+        contents = file.with_tensors()
         if contents["format"] != FORMAT:
             raise WeightsError(f'{path}: "format" must be "{FORMAT}", found {contents["format"]!r}')
         if any(key.startswith("picture_reader.") for key in contents["model"]):
@@ -60,8 +65,6 @@ def load_checkpoint(
         for key, value in {} if average is None else average.items():
             value.copy_(contents["average"][key])
         return int(contents["step"])
-    except FileNotFoundError:
-        raise WeightsError(f"{path}: no checkpoint to resume from; leave out --resume to start a training") from None
     except _DAMAGE as error:
         reason = " ".join(line.strip() for line in str(error).split("\n")[:2])
         raise WeightsError(f"{path}: is not a checkpoint of this model: {reason}") from error

@@ -14,7 +14,9 @@ from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import ConfigError, OutputError
 from bevcli.geometry.cameras import CameraRig
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
-from bevcli.model.bevformer_v2 import BEVFormerV2Config, build_model
+from bevcli.model.bevformer_v2 import BEVFormerV2Config
+from bevcli.model.build import build_model
+from bevcli.model.uniad import UniADConfig
 from bevcli.synth.random_rig import RigDistribution
 from bevcli.synth.rig import rig_for_rendering
 from bevcli.training.augmentation import AugmentationConfig
@@ -147,7 +149,9 @@ def rig_for_drives(choice: str, model: str) -> CameraRig | RigDistribution:
 
 
 def check_window(model: BEVFormerConfig, config: TrainingConfig) -> None:
-    """Raises ConfigError if clips cannot fill the window of a BEVFormerV2."""
+    """Raises ConfigError if clips cannot fill the window of a BEVFormerV2, and for a UniAD."""
+    if isinstance(model, UniADConfig):
+        raise ConfigError(f"{model.name}: a UniAD cannot be trained; expected a BEVFormer, such as tiny, small or base")
     if not isinstance(model, BEVFormerV2Config):
         return
     if model.later_frames:

@@ -16,7 +16,7 @@ from bevcli.config import load_config
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev, level_rig
 from bevcli.geometry.transforms import Array, rigid
 from bevcli.model.bevformer import BevFrameConfig
-from bevcli.model.bevformer_v2 import build_model
+from bevcli.model.build import build_model
 from bevcli.pipeline.preprocess import Preprocessor
 from bevcli.pipeline.runner import Runner
 from bevcli.pipeline.training_rigs import facts_note, rig_notes, weights_facts
