@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -13,10 +14,12 @@ import torch
 from bevcli.checkpoints import bundled_weights, inspect, load_weights
 from bevcli.config import TRACKING, known_models, load_config, load_table
 from bevcli.errors import BevcliError, WeightsError
+from bevcli.geometry.cameras import CameraRig
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
 from bevcli.model.build import build_model
 from bevcli.model.prepared import Precision, prepare_for_inference
 from bevcli.pipeline.tracking import TrackerConfig
+from bevcli.pipeline.training_rigs import facts_note, rig_notes
 
 DEFAULT_MODEL = "demo"
 UNTRAINED_SEED = 0  # two untrained runs of one drive agree
@@ -35,6 +38,7 @@ class Model:
         left_out: what of that file is for training only and was left out; "" for nothing.
         tracker: the parameters of the tracker, the table [tracking] of the model's TOML file.
         not_read: classes and functions in the weights file whose objects were not read.
+        facts: metadata in the weights file.
     """
 
     network: BEVFormerBase
@@ -45,6 +49,7 @@ class Model:
     left_out: str = ""
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     not_read: tuple[str, ...] = ()
+    facts: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def config(self) -> BEVFormerConfig:
@@ -60,6 +65,13 @@ class Model:
     def untrained(self) -> bool:
         """Whether the weights are random: boxes and maps are then meaningless."""
         return self.weights is None
+
+    def rig_notes(self, rig: CameraRig) -> tuple[str, ...]:
+        """What of a rig is far from the training of the weights, one line each; nothing for random weights."""
+        if self.untrained:
+            return ()
+        stated = facts_note(self.facts, self.config)
+        return (*([stated] if stated else []), *rig_notes(rig, self.config))
 
     @cached_property
     def config_hash(self) -> str:
@@ -134,6 +146,7 @@ def load_model(
         left_out="" if loaded is None else loaded.left_out,
         tracker=tracker,
         not_read=() if loaded is None else loaded.not_read,
+        facts={} if loaded is None else loaded.facts,
     )
 
 
