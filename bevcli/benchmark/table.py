@@ -50,7 +50,7 @@ def write_table(path: Path, device: torch.device, frames: int) -> None:
 
 def _measure(model: str, precision: str, device: torch.device, frames: int) -> dict[str, Any]:
     print(f"measuring {model}, {precision} …", file=sys.stderr)
-    options = ["--model", model, "--precision", precision, "--device", device.type, "--frames", str(frames)]
+    options = ["--model", model, "--precision", precision, "--device", str(device), "--frames", str(frames)]
     command = [sys.executable, "-m", "bevcli", "bench", *options, "--against", "plain", "--json"]
     # In a separate process, so that its peak memory is that of this model.
     answer = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)

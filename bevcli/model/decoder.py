@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.deformable_attention import DeformableAttention, sampling_locations
+from bevcli.model.deformable_attention import DeformableAttention
 from bevcli.model.feed_forward import FeedForward
 
 BOX_CODE_SIZE = 10
@@ -127,7 +127,8 @@ class DecoderLayer(nn.Module):
     def _attend_to_bev(self, query: Tensor, reference_points: Tensor, bev: Tensor) -> Tensor:
         batch, queries, _ = query.shape
         offsets, weights = self.cross_attention.predict(query)  # (B, Q, heads, 1, 1, P, 2)
-        locations = sampling_locations(reference_points[:, :, None, None, None], offsets[:, :, :, 0], self.level_shapes)
+        reference = reference_points[:, :, None, None, None]
+        locations = self.cross_attention.locations(reference, offsets[:, :, :, 0], self.level_shapes)
         sampled = self.cross_attention.sample(
             bev, self.level_shapes, locations.flatten(0, 1), weights[:, :, :, 0].flatten(0, 1), [queries] * batch
         )
@@ -162,7 +163,8 @@ class DetectionHead(nn.Module):
         """
         logits = self.class_branches[layer](query)
         code = self.box_branches[layer](query).float()
-        moved = code[..., [0, 1, 4]] + inverse_sigmoid(reference_points)
+        # Slices: a list of indices would be uploaded to a GPU, which waits for it.
+        moved = torch.cat([code[..., :2], code[..., 4:5]], dim=-1) + inverse_sigmoid(reference_points)
         refined = moved.sigmoid()
         center = refined * self.range_extent + self.range_start
         box_codes = torch.cat([center[..., :2], code[..., 2:4], center[..., 2:], code[..., 5:]], dim=-1)

@@ -9,15 +9,6 @@ from dataclasses import fields, is_dataclass
 import torch
 from torch import Tensor, nn
 
-from bevcli.model.bevformer import BEVFormerOutputs
-
-
-def is_finite(outputs: BEVFormerOutputs) -> bool:
-    """Whether the BEV map, the class logits and the box codes are finite. Reads each number once."""
-    checked = (outputs.bev, outputs.class_logits[-1], outputs.box_codes[-1])
-    extremes = torch.stack([end.float() for tensor in checked for end in torch.aminmax(tensor)])
-    return bool(torch.isfinite(extremes).all())
-
 
 def origin(model: nn.Module, step: Callable[[], object]) -> str:
     """Where numbers stop being finite: an input, or the first module whose output has NaN or infinity.

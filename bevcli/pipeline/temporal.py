@@ -18,6 +18,7 @@ from bevcli.geometry.transforms import Array, Pose
 from bevcli.model.bevformer import BEVFormer, BEVFormerBase, BEVFormerOutputs
 from bevcli.model.bevformer_v2 import BEVFormerV2, WindowFrame
 from bevcli.model.deformable_attention import FeatureMaps, LevelShapes
+from bevcli.model.upload import upload
 from bevcli.pipeline.model_inputs import model_inputs
 from bevcli.pipeline.preprocess import PreparedFrame
 
@@ -123,7 +124,8 @@ class Recurrence:
         """See `TemporalModel.step`."""
         assert memory is None or isinstance(memory, BevHistory)
         previous_pose = None if memory is None else memory.pose
-        inputs = model_inputs([prepared], [previous_pose], self.model.config).to(self.device)
+        inputs = model_inputs([prepared], [previous_pose], self.model.config)
+        inputs = inputs.to(self.device, keep_geometry=True)
         outputs = self.model(inputs, None if memory is None else memory.bev)
         return outputs, BevHistory(outputs.bev, prepared.frame.world_from_ego)
 
@@ -163,8 +165,8 @@ class Window:
         return outputs, FeatureWindow(frames[max(0, current + 1 - config.past_frames) :])
 
     def _features(self, prepared: PreparedFrame) -> FrameFeatures:
-        images = prepared.images.to(self.device, non_blocking=True)
-        features = self.model.image_features(images, prepared.camera_index.to(self.device))
+        images, camera_index = (upload(x, self.device) for x in (prepared.images, prepared.camera_index))
+        features = self.model.image_features(images, camera_index)
         return FrameFeatures(
             stamp=prepared.frame.stamp,
             pose=prepared.frame.world_from_ego,
@@ -183,8 +185,8 @@ class Window:
         width, height = self.model.config.image.padded_size
         return WindowFrame(
             image_features=FeatureMaps(frame.tokens, frame.level_shapes),
-            image_from_bev=image_from_bev.float().to(self.device),
-            has_image=frame.has_image.to(self.device),
+            image_from_bev=image_from_bev.float(),  # on the CPU, as the model reads it
+            has_image=frame.has_image,
             image_size=(height, width),
         )
 
