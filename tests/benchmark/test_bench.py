@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from importlib import resources
-from pathlib import Path
 
 import pytest
 import torch
@@ -28,25 +26,6 @@ RESULT = BenchmarkResult(
     limits=MachineLimits(gemm_gflops=200.0, copy_gbs=10.0),
     comparison=Comparison((9.0, 6.0, 5.0), 0.02, 1.0, 1e-5),
 )
-SMALL = {
-    "size = [800, 450]": "size = [160, 90]",
-    "rows = 50": "rows = 12",
-    "columns = 50": "columns = 10",
-    "channels = 256": "channels = 32",
-    "blocks = [3, 4, 6, 3]": "blocks = [1, 1, 1, 1]\nwidth = 8",
-    "queries = 900": "queries = 30",
-}
-
-
-@pytest.fixture
-def small_model_file(tmp_path: Path) -> Path:
-    text = resources.files("bevcli").joinpath("configs/tiny.toml").read_text()
-    for old, new in SMALL.items():
-        assert old in text
-        text = text.replace(old, new)
-    path = tmp_path / "small.toml"
-    path.write_text(text)
-    return path
 
 
 def test_times_limit_is_frame_time_over_operations_at_peak_rate():
