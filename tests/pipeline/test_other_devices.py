@@ -3,6 +3,7 @@ of times. A simulated device stops what a real one would stop (tests/simulated_d
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -125,3 +126,34 @@ def test_a_simulated_device_stops_a_step_with_a_tensor_on_another_one():
         assert device.waits == ["index of the CPU", "item", "cpu", "index of a mask"]
     with SimulatedDevice("mps"), pytest.raises(TypeError, match="no float64"):
         torch.zeros(3, device="mps").double()
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU")
+@pytest.mark.parametrize("name", ["demo", "base"])
+def test_a_real_gpu_is_waited_for_as_often_as_the_simulated_one(name):
+    """PyTorch reports implicit waits only: the counts of the hits, not the wait for the results."""
+    config, device = small_version(name), torch.device("cuda:0")
+    runner = Runner(prepare_for_inference(made_up_model(config), device), device, StepOptions())
+    state, reported = None, []
+    for frame in frames(config):
+        torch.cuda.synchronize()
+        torch.cuda.set_sync_debug_mode("warn")
+        with warnings.catch_warnings(record=True) as reported:
+            warnings.simplefilter("always")
+            state, _ = runner.step(state, frame)
+        torch.cuda.set_sync_debug_mode("default")
+    waits = [str(warning.message) for warning in reported if "synchroniz" in str(warning.message)]
+    assert len(waits) <= 1, waits
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU")
+def test_uploading_images_ahead_changes_no_box():
+    config, device = small_version("demo"), torch.device("cuda:0")
+    model, drive = prepare_for_inference(made_up_model(config), device), MemorySequence(count=FRAMES)
+    preprocess = Preprocessor(config)
+    in_turn = run(model, device, [preprocess(drive.load(place)) for place in range(FRAMES)], [])
+    ahead = Runner(model, device, StepOptions()).run(drive, range(FRAMES), preprocess)
+    for expected, (_, prediction, _) in zip(in_turn, ahead, strict=True):
+        np.testing.assert_allclose(prediction.boxes.centers, expected.centers, atol=1e-4)
