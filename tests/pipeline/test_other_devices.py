@@ -135,7 +135,7 @@ def test_a_real_gpu_is_waited_for_as_often_as_the_simulated_one(name):
     """PyTorch reports implicit waits only: the counts of the hits, not the wait for the results."""
     config, device = small_version(name), torch.device("cuda:0")
     runner = Runner(prepare_for_inference(made_up_model(config), device), device, StepOptions())
-    state, reported = None, []
+    state, waits = None, []
     for frame in frames(config):
         torch.cuda.synchronize()
         torch.cuda.set_sync_debug_mode("warn")
@@ -143,7 +143,7 @@ def test_a_real_gpu_is_waited_for_as_often_as_the_simulated_one(name):
             warnings.simplefilter("always")
             state, _ = runner.step(state, frame)
         torch.cuda.set_sync_debug_mode("default")
-    waits = [str(warning.message) for warning in reported if "synchroniz" in str(warning.message)]
+        waits = [str(warning.message) for warning in reported if "synchroniz" in str(warning.message)]
     assert len(waits) <= 1, waits
 
 
