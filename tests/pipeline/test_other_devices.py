@@ -113,6 +113,19 @@ def test_with_the_same_projections_the_cpu_waits_for_the_results_only(monkeypatc
     assert device.waits == ["results"]
 
 
+def test_the_attention_of_a_step_is_observed_on_its_device(monkeypatch):
+    config = small_version("demo")
+    model, (frame, *_) = made_up_model(config), frames(config)
+    options = StepOptions(ask_attention=True, probes=((3.0, 4.0),))
+    _, expected = Runner(model, CPU, options).step(None, frame)
+    with simulated("cuda:1", monkeypatch, sample_plainly) as device:
+        _, found = Runner(prepare_for_inference(model, device.device), device.device, options).step(None, frame)
+    (ours,), (theirs,) = expected.attention.probes, found.attention.probes
+    assert ours.cameras.keys() == theirs.cameras.keys()
+    for camera, samples in ours.cameras.items():
+        np.testing.assert_allclose(theirs.cameras[camera].pixels, samples.pixels, atol=0.1)
+
+
 def test_a_simulated_device_stops_a_step_with_a_tensor_on_another_one():
     device = SimulatedDevice("cuda:1")
     with device:
