@@ -46,7 +46,7 @@ class MadeUpDrive:
 
     def load(self, place: int) -> Frame:
         """The frame at an index; every call decodes its six images."""
-        stamp, pose = self.stamps[place], _pose(place * STEP_S)
+        stamp, pose = self.stamps[place], self.pose(place)
         return Frame(
             stamp=stamp,
             rig=self.rig,
@@ -55,6 +55,12 @@ class MadeUpDrive:
             world_from_ego_at=dict.fromkeys(self.rig.names, pose),
             kinematics=Kinematics(np.array([0, 0, GRAVITY]), np.array([0, 0, 0.05]), np.array([SPEED, 0, 0])),
         )
+
+    def pose(self, place: int) -> Pose:
+        """world_from_ego of the frame at an index."""
+        seconds = place * STEP_S
+        yaw = 0.05 * seconds
+        return Pose(np.array([SPEED * seconds, 0.2 * seconds, 0]), np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]))
 
     def _image(self, number: int, stamp: FrameStamp) -> CameraImage:
         encoded = self._files[number % ENCODED_IMAGES]
@@ -89,11 +95,6 @@ def _camera(name: str) -> Camera:
     turned = rotation_about_z(np.radians(NUSCENES_YAWS_DEG[name]))
     position = turned @ (0.8, 0, 0) + (0.9, 0, 1.5)
     return Camera(name, WIDTH, HEIGHT, intrinsics, rigid(position, turned @ looking_forward))
-
-
-def _pose(seconds: float) -> Pose:
-    yaw = 0.05 * seconds
-    return Pose(np.array([SPEED * seconds, 0.2 * seconds, 0]), np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]))
 
 
 def _jpeg(seed: int) -> bytes:

@@ -30,8 +30,8 @@ from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
 from bevcli.pipeline.write_behind import write_behind
 from bevcli.recording.writer import Recording
 
-MIN_WARM_UP_FRAMES = 2  # one without and one with history
-MIN_RUN_FRAMES = 3  # of the run with reading and recording, whose first frame is not timed
+WARM_UP_FRAMES = 2  # one without and one with history
+MIN_RUN_FRAMES = 3  # of the run with reading and recording; the times between them are measured
 
 
 @dataclass(frozen=True)
@@ -61,10 +61,12 @@ def run_benchmark(settings: BenchmarkSettings) -> BenchmarkResult:
     limits = measure_limits(device, settings.precision)
     model = made_up_model(config)
     fast = Version(prepare_for_inference(model, device, settings.precision), device)
-    drive = MadeUpDrive(max(warm_up_frames(config) + settings.frames, MIN_RUN_FRAMES))
-    stages = _time_stages(fast, drive, settings.frames)
+    first = config.past_frames if isinstance(config, BEVFormerV2Config) else 0
+    timed, run = first + WARM_UP_FRAMES, first + WARM_UP_FRAMES + settings.frames
+    drive = MadeUpDrive(run + max(settings.frames, MIN_RUN_FRAMES))
+    stages = _time_stages(fast, drive, first, range(timed, run))
     frame_s, peak = tuple(fast.seconds), _peak_memory(device)
-    run_frame_s = _time_run(fast, drive, max(settings.frames, MIN_RUN_FRAMES))
+    run_frame_s = _time_run(fast, drive, range(run, len(drive.stamps)))
     if settings.profile is not None:
         _write_profile(fast, _prepared(drive, config, 0), settings.profile)
     comparison = None
@@ -86,12 +88,6 @@ def run_benchmark(settings: BenchmarkSettings) -> BenchmarkResult:
     )
 
 
-def warm_up_frames(config: BEVFormerConfig) -> int:
-    """The number of frames before the timed ones: until the model has all the history that it uses."""
-    past = config.past_frames if isinstance(config, BEVFormerV2Config) else 1
-    return max(MIN_WARM_UP_FRAMES, past + 1)
-
-
 def describe_machine(device: torch.device) -> str:
     """Name of the processor or GPU, number of threads and PyTorch's version."""
     if device.type == "cuda":
@@ -104,14 +100,18 @@ def describe_machine(device: torch.device) -> str:
     return f"{name} ({capability}), {torch.get_num_threads()} threads, PyTorch {torch.__version__}"
 
 
-def _time_stages(fast: Version, drive: MadeUpDrive, frames: int) -> dict[str, tuple[float, ...]]:
-    """Seconds of each stage of each frame after the warm-up; no two stages run at the same time."""
+def _time_stages(fast: Version, drive: MadeUpDrive, first: int, timed: range) -> dict[str, tuple[float, ...]]:
+    """Seconds of each stage of the timed frames, after a warm-up; no two stages run at the same time.
+
+    first: the frame that the warm-up begins with. After it the model has all the history that it uses.
+    """
     preprocessor = Preprocessor(fast.runner.config)
     times: dict[str, list[float]] = defaultdict(list)
     with _recording(drive, fast) as recording:
-        warm_up = warm_up_frames(fast.runner.config)
-        for place in range(warm_up + frames):
-            if place == warm_up:
+        for place in range(first, timed.stop):
+            if place == first + 1:
+                fast.fill_window(drive)
+            if place == timed.start:
                 times.clear()
                 fast.forget_times()
             marks = [time.perf_counter()]
@@ -129,11 +129,11 @@ def _time_stages(fast: Version, drive: MadeUpDrive, frames: int) -> dict[str, tu
     return {stage: tuple(seconds) for stage, seconds in times.items()}
 
 
-def _time_run(fast: Version, drive: MadeUpDrive, frames: int) -> float:
+def _time_run(fast: Version, drive: MadeUpDrive, places: range) -> float:
     """Median seconds of a frame while other threads read and record, as in `bevcli run`."""
-    done = []
+    done, preprocessor = [], Preprocessor(fast.runner.config)
     with _recording(drive, fast) as recording:
-        steps = fast.runner.run(drive, range(frames), Preprocessor(fast.runner.config))
+        steps = fast.runner.run(drive, places, preprocessor, fast.state)
         for _ in write_behind(lambda step: recording.log(*step[:2]), steps):
             done.append(time.perf_counter())
     return median(after - before for before, after in pairwise(done))

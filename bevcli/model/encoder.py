@@ -142,7 +142,7 @@ class EncoderLayer(nn.Module):
         Returns:
             (B, Y·X, C).
         """
-        maps = torch.stack([query, query], dim=1) if bev_maps is None else bev_maps
+        maps = query[:, None] if bev_maps is None else bev_maps
         query = self.norms[0](query + self.temporal_self_attention(query, position, maps, reference_points))
         query = self.norms[1](query + self.spatial_cross_attention(query, image_features, hits))
         return self.norms[2](query + self.feed_forward(query))
@@ -167,13 +167,14 @@ class TemporalSelfAttention(nn.Module):
         Args:
             query: (B, Y·X, C).
             position: (Y·X, C).
-            bev_maps: (B, 2, Y·X, C), history first.
+            bev_maps: (B, 2, Y·X, C), history first; (B, 1, Y·X, C) where both are the same map.
             reference_points: (B or 1, 2, Y·X, 2) x, y, 0 to 1, in each of the two maps.
 
         Returns:
             (B, Y·X, C).
         """
         batch, cells, _ = query.shape
+        maps = bev_maps.shape[1]
         offsets, weights = self.attention.predict(torch.cat([bev_maps[:, 0], query + position], dim=-1))
         reference = reference_points.transpose(1, 2)[:, :, None, :, None, None]  # (B, Y·X, 1, 2, 1, 1, 2)
         locations = self.attention.locations(reference, offsets, self.level_shapes)  # (B, Y·X, heads, 2, 1, P, 2)
@@ -182,7 +183,7 @@ class TemporalSelfAttention(nn.Module):
             self.level_shapes,
             locations.movedim(3, 1).flatten(0, 2),
             weights.movedim(3, 1).flatten(0, 2),
-            [cells] * (2 * batch),
+            [2 * cells // maps] * (maps * batch),
         )  # (B·2·Y·X, C)
         mean = sampled.unflatten(0, (batch, 2, cells)).mean(1)
         return self.dropout(self.attention.output_projection(mean))

@@ -170,7 +170,7 @@ class ConstantTemporalSelfAttention(nn.Module):
         assert isinstance(layer, EncoderLayer)
         self.attention = layer.temporal_self_attention.attention  # for observers of the encoder
         queries = model.bev_queries.embedding[None]
-        maps, reference_points = torch.stack([queries, queries], dim=1), model.encoder.reference_points(None)
+        maps, reference_points = queries[:, None], model.encoder.reference_points(None)
         with torch.no_grad():
             attended = layer.temporal_self_attention(queries, model.bev_queries.position(), maps, reference_points)
         self.register_buffer("attended", attended, persistent=False)  # (1, Y·X, C)

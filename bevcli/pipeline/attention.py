@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
@@ -80,7 +81,7 @@ class AttentionProbe:
             hook.remove()
 
     def _see_temporal_samples(self, _module: object, arguments: tuple[Any, ...], sampled: Tensor) -> None:
-        cells = arguments[4][0]  # queries of the first map
+        cells = math.prod(arguments[1][0])  # of the one level, the BEV map
         norms = sampled.detach().unflatten(0, (-1, 2, cells)).norm(dim=-1)  # (B, 2, Y·X)
         self.history_share = norms[:, 0] / norms.sum(1).clamp(min=1e-12)
 
