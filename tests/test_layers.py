@@ -9,7 +9,7 @@ ROOT = Path(bevcli.__file__).parent
 # From the lowest to the highest; names in one set may not import each other.
 LAYERS = (
     {"duration", "errors", "findings"},
-    {"parsing", "jit"},
+    {"parsing", "jit", "waiting"},
     {"geometry"},
     {"frame"},
     {"model"},
@@ -20,8 +20,9 @@ LAYERS = (
     {"recording"},
     {"viewer"},
     {"pipeline"},
-    {"rig", "synth", "engines"},
+    {"rig", "synth", "engines", "batch"},
     {"training", "benchmark", "explain"},
+    {"robustness"},
     {"cli"},
     {"__main__"},
 )

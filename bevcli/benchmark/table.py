@@ -14,8 +14,10 @@ import torch
 
 from bevcli.config import known_models
 from bevcli.errors import BevcliError
+from bevcli.parsing.files import MIB, read_text
 
-LIMIT_S = 7200.0  # of one model in one precision
+MODEL_TIMEOUT_S = 4 * 3600.0
+LARGEST_DOCUMENT = 16 * MIB
 BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"
 COLUMNS: Mapping[str, Callable[[dict[str, Any]], str]] = {
     "model": lambda r: r["model"],
@@ -39,7 +41,7 @@ def write_table(path: Path, device: torch.device, frames: int) -> None:
 
     Raises BevcliError where an existing file lacks these lines.
     """
-    text = path.read_text() if path.is_file() else f"{BEGIN}\n{END}\n"
+    text = read_text(path, LARGEST_DOCUMENT) if path.is_file() else f"{BEGIN}\n{END}\n"
     before, begin, rest = text.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not (begin and end):
@@ -49,7 +51,9 @@ def write_table(path: Path, device: torch.device, frames: int) -> None:
     path.write_text(f"{before}{begin}\n{markdown_table(results)}\n{end}{after}")
 
 
-def measure(model: str, precision: str, device: torch.device, frames: int, limit_s: float = LIMIT_S) -> dict[str, Any]:
+def measure(
+    model: str, precision: str, device: torch.device, frames: int, limit_s: float = MODEL_TIMEOUT_S
+) -> dict[str, Any]:
     """What `bevcli bench --against plain --json` prints, in a process of its own.
 
     Raises BevcliError if it fails or takes longer than limit_s.
@@ -61,10 +65,10 @@ def measure(model: str, precision: str, device: torch.device, frames: int, limit
     try:
         answer = subprocess.run(command, check=True, capture_output=True, text=True, timeout=limit_s)
     except subprocess.TimeoutExpired:
-        raise BevcliError(f"bench of {model}, {precision}: not done after {limit_s:.0f} s") from None
+        raise BevcliError(f"bench: {model}, {precision}: not done within {limit_s / 3600:g} h") from None
     except subprocess.CalledProcessError as error:
         last = (error.stderr.strip().splitlines() or ["no message"])[-1]
-        raise BevcliError(f"bench of {model}, {precision}: failed ({last})") from None
+        raise BevcliError(f"bench: {model}, {precision}: failed with exit code {error.returncode} ({last})") from None
     found: dict[str, Any] = json.loads(answer.stdout)
     return found
 

@@ -13,6 +13,7 @@ from typing import Annotated
 import typer
 
 from bevcli import __version__
+from bevcli.cli.batch import batch
 from bevcli.cli.bench import bench
 from bevcli.cli.convert import convert
 from bevcli.cli.demo import demo
@@ -20,15 +21,17 @@ from bevcli.cli.eval import evaluate
 from bevcli.cli.explain import explain
 from bevcli.cli.export import export
 from bevcli.cli.export_onnx import export_onnx
+from bevcli.cli.find_like import find_like
 from bevcli.cli.project_debug import project_debug
 from bevcli.cli.render import render
 from bevcli.cli.run import run
 from bevcli.cli.samples import samples
+from bevcli.cli.stress import stress
 from bevcli.cli.train import train
 from bevcli.cli.validate import validate
 from bevcli.cli.viz import viz
 from bevcli.cli.weights import weights_app
-from bevcli.errors import BevcliError
+from bevcli.errors import BevcliError, WaitError
 from bevcli.pipeline.cpu_memory import keep_freed_memory
 
 app = typer.Typer(
@@ -54,6 +57,7 @@ def root(
     """Run BEVFormer on sequences from any camera rig, and look at the results."""
 
 
+app.command()(batch)
 app.command()(bench)
 app.command()(convert)
 app.command()(demo)
@@ -61,10 +65,12 @@ app.command("eval")(evaluate)
 app.command()(explain)
 app.command()(export)
 app.command()(export_onnx)
+app.command()(find_like)
 app.command()(project_debug)
 app.command()(render)
 app.command()(run)
 app.command()(samples)
+app.command()(stress)
 app.command()(train)
 app.command()(validate)
 app.command()(viz)
@@ -84,6 +90,9 @@ def run_app() -> None:
             sys.stdout.flush()  # here, where an error can still be told
     except BevcliError as error:
         print(f"error: {error}", file=sys.stderr)
+        if isinstance(error, WaitError):  # at its end, Python would wait for the thread that gets no answer
+            sys.stderr.flush()
+            os._exit(1)
         sys.exit(1)
     except BrokenPipeError:
         sys.stderr.close()  # the reader of the output is gone

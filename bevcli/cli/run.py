@@ -56,8 +56,8 @@ def run(
         str | None,
         typer.Option(
             autocompletion=complete_model,
-            help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, demo, or a FILE.toml. Default: the model that "
-            "WEIGHTS fit, else demo.",
+            help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, uniad-track-map, demo, or a FILE.toml. Default: "
+            "the model that WEIGHTS fit, else demo.",
             rich_help_panel=MODEL,
             show_default=False,
         ),
@@ -92,7 +92,9 @@ def run(
     track: Annotated[
         bool,
         typer.Option(
-            "--track/--no-track", help="Give boxes identities over time, and write tracks.csv.", rich_help_panel=MODEL
+            "--track/--no-track",
+            help="Give boxes identities over time, and write tracks.csv. A UniAD with history gives its own.",
+            rich_help_panel=MODEL,
         ),
     ] = True,
     camera: Annotated[
@@ -198,7 +200,7 @@ def run(
     """Run BEVFormer on SEQUENCE, frame by frame, and write boxes and a recording.
 
     The output folder gets recording.rrd (open it with `bevcli viz`), predictions.json (all boxes of all frames),
-    tracks.csv (one row a box with its track), summary.json and, for models with a segmentation head, segmentation/.
+    tracks.csv (one row a box with its track), summary.json and, for models that predict a map, segmentation/.
     Ctrl-C or SIGTERM finish the current frame; a second one ends the program at once.
     """
     from bevcli.cli.progress import Progress

@@ -69,7 +69,7 @@ class ExportedStep(nn.Module):
             assert isinstance(layer, EncoderLayer)
             bev_maps = torch.where(use_previous, with_history, torch.stack([bev, bev], dim=1))
             bev = layer(bev, position, bev_maps, reference_points, image_features, hits)
-        class_logits, box_codes = network.decoder(bev, network.detection_head)
+        class_logits, box_codes, _ = network.decoder(bev, network.detection_head)
         outputs = [bev, class_logits[-1], box_codes[-1]]
         if network.segmentation_head is not None:
             segmentation = network.segmentation_head(bev, position)

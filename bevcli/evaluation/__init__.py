@@ -16,6 +16,7 @@ Metrics; they read no files:
     matching            greedy matching of predictions and ground truth, the devkit's rule
     precision_recall    precision and errors as functions of recall
     segmentation        IoU of BEV maps
+    joint               scores of several drives together, from the matching of each
 
 Output:
     scores_report       scores as a dict for JSON and as a table for the terminal

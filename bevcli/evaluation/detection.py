@@ -49,7 +49,20 @@ def evaluate_detections(
     truth, found = gather(ground_truth, ego), gather(predictions, ego)
     truth, found = _with_points(truth), _with_points(found)
     matches = tuple(match_class(name, truth, found, config) for name in config.class_ranges_m)
-    unmeasured = _unmeasured(truth.boxes)
+    return score_matches(len(predictions), matches, _unmeasured(truth.boxes), config)
+
+
+def score_matches(
+    frame_count: int, matches: tuple[ClassMatches, ...], unmeasured: tuple[str, ...], config: DetectionConfig
+) -> DetectionScores:
+    """The scores of a matching.
+
+    Args:
+        frame_count: number of frames.
+        matches: by class.
+        unmeasured: names of errors that are left out, because no ground truth has the quantity.
+        config: parameters of the score, those of the matching.
+    """
 
     def table(parts: Sequence[ClassMatches]) -> ScoreTable:
         scores = {part.name: _score_class(part, config, unmeasured) for part in parts}
@@ -60,7 +73,7 @@ def evaluate_detections(
         return RangeScores(low, high, table([part for part in parts if part.truth_counts.any()]))
 
     return DetectionScores(
-        frame_count=len(predictions),
+        frame_count=frame_count,
         overall=table(matches),
         by_range=tuple(within(*ends) for ends in config.range_bins_m),
         by_visibility=_recall_by_visibility(matches, config),

@@ -8,6 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from bevcli.frame import MAP_CLASSES
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.bev_queries import BevQueries
 from bevcli.model.decoder import Decoder, DecoderConfig, DetectionHead
@@ -134,6 +135,11 @@ class BEVFormerConfig:
         """Number of the neck's levels that the BEV encoder attends to, the finest ones."""
         return min(self.neck.levels, self.image_tokens.level_embeddings)
 
+    @property
+    def map_classes(self) -> tuple[str, ...]:
+        """The classes of the map that the model predicts, in the order of their bits; empty without a map."""
+        return tuple(MAP_CLASSES) if "segmentation" in self.heads else ()
+
     def _most_neck_levels(self) -> int:
         return self.image_tokens.level_embeddings
 
@@ -206,7 +212,7 @@ class BEVFormerBase(nn.Module):
         self.image_tokens = ImageTokens(len(config.cameras), channels, config.image_tokens)
         self.bev_queries = BevQueries(grid, channels, config.ego_motion.can_bus)
         self.pillars = Pillars(grid)
-        self.encoder = Encoder(config.encoder, channels, levels, grid, config.ego_motion.history_shift)
+        self.encoder = Encoder(config.encoder, channels, levels, grid, config.ego_motion)
         self.decoder = Decoder(config.decoder, channels, bev_shape)
         self.detection_head = DetectionHead(config.decoder.layers, channels, len(config.classes), grid)
         segments = "segmentation" in config.heads
@@ -226,7 +232,7 @@ class BEVFormerBase(nn.Module):
         """What the decoder and the heads find in the BEV map (B, Y·X, C)."""
         # In float32: half precision is too coarse for the refinement of boxes.
         with torch.autocast(bev.device.type, enabled=False):
-            class_logits, box_codes = self.decoder(bev.float(), self.detection_head)
+            class_logits, box_codes, _ = self.decoder(bev.float(), self.detection_head)
             segmentation = None
             if self.segmentation_head is not None:
                 segmentation = self.segmentation_head(bev.float(), self.bev_queries.position())

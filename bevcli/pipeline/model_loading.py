@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,7 +14,7 @@ from bevcli.checkpoints import bundled_weights, inspect, load_weights
 from bevcli.config import TRACKING, known_models, load_config, load_table
 from bevcli.errors import BevcliError, WeightsError
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
-from bevcli.model.bevformer_v2 import build_model
+from bevcli.model.build import build_model
 from bevcli.model.prepared import Precision, prepare_for_inference
 from bevcli.pipeline.tracking import TrackerConfig
 
@@ -26,7 +27,7 @@ class Model:
     """A model with its weights, and the device that it runs on.
 
     Attributes:
-        network: the plain BEVFormer or BEVFormerV2, as in its paper, on the CPU.
+        network: the plain BEVFormer, BEVFormerV2 or UniAD, as in its paper, on the CPU.
         device: where it runs.
         precision: of the image features; the rest of the network computes in float32.
         weights: the file that the weights came from, None for random weights.
@@ -61,6 +62,20 @@ class Model:
         return self.weights is None
 
     @cached_property
+    def config_hash(self) -> str:
+        """SHA-256 of the configurations of network and tracker."""
+        return hashlib.sha256(repr((self.config, self.tracker)).encode()).hexdigest()
+
+    @cached_property
+    def weights_hash(self) -> str:
+        """SHA-256 of names, types, shapes and values of all weights."""
+        found = hashlib.sha256()
+        for name, tensor in self.network.state_dict().items():
+            found.update(f"{name}{tensor.dtype}{list(tensor.shape)}".encode())
+            found.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
+        return found.hexdigest()
+
+    @cached_property
     def prepared(self) -> BEVFormerBase:
         """The network on its device, made ready for inference on the first use: same results, faster."""
         return prepare_for_inference(self.network, self.device, self.precision)
@@ -79,8 +94,8 @@ def load_model(
         model = bevcli.load_model("tiny", weights="bevformer_tiny_epoch_24.pth", device="cuda")
 
     Args:
-        name: a known model ("tiny", "small", "base", "v2-t1-base", "v2-t1", "v2-t2", "v2-t8", "demo") or a FILE.toml.
-            None takes the model that the weights fit, or "demo" where there are no weights.
+        name: a known model ("tiny", "small", "base", "v2-t1-base", "v2-t1", "v2-t2", "v2-t8", "uniad-track-map",
+            "demo") or a FILE.toml. None takes the model that the weights fit, or "demo" where there are no weights.
         weights: an official .pth as published, or a .safetensors. None takes the weights of the package, which only
             "demo" has.
         device: "auto" takes a CUDA GPU where there is one, else the CPU; or "cpu", "cuda", "cuda:1", or "mps", the GPU

@@ -70,7 +70,7 @@ class Preprocessor:
         with ThreadPoolExecutor(min(len(names), os.cpu_count() or 1)) as threads:
             tasks = [threads.submit(write, i, name) for i, name in enumerate(names) if name in frame.images]
         for task in tasks:
-            task.result()
+            task.result()  # it is done: the pool has waited for it
         scales = tuple(network_scale(frame.rig[name], image) for name in names)
         matrices = [image_from_bev(frame, name) for name in names]
         networks = [network_from_image(frame.rig[name], image) for name in names]

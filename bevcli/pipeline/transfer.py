@@ -9,6 +9,7 @@ from torch import Tensor
 
 from bevcli.model.bevformer import BEVFormerOutputs
 from bevcli.model.segmentation import SegmentationOutputs
+from bevcli.model.uniad import UniADOutputs
 from bevcli.model.upload import upload
 from bevcli.pipeline.preprocess import PreparedFrame
 
@@ -38,13 +39,20 @@ class ImageUploader:
         return replace(prepared, images=images)
 
 
-def read_back(outputs: BEVFormerOutputs) -> tuple[BEVFormerOutputs, bool]:
-    """The last layers' outputs on the CPU, and whether the BEV map, class logits and box codes are finite.
+def read_back(outputs: BEVFormerOutputs, images: Tensor) -> tuple[BEVFormerOutputs, bool]:
+    """The last layers' outputs on the CPU, and whether the BEV map, the class logits and the box codes are finite.
 
-    All copies from a CUDA GPU share one wait. The BEV map stays on its device.
+    All copies from a CUDA GPU share one wait. The BEV map stays on its device, and so does everything of a UniAD.
+
+    On a CPU the input images must be finite too: the ReLU of oneDNN turns NaN into zero, so NaN in the images may not
+    reach the outputs. Weights are checked when they are read and when they are prepared. What is not seen: numbers
+    inside of the backbone that grow beyond the range of their type and that ReLU then turns into zeros.
     """
     logits, codes = outputs.class_logits[-1:], outputs.box_codes[-1:]
-    extremes = torch.stack([end.float() for x in (outputs.bev, logits, codes) for end in _extremes(x)])
+    checked = [outputs.bev, logits, codes, *([images] if outputs.bev.device.type == "cpu" else [])]
+    extremes = torch.stack([end.float() for x in checked for end in _extremes(x)])
+    if isinstance(outputs, UniADOutputs):
+        return outputs, bool(torch.isfinite(extremes).all())
     found = [logits, codes, extremes]
     segmentation = outputs.segmentation
     if segmentation is not None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pickle
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,10 +12,11 @@ from torch import nn
 
 from bevcli.errors import OutputError, WeightsError
 from bevcli.model.bevformer import BEVFormerBase
+from bevcli.parsing.pth import read_pth
 
 FORMAT = "bevcli-training/1"
-# The exceptions for a file that PyTorch cannot read, or whose contents belong to another model.
-_DAMAGE = (pickle.UnpicklingError, RuntimeError, ValueError, LookupError, TypeError, AttributeError, EOFError)
+# What PyTorch raises for contents that belong to another model.
+_DAMAGE = (RuntimeError, ValueError, LookupError, TypeError, AttributeError, OverflowError)
 
 
 def save_checkpoint(path: Path, step: int, trained: nn.Module, optimizer: torch.optim.AdamW) -> None:
@@ -31,8 +31,13 @@ def save_checkpoint(path: Path, step: int, trained: nn.Module, optimizer: torch.
 
 def load_checkpoint(path: Path, trained: nn.Module, optimizer: torch.optim.AdamW) -> int:
     """Restores model, auxiliary heads and optimizer; returns the number of steps done. Raises WeightsError."""
+    if not path.exists():
+        raise WeightsError(f"{path}: no checkpoint to resume from; leave out --resume to start a training")
+    file = read_pth(path)
+    if file.left_out:
+        raise WeightsError(f"{path}: is not a checkpoint of this model: it holds objects ({file.left_out[0]:.100})")
     try:
-        contents = torch.load(path, map_location="cpu", weights_only=True)
+        contents = file.with_tensors()
         if contents["format"] != FORMAT:
             raise WeightsError(f'{path}: "format" must be "{FORMAT}", found {contents["format"]!r}')
         if any(key.startswith("picture_reader.") for key in contents["model"]):
@@ -43,8 +48,6 @@ def load_checkpoint(path: Path, trained: nn.Module, optimizer: torch.optim.AdamW
         trained.load_state_dict(contents["model"])
         optimizer.load_state_dict(contents["optimizer"])
         return int(contents["step"])
-    except FileNotFoundError:
-        raise WeightsError(f"{path}: no checkpoint to resume from; leave out --resume to start a training") from None
     except _DAMAGE as error:
         reason = " ".join(line.strip() for line in str(error).split("\n")[:2])
         raise WeightsError(f"{path}: is not a checkpoint of this model: {reason}") from error

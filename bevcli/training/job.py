@@ -13,7 +13,9 @@ from bevcli.checkpoints import load_weights
 from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import ConfigError, OutputError
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
-from bevcli.model.bevformer_v2 import BEVFormerV2Config, build_model
+from bevcli.model.bevformer_v2 import BEVFormerV2Config
+from bevcli.model.build import build_model
+from bevcli.model.uniad import UniADConfig
 from bevcli.training.augmentation import AugmentationConfig
 from bevcli.training.clips import ClipConfig
 from bevcli.training.drives import Drives, check_training_seeds, open_drives, split_drives
@@ -131,7 +133,9 @@ def prepare_training(
 
 
 def check_window(model: BEVFormerConfig, config: TrainingConfig) -> None:
-    """Raises ConfigError if clips cannot fill the window of a BEVFormerV2."""
+    """Raises ConfigError if clips cannot fill the window of a BEVFormerV2, and for a UniAD."""
+    if isinstance(model, UniADConfig):
+        raise ConfigError(f"{model.name}: a UniAD cannot be trained; expected a BEVFormer, such as tiny, small or base")
     if not isinstance(model, BEVFormerV2Config):
         return
     if model.later_frames:

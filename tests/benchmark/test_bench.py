@@ -71,6 +71,15 @@ def test_profile_of_a_frame_in_half_precision(small_model_file, tmp_path):
     assert json.loads(profile.read_text())["traceEvents"]
 
 
+@pytest.mark.slow
+def test_the_benchmark_of_a_uniad_times_its_map_head(small_uniad_file):
+    options = ["--frames", "1", "--against", "plain", "--json"]
+    answer = CliRunner().invoke(app, ["bench", "--model", str(small_uniad_file), *options], catch_exceptions=False)
+    data = json.loads(answer.stdout)
+    assert data["stages_ms"]["map head"] > 0
+    assert data["share_within_0.1_m"] == 1
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU")
 def test_on_a_gpu_the_stages_add_up_to_the_frame(small_model_file):

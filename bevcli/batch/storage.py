@@ -1,0 +1,297 @@
+"""Folders on this machine and in object stores, with the same operations.
+
+An object store is named by a URL, such as s3://bucket/fleet. fsspec and its package for the protocol read it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import os
+import re
+import shutil
+import uuid
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, Protocol
+
+from bevcli.errors import BevcliError, InputError, OutputError
+from bevcli.parsing.files import read_bytes
+
+_URL = re.compile(r"(?P<protocol>[a-z][a-z0-9+.-]+)://", re.IGNORECASE)
+# The packages that fsspec needs for a protocol.
+_PACKAGES = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "abfs": "adlfs", "az": "adlfs"}
+LARGEST_RECORD = 1 << 28  # bytes of a small file that is read as a whole
+
+
+@dataclass(frozen=True)
+class StoredFile:
+    """A file below a folder.
+
+    Attributes:
+        name: path relative to the folder, with "/".
+        size: bytes.
+        version: what changes when its contents are replaced: modification time, or the store's checksum.
+    """
+
+    name: str
+    size: int
+    version: str
+
+
+class Storage(Protocol):
+    """A folder. Names are relative paths with "/".
+
+    Attributes:
+        where: the path or URL, for messages.
+    """
+
+    where: str
+
+    def files(self) -> list[StoredFile]:
+        """All files below the folder, sorted by name; of a file, the file itself. Raises InputError."""
+        ...
+
+    def names(self, folder: str) -> set[str]:
+        """The entries of a subfolder, empty without it. Raises InputError."""
+        ...
+
+    def read(self, name: str) -> bytes | None:
+        """The contents of a small file, None if it is missing. Raises InputError."""
+        ...
+
+    def write(self, name: str, content: bytes) -> None:
+        """Writes a file. Readers see the old or the new contents. Raises OutputError."""
+        ...
+
+    def remove(self, name: str) -> None:
+        """Removes a file or a subfolder, if it is there. Raises OutputError."""
+        ...
+
+    def land(self, folder: Path, name: str, last: str) -> None:
+        """Moves a local folder to a name that is free. Raises OutputError.
+
+        last: the file of the folder that says that it is whole; it never exists without the others.
+        """
+        ...
+
+    def fetch(self, local: Path) -> None:
+        """Copies the folder, or the file that it is, to a local path. Raises InputError."""
+        ...
+
+
+def is_url(text: str) -> bool:
+    """Whether a text names a folder in an object store. file:// is a local path."""
+    return bool(_URL.match(text)) and not text.startswith("file://")
+
+
+def open_storage(where: str) -> Storage:
+    """The folder of a path or URL. Raises BevcliError where a package for the protocol is not installed."""
+    return RemoteFolder(where) if is_url(where) else LocalFolder(Path(where.removeprefix("file://")))
+
+
+def expand(pattern: str) -> list[str]:
+    """The paths or URLs of a glob pattern, sorted; of anything else, the text itself. Raises InputError."""
+    if not glob.has_magic(pattern) or (not is_url(pattern) and os.path.exists(pattern)):
+        return [pattern]
+    if is_url(pattern):
+        system, path = _filesystem(pattern)
+        with _one_line(pattern, InputError):
+            found = sorted(system.unstrip_protocol(match) for match in system.glob(path.rstrip("/")))
+    else:
+        found = sorted(glob.glob(pattern))
+    if not found:
+        raise InputError(f"{pattern}: nothing matches this pattern (expected drives)")
+    return found
+
+
+class LocalFolder:
+    """A folder on this machine, as a `Storage`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.where = path, str(path)
+
+    def files(self) -> list[StoredFile]:
+        """See `Storage`."""
+        if self.path.is_file():
+            return [_stored(self.path, self.path.name)]
+        found = []
+        for folder, folders, names in os.walk(self.path):
+            folders.sort()
+            for name in names:
+                path = Path(folder, name)
+                with contextlib.suppress(OSError):  # a broken link
+                    found.append(_stored(path, path.relative_to(self.path).as_posix()))
+        return sorted(found, key=lambda file: file.name)
+
+    def names(self, folder: str) -> set[str]:
+        """See `Storage`."""
+        try:
+            return set(os.listdir(self.path / folder))
+        except (FileNotFoundError, NotADirectoryError):
+            return set()
+        except OSError as error:
+            raise InputError(f"{self.path / folder}: cannot be read ({error.strerror})") from None
+
+    def read(self, name: str) -> bytes | None:
+        """See `Storage`."""
+        path = self.path / name
+        return read_bytes(path, LARGEST_RECORD) if path.is_file() else None
+
+    def write(self, name: str, content: bytes) -> None:
+        """See `Storage`."""
+        path = self.path / name
+        fresh = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}.new")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            fresh.write_bytes(content)
+            os.replace(fresh, path)
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                fresh.unlink()
+            raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
+
+    def remove(self, name: str) -> None:
+        """See `Storage`."""
+        path = self.path / name
+        try:
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+        except FileNotFoundError:
+            pass
+        except OSError as error:
+            raise OutputError(f"{path}: cannot be removed ({error.strerror})") from None
+
+    def land(self, folder: Path, name: str, last: str) -> None:
+        """See `Storage`. The folder must be on the same file system."""
+        try:
+            (self.path / name).parent.mkdir(parents=True, exist_ok=True)
+            os.rename(folder, self.path / name)
+        except OSError as error:
+            raise OutputError(f"{self.path / name}: cannot be written ({error.strerror})") from None
+
+    def fetch(self, local: Path) -> None:
+        """See `Storage`."""
+        raise AssertionError("a local folder is read where it is")
+
+
+class RemoteFolder:
+    """A folder in an object store, as a `Storage`. Raises BevcliError where a package is not installed."""
+
+    def __init__(self, where: str) -> None:
+        self.where = where.rstrip("/")
+        self._system, path = _filesystem(self.where)
+        self._root = str(path).rstrip("/")
+
+    def files(self) -> list[StoredFile]:
+        """See `Storage`."""
+        with _one_line(self.where, InputError):
+            self._system.invalidate_cache()
+            found = self._system.find(self._root, detail=True)
+        if list(found) == [self._root]:
+            return [_described(PurePosixPath(self._root).name, found[self._root])]
+        return sorted(
+            (_described(name[len(self._root) + 1 :], facts) for name, facts in found.items()),
+            key=lambda file: file.name,
+        )
+
+    def names(self, folder: str) -> set[str]:
+        """See `Storage`."""
+        with _one_line(f"{self.where}/{folder}", InputError):
+            try:
+                self._system.invalidate_cache()
+                found = self._system.ls(self._path(folder), detail=False)
+            except FileNotFoundError:
+                return set()
+        return {PurePosixPath(name).name for name in found}
+
+    def read(self, name: str) -> bytes | None:
+        """See `Storage`."""
+        with _one_line(f"{self.where}/{name}", InputError):
+            try:
+                return bytes(self._system.cat_file(self._path(name)))
+            except FileNotFoundError:
+                return None
+
+    def write(self, name: str, content: bytes) -> None:
+        """See `Storage`."""
+        with _one_line(f"{self.where}/{name}", OutputError):
+            self._system.pipe_file(self._path(name), content)
+
+    def remove(self, name: str) -> None:
+        """See `Storage`."""
+        with _one_line(f"{self.where}/{name}", OutputError), contextlib.suppress(FileNotFoundError):
+            self._system.rm(self._path(name), recursive=True)
+
+    def land(self, folder: Path, name: str, last: str) -> None:
+        """See `Storage`. An object store cannot rename a folder: the file `last` is uploaded last."""
+        files = [path for path in folder.rglob("*") if path.is_file()]
+        files.sort(key=lambda path: path == folder / last)
+        with _one_line(f"{self.where}/{name}", OutputError):
+            for path in files:
+                self._system.put_file(str(path), self._path(f"{name}/{path.relative_to(folder).as_posix()}"))
+        shutil.rmtree(folder)
+
+    def fetch(self, local: Path) -> None:
+        """See `Storage`."""
+        with _one_line(self.where, InputError):
+            if self._system.isfile(self._root):
+                local.parent.mkdir(parents=True, exist_ok=True)
+                self._system.get_file(self._root, str(local))
+                return
+            for name in self._system.find(self._root):
+                inside = PurePosixPath(name[len(self._root) + 1 :])
+                if ".." in inside.parts or inside.is_absolute():
+                    raise InputError(f"{self.where}: {inside}: leads out of the folder")
+                (local / inside).parent.mkdir(parents=True, exist_ok=True)
+                self._system.get_file(name, str(local / inside))
+
+    def _path(self, name: str) -> str:
+        return f"{self._root}/{name}"
+
+
+def _stored(path: Path, name: str) -> StoredFile:
+    facts = path.stat()
+    return StoredFile(name, facts.st_size, str(facts.st_mtime_ns))
+
+
+def _described(name: str, facts: dict[str, Any]) -> StoredFile:
+    keys = ("ETag", "etag", "md5Hash", "content_md5", "LastModified", "mtime", "updated", "last_modified")
+    version = next((str(facts[key]) for key in keys if facts.get(key)), "")
+    return StoredFile(name, int(facts.get("size") or 0), version)
+
+
+def _filesystem(url: str) -> tuple[Any, str]:
+    """fsspec's file system of a URL, and the path in it. Raises BevcliError."""
+    match = _URL.match(url)
+    assert match is not None
+    protocol = match["protocol"].lower()
+    package = _PACKAGES.get(protocol, "")
+    try:
+        import fsspec
+    except ImportError:
+        raise BevcliError(f"{url}: URLs need a package: run pip install fsspec {package}".rstrip()) from None
+    try:
+        with _one_line(url, InputError):
+            system, path = fsspec.core.url_to_fs(url)
+    except ImportError as error:
+        advice = f"run pip install {package}" if package else " ".join(str(error).split())[:200]
+        raise BevcliError(f"{url}: {protocol}:// needs a package that is not installed: {advice}") from None
+    return system, str(path)
+
+
+@contextlib.contextmanager
+def _one_line(where: str, kind: type[BevcliError]) -> Iterator[None]:
+    """Makes one error of one line of what the packages of object stores raise, which have errors of many types."""
+    try:
+        yield
+    except (BevcliError, FileNotFoundError, ImportError) as error:
+        if isinstance(error, FileNotFoundError):
+            raise kind(f"{where}: is missing") from None
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise kind(f"{where}: the storage cannot be used ({reason:.200})") from None

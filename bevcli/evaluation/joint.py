@@ -1,0 +1,98 @@
+"""Joint scores of several drives, from the matching of each drive: as if all frames had been scored together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bevcli.evaluation.config import DetectionConfig
+from bevcli.evaluation.detection import score_matches
+from bevcli.evaluation.detection_scores import DetectionScores
+from bevcli.evaluation.evaluate import Scores
+from bevcli.evaluation.matching import ClassMatches, descending_scores
+from bevcli.evaluation.scored_boxes import ScoredBoxes
+from bevcli.evaluation.segmentation import SegmentationScores
+from bevcli.geometry.boxes import Boxes3D
+
+
+@dataclass(frozen=True)
+class DriveMatches:
+    """What the joint scores need of one drive.
+
+    Attributes:
+        frame_count: number of frames that were scored.
+        matches: by class, the matching of its boxes.
+        unmeasured: names of errors whose quantity no ground truth of the drive has.
+        segmentation: the scores of its maps, None without maps.
+    """
+
+    frame_count: int
+    matches: tuple[ClassMatches, ...]
+    unmeasured: tuple[str, ...]
+    segmentation: SegmentationScores | None
+
+    @staticmethod
+    def of(scores: Scores) -> DriveMatches:
+        """What the joint scores need of the scores of a drive."""
+        found = scores.detection
+        return DriveMatches(found.frame_count, found.matches, found.unmeasured, scores.segmentation)
+
+
+def score_jointly(
+    drives: Sequence[DriveMatches], config: DetectionConfig
+) -> tuple[DetectionScores, SegmentationScores | None]:
+    """The scores over all frames of the drives: AP of all boxes together, not a mean of the drives' scores.
+
+    Args:
+        drives: at least one.
+        config: the parameters with which every drive was matched.
+    """
+    matches = tuple(_merged([drive.matches[i] for drive in drives]) for i in range(len(config.class_ranges_m)))
+    measured = [set(drive.unmeasured) for drive in drives if any(len(part.ground_truth) for part in drive.matches)]
+    unmeasured = set.intersection(*measured) if measured else set()
+    names = tuple(name for name in ("vel_err", "attr_err") if name in unmeasured)
+    detection = score_matches(sum(drive.frame_count for drive in drives), matches, names, config)
+    maps = [drive.segmentation for drive in drives if drive.segmentation is not None]
+    return detection, _merged_maps(maps) if maps else None
+
+
+def _merged(parts: Sequence[ClassMatches]) -> ClassMatches:
+    """The matching of one class in all drives. Equal scores stay in the order of a joint matching."""
+    ascending = [part.predictions[np.arange(len(part.predictions))[::-1]] for part in parts]
+    starts = np.cumsum([0, *(len(part.ground_truth) for part in parts)])
+    matched = np.concatenate(
+        [np.where(p.matched < 0, -1, p.matched + start)[:, ::-1] for p, start in zip(parts, starts, strict=False)],
+        axis=1,
+    )
+    counts = np.concatenate([part.counts[:, ::-1] for part in parts], axis=1)
+    predictions = _concatenated(ascending)
+    assert predictions.boxes.scores is not None
+    order = descending_scores(predictions.boxes.scores)
+    return ClassMatches(
+        parts[0].name,
+        _concatenated([part.ground_truth for part in parts]),
+        predictions[order],
+        matched[:, order],
+        np.concatenate([part.truth_counts for part in parts]),
+        counts[:, order],
+    )
+
+
+def _concatenated(parts: Sequence[ScoredBoxes]) -> ScoredBoxes:
+    """The boxes of all drives; their frames are not numbered anew."""
+    boxes = Boxes3D.concatenate([part.boxes for part in parts])
+    if not len(boxes):
+        return parts[0]
+    frames = np.concatenate([part.frames for part in parts])
+    return ScoredBoxes(boxes, frames, np.concatenate([part.ranges_m for part in parts]))
+
+
+def _merged_maps(parts: Sequence[SegmentationScores]) -> SegmentationScores:
+    names = dict.fromkeys(name for part in parts for name in part.union)
+    return SegmentationScores(
+        {name: sum(part.intersection.get(name, 0.0) for part in parts) for name in names},
+        {name: sum(part.union.get(name, 0.0) for part in parts) for name in names},
+        sum(part.frame_count for part in parts),
+    )

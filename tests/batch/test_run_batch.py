@@ -1,0 +1,232 @@
+"""A batch in this process: same bytes as single runs, failed drives become rows, and `resume` does what is left."""
+
+import csv
+import json
+import os
+import shutil
+from dataclasses import replace
+
+import fsspec
+import pyarrow.parquet as pq
+import pytest
+from small_fleet import MINI_TOML, make_job, results_of, write_drive, write_fleet
+
+from bevcli.batch import worker as worker_module
+from bevcli.batch.drives import find_drives
+from bevcli.batch.run_batch import run_batch
+from bevcli.batch.worker import Worker
+from bevcli.errors import OutputError
+from bevcli.evaluation.evaluate import evaluate
+from bevcli.pipeline.run import run_into_folder
+from bevcli.sequences.open import open_sequence
+
+COMPARED = ("predictions.json", "tracks.csv")
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory):
+    """Three drives with ground truth, an empty folder, and a model."""
+    folder = tmp_path_factory.mktemp("fleet")
+    (folder / "mini.toml").write_text(MINI_TOML)
+    write_fleet(folder / "drives", 3, truth=True)
+    (folder / "drives/empty").mkdir()
+    return folder
+
+
+@pytest.fixture
+def batch(fleet, tmp_path):
+    """Runs the fleet, or other drives, into tmp_path/out."""
+
+    def run(texts=None, out=None, options=None, **arguments):
+        job = make_job(tmp_path / "out" if out is None else out, fleet / "mini.toml", **(options or {}))
+        drives, _ = find_drives(texts or [str(fleet / "drives/*")])
+        return run_batch(job, job.load_model(), drives, **arguments)
+
+    return run
+
+
+def run_alone(fleet, name, out):
+    job = make_job(out, fleet / "mini.toml")
+    drive = open_sequence(fleet / "drives" / name, **job.reading)
+    run_into_folder(job.load_model(), drive, out, job.run)
+
+
+def times(out):
+    """File -> time of its last change, of all results."""
+    return {path: path.stat().st_mtime_ns for part in ("drives", "failed") for path in (out / part).rglob("*")}
+
+
+def test_drives_have_the_bytes_of_single_runs_and_a_bad_one_is_a_row(batch, fleet, tmp_path):
+    summary = batch(options={"retries": 1})
+    assert (summary.drives, summary.failed, summary.skipped, summary.stopped) == (4, 1, 0, False)
+    results = results_of(tmp_path / "out")
+    assert set(results) == {"d000", "d001", "d002"}
+    run_alone(fleet, "d001", tmp_path / "alone")
+    for name in COMPARED:
+        assert (results["d001"] / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()
+    facts = json.loads((results["d001"] / "summary.json").read_text())
+    assert facts["files"] == [str(results["d001"] / name) for name in ("recording.rrd", *COMPARED, "summary.json")]
+    rows = pq.read_table(tmp_path / "out/batch.parquet").to_pylist()
+    assert [row["drive"] for row in rows] == ["d000", "d001", "d002", "empty"]
+    assert [row["frames"] for row in rows] == [3, 3, 3, None]
+    assert rows[3]["attempts"] == 2
+    assert rows[3]["error"].startswith(f"{fleet}/drives/empty: is not a sequence folder")
+    assert rows[0]["boxes"] == 30 == sum(count for name, count in rows[0].items() if name.startswith("boxes_"))
+    with (tmp_path / "out/batch.csv").open() as file:
+        assert [row["drive"] for row in csv.DictReader(file)] == ["d000", "d001", "d002", "empty"]
+    assert not list((tmp_path / "out/.bevcli/attempts").iterdir())
+
+
+def test_a_second_batch_with_resume_does_nothing(batch, tmp_path):
+    batch()
+    before = times(tmp_path / "out")
+    ran = []
+    summary = batch(resume=True, after_drive=ran.append)
+    assert (summary.skipped, summary.failed, ran) == (4, 1, [])
+    assert times(tmp_path / "out") == before
+
+
+def test_failed_drives_run_again_on_request_or_after_they_are_mended(batch, tmp_path):
+    drives = tmp_path / "drives"
+    write_drive(drives / "good", 1)
+    (drives / "bad").mkdir()
+    assert batch([str(drives / "*")]).failed == 1
+    ran = []
+    batch([str(drives / "*")], resume=True, retry_failed=True, after_drive=ran.append)
+    assert [row["drive"] for row in ran] == ["bad"]
+    write_drive(drives / "bad", 2)
+    summary = batch([str(drives / "*")], resume=True)
+    assert (summary.skipped, summary.failed) == (1, 0)
+
+
+def test_drives_run_again_if_the_input_or_an_option_differs_but_not_in_another_order(batch, tmp_path):
+    paths = [str(path) for path in write_fleet(tmp_path / "drives", 3)]
+    batch(paths)
+    assert batch(paths[::-1], resume=True).skipped == 3
+    table = tmp_path / "drives/d001/ego_motion.csv"
+    os.utime(table, ns=(0, 0))
+    assert batch(paths, resume=True).skipped == 2
+    moved = tmp_path / "moved"
+    shutil.move(tmp_path / "drives/d002", moved / "d002")
+    assert batch([*paths[:2], str(moved / "d002")], resume=True).skipped == 3
+    assert batch(paths[:2], resume=True, options={"embed": True}).skipped == 0
+
+
+def test_a_folder_with_a_batch_or_something_else_is_not_overwritten(batch, fleet, tmp_path):
+    batch([str(fleet / "drives/d000")])
+    with pytest.raises(OutputError, match="has a batch already: pass --resume"):
+        batch([str(fleet / "drives/d000")])
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/file").touch()
+    with pytest.raises(OutputError, match="is not a batch and not empty"):
+        batch([str(fleet / "drives/d000")], out=tmp_path / "other")
+
+
+def test_a_stopped_batch_goes_on_with_the_drives_that_are_left(batch, fleet, tmp_path):
+    answers = iter([False] * 5)
+    stopped = batch(should_stop=lambda: next(answers, True))
+    assert stopped.stopped
+    assert len(results_of(tmp_path / "out")) == 1  # the second drive was stopped after its second frame
+    assert not [path for path in (tmp_path / "out/.bevcli/attempts").iterdir() if path.suffix == ".run"]
+    summary = batch(resume=True)
+    assert (summary.skipped, summary.failed, len(summary.records)) == (1, 1, 4)
+
+
+def test_a_drive_that_kills_its_worker_each_time_becomes_a_row(fleet, tmp_path, monkeypatch):
+    class Killed(BaseException):
+        """What a worker does not survive."""
+
+    def die(*arguments, **options):
+        raise Killed
+
+    job = make_job(tmp_path / "out", fleet / "mini.toml", retries=2)
+    (drive,), _ = find_drives([str(fleet / "drives/d000")])
+    monkeypatch.setattr(worker_module, "run_into_folder", die)
+    for _ in range(3):
+        with pytest.raises(Killed):
+            Worker(job, "hash").run(drive)
+    record = Worker(job, "hash").run(drive)
+    assert record["attempts"] == 3
+    assert record["error"] == "the worker died in attempt 3 of 3 (out of memory, or a crash)"
+
+
+def test_any_exception_of_one_drive_leaves_the_others_alone(batch, monkeypatch):
+    def sometimes(model, sequence, *arguments, **options):
+        if sequence.name == "d001":
+            raise ZeroDivisionError("two\nlines")
+        return run_into_folder(model, sequence, *arguments, **options)
+
+    monkeypatch.setattr(worker_module, "run_into_folder", sometimes)
+    summary = batch()
+    errors = {record["drive"]: record["error"] for record in summary.records}
+    assert errors["d000"] == errors["d002"] == ""
+    assert errors["d001"] == "ZeroDivisionError: two lines"
+
+
+def test_metrics_of_drives_are_those_of_eval_and_the_joint_ones_are_written(batch, fleet, tmp_path):
+    (fleet / "drives/d000/ground_truth.json").rename(fleet / "hidden.json")
+    try:
+        summary = batch(options={"evaluate": True})
+    finally:
+        (fleet / "hidden.json").rename(fleet / "drives/d000/ground_truth.json")
+    records = {record["drive"]: record for record in summary.records}
+    assert records["d000"]["scores"] is None
+    alone = evaluate(results_of(tmp_path / "out")["d001"], fleet / "drives/d001").to_dict()
+    assert records["d001"]["scores"]["trans_err"] == pytest.approx(alone["tp_errors"]["trans_err"], abs=1e-6)
+    assert records["d001"]["scores"]["ground_truth_boxes"] == alone["ground_truth_boxes"] == 6
+    joint = json.loads((tmp_path / "out/metrics.json").read_text())
+    assert (joint["drives"], joint["frames"], joint["ground_truth_boxes"]) == (2, 6, 12)
+    row = pq.read_table(tmp_path / "out/batch.parquet").to_pylist()[1]
+    assert row["mean_ap"] == records["d001"]["scores"]["mean_ap"]
+
+
+def test_urls_are_copied_and_removed_and_results_go_to_urls(batch, fleet, tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "scratch"))
+    (tmp_path / "scratch").mkdir()
+    memory = fsspec.filesystem("memory")
+    memory.put(str(fleet / "drives/d000"), "/fleet/d000", recursive=True)
+    memory.put(str(fleet / "drives/d001"), "/fleet/d001", recursive=True)
+    try:
+        summary = batch(["memory://fleet/*"], out="memory://results")
+        assert [record["error"] for record in summary.records] == ["", ""]
+        run_alone(fleet, "d001", tmp_path / "alone")
+        found = memory.glob("/results/drives/d001-*/predictions.json")
+        assert memory.cat_file(found[0]) == (tmp_path / "alone/predictions.json").read_bytes()
+        assert memory.exists("/results/batch.parquet")
+        assert memory.exists("/results/report.html")
+        assert batch(["memory://fleet/*"], out="memory://results", resume=True).skipped == 2
+    finally:
+        memory.rm("/fleet", recursive=True)
+        memory.rm("/results", recursive=True)
+    assert not list((tmp_path / "scratch").iterdir())
+
+
+def test_the_report_needs_no_other_file_and_contains_no_markup_of_a_drive(batch, fleet, tmp_path):
+    name = "<b>bold<b>"
+    shutil.copytree(fleet / "drives/d000", tmp_path / "drives" / name)
+    batch([str(tmp_path / "drives" / name), str(fleet / "drives/empty")])
+    page = (tmp_path / "out/report.html").read_text()
+    assert "src=" not in page
+    assert "http" not in page
+    assert "<b>bold" not in page
+    assert "is not a sequence folder" in page
+    (result,) = results_of(tmp_path / "out").values()
+    assert f'href="drives/{result.name}/recording.rrd"' in page
+
+
+def test_the_hash_of_a_job_follows_model_weights_and_options(fleet, tmp_path):
+    job = make_job(tmp_path, fleet / "mini.toml")
+    model = job.load_model()
+    other = tmp_path / "other.toml"
+    other.write_text(MINI_TOML.replace("queries = 20", "queries = 21"))
+    jobs = [
+        job,
+        replace(job, reading={**job.reading, "every": 2}),
+        replace(job, run=replace(job.run, track=False)),
+        replace(job, precision="bf16"),
+    ]
+    hashes = [each.hash(model) for each in jobs] + [
+        replace(job, model=str(other)).hash(replace(job, model=str(other)).load_model())
+    ]
+    assert len(set(hashes)) == 5
+    assert replace(job, out="elsewhere", retries=0).hash(model) == job.hash(model)
