@@ -10,7 +10,11 @@ import typer
 PANEL = "Input"
 
 DeviceOption = Annotated[
-    str, typer.Option(metavar="auto|cpu|cuda|cuda:N", help="auto uses a GPU if there is one; cuda:1 is the second GPU.")
+    str,
+    typer.Option(
+        metavar="auto|cpu|cuda|cuda:N|mps",
+        help="auto uses a CUDA GPU if there is one; cuda:1 is the second one; mps is the GPU of a Mac (untried).",
+    ),
 ]
 EngineOption = Annotated[
     Literal["onnxruntime", "openvino"] | None,

@@ -69,6 +69,9 @@ class ExportedStep(nn.Module):
         projection = network.pillars.project(image_from_bev, (images.shape[2], images.shape[3]), has_image)
         hits = slot_hits(projection, self.slots)
         image_features = network.image_tokens(feature_maps, camera_index)
+        if network.calibration_embedding is not None:
+            image_size = images.shape[2], images.shape[3]
+            image_features = network.calibration_embedding(image_features, image_from_bev, image_size)
         with_history = torch.stack([history, bev_query], dim=1)
         bev = bev_query
         for layer in network.encoder.layers:
