@@ -19,7 +19,7 @@ install: $(INSTALLED)
 
 $(INSTALLED): pyproject.toml constraints.txt
 	test -x $(BIN)/python || python3 -m venv $(VENV)
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev,onnx]'
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev,onnx,openvino]'
 	touch $@
 
 demo: $(INSTALLED)
@@ -32,7 +32,7 @@ test-all: $(VENV)/.viewers
 	$(BIN)/pytest
 
 $(VENV)/.viewers: $(INSTALLED)
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev,notebook,onnx]' playwright
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev,notebook,onnx,openvino]' playwright
 	.ci/install-viewers
 	touch $@
 

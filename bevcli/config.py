@@ -46,7 +46,11 @@ def load_config(name_or_path: str | Path) -> BEVFormerConfig:
     Raises ConfigError where there is none, or where its contents are wrong.
     """
     text, file = _read_model(str(name_or_path))
-    table = _parse(text, file)
+    return config_of_table(_parse(text, file), file)
+
+
+def config_of_table(table: dict[str, Any], file: str) -> BEVFormerConfig:
+    """The configuration in the parsed contents of a model's file. Raises ConfigError, which names `file`."""
     architecture = table.get(ARCHITECTURE, "BEVFormer")
     if architecture not in list(ARCHITECTURES):
         expected = " or ".join(f'"{name}"' for name in ARCHITECTURES)
@@ -65,7 +69,37 @@ def load_table(name_or_path: str | Path, table: str, kind: type[T]) -> T:
     Raises ConfigError where there is no such file, or where its contents are wrong.
     """
     text, file = _read_model(str(name_or_path))
-    return _dataclass(_parse(text, file).get(table, {}), kind, file, f"{table}.")
+    return settings_of_table(_parse(text, file), table, kind, file)
+
+
+def settings_of_table(contents: dict[str, Any], table: str, kind: type[T], file: str) -> T:
+    """A table in the parsed contents of a model's file, as `load_table`. Raises ConfigError, which names `file`."""
+    settings = contents.get(table, {})
+    if not isinstance(settings, dict):
+        raise ConfigError(f'{file}: "{table}" must be a table, but is {settings!r:.60}')
+    return _dataclass(settings, kind, file, f"{table}.")
+
+
+def as_table(config: BEVFormerConfig, tracking: object = None) -> dict[str, Any]:
+    """The contents of the file of a model, from which `config_of_table` makes the same configuration.
+
+    tracking: the dataclass of the table TRACKING; None for no such table.
+    """
+    names = {kind: name for name, kind in ARCHITECTURES.items()}
+    table = {ARCHITECTURE: names[type(config)], **_plain(config)}
+    return table if tracking is None else table | {TRACKING: _plain(tracking)}
+
+
+def _plain(settings: Any) -> dict[str, Any]:
+    """The fields of a dataclass as TOML has them: nested dictionaries; lists for tuples; None is left out."""
+    found: dict[str, Any] = {}
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        if dataclasses.is_dataclass(value):
+            found[field.name] = _plain(value)
+        elif value is not None:
+            found[field.name] = list(value) if isinstance(value, tuple) else value
+    return found
 
 
 def _parse(text: str, file: str) -> dict[str, Any]:

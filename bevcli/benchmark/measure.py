@@ -45,6 +45,7 @@ class BenchmarkSettings:
         frames: number of timed frames, after the warm-up.
         against_plain: whether the plain version is timed too, and the results compared.
         profile: where to write PyTorch's profile of one frame (Chrome's trace format), None for no profile.
+        exported: an exported file of the model, which is timed with its own weights and precision; None for PyTorch.
     """
 
     config: BEVFormerConfig
@@ -53,6 +54,7 @@ class BenchmarkSettings:
     frames: int = 5
     against_plain: bool = False
     profile: Path | None = None
+    exported: Model | None = None
 
 
 def run_benchmark(settings: BenchmarkSettings) -> BenchmarkResult:
@@ -60,7 +62,9 @@ def run_benchmark(settings: BenchmarkSettings) -> BenchmarkResult:
     config, device = settings.config, settings.device
     limits = measure_limits(device, settings.precision)
     model = made_up_model(config)
-    fast = Version(prepare_for_inference(model, device, settings.precision), device)
+    exported = settings.exported
+    network = prepare_for_inference(model, device, settings.precision) if exported is None else exported.prepared
+    fast = Version(network, device)
     first = config.past_frames if isinstance(config, BEVFormerV2Config) else 0
     timed, run = first + WARM_UP_FRAMES, first + WARM_UP_FRAMES + settings.frames
     drive = MadeUpDrive(run + max(settings.frames, MIN_RUN_FRAMES))
@@ -76,7 +80,8 @@ def run_benchmark(settings: BenchmarkSettings) -> BenchmarkResult:
     return BenchmarkResult(
         model=config.name,
         device=device.type,
-        precision=settings.precision,
+        precision=settings.precision if exported is None else exported.precision,
+        engine="torch" if exported is None else exported.engine,
         machine=describe_machine(device),
         stages_s=stages,
         frame_s=frame_s,

@@ -33,7 +33,7 @@ class BenchmarkResult:
     Attributes:
         model: its name.
         device: "cpu" or "cuda".
-        precision: of the prepared model.
+        precision: of the prepared model or the exported file.
         machine: description of processor or GPU, threads and PyTorch's version.
         stages_s: stage -> seconds of each frame; no two stages ran at the same time.
         frame_s: seconds of the model's step for each frame, from network inputs to boxes.
@@ -42,6 +42,7 @@ class BenchmarkResult:
         operations: arithmetic operations of one frame.
         limits: the machine's peak throughput.
         comparison: with the plain version, None where that was not run.
+        engine: the program that ran the model.
     """
 
     model: str
@@ -55,6 +56,7 @@ class BenchmarkResult:
     operations: float
     limits: MachineLimits
     comparison: Comparison | None = None
+    engine: str = "torch"
 
     @property
     def times_limit(self) -> float:
@@ -73,6 +75,7 @@ class BenchmarkResult:
             "model": self.model,
             "device": self.device,
             "precision": self.precision,
+            "engine": self.engine,
             "machine": self.machine,
             "stages_ms": {stage: round(1000 * median(times), 3) for stage, times in self.stages_s.items()},
             "frame_ms": round(1000 * frame_s, 3),
@@ -99,7 +102,7 @@ class BenchmarkResult:
 
     def text(self) -> str:
         """A table of the stages, then one line for each other measurement."""
-        lines = [f"{self.model}, {self.precision}, {self.machine}", ""]
+        lines = [f"{self.model}, {self.precision}, {self.engine}, {self.machine}", ""]
         lines.append(f"{'stage':<22}{'median ms':>10}  fastest to slowest")
         for stage, times in {**self.stages_s, "whole frame": self.frame_s}.items():
             low, middle, high = (1000 * seconds for seconds in (min(times), median(times), max(times)))

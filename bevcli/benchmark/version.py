@@ -10,6 +10,7 @@ from torch import nn
 
 from bevcli.benchmark.limits import wait_for
 from bevcli.benchmark.made_up import MadeUpDrive
+from bevcli.engines.exported import ExportedBEVFormer
 from bevcli.frame import Prediction
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerOutputs
 from bevcli.pipeline.preprocess import PreparedFrame
@@ -80,6 +81,8 @@ class Version:
 
 def fine_stages(model: BEVFormerBase) -> tuple[dict[str, str], dict[str, str]]:
     """The `stages` and `starts` of a StageClock that tells the parts of the encoder apart."""
+    if isinstance(model, ExportedBEVFormer):
+        return {"engine": "engine"}, {"engine": "input"}
     stages = {"backbone": "backbone", "neck": "neck", "decoder": "decoder and head"}
     parts = {
         "temporal_self_attention": "temporal attention",

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from bevcli.cli.input_options import DeviceOption, complete_model
+from bevcli.cli.input_options import DeviceOption, EngineOption, complete_model
 
 
 def bench(
@@ -15,10 +15,11 @@ def bench(
         str,
         typer.Option(
             autocompletion=complete_model,
-            help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, uniad-track-map, or a FILE.toml.",
+            help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, uniad-track-map, a FILE.toml or a FILE.onnx.",
         ),
     ] = "tiny",
     device: DeviceOption = "auto",
+    engine: EngineOption = None,
     precision: Annotated[
         Literal["fp32", "bf16", "fp16"] | None,
         typer.Option(help="Default: fp32 on the CPU, bf16 on a GPU.", show_default=False),
@@ -48,15 +49,29 @@ def bench(
     from bevcli.benchmark.measure import BenchmarkSettings, run_benchmark
     from bevcli.benchmark.table import write_table
     from bevcli.config import load_config
-    from bevcli.pipeline.model_loading import choose_device, choose_precision
+    from bevcli.engines.exported import SUFFIX
+    from bevcli.pipeline.model_loading import choose_device, choose_precision, load_model, needs_exported_file
 
     target = choose_device(device)
     if table is not None:
         write_table(table, target, frames)
         typer.echo(f"wrote {table}", err=True)
         return
+    exported = None
+    if model.endswith(SUFFIX):
+        exported = load_model(model, device=device, precision=precision, engine=engine)
+        if against is not None or profile is not None:
+            exported.require_parts("--against" if profile is None else "--profile")
+    elif engine is not None:
+        raise needs_exported_file(engine, model)
     settings = BenchmarkSettings(
-        load_config(model), target, choose_precision(precision, target), frames, against == "plain", profile
+        load_config(model) if exported is None else exported.config,
+        target if exported is None else exported.device,
+        choose_precision(precision, target),
+        frames,
+        against == "plain",
+        profile,
+        exported,
     )
     result = run_benchmark(settings)
     print(json.dumps(result.as_data(), indent=1) if as_json else result.text())

@@ -76,6 +76,7 @@ def explain(
 
     followed = None if cell is None else parse_position(cell, "--cell")
     loaded = load_model(model, weights, device=device, untrained=untrained)
+    loaded.require_parts("bevcli explain")
     drive = open_sequence(sequence, scene=scene, rate_hz=loaded.config.rate_hz)
     place = place_of_frame(frame, [stamp.index for stamp in drive.stamps])
     traced = trace(loaded.network, loaded.device, drive, place, followed)

@@ -28,6 +28,10 @@ def export_onnx(
     cameras: Annotated[
         int | None, typer.Option(min=1, help="Number of cameras. Default: the model's.", show_default=False)
     ] = None,
+    cameras_per_cell: Annotated[
+        int,
+        typer.Option(min=1, help="Number of cameras that may see one BEV cell; more cost time (nuScenes needs 2)."),
+    ] = 2,
     decode: Annotated[bool, typer.Option("--decode", help="Add the outputs boxes, scores and classes.")] = False,
     check: Annotated[
         Path | None,
@@ -43,13 +47,14 @@ def export_onnx(
     The number of cameras is fixed, the batch is one; calibrations are inputs. The file's metadata documents every
     input and output. docs/deploy.md shows how to run it. Needs pip install 'bevcli[onnx]'.
     """
-    from bevcli.engines.check import check_exported, difference_lines
+    from bevcli.benchmark.exported import check_exported, difference_lines
     from bevcli.engines.export_onnx import export_onnx as write_onnx
     from bevcli.errors import OutputError
     from bevcli.pipeline.model_loading import load_model
     from bevcli.sequences.open import open_sequence
 
     loaded = load_model(model, weights, device="cpu", untrained=untrained)
+    loaded.require_parts("bevcli export-onnx")
     target = Path(f"{loaded.name}.onnx") if out is None else out
     if target.exists() and not force:
         raise OutputError(f"{target}: already exists; choose another name, or pass --force to overwrite it")
@@ -60,7 +65,11 @@ def export_onnx(
         opset=opset,
         deformable_convolution=deformable_convolution,
         cameras=cameras,
+        cameras_per_cell=cameras_per_cell,
         decode=decode,
+        contents=loaded.contents(),
+        untrained=loaded.untrained,
+        bundled=loaded.bundled,
     )
     typer.echo(f"{target}: {target.stat().st_size / 1e6:.1f} MB")
     if drive is not None:

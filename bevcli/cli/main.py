@@ -23,6 +23,7 @@ from bevcli.cli.export import export
 from bevcli.cli.export_onnx import export_onnx
 from bevcli.cli.find_like import find_like
 from bevcli.cli.project_debug import project_debug
+from bevcli.cli.quantize import quantize
 from bevcli.cli.render import render
 from bevcli.cli.run import run
 from bevcli.cli.samples import samples
@@ -67,6 +68,7 @@ app.command()(export)
 app.command()(export_onnx)
 app.command()(find_like)
 app.command()(project_debug)
+app.command()(quantize)
 app.command()(render)
 app.command()(run)
 app.command()(samples)

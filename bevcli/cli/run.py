@@ -15,6 +15,7 @@ from bevcli.cli.input_options import (
     ClassMapOption,
     DeviceOption,
     EgoMotionOption,
+    EngineOption,
     EveryOption,
     ExtrinsicsOption,
     FramesOption,
@@ -55,8 +56,8 @@ def run(
         str | None,
         typer.Option(
             autocompletion=complete_model,
-            help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, uniad-track-map, demo, or a FILE.toml. Default: "
-            "the model that WEIGHTS fit, else demo.",
+            help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, uniad-track-map, demo, a FILE.toml, or a "
+            "FILE.onnx of `bevcli export-onnx`. Default: the model that WEIGHTS fit, else demo.",
             rich_help_panel=MODEL,
             show_default=False,
         ),
@@ -76,6 +77,7 @@ def run(
         ),
     ] = False,
     device: DeviceOption = "auto",
+    engine: EngineOption = None,
     precision: Annotated[
         Literal["fp32", "bf16", "fp16"] | None,
         typer.Option(
@@ -211,7 +213,7 @@ def run(
 
     probes = tuple(parse_position(text, "--probe") for text in probe or ())
     recording = RecordingOptions(record, bev, score, probes, vehicle_mesh, images)
-    loaded = load_model(model, weights, device=device, precision=precision, untrained=untrained)
+    loaded = load_model(model, weights, device=device, precision=precision, untrained=untrained, engine=engine)
     drive = open_sequence(
         sequence,
         frames=parse_frames(frames),
@@ -278,6 +280,8 @@ def notes(model: Model, drive: Sequence, *, live: bool = False) -> list[str]:
     found = list(drive.notes)
     if model.untrained:
         found.append("the weights are UNTRAINED: random weights, the boxes are meaningless")
+    if model.is_exported:
+        found.append("an exported file shows no attention: the recording has no history map, pillars and probes")
     if model.left_out:
         found.append(f"{model.weights}: left out {model.left_out}, which only training uses")
     if model.not_read:

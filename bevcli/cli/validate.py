@@ -7,11 +7,13 @@ from typing import Annotated
 
 import typer
 
-from bevcli.cli.input_options import DeviceOption, complete_model
+from bevcli.cli.input_options import DeviceOption, EngineOption, complete_model
 
 
 def validate(
-    model: Annotated[str, typer.Argument(autocompletion=complete_model, help="A model name or a FILE.toml.")],
+    model: Annotated[
+        str, typer.Argument(autocompletion=complete_model, help="A model name, a FILE.toml or a FILE.onnx.")
+    ],
     weights: Annotated[
         Path | None,
         typer.Option(
@@ -51,6 +53,7 @@ def validate(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")] = False,
     device: DeviceOption = "auto",
+    engine: EngineOption = None,
 ) -> None:
     """Score a model on drives with ground truth, all drives together.
 
@@ -68,7 +71,7 @@ def validate(
     from bevcli.training.job import rig_for_drives
     from bevcli.training.validation import validate as validate_model
 
-    loaded = load_model(model, weights, device=device)
+    loaded = load_model(model, weights, device=device, engine=engine)
     seeds = None if rendered is None else parse_seeds(rendered)
     drives = open_drives(data or (), seeds, cache, loaded.config, None if rig is None else rig_for_drives(rig, model))
     runner = Runner(loaded.prepared, loaded.device, StepOptions(loaded.precision, temporal))

@@ -1,1 +1,1 @@
-"""Other programs that compute the model: export to ONNX, and ONNX Runtime in the place of PyTorch."""
+"""Other programs that compute the model: export to ONNX, ONNX Runtime and OpenVINO in the place of PyTorch, INT8."""

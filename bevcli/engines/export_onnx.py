@@ -5,18 +5,23 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
+import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 
+from bevcli.config import as_table
 from bevcli.engines.export_parts import DeformableConvolution, ExportedStep
 from bevcli.engines.interface import Port, input_ports, metadata, output_ports
 from bevcli.engines.packages import require
 from bevcli.errors import BevcliError, OutputError
 from bevcli.model.bevformer import BEVFormer, BEVFormerBase
 from bevcli.model.uniad import UniAD
+
+NAME_SCOPES = "pkg.torch.onnx.name_scopes"  # the exporter's note of the modules that a node comes from
 
 # GridSample exists since opset 16, ScatterND with a sum since 16, LayerNormalization since 17, DeformConv since 19.
 MIN_OPSET = {"operator": 19, "gridsample": 17}
@@ -29,7 +34,11 @@ def export_onnx(
     opset: int = 19,
     deformable_convolution: DeformableConvolution = "operator",
     cameras: int | None = None,
+    cameras_per_cell: int = 2,
     decode: bool = False,
+    contents: Mapping[str, Any] | None = None,
+    untrained: bool = False,
+    bundled: bool = False,
 ) -> None:
     """Writes one recurrent step of a model as an ONNX file of standard operators.
 
@@ -43,7 +52,12 @@ def export_onnx(
         deformable_convolution: "operator" uses DeformConv (opset 19), "gridsample" writes it with GridSample, for
             runtimes without it. Models without deformable convolutions are the same in both.
         cameras: number of cameras of the rig. None takes the model's own.
+        cameras_per_cell: the number of cameras that may see one cell of the BEV map; at most two of nuScenes' do. The
+            file fails on a rig where more see one. Its time for spatial cross-attention is proportional to it.
         decode: add the outputs boxes, scores and classes.
+        contents: of the model's TOML file, for the metadata. None takes those of the network's configuration.
+        untrained: whether the weights are random, for the metadata.
+        bundled: whether the weights are those of the package, for the metadata.
 
     Raises:
         BevcliError: the extra bevcli[onnx] is not installed, the opset is too old, or the model is a BEVFormerV2 or a
@@ -64,9 +78,11 @@ def export_onnx(
             f"{config.name}: BEVFormerV2, UniAD and models that crop images cannot be exported yet "
             "(expected a recurrent BEVFormer, such as tiny, small, base or demo)"
         )
-    inputs = input_ports(config, len(config.cameras) if cameras is None else cameras)
+    count = len(config.cameras) if cameras is None else cameras
+    slots = min(cameras_per_cell, count)
+    inputs = input_ports(config, count)
     outputs = output_ports(config, decode=decode)
-    step = ExportedStep(network, deformable_convolution, decode=decode).eval()
+    step = ExportedStep(network, deformable_convolution, slots, decode=decode).eval()
     with _quiet(), torch.no_grad():
         program = torch.onnx.export(
             step,
@@ -81,7 +97,9 @@ def export_onnx(
     assert program is not None
     proto = program.model_proto
     _document(proto, inputs, outputs)
-    onnx.helper.set_model_props(proto, metadata(config, inputs, outputs))
+    contents = as_table(config) if contents is None else contents
+    facts = metadata(config, inputs, outputs, contents, slots=slots, untrained=untrained, bundled=bundled)
+    onnx.helper.set_model_props(proto, facts)
     onnx.checker.check_model(proto, full_check=True)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -96,8 +114,16 @@ def _document(proto: object, inputs: tuple[Port, ...], outputs: tuple[Port, ...]
     for value in (*graph.input, *graph.output):
         value.doc_string = meanings[value.name]
     for node in graph.node:
+        node.name = f"{_part(node)}/{node.name}"
         # Where a node came from in our source code: a third of the file, and of use to nobody who runs it.
         del node.metadata_props[:]
+
+
+def _part(node: object) -> str:
+    """The part of the network that a node belongs to, such as "backbone.stages.0.0"; "" outside of all parts."""
+    scopes = [entry.value for entry in node.metadata_props if entry.key == NAME_SCOPES]  # type: ignore[attr-defined]
+    parts = re.findall(r"'network\.([\w.]+)'", scopes[0] if scopes else "")
+    return parts[-1] if parts else ""
 
 
 @contextlib.contextmanager

@@ -10,13 +10,15 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from bevcli.model.bevformer import BEVFormer, BEVFormerConfig
-from bevcli.model.deformable_attention import FeatureMaps, sample_maps, sampling_locations
+from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, split_offsets_and_mask
 from bevcli.model.encoder import EncoderLayer, SpatialCrossAttention
 from bevcli.model.pillar_projection import PillarProjection
+from bevcli.model.prepared import fold_batch_norms
 
 DeformableConvolution = Literal["operator", "gridsample"]
 
@@ -31,11 +33,14 @@ class ExportedStep(nn.Module):
     image_mean: Tensor
     image_std: Tensor
 
-    def __init__(self, model: BEVFormer, deformable_convolution: DeformableConvolution, *, decode: bool) -> None:
-        """A copy of the model, with its parts replaced; the model itself stays unchanged."""
+    def __init__(
+        self, model: BEVFormer, deformable_convolution: DeformableConvolution, slots: int, *, decode: bool
+    ) -> None:
+        """A copy of the model, with its parts replaced; the model itself stays unchanged. slots: see `slot_hits`."""
         super().__init__()
         self.network = copy.deepcopy(model).cpu().float().eval().requires_grad_(False)
-        self.config, self.decode = model.config, decode
+        self.config, self.slots, self.decode = model.config, slots, decode
+        fold_batch_norms(self.network, torch.device("meta"))  # for no device: with standard operators
         replace_parts(self.network, deformable_convolution)
         image = self.config.image
         self.register_buffer("image_mean", torch.tensor(image.mean)[:, None, None])
@@ -61,7 +66,8 @@ class ExportedStep(nn.Module):
         history = network.align_history(previous_bev, rotation)
         centers = network.encoder.cell_centers.expand(1, 2, -1, -1)
         reference_points = torch.where(use_previous, network.encoder.reference_points(shift), centers)
-        hits = list_hits(network.pillars.project(image_from_bev, (images.shape[2], images.shape[3]), has_image))
+        projection = network.pillars.project(image_from_bev, (images.shape[2], images.shape[3]), has_image)
+        hits = slot_hits(projection, self.slots)
         image_features = network.image_tokens(feature_maps, camera_index)
         if network.calibration_embedding is not None:
             image_size = images.shape[2], images.shape[3]
@@ -73,7 +79,7 @@ class ExportedStep(nn.Module):
             bev_maps = torch.where(use_previous, with_history, torch.stack([bev, bev], dim=1))
             bev = layer(bev, position, bev_maps, reference_points, image_features, hits)
         class_logits, box_codes, _ = network.decoder(bev, network.detection_head)
-        outputs = [bev, class_logits[-1], box_codes[-1]]
+        outputs = [bev, class_logits[-1], box_codes[-1], hits.most_cameras]
         if network.segmentation_head is not None:
             segmentation = network.segmentation_head(bev, position)
             outputs += [segmentation.mask_logits[-1], segmentation.class_logits[-1]]
@@ -90,54 +96,83 @@ class ExportedStep(nn.Module):
 
 
 @dataclass(frozen=True)
-class CameraHits:
-    """The cells that each camera sees, as lists of different lengths.
+class SlottedHits:
+    """The cameras that see each cell, in K slots a cell, so that every shape is fixed. A slot may be empty.
 
     Attributes:
-        cells: for each camera n, (M_n,) int64, the indices of the cells that it sees.
-        reference_points: for each camera n, (M_n, Z, 2) float32, the points of these cells' pillars, 0 to 1 over the
+        camera: (Y·X, K) int64, the camera of each slot, any camera where it is empty.
+        filled: (Y·X, K) float32, 1 for a slot with a camera that sees the cell, else 0.
+        reference_points: (Y·X, K, Z, 2) float32, the points of the cell's pillar in the slot's camera, 0 to 1 over the
             padded image.
         cameras_per_cell: (Y·X, 1) float32, the number of cameras that see a cell, at least 1.
+        most_cameras: (1,) int64, the largest number of cameras that see one cell. Those beyond K have no slot.
     """
 
-    cells: tuple[Tensor, ...]
-    reference_points: tuple[Tensor, ...]
+    camera: Tensor
+    filled: Tensor
+    reference_points: Tensor
     cameras_per_cell: Tensor
+    most_cameras: Tensor
 
 
-def list_hits(projection: PillarProjection) -> CameraHits:
-    """The hits of one batch element, camera by camera: one NonZero operator a camera."""
-    hit = projection.hit[0]  # (N, Y·X)
-    cells = tuple(seen.nonzero()[:, 0] for seen in hit.unbind(0))
-    points = zip(projection.reference_points[0].unbind(0), cells, strict=True)
-    return CameraHits(
-        cells=cells,
-        reference_points=tuple(camera.index_select(0, seen) for camera, seen in points),
-        cameras_per_cell=hit.float().sum(0).clamp(min=1)[:, None],
+def slot_hits(projection: PillarProjection, slots: int) -> SlottedHits:
+    """The hits of one batch element. slots: K, at most the number of cameras."""
+    hit = projection.hit[0].float()  # (N, Y·X)
+    cells = hit.shape[1]
+    filled, camera = hit.t().topk(slots, dim=1)
+    place = camera * cells + torch.arange(cells)[:, None]  # index in N·Y·X
+    points = projection.reference_points[0].flatten(0, 1).index_select(0, place.flatten())
+    count = hit.sum(0)
+    return SlottedHits(
+        camera=camera,
+        filled=filled,
+        reference_points=points.unflatten(0, (cells, slots)),
+        cameras_per_cell=count.clamp(min=1)[:, None],
+        most_cameras=count.max()[None].long(),
     )
 
 
-class ListedSpatialCrossAttention(nn.Module):
-    """Takes the place of `SpatialCrossAttention`, for batches of one and hits that are listed camera by camera."""
+class SlottedSpatialCrossAttention(nn.Module):
+    """Takes the place of `SpatialCrossAttention`, for batches of one and hits in slots.
+
+    The maps of all cameras are stacked into one tall map, with a row of zeros between them, so that GridSample can
+    sample another camera at every point.
+    """
 
     def __init__(self, original: SpatialCrossAttention) -> None:
         super().__init__()
         self.points, self.attention = original.points, original.attention
 
-    def forward(self, query: Tensor, image_features: FeatureMaps, hits: CameraHits) -> Tensor:
+    def forward(self, query: Tensor, image_features: FeatureMaps, hits: SlottedHits) -> Tensor:
         """As `SpatialCrossAttention.forward`."""
         offsets, weights = (part[:, :, 0] for part in self.attention.predict(query[0]))
-        heads = self.attention.shape[0]
+        heads, levels = self.attention.shape[0], image_features.level_shapes
         values = self.attention.value_projection(image_features.tokens).unflatten(-1, (heads, -1))
-        summed = torch.zeros_like(query[0])
-        for camera, (cells, points) in enumerate(zip(hits.cells, hits.reference_points, strict=True)):
-            reference = points.repeat(1, self.points // points.shape[1], 1)[:, None, None]
-            level_shapes = image_features.level_shapes
-            locations = sampling_locations(reference, offsets.index_select(0, cells), level_shapes)
-            weight = weights.index_select(0, cells)
-            sampled = sample_maps(values[camera, None], level_shapes, locations[None], weight[None])[0]  # (M_n, C)
-            summed = summed.index_add(0, cells, sampled)
-        return self.attention.output_projection(summed / hits.cameras_per_cell)[None]
+        points = hits.reference_points
+        points = points.repeat(1, 1, self.points // points.shape[2], 1)[:, None]  # (Y·X, 1, K, P, 2)
+        summed = torch.zeros(())
+        maps = values.split([height * width for height, width in levels], dim=1)
+        for level, ((height, width), level_map) in enumerate(zip(levels, maps, strict=True)):
+            x = points[..., 0] + offsets[:, :, None, level, :, 0] / width  # (Y·X, heads, K, P)
+            y = points[..., 1] * height + offsets[:, :, None, level, :, 1] - 0.5
+            # One row above or below a map is zero, and so is everything beyond.
+            y = y.clamp(-1, height) + (hits.camera * (height + 1)).float()[:, None, :, None]
+            tall = tall_map(level_map, height, width)
+            grid = torch.stack([2 * x - 1, (2 * y + 1) / tall.shape[2] - 1], dim=-1)
+            sampled = F.grid_sample(tall, grid.transpose(0, 1).flatten(2, 3), align_corners=False)
+            weight = weights[:, :, None, level] * hits.filled[:, None, :, None]  # (Y·X, heads, K, P)
+            summed = summed + (sampled * weight.transpose(0, 1).flatten(2)[:, None]).sum(-1)  # (heads, D, Y·X)
+        found = summed.permute(2, 0, 1).flatten(1)  # (Y·X, C)
+        return self.attention.output_projection(found / hits.cameras_per_cell)[None]
+
+
+def tall_map(values: Tensor, height: int, width: int) -> Tensor:
+    """The maps of all cameras below each other, each followed by a row of zeros.
+
+    values: (N, height·width, heads, D) -> (heads, D, N·(height + 1), width).
+    """
+    planes = values.permute(2, 3, 0, 1).unflatten(-1, (height, width))  # (heads, D, N, height, width)
+    return F.pad(planes, (0, 0, 0, 1)).flatten(2, 3)
 
 
 class DeformConvOperator(nn.Module):
@@ -165,7 +200,7 @@ def replace_parts(part: nn.Module, deformable_convolution: DeformableConvolution
     """Replaces, in place, the spatial cross-attentions and, for "operator", the deformable convolutions."""
     for name, child in part.named_children():
         if isinstance(child, SpatialCrossAttention):
-            setattr(part, name, ListedSpatialCrossAttention(child))
+            setattr(part, name, SlottedSpatialCrossAttention(child))
         elif isinstance(child, ModulatedDeformableConvolution) and deformable_convolution == "operator":
             setattr(part, name, DeformConvOperator(child))
         else:

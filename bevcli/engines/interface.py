@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,6 +13,11 @@ from torch import Tensor
 from bevcli import __version__
 from bevcli.model.bevformer import BEVFormerConfig
 from bevcli.model.segmentation import STUFF_CLASSES
+
+# The part of the metadata that bevcli itself reads, to run the file: the contents of the model's TOML file as JSON,
+# the number of cameras that may see one cell, whether the weights are random or those of the package, and the precision
+# of backbone and neck.
+METADATA = ("config", "cameras_per_cell", "untrained", "bundled", "precision")
 
 
 @dataclass(frozen=True)
@@ -111,6 +118,13 @@ def output_ports(config: BEVFormerConfig, *, decode: bool) -> tuple[Port, ...]:
             "(1, Q, 10): cx, cy, log w, log l, cz, log h, sin, cos, vx, vy; metres and m/s, bev frame; "
             "yaw = -atan2(sin, cos) - pi / 2.",
         ),
+        Port(
+            "most_cameras_per_cell",
+            (1,),
+            torch.int64,
+            "(1,): the largest number of cameras that see one cell of the BEV map. If it exceeds the metadata's "
+            "cameras_per_cell, cameras are left out, and the results are wrong: export with more.",
+        ),
     ]
     if "segmentation" in config.heads:
         masks = len(STUFF_CLASSES) + config.segmentation.thing_queries
@@ -146,8 +160,27 @@ def pad_value_bgr(config: BEVFormerConfig) -> tuple[float, ...]:
     return mean[::-1] if config.image.color_order == "rgb" else mean
 
 
-def metadata(config: BEVFormerConfig, inputs: tuple[Port, ...], outputs: tuple[Port, ...]) -> dict[str, str]:
-    """The metadata of a file: text, or JSON where a value is not a name."""
+def metadata(
+    config: BEVFormerConfig,
+    inputs: tuple[Port, ...],
+    outputs: tuple[Port, ...],
+    contents: Mapping[str, Any],
+    *,
+    slots: int,
+    untrained: bool,
+    bundled: bool,
+) -> dict[str, str]:
+    """The metadata of a file: text, or JSON where a value is not a name.
+
+    Args:
+        config: of the model.
+        inputs: of the file.
+        outputs: of the file.
+        contents: of the model's TOML file.
+        slots: the number of cameras that may see one cell.
+        untrained: whether the weights are random.
+        bundled: whether the weights are those of the package.
+    """
     image, grid = config.image, config.bev_grid
     facts = {
         "inputs": {port.name: port.meaning for port in inputs},
@@ -164,9 +197,14 @@ def metadata(config: BEVFormerConfig, inputs: tuple[Port, ...], outputs: tuple[P
         "max_gap_s": config.max_gap_s,
         "use_shift": config.ego_motion.shift,
         "use_rotation": config.ego_motion.rotation,
+        "cameras_per_cell": slots,
+        "config": contents,
+        "untrained": untrained,
+        "bundled": bundled,
     }
     names = {
         "model": config.name,
+        "precision": "fp32",
         "bevcli_version": __version__,
         "resize": image.resize,
         "can_bus_quaternion": config.ego_motion.can_bus_quaternion,

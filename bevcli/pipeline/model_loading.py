@@ -8,11 +8,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any, Literal
 
 import torch
 
 from bevcli.checkpoints import bundled_weights, inspect, load_weights
-from bevcli.config import TRACKING, known_models, load_config, load_table
+from bevcli.config import TRACKING, as_table, known_models, load_config, load_table, settings_of_table
+from bevcli.engines.engine import EngineName
+from bevcli.engines.exported import SUFFIX, ExportedBEVFormer
 from bevcli.errors import BevcliError, WeightsError
 from bevcli.geometry.cameras import CameraRig
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
@@ -30,26 +33,28 @@ class Model:
     """A model with its weights, and the device that it runs on.
 
     Attributes:
-        network: the plain BEVFormer, BEVFormerV2 or UniAD, as in its paper, on the CPU.
+        network: the plain BEVFormer, BEVFormerV2 or UniAD, as in its paper, on the CPU; or an exported file.
         device: where it runs.
-        precision: of the image features; the rest of the network computes in float32.
+        precision: of the image features; the rest of the network computes in float32. Only exported files have "int8".
         weights: the file that the weights came from, None for random weights.
         bundled: whether that file is part of the package.
         left_out: what of that file is for training only and was left out; "" for nothing.
         tracker: the parameters of the tracker, the table [tracking] of the model's TOML file.
         not_read: classes and functions in the weights file whose objects were not read.
         facts: metadata in the weights file.
+        engine: the program that computes it: "torch", or for an exported file "onnxruntime" or "openvino".
     """
 
     network: BEVFormerBase
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
-    precision: Precision = "fp32"
+    precision: Precision | Literal["int8"] = "fp32"
     weights: Path | None = None
     bundled: bool = False
     left_out: str = ""
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     not_read: tuple[str, ...] = ()
     facts: Mapping[str, str] = field(default_factory=dict)
+    engine: Literal["torch"] | EngineName = "torch"
 
     @property
     def config(self) -> BEVFormerConfig:
@@ -73,6 +78,22 @@ class Model:
         stated = facts_note(self.facts, self.config)
         return (*([stated] if stated else []), *rig_notes(rig, self.config))
 
+    @property
+    def is_exported(self) -> bool:
+        """Whether the network is an exported file, whose parts cannot be observed, trained or exported again."""
+        return self.engine != "torch"
+
+    def require_parts(self, what: str) -> None:
+        """Raises BevcliError for an exported file. what: needs the network's parts, such as "--probe"."""
+        if isinstance(self.network, ExportedBEVFormer):
+            raise BevcliError(
+                f"{what}: not available for {self.network.file}, an exported file: use {self.name} by its name"
+            )
+
+    def contents(self) -> dict[str, Any]:
+        """The contents of the model's TOML file, [training] excluded."""
+        return as_table(self.config, self.tracker)
+
     @cached_property
     def config_hash(self) -> str:
         """SHA-256 of the configurations of network and tracker."""
@@ -90,6 +111,9 @@ class Model:
     @cached_property
     def prepared(self) -> BEVFormerBase:
         """The network on its device, made ready for inference on the first use: same results, faster."""
+        if isinstance(self.network, ExportedBEVFormer):
+            return self.network
+        assert self.precision != "int8"
         return prepare_for_inference(self.network, self.device, self.precision)
 
 
@@ -100,6 +124,7 @@ def load_model(
     device: str | torch.device = "auto",
     precision: Precision | None = None,
     untrained: bool = False,
+    engine: EngineName | None = None,
 ) -> Model:
     """Loads a model and its weights.
 
@@ -107,19 +132,25 @@ def load_model(
 
     Args:
         name: a known model ("tiny", "small", "base", "v2-t1-base", "v2-t1", "v2-t2", "v2-t8", "uniad-track-map",
-            "demo") or a FILE.toml. None takes the model that the weights fit, or "demo" where there are no weights.
+            "demo"), a FILE.toml, or an exported FILE.onnx, which holds its weights and runs on the CPU in the precision
+            of the file. None takes the model that the weights fit, or "demo" where there are no weights.
         weights: an official .pth as published, or a .safetensors. None takes the weights of the package, which only
             "demo" has.
         device: "auto" takes a CUDA GPU where there is one, else the CPU; or "cpu", "cuda", "cuda:1", or "mps", the GPU
             of a Mac, which nobody has tried yet.
         precision: "fp32", "bf16" or "fp16". None takes fp32 on a CPU and bf16 on a GPU.
         untrained: use random weights, always the same ones.
+        engine: the program that runs a FILE.onnx: "onnxruntime" (the default) or "openvino".
 
     Raises:
         ConfigError: the model's TOML file is missing or wrong.
         WeightsError: there are no weights, they do not fit, or both weights and `untrained` are given.
-        BevcliError: the device is not there.
+        BevcliError: the device is not there, the engine is not installed, or an option does not apply to the model.
     """
+    if name is not None and str(name).endswith(SUFFIX):
+        return _load_exported(Path(name), weights, device, precision, engine or "onnxruntime", untrained=untrained)
+    if engine is not None:
+        raise needs_exported_file(engine, "tiny" if name is None else str(name))
     weights = None if weights is None else Path(weights)
     if weights is not None and untrained:
         raise WeightsError(f"--weights {weights} and --untrained exclude each other: give one of them")
@@ -148,6 +179,46 @@ def load_model(
         tracker=tracker,
         not_read=() if loaded is None else loaded.not_read,
         facts={} if loaded is None else loaded.facts,
+    )
+
+
+def needs_exported_file(engine: EngineName, model: str) -> BevcliError:
+    """The error for an engine that is to run a model by its name."""
+    return BevcliError(
+        f"--engine {engine}: runs exported files only: bevcli export-onnx {model}, then --model {model}.onnx"
+    )
+
+
+def _load_exported(
+    file: Path,
+    weights: str | Path | None,
+    device: str | torch.device,
+    precision: Precision | None,
+    engine: EngineName,
+    *,
+    untrained: bool,
+) -> Model:
+    """The model of a file of `bevcli export-onnx` or `bevcli quantize`."""
+    if weights is not None or untrained:
+        option = "--untrained" if untrained else f"--weights {weights}"
+        raise WeightsError(f"{file}: an exported file holds its weights: leave out {option}")
+    if precision is not None:
+        raise BevcliError(
+            f"--precision {precision}: {file} has a fixed precision: leave out the option "
+            "(bevcli quantize writes files with INT8)"
+        )
+    if str(device) not in ("auto", "cpu"):
+        raise BevcliError(f"--device {device}: {file} runs on the CPU: leave out the option")
+    network = ExportedBEVFormer(file, engine)
+    found = network.metadata
+    return Model(
+        network,
+        torch.device("cpu"),
+        found.precision,
+        None if found.untrained else file,
+        bundled=found.bundled,
+        tracker=settings_of_table(found.contents, TRACKING, TrackerConfig, str(file)),
+        engine=engine,
     )
 
 

@@ -55,8 +55,11 @@ def run(
             name, else the one with the nearest viewing direction.
 
     Raises:
-        InputError: a frame cannot be read, a probe lies outside the BEV grid, or a camera is unknown.
+        InputError: a frame cannot be read, a probe lies outside the BEV grid, a camera is unknown, or the attention
+            of an exported file is asked for.
     """
+    if attention or probes:
+        model.require_parts("attention and probes")
     asked = StepOptions(model.precision, temporal, ask_attention=attention or bool(probes), probes=tuple(probes))
     steps = _steps(model, sequence, asked, cameras, track=track)
     return ((frame, prediction) for frame, prediction, _ in steps)
@@ -142,6 +145,8 @@ def run_into_folder(
             the run to resume was another one.
     """
     options = RunOptions() if options is None else options
+    if options.recording.probes:
+        model.require_parts("--probe")
     if force and resume:
         raise OutputError("--force and --resume exclude each other: pass one of them")
     with RunFolder(out, force=force, resume=resume) as folder:

@@ -69,7 +69,7 @@ def run_facts(model: Model, sequence: Sequence, options: object) -> dict[str, st
         "model": f"{model.name}, {_short(model.config_hash)}",
         "weights": f"{model.weights or 'random'}, {_short(model.weights_hash)}",
         "device": model.device.type,
-        "precision": model.precision,
+        "precision": f"{model.precision}, {model.engine}" if model.is_exported else model.precision,
         **{f"option {name.replace('_', '-')}": repr(value) for name, value in vars(options).items()},
         "frames of the input": f"{len(sequence.stamps)}, {_short(digest(sequence.stamps))}",
         "calibration": _short(digest(sequence.rig)),

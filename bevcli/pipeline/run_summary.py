@@ -103,6 +103,7 @@ class RunSummary:
             "untrained": model.untrained,
             "device": model.device.type,
             "precision": model.precision,
+            "engine": model.engine,
             "temporal": self._temporal,
             "frames": self._whole.count,
             "frames_asked_for": len(self._sequence.stamps),

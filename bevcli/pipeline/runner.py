@@ -8,10 +8,12 @@ from collections.abc import Iterable, Iterator
 from collections.abc import Sequence as Items
 from dataclasses import dataclass
 from itertools import islice
+from typing import Literal
 
 import torch
 from torch import Tensor
 
+from bevcli.engines.exported import ExportedBEVFormer
 from bevcli.frame import AttentionView, BevMap, Frame, FrameStamp, Prediction, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerOutputs
@@ -51,13 +53,13 @@ class StepOptions:
     """How a step is computed.
 
     Attributes:
-        precision: of a plain model, by autocast; a prepared model has its own.
+        precision: of a plain model, by autocast; a prepared model and an exported file have their own.
         temporal: whether history is used.
-        ask_attention: whether predictions carry an AttentionView.
+        ask_attention: whether predictions carry an AttentionView; those of an exported file never do.
         probes: x, y in metres, bev frame: the cells whose sampling points the AttentionView shows.
     """
 
-    precision: Precision = "fp32"
+    precision: Precision | Literal["int8"] = "fp32"
     temporal: bool = True
     ask_attention: bool = False
     probes: tuple[tuple[float, float], ...] = ()
@@ -176,7 +178,7 @@ class Runner:
         return usable
 
     def _probe(self) -> AttentionProbe | None:
-        if not self.options.ask_attention:
+        if not self.options.ask_attention or isinstance(self.model, ExportedBEVFormer):
             return None
         cells = probe_cells(self.options.probes, self.config.bev_grid)
         return AttentionProbe(self.model, self.config.encoder.layers - 1, cells.to(self.device))
@@ -196,7 +198,7 @@ class Runner:
 
     def _autocast(self) -> contextlib.AbstractContextManager[object]:
         # For a plain model; a prepared one has a precision of its own and ignores it.
-        if self.options.precision == "fp32":
+        if self.options.precision not in _AUTOCAST:
             return contextlib.nullcontext()
         return torch.autocast(self.device.type, _AUTOCAST[self.options.precision])
 

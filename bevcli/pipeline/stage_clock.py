@@ -20,6 +20,7 @@ STAGES = {
     "query_interaction": "tracks",
     "map_head": "map_head",
     "segmentation_head": "segmentation_head",
+    "engine": "engine",  # of an exported file: all of the above
 }
 
 

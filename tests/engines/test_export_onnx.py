@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import torch
 
-from bevcli.config import load_config
-from bevcli.engines.check import check_exported
+from bevcli.benchmark.exported import check_exported
+from bevcli.engines.engine import ENGINES
 from bevcli.engines.export_onnx import export_onnx
-from bevcli.engines.onnx_runtime import OnnxBEVFormer
+from bevcli.engines.exported import ExportedBEVFormer
 from bevcli.errors import BevcliError, WeightsError
 from bevcli.model.box_coding import decode
 from bevcli.pipeline.model_loading import Model, load_model
@@ -47,7 +47,7 @@ def demo_file(tmp_path_factory) -> Path:
 
 def test_a_file_equals_the_model_with_and_without_history(small_file):
     model = small_model()
-    exported = OnnxBEVFormer(small_file, model.config)
+    exported = ExportedBEVFormer(small_file, "onnxruntime")
     history = torch.randn(1, 48, 32, generator=torch.Generator().manual_seed(1))
     for previous in (None, history):
         with torch.inference_mode():
@@ -59,7 +59,7 @@ def test_a_file_equals_the_model_with_and_without_history(small_file):
 
 def test_a_camera_without_an_image_sees_nothing(small_file):
     model = small_model()
-    exported = OnnxBEVFormer(small_file, model.config)
+    exported = ExportedBEVFormer(small_file, "onnxruntime")
     inputs = small_inputs()
     inputs.has_image[:] = False
     with torch.inference_mode():
@@ -68,11 +68,12 @@ def test_a_camera_without_an_image_sees_nothing(small_file):
 
 def test_decoded_boxes_equal_the_decoder_of_the_library(small_file):
     model = small_model()
-    exported = OnnxBEVFormer(small_file, model.config)
-    feed = exported._feed(small_inputs(), None)
-    boxes, scores, classes = exported.session.run(["boxes", "scores", "classes"], feed)
+    exported = ExportedBEVFormer(small_file, "onnxruntime")
+    found: dict[str, np.ndarray] = {}
+    exported.engine.register_forward_hook(lambda module, arguments, outputs: found.update(outputs))
     with torch.inference_mode():
         [expected] = decode(exported(small_inputs()), model.config)
+    boxes, scores, classes = (found[name] for name in ("boxes", "scores", "classes"))
     np.testing.assert_allclose(scores[0], expected.scores, atol=1e-6)
     np.testing.assert_allclose(boxes[0, :, :3], expected.centers, atol=1e-5)
     np.testing.assert_allclose(boxes[0, :, 3:6], expected.sizes_lwh, rtol=1e-5)
@@ -138,8 +139,9 @@ def test_the_program_of_the_deployment_page_finds_the_boxes_of_bevcli(demo_file,
 def test_mistakes_are_named(small_file, tmp_path):
     with pytest.raises(BevcliError, match="expected 19 or newer"):
         export_onnx(small_model(), tmp_path / "old.onnx", opset=18)
-    with pytest.raises(WeightsError, match="holds the model small-for-tests, expected demo"):
-        OnnxBEVFormer(small_file, load_config("demo"))
     (tmp_path / "broken.onnx").write_bytes(b"no model")
-    with pytest.raises(WeightsError, match="cannot load it"):
-        OnnxBEVFormer(tmp_path / "broken.onnx", small_model().config)
+    for engine in ENGINES:
+        with pytest.raises(WeightsError, match="cannot load it"):
+            ExportedBEVFormer(tmp_path / "broken.onnx", engine)
+        with pytest.raises(WeightsError, match="No such file"):
+            ExportedBEVFormer(tmp_path / "missing.onnx", engine)

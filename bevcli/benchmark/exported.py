@@ -9,9 +9,11 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from bevcli.engines.onnx_runtime import OnnxBEVFormer
+from bevcli.benchmark.comparison import NEAR_M
+from bevcli.engines.engine import EngineName
+from bevcli.engines.exported import ExportedBEVFormer
 from bevcli.frame import Sequence
-from bevcli.model.bevformer import BEVFormerOutputs
+from bevcli.model.bevformer import BEVFormerBase, BEVFormerOutputs
 from bevcli.model.prepared import prepare_for_inference
 from bevcli.pipeline.model_loading import Model
 from bevcli.pipeline.preprocess import Preprocessor
@@ -27,6 +29,7 @@ class FrameDifference:
         bev: of the BEV map.
         logits: of the class logits.
         box_m: of the box centres, metres.
+        near: share of the box centres that differ by at most 0.1 m, 0 to 1.
         code: of the other numbers of the box codes: logarithms of sizes, sine and cosine, m/s.
         masks: of the probabilities of the map's cells; 0 without segmentation.
     """
@@ -35,28 +38,41 @@ class FrameDifference:
     bev: float
     logits: float
     box_m: float
+    near: float
     code: float
     masks: float
 
 
-def check_exported(file: Path, model: Model, sequence: Sequence) -> Iterator[FrameDifference]:
+def check_exported(
+    file: Path, model: Model, sequence: Sequence, engine: EngineName = "onnxruntime"
+) -> Iterator[FrameDifference]:
     """Runs both over a drive, each with the state of its own last frame, and yields the differences frame by frame.
 
     Args:
         file: an exported file of the model.
         model: the model; it runs on the CPU in float32.
         sequence: the drive. Frames without any image are left out.
+        engine: the program that runs the file.
 
     Raises:
-        WeightsError: the file cannot be loaded, or holds another model.
+        WeightsError: the file cannot be loaded.
         InputError: a frame cannot be read.
     """
+    network = prepare_for_inference(model.network, torch.device("cpu"))
+    yield from _differences((network, ExportedBEVFormer(file, engine)), sequence)
+
+
+def compare_exported(file: Path, other: Path, sequence: Sequence, engine: EngineName) -> Iterator[FrameDifference]:
+    """As `check_exported`, for two exported files of one model."""
+    yield from _differences((ExportedBEVFormer(other, engine), ExportedBEVFormer(file, engine)), sequence)
+
+
+def _differences(networks: tuple[BEVFormerBase, BEVFormerBase], sequence: Sequence) -> Iterator[FrameDifference]:
     cpu = torch.device("cpu")
-    networks = (prepare_for_inference(model.network, cpu), OnnxBEVFormer(file, model.config))
     outputs = [_Latest(network) for network in networks]
     runners = [Runner(network, cpu) for network in networks]
     states = [None, None]
-    preprocess = Preprocessor(model.config)
+    preprocess = Preprocessor(networks[0].config)
     for place, stamp in enumerate(sequence.stamps):
         prepared = preprocess(sequence.load(place))
         if not prepared.frame.images:
@@ -69,6 +85,7 @@ def compare_outputs(frame: int, ours: BEVFormerOutputs, theirs: BEVFormerOutputs
     """The largest differences of the last decoder layer, the BEV map and the segmentation of a frame."""
     codes = (ours.box_codes[-1] - theirs.box_codes[-1]).abs()
     center = [0, 1, 4]
+    distances = codes[..., center].norm(dim=-1)
     others = [index for index in range(codes.shape[-1]) if index not in center]
     masks = 0.0
     if ours.segmentation is not None and theirs.segmentation is not None:
@@ -77,18 +94,22 @@ def compare_outputs(frame: int, ours: BEVFormerOutputs, theirs: BEVFormerOutputs
         frame=frame,
         bev=_largest(ours.bev, theirs.bev),
         logits=_largest(ours.class_logits[-1], theirs.class_logits[-1]),
-        box_m=codes[..., center].norm(dim=-1).max().item(),
+        box_m=distances.max().item(),
+        near=(distances <= NEAR_M).float().mean().item(),
         code=codes[..., others].max().item(),
         masks=masks,
     )
 
 
 def difference_lines(differences: list[FrameDifference]) -> list[str]:
-    """A table, one line a frame, and the largest of each column."""
+    """A table, one line a frame, and the largest of each column; of the share of boxes, the smallest."""
     columns = ("bev", "logits", "box_m", "code", "masks")
-    rows = [(str(row.frame), *(f"{getattr(row, name):.1e}" for name in columns)) for row in differences]
-    largest = ("largest", *(f"{max(getattr(row, name) for row in differences):.1e}" for name in columns))
-    heads = ("frame", "BEV map", "logits", "centres m", "codes", "masks")
+    rows = [
+        (str(row.frame), *(f"{getattr(row, name):.1e}" for name in columns), f"{row.near:.1%}") for row in differences
+    ]
+    worst = (f"{max(getattr(row, name) for row in differences):.1e}" for name in columns)
+    largest = ("largest", *worst, f"{min(row.near for row in differences):.1%}")
+    heads = ("frame", "BEV map", "logits", "centres m", "codes", "masks", "in 0.1 m")
     return ["  ".join(f"{text:>9}" for text in row) for row in (heads, *rows, largest)]
 
 

@@ -1,0 +1,118 @@
+"""Engines: ONNX Runtime and OpenVINO on the CPU, with one interface. Each runs an exported file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from torch import nn
+
+from bevcli.engines.packages import import_openvino, require
+from bevcli.errors import WeightsError
+
+EngineName = Literal["onnxruntime", "openvino"]
+Arrays = Mapping[str, np.ndarray]
+
+LARGEST_BYTES = 2**31  # protobuf's own limit, which every file of `bevcli export-onnx` keeps
+
+
+class Engine(nn.Module):
+    """An exported file, loaded. A module without parameters, so that its time can be measured like any other part's.
+
+    Attributes:
+        metadata: of the file: text by name.
+        input_shapes: name of each input -> its shape.
+        outputs: names of the outputs.
+    """
+
+    metadata: Mapping[str, str]
+    input_shapes: Mapping[str, tuple[int, ...]]
+    outputs: tuple[str, ...]
+
+    def forward(self, feed: Arrays) -> dict[str, np.ndarray]:
+        """One step. feed: every input by name. Returns every output by name."""
+        raise NotImplementedError
+
+
+class OnnxRuntimeEngine(Engine):
+    """ONNX Runtime on the CPU, in the precision of the file."""
+
+    def __init__(self, file: Path, threads: int) -> None:
+        """Raises BevcliError without ONNX Runtime, WeightsError for a file that it cannot load."""
+        super().__init__()
+        require("onnxruntime")
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads
+        options.log_severity_level = 3  # errors only
+        # Waiting threads sleep, as PyTorch's do here: spinning ones slow down the rest of the run.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        try:
+            check_size(file)
+            self.session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # ONNX Runtime has classes of its own for a missing and for a broken file
+            raise _cannot_load(file, "ONNX Runtime", error) from error
+        self.metadata = self.session.get_modelmeta().custom_metadata_map
+        self.input_shapes = {value.name: tuple(value.shape) for value in self.session.get_inputs()}
+        self.outputs = tuple(value.name for value in self.session.get_outputs())
+
+    def forward(self, feed: Arrays) -> dict[str, np.ndarray]:
+        """See `Engine`."""
+        return dict(zip(self.outputs, self.session.run(self.outputs, dict(feed)), strict=True))
+
+
+class OpenVinoEngine(Engine):
+    """OpenVINO on the CPU, in the precision of the file."""
+
+    def __init__(self, file: Path, threads: int) -> None:
+        """Raises BevcliError without OpenVINO, WeightsError for a file that it cannot load."""
+        super().__init__()
+        require("openvino", "onnx", extra="openvino")
+        import onnx
+
+        openvino = import_openvino()
+        settings: dict[str, Any] = {
+            # By default OpenVINO rounds everything to bfloat16 where the CPU has it, which moves boxes by decimetres.
+            "INFERENCE_PRECISION_HINT": "f32",
+            "INFERENCE_NUM_THREADS": threads,
+            "NUM_STREAMS": 1,
+        }
+        try:
+            check_size(file)
+            # OpenVINO drops the metadata of a file.
+            proto = onnx.load(str(file), load_external_data=False)
+            self.model = openvino.Core().compile_model(str(file), "CPU", settings)
+        except Exception as error:  # both have classes of their own
+            raise _cannot_load(file, "OpenVINO", error) from error
+        self.metadata = {entry.key: entry.value for entry in proto.metadata_props}
+        self.input_shapes = {port.any_name: tuple(port.shape) for port in self.model.inputs}
+        self.outputs = tuple(port.any_name for port in self.model.outputs)
+        self.request = self.model.create_infer_request()
+
+    def forward(self, feed: Arrays) -> dict[str, np.ndarray]:
+        """See `Engine`."""
+        found = self.request.infer(dict(feed), share_inputs=True)
+        return {name: found[name] for name in self.outputs}
+
+
+ENGINES: Mapping[str, type[OnnxRuntimeEngine | OpenVinoEngine]] = {
+    "onnxruntime": OnnxRuntimeEngine,
+    "openvino": OpenVinoEngine,
+}
+
+
+def check_size(file: Path) -> None:
+    """Raises OSError for a missing file, ValueError for one that is larger than an exported file can be."""
+    size = file.stat().st_size
+    if size > LARGEST_BYTES:
+        raise ValueError(f"it has {size} bytes (expected at most {LARGEST_BYTES})")
+
+
+def _cannot_load(file: Path, program: str, error: Exception) -> WeightsError:
+    if isinstance(error, OSError) and error.strerror:
+        return WeightsError(f"{file}: {error.strerror}")
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return WeightsError(f"{file}: {program} cannot load it: {lines[-1] if lines else type(error).__name__}")

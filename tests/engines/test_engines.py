@@ -1,0 +1,188 @@
+"""ONNX Runtime and OpenVINO in the place of PyTorch: the commands run an exported file, and INT8 stays close to it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from bevcli.cli.main import app
+from bevcli.config import as_table
+from bevcli.engines.engine import ENGINES
+from bevcli.engines.export_onnx import export_onnx
+from bevcli.engines.exported import ExportedBEVFormer, raw_images
+from bevcli.engines.quantize import quantize
+from bevcli.errors import BevcliError, ConfigError, WeightsError
+from bevcli.pipeline.model_loading import load_model
+from bevcli.pipeline.run import run
+from bevcli.pipeline.tracking import TrackerConfig
+from bevcli.sequences.open import open_sequence
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
+from small_model import small_inputs, small_model
+
+onnx = pytest.importorskip("onnx")
+pytest.importorskip("onnxruntime")
+pytest.importorskip("openvino")
+STREET = Path(__file__).parents[2] / "samples" / "street"
+
+
+@pytest.fixture(scope="module")
+def small_file(tmp_path_factory) -> Path:
+    """A small model without deformable convolutions, which OpenVINO lacks, for two cameras; its weights are random."""
+    model = small_model(backbone=_plain_backbone())
+    file = tmp_path_factory.mktemp("small") / "small.onnx"
+    export_onnx(model, file, contents=as_table(model.config, TrackerConfig(birth_score=0.5)), untrained=True)
+    return file
+
+
+@pytest.fixture(scope="module")
+def int8_file(small_file) -> Path:
+    file = small_file.with_name("small-int8.onnx")
+    quantize(small_file, [raw_images(small_inputs(seed).images, _model().config).numpy() for seed in range(4)], file)
+    return file
+
+
+def _plain_backbone():
+    from bevcli.model.resnet import ResNetConfig
+
+    return ResNetConfig((1, 1, 1, 1), "pytorch", output_stages=(3, 4), deformable_stages=(), width=8)
+
+
+def _model():
+    return small_model(backbone=_plain_backbone())
+
+
+@pytest.mark.parametrize("engine", list(ENGINES))
+def test_an_engine_equals_the_model_with_and_without_history(small_file, engine):
+    exported, model = ExportedBEVFormer(small_file, engine), _model()
+    history = torch.randn(1, 48, 32, generator=torch.Generator().manual_seed(1))
+    for previous in (None, history):
+        with torch.inference_mode():
+            expected, found = model(small_inputs(), previous), exported(small_inputs(), previous)
+        torch.testing.assert_close(found.bev, expected.bev, rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(found.class_logits[-1], expected.class_logits[-1], rtol=1e-4, atol=1e-3)
+        torch.testing.assert_close(found.box_codes[-1], expected.box_codes[-1], rtol=1e-4, atol=1e-3)
+
+
+def test_a_file_tells_its_model_and_that_its_weights_are_random(small_file):
+    model = load_model(small_file)
+    assert model.config == _model().config
+    assert model.tracker == TrackerConfig(birth_score=0.5)
+    assert model.untrained
+    assert model.prepared is model.network
+
+
+@pytest.mark.parametrize("engine", list(ENGINES))
+def test_int8_is_close_to_float32_and_only_the_image_features_are_rounded(small_file, int8_file, engine):
+    assert load_model(int8_file).precision == "int8"
+    exact, rounded = (ExportedBEVFormer(file, engine) for file in (small_file, int8_file))
+    with torch.inference_mode():
+        expected, found = exact(small_inputs()).bev, rounded(small_inputs()).bev
+    difference = (found - expected).norm() / expected.norm()
+    assert 1e-5 < difference < 0.1
+    proto = onnx.load(int8_file)
+    quantizers = [node for node in proto.graph.node if node.op_type == "QuantizeLinear"]
+    readers = [node for node in proto.graph.node if node.op_type == "Conv"]
+    assert len(quantizers) > 10
+    assert all(name.endswith("DequantizeLinear_Output") for node in readers for name in node.input[:2])
+    weights = [value.name for value in proto.graph.initializer if value.name.endswith("weight_quantized")]
+    assert len(weights) == len(readers)  # of the convolutions, and no others
+
+
+def test_more_cameras_on_a_cell_than_the_file_has_slots_for_are_an_error(small_file, int8_file, tmp_path):
+    model = _model()
+    inputs = small_inputs()
+    inputs.image_from_bev[:, 1] = inputs.image_from_bev[:, 0]  # both cameras look the same way
+    with torch.inference_mode():
+        expected = model(inputs).bev
+        torch.testing.assert_close(
+            ExportedBEVFormer(small_file, "onnxruntime")(inputs).bev, expected, rtol=1e-4, atol=1e-4
+        )
+    one = tmp_path / "one.onnx"
+    proto = onnx.load(small_file)
+    for entry in proto.metadata_props:
+        entry.value = "1" if entry.key == "cameras_per_cell" else entry.value
+    onnx.save(proto, one)
+    with pytest.raises(WeightsError, match=r"takes 1 cameras .* has 2: export it with --cameras-per-cell 2"):
+        ExportedBEVFormer(one, "onnxruntime")(inputs)
+
+
+def test_a_model_in_the_metadata_is_checked_like_a_model_file(small_file, tmp_path):
+    proto = onnx.load(small_file)
+    for key, value, error, message in (
+        ("config", '{"name": "x", "wings": 2}', ConfigError, 'unknown key "wings"'),
+        ("config", "[1]", WeightsError, "expected a table"),
+        ("config", None, WeightsError, "its metadata lacks config"),
+    ):
+        metadata = {entry.key: entry.value for entry in proto.metadata_props} | {key: value}
+        onnx.helper.set_model_props(proto, {name: text for name, text in metadata.items() if text is not None})
+        onnx.save(proto, tmp_path / "changed.onnx")
+        with pytest.raises(error, match=message):
+            load_model(tmp_path / "changed.onnx")
+
+
+def test_options_that_do_not_apply_are_named(small_file, int8_file):
+    for options, message in (
+        ({"weights": "w.pth"}, "an exported file holds its weights: leave out --weights w.pth"),
+        ({"untrained": True}, "leave out --untrained"),
+        ({"precision": "bf16"}, "--precision bf16: .* has a fixed precision"),
+        ({"device": "cuda"}, "--device cuda: .* runs on the CPU"),
+    ):
+        with pytest.raises(BevcliError, match=message):
+            load_model(small_file, **options)
+    with pytest.raises(BevcliError, match=r"bevcli export-onnx tiny, then --model tiny\.onnx"):
+        load_model("tiny", untrained=True, engine="openvino")
+    with pytest.raises(WeightsError, match="is quantised already"):
+        quantize(int8_file, [], int8_file.with_name("again.onnx"))
+    with pytest.raises(BevcliError, match="attention and probes: not available"):
+        run(load_model(small_file), open_sequence(STREET), attention=True)
+
+
+@pytest.mark.slow
+def test_every_command_runs_demo_from_a_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    command("export-onnx", "demo")
+    command("quantize", "demo.onnx", "--calibrate", str(STREET), "--frames", "4", "--check", str(STREET))
+    expected = [prediction.boxes for _, prediction in run(load_model("demo"), open_sequence(STREET))]
+    for engine in ENGINES:
+        command("run", str(STREET), "--model", "demo.onnx", "--engine", engine, "--out", engine)
+        found = json.loads((tmp_path / engine / "predictions.json").read_text())
+        first = found["frames"][0]["boxes"][0]
+        np.testing.assert_allclose(first["score"], expected[0].scores[0], atol=1e-3)
+        summary = json.loads((tmp_path / engine / "summary.json").read_text())
+        assert (summary["model"], summary["engine"], summary["untrained"]) == ("demo", engine, False)
+    scores = json.loads(command("validate", "demo-int8.onnx", "--data", str(STREET), "--json"))
+    reference = json.loads(command("validate", "demo", "--data", str(STREET), "--json"))
+    maps = [found["classes_with_ground_truth"]["mean_ap"] for found in (scores, reference)]
+    assert abs(maps[0] - maps[1]) < 0.05  # a drive of few frames; docs/speed.md has more
+    timed = json.loads(command("bench", "--model", "demo-int8.onnx", "--frames", "2", "--json"))
+    assert (timed["precision"], timed["engine"]) == ("int8", "onnxruntime")
+
+
+def test_openvino_opens_no_connection(small_file):
+    watched = f"""
+import sys
+def watch(event, arguments):
+    if event in ("socket.connect", "socket.getaddrinfo", "socket.sendto", "socket.bind"):
+        print("CONNECTION", event, arguments, file=sys.stderr)
+sys.addaudithook(watch)
+from pathlib import Path
+from bevcli.engines.exported import ExportedBEVFormer
+ExportedBEVFormer(Path({str(small_file)!r}), "openvino")
+"""
+    done = subprocess.run([sys.executable, "-c", watched], capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert "CONNECTION" not in done.stderr
+
+
+def command(*arguments: str) -> str:
+    done = CliRunner().invoke(app, list(arguments))
+    assert done.exit_code == 0, (arguments, done.output, done.exception)
+    return done.output
