@@ -28,6 +28,7 @@ INTEGER_KEY = "num_batches_tracked"
 # Parts of the official BEVFormerV2 files that only its training uses: a head on the image features, and further groups
 # of object queries.
 _PERSPECTIVE_HEAD = "fcos3d_bbox_head."
+_CALIBRATION_EMBEDDING = "calibration_embedding."
 _OBJECT_QUERIES = "decoder.query_embedding"
 OFFICIAL_QUERIES = 900  # of all published models; a group of BEVFormerV2 has as many
 
@@ -111,13 +112,16 @@ def load_weights(path: Path, model: BEVFormerBase, *, resample: bool = False) ->
     Args:
         path: an official .pth or a .safetensors.
         model: unchanged where the file does not fit.
-        resample: whether BEV queries of a grid with another number of cells are interpolated, for fine-tuning.
+        resample: for fine-tuning: BEV queries of a grid with another number of cells are interpolated, and a
+            calibration embedding that the file lacks keeps the model's initial weights, which change nothing.
 
     Raises WeightsError that names the known model that the file fits, or else every key that differs.
     """
     checkpoint = read_checkpoint(path)
     if resample:
-        checkpoint = replace(checkpoint, state=model.bev_queries.resampled(checkpoint.state, "bev_queries."))
+        state = model.bev_queries.resampled(checkpoint.state, "bev_queries.")
+        added = {key: value for key, value in model.state_dict().items() if key.startswith(_CALIBRATION_EMBEDDING)}
+        checkpoint = replace(checkpoint, state=added | dict(state))
     require_fit(checkpoint, model.config.name, model.state_dict())
     model.load_state_dict(dict(checkpoint.state))
     return checkpoint

@@ -63,6 +63,9 @@ class ExportedStep(nn.Module):
         reference_points = torch.where(use_previous, network.encoder.reference_points(shift), centers)
         hits = list_hits(network.pillars.project(image_from_bev, (images.shape[2], images.shape[3]), has_image))
         image_features = network.image_tokens(feature_maps, camera_index)
+        if network.calibration_embedding is not None:
+            image_size = images.shape[2], images.shape[3]
+            image_features = network.calibration_embedding(image_features, image_from_bev, image_size)
         with_history = torch.stack([history, bev_query], dim=1)
         bev = bev_query
         for layer in network.encoder.layers:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from bevcli.frame import MAP_CLASSES
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.bev_queries import BevQueries
+from bevcli.model.calibration_embedding import CalibrationEmbedding
 from bevcli.model.decoder import Decoder, DecoderConfig, DetectionHead
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.ego_motion import EgoMotionConfig, rotate_history
@@ -20,6 +21,7 @@ from bevcli.model.image_tokens import ImageTokens, ImageTokensConfig
 from bevcli.model.pillar_projection import Pillars
 from bevcli.model.resnet import ResNet, ResNetConfig
 from bevcli.model.segmentation import SegmentationConfig, SegmentationHead, SegmentationOutputs
+from bevcli.model.upload import upload
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,9 @@ class ImageConfig:
         pad_divisor: width and height are padded with zeros to a multiple of it.
         resize: "linear", as the published weights were trained, aliases where images shrink to less than half;
             "area" averages the pixels that fall into one.
+        half_pixel_shift: whether projections follow the resized image exactly: it keeps the corners of the image, so
+            that pixel u goes to (u + 0.5) * scale - 0.5. If false, it goes to u * scale, as the published weights were
+            trained, which is 0.3 pixels off where 1600 pixels become 512.
         crop: (left, top, right, bottom) in pixels of the resized image: the part that the network sees. None for all.
     """
 
@@ -44,6 +49,7 @@ class ImageConfig:
     color_order: Literal["rgb", "bgr"]
     pad_divisor: int = 32
     resize: Literal["linear", "area"] = "linear"
+    half_pixel_shift: bool = False
     crop: tuple[int, int, int, int] | None = None
 
     def __post_init__(self) -> None:
@@ -67,6 +73,44 @@ class ImageConfig:
 
 
 @dataclass(frozen=True)
+class BevFrameConfig:
+    """The bev frame that a model was trained in, relative to the ego frame, whose origin is on the ground.
+
+    Attributes:
+        level: whether the z axis of the bev frame must be vertical. The bev frame of every drive is then replaced by a
+            level one with the same heading and origin, at the height `height_m`. If false, the drive's is used.
+        height_m: height of the origin above the ground, metres; nuScenes' LIDAR_TOP has 1.84.
+    """
+
+    level: bool = False
+    height_m: float = 1.84
+
+
+@dataclass(frozen=True)
+class TrainingRigsConfig:
+    """The rigs that a model's weights were trained on. It changes no result: a drive's rig is compared with it.
+
+    Attributes:
+        cameras: smallest and largest number of cameras; 0 and 0 where the rigs are not known.
+        fov_deg: smallest and largest horizontal field of view.
+        height_m: smallest and largest height of a camera above the ground.
+        tilt_deg: largest pitch or roll of a camera.
+        cost: what other rigs were measured to cost, in words.
+    """
+
+    cameras: tuple[int, int] = (0, 0)
+    fov_deg: tuple[float, float] = (0.0, 180.0)
+    height_m: tuple[float, float] = (0.0, 10.0)
+    tilt_deg: float = 90.0
+    cost: str = ""
+
+    @property
+    def known(self) -> bool:
+        """Whether the model's file states the rigs."""
+        return self.cameras[1] > 0
+
+
+@dataclass(frozen=True)
 class BEVFormerConfig:
     """A whole model. `bevcli.config.load_config` reads it from a TOML file.
 
@@ -76,6 +120,8 @@ class BEVFormerConfig:
         cameras: names of the camera embeddings, in their order.
         image: how images become the network's input.
         bev_grid: the cells of the BEV map and their pillars.
+        bev_frame: the frame in which the grid lies.
+        training_rigs: the rigs that the weights were trained on.
         rate_hz: frame rate of the training data.
         max_gap_s: after a longer time between two frames the history is dropped.
         channels: C, of all tokens and queries.
@@ -94,6 +140,8 @@ class BEVFormerConfig:
     cameras: tuple[str, ...]
     image: ImageConfig
     bev_grid: BevGrid
+    bev_frame: BevFrameConfig = field(default_factory=BevFrameConfig)
+    training_rigs: TrainingRigsConfig = field(default_factory=TrainingRigsConfig)
     rate_hz: float = 2.0
     max_gap_s: float = 2.0
     channels: int = 256
@@ -150,7 +198,7 @@ class BEVFormerInputs:
     Attributes:
         images: (B, N, 3, H, W), normalised and padded.
         image_from_bev: (B, N, 4, 4) float32, bev metres to pixels of the network's input (rows u·d, v·d, d, 1).
-        camera_index: (N,) int64, the camera embedding of each image.
+        camera_index: (N,) int64, the camera embedding of each image; (B, N) where the sequences differ.
         has_image: (B, N) bool; a camera without an image sees no BEV cell.
         can_bus: (B, 18) float32, the translation and the change of heading since the previous frame included.
         shift: (B, 2) float32, translation of the history (x, y) in normalised BEV coordinates; zero without history.
@@ -170,10 +218,15 @@ class BEVFormerInputs:
         """(height, width) of the network's input, pixels."""
         return self.images.shape[-2], self.images.shape[-1]
 
-    def to(self, device: torch.device) -> BEVFormerInputs:
-        """The same inputs on a device."""
-        tensors = (getattr(self, part.name) for part in fields(self))
-        return BEVFormerInputs(*(tensor.to(device, non_blocking=True) for tensor in tensors))
+    def to(self, device: torch.device, *, keep_geometry: bool = False) -> BEVFormerInputs:
+        """The same inputs on a device.
+
+        keep_geometry: image_from_bev, has_image and rotation_deg stay on the CPU, where a prepared model reads them
+            without waiting for a GPU.
+        """
+        kept = ("image_from_bev", "has_image", "rotation_deg") if keep_geometry else ()
+        tensors = {part.name: getattr(self, part.name) for part in fields(self)}
+        return BEVFormerInputs(**{name: x if name in kept else upload(x, device) for name, x in tensors.items()})
 
 
 @dataclass(frozen=True)
@@ -204,6 +257,8 @@ class BEVFormerBase(nn.Module):
         self.backbone = ResNet(config.backbone)
         self.neck = FPN(config.backbone.output_channels(), channels, config.neck)
         self.image_tokens = ImageTokens(len(config.cameras), channels, config.image_tokens)
+        embeds_rays = config.image_tokens.calibration_embedding
+        self.calibration_embedding = CalibrationEmbedding(channels, config.bev_frame.height_m) if embeds_rays else None
         self.bev_queries = BevQueries(grid, channels, config.ego_motion.can_bus)
         self.pillars = Pillars(grid)
         self.encoder = Encoder(config.encoder, channels, levels, grid, config.ego_motion)
@@ -217,7 +272,7 @@ class BEVFormerBase(nn.Module):
 
         Args:
             images: (B, N, 3, H, W), normalised and padded.
-            camera_index: (N,) int64, the camera embedding of each image.
+            camera_index: (N,) or (B, N) int64, the camera embedding of each image.
         """
         feature_maps = self.neck(self.backbone(images.flatten(0, 1)))
         return self.image_tokens(feature_maps[: self.config.encoder_levels], camera_index)
@@ -243,6 +298,8 @@ class BEVFormer(BEVFormerBase):
     def bev_map(self, inputs: BEVFormerInputs, history: Tensor | None) -> Tensor:
         """The BEV map (B, Y·X, C): the part of `forward` before the decoder and the heads."""
         image_features = self.image_features(inputs.images, inputs.camera_index)
+        if self.calibration_embedding is not None:
+            image_features = self.calibration_embedding(image_features, inputs.image_from_bev, inputs.image_size)
         return self.encoder(
             bev_query=self.bev_queries(inputs.can_bus),
             position=self.bev_queries.position(),

@@ -65,6 +65,7 @@ def _names_and_modules(config: BEVFormerConfig) -> Iterator[tuple[str, ...]]:
     yield "neck (FPN)", "neck"
     yield "level embeddings", "image_tokens.level_embedding"
     yield "camera embeddings", "image_tokens.camera_embedding"
+    yield "calibration embedding", "calibration_embedding"
     yield "BEV queries", "bev_queries.embedding"
     yield "position embedding, rows", "bev_queries.row_embedding"
     yield "position embedding, columns", "bev_queries.column_embedding"
