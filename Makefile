@@ -1,6 +1,6 @@
 # make demo       run the model on samples/street; the recording is runs/street/recording.rrd
 # make test       the fast tests; make test-all: all tests
-# make fuzz       5,550 broken files of every format, up to ten minutes
+# make fuzz       6,450 broken files of every format, up to ten minutes
 # make check      lint and types; make format: fix what ruff can fix
 # make bench      measure this machine and rewrite the table of docs/speed.md; nothing else should run meanwhile
 VENV := .venv

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
 
-import safetensors
 import safetensors.torch
 import torch
 from torch import Tensor
@@ -15,10 +14,11 @@ from torch import Tensor
 from bevcli.config import known_models, load_config
 from bevcli.errors import WeightsError
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
-from bevcli.model.bevformer_v2 import build_model
-from bevcli.model.official_keys import from_official, is_official
+from bevcli.model.build import build_model
+from bevcli.model.official_keys import from_official, is_official, unused_keys
 from bevcli.parsing.pickles import Placeholder
 from bevcli.parsing.pth import StoredTensor, read_pth
+from bevcli.parsing.safetensors_file import read_safetensors
 
 # The types of numbers that weights may have, and the end of the only keys whose numbers are integers.
 FLOATS = (torch.float32, torch.float16, torch.bfloat16, torch.float64)
@@ -28,6 +28,7 @@ INTEGER_KEY = "num_batches_tracked"
 # Parts of the official BEVFormerV2 files that only its training uses: a head on the image features, and further groups
 # of object queries.
 _PERSPECTIVE_HEAD = "fcos3d_bbox_head."
+_CALIBRATION_EMBEDDING = "calibration_embedding."
 _OBJECT_QUERIES = "decoder.query_embedding"
 OFFICIAL_QUERIES = 900  # of all published models; a group of BEVFormerV2 has as many
 
@@ -111,13 +112,16 @@ def load_weights(path: Path, model: BEVFormerBase, *, resample: bool = False) ->
     Args:
         path: an official .pth or a .safetensors.
         model: unchanged where the file does not fit.
-        resample: whether BEV queries of a grid with another number of cells are interpolated, for fine-tuning.
+        resample: for fine-tuning: BEV queries of a grid with another number of cells are interpolated, and a
+            calibration embedding that the file lacks keeps the model's initial weights, which change nothing.
 
     Raises WeightsError that names the known model that the file fits, or else every key that differs.
     """
     checkpoint = read_checkpoint(path)
     if resample:
-        checkpoint = replace(checkpoint, state=model.bev_queries.resampled(checkpoint.state, "bev_queries."))
+        state = model.bev_queries.resampled(checkpoint.state, "bev_queries.")
+        added = {key: value for key, value in model.state_dict().items() if key.startswith(_CALIBRATION_EMBEDDING)}
+        checkpoint = replace(checkpoint, state=added | dict(state))
     require_fit(checkpoint, model.config.name, model.state_dict())
     model.load_state_dict(dict(checkpoint.state))
     return checkpoint
@@ -183,13 +187,16 @@ def read_checkpoint(path: Path) -> Checkpoint:
         raise WeightsError(f"{path}: weights file not found")
     not_read: tuple[str, ...] = ()
     if path.suffix == ".safetensors":
-        state, facts = _read_safetensors(path)
+        state, facts = read_safetensors(path, error=WeightsError)
     else:
         state, facts, not_read = _read_pth(path)
     _check_numbers(path, state)
     if not is_official(state):
         return Checkpoint(path, state, official=False, facts=facts, not_read=not_read)
+    unused = unused_keys(state)
     state, left_out = _without_training_parts(from_official(state))
+    if unused:
+        left_out = f"{len(unused)} keys, such as {unused[0]}"
     return Checkpoint(path, state, official=True, facts=facts, left_out=left_out, not_read=not_read)
 
 
@@ -237,15 +244,6 @@ def _without_training_parts(state: Mapping[str, Tensor]) -> tuple[dict[str, Tens
             kept[_OBJECT_QUERIES] = queries[:OFFICIAL_QUERIES].clone()
             parts.append(f"{groups - 1} of {groups} groups of object queries")
     return kept, " and ".join(parts)
-
-
-def _read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    try:
-        with safetensors.safe_open(path, framework="pt") as file:
-            state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-            return state, dict(file.metadata() or {})
-    except safetensors.SafetensorError as error:
-        raise WeightsError(f"{path}: not a valid safetensors file: {error}") from error
 
 
 def _read_pth(path: Path) -> tuple[dict[str, Tensor], dict[str, str], tuple[str, ...]]:

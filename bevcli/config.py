@@ -16,6 +16,7 @@ from typing import Any, Literal, TypeVar
 from bevcli.errors import ConfigError
 from bevcli.model.bevformer import BEVFormerConfig
 from bevcli.model.bevformer_v2 import BEVFormerV2Config
+from bevcli.model.uniad import UniADConfig
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import read_text
 
@@ -23,7 +24,11 @@ T = TypeVar("T")
 
 # The key that says which model a file configures, and its values. A file without it configures a BEVFormer.
 ARCHITECTURE = "architecture"
-ARCHITECTURES: dict[str, type[BEVFormerConfig]] = {"BEVFormer": BEVFormerConfig, "BEVFormerV2": BEVFormerV2Config}
+ARCHITECTURES: dict[str, type[BEVFormerConfig]] = {
+    "BEVFormer": BEVFormerConfig,
+    "BEVFormerV2": BEVFormerV2Config,
+    "UniAD": UniADConfig,
+}
 
 TRACKING = "tracking"  # the table of a model's file with the parameters of the tracker
 TRAINING = "training"  # the table of a model's file with the settings of its training, which the model does not need

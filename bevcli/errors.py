@@ -23,3 +23,10 @@ class WeightsError(BevcliError):
 
 class OutputError(BevcliError):
     """An output cannot be written to the given path."""
+
+
+class WaitError(BevcliError):
+    """A disk, a network folder, a viewer or another process has not answered in time.
+
+    A thread may still wait for it, so the command line then ends the process without waiting for its threads.
+    """

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
@@ -19,8 +19,16 @@ from bevcli.geometry.transforms import Array, Pose
 if TYPE_CHECKING:
     from torch import Tensor
 
-# The bits of a BEV map's cells. A cell may belong to several classes (file format ground_truth_map/NNNNNN.png).
-MAP_CLASSES = {"drivable_road": 1, "lane_boundary": 2, "pedestrian_crossing": 4, "vehicle": 8}
+MOST_MAP_CLASSES = 8  # a BEV map has one bit for each class
+
+
+def class_bits(names: Iterable[str]) -> dict[str, int]:
+    """The bits of map classes in the cells of a BEV map: class -> 1, 2, 4 and so on, in their order."""
+    return {name: 1 << index for index, name in enumerate(names)}
+
+
+# The map classes of rendered drives and of the segmentation head.
+MAP_CLASSES = class_bits(["drivable_road", "lane_boundary", "pedestrian_crossing", "vehicle"])
 
 
 @dataclass(frozen=True)
@@ -45,15 +53,21 @@ class BevMap:
     """A map of the ground in the bev frame.
 
     Attributes:
-        cells: (rows, columns) uint8, the bits of MAP_CLASSES. Columns run from the smallest x to the largest, rows
-            from the LARGEST y (ahead, top) to the smallest, as in an image.
+        cells: (rows, columns) uint8, the bits of the classes; a cell may belong to several. Columns run from the
+            smallest x to the largest, rows from the LARGEST y (ahead, top) to the smallest, as in an image.
         x_range_m: smallest and largest x, metres.
         y_range_m: smallest and largest y, metres.
+        classes: class -> its bit.
     """
 
     cells: NDArray[np.uint8]
     x_range_m: tuple[float, float]
     y_range_m: tuple[float, float]
+    classes: Mapping[str, int] = field(default_factory=lambda: MAP_CLASSES)
+
+    def layer(self, name: str) -> NDArray[np.bool_]:
+        """(rows, columns) bool, the cells of a class; all False for a class that the map does not have."""
+        return (self.cells & np.uint8(self.classes.get(name, 0))) > 0
 
 
 @dataclass(frozen=True)

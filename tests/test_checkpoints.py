@@ -27,7 +27,7 @@ from bevcli.cli.main import app
 from bevcli.config import known_models, load_config
 from bevcli.errors import WeightsError
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.bevformer_v2 import build_model
+from bevcli.model.build import build_model
 from bevcli.model.official_keys import from_official
 from bevcli.model.parts import model_parts
 
@@ -91,6 +91,26 @@ def test_parts_of_official_v2_files_for_training_only_are_named_and_left_out(mod
     assert set(summary.models) <= {model, "v2-t1-base", "v2-t1"}  # these two differ only in what is left out
     groups = "" if model == "v2-t1-base" else " and 10 of 11 groups of object queries"
     assert summary.left_out == f"363 keys fcos3d_bbox_head.*{groups}"
+
+
+def official_uniad(tmp_path: Path, *, version_1_0: bool) -> Path:
+    """An official file of UniAD's first stage of zeros that takes no space, with all keys of its training."""
+    file = json.loads((Path(__file__).parent / "data" / "golden_keys_uniad.json").read_text())
+    shapes = {**KEYS["base"], **file["keys"], **file["unused"]}
+    old = ("pts_bbox_head.query_embedding.", "pts_bbox_head.transformer.reference_points.", "bbox_size_fc.")
+    shapes = {key: shape for key, shape in shapes.items() if version_1_0 or not key.startswith(old)}
+    path = tmp_path / "uniad_base_track_map.pth"
+    torch.save({"state_dict": {key: torch.zeros(()).expand(shape) for key, shape in shapes.items()}}, path)
+    return path
+
+
+@pytest.mark.parametrize(("version_1_0", "left_out"), [(False, 132), (True, 137)])
+def test_keys_of_official_uniad_files_without_effect_are_left_out(
+    version_1_0: bool, left_out: int, tmp_path: Path
+) -> None:
+    summary = inspect(official_uniad(tmp_path, version_1_0=version_1_0))
+    assert summary.models == ("uniad-track-map",)
+    assert summary.left_out.startswith(f"{left_out} keys, such as ")
 
 
 def test_other_differences_of_v2_files_are_refused(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import pytest
 from bevcli.config import TRAINING, known_models, load_config, load_table
 from bevcli.errors import ConfigError
 from bevcli.model.bevformer_v2 import BEVFormerV2Config
+from bevcli.model.uniad import UniADConfig
 
 
 @dataclass(frozen=True)
@@ -139,6 +140,27 @@ def test_values_that_do_not_fit_each_other_are_an_error(tmp_path: Path, old: str
     assert "mine.toml" in str(caught.value)
 
 
+def test_a_uniad_file_configures_tracks_and_map(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[1] / "bevcli" / "configs" / "uniad-track-map.toml").read_text()
+    path = tmp_path / "uniad.toml"
+    path.write_text(text)
+    config = load_config(path)
+    assert isinstance(config, UniADConfig)
+    assert config.map_classes == ("drivable_area", "divider", "pedestrian_crossing", "contour")
+    for wrong, message in [
+        (("keep_score = 0.35", "keep_score = 0.45"), "[track_queries]: keep_score and birth_score must be 0 to 1"),
+        (("max_misses = 5", "max_misses = 0"), "[track_queries]: max_misses, memory_length"),
+        (('box_z = "bottom"', 'box_z = "top"'), '"track_queries.box_z" must be "center" or "bottom"'),
+        (("queries = 901", "queries = 1"), "decoder.queries must be at least 2"),
+        (('["detection"]', '["detection", "segmentation"]'), 'heads must be ["detection"]'),
+    ]:
+        assert wrong[0] in text
+        path.write_text(text.replace(*wrong))
+        with pytest.raises(ConfigError) as error:
+            load_config(path)
+        assert message in str(error.value)
+
+
 @pytest.mark.parametrize("name", ["huge", "nowhere/x.toml"])
 def test_the_error_for_an_unknown_model_names_the_known_ones(name: str) -> None:
     with pytest.raises(ConfigError, match=r"base.*small.*tiny"):
@@ -162,7 +184,7 @@ def test_the_architecture_of_a_file_is_named(tmp_path: Path) -> None:
     for wrong, message in [
         (
             ('"BEVFormerV2"', '"BEVFormerV3"'),
-            '"architecture" must be "BEVFormer" or "BEVFormerV2", but is \'BEVFormerV3\'',
+            '"architecture" must be "BEVFormer" or "BEVFormerV2" or "UniAD", but is \'BEVFormerV3\'',
         ),
         (("frames = [-1, 0]", ""), '"frames" is missing; expected a list, each element'),
         (("frames = [-1, 0]", "frames = [-2, -1]"), "frames must be ascending, and hold 0, the current frame"),

@@ -9,7 +9,7 @@ ROOT = Path(bevcli.__file__).parent
 # From the lowest to the highest; names in one set may not import each other.
 LAYERS = (
     {"duration", "errors", "findings"},
-    {"parsing", "jit"},
+    {"parsing", "jit", "waiting"},
     {"geometry"},
     {"frame"},
     {"model"},
@@ -22,6 +22,7 @@ LAYERS = (
     {"pipeline"},
     {"rig", "synth", "engines", "batch"},
     {"training", "benchmark", "explain"},
+    {"robustness"},
     {"cli"},
     {"__main__"},
 )

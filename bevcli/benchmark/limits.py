@@ -13,10 +13,12 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
-from bevcli.model.bevformer_v2 import BEVFormerV2, build_model
+from bevcli.model.bevformer_v2 import BEVFormerV2
+from bevcli.model.build import build_model
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.prepared import DTYPES, Precision
+from bevcli.model.uniad import UniAD
 
 # Edge of the square matrices and floats of the copied block: large enough for full speed, small enough to be quick.
 CPU_EDGE, GPU_EDGE = 2048, 8192
@@ -84,6 +86,8 @@ def count_operations(config: BEVFormerConfig, hits_per_camera: tuple[int, ...]) 
         else:
             bev = _encode(model, features, hits_per_camera, history=True)
         model.decoder(bev, model.detection_head)
+        if isinstance(model, UniAD):
+            model.map_head(bev)
     return float(counter.get_total_flops())
 
 

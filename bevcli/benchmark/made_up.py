@@ -14,7 +14,7 @@ from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import GRAVITY, Kinematics
 from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
-from bevcli.model.bevformer_v2 import build_model
+from bevcli.model.build import build_model
 from bevcli.pipeline.camera_assignment import NUSCENES_YAWS_DEG
 
 WIDTH, HEIGHT = 1600, 900

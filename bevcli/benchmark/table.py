@@ -14,7 +14,10 @@ import torch
 
 from bevcli.config import known_models
 from bevcli.errors import BevcliError
+from bevcli.parsing.files import MIB, read_text
 
+MODEL_TIMEOUT_S = 4 * 3600.0
+LARGEST_DOCUMENT = 16 * MIB
 BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"
 COLUMNS: Mapping[str, Callable[[dict[str, Any]], str]] = {
     "model": lambda r: r["model"],
@@ -38,7 +41,7 @@ def write_table(path: Path, device: torch.device, frames: int) -> None:
 
     Raises BevcliError where an existing file lacks these lines.
     """
-    text = path.read_text() if path.is_file() else f"{BEGIN}\n{END}\n"
+    text = read_text(path, LARGEST_DOCUMENT) if path.is_file() else f"{BEGIN}\n{END}\n"
     before, begin, rest = text.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not (begin and end):
@@ -53,7 +56,12 @@ def _measure(model: str, precision: str, device: torch.device, frames: int) -> d
     options = ["--model", model, "--precision", precision, "--device", device.type, "--frames", str(frames)]
     command = [sys.executable, "-m", "bevcli", "bench", *options, "--against", "plain", "--json"]
     # In a separate process, so that its peak memory is that of this model.
-    answer = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+    try:
+        answer = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, timeout=MODEL_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        raise BevcliError(f"bench: {model}, {precision}: not done within {MODEL_TIMEOUT_S / 3600:.0f} h") from None
+    except subprocess.CalledProcessError as error:
+        raise BevcliError(f"bench: {model}, {precision}: failed with exit code {error.returncode}") from None
     return json.loads(answer.stdout)
 
 

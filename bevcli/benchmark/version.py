@@ -89,4 +89,5 @@ def fine_stages(model: BEVFormerBase) -> tuple[dict[str, str], dict[str, str]]:
         stages |= {f"encoder.layers.{layer}.{part}": stage for part, stage in parts.items()}
     # The last norm of the encoder counts as FFN; pillars and history are computed just before the encoder.
     stages |= {"encoder": "FFN", "fusion": "fusion", "segmentation_head": "segmentation head"}
+    stages |= {"query_interaction": "tracks", "map_head": "map head"}
     return stages, {"backbone": "input", "encoder": "projection"}

@@ -14,7 +14,8 @@ def bench(
     model: Annotated[
         str,
         typer.Option(
-            autocompletion=complete_model, help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, or a FILE.toml."
+            autocompletion=complete_model,
+            help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, uniad-track-map, or a FILE.toml.",
         ),
     ] = "tiny",
     device: DeviceOption = "auto",

@@ -26,11 +26,12 @@ from bevcli.cli.project_debug import project_debug
 from bevcli.cli.render import render
 from bevcli.cli.run import run
 from bevcli.cli.samples import samples
+from bevcli.cli.stress import stress
 from bevcli.cli.train import train
 from bevcli.cli.validate import validate
 from bevcli.cli.viz import viz
 from bevcli.cli.weights import weights_app
-from bevcli.errors import BevcliError
+from bevcli.errors import BevcliError, WaitError
 from bevcli.pipeline.cpu_memory import keep_freed_memory
 
 app = typer.Typer(
@@ -69,6 +70,7 @@ app.command()(project_debug)
 app.command()(render)
 app.command()(run)
 app.command()(samples)
+app.command()(stress)
 app.command()(train)
 app.command()(validate)
 app.command()(viz)
@@ -88,6 +90,9 @@ def run_app() -> None:
             sys.stdout.flush()  # here, where an error can still be told
     except BevcliError as error:
         print(f"error: {error}", file=sys.stderr)
+        if isinstance(error, WaitError):  # at its end, Python would wait for the thread that gets no answer
+            sys.stderr.flush()
+            os._exit(1)
         sys.exit(1)
     except BrokenPipeError:
         sys.stderr.close()  # the reader of the output is gone

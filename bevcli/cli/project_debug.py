@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from bevcli.cli.input_options import AllowOutsideOption, TopicOption, TopicsOption, parse_topics
+from bevcli.cli.input_options import AllowOutsideOption, TopicOption, TopicsOption, complete_model, parse_topics
 
 ERRORS_FOUND = 3
 
@@ -27,6 +28,13 @@ def project_debug(
     topic: TopicOption = None,
     topics: TopicsOption = None,
     allow_outside: AllowOutsideOption = False,
+    model: Annotated[
+        str,
+        typer.Option(
+            autocompletion=complete_model,
+            help="Compare the rig with those that this model's weights were trained on: a model name or a FILE.toml.",
+        ),
+    ] = "demo",
     json: Annotated[
         bool, typer.Option("--json", help="Print the findings and the coverage as one JSON object.")
     ] = False,
@@ -39,7 +47,10 @@ def project_debug(
 
     Exit code: 0 without errors, 3 with findings of severity error.
     """
+    from bevcli.config import load_config
+    from bevcli.pipeline.training_rigs import rig_notes
     from bevcli.rig.check_calibration import check_calibration
+    from bevcli.rig.report_text import INDENT, WIDTH
 
     options: dict[str, Any] = {"topics": parse_topics(topic), "topics_file": topics} if topic or topics else {}
     check = check_calibration(calibration, sequence, frame, allow_outside=allow_outside, **options)
@@ -47,6 +58,10 @@ def project_debug(
     if json:
         print(check.to_json())
     else:
-        print(check.text(), "", "Written: " + ", ".join(map(str, written)), sep="\n")
+        notes = [
+            textwrap.fill(f"Model {model}: {note}.", WIDTH, subsequent_indent=INDENT) + "\n"
+            for note in rig_notes(check.rig, load_config(model))
+        ]
+        print(check.text(), "", *notes, "Written: " + ", ".join(map(str, written)), sep="\n")
     if check.errors:
         raise typer.Exit(ERRORS_FOUND)

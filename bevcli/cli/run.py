@@ -41,7 +41,6 @@ from bevcli.cli.input_options import (
 
 if TYPE_CHECKING:
     from bevcli.frame import Frame, Prediction, Sequence
-    from bevcli.geometry.transforms import Array
     from bevcli.pipeline.model_loading import Model
 
 MODEL, OUTPUT, RECORDING = "Model", "Output", "Recording"
@@ -56,8 +55,8 @@ def run(
         str | None,
         typer.Option(
             autocompletion=complete_model,
-            help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, demo, or a FILE.toml. Default: the model that "
-            "WEIGHTS fit, else demo.",
+            help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, uniad-track-map, demo, or a FILE.toml. Default: "
+            "the model that WEIGHTS fit, else demo.",
             rich_help_panel=MODEL,
             show_default=False,
         ),
@@ -92,7 +91,9 @@ def run(
     track: Annotated[
         bool,
         typer.Option(
-            "--track/--no-track", help="Give boxes identities over time, and write tracks.csv.", rich_help_panel=MODEL
+            "--track/--no-track",
+            help="Give boxes identities over time, and write tracks.csv. A UniAD with history gives its own.",
+            rich_help_panel=MODEL,
         ),
     ] = True,
     camera: Annotated[
@@ -198,7 +199,7 @@ def run(
     """Run BEVFormer on SEQUENCE, frame by frame, and write boxes and a recording.
 
     The output folder gets recording.rrd (open it with `bevcli viz`), predictions.json (all boxes of all frames),
-    tracks.csv (one row a box with its track), summary.json and, for models with a segmentation head, segmentation/.
+    tracks.csv (one row a box with its track), summary.json and, for models that predict a map, segmentation/.
     Ctrl-C or SIGTERM finish the current frame; a second one ends the program at once.
     """
     from bevcli.cli.progress import Progress
@@ -286,31 +287,10 @@ def notes(model: Model, drive: Sequence, *, live: bool = False) -> list[str]:
         found.append(
             f"model {model.name} looks ahead: the viewer shows a frame when {config.later_frames} more are read"
         )
-    tilt = tilt_note(drive.rig.ego_from_bev, bundled=model.bundled)
-    if tilt:
-        found.append(tilt)
+    found += model.rig_notes(drive.rig)
     if model.bundled:
         found.append("these weights were trained on rendered streets, not on the real world (docs/model-card.md)")
     return found
-
-
-def tilt_note(ego_from_bev: Array, *, bundled: bool) -> str | None:
-    """What to tell of a bev frame that is tilted more than the one that the weights were trained with.
-
-    bundled: whether the weights are those of the package, which were trained with a level frame; published ones were
-    trained with nuScenes' LIDAR_TOP, which is tilted by up to 3°.
-    """
-    import numpy as np
-
-    tilt_deg = float(np.degrees(np.arccos(np.clip(ego_from_bev[2, 2], -1, 1))))
-    if tilt_deg <= (1.0 if bundled else 4.0):
-        return None
-    trained = "a level one" if bundled else "one tilted by up to 3°"
-    height = 30 * np.tan(np.radians(tilt_deg))
-    return (
-        f"the bev frame is tilted by {tilt_deg:.1f}°, but the weights were trained with {trained}: boxes 30 m away may "
-        f'be {height:.1f} m too high or too low (level "ego_from_bev" in the calibration)'
-    )
 
 
 def warnings(frame: Frame, prediction: Prediction) -> list[str]:

@@ -25,6 +25,15 @@ def validate(
         str | None,
         typer.Option(metavar="SEEDS", help="Use rendered drives with these seeds: A:B (B excluded), or A,B,C."),
     ] = None,
+    rig: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE|random",
+            help="Cameras of the rendered drives: a calibration.json, scaled to the model's image size, or a random "
+            "rig for each drive, from training.rigs of the model. Default: six cameras like nuScenes.",
+            show_default=False,
+        ),
+    ] = None,
     cache: Annotated[Path, typer.Option(metavar="DIR", help="Folder that keeps rendered drives.")] = Path(
         "runs/drives"
     ),
@@ -56,11 +65,12 @@ def validate(
     from bevcli.pipeline.model_loading import load_model
     from bevcli.pipeline.runner import Runner, StepOptions
     from bevcli.training.drives import count_frames, open_drives, parse_seeds
+    from bevcli.training.job import rig_for_drives
     from bevcli.training.validation import validate as validate_model
 
     loaded = load_model(model, weights, device=device)
     seeds = None if rendered is None else parse_seeds(rendered)
-    drives = open_drives(data or (), seeds, cache, loaded.config)
+    drives = open_drives(data or (), seeds, cache, loaded.config, None if rig is None else rig_for_drives(rig, model))
     runner = Runner(loaded.prepared, loaded.device, StepOptions(loaded.precision, temporal))
     with Progress(count_frames(drives), "frames") as progress:
         scores = validate_model(

@@ -16,6 +16,7 @@ from bevcli.engines.interface import Port, input_ports, metadata, output_ports
 from bevcli.engines.packages import require
 from bevcli.errors import BevcliError, OutputError
 from bevcli.model.bevformer import BEVFormer, BEVFormerBase
+from bevcli.model.uniad import UniAD
 
 # GridSample exists since opset 16, ScatterND with a sum since 16, LayerNormalization since 17, DeformConv since 19.
 MIN_OPSET = {"operator": 19, "gridsample": 17}
@@ -45,7 +46,8 @@ def export_onnx(
         decode: add the outputs boxes, scores and classes.
 
     Raises:
-        BevcliError: the extra bevcli[onnx] is not installed, the opset is too old, or the model is a BEVFormerV2.
+        BevcliError: the extra bevcli[onnx] is not installed, the opset is too old, or the model is a BEVFormerV2 or a
+            UniAD.
         OutputError: the file cannot be written.
     """
     require("onnx", "onnxscript")
@@ -57,9 +59,9 @@ def export_onnx(
             f"--deformable-convolution {deformable_convolution}"
         )
     config = network.config
-    if not isinstance(network, BEVFormer) or config.image.crop is not None:
+    if not isinstance(network, BEVFormer) or isinstance(network, UniAD) or config.image.crop is not None:
         raise BevcliError(
-            f"{config.name}: BEVFormerV2 and models that crop images cannot be exported yet "
+            f"{config.name}: BEVFormerV2, UniAD and models that crop images cannot be exported yet "
             "(expected a recurrent BEVFormer, such as tiny, small, base or demo)"
         )
     inputs = input_ports(config, len(config.cameras) if cameras is None else cameras)

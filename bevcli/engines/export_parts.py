@@ -63,13 +63,16 @@ class ExportedStep(nn.Module):
         reference_points = torch.where(use_previous, network.encoder.reference_points(shift), centers)
         hits = list_hits(network.pillars.project(image_from_bev, (images.shape[2], images.shape[3]), has_image))
         image_features = network.image_tokens(feature_maps, camera_index)
+        if network.calibration_embedding is not None:
+            image_size = images.shape[2], images.shape[3]
+            image_features = network.calibration_embedding(image_features, image_from_bev, image_size)
         with_history = torch.stack([history, bev_query], dim=1)
         bev = bev_query
         for layer in network.encoder.layers:
             assert isinstance(layer, EncoderLayer)
             bev_maps = torch.where(use_previous, with_history, torch.stack([bev, bev], dim=1))
             bev = layer(bev, position, bev_maps, reference_points, image_features, hits)
-        class_logits, box_codes = network.decoder(bev, network.detection_head)
+        class_logits, box_codes, _ = network.decoder(bev, network.detection_head)
         outputs = [bev, class_logits[-1], box_codes[-1]]
         if network.segmentation_head is not None:
             segmentation = network.segmentation_head(bev, position)

@@ -183,6 +183,12 @@ def _score_maps(
     left_out = len(pairs.predictions) - len(indices)
     notes = [f"{left_out} of {len(pairs.predictions)} frames lack a map on one side: left out"] if left_out else []
     classes = [name for name in true.classes if name in found.classes]
+    if not classes:
+        kinds = f"predictions {', '.join(found.classes)}; ground truth {', '.join(true.classes)}"
+        return None, [f"maps are not scored: they have no class in common ({kinds})"]
+    unscored = [name for name in (*found.classes, *true.classes) if name not in classes]
+    if unscored:
+        notes.append(f"map classes on one side only, not scored: {', '.join(unscored)}")
     maps = ((found.load(one), true.load(other)) for one, other in indices)
     return evaluate_segmentation(maps, classes), notes
 

@@ -106,7 +106,7 @@ def _classes(detection: DetectionScores) -> str:
     rows += [_class_row(name, scores) for name, scores in table.classes.items()]
     means = [_number(table.errors[name]) for name in ERRORS]
     rows.append(("all", str(detection.ground_truth_count), _number(table.mean_ap), *[""] * len(distances), "", *means))
-    return f"{_aligned(rows)}\n\nmAP {_number(table.mean_ap)}   NDS {_number(table.nd_score)}"
+    return f"{aligned(rows)}\n\nmAP {_number(table.mean_ap)}   NDS {_number(table.nd_score)}"
 
 
 def _class_row(name: str, scores: ClassScores) -> tuple[str, ...]:
@@ -123,7 +123,7 @@ def _ranges(detection: DetectionScores) -> str:
         rows.append((name, *(_number(scores.mean_ap) if scores else "-" for scores in found)))
     rows.append(("mAP", *(_number(part.table.mean_ap) for part in bins)))
     rows.append(("NDS", *(_number(part.table.nd_score) for part in bins)))
-    return _aligned(rows)
+    return aligned(rows)
 
 
 def _visibilities(detection: DetectionScores) -> str:
@@ -131,15 +131,15 @@ def _visibilities(detection: DetectionScores) -> str:
     for part in detection.by_visibility:
         percent = f"{100 * part.low:.0f}-{100 * part.high:.0f} %"
         rows.append((percent, str(part.ground_truth_count), str(part.found_count), _number(part.mean_recall)))
-    return _aligned(rows)
+    return aligned(rows)
 
 
 def _maps(segmentation: SegmentationScores) -> str:
     rows = [("map class", "IoU"), *((name, _number(iou)) for name, iou in segmentation.iou.items())]
-    return f"{_aligned(rows)}\n({segmentation.frame_count} maps)"
+    return f"{aligned(rows)}\n({segmentation.frame_count} maps)"
 
 
-def _aligned(rows: Iterable[Sequence[str]]) -> str:
+def aligned(rows: Iterable[Sequence[str]]) -> str:
     """Rows as aligned columns, the first to the left, the others to the right."""
     lines = list(rows)
     widths = [max(len(cell) for cell in column) for column in zip(*lines, strict=True)]

@@ -84,7 +84,7 @@ def reason_to_leave_out(step: str, trace: Trace) -> str:
         return f"the frame has no history ({prediction.started_anew})"
     if step == "recurrence" and len(trace.recent) < 2:
         return "there is no earlier frame"
-    if step == "segmentation" and prediction.segmentation is None:
+    if step == "segmentation" and trace.outputs.segmentation is None:
         return f"model {trace.config.name} has no segmentation head"
     return ""
 

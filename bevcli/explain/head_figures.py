@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 import torch
 from matplotlib.axes import Axes
@@ -31,6 +33,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
 from bevcli.model.bevformer import BEVFormerOutputs
 from bevcli.model.box_coding import decode
+from bevcli.model.segmentation import STUFF_CLASSES, THING_CLASS
 
 CODE_NAMES = ("cx", "cy", "log w", "log l", "cz", "log h", "sin", "cos", "vx", "vy")
 MAP_COLORS = {
@@ -38,7 +41,11 @@ MAP_COLORS = {
     "lane_boundary": "#f2a900",
     "pedestrian_crossing": "#5fa3d3",
     "vehicle": "#e4572e",
+    "drivable_area": "#dde0d8",
+    "divider": "#c77d00",
+    "contour": "#1769aa",
 }
+OTHER_MAP_COLORS = ("#2a9d5c", "#8e5bb5", "#a05a2c", "#d65db1", "#3a3f4b", "#7fb800", "#0aa5a5", "#7d8597")
 
 
 def decoder(trace: Trace) -> Figure:
@@ -114,7 +121,7 @@ def segmentation(trace: Trace) -> Figure:
     grid = trace.grid
     outputs = trace.outputs.segmentation
     masks = outputs.mask_logits[-1, 0].float().sigmoid() * outputs.class_logits[-1, 0].float().sigmoid()[:, None]
-    stuff = [name for name in MAP_CLASSES if name != "vehicle"]
+    stuff = STUFF_CLASSES
     layers = torch.cat([masks[: len(stuff)], masks[len(stuff) :].amax(0, keepdim=True)])
     shares = layers.cpu().numpy().reshape(-1, grid.rows, grid.columns)
     figure = titled_figure(
@@ -125,7 +132,7 @@ def segmentation(trace: Trace) -> Figure:
         heading_inches=1.6,
     )
     spec = figure.add_gridspec(1, 4, wspace=0.1, left=0.045, right=0.94, top=0.805, bottom=0.52)
-    for column, (name, share) in enumerate(zip((*stuff, "vehicle"), shares, strict=True)):
+    for column, (name, share) in enumerate(zip((*stuff, THING_CLASS), shares, strict=True)):
         axes = figure.add_subplot(spec[column])
         bev_axes(axes, trace, name.replace("_", " "))
         image = show_bev(axes, trace, share, cmap="magma", vmin=0, vmax=1)
@@ -154,7 +161,7 @@ def segmentation(trace: Trace) -> Figure:
         axes.set_ylim(*grid.y_range_m)
     axes = figure.add_subplot(lower[2])
     axes.axis("off")
-    handles = [Patch(fc=color, label=name.replace("_", " ")) for name, color in MAP_COLORS.items()]
+    handles = [Patch(fc=color, label=name.replace("_", " ")) for name, color in map_colors(MAP_CLASSES).items()]
     axes.legend(handles=handles, loc="center left", fontsize=13, frameon=False)
     return figure
 
@@ -315,9 +322,17 @@ def _meanings(code: Array) -> list[str]:
     ]
 
 
+def map_colors(classes: Iterable[str]) -> dict[str, str]:
+    """Map class -> colour on a white page. Classes that are not in MAP_COLORS take OTHER_MAP_COLORS, in their order."""
+    names = list(classes)
+    others = (name for name in names if name not in MAP_COLORS)
+    chosen = {**MAP_COLORS, **dict(zip(others, OTHER_MAP_COLORS, strict=False))}
+    return {name: chosen[name] for name in names}
+
+
 def map_image(bev_map: BevMap) -> np.ndarray:
     """(rows, columns, 3) uint8 RGB of a BEV map, rows as in the map; later classes lie on top."""
     image = np.full((*bev_map.cells.shape, 3), 255, np.uint8)
-    for name, color in MAP_COLORS.items():
-        image[(bev_map.cells & MAP_CLASSES[name]) > 0] = [int(color[i : i + 2], 16) for i in (1, 3, 5)]
+    for name, color in map_colors(bev_map.classes).items():
+        image[bev_map.layer(name)] = [int(color[i : i + 2], 16) for i in (1, 3, 5)]
     return image

@@ -16,6 +16,7 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.model.bevformer import BEVFormer, BEVFormerBase, BEVFormerConfig, BEVFormerInputs, BEVFormerOutputs
 from bevcli.model.pillar_projection import project_pillars
+from bevcli.model.uniad import UniAD
 from bevcli.pipeline.model_inputs import model_inputs
 from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
 from bevcli.pipeline.runner import BevState, Runner, StepOptions
@@ -97,12 +98,14 @@ def trace(
 
     model: the plain model, not a prepared one. place: index in `sequence.stamps`.
     cell_xy: x, y of the cell to follow, metres, bev frame; None takes the cell under the best box ahead of the
-    vehicle. Raises InputError when the cell lies outside the grid, when the frame has no image, or for a BEVFormerV2.
+    vehicle. Raises InputError when the cell lies outside the grid, when the frame has no image, or for a BEVFormerV2 or
+    a UniAD.
     """
-    if not isinstance(model, BEVFormer):
+    if not isinstance(model, BEVFormer) or isinstance(model, UniAD):
+        kind = "UniAD" if isinstance(model, UniAD) else "BEVFormerV2"
         raise InputError(
-            f"model {model.config.name} is a BEVFormerV2: the figures show BEVFormer's recurrence "
-            "(use tiny, small, base or demo; docs/bevformer.md explains BEVFormerV2)"
+            f"model {model.config.name} is a {kind}: the figures show BEVFormer's recurrence "
+            f"(use tiny, small, base or demo; docs/bevformer.md explains {kind})"
         )
     cell = None if cell_xy is None else cell_at(cell_xy, model.config.bev_grid)
     runner = Runner(model, device, StepOptions())

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bevcli.geometry.transforms import Array, apply, inverse, rigid
+from bevcli.geometry.transforms import Array, apply, inverse, rigid, rotation_about_z, yaw_of_rotation
 
 NEAR_M = 1e-5  # a point with a smaller depth, or behind the camera, has no pixel
 OUTSIDE = -1e4  # pixel coordinate outside any image, in place of NaN, which cv2.remap does not accept
@@ -154,6 +154,16 @@ class CameraRig:
 def default_ego_from_bev() -> Array:
     """(4, 4) of a level frame like nuScenes' LIDAR_TOP: x right, y forward, origin at (0.94, 0, 1.84) m in ego."""
     return rigid((0.94, 0.0, 1.84), [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def level_rig(rig: CameraRig, height_m: float) -> CameraRig:
+    """The rig with a level bev frame at a height above the ground, with the origin and heading of the rig's.
+
+    The ground is the plane z = 0 of the ego frame. A rig whose bev frame is so already is returned as it is.
+    """
+    given = rig.ego_from_bev
+    level = rigid((*given[:2, 3], height_m), rotation_about_z(yaw_of_rotation(given[:3, :3])))
+    return rig if np.allclose(level, given, rtol=0, atol=1e-6) else replace(rig, ego_from_bev=level)
 
 
 def distort(rays: ArrayLike, distortion: Distortion) -> Array:

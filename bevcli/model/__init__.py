@@ -1,1 +1,1 @@
-"""BEVFormer and BEVFormerV2 in plain PyTorch, one block of the papers a file."""
+"""BEVFormer, BEVFormerV2 and UniAD in plain PyTorch, one block of the papers a file."""

@@ -8,8 +8,10 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from bevcli.frame import MAP_CLASSES
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.bev_queries import BevQueries
+from bevcli.model.calibration_embedding import CalibrationEmbedding
 from bevcli.model.decoder import Decoder, DecoderConfig, DetectionHead
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.ego_motion import EgoMotionConfig, rotate_history
@@ -34,6 +36,9 @@ class ImageConfig:
         pad_divisor: width and height are padded with zeros to a multiple of it.
         resize: "linear", as the published weights were trained, aliases where images shrink to less than half;
             "area" averages the pixels that fall into one.
+        half_pixel_shift: whether projections follow the resized image exactly: it keeps the corners of the image, so
+            that pixel u goes to (u + 0.5) * scale - 0.5. If false, it goes to u * scale, as the published weights were
+            trained, which is 0.3 pixels off where 1600 pixels become 512.
         crop: (left, top, right, bottom) in pixels of the resized image: the part that the network sees. None for all.
     """
 
@@ -43,6 +48,7 @@ class ImageConfig:
     color_order: Literal["rgb", "bgr"]
     pad_divisor: int = 32
     resize: Literal["linear", "area"] = "linear"
+    half_pixel_shift: bool = False
     crop: tuple[int, int, int, int] | None = None
 
     def __post_init__(self) -> None:
@@ -66,6 +72,44 @@ class ImageConfig:
 
 
 @dataclass(frozen=True)
+class BevFrameConfig:
+    """The bev frame that a model was trained in, relative to the ego frame, whose origin is on the ground.
+
+    Attributes:
+        level: whether the z axis of the bev frame must be vertical. The bev frame of every drive is then replaced by a
+            level one with the same heading and origin, at the height `height_m`. If false, the drive's is used.
+        height_m: height of the origin above the ground, metres; nuScenes' LIDAR_TOP has 1.84.
+    """
+
+    level: bool = False
+    height_m: float = 1.84
+
+
+@dataclass(frozen=True)
+class TrainingRigsConfig:
+    """The rigs that a model's weights were trained on. It changes no result: a drive's rig is compared with it.
+
+    Attributes:
+        cameras: smallest and largest number of cameras; 0 and 0 where the rigs are not known.
+        fov_deg: smallest and largest horizontal field of view.
+        height_m: smallest and largest height of a camera above the ground.
+        tilt_deg: largest pitch or roll of a camera.
+        cost: what other rigs were measured to cost, in words.
+    """
+
+    cameras: tuple[int, int] = (0, 0)
+    fov_deg: tuple[float, float] = (0.0, 180.0)
+    height_m: tuple[float, float] = (0.0, 10.0)
+    tilt_deg: float = 90.0
+    cost: str = ""
+
+    @property
+    def known(self) -> bool:
+        """Whether the model's file states the rigs."""
+        return self.cameras[1] > 0
+
+
+@dataclass(frozen=True)
 class BEVFormerConfig:
     """A whole model. `bevcli.config.load_config` reads it from a TOML file.
 
@@ -75,6 +119,8 @@ class BEVFormerConfig:
         cameras: names of the camera embeddings, in their order.
         image: how images become the network's input.
         bev_grid: the cells of the BEV map and their pillars.
+        bev_frame: the frame in which the grid lies.
+        training_rigs: the rigs that the weights were trained on.
         rate_hz: frame rate of the training data.
         max_gap_s: after a longer time between two frames the history is dropped.
         channels: C, of all tokens and queries.
@@ -93,6 +139,8 @@ class BEVFormerConfig:
     cameras: tuple[str, ...]
     image: ImageConfig
     bev_grid: BevGrid
+    bev_frame: BevFrameConfig = field(default_factory=BevFrameConfig)
+    training_rigs: TrainingRigsConfig = field(default_factory=TrainingRigsConfig)
     rate_hz: float = 2.0
     max_gap_s: float = 2.0
     channels: int = 256
@@ -133,6 +181,11 @@ class BEVFormerConfig:
         """Number of the neck's levels that the BEV encoder attends to, the finest ones."""
         return min(self.neck.levels, self.image_tokens.level_embeddings)
 
+    @property
+    def map_classes(self) -> tuple[str, ...]:
+        """The classes of the map that the model predicts, in the order of their bits; empty without a map."""
+        return tuple(MAP_CLASSES) if "segmentation" in self.heads else ()
+
     def _most_neck_levels(self) -> int:
         return self.image_tokens.level_embeddings
 
@@ -144,7 +197,7 @@ class BEVFormerInputs:
     Attributes:
         images: (B, N, 3, H, W), normalised and padded.
         image_from_bev: (B, N, 4, 4) float32, bev metres to pixels of the network's input (rows u·d, v·d, d, 1).
-        camera_index: (N,) int64, the camera embedding of each image.
+        camera_index: (N,) int64, the camera embedding of each image; (B, N) where the sequences differ.
         has_image: (B, N) bool; a camera without an image sees no BEV cell.
         can_bus: (B, 18) float32, the translation and the change of heading since the previous frame included.
         shift: (B, 2) float32, translation of the history (x, y) in normalised BEV coordinates; zero without history.
@@ -198,9 +251,11 @@ class BEVFormerBase(nn.Module):
         self.backbone = ResNet(config.backbone)
         self.neck = FPN(config.backbone.output_channels(), channels, config.neck)
         self.image_tokens = ImageTokens(len(config.cameras), channels, config.image_tokens)
+        embeds_rays = config.image_tokens.calibration_embedding
+        self.calibration_embedding = CalibrationEmbedding(channels, config.bev_frame.height_m) if embeds_rays else None
         self.bev_queries = BevQueries(grid, channels, config.ego_motion.can_bus)
         self.pillars = Pillars(grid)
-        self.encoder = Encoder(config.encoder, channels, levels, grid, config.ego_motion.history_shift)
+        self.encoder = Encoder(config.encoder, channels, levels, grid, config.ego_motion)
         self.decoder = Decoder(config.decoder, channels, bev_shape)
         self.detection_head = DetectionHead(config.decoder.layers, channels, len(config.classes), grid)
         segments = "segmentation" in config.heads
@@ -211,7 +266,7 @@ class BEVFormerBase(nn.Module):
 
         Args:
             images: (B, N, 3, H, W), normalised and padded.
-            camera_index: (N,) int64, the camera embedding of each image.
+            camera_index: (N,) or (B, N) int64, the camera embedding of each image.
         """
         feature_maps = self.neck(self.backbone(images.flatten(0, 1)))
         return self.image_tokens(feature_maps[: self.config.encoder_levels], camera_index)
@@ -220,7 +275,7 @@ class BEVFormerBase(nn.Module):
         """What the decoder and the heads find in the BEV map (B, Y·X, C)."""
         # In float32: half precision is too coarse for the refinement of boxes.
         with torch.autocast(bev.device.type, enabled=False):
-            class_logits, box_codes = self.decoder(bev.float(), self.detection_head)
+            class_logits, box_codes, _ = self.decoder(bev.float(), self.detection_head)
             segmentation = None
             if self.segmentation_head is not None:
                 segmentation = self.segmentation_head(bev.float(), self.bev_queries.position())
@@ -237,6 +292,8 @@ class BEVFormer(BEVFormerBase):
     def bev_map(self, inputs: BEVFormerInputs, history: Tensor | None) -> Tensor:
         """The BEV map (B, Y·X, C): the part of `forward` before the decoder and the heads."""
         image_features = self.image_features(inputs.images, inputs.camera_index)
+        if self.calibration_embedding is not None:
+            image_features = self.calibration_embedding(image_features, inputs.image_from_bev, inputs.image_size)
         return self.encoder(
             bev_query=self.bev_queries(inputs.can_bus),
             position=self.bev_queries.position(),

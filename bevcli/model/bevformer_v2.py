@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from torch import Tensor
 
 from bevcli.model.bev_fusion import BevFusion, BevFusionConfig
-from bevcli.model.bevformer import BEVFormer, BEVFormerBase, BEVFormerConfig, BEVFormerOutputs
+from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig, BEVFormerOutputs
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.ego_motion import EgoMotionConfig
 
@@ -132,8 +132,3 @@ def fill_window(frames: Sequence[int], exists: Sequence[bool]) -> list[int]:
         if not exists[place]:
             sources[place] = sources[place + (1 if place < current else -1)]
     return sources
-
-
-def build_model(config: BEVFormerConfig) -> BEVFormer | BEVFormerV2:
-    """The model of a configuration, with random weights."""
-    return BEVFormerV2(config) if isinstance(config, BEVFormerV2Config) else BEVFormer(config)

@@ -29,7 +29,7 @@ def decode(outputs: BEVFormerOutputs, config: BEVFormerConfig) -> list[Boxes3D]:
     last_codes = outputs.box_codes[-1].detach()
     codes = last_codes.gather(1, query[..., None].expand(-1, -1, last_codes.shape[-1]))
     return [
-        _boxes(code.double().cpu().numpy(), classes[names.cpu().numpy()], score.double().cpu().numpy())
+        boxes_of_codes(code.double().cpu().numpy(), classes[names.cpu().numpy()], score.double().cpu().numpy())
         for code, names, score in zip(codes, label, best, strict=True)
     ]
 
@@ -43,7 +43,7 @@ def encode(boxes: Boxes3D) -> Array:
     return np.concatenate([np.stack(columns, axis=-1), boxes.velocities], axis=-1)
 
 
-def _boxes(code: Array, classes: np.ndarray, scores: Array) -> Boxes3D:
+def boxes_of_codes(code: Array, classes: np.ndarray, scores: Array) -> Boxes3D:
     angle = np.arctan2(code[:, 6], code[:, 7])
     return Boxes3D(
         centers=code[:, [0, 1, 4]],

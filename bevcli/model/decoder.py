@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.deformable_attention import DeformableAttention, sampling_locations
+from bevcli.model.deformable_attention import DeformableAttention
 from bevcli.model.feed_forward import FeedForward
 
 BOX_CODE_SIZE = 10
@@ -48,6 +48,21 @@ class DecoderConfig:
             )
 
 
+@dataclass(frozen=True)
+class ObjectQueries:
+    """Queries as they enter the first decoder layer.
+
+    Attributes:
+        position: (B, Q, C).
+        content: (B, Q, C).
+        reference_points: (B, Q, 3) x, y, z, 0 to 1 over the range.
+    """
+
+    position: Tensor
+    content: Tensor
+    reference_points: Tensor
+
+
 class Decoder(nn.Module):
     """Object queries that attend to the BEV map and move their reference points to the objects."""
 
@@ -61,39 +76,51 @@ class Decoder(nn.Module):
         nn.init.xavier_uniform_(self.reference_points.weight)
         nn.init.zeros_(self.reference_points.bias)
 
-    def forward(self, bev: Tensor, head: DetectionHead) -> tuple[Tensor, Tensor]:
-        """bev: (B, Y·X, C) -> class logits (L, B, Q, classes) and box codes (L, B, Q, 10) of all L layers.
+    def forward(
+        self, bev: Tensor, head: DetectionHead, queries: ObjectQueries | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """What the queries find in the BEV map.
 
-        In training mode the Q queries are those of all groups, one group after another.
+        Args:
+            bev: (B, Y·X, C).
+            head: class and box branches of the layers.
+            queries: None takes the learned ones, in training mode those of all groups, one group after another.
+
+        Returns:
+            Class logits (L, B, Q, classes) and box codes (L, B, Q, 10) of all L layers; the queries (B, Q, C) after
+            the last layer.
         """
         groups = self.training_groups if self.training else 1
-        position, query = self.object_queries(len(bev), groups)
-        reference_points = self.reference_points(position).float().sigmoid()  # (B, Q, 3)
+        queries = self.object_queries(len(bev), groups) if queries is None else queries
+        query, reference_points = queries.content, queries.reference_points
         class_logits, box_codes = [], []
         for index, layer in enumerate(self.layers):
-            query = layer(query, position, reference_points[..., :2], bev, groups)
+            query = layer(query, queries.position, reference_points[..., :2], bev, groups)
             logits, codes, refined = head(index, query, reference_points)
             class_logits.append(logits)
             box_codes.append(codes)
             reference_points = refined.detach()
-        return torch.stack(class_logits), torch.stack(box_codes)
+        return torch.stack(class_logits), torch.stack(box_codes), query
 
-    def object_queries(self, batch: int, groups: int = 1) -> tuple[Tensor, Tensor]:
-        """Position and content, each (batch, Q, C), of the learned queries of the first groups."""
+    def object_queries(self, batch: int, groups: int = 1) -> ObjectQueries:
+        """The learned queries of the first groups, the same for each batch element."""
         count = len(self.query_embedding) // self.training_groups * groups
         position, content = self.query_embedding[:count].expand(batch, -1, -1).chunk(2, dim=-1)
-        return position, content
+        return ObjectQueries(position, content, self.reference_points(position).float().sigmoid())
 
 
 class DecoderLayer(nn.Module):
     """Self-attention among the object queries, deformable cross-attention to the BEV map, feed-forward network."""
 
-    def __init__(self, config: DecoderConfig, channels: int, bev_shape: tuple[int, int]) -> None:
+    def __init__(
+        self, config: DecoderConfig, channels: int, bev_shape: tuple[int, int], attention_levels: int = 1
+    ) -> None:
+        """Random weights. attention_levels: levels that the cross-attention is built for, although there is one map."""
         super().__init__()
         self.level_shapes = (bev_shape,)
-        dropout = config.dropout
-        self.self_attention = nn.MultiheadAttention(channels, config.attention_heads, dropout, batch_first=True)
-        self.cross_attention = DeformableAttention(channels, channels, config.attention_heads, config.points)
+        heads, dropout = config.attention_heads, config.dropout
+        self.self_attention = nn.MultiheadAttention(channels, heads, dropout, batch_first=True)
+        self.cross_attention = DeformableAttention(channels, channels, heads, config.points, attention_levels)
         self.feed_forward = FeedForward(channels, config.feed_forward_width, dropout)
         self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(3))
         self.dropout = nn.Dropout(dropout)
@@ -107,7 +134,7 @@ class DecoderLayer(nn.Module):
         Args:
             query: (B, Q, C), contents of the queries.
             position: (B, Q, C), positions of the queries.
-            reference_points: (B, Q, 2) x, y, 0 to 1 over the map.
+            reference_points: (B, Q, 2) x, y, 0 to 1 over the map; or (B, Q, 4) with the extent along x and y.
             bev: (B, Y·X, C).
             groups: number of groups of queries; queries of different groups do not attend to each other.
 
@@ -115,7 +142,8 @@ class DecoderLayer(nn.Module):
             (B, Q, C).
         """
         query = self.norms[0](query + self.dropout(self._attend_to_queries(query, position, groups)))
-        query = self.norms[1](query + self.dropout(self._attend_to_bev(query + position, reference_points, bev)))
+        attended = self.cross_attention.attend(query + position, reference_points, bev, self.level_shapes)
+        query = self.norms[1](query + self.dropout(attended))
         return self.norms[2](query + self.feed_forward(query))
 
     def _attend_to_queries(self, query: Tensor, position: Tensor, groups: int) -> Tensor:
@@ -123,15 +151,6 @@ class DecoderLayer(nn.Module):
         key = value + position.unflatten(1, (groups, -1)).flatten(0, 1)
         attended, _ = self.self_attention(key, key, value, need_weights=False)
         return attended.reshape(query.shape)
-
-    def _attend_to_bev(self, query: Tensor, reference_points: Tensor, bev: Tensor) -> Tensor:
-        batch, queries, _ = query.shape
-        offsets, weights = self.cross_attention.predict(query)  # (B, Q, heads, 1, 1, P, 2)
-        locations = sampling_locations(reference_points[:, :, None, None, None], offsets[:, :, :, 0], self.level_shapes)
-        sampled = self.cross_attention.sample(
-            bev, self.level_shapes, locations.flatten(0, 1), weights[:, :, :, 0].flatten(0, 1), [queries] * batch
-        )
-        return self.cross_attention.output_projection(sampled.unflatten(0, (batch, queries)))
 
 
 class DetectionHead(nn.Module):

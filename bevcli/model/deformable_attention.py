@@ -69,6 +69,40 @@ class DeformableAttention(nn.Module):
         weights = self.attention_weights(query).unflatten(-1, (heads, maps, levels * points)).softmax(-1)
         return offsets, weights.unflatten(-1, (levels, points))
 
+    def attend(self, query: Tensor, reference_points: Tensor, tokens: Tensor, level_shapes: LevelShapes) -> Tensor:
+        """The attended values of queries that sample one map each.
+
+        A module that was built for more levels than the map has reads locations and weights as the CUDA kernel of the
+        released code does: it takes the flat list of all (query, head, level) for a list of the map's L levels. Query n
+        then gets the heads · L entries from n · heads · L on. They were predicted by query n · L / (predicted levels),
+        rounded down, and lie around that query's reference point. Their weights are not normalised again. The published
+        UniAD weights were trained in this way.
+
+        Args:
+            query: (B, Q, query_channels).
+            reference_points: (B, Q, 2) x, y, 0 to 1 over the map, or (B, Q, 4) with the extent along x and y: then
+                offsets are measured in half extents, divided by the number of points.
+            tokens: (B, S, C).
+            level_shapes: (height, width) of each of the L levels.
+
+        Returns:
+            (B, Q, C).
+        """
+        batch, queries, _ = query.shape
+        heads, _, predicted, points = self.shape
+        levels = len(level_shapes)
+        read = -(-queries * levels // predicted)  # the queries whose offsets and weights are used; all if predicted = L
+        offsets, weights = self.predict(query[:, :read])  # (B, read, heads, 1, predicted, P, 2)
+        offsets, reference = offsets[:, :, :, 0], reference_points[:, :read, None, None, None]
+        if reference_points.shape[-1] == 2:
+            locations = sampling_locations(reference, offsets, level_shapes)
+        else:
+            locations = reference[..., :2] + offsets / points * reference[..., 2:] * 0.5
+        locations = locations.flatten(1, 3).unflatten(1, (-1, heads, levels))[:, :queries]  # (B, Q, heads, L, P, 2)
+        weights = weights.flatten(1, 4).unflatten(1, (-1, heads, levels))[:, :queries]
+        sampled = self.sample(tokens, level_shapes, locations.flatten(0, 1), weights.flatten(0, 1), [queries] * batch)
+        return self.output_projection(sampled.unflatten(0, (batch, queries)))
+
     def sample(
         self,
         tokens: Tensor,

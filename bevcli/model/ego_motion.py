@@ -38,6 +38,9 @@ class EgoMotionConfig:
             cells from the map's corner.
         can_bus_quaternion: the quaternion in the can-bus numbers: "wxyz", or "w" for w four times, as in the released
             code.
+        first_frame: translation and change of heading in a scene's first frame: "zero"; or "original" for those since
+            the last frame of the run, also of another scene, and in the run's first frame since the origin of the
+            world, as in the released code of UniAD. They then shift the reference points although there is no history.
     """
 
     can_bus: bool = True
@@ -46,6 +49,7 @@ class EgoMotionConfig:
     history_shift: Literal["both", "history"] = "both"
     history_rotation_center: RotationCenter = "original"
     can_bus_quaternion: Literal["w", "wxyz"] = "w"
+    first_frame: Literal["zero", "original"] = "zero"
 
 
 @dataclass(frozen=True)
@@ -76,8 +80,8 @@ def ego_motion_inputs(
 
     Args:
         pose: world_from_ego, with the sign of the quaternion as stored.
-        previous_pose: world_from_ego of the previous frame of the same scene; None for a scene's first frame, which
-            has neither translation nor rotation.
+        previous_pose: world_from_ego of the previous frame. None for a scene's first frame, which has neither
+            translation nor rotation, and where config.first_frame is "original" for the first frame of the run.
         acceleration: (3,) m/s², ego frame.
         angular_rate: (3,) rad/s, ego frame.
         velocity: (3,) m/s, ego frame.
@@ -87,6 +91,8 @@ def ego_motion_inputs(
     position = np.asarray(pose.translation, dtype=np.float64)
     yaw_deg = heading_deg(pose.quaternion)
     moved, turned_deg = np.zeros(3), 0.0
+    if previous_pose is None and config.first_frame == "original":
+        previous_pose = Pose.identity()
     if previous_pose is not None:
         moved = position - np.asarray(previous_pose.translation, dtype=np.float64)
         # Not wrapped to ±180, as in the training of the published weights: crossing 0 gives about ±360.

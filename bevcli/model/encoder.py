@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.deformable_attention import DeformableAttention, FeatureMaps, LevelShapes, sampling_locations
+from bevcli.model.ego_motion import EgoMotionConfig
 from bevcli.model.feed_forward import FeedForward
 from bevcli.model.pillar_projection import PillarHits
 
@@ -55,13 +55,14 @@ class Encoder(nn.Module):
         channels: int,
         levels: int,
         grid: BevGrid,
-        history_shift: Literal["both", "history"],
+        ego_motion: EgoMotionConfig,
     ) -> None:
         super().__init__()
         bev_shape = (grid.rows, grid.columns)
         self.layers = nn.ModuleList(EncoderLayer(config, channels, levels, bev_shape) for _ in range(config.layers))
-        self.history_shift = history_shift
-        self.register_buffer("cell_centers", _normalized_centers(grid), persistent=False)
+        self.history_shift = ego_motion.history_shift
+        self.shift_without_history = ego_motion.first_frame == "original"
+        self.register_buffer("cell_centers", normalized_centers(grid), persistent=False)
 
     def forward(
         self,
@@ -80,15 +81,16 @@ class Encoder(nn.Module):
             image_features: tokens of B·N images.
             hits: the cells that each camera sees.
             history: (B, Y·X, C), the previous BEV map, rotated to the current heading; None without history.
-            shift: (B, 2), translation of the history (x, y) in normalised BEV coordinates;
-                needed with history.
+            shift: (B, 2), translation of the history (x, y) in normalised BEV coordinates; needed with history, and
+                where ego_motion.first_frame is "original".
 
         Returns:
             (B, Y·X, C).
         """
         # With history, all layers attend to the same two maps; without it, to their own queries twice.
         bev_maps = None if history is None else torch.stack([history, bev_query], dim=1)
-        reference_points = self.reference_points(None if history is None else shift)
+        is_shifted = history is not None or self.shift_without_history
+        reference_points = self.reference_points(shift if is_shifted else None)
         bev = bev_query
         for layer in self.layers:
             bev = layer(bev, position, bev_maps, reference_points, image_features, hits)
@@ -97,7 +99,7 @@ class Encoder(nn.Module):
     def reference_points(self, shift: Tensor | None) -> Tensor:
         """(B or 1, 2, Y·X, 2) float32: where the cells' centres lie in the history map and in the current one.
 
-        shift: as for `forward`; None without history.
+        shift: as for `forward`; None where the history is not shifted.
         """
         centers = self.cell_centers.float()
         if shift is None:
@@ -232,7 +234,7 @@ class SpatialCrossAttention(nn.Module):
         return sampling_locations(reference[:, None, None], offsets, level_shapes), weights
 
 
-def _normalized_centers(grid: BevGrid) -> Tensor:
+def normalized_centers(grid: BevGrid) -> Tensor:
     """(Y·X, 2) float32 centres of the cells, x and y, 0 to 1 over the map."""
     x = (torch.arange(grid.columns, dtype=torch.float32) + 0.5) / grid.columns
     y = (torch.arange(grid.rows, dtype=torch.float32) + 0.5) / grid.rows

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 
 class FeedForward(nn.Module):
-    """Linear, ReLU, linear, with dropout after each linear layer."""
+    """Linear, activation, linear, with dropout after each linear layer."""
 
-    def __init__(self, channels: int, width: int, dropout: float) -> None:
+    def __init__(self, channels: int, width: int, dropout: float, activation: Literal["relu", "gelu"] = "relu") -> None:
         super().__init__()
+        self.activation = activation
         self.expand = nn.Linear(channels, width)
         self.reduce = nn.Linear(width, channels)
         self.dropout = nn.Dropout(dropout)
@@ -20,4 +23,6 @@ class FeedForward(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """x: (..., C) -> (..., C), without the residual."""
-        return self.dropout(self.reduce(self.dropout(F.relu(self.expand(x), inplace=True))))
+        expanded = self.expand(x)
+        activated = F.gelu(expanded) if self.activation == "gelu" else F.relu(expanded, inplace=True)
+        return self.dropout(self.reduce(self.dropout(activated)))

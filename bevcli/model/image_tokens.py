@@ -18,10 +18,13 @@ class ImageTokensConfig:
     Attributes:
         camera_embedding: whether every image feature gets the learned embedding of its camera.
         level_embeddings: number of learned level embeddings, at least the neck's levels (published weights hold four).
+        calibration_embedding: whether every image feature gets an embedding of its viewing ray, see
+            `CalibrationEmbedding`. The published models have none.
     """
 
     camera_embedding: bool = True
     level_embeddings: int = 4
+    calibration_embedding: bool = False
 
 
 class ImageTokens(nn.Module):
@@ -39,7 +42,7 @@ class ImageTokens(nn.Module):
 
         Args:
             maps: (B·N, C, H_l, W_l), one a level.
-            camera_index: (N,) int64, the camera embedding of each image.
+            camera_index: (N,) or (B, N) int64, the camera embedding of each image.
 
         Returns:
             Tokens (B·N, S, C) in the maps' dtype, S the cells of all levels.
@@ -48,8 +51,8 @@ class ImageTokens(nn.Module):
         levels = [x.flatten(2).transpose(1, 2) + self.level_embedding[i] for i, x in enumerate(maps)]
         tokens = torch.cat(levels, dim=1)  # (B·N, S, C)
         if self.camera_embedding is not None:
-            embedding = self.camera_embedding[camera_index]  # (N, C)
-            by_camera = tokens.unflatten(0, (-1, len(camera_index))) + embedding[:, None]  # (B, N, S, C)
+            embedding = self.camera_embedding[camera_index]  # (N, C) or (B, N, C)
+            by_camera = tokens.unflatten(0, (-1, camera_index.shape[-1])) + embedding[..., None, :]  # (B, N, S, C)
             tokens = by_camera.flatten(0, 1)  # (B·N, S, C)
         # Where the maps are in half precision, the sums with the embeddings are rounded once, here.
         return FeatureMaps(tokens.to(maps[0].dtype), level_shapes)

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import torch
 
 from bevcli.model.bevformer import BEVFormerConfig
-from bevcli.model.bevformer_v2 import BEVFormerV2Config, build_model
+from bevcli.model.bevformer_v2 import BEVFormerV2Config
+from bevcli.model.build import build_model
 
 Shape = tuple[int, ...]
 
@@ -64,6 +65,7 @@ def _names_and_modules(config: BEVFormerConfig) -> Iterator[tuple[str, ...]]:
     yield "neck (FPN)", "neck"
     yield "level embeddings", "image_tokens.level_embedding"
     yield "camera embeddings", "image_tokens.camera_embedding"
+    yield "calibration embedding", "calibration_embedding"
     yield "BEV queries", "bev_queries.embedding"
     yield "position embedding, rows", "bev_queries.row_embedding"
     yield "position embedding, columns", "bev_queries.column_embedding"
@@ -88,10 +90,18 @@ def _names_and_modules(config: BEVFormerConfig) -> Iterator[tuple[str, ...]]:
         yield f"decoder layer {layer}: norms", f"{prefix}.norms"
     yield f"detection head: {config.decoder.layers} class branches", "detection_head.class_branches"
     yield f"detection head: {config.decoder.layers} box branches", "detection_head.box_branches"
+    yield "tracks: memory bank", "memory_bank"
+    yield "tracks: query interaction", "query_interaction"
     yield "segmentation: stuff queries", "segmentation_head.stuff_queries"
     yield "segmentation: location decoder", "segmentation_head.location_decoder"
     for layer in range(config.segmentation.mask_layers):
         yield f"segmentation: mask decoder layer {layer}", f"segmentation_head.mask_layers.{layer}"
+    yield "map head: encoder", "map_head.encoder"
+    yield "map head: location decoder", "map_head.location_decoder"
+    yield "map head: class branch", "map_head.class_branch"
+    yield "map head: stuff queries", "map_head.stuff_queries"
+    yield "map head: mask decoder of things", "map_head.thing_masks"
+    yield "map head: mask decoder of stuff", "map_head.stuff_masks"
 
 
 def _size(shape: Shape) -> tuple[int, Shape]:

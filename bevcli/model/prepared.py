@@ -5,6 +5,7 @@ The plain model knows nothing of this. A prepared model is a copy whose parts ar
 
 from __future__ import annotations
 
+import atexit
 import copy
 import threading
 from collections.abc import Sequence
@@ -16,6 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_weights
 
+from bevcli.errors import WeightsError
 from bevcli.model.bev_fusion import FusionBlock
 from bevcli.model.bevformer import BEVFormer, BEVFormerBase, BEVFormerInputs, BEVFormerOutputs
 from bevcli.model.bevformer_v2 import BEVFormerV2, WindowFrame
@@ -27,25 +29,35 @@ from bevcli.model.kernels.compiled import CompiledDeformableConvolution, Compile
 from bevcli.model.kernels.onednn import use_onednn
 from bevcli.model.pillar_projection import PillarHits, Pillars
 from bevcli.model.resnet import Bottleneck, ResNet
+from bevcli.model.track_queries import FrameMotion, TrackQueries
+from bevcli.model.uniad import UniAD, UniADOutputs
 
 Precision = Literal["fp32", "bf16", "fp16"]
+LOADING_TIMEOUT_S = 120.0  # the compilation takes half a minute where there is no cache
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 
 
 def prepare_for_inference(
     model: BEVFormerBase, device: torch.device, precision: Precision = "fp32"
-) -> PreparedBEVFormer | PreparedBEVFormerV2:
-    """A copy of the model on the device, for inference only; the model itself stays unchanged."""
-    prepared: PreparedBEVFormer | PreparedBEVFormerV2
+) -> PreparedBEVFormer | PreparedBEVFormerV2 | PreparedUniAD:
+    """A copy of the model on the device, for inference only; the model itself stays unchanged.
+
+    Raises WeightsError where a prepared weight is not finite, as with a batch norm of negative variance.
+    """
+    prepared: PreparedBEVFormer | PreparedBEVFormerV2 | PreparedUniAD
     if isinstance(model, BEVFormerV2):
         prepared = PreparedBEVFormerV2(model, device, precision)
+    elif isinstance(model, UniAD):
+        prepared = PreparedUniAD(model, device, precision)
     else:
         assert isinstance(model, BEVFormer)
         prepared = PreparedBEVFormer(model, device, precision)
     if device.type == "cpu":
         # Runs beside the first frame's backbone, which needs no Python. Started any earlier, it would slow down the
         # copying of the model.
-        threading.Thread(target=load_compiled, args=(DTYPES[precision],), name="load-compiled").start()
+        loading = threading.Thread(target=load_compiled, args=(DTYPES[precision],), name="load-compiled", daemon=True)
+        loading.start()
+        atexit.register(loading.join, LOADING_TIMEOUT_S)  # Python cannot end in the middle of a compilation
     return prepared
 
 
@@ -98,20 +110,53 @@ class PreparedBEVFormerV2(BEVFormerV2):
             return super().forward(window)
 
 
+class PreparedUniAD(UniAD):
+    """A UniAD for inference on one device: see `PreparedBEVFormer`."""
+
+    def __init__(self, model: UniAD, device: torch.device, precision: Precision) -> None:
+        nn.Module.__init__(self)
+        self.__dict__.update(copy.deepcopy(model).__dict__)
+        self.images_dtype = DTYPES[precision]
+        _prepare(self, device, self.images_dtype)
+
+    def forward(
+        self,
+        inputs: BEVFormerInputs,
+        history: Tensor | None = None,
+        tracks: TrackQueries | None = None,
+        motion: FrameMotion | None = None,
+    ) -> UniADOutputs:
+        """As `UniAD.forward`."""
+        with torch.autocast(inputs.images.device.type, enabled=False):
+            return super().forward(replace(inputs, images=inputs.images.to(self.images_dtype)), history, tracks, motion)
+
+
 def _prepare(model: BEVFormerBase, device: torch.device, images_dtype: torch.dtype) -> None:
     """Replaces the parts of a model by faster ones, in place."""
     model.to(device).eval().requires_grad_(False)
     fold_batch_norms(model, device)
     choose_kernels(model, device)
     model.pillars = CachedPillars(model.config.bev_grid).to(device)
-    model.decoder.layers[0].self_attention = ConstantSelfAttention(model.decoder)
+    if not isinstance(model, UniAD):  # whose tracks attend to the learned queries
+        model.decoder.layers[0].self_attention = ConstantSelfAttention(model.decoder)
     for part in (model.backbone, model.neck):
         part.to(images_dtype)
     for module in model.encoder.modules():
         if isinstance(module, SpatialCrossAttention):
             module.attention.value_projection.to(images_dtype)
+    _check_finite(model)
     if device.type == "cpu":
         use_onednn(model)
+
+
+def _check_finite(model: nn.Module) -> None:
+    """Raises WeightsError for a folded or cast weight with NaN or infinity: oneDNN's ReLU would turn it into zeros."""
+    for name, parameter in model.named_parameters():
+        if not torch.isfinite(parameter).all():
+            raise WeightsError(
+                f"{name}: has NaN or infinity after batch norms were folded into it and it was cast to "
+                f"{str(parameter.dtype).removeprefix('torch.')}: the weights are damaged, or need --precision fp32"
+            )
 
 
 class CachedPillars(Pillars):
@@ -142,9 +187,9 @@ class ConstantSelfAttention(nn.Module):
         first = decoder.layers[0]
         assert isinstance(first, DecoderLayer)
         with torch.no_grad():
-            position, query = decoder.object_queries(batch=1)
-            key = query + position
-            attended, _ = first.self_attention(key, key, query, need_weights=False)
+            queries = decoder.object_queries(batch=1)
+            key = queries.content + queries.position
+            attended, _ = first.self_attention(key, key, queries.content, need_weights=False)
         self.register_buffer("attended", attended, persistent=False)  # (1, Q, C)
 
     def forward(self, query: Tensor, key: Tensor, value: Tensor, *, need_weights: bool) -> tuple[Tensor, None]:

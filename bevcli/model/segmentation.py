@@ -114,16 +114,40 @@ class SegmentationHead(nn.Module):
 class LocationDecoder(nn.Module):
     """Thing queries that attend to the BEV map and predict the centre and the extent of their things.
 
-    Only the training loss uses the locations: they teach the queries where their things are before masks are made.
+    In the segmentation head, only the training loss uses the locations: they teach the queries where their things are
+    before masks are made.
     """
 
-    def __init__(self, config: DecoderConfig, channels: int, bev_shape: tuple[int, int]) -> None:
+    def __init__(
+        self,
+        config: DecoderConfig,
+        channels: int,
+        bev_shape: tuple[int, int],
+        *,
+        branch_layers: int = 2,
+        refines_extent: bool = False,
+        attention_levels: int = 1,
+    ) -> None:
+        """Random weights.
+
+        Args:
+            config: of the layers.
+            channels: C.
+            bev_shape: rows and columns of the BEV map.
+            branch_layers: linear layers of a location branch.
+            refines_extent: whether a layer refines centre and extent of the layer before, and samples inside them;
+                otherwise it refines the centre only.
+            attention_levels: see `DecoderLayer`.
+        """
         super().__init__()
+        self.refines_extent = refines_extent
         # The first half of the channels is the position of a query, the second half its content.
         self.query_embedding = nn.Parameter(torch.randn(config.queries, 2 * channels))
         self.reference_points = nn.Linear(channels, 2)
-        self.layers = nn.ModuleList(DecoderLayer(config, channels, bev_shape) for _ in range(config.layers))
-        self.location_branches = nn.ModuleList(_location_branch(channels) for _ in range(config.layers))
+        self.layers = nn.ModuleList(
+            DecoderLayer(config, channels, bev_shape, attention_levels) for _ in range(config.layers)
+        )
+        self.location_branches = nn.ModuleList(_location_branch(channels, branch_layers) for _ in range(config.layers))
 
     def forward(self, bev: Tensor) -> tuple[Tensor, Tensor]:
         """bev: (B, Y·X, C) -> thing queries (B, T, C) and locations (L, B, T, 4) of all L layers.
@@ -135,10 +159,11 @@ class LocationDecoder(nn.Module):
         locations = []
         for layer, branch in zip(self.layers, self.location_branches, strict=True):
             query = layer(query, position, reference_points, bev)
-            moved, extent = branch(query).chunk(2, dim=-1)
-            center = (moved + inverse_sigmoid(reference_points)).sigmoid()
-            locations.append(torch.cat([center, extent.sigmoid()], dim=-1))
-            reference_points = center.detach()
+            code, refined = branch(query), reference_points.shape[-1]
+            moved = code[..., :refined] + inverse_sigmoid(reference_points)
+            location = torch.cat([moved.sigmoid(), code[..., refined:].sigmoid()], dim=-1)
+            locations.append(location)
+            reference_points = (location if self.refines_extent else location[..., :2]).detach()
         return query, torch.stack(locations)
 
 
@@ -171,9 +196,9 @@ class MaskDecoderLayer(nn.Module):
         Returns:
             Refined queries (B, Q, C), mask logits (B, Q, Y·X) and class logits (B, Q).
         """
-        queries = self._split(self.query_projection(query))
-        keys = self._split(self.key_projection(bev + position))
-        values = self._split(self.value_projection(bev))  # (B, heads, Y·X, C / heads)
+        queries = split_heads(self.query_projection(query), self.heads)
+        keys = split_heads(self.key_projection(bev + position), self.heads)
+        values = split_heads(self.value_projection(bev), self.heads)  # (B, heads, Y·X, C / heads)
         attention = queries @ keys.transpose(-1, -2) / math.sqrt(keys.shape[-1])  # (B, heads, Q, Y·X)
         mask_logits = self.mask_projection(attention.movedim(1, -1)).squeeze(-1)  # (B, Q, Y·X)
         attended = (attention.softmax(-1) @ values).transpose(1, 2).flatten(2)  # (B, Q, C)
@@ -181,9 +206,10 @@ class MaskDecoderLayer(nn.Module):
         query = self.norms[1](query + self.feed_forward(query))
         return query, mask_logits, self.class_branch(query).squeeze(-1)
 
-    def _split(self, tokens: Tensor) -> Tensor:
-        """(B, S, C) -> (B, heads, S, C / heads)."""
-        return tokens.unflatten(-1, (self.heads, -1)).transpose(1, 2)
+
+def split_heads(tokens: Tensor, heads: int) -> Tensor:
+    """(B, S, C) -> (B, heads, S, C / heads)."""
+    return tokens.unflatten(-1, (heads, -1)).transpose(1, 2)
 
 
 @dataclass(frozen=True)
@@ -249,5 +275,6 @@ def _upsampled(layers: Tensor, scale: int) -> Tensor:
     return F.interpolate(layers[None], scale_factor=scale, mode="bilinear", align_corners=False)[0]
 
 
-def _location_branch(channels: int) -> nn.Sequential:
-    return nn.Sequential(nn.Linear(channels, channels), nn.ReLU(), nn.Linear(channels, 4))
+def _location_branch(channels: int, layers: int) -> nn.Sequential:
+    hidden = [module for _ in range(layers - 1) for module in (nn.Linear(channels, channels), nn.ReLU())]
+    return nn.Sequential(*hidden, nn.Linear(channels, 4))

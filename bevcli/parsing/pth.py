@@ -68,6 +68,24 @@ class PthFile:
         with self._storages:
             return {name: self._storages.tensor(name, described) for name, described in stored.items()}
 
+    def with_tensors(self) -> Any:
+        """The contents with tensors in place of `StoredTensor`.
+
+        Raises WeightsError as `tensors`, and RecursionError where a list contains itself.
+        """
+        with self._storages:
+            return self._filled(self.contents, "")
+
+    def _filled(self, value: Any, name: str) -> Any:
+        if isinstance(value, StoredTensor):
+            return self._storages.tensor(name, value)
+        if isinstance(value, dict):
+            return {key: self._filled(item, f"{name}.{key}".lstrip(".")) for key, item in value.items()}
+        if isinstance(value, list | tuple):
+            items = [self._filled(item, f"{name}.{place}".lstrip(".")) for place, item in enumerate(value)]
+            return items if isinstance(value, list) else tuple(items)
+        return value
+
 
 @dataclass(frozen=True, eq=False)
 class Storage:

@@ -18,7 +18,7 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
 from bevcli.model.encoder import EncoderLayer
 from bevcli.model.pillar_projection import PillarHits
-from bevcli.pipeline.preprocess import PreparedFrame
+from bevcli.pipeline.preprocess import PreparedFrame, resize_shift
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,8 @@ def _samples(
         index = int(samples.camera[row])
         camera = prepared.frame.rig[prepared.assignment.cameras[index]]
         network_pixels = samples.locations[row].float().cpu().double().numpy().reshape(-1, 2) * size
-        pixels = (network_pixels + config.image.crop_box[:2]) / prepared.scales[index]
+        scale = prepared.scales[index]
+        pixels = (network_pixels + config.image.crop_box[:2] - resize_shift(scale, config.image)) / scale
         weights = samples.weights[row].float().cpu().double().numpy().reshape(-1)
         shares = weights / (len(chosen) * samples.weights.shape[1])  # the sum over all heads and cameras is 1
         result[camera.name] = CameraSamples(camera.distorted(pixels), shares)

@@ -25,20 +25,21 @@ def model_inputs(
         config: of the model.
 
     Raises:
-        InputError: the cameras of the sequences do not take the same camera embeddings.
+        InputError: the sequences do not have the same number of cameras.
     """
-    index = frames[0].camera_index
+    indices = [prepared.camera_index for prepared in frames]
     for prepared in frames:
-        if not torch.equal(prepared.camera_index, index):
+        if len(prepared.camera_index) != len(indices[0]):
             raise InputError(
                 f"cameras {', '.join(prepared.assignment.cameras)} and {', '.join(frames[0].assignment.cameras)} "
-                "cannot go into one batch: use sequences of one rig, or batches of 1"
+                "cannot go into one batch: use sequences with the same number of cameras, or batches of 1"
             )
+    same = all(torch.equal(index, indices[0]) for index in indices)
     motions = [_motion(prepared, pose, config) for prepared, pose in zip(frames, previous_poses, strict=True)]
     return BEVFormerInputs(
         images=torch.cat([prepared.images for prepared in frames]),
         image_from_bev=torch.cat([prepared.image_from_bev for prepared in frames]).float(),
-        camera_index=index,
+        camera_index=indices[0] if same else torch.stack(indices),
         has_image=torch.cat([prepared.has_image for prepared in frames]),
         can_bus=torch.from_numpy(np.stack([motion.can_bus for motion in motions])),
         shift=torch.from_numpy(np.stack([motion.shift for motion in motions])),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -13,10 +14,12 @@ import torch
 from bevcli.checkpoints import bundled_weights, inspect, load_weights
 from bevcli.config import TRACKING, known_models, load_config, load_table
 from bevcli.errors import BevcliError, WeightsError
+from bevcli.geometry.cameras import CameraRig
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
-from bevcli.model.bevformer_v2 import build_model
+from bevcli.model.build import build_model
 from bevcli.model.prepared import Precision, prepare_for_inference
 from bevcli.pipeline.tracking import TrackerConfig
+from bevcli.pipeline.training_rigs import facts_note, rig_notes
 
 DEFAULT_MODEL = "demo"
 UNTRAINED_SEED = 0  # two untrained runs of one drive agree
@@ -27,7 +30,7 @@ class Model:
     """A model with its weights, and the device that it runs on.
 
     Attributes:
-        network: the plain BEVFormer or BEVFormerV2, as in its paper, on the CPU.
+        network: the plain BEVFormer, BEVFormerV2 or UniAD, as in its paper, on the CPU.
         device: where it runs.
         precision: of the image features; the rest of the network computes in float32.
         weights: the file that the weights came from, None for random weights.
@@ -35,6 +38,7 @@ class Model:
         left_out: what of that file is for training only and was left out; "" for nothing.
         tracker: the parameters of the tracker, the table [tracking] of the model's TOML file.
         not_read: classes and functions in the weights file whose objects were not read.
+        facts: metadata in the weights file.
     """
 
     network: BEVFormerBase
@@ -45,6 +49,7 @@ class Model:
     left_out: str = ""
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     not_read: tuple[str, ...] = ()
+    facts: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def config(self) -> BEVFormerConfig:
@@ -60,6 +65,13 @@ class Model:
     def untrained(self) -> bool:
         """Whether the weights are random: boxes and maps are then meaningless."""
         return self.weights is None
+
+    def rig_notes(self, rig: CameraRig) -> tuple[str, ...]:
+        """What of a rig is far from the training of the weights, one line each; nothing for random weights."""
+        if self.untrained:
+            return ()
+        stated = facts_note(self.facts, self.config)
+        return (*([stated] if stated else []), *rig_notes(rig, self.config))
 
     @cached_property
     def config_hash(self) -> str:
@@ -94,8 +106,8 @@ def load_model(
         model = bevcli.load_model("tiny", weights="bevformer_tiny_epoch_24.pth", device="cuda")
 
     Args:
-        name: a known model ("tiny", "small", "base", "v2-t1-base", "v2-t1", "v2-t2", "v2-t8", "demo") or a FILE.toml.
-            None takes the model that the weights fit, or "demo" where there are no weights.
+        name: a known model ("tiny", "small", "base", "v2-t1-base", "v2-t1", "v2-t2", "v2-t8", "uniad-track-map",
+            "demo") or a FILE.toml. None takes the model that the weights fit, or "demo" where there are no weights.
         weights: an official .pth as published, or a .safetensors. None takes the weights of the package, which only
             "demo" has.
         device: "auto" takes a GPU where there is one, else the CPU; or "cpu", "cuda", "cuda:1".
@@ -134,6 +146,7 @@ def load_model(
         left_out="" if loaded is None else loaded.left_out,
         tracker=tracker,
         not_read=() if loaded is None else loaded.not_read,
+        facts={} if loaded is None else loaded.facts,
     )
 
 

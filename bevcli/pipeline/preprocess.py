@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bevcli.frame import Frame
-from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.geometry.cameras import Camera, CameraRig, level_rig
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.model.bevformer import BEVFormerConfig, ImageConfig
 from bevcli.pipeline.camera_assignment import CameraAssignment, assign_cameras
@@ -25,7 +25,7 @@ class PreparedFrame:
     """A frame and the network's input made of it, for N cameras.
 
     Attributes:
-        frame: the frame as it was read.
+        frame: the frame as it was read, but for the bev frame of its rig: see `BevFrameConfig.level`.
         assignment: the N cameras and the model cameras whose embeddings they use.
         scales: (N,) pixels of the resized image per pixel of the camera's image.
         images: (1, N, 3, H, W) float32, normalised; zero where an image is missing.
@@ -53,11 +53,13 @@ class Preprocessor:
         self.config = config
         self._chosen_cameras = chosen_cameras
         self._rig: CameraRig | None = None
+        self._model_rig: CameraRig
         self._assignment = CameraAssignment((), ())
 
     def __call__(self, frame: Frame) -> PreparedFrame:
         """The frame with its images undistorted, resized, normalised and padded, and the matching projections."""
         self._use_rig(frame.rig)
+        frame = frame if frame.rig is self._model_rig else replace(frame, rig=self._model_rig)
         image, names = self.config.image, self._assignment.cameras
         width, height = image.padded_size
         images = torch.zeros(1, len(names), 3, height, width)
@@ -70,7 +72,7 @@ class Preprocessor:
         with ThreadPoolExecutor(min(len(names), os.cpu_count() or 1)) as threads:
             tasks = [threads.submit(write, i, name) for i, name in enumerate(names) if name in frame.images]
         for task in tasks:
-            task.result()
+            task.result()  # it is done: the pool has waited for it
         scales = tuple(network_scale(frame.rig[name], image) for name in names)
         matrices = [image_from_bev(frame, name) for name in names]
         networks = [network_from_image(frame.rig[name], image) for name in names]
@@ -88,7 +90,8 @@ class Preprocessor:
     def _use_rig(self, rig: CameraRig) -> None:
         if rig is self._rig:
             return
-        self._rig = rig
+        self._rig, bev_frame = rig, self.config.bev_frame
+        self._model_rig = level_rig(rig, bev_frame.height_m) if bev_frame.level else rig
         self._assignment = assign_cameras(rig, self.config.cameras, self._chosen_cameras)
 
 
@@ -102,8 +105,14 @@ def network_from_image(camera: Camera, image: ImageConfig) -> Array:
     scale = network_scale(camera, image)
     left, top = image.crop_box[:2]
     matrix = np.diag([scale, scale, 1.0, 1.0])
-    matrix[:2, 2] = -left, -top
+    shift = resize_shift(scale, image)
+    matrix[:2, 2] = shift - left, shift - top
     return matrix
+
+
+def resize_shift(scale: float, image: ImageConfig) -> float:
+    """Pixels of the resized image that are added to scaled pixel coordinates: see `ImageConfig.half_pixel_shift`."""
+    return (scale - 1) / 2 if image.half_pixel_shift else 0.0
 
 
 def write_network_image(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: NDArray[np.float32]) -> None:

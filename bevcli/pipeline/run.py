@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from bevcli.errors import OutputError
@@ -19,6 +19,7 @@ from bevcli.pipeline.run_summary import RunSummary
 from bevcli.pipeline.runner import Runner, StepOptions
 from bevcli.pipeline.state_file import save_state
 from bevcli.pipeline.tracking import track as track_boxes
+from bevcli.pipeline.tracking import without_identities
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.writer import LiveSink
 
@@ -45,6 +46,7 @@ def run(
         sequence: of `open_sequence`.
         temporal: whether the previous BEV map is used.
         track: whether the boxes get identities over time: the columns `instances`, `track_scores` and `duplicates`.
+            With history, those of a UniAD are the model's own.
         attention: whether `Prediction.attention` is filled in.
         probes: x, y in metres, bev frame: BEV cells whose sampling points `Prediction.attention` shows. They imply
             `attention`.
@@ -75,7 +77,9 @@ def _steps(
     tracks = state.tracks
     for frame, prediction, bev in runner.run(sequence, places, Preprocessor(model.config, cameras), state.bev):
         tracked = prediction
-        if track:
+        if not track:
+            tracked = replace(prediction, boxes=without_identities(prediction.boxes))
+        elif not runner.tracks:
             ((_, tracked, tracks),) = track_boxes(model.tracker, [(frame, prediction)], tracks)
         yield frame, tracked, RunnerState(bev, tracks)
 

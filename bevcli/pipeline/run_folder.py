@@ -6,7 +6,6 @@ Its own files are in the subfolder .bevcli: `lock`, `written` (one path a line) 
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import sys
 from collections.abc import Iterator
@@ -14,12 +13,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO
 
-from bevcli.errors import OutputError
+from bevcli.errors import InputError, OutputError
+from bevcli.parsing.documents import read_json
+from bevcli.parsing.files import MIB, read_bytes
 from bevcli.sequences.files.growing_file import GrowingFile
 from bevcli.sequences.files.incremental_json import partial_path
 
 OWN = ".bevcli"
 SUMMARY = "summary.json"
+LARGEST_LIST = 64 * MIB  # of the list of written files
 
 
 class RunFolder:
@@ -101,7 +103,8 @@ class RunFolder:
         """The files of earlier runs: the list, or of older versions the files that summary.json names."""
         file = self.path / OWN / "written"
         if file.is_file():
-            names = file.read_text(errors="replace").splitlines()
+            content = read_bytes(file, LARGEST_LIST, error=OutputError)
+            names = content.decode(errors="replace").splitlines()
         else:
             names = [os.path.relpath(path, self.path) for path in _files_in_summary(self.path / SUMMARY)]
         # A path with ".." would leave the folder: no run of ours writes one.
@@ -140,7 +143,7 @@ def _locked(path: Path, out: Path) -> IO[str]:
     import fcntl
 
     while True:
-        file = path.open("a+")
+        file = path.open("a+", errors="replace")
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -162,8 +165,8 @@ def _locked(path: Path, out: Path) -> IO[str]:
 
 def _files_in_summary(path: Path) -> list[str]:
     try:
-        summary = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError):
+        summary = read_json(path)
+    except InputError:
         return []
     if not isinstance(summary, dict) or "bevcli_version" not in summary or not isinstance(summary.get("files"), list):
         return []

@@ -14,6 +14,7 @@ import torch
 from bevcli import __version__
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import Sequence
+from bevcli.parsing.files import read_bytes
 from bevcli.pipeline.model_loading import Model
 from bevcli.pipeline.run_files import FilesState
 from bevcli.pipeline.run_folder import RunFolder
@@ -89,14 +90,22 @@ def open_state(folder: RunFolder, facts: Mapping[str, str]) -> RunState | None:
         raise OutputError(f"--resume: {error}; pass --force to start anew") from None
     if not isinstance(state, RunState):
         raise OutputError(f"--resume: {path}: is not the state of a run; pass --force to start anew")
-    names = [name for name in {**state.facts, **facts} if state.facts.get(name) != facts.get(name)]
+    check_same_run(folder.path, state.facts, facts)
+    return state
+
+
+def check_same_run(out: Path, saved: Mapping[str, str], facts: Mapping[str, str]) -> None:
+    """Raises OutputError if a saved run was made of something else than this one.
+
+    saved: the facts of the run in `out`, see `run_facts`. facts: those of the run that wants to go on.
+    """
+    names = [name for name in {**saved, **facts} if saved.get(name) != facts.get(name)]
     if names:
-        pairs = (f"{name}: was {state.facts.get(name)}, is {facts.get(name)}" for name in names)
+        pairs = (f"{name}: was {saved.get(name)}, is {facts.get(name)}" for name in names)
         raise OutputError(
-            f"{folder.path}: --resume: the interrupted run differs from this one ({'; '.join(pairs)}): "
+            f"{out}: --resume: the interrupted run differs from this one ({'; '.join(pairs)}): "
             "pass the same model, options and input, or --force to start anew"
         )
-    return state
 
 
 class StateSaver:
@@ -143,9 +152,11 @@ def _file_facts(path: Path) -> tuple[str, int, str]:
         facts = path.stat()
         if facts.st_size > HASHED_BYTES:
             return path.name, facts.st_size, str(facts.st_mtime_ns)
-        return path.name, facts.st_size, hashlib.sha256(path.read_bytes()).hexdigest()
+        return path.name, facts.st_size, hashlib.sha256(read_bytes(path, HASHED_BYTES)).hexdigest()
     except OSError as error:
         return path.name, -1, str(error.strerror)
+    except InputError as error:
+        return path.name, -1, str(error)
 
 
 def _short(hexdigest: str) -> str:

@@ -118,7 +118,7 @@ class RunSummary:
             "skipped_frames": self._skipped,
             "not_finite_frames": self._not_finite,
             "started_anew": self._started_anew,
-            "notes": list(self._sequence.notes),
+            "notes": [*self._sequence.notes, *self._model.rig_notes(self._sequence.rig)],
             "files": [str(path) for path in self.files],
         }
 
@@ -155,6 +155,7 @@ class RunSummary:
             rows.append(("failed", f"{len(self._not_finite)} frames: NaN or infinity, first in {first['where']}"))
         if self._model.untrained:
             rows.append(("weights", "UNTRAINED: random weights, the boxes are meaningless"))
+        rows += [("rig", note) for note in self._model.rig_notes(self._sequence.rig)]
         rows += [("written", str(path)) for path in self.files]
         return "\n".join(f"{name:<8} {text}" for name, text in rows)
 

@@ -16,14 +16,18 @@ from bevcli.frame import AttentionView, BevMap, Frame, FrameStamp, Prediction, S
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerOutputs
 from bevcli.model.box_coding import decode
+from bevcli.model.map_merging import merge_map
 from bevcli.model.prepared import Precision
 from bevcli.model.segmentation import decode_maps
+from bevcli.model.track_boxes import decode_tracks
+from bevcli.model.uniad import UniAD, UniADConfig, UniADOutputs
 from bevcli.pipeline.attention import AttentionProbe, attention_view, probe_cells
 from bevcli.pipeline.not_finite import is_finite, origin
 from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
 from bevcli.pipeline.read_ahead import read_ahead
 from bevcli.pipeline.stage_clock import StageClock
 from bevcli.pipeline.temporal import Memory, temporal_model
+from bevcli.pipeline.tracking import without_identities
 
 _AUTOCAST = {"bf16": torch.bfloat16, "fp16": torch.float16}
 
@@ -34,11 +38,11 @@ class BevState:
 
     Attributes:
         memory: of the model; the runner only passes it on.
-        stamp: of the frame.
+        stamp: of the frame; None where the next frame starts anew.
     """
 
     memory: Memory
-    stamp: FrameStamp
+    stamp: FrameStamp | None
 
 
 @dataclass(frozen=True)
@@ -84,12 +88,12 @@ class Runner:
         Returns:
             the new state and the prediction. A frame without any image returns the state unchanged, so that the next
             alignment by ego-motion spans both frames. Where the model's numbers stop being finite, the prediction has
-            no boxes and names the place, and the state is None: the next frame starts anew.
+            no boxes and names the place, and the next frame starts anew.
         """
         frame = prepared.frame
         started_anew = self._reason_to_start_anew(None if state is None else state.stamp, frame.stamp)
         if started_anew:
-            state = None
+            state = self._restarted(state)
         if not frame.images:
             return state, self._prediction(prepared, started_anew, Boxes3D.empty(), None)
         probe = self._probe()
@@ -97,10 +101,11 @@ class Runner:
             with self._autocast(), probe or contextlib.nullcontext():
                 before, later = None if state is None else state.memory, self._usable(prepared, upcoming)
                 outputs, memory = self.temporal_model.step(prepared, before, later)
-                if not is_finite(outputs):
+                if not is_finite(outputs, prepared.images):
                     where = origin(self.model, lambda: self.temporal_model.step(prepared, before, later))
-                    return None, self._prediction(prepared, started_anew, Boxes3D.empty(), None, not_finite=where)
-            boxes = decode(outputs, self.config)[0]
+                    lost = self._prediction(prepared, started_anew, Boxes3D.empty(), None, not_finite=where)
+                    return self._restarted(state), lost
+            boxes = self._boxes(outputs)
             self.clock.mark("box_decoding")
             segmentation = self._segmentation(outputs)
         view = None if probe is None else attention_view(probe, prepared, self.config)
@@ -122,6 +127,25 @@ class Runner:
         for prepared, upcoming in with_upcoming(read_ahead(prepare, places), ahead):
             state, prediction = self.step(state, prepared, upcoming)
             yield prepared.frame, prediction, state
+
+    @property
+    def tracks(self) -> bool:
+        """Whether the boxes have identities, those of the model's own tracks."""
+        return self.options.temporal and isinstance(self.model, UniAD)
+
+    def _boxes(self, outputs: BEVFormerOutputs) -> Boxes3D:
+        if not isinstance(outputs, UniADOutputs):
+            return decode(outputs, self.config)[0]
+        assert isinstance(self.config, UniADConfig)
+        boxes = decode_tracks(outputs, self.config)
+        return boxes if self.tracks else without_identities(boxes)
+
+    def _restarted(self, state: BevState | None) -> BevState | None:
+        """The state before a frame without history: what the model keeps over scenes, None for nothing."""
+        if state is None or not self.options.temporal:
+            return None
+        memory = self.temporal_model.restarted(state.memory)
+        return None if memory is None else BevState(memory, None)
 
     def _reason_to_start_anew(self, before: FrameStamp | None, stamp: FrameStamp) -> str:
         if not self.options.temporal:
@@ -155,10 +179,15 @@ class Runner:
         return AttentionProbe(self.model, self.config.encoder.layers - 1, cells.to(self.device))
 
     def _segmentation(self, outputs: BEVFormerOutputs) -> BevMap | None:
-        if outputs.segmentation is None:
-            return None
         grid = self.config.bev_grid
-        bev_map = decode_maps(outputs.segmentation, self.config.segmentation, grid)[0].bev_map(grid)
+        if isinstance(outputs, UniADOutputs) and outputs.map is not None:
+            assert isinstance(self.config, UniADConfig)
+            head = self.config.map_head
+            bev_map = merge_map(outputs.map, head, grid)[0].bev_map(grid, head)
+        elif outputs.segmentation is not None:
+            bev_map = decode_maps(outputs.segmentation, self.config.segmentation, grid)[0].bev_map(grid)
+        else:
+            return None
         self.clock.mark("map_merging")
         return bev_map
 

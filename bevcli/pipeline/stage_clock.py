@@ -17,6 +17,8 @@ STAGES = {
     "encoder": "encoder",
     "fusion": "fusion",
     "decoder": "decoder",
+    "query_interaction": "tracks",
+    "map_head": "map_head",
     "segmentation_head": "segmentation_head",
 }
 

@@ -18,11 +18,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
 from bevcli.errors import InputError, OutputError
+from bevcli.parsing.documents import parse_json
+from bevcli.parsing.safetensors_file import read_safetensors
 
 FORMAT = "bevcli-state/1"
 
@@ -31,7 +32,8 @@ def save_state(path: Path, tree: object) -> None:
     """Writes a state. The file is replaced at once, so that it is whole at every moment. Raises OutputError."""
     tensors: dict[str, Tensor] = {}
     node = _to_json(tree, tensors)
-    content = save(tensors, {"format": FORMAT, "tree": json.dumps(node)})
+    text = json.dumps(node)
+    content = save(tensors, {"format": FORMAT, "tree": text, "sha256": _hash(text, tensors)})
     fresh = path.with_name(path.name + ".new")
     try:
         fresh.write_bytes(content)
@@ -43,25 +45,33 @@ def save_state(path: Path, tree: object) -> None:
 
 
 def load_state(path: Path) -> Any:
-    """Reads a state that `save_state` wrote; tensors are on the CPU. Raises InputError."""
+    """Reads a state that `save_state` wrote; tensors are on the CPU. Raises InputError, also for a changed file."""
+    tensors, metadata = read_safetensors(path)
+    if metadata.get("format") != FORMAT:
+        raise InputError(f'{path}: is not a state file: "format" must be "{FORMAT}"')
+    text = metadata.get("tree", "")
+    if metadata.get("sha256") != _hash(text, tensors):
+        raise InputError(f"{path}: the state cannot be read: the file is damaged")
     try:
-        with safe_open(path, "pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        if metadata.get("format") != FORMAT:
-            raise InputError(f'{path}: is not a state file: "format" must be "{FORMAT}"')
-        return _from_json(json.loads(metadata["tree"]), tensors)
-    except (OSError, SafetensorError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        return _from_json(parse_json(text.encode(), path), tensors)
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: the state cannot be read ({error})") from None
 
 
 def digest(tree: object) -> str:
     """A hash of a tree that `save_state` could write."""
     tensors: dict[str, Tensor] = {}
-    found = hashlib.sha256(json.dumps(_to_json(tree, tensors)).encode())
-    for tensor in tensors.values():
+    node = _to_json(tree, tensors)
+    return _hash(json.dumps(node), tensors)
+
+
+def _hash(text: str, tensors: dict[str, Tensor]) -> str:
+    """SHA-256 of a tree's text and tensors."""
+    found = hashlib.sha256(text.encode())
+    for name in sorted(tensors, key=lambda name: (len(name), name)):
+        tensor = tensors[name]
         found.update(f"{tensor.dtype}{list(tensor.shape)}".encode())
-        found.update(tensor.reshape(-1).view(torch.uint8).numpy().tobytes())
+        found.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
     return found.hexdigest()
 
 
@@ -88,7 +98,7 @@ def _to_json(value: Any, tensors: dict[str, Tensor]) -> Any:
 
 def _keep(tensor: Tensor, tensors: dict[str, Tensor]) -> str:
     name = str(len(tensors))
-    tensors[name] = tensor.contiguous().clone()
+    tensors[name] = tensor.clone(memory_format=torch.contiguous_format)
     return name
 
 

@@ -1,4 +1,7 @@
-"""What a run remembers from frame to frame: BEVFormer the last BEV map, BEVFormerV2 the image features of its window.
+"""What a run remembers from frame to frame.
+
+BEVFormer remembers the last BEV map, BEVFormerV2 the image features of its window, UniAD the last BEV map and the
+tracks.
 
 `temporal_model` wraps a model so that the runner drives both in the same way: memory goes in and comes out.
 """
@@ -6,7 +9,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -14,10 +17,12 @@ import torch
 from torch import Tensor
 
 from bevcli.frame import FrameStamp
-from bevcli.geometry.transforms import Array, Pose
+from bevcli.geometry.transforms import Array, Pose, inverse
 from bevcli.model.bevformer import BEVFormer, BEVFormerBase, BEVFormerOutputs
 from bevcli.model.bevformer_v2 import BEVFormerV2, WindowFrame
 from bevcli.model.deformable_attention import FeatureMaps, LevelShapes
+from bevcli.model.track_queries import FrameMotion, TrackQueries
+from bevcli.model.uniad import UniAD, UniADOutputs
 from bevcli.pipeline.model_inputs import model_inputs
 from bevcli.pipeline.preprocess import PreparedFrame
 
@@ -70,11 +75,30 @@ class FeatureWindow:
     frames: tuple[FrameFeatures, ...]
 
 
-Memory = BevHistory | FeatureWindow
+@dataclass(frozen=True)
+class TrackHistory:
+    """What UniAD remembers.
+
+    Attributes:
+        bev: (1, Y·X, C), the BEV map of the last frame; None where a scene has ended.
+        tracks: of the last frame, with their memories.
+        pose: world_from_ego of that frame.
+        ego_from_bev: (4, 4) of that frame.
+        timestamp_ns: of that frame.
+    """
+
+    bev: Tensor | None
+    tracks: TrackQueries
+    pose: Pose
+    ego_from_bev: Array
+    timestamp_ns: int
+
+
+Memory = BevHistory | FeatureWindow | TrackHistory
 
 
 class TemporalModel(Protocol):
-    """A model with its memory, of either kind.
+    """A model with its memory, of any kind.
 
     Attributes:
         later_frames: how many frames after the current one the model looks at.
@@ -94,9 +118,14 @@ class TemporalModel(Protocol):
 
         Args:
             prepared: the frame.
-            memory: what the step of the frame before returned; None where the history starts anew.
+            memory: what the step of the frame before returned; where the history starts anew, what `restarted` makes
+                of it.
             upcoming: the next `later_frames` frames that have images; fewer at the end of a scene.
         """
+        ...
+
+    def restarted(self, memory: Memory) -> Memory | None:
+        """What remains of a memory where the history starts anew; None for nothing."""
         ...
 
 
@@ -104,6 +133,8 @@ def temporal_model(model: BEVFormerBase, device: torch.device) -> TemporalModel:
     """The model with the memory of its kind."""
     if isinstance(model, BEVFormerV2):
         return Window(model, device)
+    if isinstance(model, UniAD):
+        return TrackRecurrence(model, device)
     assert isinstance(model, BEVFormer)
     return Recurrence(model, device)
 
@@ -126,6 +157,53 @@ class Recurrence:
         inputs = model_inputs([prepared], [previous_pose], self.model.config).to(self.device)
         outputs = self.model(inputs, None if memory is None else memory.bev)
         return outputs, BevHistory(outputs.bev, prepared.frame.world_from_ego)
+
+    def restarted(self, memory: Memory) -> None:
+        """See `TemporalModel.restarted`."""
+
+
+class TrackRecurrence:
+    """A UniAD: BEV map and tracks of a frame go on to the next. Identities stay different over all scenes of a run."""
+
+    later_frames = 0
+    uses_history = True
+
+    def __init__(self, model: UniAD, device: torch.device) -> None:
+        self.model, self.device = model, device
+
+    def step(
+        self, prepared: PreparedFrame, memory: Memory | None, upcoming: Sequence[PreparedFrame]
+    ) -> tuple[UniADOutputs, TrackHistory]:
+        """See `TemporalModel.step`."""
+        assert memory is None or isinstance(memory, TrackHistory)
+        frame, config = prepared.frame, self.model.config
+        is_known = memory is not None and (memory.bev is not None or config.ego_motion.first_frame == "original")
+        previous_pose = memory.pose if memory is not None and is_known else None
+        inputs = model_inputs([prepared], [previous_pose], config).to(self.device)
+        history = tracks = motion = None
+        if memory is not None:
+            history = None if memory.bev is None else memory.bev.to(self.device)
+            tracks, motion = memory.tracks.to(self.device), self._motion(prepared, memory)
+        outputs: UniADOutputs = self.model(inputs, history, tracks, motion)
+        return outputs, TrackHistory(
+            outputs.bev,
+            outputs.tracks,
+            frame.world_from_ego,
+            frame.rig.ego_from_bev,
+            frame.stamp.timestamp_ns,
+        )
+
+    def restarted(self, memory: Memory) -> TrackHistory:
+        """See `TemporalModel.restarted`: the next identity, and the pose for EgoMotionConfig.first_frame "original"."""
+        assert isinstance(memory, TrackHistory)
+        return replace(memory, bev=None, tracks=memory.tracks.ended())
+
+    def _motion(self, prepared: PreparedFrame, memory: TrackHistory) -> FrameMotion:
+        frame = prepared.frame
+        world_from_bev = frame.world_from_ego.matrix @ frame.rig.ego_from_bev
+        bev_from_previous_bev = inverse(world_from_bev) @ memory.pose.matrix @ memory.ego_from_bev
+        seconds = (frame.stamp.timestamp_ns - memory.timestamp_ns) / 1e9
+        return FrameMotion(torch.from_numpy(bev_from_previous_bev).float().to(self.device), seconds)
 
 
 class Window:
@@ -161,6 +239,9 @@ class Window:
         )
         # The next frame needs one frame less of the past.
         return outputs, FeatureWindow(frames[max(0, current + 1 - config.past_frames) :])
+
+    def restarted(self, memory: Memory) -> None:
+        """See `TemporalModel.restarted`."""
 
     def _features(self, prepared: PreparedFrame) -> FrameFeatures:
         images = prepared.images.to(self.device, non_blocking=True)

@@ -197,6 +197,11 @@ def step(
     return TrackerState(tracks, stamp, number + len(born)), tracked
 
 
+def without_identities(boxes: Boxes3D) -> Boxes3D:
+    """The boxes without the columns that tracking adds."""
+    return replace(boxes, instances=None, track_scores=None, duplicates=None)
+
+
 def track_score(tracks: Tracks) -> Array:
     """(T,) 0 to 1: the mean score of a track's boxes."""
     return tracks.score_sums / tracks.frames

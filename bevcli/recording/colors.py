@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import colorsys
+from collections.abc import Iterable
+from itertools import cycle
 
 import cv2
 import numpy as np
@@ -33,13 +35,20 @@ STAGE_COLORS: tuple[Color, ...] = (
 )  # fmt: skip
 DUPLICATE_COLOR: Color = (150, 156, 170)
 RING_COLOR: Color = (92, 98, 112)
-# Dark and hardly coloured, so that nothing on a map looks like a box.
+# Dark and hardly coloured, so that nothing on a map looks like a box. The views have a dark background in every theme.
 MAP_COLORS: dict[str, Color] = {
     "drivable_road": (58, 64, 75),
     "lane_boundary": (112, 112, 100),
     "pedestrian_crossing": (86, 76, 104),
     "vehicle": (44, 84, 112),
+    "drivable_area": (70, 78, 72),
+    "divider": (125, 95, 55),
+    "contour": (20, 125, 120),
 }
+# For classes that are not in MAP_COLORS.
+OTHER_MAP_COLORS: tuple[Color, ...] = (
+    (85, 45, 20), (90, 125, 80), (75, 40, 80), (65, 70, 20), (35, 55, 100), (125, 85, 80), (20, 80, 55), (90, 40, 55),
+)  # fmt: skip
 BACKGROUND: Color = (18, 20, 25)
 
 
@@ -49,6 +58,14 @@ def class_color(name: str, index: int) -> Color:
         return CLASS_COLORS[name]
     red, green, blue = colorsys.hsv_to_rgb((0.11 + index * 0.618034) % 1.0, 0.65, 1.0)
     return round(red * 255), round(green * 255), round(blue * 255)
+
+
+def map_colors(classes: Iterable[str]) -> dict[str, Color]:
+    """Map class -> colour, in the order of the classes. Classes that are not in MAP_COLORS take OTHER_MAP_COLORS."""
+    names = list(classes)
+    others = (name for name in names if name not in MAP_COLORS)
+    chosen = {**MAP_COLORS, **dict(zip(others, cycle(OTHER_MAP_COLORS), strict=False))}
+    return {name: chosen[name] for name in names}
 
 
 def colormap(values: ArrayLike, name: str = "viridis") -> NDArray[np.uint8]:

@@ -11,10 +11,10 @@ from bevcli.recording import entities
 from bevcli.recording.colors import (
     DUPLICATE_COLOR,
     GROUND_TRUTH_COLOR,
-    MAP_COLORS,
     MISSED_COLOR,
     Color,
     class_color,
+    map_colors,
 )
 
 COLUMNS = 2
@@ -22,15 +22,15 @@ COLUMN_WIDTH, ROW_HEIGHT = 9.0, 1.0  # in the units of the view
 TEXT_COLOR: Color = (225, 228, 235)
 
 
-def legend_entries(class_names: Sequence[str], *, with_map: bool) -> list[tuple[str, Color]]:
-    """The texts and colours of the legend. with_map: whether the model predicts a map."""
+def legend_entries(class_names: Sequence[str], map_classes: Sequence[str] = ()) -> list[tuple[str, Color]]:
+    """The texts and colours of the legend. map_classes: of the model's map; empty without one."""
     classes = [(name.replace("_", " "), class_color(name, index)) for index, name in enumerate(class_names)]
     states = [
         ("ground truth", GROUND_TRUTH_COLOR),
         ("missed, false", MISSED_COLOR),
         ("duplicate", DUPLICATE_COLOR),
     ]
-    maps = [(f"map: {name.replace('_', ' ')}", color) for name, color in MAP_COLORS.items()] if with_map else []
+    maps = [(f"map: {name.replace('_', ' ')}", color) for name, color in map_colors(map_classes).items()]
     return [*classes, *states, *maps]
 
 

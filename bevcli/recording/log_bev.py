@@ -6,11 +6,11 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from bevcli.frame import MAP_CLASSES, BevMap, Probe
+from bevcli.frame import BevMap, Probe
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.transforms import Array, apply
 from bevcli.recording import entities
-from bevcli.recording.colors import BACKGROUND, MAP_COLORS, colormap
+from bevcli.recording.colors import BACKGROUND, colormap, map_colors
 
 GROUND_OPACITY = 110  # of 255: boxes, rings and the trajectory stay readable on the map
 BELOW_GROUND_M = 0.06  # the map is drawn below the ground, so that it does not flicker with the range rings
@@ -29,8 +29,8 @@ def log_features(stream: rr.RecordingStream, image: NDArray[np.uint8], grid: Bev
 def log_segmentation(stream: rr.RecordingStream, segmentation: BevMap, ego_from_bev: Array) -> None:
     """Writes a segmentation into the BEV view and onto the ground of the scene, in the colours of the map classes."""
     colors = np.full((*segmentation.cells.shape, 3), BACKGROUND, dtype=np.uint8)
-    for name, bit in MAP_CLASSES.items():  # where a cell has several classes, the last one is shown
-        colors[(segmentation.cells & bit) > 0] = MAP_COLORS[name]
+    for name, color in map_colors(segmentation.classes).items():  # where a cell has several, the last one is shown
+        colors[segmentation.layer(name)] = color
     image = rr.Image(colors, draw_order=-5)
     stream.log(entities.BEV_SEGMENTATION, image, _placed(colors, segmentation.x_range_m, segmentation.y_range_m))
     ground = _on_ground(colors, segmentation.x_range_m, segmentation.y_range_m, ego_from_bev, 255)

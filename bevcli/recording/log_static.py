@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -64,13 +65,16 @@ def log_about(
     class_names: Sequence[str],
     options: RecordingOptions,
     *,
+    map_classes: Sequence[str] = (),
     untrained: bool,
     note: str = "",
 ) -> None:
     """Writes the page "About", and the facts of the run that readers of the file need.
 
-    note: what titles say about the weights, see `recording_blueprint`.
+    map_classes: of the map that the recording shows; empty for none. note: what titles say about the weights, see
+    `recording_blueprint`.
     """
+    of_map: dict[str, Any] = {"map_classes": list(map_classes)} if map_classes else {}
     facts = rr.AnyValues(
         title=title,
         untrained=untrained,
@@ -78,6 +82,7 @@ def log_about(
         score=options.score,
         class_names=list(class_names),
         camera_names=list(rig.names),
+        **of_map,
     )
     text = about_text(title, rig, options, untrained=untrained)
     stream.log(entities.RUN, rr.TextDocument(text, media_type="text/markdown"), facts, static=True)

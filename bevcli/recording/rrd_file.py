@@ -2,6 +2,9 @@
 
 rerun's own writer waits for ever when the disk is full. So rerun writes into a pipe, which never fails, and a thread
 moves the bytes into the file.
+
+rerun keeps the index of a stream in memory until the stream ends, about 0.3 MB a frame. A long recording therefore
+consists of several streams, one after the other in one file without an index.
 """
 
 from __future__ import annotations
@@ -15,7 +18,7 @@ from pathlib import Path
 
 import rerun as rr
 
-from bevcli.errors import OutputError
+from bevcli.errors import OutputError, WaitError
 
 BLOCK = 1 << 20  # bytes
 HEADER = 12  # bytes at the beginning of an .rrd file
@@ -23,10 +26,11 @@ TIMEOUT_S = 20.0
 
 
 class RrdFile:
-    """Receives the bytes of one recording stream.
+    """Receives the bytes of a recording.
 
         file = RrdFile(path)
         stream.set_sinks(file.sink())
+        file.opened()
 
     Attributes:
         path: the .rrd file.
@@ -41,7 +45,7 @@ class RrdFile:
         """
         self.path = path
         self.size = 0
-        self._resumed = resume_at is not None
+        self._is_joined = resume_at is not None  # of several streams, so that the index of the last does not fit
         self._error: OSError | None = None
         try:
             self._file = path.open("wb" if resume_at is None else "r+b", buffering=0)
@@ -50,15 +54,22 @@ class RrdFile:
                 self.size = self._file.seek(resume_at)
         except OSError as error:
             raise OutputError(f"{path}: the recording cannot be written ({error.strerror})") from None
-        self._to_skip = HEADER if self._resumed else 0  # the file has its header already
-        self._pipe, self._pipe_in = os.pipe()
-        os.set_blocking(self._pipe, False)
+        self._pipe = -1
         self._busy = threading.Lock()
-        self._thread = threading.Thread(target=self._move_all, name="rrd-file", daemon=True)
-        self._thread.start()
 
     def sink(self) -> rr.FileSink:
-        """Where rerun writes to. After it was passed to `set_sinks`, call `opened`."""
+        """Where rerun writes to from now on. After it was passed to `set_sinks`, call `opened`.
+
+        Call `sync` before the second one: all that comes through an earlier sink afterwards, its index, is left out.
+        """
+        pipe, self._pipe_in = os.pipe()
+        os.set_blocking(pipe, False)
+        with self._busy:
+            self._is_joined |= self._pipe >= 0
+            self._to_skip = HEADER if self.size else 0  # the file has its header already
+            self._pipe = pipe
+        self._thread = threading.Thread(target=self._move_all, args=(pipe,), name="rrd-file", daemon=True)
+        self._thread.start()
         return rr.FileSink(f"/dev/fd/{self._pipe_in}")
 
     def opened(self) -> None:
@@ -66,14 +77,14 @@ class RrdFile:
         os.close(self._pipe_in)
 
     def sync(self) -> None:
-        """Waits until all that rerun has flushed is in the file. Raises OutputError if it could not be written."""
+        """Waits until all that rerun has flushed is in the file.
+
+        Raises OutputError if it could not be written, and WaitError if the disk does not answer.
+        """
         deadline = time.monotonic() + TIMEOUT_S
-        while self._error is None and self._thread.is_alive():
-            with self._busy:
-                if not select.select([self._pipe], [], [], 0)[0]:
-                    break
+        while self._error is None and self._thread.is_alive() and not self._is_drained():
             if time.monotonic() > deadline:
-                raise OutputError(f"{self.path}: the disk has not taken the recording for {TIMEOUT_S:.0f} s")
+                raise self._no_answer()
             time.sleep(0.0005)
         self._raise_error()
         self.size = self._file.tell()
@@ -82,10 +93,10 @@ class RrdFile:
         """Waits until rerun has closed the sink, and closes the file. Raises OutputError as `sync` does."""
         self._thread.join(TIMEOUT_S)
         if self._thread.is_alive():
-            raise OutputError(f"{self.path}: the disk has not taken the recording for {TIMEOUT_S:.0f} s")
+            raise self._no_answer()
         with self._file:
-            if self._error is not None or self._resumed:
-                # A cut message; or an index that counts the bytes from where the file was resumed.
+            if self._error is not None or self._is_joined:
+                # A cut message; or an index that counts the bytes from the start of its stream.
                 with contextlib.suppress(OSError):
                     self._file.truncate(self.size)
         self._raise_error()
@@ -98,17 +109,31 @@ class RrdFile:
         if self._error is not None:
             raise OutputError(f"{self.path}: the recording cannot be written ({self._error.strerror})")
 
-    def _move_all(self) -> None:
+    def _no_answer(self) -> WaitError:
+        return WaitError(f"{self.path}: the disk has not taken the recording for {TIMEOUT_S:.0f} s")
+
+    def _is_drained(self) -> bool:
+        """Whether all that is in the pipe has been written."""
+        if not self._busy.acquire(timeout=TIMEOUT_S):
+            raise self._no_answer()
+        try:
+            return not select.select([self._pipe], [], [], 0)[0]
+        finally:
+            self._busy.release()
+
+    def _move_all(self, pipe: int) -> None:
+        """Moves a stream into the file, until rerun closes it."""
         try:
             while True:
-                select.select([self._pipe], [], [])
+                select.select([pipe], [], [])  # as long as rerun has nothing to write
                 with self._busy:
-                    block = os.read(self._pipe, BLOCK)
+                    block = os.read(pipe, BLOCK)
                     if not block:
                         return
-                    self._write(block)
+                    if pipe == self._pipe:
+                        self._write(block)
         finally:
-            os.close(self._pipe)
+            os.close(pipe)
 
     def _write(self, block: bytes) -> None:
         """Writes a block. After an error the rest is read and thrown away, so that rerun never waits."""

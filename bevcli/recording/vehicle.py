@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array
+from bevcli.parsing.files import MIB, open_regular
 from bevcli.recording.colors import EGO_COLOR, Color
 
 if TYPE_CHECKING:
@@ -24,7 +26,9 @@ RUBBER: Color = (20, 22, 26)
 OUTLINE = np.array([[3.65, -0.93], [3.65, 0.93], [-0.95, 0.93], [-0.95, -0.93], [3.65, -0.93]])  # in ego, from above
 FRONT_ARROW = np.array([[2.2, -0.8], [3.3, 0.0], [2.2, 0.8]])
 SMOOTH_BELOW_RAD = np.radians(40.0)  # faces that meet at a smaller angle are shaded as one curved surface
+LARGEST_BYTES = 256 * MIB
 LONGEST_M = 50.0  # a longer mesh is not in metres
+Part = tuple[Array, Array, NDArray[np.int64], NDArray[np.uint8]]  # vertices, normals, faces, colours
 GLTF_FILES = (".glb", ".gltf")
 EGO_FROM_GLTF = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # glTF: y up, z forward, x left
 
@@ -57,12 +61,12 @@ def load_vehicle(path: Path) -> VehicleMesh:
 
     Raises InputError where trimesh cannot read the file, and where it has no triangles or is longer than 50 m.
     """
-    parts = [_part(mesh) for mesh in _read_meshes(path)]
+    parts = _read_parts(path)
     counts = [len(vertices) for vertices, *_ in parts]
     starts = np.cumsum([0, *counts[:-1]])
     vertices = np.concatenate([vertices for vertices, *_ in parts])
     low, high = vertices.min(0), vertices.max(0)
-    if not np.isfinite(vertices).all() or (high - low).max() > LONGEST_M:
+    if not np.isfinite(vertices).all() or not (high - low).max() <= LONGEST_M:
         size = " x ".join(f"{length:.4g}" for length in high - low)
         raise InputError(
             f"{path}: the vehicle's size is {size} m (expected at most {LONGEST_M:g} m; scale it to metres)"
@@ -76,26 +80,31 @@ def load_vehicle(path: Path) -> VehicleMesh:
     )
 
 
-def _read_meshes(path: Path) -> list[trimesh.Trimesh]:
-    """The triangle meshes of a file in the ego frame."""
+def _read_parts(path: Path) -> list[Part]:
+    """The triangle meshes of a file in the ego frame. Raises InputError."""
     import trimesh  # only here: it takes half a second to load
 
+    with open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+    if size > LARGEST_BYTES:
+        raise InputError(f"{path}: the mesh has {size / MIB:.0f} MiB (expected at most {LARGEST_BYTES // MIB})")
     try:
         scene = trimesh.load_scene(path)
         if path.suffix.lower() in GLTF_FILES:
             scene.apply_transform(EGO_FROM_GLTF)
         meshes = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+        parts = [_part(mesh) for mesh in meshes]
     except Exception as error:  # each of trimesh's many readers raises errors of its own
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(
             f"{path}: trimesh cannot read this mesh file ({reason}); try .glb, .ply, .obj or .stl"
         ) from error
-    if not meshes:
+    if not parts:
         raise InputError(f"{path}: the file has no triangles (expected a triangle mesh of the vehicle)")
-    return meshes
+    return parts
 
 
-def _part(mesh: trimesh.Trimesh) -> tuple[Array, Array, NDArray[np.int64], NDArray[np.uint8]]:
+def _part(mesh: trimesh.Trimesh) -> Part:
     """Vertices, normals, faces and colours of one mesh, with sharp edges."""
     import trimesh
 

@@ -79,9 +79,12 @@ class Av1Decoder:
         self._context.options = {"max_frame_delay": "1", "threads": "1"}
 
     def decode(self, data: bytes) -> NDArray[np.uint8] | None:
-        """The next image, (H, W, 3) uint8 BGR; None before the first keyframe."""
+        """The next image, (H, W, 3) uint8 BGR; None before the first keyframe and for damaged data."""
         import av
 
         assert isinstance(self._context, av.VideoCodecContext)
-        images = self._context.decode(av.Packet(data))
+        try:
+            images = self._context.decode(av.Packet(data))
+        except av.FFmpegError:
+            return None
         return images[-1].to_ndarray(format="bgr24").astype(np.uint8, copy=False) if images else None

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 from rerun.sinks import LogSinkLike
 
-from bevcli.errors import OutputError
+from bevcli.errors import OutputError, WaitError
 from bevcli.frame import Frame, FrameStamp, Prediction, Sequence, facts_of
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, Pose, inverse, rigid
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 
 APPLICATION = "bevcli"
 FLUSH_TIMEOUT_S = 20.0
+INDEXED_FRAMES = 200  # a longer recording has no index, see `rrd_file`
 UNTRAINED = "untrained weights"
 FROM_RENDERED = "trained on renderings"
 PosedCameras = tuple[PosedCamera, ...]
@@ -147,6 +149,7 @@ class Recording:
         self._live = live
         self._origin: Array | None = None  # (3,) position of the first frame's ego vehicle in the world
         self._last: LastFrame | None = None
+        self._frames = 0
         self._early_events: list[tuple[str, str]] = []  # logged before the first frame
         self._pillars: Array | None = None
         self._tracks = TrackLog(self._stream, self.class_names)
@@ -158,15 +161,13 @@ class Recording:
     def __enter__(self) -> Recording:
         mesh = self.options.vehicle_mesh
         vehicle = None if mesh is None else load_vehicle(mesh)
-        grid, segmentation = (
-            self._config.bev_grid,
-            "segmentation" in self._config.heads and self.options.shows_internals,
-        )
-        legend = legend_entries(self.class_names, with_map=segmentation)
+        grid = self._config.bev_grid
+        map_classes = self._config.map_classes if self.options.shows_internals else ()
+        legend = legend_entries(self.class_names, map_classes)
         facts = LayoutFacts(
             note=self.note,
             probes=bool(self.options.probes),
-            segmentation=segmentation,
+            segmentation=bool(map_classes),
             rate_hz=self._rate_hz,
             on_earth=self._geo_origin is not None,
             legend_entries=len(legend),
@@ -174,24 +175,35 @@ class Recording:
         )
         blueprint = recording_blueprint(self.rig, facts)
         self._file = RrdFile(self.path, None if self._resume is None else self._resume.size)
-        sinks = [] if self._live is None else [self._live.sink]
-        try:
-            self._stream.set_sinks(self._file.sink(), *sinks, default_blueprint=blueprint)
-        except RuntimeError as error:
-            raise OutputError(f"{self.path}: the recording cannot be written ({error})") from error
-        finally:
-            self._file.opened()
+        self._connect(self._file, blueprint)
         if self._live is not None:
             self._live.open()
         names, untrained = self.class_names, self.untrained
         log_static.log_scene(self._stream, self.rig, names, vehicle, grid)
         log_static.log_about(
-            self._stream, self.title, self.rig, names, self.options, untrained=untrained, note=self.note
+            self._stream,
+            self.title,
+            self.rig,
+            names,
+            self.options,
+            map_classes=map_classes,
+            untrained=untrained,
+            note=self.note,
         )
         log_legend(self._stream, legend)
         if self._resume is not None:
             self._go_on_from(self._resume)
         return self
+
+    def _connect(self, file: RrdFile, blueprint: rrb.Blueprint | None) -> None:
+        """Makes rerun write a new stream into the file, and to the viewer that follows. Raises OutputError."""
+        sinks = [] if self._live is None else [self._live.sink]
+        try:
+            self._stream.set_sinks(file.sink(), *sinks, default_blueprint=blueprint)
+        except RuntimeError as error:
+            raise OutputError(f"{self.path}: the recording cannot be written ({error})") from error
+        finally:
+            file.opened()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -242,6 +254,11 @@ class Recording:
             self._log_internals(frame, prediction, cameras)
         self._last = LastFrame(frame.stamp.scene, frame.world_from_ego)
         self._flush()
+        self._frames += 1
+        # A new stream frees the index of the one before. With a viewer it would end the viewer's stream too.
+        if self._frames % INDEXED_FRAMES == 0 and self._live is None:
+            assert self._file is not None
+            self._connect(self._file, None)
 
     def event(self, text: str, level: str = "INFO") -> None:
         """Writes a line into the event log, at the newest frame; before the first frame, at the first one.
@@ -259,7 +276,7 @@ class Recording:
         closing.start()
         closing.join(FLUSH_TIMEOUT_S)
         if closing.is_alive():
-            raise OutputError(f"{self.path}: the recording could not be closed within {FLUSH_TIMEOUT_S:.0f} s")
+            raise WaitError(f"{self.path}: the recording could not be closed within {FLUSH_TIMEOUT_S:.0f} s")
 
     def _at(self, stamp: FrameStamp) -> None:
         self._stream.set_time(entities.FRAME_TIMELINE, sequence=stamp.index)

@@ -98,7 +98,7 @@ def _warnings(pose: Array) -> tuple[Finding, ...]:
     elif _tilt_deg(pose) > TILT_INFO_DEG:
         message, found = '"ego_from_bev" is tilted', f"{_tilt_deg(pose):.1f}°"
         expected = "as in training: 1 to 3° in nuScenes, 0° in rendered drives"
-        advice = "level it for the demo model, whose boxes get too high or too low otherwise"
+        advice = "nothing for the demo model, which levels the frame itself"
         findings.append(Finding("bev-tilted", "info", None, message, found, expected, advice))
     return tuple(findings)
 

@@ -19,8 +19,10 @@ from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.parsing.images import decode_image, media_type_of, size_of_image
 from bevcli.sequences.video import VideoReader
+from bevcli.waiting import result_within
 
 DECODING_THREADS = 6
+READING_TIMEOUT_S = 120.0
 MOST_PIXELS = 64 << 20  # of an image in a bag
 LARGEST_METADATA = 4 * MIB  # bytes of an image file beyond its pixels
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
@@ -92,7 +94,7 @@ class ImageReader:
 
         dropped: cameras already known to have no image, with the reasons.
         Raises InputError where a camera's first image has another size than the calibration states, where an image
-        lies outside of the folder and, with `strict`, for a missing image.
+        lies outside of the folder and, with `strict`, for a missing image. Raises WaitError if a disk does not answer.
         """
         if self._strict and dropped:
             camera, reason = next(iter(dropped.items()))
@@ -102,7 +104,7 @@ class ImageReader:
         reasons = dict(dropped)
         for name, task in tasks.items():
             try:
-                images[name] = task.result()
+                images[name] = result_within(task, READING_TIMEOUT_S, f"{sources[name]}: reading the image")
             except UnreadableImage as unreadable:
                 if self._strict:
                     hint = "replace the image, or remove --strict"

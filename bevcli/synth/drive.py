@@ -21,7 +21,7 @@ from bevcli.synth.render.ground_texture import GroundTexture, paint_ground
 from bevcli.synth.render.renderer import RenderedView, WorldSnapshot, render_view
 from bevcli.synth.render.shadow_map import ShadowMap
 from bevcli.synth.rig import nuscenes_like_rig
-from bevcli.synth.world.actors import ActorState
+from bevcli.synth.world.actors import Actor, ActorState
 from bevcli.synth.world.city import CityPlan
 from bevcli.synth.world.ground_plan import GroundPlan
 from bevcli.synth.world.scenery import Scenery, signal_meshes
@@ -80,8 +80,10 @@ class RenderedFrame:
 
     Attributes:
         stamp: index, scene and timestamp.
-        views: camera name to image; all cameras see the world at the same time.
+        views: camera name to image.
         world_from_ego: pose of the ego vehicle.
+        world_from_ego_at: camera name to pose of the ego vehicle at the camera's time.
+        camera_timestamps_ns: camera name to the time of its image.
         boxes: ground truth boxes in the world frame, with attributes, instances, visibilities and numbers of pixels.
         bev_map: ground truth map.
     """
@@ -89,6 +91,8 @@ class RenderedFrame:
     stamp: FrameStamp
     views: Mapping[str, RenderedView]
     world_from_ego: Pose
+    world_from_ego_at: Mapping[str, Pose]
+    camera_timestamps_ns: Mapping[str, int]
     boxes: Boxes3D
     bev_map: BevMap
 
@@ -113,6 +117,7 @@ class RenderedDrive:
         supersampling: samples per pixel along each axis (anti-aliasing).
         threads: number of cameras rendered in parallel.
         map_window: extent and cell size of the ground truth maps.
+        camera_delays_s: camera name to the time of its images after that of the frame, 0 to 0.1 s; default: none.
     """
 
     def __init__(
@@ -126,10 +131,12 @@ class RenderedDrive:
         supersampling: int = 1,
         threads: int = 1,
         map_window: MapWindow = MapWindow(),
+        camera_delays_s: Mapping[str, float] | None = None,
     ) -> None:
         self.seed, self.frames, self.rate_hz = seed, frames, rate_hz
         self.rig = rig or nuscenes_like_rig(400, 225)
         self.map_window = map_window
+        self._delays_s = camera_delays_s or {}
         self._supersampling, self._threads = supersampling, threads
         self._assets = assets or Assets.build()
         self._city = CityPlan(seed)
@@ -160,7 +167,8 @@ class RenderedDrive:
 
     def ego_motion(self, rate_hz: float = 50.0) -> EgoMotion:
         """Poses and kinematics over the whole drive, `rate_hz` per second."""
-        count = int(np.ceil((self.frames - 1) / self.rate_hz * rate_hz)) + 1
+        last_s = (self.frames - 1) / self.rate_hz + max(self._delays_s.values(), default=0.0)
+        count = int(np.ceil(last_s * rate_hz)) + 1
         times = np.arange(count) / rate_hz
         poses = [self.world_from_ego(float(t)) for t in times]
         motions = [self.simulation.ego.motion(float(t)) for t in times]
@@ -172,28 +180,49 @@ class RenderedDrive:
 
     def states(self, index: int) -> list[ActorState]:
         """The annotated objects around the vehicle at a frame, in the order of the object indices in its views."""
+        return [state for _, state in self._actors(index)]
+
+    def _actors(self, index: int) -> list[tuple[Actor, ActorState]]:
+        """The annotated objects around the vehicle at a frame, with their states."""
         origin = self.world_from_ego(self.time_s(index)).translation[:2]
         found = []
         for actor in self.simulation.actors_near(origin, ACTORS_M):
             state = actor.state(self.time_s(index))
             if state is not None and np.hypot(*(state.position[:2] - origin)) < ACTORS_M:
-                found.append(state)
+                found.append((actor, state))
         return found
 
     def frame(self, index: int) -> RenderedFrame:
         """Render a frame. index: 0 to frames - 1."""
-        states = self.states(index)
-        pose = self.world_from_ego(self.time_s(index))
-        views = self._render_views(states, pose, self.time_s(index))
+        actors, time_s, stamp = self._actors(index), self.time_s(index), self.stamp(index)
+        states = [state for _, state in actors]
+        pose = self.world_from_ego(time_s)
+        delays = {name: self._delays_s.get(name, 0.0) for name in self.rig.names}
+        views: dict[str, RenderedView] = {}
+        for delay in sorted(set(delays.values())):
+            later = [actor.state(time_s + delay) for actor, _ in actors] if delay else states
+            # An object that has gone in the meantime is drawn where it was.
+            seen = [state if moved is None else moved for state, moved in zip(states, later, strict=True)]
+            names = [name for name in self.rig.names if delays[name] == delay]
+            views |= self._render_views(
+                names, seen, self.world_from_ego(time_s + delay), time_s + delay, pose.translation[:2]
+            )
+        views = {name: views[name] for name in self.rig.names}
         boxes = self._boxes(states, views, pose)
         bev_from_world = inverse(pose.matrix @ self.rig.ego_from_bev)
         pieces = self._ground.pieces_around(pose.translation[:2], self.map_window.half_extent_m * 1.5)
         bev_map = draw_map(pieces, boxes, bev_from_world, self.map_window)
-        return RenderedFrame(self.stamp(index), views, pose, boxes, bev_map)
+        poses = {name: self.world_from_ego(time_s + delay) for name, delay in delays.items()}
+        times = {name: stamp.timestamp_ns + round(delay * 1e9) for name, delay in delays.items()}
+        return RenderedFrame(stamp, views, pose, poses, times, boxes, bev_map)
 
-    def _render_views(self, states: list[ActorState], world_from_ego: Pose, time_s: float) -> dict[str, RenderedView]:
-        """The images of all cameras. The object indices in them are positions in `states`."""
-        here = world_from_ego.translation[:2]
+    def _render_views(
+        self, names: list[str], states: list[ActorState], world_from_ego: Pose, time_s: float, here: Array
+    ) -> dict[str, RenderedView]:
+        """The images of cameras that see the world at the same time. The object indices are positions in `states`.
+
+        here: (2,) world, metres, the point around which the scenery is made.
+        """
         around = self._surroundings(here)
         near_first = np.argsort([np.hypot(*(state.position[:2] - here)) for state in states], kind="stable")
         actors = [self._place(states[k]) for k in near_first]
@@ -207,9 +236,9 @@ class RenderedDrive:
             return render_view(snapshot, self.rig[name], world_from_ego.matrix, self._supersampling)
 
         if self._threads == 1:
-            return {name: render_one(name) for name in self.rig.names}
+            return {name: render_one(name) for name in names}
         with ThreadPoolExecutor(self._threads) as pool:
-            return dict(zip(self.rig.names, pool.map(render_one, self.rig.names), strict=True))
+            return dict(zip(names, pool.map(render_one, names), strict=True))
 
     def _surroundings(self, here: Array) -> Surroundings:
         """The surroundings of the nearest point of a grid with SNAP_M spacing, so that they are rarely made again."""

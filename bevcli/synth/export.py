@@ -123,13 +123,15 @@ def export_drive(
             rendered = drive.frame(index)
             kinematics = motion.kinematics_at(rendered.stamp.timestamp_ns)
             images = {
-                name: CameraImage(rendered.stamp.timestamp_ns, pixels, _encode_jpeg(pixels, quality), "image/jpeg")
-                for name, pixels in rendered.images.items()
+                name: CameraImage(time_ns, pixels, _encode_jpeg(pixels, quality), "image/jpeg")
+                for (name, pixels), time_ns in zip(
+                    rendered.images.items(), rendered.camera_timestamps_ns.values(), strict=True
+                )
             }
             writer.write(
                 Frame(
                     rendered.stamp, drive.rig, images, rendered.world_from_ego,
-                    dict.fromkeys(images, rendered.world_from_ego), kinematics,
+                    rendered.world_from_ego_at, kinematics,
                     ground_truth=_rounded(rendered.boxes), ground_truth_map=rendered.bev_map,
                 )
             )  # fmt: skip

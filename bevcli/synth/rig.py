@@ -21,7 +21,7 @@ _MOUNTS = {
     "CAM_BACK_LEFT": (1.05, 0.48, 1.56, 109.0, 1256.0),
     "CAM_BACK_RIGHT": (1.05, -0.48, 1.56, -111.0, 1256.0),
 }
-_EGO_AXES_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+EGO_AXES_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # of one that looks ahead
 
 
 def nuscenes_like_rig(width: int = 1600, height: int = 900) -> CameraRig:
@@ -29,7 +29,7 @@ def nuscenes_like_rig(width: int = 1600, height: int = 900) -> CameraRig:
     cameras = []
     for name, (x, y, z, yaw_deg, focal) in _MOUNTS.items():
         intrinsics: Array = np.array([[focal, 0, 800.0], [0, focal, 450.0], [0, 0, 1.0]])
-        rotation = rotation_about_z(np.radians(yaw_deg)) @ _EGO_AXES_FROM_CAMERA
+        rotation = rotation_about_z(np.radians(yaw_deg)) @ EGO_AXES_FROM_CAMERA
         camera = Camera(name, 1600, 900, intrinsics, rigid((x, y, z), rotation))
         cameras.append(camera.scaled(width / 1600, height / 900))
     return CameraRig(tuple(cameras), default_ego_from_bev())

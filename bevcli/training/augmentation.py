@@ -1,4 +1,7 @@
-"""Image augmentation: photometric distortion and grid mask. Boxes, maps and calibration stay as they are."""
+"""Image augmentation: photometric distortion, exposure, noise, missing images and grid mask.
+
+Boxes, maps and calibration stay as they are.
+"""
 
 from __future__ import annotations
 
@@ -25,14 +28,62 @@ class AugmentationConfig:
     Attributes:
         photometric: probability (0 to 1) of each distortion of an image: brightness, contrast, saturation, hue.
         grid_mask: probability (0 to 1) that a grid of grey squares covers an image.
+        exposure: largest change of the exposure of a camera, in stops (factors of 2); constant over a clip.
+        white_balance: largest relative change of a camera's red and blue; constant over a clip.
+        noise: largest standard deviation of the noise, of pixel values 0 to 255. Half of the clips have noise.
+        drop_image: probability (0 to 1) that an image is missing. A frame keeps at least one image.
     """
 
     photometric: float = 0.5
     grid_mask: float = 0.7
+    exposure: float = 0.0
+    white_balance: float = 0.0
+    noise: float = 0.0
+    drop_image: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (0 <= self.photometric <= 1 and 0 <= self.grid_mask <= 1):
-            raise ValueError("photometric and grid_mask are probabilities, from 0 to 1")
+        if not all(0 <= share <= 1 for share in (self.photometric, self.grid_mask, self.drop_image)):
+            raise ValueError("photometric, grid_mask and drop_image are probabilities, from 0 to 1")
+        if min(self.exposure, self.white_balance, self.noise) < 0 or self.white_balance >= 1:
+            raise ValueError("exposure, white_balance and noise must not be negative, white_balance must be below 1")
+
+
+class ImageVariation:
+    """How the cameras of one clip see: exposure, white balance and noise, drawn once; missing images."""
+
+    def __init__(self, config: AugmentationConfig, random: np.random.Generator) -> None:
+        self._config, self._random = config, random
+        self._tables: dict[str, NDArray[np.uint8]] = {}
+        stops = random.uniform(-1, 1) * config.exposure if config.exposure else 0.0
+        self._clip_stops = stops / 2  # half of the change is common to all cameras
+        self._noise = max(0.0, random.uniform(-1, 1)) * config.noise if config.noise else 0.0
+
+    def __call__(self, frame: Frame) -> Frame:
+        """A copy of the frame with its images changed and some of them left out."""
+        config, names = self._config, list(frame.images)
+        if config.drop_image:
+            kept = [name for name in names if self._random.random() >= config.drop_image]
+            names = kept or names[:1]
+        if not (config.exposure or config.white_balance or self._noise) and len(names) == len(frame.images):
+            return frame
+        images = {name: self._changed(name, frame.images[name]) for name in names}
+        return replace(frame, images=images)
+
+    def _changed(self, name: str, image: CameraImage) -> CameraImage:
+        if name not in self._tables:
+            self._tables[name] = self._table()
+        pixels = cv2.LUT(image.pixels_bgr, self._tables[name])
+        if self._noise:
+            noise = self._random.standard_normal(pixels.shape, dtype=np.float32) * np.float32(self._noise)
+            pixels = (pixels + noise).clip(0, 255).astype(np.uint8)
+        return replace(image, pixels_bgr=np.asarray(pixels, dtype=np.uint8))
+
+    def _table(self) -> NDArray[np.uint8]:
+        """(1, 256, 3) the new value of each pixel value of a channel, of one camera."""
+        stops = self._clip_stops + self._random.uniform(-0.5, 0.5) * self._config.exposure
+        blue, red = 1 + self._random.uniform(-1, 1, 2) * self._config.white_balance
+        gains = np.array([blue, 1.0, red]) * 2.0**stops
+        return (np.arange(256)[None, :, None] * gains).clip(0, 255).round().astype(np.uint8)
 
 
 def distort_images(frame: Frame, probability: float, random: np.random.Generator) -> Frame:

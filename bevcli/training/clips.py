@@ -10,7 +10,7 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.frame import Sequence
 from bevcli.sequences.selection import scenes_of
-from bevcli.training.drives import Drives
+from bevcli.training.drives import Drives, camera_counts_of
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,14 @@ def draw_clips(drives: Drives, config: ClipConfig, random: np.random.Generator, 
     frames = config.frames
     if frames > 1 and random.random() < config.short_share:
         frames = int(random.integers(1, frames))
-    clips = []
+    clips: list[Clip] = []
+    counts = camera_counts_of(drives)
     for _ in range(config.batch):
-        drive = int(random.integers(len(drives)))
+        if clips and counts is not None:  # a batch needs the same number of cameras in all its clips
+            alike = np.flatnonzero(np.array(counts) == counts[clips[0].drive])
+            drive = int(alike[random.integers(len(alike))])
+        else:
+            drive = int(random.integers(len(drives)))
         leave_out = with_gap and config.learn == "last"
         clips.append(Clip(drive, draw_frames(drives.open(drive), frames, random, with_gap=leave_out)))
     return clips

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 import threading
@@ -11,11 +12,13 @@ from typing import Protocol
 
 from bevcli.errors import InputError
 from bevcli.frame import Sequence
+from bevcli.geometry.cameras import CameraRig
 from bevcli.model.bevformer import BEVFormerConfig
 from bevcli.sequences.open import open_sequence
 from bevcli.synth.assets.catalog import Assets
 from bevcli.synth.drive import RenderedDrive
 from bevcli.synth.export import export_drive
+from bevcli.synth.random_rig import DrawnRig, RigDistribution, draw_rig
 from bevcli.synth.render.bev_map import MapWindow
 from bevcli.synth.rig import nuscenes_like_rig
 
@@ -24,7 +27,10 @@ FRAMES_PER_DRIVE = 20
 
 
 class Drives(Protocol):
-    """A list of drives. Several threads may open them at the same time."""
+    """A list of drives. Several threads may open them at the same time.
+
+    It may have an attribute `camera_counts`, the number of cameras of each drive. Without it all drives have the same.
+    """
 
     def __len__(self) -> int: ...
 
@@ -53,11 +59,33 @@ class FolderDrives:
 
 
 class RenderedDrives:
-    """Rendered drives in the model's image size, kept as sequence folders `cache/WIDTHxHEIGHT/SEED`."""
+    """Rendered drives in the model's image size, kept as sequence folders `cache/WIDTHxHEIGHT/SEED`.
 
-    def __init__(self, seeds: Items[int], cache: Path, config: BEVFormerConfig) -> None:
-        width, height = config.image.size
-        self._folders = [cache / f"{width}x{height}" / f"{seed:06d}" for seed in seeds]
+    Drives with other cameras than the default ones are kept in `cache/WIDTHxHEIGHT-RIG/SEED`.
+
+    Args:
+        rig: the cameras of all drives, scaled to the model's image size, or the distribution of the drives' rigs.
+            Default: `nuscenes_like_rig`.
+    """
+
+    def __init__(
+        self,
+        seeds: Items[int],
+        cache: Path,
+        config: BEVFormerConfig,
+        rig: CameraRig | RigDistribution | None = None,
+    ) -> None:
+        size = width, height = config.image.size
+        name = f"{width}x{height}"
+        if isinstance(rig, RigDistribution):
+            self._rigs = [draw_rig(rig, seed, size) for seed in seeds]
+            name += f"-rigs-{rig.digest}"
+        else:
+            found = nuscenes_like_rig(width, height) if rig is None else _fitting(rig, size)
+            self._rigs = [DrawnRig(found)] * len(seeds)
+            name += "" if rig is None else f"-rig-{_digest(found)}"
+        self.camera_counts = tuple(len(drawn.rig.cameras) for drawn in self._rigs)
+        self._folders = [cache / name / f"{seed:06d}" for seed in seeds]
         self._seeds = tuple(seeds)
         self._config = config
         self._rendering = threading.Lock()
@@ -72,26 +100,27 @@ class RenderedDrives:
         folder = self._folders[index]
         with self._rendering:
             if not folder.exists():
-                self._render(self._seeds[index], folder)
+                self._render(self._seeds[index], self._rigs[index], folder)
         return self._drives.open(index)
 
-    def _render(self, seed: int, folder: Path) -> None:
+    def _render(self, seed: int, drawn: DrawnRig, folder: Path) -> None:
         """Writes to a temporary folder and renames it, so that an interrupted process leaves no partial drive."""
         self._assets = self._assets or Assets.build()
-        width, height = self._config.image.size
         grid = self._config.bev_grid
         half_extent = max(abs(end) for end in (*grid.x_range_m, *grid.y_range_m))
         drive = RenderedDrive(
             seed,
             FRAMES_PER_DRIVE,
             self._config.rate_hz,
-            nuscenes_like_rig(width, height),
+            drawn.rig,
             assets=self._assets,
+            supersampling=drawn.supersampling,
             map_window=MapWindow(half_extent_m=half_extent),
+            camera_delays_s=drawn.delays_s,
         )
         unfinished = folder.with_suffix(f".unfinished-{os.getpid()}")
         shutil.rmtree(unfinished, ignore_errors=True)
-        export_drive(drive, unfinished)
+        export_drive(drive, unfinished, quality=drawn.jpeg_quality)
         try:
             os.replace(unfinished, folder)
         except OSError:
@@ -100,9 +129,32 @@ class RenderedDrives:
             shutil.rmtree(unfinished)  # another process has rendered the same drive meanwhile
 
 
+def _fitting(rig: CameraRig, size: tuple[int, int]) -> CameraRig:
+    """The rig with each camera's images scaled to fit inside a size (width, height) in pixels."""
+    cameras = tuple(camera.scaled(min(size[0] / camera.width, size[1] / camera.height)) for camera in rig.cameras)
+    return CameraRig(cameras, rig.ego_from_bev, rig.ego_from_bev_assumed)
+
+
+def _digest(rig: CameraRig) -> str:
+    """Eight hexadecimal digits that differ between rigs."""
+    parts = [
+        (c.name, c.width, c.height, c.intrinsics.tolist(), c.ego_from_camera.tolist(), c.distortion)
+        for c in rig.cameras
+    ]
+    return hashlib.sha256(repr((parts, rig.ego_from_bev.tolist())).encode()).hexdigest()[:8]
+
+
+def camera_counts_of(drives: Drives) -> tuple[int, ...] | None:
+    """The number of cameras of each drive; None where all have the same."""
+    counts = getattr(drives, "camera_counts", None)
+    return counts if counts is not None and len(set(counts)) > 1 else None
+
+
 class _Subset:
     def __init__(self, drives: Drives, indices: range) -> None:
         self._drives, self._indices = drives, indices
+        counts = camera_counts_of(drives)
+        self.camera_counts = None if counts is None else tuple(counts[index] for index in indices)
 
     def __len__(self) -> int:
         return len(self._indices)
@@ -111,20 +163,27 @@ class _Subset:
         return self._drives.open(self._indices[index])
 
 
-def open_drives(folders: Items[Path], seeds: Items[int] | None, cache: Path, config: BEVFormerConfig) -> Drives:
+def open_drives(
+    folders: Items[Path],
+    seeds: Items[int] | None,
+    cache: Path,
+    config: BEVFormerConfig,
+    rig: CameraRig | RigDistribution | None = None,
+) -> Drives:
     """The drives in folders, or those rendered from seeds.
 
     Args:
         folders: sequence folders with ground truth; empty if seeds are given.
         seeds: of rendered drives; None if folders are given.
         cache: the folder that keeps rendered drives.
+        rig: of rendered drives, or the distribution of their rigs; None for the default rig.
 
     Raises:
         InputError: both or neither are given.
     """
     if bool(folders) == (seeds is not None):
         raise InputError("choose the drives: give either --data DIR (repeatable) or --rendered SEEDS, not both")
-    return FolderDrives(folders, config.rate_hz) if seeds is None else RenderedDrives(seeds, cache, config)
+    return FolderDrives(folders, config.rate_hz) if seeds is None else RenderedDrives(seeds, cache, config, rig)
 
 
 def check_training_seeds(seeds: Items[int]) -> None:

@@ -12,8 +12,13 @@ import torch
 from bevcli.checkpoints import load_weights
 from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import ConfigError, OutputError
+from bevcli.geometry.cameras import CameraRig
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
-from bevcli.model.bevformer_v2 import BEVFormerV2Config, build_model
+from bevcli.model.bevformer_v2 import BEVFormerV2Config
+from bevcli.model.build import build_model
+from bevcli.model.uniad import UniADConfig
+from bevcli.synth.random_rig import RigDistribution
+from bevcli.synth.rig import rig_for_rendering
 from bevcli.training.augmentation import AugmentationConfig
 from bevcli.training.clips import ClipConfig
 from bevcli.training.drives import Drives, check_training_seeds, open_drives, split_drives
@@ -38,6 +43,7 @@ class TrainingConfig(LossConfigs):
         weights_dtype: data type of weights.safetensors.
         clips: how clips are drawn.
         augmentation: image augmentation.
+        rigs: the rigs of rendered drives.
         optimizer: AdamW and the learning rate schedule.
     """
 
@@ -50,6 +56,7 @@ class TrainingConfig(LossConfigs):
     weights_dtype: Literal["float32", "float16"] = "float32"
     clips: ClipConfig = field(default_factory=ClipConfig)
     augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
+    rigs: RigDistribution = field(default_factory=RigDistribution)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
 
     def __post_init__(self) -> None:
@@ -121,7 +128,8 @@ def prepare_training(
     check_window(model_config, config)
     out = Path("runs") / f"train-{model_config.name}" if out is None else out
     check_training_seeds(rendered_seeds or ())
-    drives = open_drives(folders, rendered_seeds, out / "drives", model_config)
+    rigs = config.rigs if config.rigs.random_share > 0 else None
+    drives = open_drives(folders, rendered_seeds, out / "drives", model_config, rigs)
     drives, evaluated = split_drives(drives, config.held_out)
     prepare_folder(out, resume=resume)
     model = build_model(model_config)
@@ -130,8 +138,20 @@ def prepare_training(
     return TrainingJob(model, config, drives, evaluated, out, device, seed, join_process_group(device))
 
 
+def rig_for_drives(choice: str, model: str) -> CameraRig | RigDistribution:
+    """The rig in a calibration.json, or for "random" the distribution of the [training.rigs] table of a model file.
+
+    With "random" every drive has a random rig. Raises InputError or ConfigError where a file is wrong.
+    """
+    if choice == "random":
+        return replace(load_table(model, TRAINING, TrainingConfig).rigs, random_share=1.0)
+    return rig_for_rendering(choice, None)
+
+
 def check_window(model: BEVFormerConfig, config: TrainingConfig) -> None:
-    """Raises ConfigError if clips cannot fill the window of a BEVFormerV2."""
+    """Raises ConfigError if clips cannot fill the window of a BEVFormerV2, and for a UniAD."""
+    if isinstance(model, UniADConfig):
+        raise ConfigError(f"{model.name}: a UniAD cannot be trained; expected a BEVFormer, such as tiny, small or base")
     if not isinstance(model, BEVFormerV2Config):
         return
     if model.later_frames:

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bevcli.errors import InputError
+from bevcli.parsing.files import MIB, read_text
 from bevcli.training.checkpoint import replace_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Row = Mapping[str, float]
+LARGEST_BYTES = 256 * MIB
 
 
 class LearningCurve:
@@ -24,7 +28,9 @@ class LearningCurve:
     """
 
     def __init__(self, path: Path, done: int = 0) -> None:
-        """Opens the file of a resumed training, or starts a new one. Raises OutputError.
+        """Opens the file of a resumed training, or starts a new one.
+
+        Raises OutputError, and InputError for a damaged file.
 
         Args:
             done: steps done. Rows after them, of an interrupted run, are dropped; 0 starts a new file.
@@ -77,10 +83,19 @@ def _smoothed(rows: list[Row], points: int = 200) -> list[Row]:
 
 
 def _read(path: Path) -> list[Row]:
+    """The rows of a file. Raises InputError."""
     if not path.is_file():
         return []
-    with path.open(newline="") as file:
-        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+    text = read_text(path, LARGEST_BYTES)
+    try:
+        rows: list[Row] = [
+            {name: float(value) for name, value in row.items()} for row in csv.DictReader(io.StringIO(text))
+        ]
+    except (ValueError, TypeError, csv.Error) as error:  # no number, a missing or an additional one, a null byte
+        raise InputError(f"{path}: is damaged ({error}): move it away, or start a new training") from None
+    if rows and "step" not in rows[0]:
+        raise InputError(f"{path}: has no column step: move it away, or start a new training")
+    return rows
 
 
 def _write(path: Path, rows: list[Row], mode: str, *, header: bool = True) -> None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,8 @@ class OptimizerConfig:
         warm_up_start: relative rate at step 0.
         final_share: relative rate at the end of the cosine decay.
         max_gradient_norm: gradients are clipped to this L2 norm.
+        average: decay per update of a running average of the weights, such as 0.998; 0 for none. The average is what is
+            evaluated and released, so that a training may end before its learning rate has decayed.
     """
 
     learning_rate: float = 2e-4
@@ -30,10 +33,13 @@ class OptimizerConfig:
     warm_up_start: float = 1 / 3
     final_share: float = 1e-3
     max_gradient_norm: float = 35.0
+    average: float = 0.0
 
     def __post_init__(self) -> None:
         if min(self.learning_rate, self.max_gradient_norm) <= 0 or self.warm_up_steps < 0:
             raise ValueError("learning_rate and max_gradient_norm must be positive, warm_up_steps not negative")
+        if not 0 <= self.average < 1:
+            raise ValueError("average must be from 0 to below 1")
 
     def learning_rate_at(self, step: int, steps: int) -> float:
         """The learning rate of a step (0 to steps - 1)."""
@@ -56,6 +62,16 @@ def set_learning_rate(optimizer: torch.optim.AdamW, rate: float) -> None:
     """Sets the learning rate of the next step; each parameter group takes its share of it."""
     for group in optimizer.param_groups:
         group["lr"] = rate * group["share"]
+
+
+@torch.no_grad()
+def update_average(average: dict[str, Tensor], state: Mapping[str, Tensor], decay: float) -> None:
+    """Moves a running average of a state dict towards it, in place; integers are copied."""
+    for key, value in state.items():
+        if value.is_floating_point():
+            average[key].lerp_(value, 1 - decay)
+        else:
+            average[key].copy_(value)
 
 
 def clip_gradients(module: nn.Module, max_norm: float) -> float:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bevcli.errors import InputError
-from bevcli.frame import MAP_CLASSES, BevMap
+from bevcli.frame import BevMap
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.segmentation import STUFF_CLASSES
@@ -43,7 +43,7 @@ class SegmentationTargets:
 
 
 def segmentation_targets(boxes: Boxes3D, bev_map: BevMap | None, grid: BevGrid) -> SegmentationTargets:
-    """Masks on the BEV grid. Raises InputError if the map does not cover the grid.
+    """Masks on the BEV grid. Raises InputError if the map does not cover the grid, or has none of STUFF_CLASSES.
 
     Args:
         boxes: the frame's ground truth boxes, bev frame.
@@ -60,19 +60,24 @@ def segmentation_targets(boxes: Boxes3D, bev_map: BevMap | None, grid: BevGrid) 
 
 def _stuff(bev_map: BevMap, grid: BevGrid) -> NDArray[np.bool_]:
     """(S, Y·X): whether a class covers enough of a cell."""
-    _check_coverage(bev_map, grid)
+    _check_map(bev_map, grid)
     fine = BevGrid(grid.rows * SAMPLES, grid.columns * SAMPLES, grid.x_range_m, grid.y_range_m)
     rows, columns = bev_map.cells.shape
     map_grid = BevGrid(rows, columns, bev_map.x_range_m, bev_map.y_range_m)
     map_cells = map_grid.cell_of(fine.cell_centers())  # (Y · SAMPLES, X · SAMPLES, 2)
-    bits = bev_map.cells[::-1][map_cells[..., 0], map_cells[..., 1]]  # the map's rows start at the largest y
-    layers = np.stack([(bits & MAP_CLASSES[name]) > 0 for name in STUFF_CLASSES])
+    on_map = np.stack([bev_map.layer(name)[::-1] for name in STUFF_CLASSES])  # the map's rows start at the largest y
+    layers = on_map[:, map_cells[..., 0], map_cells[..., 1]]
     shares = layers.reshape(len(layers), grid.rows, SAMPLES, grid.columns, SAMPLES).mean((2, 4))
     min_shares = np.array([MIN_SHARES[name] for name in STUFF_CLASSES])
     return (shares >= min_shares[:, None, None]).reshape(len(layers), -1)
 
 
-def _check_coverage(bev_map: BevMap, grid: BevGrid) -> None:
+def _check_map(bev_map: BevMap, grid: BevGrid) -> None:
+    if not set(STUFF_CLASSES) & set(bev_map.classes):
+        raise InputError(
+            f"a ground truth map has the classes {', '.join(bev_map.classes)}, but the segmentation head learns "
+            f"{', '.join(STUFF_CLASSES)}: write other maps, or train without the segmentation head"
+        )
     for axis, found, needed in (("x", bev_map.x_range_m, grid.x_range_m), ("y", bev_map.y_range_m, grid.y_range_m)):
         if found[0] > needed[0] or found[1] < needed[1]:
             raise InputError(

@@ -23,7 +23,7 @@ from bevcli.training.clips import draw_clips
 from bevcli.training.frame_losses import FrameLosses
 from bevcli.training.job import CHECKPOINT, TrainingJob
 from bevcli.training.learning_curves import LearningCurve, draw_learning_curves
-from bevcli.training.optimizer import clip_gradients, make_optimizer, set_learning_rate
+from bevcli.training.optimizer import clip_gradients, make_optimizer, set_learning_rate, update_average
 from bevcli.training.samples import Batch, load_batch
 from bevcli.training.validation import Validation, validate
 
@@ -48,7 +48,12 @@ class Trainer:
         self._losses = FrameLosses(job.model, job.config)
         self.trained = nn.ModuleDict({"model": job.model, **self._losses.auxiliary_heads}).to(job.device)
         self.optimizer = make_optimizer(self.trained, job.model.backbone, job.config.optimizer)
-        self.done = load_checkpoint(job.out / CHECKPOINT, self.trained, self.optimizer) if resume else 0
+        self._average: dict[str, Tensor] | None = None
+        if job.config.optimizer.average > 0:
+            self._average = {key: value.detach().clone() for key, value in job.model.state_dict().items()}
+        self.done = 0
+        if resume:
+            self.done = load_checkpoint(job.out / CHECKPOINT, self.trained, self.optimizer, self._average)
         choose_kernels(job.model, job.device, gradients=True)
         if job.group.leads:
             self._loss_curve = LearningCurve(job.out / "loss.csv", self.done)
@@ -82,7 +87,7 @@ class Trainer:
             if self.done % config.evaluate_every == 0 or last:
                 after_validation(self.done, self._validate())
             if self.done % config.checkpoint_every == 0 or last or stopped:
-                save_checkpoint(self.job.out / CHECKPOINT, self.done, self.trained, self.optimizer)
+                save_checkpoint(self.job.out / CHECKPOINT, self.done, self.trained, self.optimizer, self._average)
             after_step()
             if stopped:
                 break
@@ -146,6 +151,8 @@ class Trainer:
         self.job.group.average_gradients(self.trained)
         norm = clip_gradients(self.trained, self.job.config.optimizer.max_gradient_norm)
         self.optimizer.step()
+        if self._average is not None:
+            update_average(self._average, self.job.model.state_dict(), self.job.config.optimizer.average)
         return {"loss": total.item(), **{name: loss.item() for name, loss in losses.items()}, "gradient norm": norm}
 
     def _validate(self) -> Validation:
@@ -153,11 +160,14 @@ class Trainer:
         job = self.job
         options = StepOptions(choose_precision(None, job.device), temporal=job.config.clips.frames > 1)
         # A copy, because a Runner puts timing hooks on its model and switches it to evaluation mode.
-        runner = Runner(copy.deepcopy(job.model), job.device, options)
+        model = copy.deepcopy(job.model)
+        if self._average is not None:
+            model.load_state_dict(self._average)
+        runner = Runner(model, job.device, options)
         scores = validate(runner, job.held_out if len(job.held_out) else job.drives)
         self._validation_curve.add(self.done, scores.row())
         dtype = torch.float16 if job.config.weights_dtype == "float16" else torch.float32
-        save_weights(job.out / "weights.safetensors", job.model, dtype)
+        save_weights(job.out / "weights.safetensors", model, dtype)
         draw_learning_curves(self._loss_curve, self._validation_curve, job.out / "curves.png")
         return scores
 

@@ -85,7 +85,7 @@ def validate(
             if frame.ground_truth is not None:
                 if tracker is not None:
                     tracks.append(_tracked_frame(index, frame, frame.ground_truth, prediction))
-                predicted, truth = _boxes_ego(frame, frame.ground_truth, prediction)
+                predicted, truth = boxes_ego(frame, frame.ground_truth, prediction)
                 predictions.append(predicted)
                 truths.append(truth)
             if prediction.segmentation is not None and frame.ground_truth_map is not None:
@@ -99,7 +99,7 @@ def validate(
     )
 
 
-def _boxes_ego(frame: Frame, ground_truth: Boxes3D, prediction: Prediction) -> tuple[Boxes3D, Boxes3D]:
+def boxes_ego(frame: Frame, ground_truth: Boxes3D, prediction: Prediction) -> tuple[Boxes3D, Boxes3D]:
     """Predicted and ground truth boxes in the ego frame. The model has no attributes: they follow from the speed."""
     predicted = prediction.boxes_ego
     predicted = replace(predicted, attributes=attributes_by_speed(predicted))

@@ -6,9 +6,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bevcli.parsing.images import decode_image
 from bevcli.recording import entities
 from bevcli.recording.video_images import Av1Decoder, require_av
 from bevcli.viewer.recording_reader import RecordedFrame
+
+MOST_PIXELS = 64 << 20
 
 
 class CameraImages:
@@ -24,7 +27,7 @@ class CameraImages:
         if data:
             return self._decoder(camera).decode(data)
         encoded = frame.blob(entity, "EncodedImage:blob")
-        image = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR) if encoded else None
+        image = decode_image(encoded, cv2.IMREAD_COLOR, MOST_PIXELS) if encoded else None
         return None if image is None else image.astype(np.uint8, copy=False)
 
     def _decoder(self, camera: str) -> Av1Decoder:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 import subprocess
 import sys
 import tempfile
@@ -10,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 from bevcli.errors import InputError
 from bevcli.viewer.native import viewer_binary, viewer_environment
@@ -20,7 +22,7 @@ import sys, warnings
 from rerun.chunk import RrdReader
 try:
     import resource
-    resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[2]), int(sys.argv[2])))
+    resource.setrlimit(resource.RLIMIT_DATA, (int(sys.argv[2]), int(sys.argv[2])))
 except (ImportError, ValueError, OSError):
     pass
 warnings.simplefilter("ignore")
@@ -30,10 +32,15 @@ try:
 except Exception as error:
     sys.exit(" ".join(str(error).split()))
 """
-CHECK_MEMORY = 4 << 30  # bytes of address space, most of it never used, beside a multiple of the file's size
-SECONDS, BYTES_PER_SECOND = 30.0, 5e6  # time limit of a process that reads a recording
+CHECK_MEMORY = 1 << 30  # bytes, beside four times the file's size
+# rerun's allocator sets aside 1 GiB at its start, which would count. In KiB.
+CHECK_ENVIRONMENT = {"MIMALLOC_ARENA_RESERVE": "65536"}
+SECONDS, BYTES_PER_SECOND = 30.0, 1e6  # time limit of a process that reads a recording
 RECORDING = "recording.rrd"
+LARGEST_INDEXED = 256 << 20  # bytes; to make an index takes several times its size in memory
 MAGIC, FOOTER = b"RRF2", b"RRF2FOOT"  # the first bytes of an .rrd file, and the bytes 12 before its end
+FILE_HEADER, MESSAGE_HEADER = 12, struct.Struct("<QQ")  # bytes; kind and length of a message
+MESSAGE_KINDS = (1, 2, 3)  # facts of the recording, data, and the choice of a blueprint
 
 
 @dataclass(frozen=True)
@@ -51,7 +58,7 @@ class RecordingFile:
 
 @contextmanager
 def open_recording(path: Path) -> Iterator[RecordingFile]:
-    """The recording at a path. If its end is missing: a repaired copy, which is deleted when the context ends.
+    """The recording at a path. If its last message is cut: a repaired copy, which is deleted when the context ends.
 
     path: the recording, or the output folder of `bevcli run`.
 
@@ -92,10 +99,12 @@ def _check(file: Path, path: Path) -> None:
 
 
 def restore_index(path: Path) -> bool:
-    """Gives a recording that lacks its end an index, in place. False if it stays as it is, such as on a full disk.
+    """Gives a recording of at most 256 MiB an index, in place. False if it stays as it is, such as on a full disk.
 
-    Every reader of this package reads a recording without an index too; it then works on a repaired copy.
+    Every reader of this package reads a recording without an index too.
     """
+    if path.stat().st_size > LARGEST_INDEXED:
+        return False
     copy = path.with_name(path.name + ".repaired")
     try:
         _repair(path, copy)
@@ -116,7 +125,7 @@ def _repair(path: Path, copy: Path) -> None:
 
 def _run(command: list[str], path: Path) -> subprocess.CompletedProcess[bytes]:
     seconds = SECONDS + path.stat().st_size / BYTES_PER_SECOND
-    environment = {**viewer_environment(), "RUST_BACKTRACE": "0"}
+    environment = {**viewer_environment(), **CHECK_ENVIRONMENT, "RUST_BACKTRACE": "0"}
     try:
         return subprocess.run(
             command, stdin=subprocess.DEVNULL, capture_output=True, env=environment, check=False, timeout=seconds
@@ -132,6 +141,7 @@ def _is_whole(path: Path) -> bool:
             size = file.seek(0, 2)
             file.seek(max(0, size - 12))
             end = file.read(12)
+            has_whole_messages = end.startswith(FOOTER) or _ends_with_a_message(file, size)
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such recording (`bevcli run` writes one)") from None
     except OSError as error:
@@ -140,4 +150,16 @@ def _is_whole(path: Path) -> bool:
         raise InputError(f"{path}: is not a recording: the file is empty")
     if start != MAGIC:
         raise InputError(f"{path}: is not a recording (expected a file that starts with RRF2, found {start!r})")
-    return end.startswith(FOOTER)
+    return has_whole_messages
+
+
+def _ends_with_a_message(file: BinaryIO, size: int) -> bool:
+    """Whether a file without an index ends after a whole message and has one at least."""
+    place = FILE_HEADER
+    while place + MESSAGE_HEADER.size <= size:
+        file.seek(place)
+        kind, length = MESSAGE_HEADER.unpack(file.read(MESSAGE_HEADER.size))
+        if kind not in MESSAGE_KINDS:
+            return False
+        place += MESSAGE_HEADER.size + length
+    return place == size > FILE_HEADER

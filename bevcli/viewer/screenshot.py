@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -13,12 +14,13 @@ import numpy as np
 from rerun.experimental import ViewerClient
 from rerun.experimental._viewer_client import ViewerState
 
-from bevcli.errors import InputError, OutputError
+from bevcli.errors import InputError, OutputError, WaitError
 from bevcli.recording import entities
 from bevcli.viewer.native import LOOPBACK, free_port, start_viewer, stop
 
 Answer = TypeVar("Answer")
 START_TIMEOUT_S = 40.0
+WHOLE_TIMEOUT_S = 180.0
 ENDINGS = (".png", ".jpg", ".jpeg")
 JPEG_QUALITY = 90
 SETTLE_S = 2.5  # the viewer decodes images after it opened the views, and does not report when it is done
@@ -30,13 +32,17 @@ def take_screenshot(recording: Path, image: Path, frame: int | None = None) -> t
 
     image: a .png, .jpg or .jpeg file. frame: the frame's index; None takes the first one.
 
-    Raises OutputError if the viewer cannot draw (no Vulkan driver) or the file cannot be written, InputError if the
-    file has another ending or the recording does not have the frame.
+    Raises OutputError if the viewer cannot draw (no Vulkan driver) or the file cannot be written, WaitError if the
+    viewer hangs, and InputError if the file has another ending or the recording does not have the frame.
     """
     if image.suffix.lower() not in ENDINGS:
         raise InputError(f"--screenshot {image}: the file must end in .png, .jpg or .jpeg")
     port = free_port()
     process = start_viewer("--headless", "--bind", LOOPBACK, "--port", str(port))
+    # The client waits for the viewer without a limit; its calls fail when the viewer ends.
+    limit = threading.Timer(WHOLE_TIMEOUT_S, process.kill)
+    limit.daemon = True
+    limit.start()
     try:
         client = _connect(process, port)
         client.open(str(recording))
@@ -45,7 +51,12 @@ def take_screenshot(recording: Path, image: Path, frame: int | None = None) -> t
         time.sleep(SETTLE_S)
         _write(image, client.take_screenshot())
         return tuple(view.name for view in client.get_state().views)
+    except (ConnectionError, RuntimeError) as error:
+        if limit.is_alive():
+            raise
+        raise WaitError(f"{recording}: the viewer has not drawn it within {WHOLE_TIMEOUT_S:.0f} s") from error
     finally:
+        limit.cancel()
         stop(process)
 
 

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from bevcli.frame import MAP_CLASSES
 from bevcli.geometry.transforms import Array
 from bevcli.recording import entities
 from bevcli.recording.camera_layout import rows_by_yaw
-from bevcli.recording.colors import MAP_COLORS, class_color
+from bevcli.recording.colors import class_color, map_colors
 from bevcli.viewer.camera_images import CameraImages
 from bevcli.viewer.flat_drawing import (
     Canvas,
@@ -156,12 +157,14 @@ def _draw_legend(canvas: Canvas, frame: RecordedFrame) -> None:
         cv2.rectangle(canvas, (x, y - 7), (x + 14, y + 7), (blue, green, red), -1)
         draw_text(canvas, f"{name.replace('_', ' ')} {counts[name]}", (x + 24, y), TEXT)
     if frame.has(entities.BEV_SEGMENTATION, "Image:buffer"):
-        _draw_map_legend(canvas)
+        # Recordings of version 0.1.0 do not name their classes, which are those of the segmentation head.
+        _draw_map_legend(canvas, frame.values(entities.RUN, "map_classes") or list(MAP_CLASSES))
 
 
-def _draw_map_legend(canvas: Canvas) -> None:
-    for index, (name, (red, green, blue)) in enumerate(MAP_COLORS.items()):
-        x, y = 16 + 250 * index, 60 + 32 * 2
+def _draw_map_legend(canvas: Canvas, classes: list[str]) -> None:
+    width = min(250, (CAMERAS_WIDTH - 16) // len(classes))
+    for index, (name, (red, green, blue)) in enumerate(map_colors(classes).items()):
+        x, y = 16 + width * index, 60 + 32 * 2
         cv2.rectangle(canvas, (x, y - 7), (x + 14, y + 7), (blue, green, red), -1)
         draw_text(canvas, f"map: {name.replace('_', ' ')}", (x + 24, y), TEXT)
 

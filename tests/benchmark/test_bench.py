@@ -36,15 +36,27 @@ SMALL = {
     "blocks = [3, 4, 6, 3]": "blocks = [1, 1, 1, 1]\nwidth = 8",
     "queries = 900": "queries = 30",
 }
+SMALL_UNIAD = {
+    "size = [1600, 900]": "size = [160, 90]",
+    "rows = 200": "rows = 12",
+    "columns = 200": "columns = 10",
+    "channels = 256": "channels = 32",
+    "blocks = [3, 4, 23, 3]": "blocks = [1, 1, 1, 1]\nwidth = 8",
+    "queries = 901": "queries = 30",
+}
 
 
 @pytest.fixture
 def small_model_file(tmp_path: Path) -> Path:
-    text = resources.files("bevcli").joinpath("configs/tiny.toml").read_text()
-    for old, new in SMALL.items():
+    return model_file(tmp_path / "small.toml", "tiny", SMALL)
+
+
+def model_file(path: Path, model: str, changes: dict[str, str]) -> Path:
+    """Writes a known model's TOML file with changed lines."""
+    text = resources.files("bevcli").joinpath(f"configs/{model}.toml").read_text()
+    for old, new in changes.items():
         assert old in text
         text = text.replace(old, new)
-    path = tmp_path / "small.toml"
     path.write_text(text)
     return path
 
@@ -90,6 +102,16 @@ def test_profile_of_a_frame_in_half_precision(small_model_file, tmp_path):
     answer = CliRunner().invoke(app, ["bench", "--model", str(small_model_file), *options], catch_exceptions=False)
     assert "bf16" in answer.stdout
     assert json.loads(profile.read_text())["traceEvents"]
+
+
+@pytest.mark.slow
+def test_the_benchmark_of_a_uniad_times_its_map_head(tmp_path):
+    file = model_file(tmp_path / "uniad.toml", "uniad-track-map", SMALL_UNIAD)
+    options = ["--frames", "1", "--against", "plain", "--json"]
+    answer = CliRunner().invoke(app, ["bench", "--model", str(file), *options], catch_exceptions=False)
+    data = json.loads(answer.stdout)
+    assert data["stages_ms"]["map head"] > 0
+    assert data["share_within_0.1_m"] == 1
 
 
 @pytest.mark.gpu

@@ -27,3 +27,9 @@ def test_one_more_hit_adds_its_samples_in_every_layer():
 @pytest.mark.parametrize("name", ["small", "base"])
 def test_larger_models_need_more_operations(name):
     assert count_operations(load_config(name), HITS) > 4 * count_operations(load_config("tiny"), HITS)
+
+
+@pytest.mark.slow
+def test_tracks_and_map_of_uniad_take_at_most_a_fifth_of_the_operations_of_base():
+    base = count_operations(load_config("base"), HITS)
+    assert base < count_operations(load_config("uniad-track-map"), HITS) < 1.2 * base

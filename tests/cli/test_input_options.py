@@ -1,6 +1,5 @@
 """The options that select inputs, models and devices, and what `run` tells before it starts."""
 
-import numpy as np
 import pytest
 import torch
 import typer
@@ -8,7 +7,6 @@ from typer.testing import CliRunner
 
 from bevcli.cli.input_options import complete_model, ego_motion_use, parse_frames, parse_rate
 from bevcli.cli.main import app
-from bevcli.cli.run import tilt_note
 from bevcli.config import known_models
 from bevcli.errors import BevcliError
 from bevcli.pipeline.model_loading import choose_device
@@ -63,21 +61,6 @@ def test_an_unknown_device_is_an_error(name):
 def test_a_numbered_gpu_that_is_not_there_is_an_error():
     with pytest.raises(BevcliError, match="--device cuda:1: PyTorch sees no CUDA GPU here"):
         choose_device("cuda:1")
-
-
-def test_a_tilted_bev_frame_is_told_by_what_the_weights_were_trained_with():
-    tilted = rotation_about_x(2.7)
-    assert "tilted by 2.7°, but the weights were trained with a level one" in (tilt_note(tilted, bundled=True) or "")
-    assert tilt_note(tilted, bundled=False) is None
-    assert "boxes 30 m away may be 2.6 m too high or too low" in (tilt_note(rotation_about_x(5), bundled=False) or "")
-    assert tilt_note(np.eye(4), bundled=True) is None
-
-
-def rotation_about_x(degrees):
-    matrix = np.eye(4)
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    matrix[1:3, 1:3] = [[c, -s], [s, c]]
-    return matrix
 
 
 def test_the_sample_drive_is_copied_once(tmp_path):

@@ -55,8 +55,8 @@ def start(folder, out, *more, **options) -> subprocess.Popen:
 
 def finished(out: Path) -> int:
     """The number of frames in predictions.json or its partial file; 0 without one."""
-    partial = out / "predictions.json.partial"
-    if not (partial.exists() or (out / "predictions.json").exists()):
+    files = [out / name for name in ("predictions.json", "predictions.json.partial")]
+    if not any(file.exists() and file.stat().st_size for file in files):
         return 0
     return len(read_boxes(out / "predictions.json").frames)
 

@@ -138,6 +138,32 @@ def test_maps_next_to_the_files_are_scored(tmp_path: Path) -> None:
     assert any("1 of 2 frames lack a map" in note for note in scores["notes"])
 
 
+@pytest.mark.parametrize(
+    ("classes", "iou", "note"),
+    [
+        (
+            {"drivable_area": 1, "pedestrian_crossing": 2},
+            {"pedestrian_crossing": 1},
+            "map classes on one side only, not scored: drivable_area, drivable_road, lane_boundary, vehicle",
+        ),
+        ({"drivable_area": 1, "divider": 2}, None, "maps are not scored: they have no class in common"),
+    ],
+)
+def test_only_map_classes_of_both_sides_are_scored(
+    tmp_path: Path, classes: dict[str, int], iou: dict[str, float] | None, note: str
+) -> None:
+    run, drive = tmp_path / "run", tmp_path / "drive"
+    for folder, name in ((run, "predictions"), (drive, "ground_truth")):
+        folder.mkdir()
+        write_frames(folder / f"{name}.json", as_predictions(random_truth(29, frames=1), 30), pose=Pose.identity())
+    extent = ((-2, 2), (-2, 2))
+    write_map(run / "segmentation", 0, BevMap(np.full((4, 4), 2, np.uint8), *extent, classes))
+    write_map(drive / "ground_truth_map", 0, BevMap(np.full((4, 4), 4, np.uint8), *extent))
+    scores = evaluated(run, drive)
+    assert scores["iou"] == iou
+    assert any(note in text for text in scores["notes"])
+
+
 def test_plots_are_not_empty(tmp_path: Path, files: tuple[Path, Path]) -> None:
     CliRunner().invoke(app, ["eval", *map(str, files), "--plot", str(tmp_path / "plots")], catch_exceptions=False)
     names = {"precision_recall.png", "errors_by_range.png", "misses_and_false_alarms.png"}

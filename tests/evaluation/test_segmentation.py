@@ -24,6 +24,13 @@ def test_a_cell_may_be_several_classes() -> None:
     assert np.isnan(scores.iou["lane_boundary"])
 
 
+def test_classes_are_compared_by_name() -> None:
+    found = BevMap(np.array([[1, 2], [3, 0]], np.uint8), *RANGES, {"drivable_area": 1, "pedestrian_crossing": 2})
+    true = bev_map([[0, 4], [4, 4]])
+    scores = evaluate_segmentation([(found, true)], ["pedestrian_crossing"])
+    assert scores.iou == pytest.approx({"pedestrian_crossing": 2 / 3})
+
+
 def test_cells_are_summed_over_frames() -> None:
     empty, full = bev_map([[0, 0], [0, 0]]), bev_map([[8, 8], [8, 8]])
     one = bev_map([[8, 0], [0, 0]])

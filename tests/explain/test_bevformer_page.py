@@ -74,7 +74,7 @@ def facts_of(name: str) -> dict[str, str]:
         queries = model.bev_queries(torch.zeros(1, 18))[0]
         position = model.bev_queries.position()
         can_bus = model.bev_queries.can_bus_embedding(torch.zeros(1, 18))[0]
-        class_logits, box_codes = model.decoder(queries[None], model.detection_head)
+        class_logits, box_codes, _ = model.decoder(queries[None], model.detection_head)
         object_position = model.decoder.query_embedding[:, :channels]
         references = model.decoder.reference_points(object_position)
     pillars = grid.pillars().reshape(-1, grid.pillar_points, 3)

@@ -97,6 +97,38 @@ def _recording(folder: Path) -> None:
         summarise(folder / "recording.rrd", file.path).text()
 
 
+def _state(folder: Path) -> None:
+    from bevcli.pipeline.run_folder import RunFolder
+    from bevcli.pipeline.run_state import open_state
+
+    with RunFolder(folder / "out", resume=True) as out:
+        open_state(out, {"model": "mini"})
+
+
+def _older_run(folder: Path) -> None:
+    from bevcli.pipeline.run_folder import RunFolder
+
+    with RunFolder(folder / "older", force=True):
+        pass
+
+
+def _checkpoint(folder: Path) -> None:
+    import torch
+
+    from bevcli.training.checkpoint import load_checkpoint
+    from bevcli.training.learning_curves import LearningCurve
+
+    model = torch.nn.Linear(2, 1)
+    load_checkpoint(folder / "checkpoint.pt", model, torch.optim.AdamW(model.parameters()))
+    LearningCurve(folder / "loss.csv", done=1)
+
+
+def _vehicle(folder: Path) -> None:
+    from bevcli.recording.vehicle import load_vehicle
+
+    load_vehicle(folder / "vehicle.glb")
+
+
 def _nuscenes(folder: Path) -> None:
     _open(folder / "nuscenes")
 
@@ -151,6 +183,12 @@ READERS = {
     "MCAP": Reader("bag.mcap", "bytes", _bag("bag.mcap")),
     "rosbag2": Reader("rosbag2/rosbag2.db3", "bytes", _bag("rosbag2")),
     "submission": Reader("results_nusc.json", "json", _submission),
+    "state": Reader("out/.bevcli/state.safetensors", "bytes", _state),
+    "written files": Reader("out/.bevcli/written", "bytes", _state),
+    "summary": Reader("older/summary.json", "json", _older_run),
+    "checkpoint": Reader("checkpoint.pt", "bytes", _checkpoint),
+    "learning curve": Reader("loss.csv", "text", _checkpoint),
+    "vehicle mesh": Reader("vehicle.glb", "bytes", _vehicle),
     "CAN bus": Reader("nuscenes/can_bus/scene-0001_pose.json", "json", _nuscenes),
     **{
         f"nuScenes {name}": Reader(f"nuscenes/v1.0-mini/{name}.json", "json", _nuscenes)

@@ -12,14 +12,22 @@ import cv2
 import numpy as np
 import safetensors.torch
 import torch
+import trimesh
 import yaml
 from bags import drive_messages, write_mcap, write_rosbag2
 from memory_drive import MemorySequence, make_rig
 from nuscenes_tables import Size, scene_name, write_tables
 from recorded_drive import record
 
+from bevcli.frame import FrameStamp
+from bevcli.geometry.transforms import Pose
+from bevcli.pipeline.run_state import RunnerState, RunState
+from bevcli.pipeline.runner import BevState
+from bevcli.pipeline.state_file import save_state
+from bevcli.pipeline.temporal import BevHistory
 from bevcli.sequences.native.ego_motion_file import read_ego_motion
 from bevcli.sequences.open import open_sequence
+from bevcli.training.checkpoint import save_checkpoint
 
 CAMERAS = ("CAM_FRONT", "CAM_BACK")
 SIZE = (64, 36)
@@ -37,6 +45,7 @@ def write_seeds(folder: Path) -> None:
     _nuscenes(folder / "nuscenes")
     _boxes(folder)
     _bags(folder)
+    _runs(folder)
     (folder / "classes.toml").write_text('"Lorry" = "truck"\nVan = "car"\n')
     (folder / "model.toml").write_bytes(resources.files("bevcli").joinpath("configs", "demo.toml").read_bytes())
 
@@ -144,6 +153,25 @@ def _weights(folder: Path) -> None:
     torch.save(contents, folder / "old.pth", _use_new_zipfile_serialization=False)
     tensors = {name: tensor.contiguous().clone() for name, tensor in state.items()}
     safetensors.torch.save_file(tensors, folder / "weights.safetensors", {"epoch": "3"})
+
+
+def _runs(folder: Path) -> None:
+    """The state of a run, the summary of an older one, a checkpoint of a training, and a mesh of the vehicle."""
+    (folder / "out/.bevcli").mkdir(parents=True)
+    (folder / "out/.bevcli/written").write_text("recording.rrd\npredictions.json\n")
+    runner = RunnerState(
+        BevState(BevHistory(torch.zeros(1, 4, 2), Pose(np.zeros(3), np.eye(4)[0])), FrameStamp(0, "", 5))
+    )
+    save_state(folder / "out/.bevcli/state.safetensors", RunState({"model": "mini"}, 1, runner, None, {"boxes": 3}))
+    (folder / "older").mkdir()
+    (folder / "older/summary.json").write_text(json.dumps({"bevcli_version": "0.1", "files": ["older/recording.rrd"]}))
+    model = torch.nn.Linear(2, 1)
+    optimizer = torch.optim.AdamW(model.parameters())
+    model(torch.ones(1, 2)).sum().backward()
+    optimizer.step()
+    save_checkpoint(folder / "checkpoint.pt", 1, model, optimizer)
+    (folder / "loss.csv").write_text("step,loss\n1,0.5\n")
+    (folder / "vehicle.glb").write_bytes(trimesh.creation.box((4.0, 2.0, 1.5)).export(file_type="glb"))
 
 
 def _bags(folder: Path) -> None:

@@ -119,17 +119,17 @@ def pose(frame: int) -> Pose:
     return Pose(np.array(info["ego2global_translation"]), np.array(info["ego2global_rotation"]))
 
 
-def motion(frame: int, config: BEVFormerConfig) -> EgoMotionInputs:
-    """The ego-motion inputs of a frame."""
-    previous = pose(frame - 1) if frame in (1, 2) else None
+def motion(frame: int, config: BEVFormerConfig, *, all_frames: bool = False) -> EgoMotionInputs:
+    """The ego-motion inputs of a frame. all_frames: whether frame 3 moves from frame 2, which is of another scene."""
+    previous = pose(frame - 1) if frame in (1, 2) or (frame == 3 and all_frames) else None
     can_bus = np.array(frames()[frame]["can_bus"])
     sensors = can_bus[7:10], can_bus[10:13], can_bus[13:16]
     return ego_motion_inputs(pose(frame), previous, *sensors, config.bev_grid, config.ego_motion)
 
 
-def inputs(frame: int, config: BEVFormerConfig) -> BEVFormerInputs:
-    """The network's inputs for one of the four frames."""
-    moved = motion(frame, config)
+def inputs(frame: int, config: BEVFormerConfig, *, all_frames: bool = False) -> BEVFormerInputs:
+    """The network's inputs for one of the four frames. all_frames: see `motion`."""
+    moved = motion(frame, config, all_frames=all_frames)
     images = np.stack([network_image(frame, name, config) for name in config.cameras])
     return BEVFormerInputs(
         images=torch.from_numpy(images)[None],

@@ -1,11 +1,13 @@
 """A frame whose numbers become NaN or infinite is marked with the place where this happens; the next frame recovers."""
 
+import copy
 from dataclasses import replace
 
 import pytest
 import torch
 from memory_drive import MemorySequence
 
+from bevcli.errors import WeightsError
 from bevcli.model.prepared import prepare_for_inference
 from bevcli.pipeline.preprocess import Preprocessor
 from bevcli.pipeline.runner import Runner, StepOptions
@@ -67,8 +69,10 @@ def test_the_frames_after_a_failed_one_are_those_of_a_fresh_start(mini_model):
         assert torch.equal(after.bev, expected.bev)
 
 
-def test_an_input_that_is_not_finite_is_named(mini_model):
-    runner, preprocessor, sequence = Runner(mini_model, CPU, StepOptions()), Preprocessor(mini_model.config), None
+@pytest.mark.parametrize("prepared_model", [False, True], ids=["plain", "prepared"])
+def test_an_input_that_is_not_finite_is_named(mini_model, prepared_model):
+    model = prepare_for_inference(mini_model, CPU) if prepared_model else mini_model
+    runner, preprocessor, sequence = Runner(model, CPU, StepOptions()), Preprocessor(mini_model.config), None
     sequence = MemorySequence(1)
     prepared = preprocessor(sequence.load(0))
     images = prepared.images.clone()
@@ -76,3 +80,10 @@ def test_an_input_that_is_not_finite_is_named(mini_model):
     state, prediction = runner.step(None, replace(prepared, images=images))
     assert state is None
     assert prediction.not_finite == "input images"
+
+
+def test_a_batch_norm_with_negative_variance_is_refused_before_the_first_frame(mini_model):
+    model = copy.deepcopy(mini_model)
+    model.backbone.bn1.running_var[3] = -1.0  # finite, but its root is not
+    with pytest.raises(WeightsError, match=r"backbone\.conv1\.weight: has NaN or infinity"):
+        prepare_for_inference(model, CPU)

@@ -103,3 +103,23 @@ def test_missing_image_is_black_and_marked(mini_config):
     place = prepared.assignment.cameras.index("CAM_BACK")
     assert prepared.has_image[0].tolist() == [name != "CAM_BACK" for name in prepared.assignment.cameras]
     assert (prepared.images[0, place] == 0).all()
+
+
+def test_projections_follow_the_resized_image_to_a_fraction_of_a_pixel(mini_config):
+    """A bright spot, resized to a quarter, lies where its ray is projected to."""
+    config = replace(mini_config, image=replace(mini_config.image, resize="area", half_pixel_shift=True))
+    camera = make_camera("CAM_FRONT", 0, width=640, height=384)
+    sequence = MemorySequence(rig=CameraRig((camera,), make_rig().ego_from_bev))
+    frame = sequence.load(0)
+    dark = np.zeros((384, 640, 3), np.uint8)
+    dark[100:107, 300:307] = 255  # its centre is pixel (303, 103)
+    frame = replace(frame, images={"CAM_FRONT": replace(frame.images["CAM_FRONT"], pixels_bgr=dark)})
+    prepared = Preprocessor(config)(frame)
+    image = prepared.images[0, 0, 0, :90, :150].numpy()  # without the padding
+    weights = image - image.min()
+    rows, columns = np.indices(weights.shape)
+    seen = (columns * weights).sum() / weights.sum(), (rows * weights).sum() / weights.sum()
+    in_camera = 10.0 * np.linalg.inv(camera.intrinsics) @ [303, 103, 1]
+    point_bev = apply(inverse(sequence.rig.ego_from_bev) @ camera.ego_from_camera, in_camera)
+    u, v, d, _ = prepared.image_from_bev[0, 0].numpy() @ [*point_bev, 1]
+    assert seen == pytest.approx((u / d, v / d), abs=0.1)

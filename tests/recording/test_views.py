@@ -1,6 +1,6 @@
 """The views: legend, colours of maps, range rings, size of the camera views, titles, speed, street map."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
@@ -8,13 +8,22 @@ import pytest
 from memory_drive import MemorySequence, make_camera, make_rig
 from recorded_drive import GRID, TINY, NamedModel, predict, record
 
-from bevcli.frame import MAP_CLASSES, BevMap, DriveFacts
+from bevcli.frame import MAP_CLASSES, MOST_MAP_CLASSES, BevMap, DriveFacts, class_bits
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.geometry.geographic import GeoOrigin
+from bevcli.model.bevformer import BEVFormerConfig
 from bevcli.recording import entities
 from bevcli.recording.blueprint import TEXTS_SHARE, TITLE_HEIGHT, WINDOW, camera_row_shares
-from bevcli.recording.colors import CLASS_COLORS, GROUND_TRUTH_COLOR, MAP_COLORS, MISSED_COLOR
+from bevcli.recording.colors import (
+    BACKGROUND,
+    CLASS_COLORS,
+    GROUND_TRUTH_COLOR,
+    MAP_COLORS,
+    MISSED_COLOR,
+    OTHER_MAP_COLORS,
+    map_colors,
+)
 from bevcli.recording.legend import legend_entries
 from bevcli.recording.log_static import ring_distances_m
 from bevcli.recording.writer import FROM_RENDERED, UNTRAINED, Recording, frame_rate_hz, weights_note
@@ -33,20 +42,34 @@ def lab(color) -> np.ndarray:
     return cv2.cvtColor(np.float32([[color]]) / 255, cv2.COLOR_RGB2LAB)[0, 0]
 
 
-@pytest.mark.parametrize("name", MAP_COLORS)
-def test_a_map_colour_cannot_be_taken_for_a_box(name):
+COLORS_OF_MAPS = (*MAP_COLORS.values(), *OTHER_MAP_COLORS)
+
+
+@pytest.mark.parametrize("index", range(len(COLORS_OF_MAPS)))
+def test_a_map_colour_cannot_be_taken_for_a_box_or_another_class(index):
+    color, others = COLORS_OF_MAPS[index], [*COLORS_OF_MAPS[:index], *COLORS_OF_MAPS[index + 1 :]]
     of_boxes = [*CLASS_COLORS.values(), GROUND_TRUTH_COLOR, MISSED_COLOR]
-    nearest = min(np.linalg.norm(lab(MAP_COLORS[name]) - lab(color)) for color in of_boxes)
+    nearest = min(np.linalg.norm(lab(color) - lab(other)) for other in of_boxes)
     assert nearest > 22  # 2 is the smallest difference that people see side by side
-    others = [np.linalg.norm(lab(MAP_COLORS[name]) - lab(MAP_COLORS[other])) for other in MAP_COLORS if other != name]
-    assert min(others) > 12
+    assert min(np.linalg.norm(lab(color) - lab(other)) for other in others) > 12
+    assert np.linalg.norm(lab(color) - lab(BACKGROUND)) > 12
+
+
+def test_map_classes_of_any_name_have_different_colours():
+    names = ["vehicle", *"abcdefg"]
+    colors = map_colors(names)
+    assert list(colors) == names
+    assert len(set(colors.values())) == MOST_MAP_CLASSES == len(names)
+    assert colors["vehicle"] == MAP_COLORS["vehicle"]
+    assert map_colors(names) == colors
+    assert map_colors(["b", "a"])["b"] == map_colors(["a", "b"])["a"]  # by their order
 
 
 def test_the_legend_names_every_class_and_map_class():
-    names = [text for text, _ in legend_entries(TINY.classes, with_map=True)]
+    names = [text for text, _ in legend_entries(TINY.classes, list(MAP_CLASSES))]
     assert set(TINY.classes) <= {name.replace(" ", "_") for name in names}
     assert {f"map: {name.replace('_', ' ')}" for name in MAP_CLASSES} <= set(names)
-    assert not any(text.startswith("map") for text, _ in legend_entries(TINY.classes, with_map=False))
+    assert not any(text.startswith("map") for text, _ in legend_entries(TINY.classes))
 
 
 def test_the_legend_is_in_the_recording(tmp_path):
@@ -130,6 +153,40 @@ def test_the_segmentation_lies_on_the_ground(tmp_path):
     left_ahead = corners[3]  # bev x smallest, y largest
     assert left_ahead[0] == pytest.approx(51.2 + 0.94, abs=1e-3)  # in ego: forward
     assert left_ahead[1] == pytest.approx(51.2, abs=1e-3)
+
+
+@dataclass(frozen=True)
+class LaneModel(NamedModel):
+    """A model whose map has classes of its own; "kerb" has no colour of its own."""
+
+    @property
+    def config(self):
+        return LaneConfig(**{part.name: getattr(TINY, part.name) for part in fields(TINY)})
+
+
+class LaneConfig(BEVFormerConfig):
+    """The configuration of that model."""
+
+    @property
+    def map_classes(self):
+        return ("drivable_area", "divider", "kerb")
+
+
+def test_a_model_with_map_classes_of_its_own_is_drawn_with_a_legend(tmp_path):
+    drive = MemorySequence(1)
+    cells = np.zeros((20, 20), dtype=np.uint8)
+    cells[0, :3] = [1, 1 + 2, 4]
+    maps = BevMap(cells, GRID.x_range_m, GRID.y_range_m, class_bits(LaneModel().config.map_classes))
+    with Recording(tmp_path / "r.rrd", drive, LaneModel()) as recording:
+        recording.log(drive.load(0), replace(predict(drive.load(0)), segmentation=maps))
+    (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
+    texture = frame.blob(entities.SEGMENTATION_ON_GROUND, "Mesh3D:albedo_texture_buffer")
+    drawn = [tuple(texture[3 * place : 3 * place + 3]) for place in range(4)]
+    assert drawn == [MAP_COLORS["drivable_area"], MAP_COLORS["divider"], OTHER_MAP_COLORS[0], BACKGROUND]
+    texts = frame.values(f"{entities.LEGEND}/texts", "Points2D:labels")
+    assert {"map: drivable area", "map: divider", "map: kerb"} <= set(texts)
+    assert not {"map: vehicle", "map: drivable road"} & set(texts)
+    assert frame.values(entities.RUN, "map_classes") == ["drivable_area", "divider", "kerb"]
 
 
 def test_a_drive_with_a_place_on_earth_has_a_street_map(tmp_path):

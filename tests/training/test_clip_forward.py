@@ -13,7 +13,8 @@ from painted_drives import CONFIG, PaintedDrives
 from bevcli.config import TRAINING, known_models, load_config, load_table
 from bevcli.errors import ConfigError
 from bevcli.model.bev_fusion import BevFusionConfig
-from bevcli.model.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config, build_model
+from bevcli.model.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config
+from bevcli.model.build import build_model
 from bevcli.model.fpn import FPNConfig
 from bevcli.pipeline.preprocess import Preprocessor
 from bevcli.pipeline.temporal import temporal_model

@@ -81,3 +81,17 @@ def test_a_class_needs_a_minimum_share_of_a_cell() -> None:
 def test_a_map_smaller_than_the_grid_is_rejected() -> None:
     with pytest.raises(InputError, match="covers x -6 to 6 m, but the model's BEV grid -8 to 8 m"):
         segmentation_targets(Boxes3D.empty(), BevMap(np.zeros((4, 4), np.uint8), (-6, 6), (-4, 4)), GRID)
+
+
+def test_the_bits_of_a_map_are_those_that_it_states() -> None:
+    cells = np.full((8, 16), 2, dtype=np.uint8)
+    crossings = BevMap(cells, (-8, 8), (-4, 4), {"kerb": 1, "pedestrian_crossing": 2})
+    stuff = segmentation_targets(Boxes3D.empty(), crossings, GRID).stuff
+    assert stuff is not None
+    assert stuff.any(dim=1).tolist() == [False, False, True]
+
+
+def test_a_map_without_any_class_of_the_head_is_rejected() -> None:
+    kerbs = BevMap(np.zeros((8, 16), np.uint8), (-8, 8), (-4, 4), {"kerb": 1})
+    with pytest.raises(InputError, match="has the classes kerb, but the segmentation head learns drivable_road"):
+        segmentation_targets(Boxes3D.empty(), kerbs, GRID)

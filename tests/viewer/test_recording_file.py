@@ -1,14 +1,18 @@
 """A recording that was cut off is repaired; a file that is not a recording is an error of one line."""
 
+import sys
+import warnings
+
 import pytest
 from memory_drive import MemorySequence
 from recorded_drive import NamedModel, predict, record
 from rerun.chunk import RrdReader
 
 from bevcli.errors import InputError
-from bevcli.recording import entities
+from bevcli.recording import entities, writer
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.writer import Recording
+from bevcli.viewer import recording_file
 from bevcli.viewer.recording_file import open_recording, restore_index
 from bevcli.viewer.recording_reader import RecordingReader
 
@@ -70,18 +74,44 @@ def test_a_resumed_recording_shows_all_frames(tmp_path, bev):
     assert restore_index(restored)
     record(tmp_path / "whole.rrd", sequence, options, truth=False)
     expected = list(RecordingReader(tmp_path / "whole.rrd").frames())
-    with open_recording(path) as repaired:
-        assert repaired.repaired
-        for file in (repaired.path, restored):
-            found = list(RecordingReader(file).frames())
-            assert [frame.index for frame in found] == [0, 1, 2, 3, 4, 5]
-            for one, other in zip(found, expected, strict=True):
-                assert one.rows.keys() == other.rows.keys()
-                for entity in (entities.EGO, entities.BOXES, entities.TRAJECTORY):
-                    assert one.rows.get(entity) == other.rows.get(entity)
-    with open_recording(restored) as file:
+    for recording in (path, restored):
+        with open_recording(recording) as file:
+            assert not file.repaired
+            assert_same_frames(file.path, expected)
+
+
+def assert_same_frames(path, expected):
+    found = list(RecordingReader(path).frames())
+    assert [frame.index for frame in found] == [frame.index for frame in expected]
+    for one, other in zip(found, expected, strict=True):
+        assert one.rows.keys() == other.rows.keys()
+        for entity in (entities.EGO, entities.BOXES, entities.TRAJECTORY):
+            assert one.rows.get(entity) == other.rows.get(entity)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # rerun warns about a file without an index
+        assert len(RrdReader(path).recordings()) == 1
+
+
+def test_a_long_recording_of_several_streams_is_one_recording(tmp_path, monkeypatch):
+    sequence, finished = MemorySequence(6), 5
+    record(tmp_path / "whole.rrd", sequence, truth=False)
+    monkeypatch.setattr(writer, "INDEXED_FRAMES", 2)
+    path = tmp_path / "long.rrd"
+    with Recording(path, sequence, NamedModel()) as recording:
+        for place in range(finished):
+            recording.log(sequence.load(place), predict(sequence.load(place)))
+            copy = tmp_path / f"{place}.rrd"
+            copy.write_bytes(path.read_bytes())  # what a kill here leaves
+    expected = list(RecordingReader(tmp_path / "whole.rrd").frames())
+    with open_recording(path) as file:
         assert not file.repaired
-        assert len(RrdReader(file.path).recordings()) == 1
+        assert_same_frames(file.path, expected[:finished])
+    with open_recording(tmp_path / "3.rrd") as file:
+        assert [frame.index for frame in RecordingReader(file.path).frames()] == [0, 1, 2, 3]
+    path.write_bytes(path.read_bytes()[:-10])
+    with open_recording(path) as file:
+        assert file.repaired
+        assert len(list(RecordingReader(file.path).frames())) == finished
 
 
 def test_a_missing_file_and_a_folder_without_a_recording_are_errors(tmp_path):
@@ -106,3 +136,11 @@ def test_damaged_data_never_ends_the_process(recording, tmp_path, place):
         message = str(error)
     assert message.startswith(f"{damaged}: ")
     assert "\n" not in message
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not limit the memory of a process")
+def test_the_process_that_reads_a_recording_first_has_one_gigabyte(recording):
+    greedy = recording_file.CHECK.replace("try:\n    for", "bytearray(1200 << 20)\ntry:\n    for")
+    done = recording_file._run([sys.executable, "-c", greedy, str(recording), str(1 << 30)], recording)
+    assert done.returncode == 1
+    assert b"MemoryError" in done.stderr

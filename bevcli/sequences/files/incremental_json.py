@@ -12,7 +12,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from bevcli.errors import OutputError
+from bevcli.errors import InputError, OutputError
 from bevcli.parsing.documents import parse_json
 from bevcli.parsing.files import read_bytes
 from bevcli.sequences.files.growing_file import GrowingFile
@@ -40,6 +40,8 @@ def read_entries(path: Path, tail: str, largest: int, *, missing: str = "the fil
     file = existing(path)
     content = read_bytes(file, largest, missing=missing)
     if file.suffix == PARTIAL:
+        if not content:
+            raise InputError(f"{file}: is empty: the run ended before its first frame")
         content = _without_cut_entry(content) + tail.encode()
     return parse_json(content, path)
 

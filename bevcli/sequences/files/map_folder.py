@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import cv2
 import numpy as np
 
 from bevcli.errors import InputError, OutputError
-from bevcli.frame import MAP_CLASSES, BevMap
+from bevcli.frame import MOST_MAP_CLASSES, BevMap
 from bevcli.parsing.documents import read_json
 from bevcli.parsing.files import read_bytes
 from bevcli.parsing.images import decode_image
@@ -19,6 +20,7 @@ from bevcli.parsing.images import decode_image
 FORMAT = "bevcli-map/1"
 LEGEND = "map.json"
 LARGEST_BYTES, LARGEST_CELLS = 64 << 20, 64 << 20  # of one map
+LONGEST_NAME = 100  # characters of a class
 
 
 @dataclass(frozen=True)
@@ -29,13 +31,13 @@ class MapFolder:
         path: the folder.
         x_range_m: smallest and largest x, metres.
         y_range_m: smallest and largest y, metres.
-        classes: names of the classes that the maps may contain.
+        classes: class -> its bit, of the classes that the maps may contain, by rising bit.
     """
 
     path: Path
     x_range_m: tuple[float, float]
     y_range_m: tuple[float, float]
-    classes: tuple[str, ...]
+    classes: Mapping[str, int]
 
     def has(self, frame: int) -> bool:
         """Whether the folder has a map of this frame."""
@@ -50,10 +52,10 @@ class MapFolder:
         if cells is None or cells.ndim != 2 or cells.dtype != np.uint8:
             found = "an unreadable image" if cells is None else f"{cells.dtype} of shape {cells.shape}"
             raise InputError(f"{path}: expected an 8-bit image with one channel, found {found}")
-        unknown = int(np.bitwise_or.reduce(cells, axis=None)) & ~sum(MAP_CLASSES[name] for name in self.classes)
+        unknown = int(np.bitwise_or.reduce(cells, axis=None)) & ~sum(self.classes.values())
         if unknown:
             raise InputError(f"{path}: bits {unknown:#x} belong to no class in {LEGEND} ({', '.join(self.classes)})")
-        return BevMap(cells.astype(np.uint8), self.x_range_m, self.y_range_m)
+        return BevMap(cells.astype(np.uint8), self.x_range_m, self.y_range_m, self.classes)
 
 
 def open_maps(path: Path) -> MapFolder:
@@ -71,23 +73,30 @@ def open_maps(path: Path) -> MapFolder:
 def write_map(folder: Path, frame: int, bev_map: BevMap) -> None:
     """Write a frame's map as NNNNNN.png. The folder and map.json are created if they are missing.
 
-    Raises OutputError if the map cannot be written, and InputError if the folder's maps have another extent.
+    Raises OutputError if the map cannot be written, and InputError if the folder's maps have another extent or
+    other classes.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not (folder / LEGEND).exists():
             (folder / LEGEND).write_text(json.dumps(_legend(bev_map), indent=1) + "\n")
-        _check_extent(open_maps(folder), bev_map)
+        _check_legend(open_maps(folder), bev_map)
         map_path(folder, frame).write_bytes(cv2.imencode(".png", bev_map.cells)[1].tobytes())
     except OSError as error:
         raise OutputError(f"{folder}: the map cannot be written ({error.strerror})") from None
 
 
-def _check_extent(folder: MapFolder, bev_map: BevMap) -> None:
+def _check_legend(folder: MapFolder, bev_map: BevMap) -> None:
+    """Raises InputError where a new map does not fit the maps in a folder."""
     if (folder.x_range_m, folder.y_range_m) != (tuple(bev_map.x_range_m), tuple(bev_map.y_range_m)):
         raise InputError(
             f"{folder.path / LEGEND}: states x {folder.x_range_m}, y {folder.y_range_m}, but the new map has "
             f"x {bev_map.x_range_m}, y {bev_map.y_range_m}: write it to another folder"
+        )
+    if dict(folder.classes) != dict(bev_map.classes):
+        raise InputError(
+            f"{folder.path / LEGEND}: states the classes {', '.join(folder.classes)}, but the new map has "
+            f"{', '.join(bev_map.classes)}: write it to another folder"
         )
 
 
@@ -101,7 +110,7 @@ def _legend(bev_map: BevMap) -> dict[str, Any]:
         "format": FORMAT,
         "x_range_m": list(bev_map.x_range_m),
         "y_range_m": list(bev_map.y_range_m),
-        "classes": {str(bit): name for name, bit in MAP_CLASSES.items()},
+        "classes": {str(bit): name for name, bit in bev_map.classes.items()},
     }
 
 
@@ -113,9 +122,19 @@ def _range(legend: dict[str, Any], key: str, path: Path) -> tuple[float, float]:
     return float(numbers[0]), float(numbers[1])
 
 
-def _classes(legend: dict[str, Any], path: Path) -> tuple[str, ...]:
+def _classes(legend: dict[str, Any], path: Path) -> dict[str, int]:
+    """Class -> its bit, by rising bit."""
     value = legend.get("classes")
-    known = {str(bit): name for name, bit in MAP_CLASSES.items()}
-    if not isinstance(value, dict) or not value or not value.items() <= known.items():
-        raise InputError(f'{path}: "classes" must name bits as in {json.dumps(known)}; found {value!r:.80}')
-    return tuple(value.values())
+    bits = {str(1 << index): 1 << index for index in range(MOST_MAP_CLASSES)}
+    if not isinstance(value, dict) or not value or not value.keys() <= bits.keys() or not _are_names(value.values()):
+        raise InputError(
+            f'{path}: "classes" must name bits, such as {{"1": "drivable_road", "2": "lane_boundary"}}: powers of two '
+            f"up to {max(bits.values())}, each name once; found {value!r:.80}"
+        )
+    return {str(name): bits[bit] for bit, name in sorted(value.items(), key=lambda item: bits[item[0]])}
+
+
+def _are_names(values: Collection[Any]) -> bool:
+    """Whether these are different names of up to LONGEST_NAME printable characters."""
+    texts = {text for text in values if isinstance(text, str) and 0 < len(text) <= LONGEST_NAME and text.isprintable()}
+    return len(texts) == len(values)

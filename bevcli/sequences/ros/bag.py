@@ -16,12 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import BevcliError, InputError
+from bevcli.parsing.compressed import decompressed
 from bevcli.parsing.documents import read_yaml
+from bevcli.parsing.files import MIB, open_regular
 from bevcli.sequences.ros.decoding import Decode, Topic, decoder
 
 SUFFIXES = (".mcap", ".db3")
 METADATA = "metadata.yaml"
 SPLIT_NAME = re.compile(r"(?P<stem>.*?)_\d+")  # rosbag2 numbers the files of a recording: drive_0.mcap, drive_1.mcap
+LARGEST_MESSAGE = 256 * MIB  # bytes after decompression
 PACKAGES = ("mcap", "rosbags", "google.protobuf")
 
 
@@ -106,7 +109,7 @@ class Bag:
                 count = len(file.times(topic)) if topic in file.topics else 0
                 if index < count:
                     data = file.read(topic, index)
-                    return _decompressed(data) if self._compression == "message" else data
+                    return decompressed("zstd", data, LARGEST_MESSAGE) if self._compression == "message" else data
                 index -= count
         raise IndexError(f"{topic} has no message {index}")
 
@@ -138,7 +141,10 @@ def is_ros_bag(path: Path) -> bool:
 
 
 def _is_rosbag_metadata(path: Path) -> bool:
-    return path.is_file() and "rosbag2_bagfile_information" in path.read_text(encoding="utf-8", errors="replace")[:4096]
+    if not path.is_file():
+        return False
+    with open_regular(path) as file:
+        return b"rosbag2_bagfile_information" in file.read(4096)
 
 
 def _metadata(path: Path) -> dict[str, Any]:
@@ -170,12 +176,6 @@ def _is_installed(name: str) -> bool:
         return importlib.util.find_spec(name) is not None
     except ModuleNotFoundError:  # the package around it
         return False
-
-
-def _decompressed(data: bytes) -> bytes:
-    import zstandard
-
-    return zstandard.ZstdDecompressor().decompressobj().decompress(data)
 
 
 def _stem(file: Path) -> str:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 from bevcli.errors import InputError
+from bevcli.parsing.documents import parse_json
 
 Decode = Callable[[bytes], Any]
 
@@ -78,7 +79,14 @@ def _cdr(topic: Topic) -> Decode:
 
 
 def _json(topic: Topic) -> Decode:
-    return lambda data: json.loads(data, object_hook=lambda fields: SimpleNamespace(**fields))
+    return lambda data: _with_attributes(parse_json(data, Path(topic.name)))
+
+
+def _with_attributes(value: Any) -> Any:
+    """The value of a JSON document with objects that have attributes in place of dicts."""
+    if isinstance(value, dict):
+        return SimpleNamespace(**{name: _with_attributes(item) for name, item in value.items()})
+    return [_with_attributes(item) for item in value] if isinstance(value, list) else value
 
 
 def _protobuf(topic: Topic) -> Decode:

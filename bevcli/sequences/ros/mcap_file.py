@@ -7,7 +7,7 @@ from collections import OrderedDict
 from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
@@ -15,11 +15,11 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, ChunkIndex, Schema
-from mcap.stream_reader import get_chunk_data_stream
 from mcap.summary import Summary
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
+from bevcli.parsing.compressed import decompressed
 from bevcli.sequences.ros.decoding import Encoding, Topic
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -205,12 +205,10 @@ class McapFile:
 
 def _decompressed(content: bytes) -> bytes:
     """The records of a chunk. Raises ValueError for a damaged one."""
-    stream: Any = ReadDataStream(BytesIO(content))
-    try:
-        chunk = Chunk.read(stream)
-        if chunk.uncompressed_size > LARGEST_CHUNK:
-            raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
-        data, length = get_chunk_data_stream(chunk)
-        return data.read(length)
-    except Exception as error:  # each compression has exceptions of its own
-        raise ValueError(str(error)) from None
+    chunk = Chunk.read(ReadDataStream(BytesIO(content)))
+    if chunk.uncompressed_size > LARGEST_CHUNK:
+        raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes (expected at most {LARGEST_CHUNK})")
+    data = decompressed(chunk.compression, chunk.data, chunk.uncompressed_size)
+    if len(data) < chunk.uncompressed_size:
+        raise ValueError(f"a chunk of {len(data)} bytes (expected {chunk.uncompressed_size})")
+    return data

@@ -9,7 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
+from bevcli.parsing.files import MIB
 from bevcli.sequences.ros.decoding import Encoding, Topic
+
+TABLES = ("topics", "messages", "message_definitions", "sqlite_master")
+BUSY_TIMEOUT_S = 5.0
+LARGEST_VALUE = 512 * MIB  # bytes of a message
 
 
 class SqliteFile:
@@ -29,7 +34,9 @@ class SqliteFile:
             # A recording that was cut off leaves a -wal file beside the database, which SQLite must be able to apply.
             options = "mode=ro" if path.with_name(path.name + "-wal").exists() else "mode=ro&immutable=1"
             uri = f"{path.resolve().as_uri()}?{options}"
-            self._database = sqlite3.connect(uri, uri=True, check_same_thread=False)
+            self._database = sqlite3.connect(uri, uri=True, check_same_thread=False, timeout=BUSY_TIMEOUT_S)
+            self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_VALUE)
+            self._check_tables()
             rows = self._database.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
             definitions = self._definitions()
         except sqlite3.Error as error:
@@ -71,6 +78,14 @@ class SqliteFile:
         for name, numbers in self._ids.items():
             part = table[np.isin(table[:, 2], numbers), :2]
             self._references[name] = part[np.argsort(part[:, 0], kind="stable")]
+
+    def _check_tables(self) -> None:
+        """Raises sqlite3.Error if a table of the bag is a view: a query in the file can compute for ever."""
+        self._database.execute("PRAGMA trusted_schema = OFF")
+        kinds = self._database.execute("SELECT name, type FROM sqlite_master").fetchall()
+        views = [name for name, kind in kinds if name in TABLES and kind not in ("table", "index")]
+        if views:
+            raise sqlite3.DatabaseError(f"{views[0]} is a view (expected a table)")
 
     def _definitions(self) -> dict[str, tuple[str, bytes]]:
         """Encoding and text of each type's definition; files of older ROS releases have none."""

@@ -1,0 +1,96 @@
+"""Image features that know their camera: an embedding of each feature's viewing ray, computed from the calibration."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from bevcli.model.deformable_attention import FeatureMaps
+
+RAY_FEATURES = 9
+HIDDEN = 64
+# Units of the numbers that describe a ray, chosen so that they are about 1.
+_METRES = 2.0  # of the camera's position
+_FOCAL = 32.0  # of the focal length, in cells of a feature map
+_NEAREST_M = 2.0  # distance to the ground: nearer points count as this near
+
+
+class CalibrationEmbedding(nn.Module):
+    """Scales and shifts every image feature by functions of its viewing ray.
+
+    A small network sees the ray of the feature in the bev frame, the camera's position, its focal length in cells of
+    the feature map, and the depth at which the ray meets the ground. With these the model can turn the size of an
+    object in the image into a distance, for any camera. BEVDepth's camera-aware depth network and PETR's position
+    embedding of rays have the same purpose. The last layer starts at zero: an untrained embedding changes nothing.
+    """
+
+    def __init__(self, channels: int, height_m: float) -> None:
+        """height_m: height of the bev frame above the ground, metres."""
+        super().__init__()
+        self.height_m = height_m
+        self.layers = nn.Sequential(
+            nn.Linear(RAY_FEATURES, HIDDEN), nn.GELU(), nn.Linear(HIDDEN, HIDDEN), nn.GELU(),
+            nn.Linear(HIDDEN, 2 * channels),
+        )  # fmt: skip
+        last = self.layers[-1]
+        assert isinstance(last, nn.Linear)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+
+    def forward(self, image_features: FeatureMaps, image_from_bev: Tensor, image_size: tuple[int, int]) -> FeatureMaps:
+        """Scaled and shifted tokens.
+
+        Args:
+            image_features: tokens (B·N, S, C) of B·N images.
+            image_from_bev: (B, N, 4, 4) float32, bev metres to pixels of the network's input.
+            image_size: (height, width) of the network's input, pixels.
+
+        Returns:
+            Tokens of the same shape and dtype.
+        """
+        tokens = image_features.tokens
+        # In float32: half precision is too coarse for rays.
+        with torch.autocast(tokens.device.type, enabled=False):
+            rays = ray_features(image_from_bev.flatten(0, 1), image_features.level_shapes, image_size, self.height_m)
+            scale, shift = self.layers(rays).chunk(2, dim=-1)  # (B·N, S, C) each
+        return FeatureMaps((tokens * (1 + scale) + shift).to(tokens.dtype), image_features.level_shapes)
+
+
+def ray_features(
+    image_from_bev: Tensor, level_shapes: tuple[tuple[int, int], ...], image_size: tuple[int, int], height_m: float
+) -> Tensor:
+    """(K, S, RAY_FEATURES) float32: numbers of about 1 that describe the viewing rays of all cells of K images.
+
+    image_from_bev: (K, 4, 4) float32. level_shapes: (rows, columns) of each feature map, S cells in all.
+    image_size: (height, width), pixels. height_m: of the bev frame above the ground, metres.
+    """
+    matrix = image_from_bev[:, :3, :3].float()
+    rows = matrix.unbind(1)
+    # The inverse by cross products, which ONNX has.
+    columns = [torch.linalg.cross(rows[1], rows[2]), torch.linalg.cross(rows[2], rows[0])]
+    columns.append(torch.linalg.cross(rows[0], rows[1]))
+    determinant = (rows[0] * columns[0]).sum(-1)
+    bev_from_image = torch.stack(columns, dim=-1) / determinant[:, None, None]  # (K, 3, 3)
+    center = -(bev_from_image * image_from_bev[:, None, :3, 3]).sum(-1)  # (K, 3)
+    focal = torch.linalg.norm(columns[0], dim=-1).reciprocal() * determinant  # of the x axis, pixels
+    levels = []
+    for level_rows, level_columns in level_shapes:
+        pixels = _cell_centers(level_rows, level_columns, image_size).to(matrix)  # (S_l, 3)
+        rays = (bev_from_image[:, None] * pixels[:, None]).sum(-1)  # (K, S_l, 3), of depth 1 m
+        above_ground = (center[:, None, 2] + height_m).clamp(min=0.1)
+        to_ground = (-rays[..., 2] / above_ground).clamp(0, 1 / _NEAREST_M)[..., None]  # inverse depth of the ground
+        directions = rays / torch.linalg.norm(rays, dim=-1, keepdim=True)
+        cells = focal * level_columns / image_size[1]
+        of_camera = torch.cat([center / _METRES, torch.log(cells / _FOCAL)[:, None]], dim=-1)[:, None]
+        numbers = [directions, of_camera.expand(-1, len(pixels), -1), to_ground, torch.log1p(20 * to_ground)]
+        levels.append(torch.cat(numbers, dim=-1))
+    return torch.cat(levels, dim=1)
+
+
+def _cell_centers(rows: int, columns: int, image_size: tuple[int, int]) -> Tensor:
+    """(rows · columns, 3) float32 homogeneous pixels of the centres of a feature map's cells."""
+    height, width = image_size
+    v = (torch.arange(rows, dtype=torch.float32) + 0.5) * (height / rows)
+    u = (torch.arange(columns, dtype=torch.float32) + 0.5) * (width / columns)
+    vv, uu = torch.meshgrid(v, u, indexing="ij")
+    return torch.stack([uu, vv, torch.ones_like(uu)], dim=-1).flatten(0, 1)

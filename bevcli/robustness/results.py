@@ -1,0 +1,150 @@
+"""The result of a stress test: scores by condition, resilience rates, corruption errors, and the file stress.json."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bevcli.errors import InputError
+from bevcli.parsing.documents import read_json
+from bevcli.robustness.conditions import CLEAN, CORRUPTIONS, Corruption
+
+FORMAT = "bevcli-stress/1"
+
+
+@dataclass(frozen=True)
+class ConditionScores:
+    """The scores under one condition, over the classes that have ground truth.
+
+    Attributes:
+        corruption: its name, or "clean".
+        severity: "easy", "mid", "hard" or a level; "" for clean.
+        mean_ap: mAP, 0 to 1.
+        nd_score: NDS, 0 to 1.
+        errors: true-positive errors by the devkit's names; NaN where undefined.
+        class_aps: class -> AP.
+    """
+
+    corruption: str
+    severity: str
+    mean_ap: float
+    nd_score: float
+    errors: Mapping[str, float]
+    class_aps: Mapping[str, float]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The scores for JSON; undefined numbers are None."""
+        errors = {name: None if math.isnan(value) else value for name, value in self.errors.items()}
+        return {
+            "corruption": self.corruption,
+            "severity": self.severity,
+            "nd_score": self.nd_score,
+            "mean_ap": self.mean_ap,
+            "tp_errors": errors,
+            "mean_dist_aps": dict(self.class_aps),
+        }
+
+
+@dataclass(frozen=True)
+class StressResults:
+    """The scores of a model under several conditions.
+
+    Attributes:
+        header: what was tested, such as model, weights, drives, seed; for JSON.
+        scores: by condition, clean first.
+        is_complete: whether all requested conditions were run.
+    """
+
+    header: Mapping[str, Any]
+    scores: tuple[ConditionScores, ...]
+    is_complete: bool = True
+
+    @property
+    def clean(self) -> ConditionScores | None:
+        """The scores without corruption; None if they are not there yet."""
+        return next((scores for scores in self.scores if scores.corruption == CLEAN), None)
+
+    def of(self, name: str) -> dict[str, ConditionScores]:
+        """Severity -> scores of a corruption, in the order of the severities."""
+        return {scores.severity: scores for scores in self.scores if scores.corruption == name}
+
+    def tested(self) -> tuple[Corruption, ...]:
+        """The corruptions that have scores, in their order."""
+        return tuple(corruption for corruption in CORRUPTIONS if self.of(corruption.name))
+
+    def resilience(self, name: str) -> float:
+        """Resilience rate of a corruption: its mean NDS over its severities, over the NDS of clean drives."""
+        found = self.of(name).values()
+        if self.clean is None or not found or not self.clean.nd_score:
+            return math.nan
+        return sum(scores.nd_score for scores in found) / len(found) / self.clean.nd_score
+
+    def corruption_error(self, name: str, against: StressResults) -> float:
+        """Corruption error: the sum of 1 - NDS over the severities that both runs have, over that of the other run."""
+        own, other = self.of(name), against.of(name)
+        common = [severity for severity in own if severity in other]
+        below = sum(1 - other[severity].nd_score for severity in common)
+        return sum(1 - own[severity].nd_score for severity in common) / below if below else math.nan
+
+    def mean_resilience(self) -> float:
+        """mRR: the mean resilience rate of RoboBEV's corruptions that were tested; NaN without any."""
+        return _mean([self.resilience(corruption.name) for corruption in self.tested() if corruption.published])
+
+    def mean_corruption_error(self, against: StressResults) -> float:
+        """mCE: the mean corruption error of RoboBEV's corruptions that both runs have; NaN without any."""
+        return _mean(
+            [self.corruption_error(corruption.name, against) for corruption in self.tested() if corruption.published]
+        )
+
+    def to_dict(self, against: StressResults | None = None) -> dict[str, Any]:
+        """All of it for JSON; undefined numbers are None. docs/robustness.md explains the keys."""
+        names = [corruption.name for corruption in self.tested()]
+        content: dict[str, Any] = {
+            "format": FORMAT,
+            **self.header,
+            "complete": self.is_complete,
+            "conditions": [scores.to_dict() for scores in self.scores],
+            "resilience": {name: _number(self.resilience(name)) for name in names},
+            "mRR": _number(self.mean_resilience()),
+        }
+        if against is not None:
+            content["against"] = {name: against.header.get(name) for name in ("model", "weights")}
+            content["corruption_error"] = {name: _number(self.corruption_error(name, against)) for name in names}
+            content["mCE"] = _number(self.mean_corruption_error(against))
+        return content
+
+    def differences(self, other: StressResults) -> tuple[str, ...]:
+        """What else than model and weights differs between the tests, so that their scores cannot be compared."""
+        names = ("drives", "max_range_m", "seed", "lost_images")
+        return tuple(name for name in names if self.header.get(name) != other.header.get(name))
+
+
+def read_results(path: Path) -> StressResults:
+    """Reads a stress.json. Raises InputError where it is missing or wrong."""
+    content = read_json(path)
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise InputError(f'{path}: is no result of `bevcli stress` (expected "format": "{FORMAT}")')
+    try:
+        scores = tuple(map(_scores, content["conditions"]))
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f'{path}: "conditions" is wrong ({type(error).__name__}: {error})') from None
+    return StressResults(content, scores, content.get("complete") is True)
+
+
+def _scores(entry: Any) -> ConditionScores:
+    errors = {str(name): math.nan if value is None else float(value) for name, value in entry["tp_errors"].items()}
+    aps = {str(name): float(value) for name, value in entry["mean_dist_aps"].items()}
+    numbers = float(entry["mean_ap"]), float(entry["nd_score"])
+    return ConditionScores(str(entry["corruption"]), str(entry["severity"]), *numbers, errors, aps)
+
+
+def _number(value: float) -> float | None:
+    return None if math.isnan(value) else value
+
+
+def _mean(values: list[float]) -> float:
+    known = [value for value in values if not math.isnan(value)]
+    return sum(known) / len(known) if known else math.nan

@@ -1,0 +1,203 @@
+"""The map head: its attention as the released code's kernel reads it, its shapes, and the rules of its map."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from bevcli.geometry.bev_grid import BevGrid
+from bevcli.model.deformable_attention import DeformableAttention
+from bevcli.model.map_encoder import sine_position
+from bevcli.model.map_head import MapHead, MapHeadConfig, MapOutputs
+from bevcli.model.map_merging import merge_map, thing_scores
+
+SMALL = MapHeadConfig(
+    thing_queries=7,
+    max_things=9,
+    encoder_layers=2,
+    location_layers=2,
+    thing_mask_layers=1,
+    stuff_mask_layers=1,
+    attention_heads=4,
+    feed_forward_width=24,
+    mask_feed_forward_width=24,
+)
+GRID = BevGrid(5, 6, x_range_m=(-6, 6), y_range_m=(-5, 5))
+
+
+def small_head() -> MapHead:
+    """Random weights, of which none are zero."""
+    torch.manual_seed(0)
+    head = MapHead(SMALL, 16, GRID).eval()
+    with torch.no_grad():
+        for parameter in head.parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+    return head
+
+
+def test_shapes() -> None:
+    outputs = small_head()(torch.randn(2, 30, 16))
+    assert outputs.class_logits.shape == (2, 7, 3)
+    assert outputs.locations.shape == (2, 2, 7, 4)
+    assert outputs.queries.shape == outputs.labels.shape == outputs.scores.shape == (2, 9)
+    assert outputs.thing_masks.shape == (2, 9, 30)
+    assert outputs.stuff_masks.shape == (2, 1, 30)
+    assert outputs.thing_masks.min() >= 0
+
+
+def test_a_batch_of_two_equals_two_batches_of_one() -> None:
+    head, bev = small_head(), torch.randn(2, 30, 16)
+    together, alone = head(bev), head(bev[1:])
+    torch.testing.assert_close(together.thing_masks[1:], alone.thing_masks)
+    torch.testing.assert_close(together.stuff_masks[1:], alone.stuff_masks)
+
+
+def test_a_query_is_selected_for_each_of_its_best_classes() -> None:
+    outputs = small_head()(torch.randn(1, 30, 16))
+    scores = outputs.class_logits[0].sigmoid()
+    of_pairs = scores[outputs.queries[0], outputs.labels[0]]
+    torch.testing.assert_close(of_pairs, scores.flatten().sort(descending=True).values[:9])
+    torch.testing.assert_close(of_pairs, outputs.scores[0])
+
+
+def bilinear(values: np.ndarray, x: float, y: float) -> np.ndarray:
+    """A map (rows, columns, D) at x, y, 0 to 1; values outside are zero."""
+    rows, columns, _ = values.shape
+    column, row = x * columns - 0.5, y * rows - 0.5
+    found = np.zeros(values.shape[-1])
+    for r in (math.floor(row), math.floor(row) + 1):
+        for c in (math.floor(column), math.floor(column) + 1):
+            if 0 <= r < rows and 0 <= c < columns:
+                found += (1 - abs(row - r)) * (1 - abs(column - c)) * values[r, c]
+    return found
+
+
+@pytest.mark.parametrize("reference_size", [2, 4])
+@pytest.mark.parametrize("queries", [30, 8, 3])
+def test_attention_built_for_four_levels_reads_as_the_kernel_of_the_released_code(
+    queries: int, reference_size: int
+) -> None:
+    """The kernel walks two flat arrays with the strides of one level; this loop does the same index arithmetic."""
+    heads, levels, points, channels, (rows, columns) = 4, 4, 2, 8, (5, 6)
+    torch.manual_seed(1)
+    attention = DeformableAttention(channels, channels, heads, points, levels)
+    with torch.no_grad():
+        for parameter in attention.parameters():
+            parameter.add_(torch.randn_like(parameter))
+    query, cells = torch.randn(1, queries, channels), torch.randn(1, rows * columns, channels)
+    reference = torch.rand(1, queries, reference_size)
+    found = attention.attend(query, reference, cells, ((rows, columns),))
+
+    offsets = attention.sampling_offsets(query[0]).view(queries, heads, levels, points, 2)
+    weights = attention.attention_weights(query[0]).view(queries, heads, levels * points).softmax(-1)
+    place = reference[0, :, None, None, None]
+    if reference_size == 2:
+        locations = place + offsets / torch.tensor([columns, rows])
+    else:
+        locations = place[..., :2] + offsets / points * place[..., 2:] * 0.5
+    values = attention.value_projection(cells[0]).view(rows, columns, heads, -1).detach().numpy()
+    flat_locations, flat_weights = locations.detach().numpy().ravel(), weights.detach().numpy().ravel()
+    sampled = np.zeros((queries, heads, channels // heads))
+    for n in range(queries):
+        for m in range(heads):
+            start = (n * heads + m) * 1 * points  # the number of levels in the list of maps is 1
+            for p in range(points):
+                x, y = flat_locations[2 * (start + p) : 2 * (start + p) + 2]
+                sampled[n, m] += flat_weights[start + p] * bilinear(values[:, :, m], x, y)
+    expected = attention.output_projection(torch.from_numpy(sampled.reshape(1, queries, -1)).float())
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-5)
+
+
+def test_the_position_embedding_is_that_of_the_row_and_then_that_of_the_column() -> None:
+    position = sine_position(4, 3, 8).view(4, 3, 8)
+    y, x = (2.5 / 4) * 2 * math.pi, (0.5 / 3) * 2 * math.pi
+    expected = [math.sin(y), math.cos(y), math.sin(y / 100), math.cos(y / 100)]
+    expected += [math.sin(x), math.cos(x), math.sin(x / 100), math.cos(x / 100)]
+    assert position[2, 0].tolist() == pytest.approx(expected, abs=1e-5)
+
+
+def outputs_of(*things: tuple[int, float, list[float]], stuff: list[float] | None = None) -> MapOutputs:
+    """Outputs on a grid of one row. things: class, class score and mask, by falling score."""
+    labels, scores, masks = (torch.tensor([list(part)]) for part in zip(*things, strict=True))
+    road = torch.zeros(1, 1, masks.shape[-1]) if stuff is None else torch.tensor([[stuff]])
+    return MapOutputs(torch.zeros(1), torch.zeros(1), labels, labels, scores, masks, road)
+
+
+def layers(outputs: MapOutputs, cells: int) -> list[list[list[int]]]:
+    """(classes, 1, cells) of the things in the merged map."""
+    merged = merge_map(outputs, SMALL, BevGrid(1, cells))[0]
+    return merged.things.astype(int).tolist()
+
+
+DIVIDER, CROSSING, CONTOUR = 0, 1, 2
+ON, OFF = 1.2, 0.4  # a cell belongs to a mask above 0.5
+
+
+def test_a_thing_score_falls_with_the_mean_of_its_mask() -> None:
+    masks = torch.tensor([[0.9, 0.7, 0.2], [0.0, 0.1, 0.2]])
+    scores = thing_scores(masks, torch.tensor([0.5, 0.5]), min_mask=0.5)
+    assert scores.tolist() == pytest.approx([0.5 * (1.6 / 3) ** 2, 0])  # the denominator is the number of cells plus 1
+
+
+def test_things_get_the_cells_that_better_things_leave() -> None:
+    outputs = outputs_of((CONTOUR, 0.9, [ON, ON, ON, OFF, OFF]), (CROSSING, 0.8, [OFF, OFF, ON, ON, ON]))
+    assert layers(outputs, 5) == [[[0, 0, 0, 0, 0]], [[0, 0, 0, 1, 1]], [[1, 1, 1, 0, 0]]]
+
+
+def test_a_thing_that_is_covered_too_much_is_left_out() -> None:
+    outputs = outputs_of((CONTOUR, 0.9, [ON, ON, ON, OFF]), (CROSSING, 0.8, [OFF, ON, ON, ON]))
+    assert layers(outputs, 4) == [[[0, 0, 0, 0]], [[0, 0, 0, 0]], [[1, 1, 1, 0]]]
+
+
+def test_dividers_take_no_cells_from_others() -> None:
+    outputs = outputs_of((DIVIDER, 0.9, [ON, ON, ON, OFF]), (CROSSING, 0.8, [OFF, ON, ON, ON]))
+    merged = merge_map(outputs, SMALL, BevGrid(1, 4))[0]
+    assert merged.things.astype(int).tolist() == [[[1, 1, 1, 0]], [[0, 1, 1, 1]], [[0, 0, 0, 0]]]
+    assert merged.instances.tolist() == [[1, 2, 2, 2]]
+    assert merged.instance_labels == (DIVIDER, CROSSING)
+
+
+def test_improbable_things_are_left_out() -> None:
+    outputs = outputs_of((CONTOUR, 0.3, [ON, ON, OFF]), (CROSSING, 0.1, [OFF, OFF, ON]))
+    assert layers(outputs, 3)[CROSSING] == [[0, 0, 0]]  # 0.1 · (1.2 / 2)² < 0.1
+    assert layers(outputs, 3)[CONTOUR] == [[1, 1, 0]]  # 0.3 · (2.4 / 3)² > 0.1
+
+
+def test_a_map_has_stuff_below_things_and_its_first_row_ahead() -> None:
+    grid = BevGrid(3, 2, x_range_m=(-1, 1), y_range_m=(-1.5, 1.5))
+    crossing = [OFF, OFF, OFF, OFF, ON, OFF]  # the first cell of the row that is furthest ahead
+    outputs = outputs_of((CROSSING, 0.9, crossing), stuff=[ON, ON, OFF, OFF, ON, ON])
+    bev_map = merge_map(outputs, SMALL, grid)[0].bev_map(grid, SMALL)
+    assert bev_map.classes == {"drivable_area": 1, "divider": 2, "pedestrian_crossing": 4, "contour": 8}
+    # By 0.94 m further back: the next row.
+    assert bev_map.layer("pedestrian_crossing").tolist() == [[False, False], [True, False], [False, False]]
+    assert bev_map.layer("drivable_area").tolist() == [[True, True], [False, False], [True, True]]
+    assert (bev_map.x_range_m, bev_map.y_range_m) == ((-1, 1), (-1.5, 1.5))
+
+
+@pytest.mark.parametrize(("offset", "column"), [((0.0, 0.0), 2), ((1.2, 0.0), 3), ((-2.0, 0.0), 0), ((9.0, 0.0), None)])
+def test_things_are_moved_by_whole_cells(offset: tuple[float, float], column: int | None) -> None:
+    grid = BevGrid(1, 4, x_range_m=(-2, 2), y_range_m=(-0.5, 0.5))
+    config = MapHeadConfig(thing_offset_m=offset)
+    merged = merge_map(outputs_of((CONTOUR, 0.9, [OFF, OFF, ON, OFF])), config, grid)[0]
+    found = np.flatnonzero(merged.bev_map(grid, config).layer("contour")).tolist()
+    assert found == ([] if column is None else [column])
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"things": ()},
+        {"stuff": ("road", "road")},
+        {"things": tuple("abcdefgh")},
+        {"max_things": 1000},
+        {"attention_levels": 0},
+        {"encoder_layers": 0},
+    ],
+)
+def test_a_wrong_configuration_is_an_error(wrong: dict) -> None:
+    with pytest.raises(ValueError, match=r"must|need"):
+        MapHeadConfig(**wrong)

@@ -1,0 +1,161 @@
+"""UniAD's first stage equals the released code (float32, CPU).
+
+golden_uniad_tracks.npz in tests/data holds a part of the original tracker's numbers over 19 frames with given BEV maps:
+births, misses, deaths, full memories and a scene change. The full numbers, and those of the whole model over four
+frames, are in the folder golden/ of BEVCLI_SHARED.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import original_reference as original
+import pytest
+import torch
+import uniad_reference as reference
+from uniad_rule import rule_bev
+
+from bevcli.geometry.transforms import Array, inverse, rigid, rotation_from_quaternion
+from bevcli.model.map_merging import merge_map
+from bevcli.model.prepared import prepare_for_inference
+from bevcli.model.track_boxes import decode_tracks
+from bevcli.model.track_queries import FrameMotion, TrackQueries
+from bevcli.model.uniad import UniAD, UniADOutputs
+
+KEPT = np.load(original.DATA / "golden_uniad_tracks.npz")
+
+
+def tracked(model: UniAD) -> Iterator[UniADOutputs]:
+    """The outputs of the tracker for each frame of the track-only sequence."""
+    tracks = motion = None
+    for frame, scene in enumerate(reference.SCENES):
+        if tracks is not None and scene != reference.SCENES[frame - 1]:
+            tracks = tracks.ended()
+        elif frame:
+            moved = inverse(reference.world_from_bev(frame)) @ reference.world_from_bev(frame - 1)
+            seconds = reference.SECONDS[frame] - reference.SECONDS[frame - 1]
+            motion = FrameMotion(torch.from_numpy(moved).float(), seconds)
+        with torch.inference_mode():
+            outputs = model.track(rule_bev(frame), tracks, motion)
+        tracks = outputs.tracks
+        yield outputs
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_tracks_equal_the_originals_over_19_frames() -> None:
+    model = reference.rule_tracker()
+    for frame, outputs in enumerate(tracked(model)):
+        expected = {key.partition("_")[2]: KEPT[key] for key in KEPT.files if key.startswith(f"t{frame}_")}
+        check_identities(outputs, expected)
+        check_boxes(model, outputs, expected)
+        tracks, queries = outputs.tracks, torch.cat([outputs.tracks.position, outputs.tracks.content], dim=-1)
+        assert np.array_equal(np.packbits(tracks.memories.is_empty.numpy()), expected["mem_pad"])
+        assert np.array_equal(tracks.memories.wait, expected["save_period"])
+        np.testing.assert_allclose(queries[:, ::128], expected["next_query_sub"], atol=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_every_part_of_the_tracker_equals_the_originals(shared: Path) -> None:
+    arrays = np.load(shared / "golden/golden_uniad_track_only.npz")
+    for frame, outputs in enumerate(tracked(reference.rule_tracker())):
+        expected = {key.partition("_")[2]: arrays[key] for key in arrays.files if key.startswith(f"t{frame}_")}
+        count = int(expected["n_query"])
+        rows = [*range(0, 901, 9), *range(901, count)]
+        close(outputs.class_logits[-1, 0, rows], expected["all_cls_scores_sub"], 1e-3)
+        check_codes(outputs.box_codes[-1, 0, rows], expected["all_bbox_preds_sub"])
+        close(outputs.scores, expected["scores"], 1e-4)
+        memories = outputs.tracks.memories
+        close(memories.embeddings[:, :, ::32], expected["mem_bank_sub"], 1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize(("first_frame", "prefixes"), [("original", "f0 f1 f2 f3"), ("zero", "z0 z1")])
+def test_the_whole_model_equals_the_original(shared: Path, first_frame: str, prefixes: str) -> None:
+    """Over three frames of a scene and one of another; with motion on first frames as in the original, and without."""
+    arrays = np.load(shared / "golden/golden_uniad_stage1.npz")
+    plain = reference.rule_uniad(first_frame)
+    model = prepare_for_inference(plain, torch.device("cpu"))
+    assert isinstance(model, UniAD)
+    history: torch.Tensor | None = None
+    tracks: TrackQueries | None = None
+    for frame, prefix in enumerate(prefixes.split()):
+        expected = {key.partition("_")[2]: arrays[key] for key in arrays.files if key.startswith(f"{prefix}_")}
+        motion = None
+        if frame == 3:  # another scene
+            assert tracks is not None
+            history, tracks = None, tracks.ended()
+        elif frame:
+            moved = inverse(world_from_bev(frame)) @ world_from_bev(frame - 1)
+            motion = FrameMotion(torch.from_numpy(moved).float(), float(expected["time_delta"][0]))
+        inputs = original.inputs(frame, plain.config, all_frames=first_frame == "original")
+        close(inputs.can_bus[0], expected["can_bus_in"].astype(np.float32), 1e-4)
+        close(inputs.shift, expected["shift"], 1e-5)
+        with torch.inference_mode():
+            outputs = model(inputs, history, tracks, motion)
+        rows = 37 if prefix.startswith("f") else 148
+        close(outputs.bev[0, ::rows], expected["bev_embed_sub"], 1e-3)
+        close(outputs.class_logits[-1, 0], expected["all_cls_scores"], 1e-3)
+        check_codes(outputs.box_codes[-1, 0], expected["all_bbox_preds"])
+        check_identities(outputs, expected)
+        check_boxes(plain, outputs, expected)
+        check_map(plain, outputs, expected)
+        history, tracks = outputs.bev, outputs.tracks
+
+
+def world_from_bev(frame: int) -> Array:
+    """(4, 4) of one of the four frames."""
+    info = original.frames()[frame]
+    ego_from_bev = rigid(info["lidar2ego_translation"], rotation_from_quaternion(info["lidar2ego_rotation"]))
+    return original.pose(frame).matrix @ ego_from_bev
+
+
+def check_identities(outputs: UniADOutputs, expected: Mapping[str, Any]) -> None:
+    assert np.array_equal(outputs.ids, expected["obj_idxes"])
+    assert np.array_equal(outputs.tracks.misses, expected["disappear_time"][expected["obj_idxes"] >= 0])
+
+
+def check_boxes(model: UniAD, outputs: UniADOutputs, expected: Mapping[str, Any]) -> None:
+    boxes = decode_tracks(outputs, model.config)
+    np.testing.assert_allclose(boxes.scores, expected["scores_3d_det"], atol=1e-4)
+    assert boxes.instances is not None
+    row_of = {name: row for row, name in enumerate(boxes.instances) if name}
+    assert row_of.keys() == {str(name) for name in expected["track_ids"]}
+    boxes, original_boxes = boxes[[row_of[str(name)] for name in expected["track_ids"]]], expected["boxes_3d"]
+    assert np.array_equal(boxes.classes, np.array(model.config.classes)[expected["labels_3d"]])
+    np.testing.assert_allclose(boxes.scores, expected["scores_3d"], atol=1e-4)
+    bottoms = boxes.centers - boxes.sizes_lwh * (0, 0, 0.5)
+    np.testing.assert_allclose(bottoms, original_boxes[:, :3], atol=1e-2)
+    np.testing.assert_allclose(boxes.sizes_lwh[:, [1, 0, 2]], original_boxes[:, 3:6], rtol=1e-3, atol=1e-2)
+    turned = boxes.yaws - (-original_boxes[:, 6] - np.pi / 2)  # the original measures clockwise from -y
+    np.testing.assert_allclose(np.sin(turned), 0, atol=1e-2)
+    assert (np.cos(turned) > 0).all()
+    np.testing.assert_allclose(boxes.velocities, original_boxes[:, 7:], atol=1e-2)
+
+
+def check_codes(found: torch.Tensor, expected: np.ndarray) -> None:
+    np.testing.assert_allclose(found, expected, atol=1e-2, rtol=0)
+
+
+def check_map(model: UniAD, outputs: UniADOutputs, expected: Mapping[str, Any]) -> None:
+    config, found = model.config, outputs.map
+    assert found is not None
+    close(found.class_logits[0], expected["seg_cls"], 1e-3)
+    close(found.locations[-1, 0], expected["seg_box"], 1e-4)
+    merged = merge_map(found, config.map_head, config.bev_grid)[0]
+    cells = (config.bev_grid.rows, config.bev_grid.columns)
+    lanes = np.unpackbits(expected["lane_bits"])[: 3 * merged.things[0].size].reshape(3, *cells)
+    drivable = np.unpackbits(expected["drivable_bits"])[: merged.stuff[0].size].reshape(cells)
+    # A few cells of the original's masks are within 1e-5 of the threshold.
+    assert (merged.things != lanes).sum() <= 20
+    assert (merged.stuff[0] != drivable).sum() <= 3
+    assert np.array_equal(merged.instances, expected["id_map"]) or (merged.instances != expected["id_map"]).sum() <= 20
+
+
+def close(found: torch.Tensor, expected: np.ndarray, tolerance: float) -> None:
+    np.testing.assert_allclose(found.numpy(), expected.reshape(found.shape), atol=tolerance, rtol=0)

@@ -1,0 +1,181 @@
+"""Sequences with lost images, wrong calibration, wrong times, lost ego-motion, and lower rates."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from memory_drive import MemorySequence
+
+from bevcli.frame import Frame
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.ego_motion import Kinematics
+from bevcli.geometry.transforms import Pose, inverse
+from bevcli.robustness.calibration_noise import CalibrationNoise, camera_pose_noise
+from bevcli.robustness.draws import Draws
+from bevcli.robustness.ego_motion_faults import EgoMotionLost, TimeOffsets, motion_during
+from bevcli.robustness.lost_images import CameraCrash, FrameLost
+from bevcli.robustness.sequences import FrameStore, KeptFrames, at_lower_rate, split_scenes
+
+DRAWS = Draws(0, "test")
+
+
+class WithTruth(MemorySequence):
+    """The noise drive with a parked car, in the world frame; counts how often a frame is read."""
+
+    loads = 0
+
+    def load(self, place: int) -> Frame:
+        self.loads += 1
+        car = Boxes3D(
+            np.array([[9.0, 2.0, 0.8]]),
+            np.array([[4.5, 2, 1.6]]),
+            np.array([0.3]),
+            np.array([[0.4, 0.1]]),
+            np.array(["car"]),
+        )
+        return replace(super().load(place), ground_truth=car)
+
+
+def lost_cameras(frame: Frame) -> set[str]:
+    return {name for name, image in frame.images.items() if not image.pixels_bgr.any()}
+
+
+def test_a_crashed_camera_is_black_in_every_frame_and_crashes_at_harder_levels_too():
+    drive = MemorySequence(3)
+    lost = {}
+    for level in (2, 4, 5):
+        frames = [CameraCrash(drive, level, DRAWS, "black").load(place) for place in range(3)]
+        each = [lost_cameras(frame) for frame in frames]
+        assert each[0] == each[1] == each[2]
+        assert 1 <= len(each[0]) <= level
+        assert all(set(frame.images) == set(drive.rig.names) for frame in frames)
+        lost[level] = each[0]
+    assert lost[2] <= lost[4] <= lost[5]
+
+
+def test_cameras_crash_with_replacement_so_that_some_scenes_lose_fewer():
+    drive = MemorySequence(1)
+    counts = {len(CameraCrash(drive, 2, Draws(seed, "test"), "black").lost(drive.load(0))) for seed in range(30)}
+    assert counts == {1, 2}
+
+
+def test_a_missing_image_is_left_out_and_reported():
+    drive = MemorySequence(1)
+    black, missing = (CameraCrash(drive, 4, DRAWS, kind).load(0) for kind in ("black", "missing"))
+    assert set(missing.dropped) == lost_cameras(black) == set(drive.rig.names) - set(missing.images)
+
+
+@pytest.mark.parametrize("level", [2, 4, 5])
+def test_frame_lost_loses_a_share_of_level_sixths(level):
+    drive = MemorySequence(1)
+    frame, sequence = drive.load(0), FrameLost(drive, level, DRAWS, "black")
+    frames = [replace(frame, stamp=replace(frame.stamp, index=index)) for index in range(400)]
+    lost = sum(len(sequence.lost(each)) for each in frames)
+    assert lost / 2400 == pytest.approx(level / 6, abs=0.03)
+
+
+def test_calibration_noise_has_the_stated_spread_per_axis():
+    level = 4
+    noise = [camera_pose_noise(level, Draws(seed, "test").generator()) for seed in range(2000)]
+    translations = np.array([each[:3, 3] for each in noise])
+    # For small angles, the rotation about each axis is in the skew-symmetric part.
+    skew = np.array([(each[:3, :3] - each[:3, :3].T) / 2 for each in noise])
+    angles_deg = np.degrees(np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=-1))
+    assert translations.std(axis=0) == pytest.approx(0.20, rel=0.06)
+    assert angles_deg.var(axis=0) == pytest.approx(4.0, rel=0.1)
+
+
+def test_calibration_noise_is_one_wrong_rig_per_scene_and_leaves_all_else():
+    drive = MemorySequence(4, scenes="aabb")
+    noisy = CalibrationNoise(drive, 2, DRAWS)
+    frames = [noisy.load(place) for place in range(4)]
+    assert frames[0].rig is frames[1].rig  # so that maps of the lens are made once
+    poses = [frame.rig["CAM_FRONT"].ego_from_camera for frame in frames]
+    assert np.array_equal(poses[2], poses[3])
+    assert not np.allclose(poses[1], poses[2], atol=1e-4)
+    clean = drive.load(0)
+    assert np.array_equal(frames[0].rig.ego_from_bev, clean.rig.ego_from_bev)
+    assert np.array_equal(frames[0].images["CAM_BACK"].pixels_bgr, clean.images["CAM_BACK"].pixels_bgr)
+    assert np.array_equal(frames[0].rig["CAM_BACK"].intrinsics, clean.rig["CAM_BACK"].intrinsics)
+
+
+def test_a_wrong_capture_time_moves_the_camera_along_the_vehicles_path():
+    drive = MemorySequence(2)
+    clean, wrong = drive.load(1), TimeOffsets(drive, 200, DRAWS).load(1)
+    offsets = {name: wrong.images[name].timestamp_ns - clean.images[name].timestamp_ns for name in drive.rig.names}
+    assert len(set(offsets.values())) == 6
+    assert max(map(abs, offsets.values())) <= 200_000_000
+    for name, offset_ns in offsets.items():
+        moved = inverse(clean.world_from_ego.matrix) @ wrong.world_from_ego_at[name].matrix
+        assert moved[0, 3] == pytest.approx(6.0 * offset_ns / 1e9, abs=0.01)  # the drive has 6 m/s and 0.1 rad/s
+        assert np.arctan2(moved[1, 0], moved[0, 0]) == pytest.approx(0.1 * offset_ns / 1e9, abs=1e-6)
+    assert wrong.world_from_ego is clean.world_from_ego or np.array_equal(
+        wrong.world_from_ego.matrix, clean.world_from_ego.matrix
+    )
+
+
+def test_the_motion_during_a_time_is_that_of_many_short_steps():
+    kinematics = Kinematics(np.zeros(3), np.array([0.02, -0.05, 0.6]), np.array([8.0, 0.3, 0.1]))
+    steps = np.eye(4)
+    for _ in range(1000):
+        steps = steps @ motion_during(0.2 / 1000, kinematics)
+    whole = motion_during(0.2, kinematics)
+    assert np.abs(whole - steps).max() < 0.003
+    assert np.allclose(whole @ motion_during(-0.2, kinematics), np.eye(4), atol=0.003)
+
+
+def test_a_lost_pose_is_the_last_one_that_arrived_and_the_truth_stays_around_the_vehicle():
+    drive = WithTruth(10)
+    stale = EgoMotionLost(drive, 4, DRAWS)
+    clean, frames = [drive.load(place) for place in range(10)], [stale.load(place) for place in range(10)]
+    poses = [frame.world_from_ego for frame in frames]
+    assert np.array_equal(poses[0].matrix, clean[0].world_from_ego.matrix)
+    held = 0
+    for place in range(1, 10):
+        own, last = clean[place].world_from_ego.matrix, poses[place - 1].matrix
+        arrived = np.array_equal(poses[place].matrix, own)
+        assert arrived or np.array_equal(poses[place].matrix, last)
+        held += not arrived
+        truths = [_in_ego(frame) for frame in (clean[place], frames[place])]
+        assert truths[0] == pytest.approx(truths[1], abs=1e-9)
+    assert 3 <= held <= 9
+    backwards = [EgoMotionLost(drive, 4, DRAWS).load(place).world_from_ego.matrix for place in range(10)]
+    assert np.array_equal([pose.matrix for pose in poses], backwards)
+
+
+def _in_ego(frame: Frame) -> np.ndarray:
+    assert frame.ground_truth is not None
+    return frame.ground_truth.transformed(inverse(frame.world_from_ego.matrix)).to_numpy()
+
+
+def test_the_first_frame_of_a_scene_keeps_its_pose():
+    drive = MemorySequence(10, scenes="ababababab")
+    stale = EgoMotionLost(drive, 5, DRAWS)
+    for place in range(10):
+        assert np.array_equal(stale.load(place).world_from_ego.matrix, drive.pose(place).matrix)
+
+
+@pytest.mark.parametrize("step", [2, 3, 4])
+def test_a_lower_rate_has_every_frame_once(step):
+    parts = at_lower_rate(MemorySequence(9), step)
+    indices = [[stamp.index for stamp in part.stamps] for part in parts]
+    assert sorted(index for part in indices for index in part) == list(range(9))
+    assert all(later - earlier == step for part in indices for earlier, later in pairwise(part))
+
+
+def test_kept_frames_are_read_once_while_the_memory_lasts():
+    drive = WithTruth(3)
+    frame_bytes = sum(image.pixels_bgr.nbytes for image in drive.load(0).images.values())
+    drive.loads = 0
+    kept = KeptFrames(drive, FrameStore(limit=2 * frame_bytes))
+    for _ in range(3):
+        for place in range(3):
+            kept.load(place)
+    assert drive.loads == 2 + 3
+    assert isinstance(kept.load(0).world_from_ego, Pose)
+
+
+def test_scenes_are_run_one_by_one():
+    scenes = split_scenes(MemorySequence(5, scenes="aabbb"))
+    assert [[stamp.scene for stamp in scene.stamps] for scene in scenes] == [["a", "a"], ["b", "b", "b"]]

@@ -1,0 +1,127 @@
+"""Rigs drawn at random, and cameras that take their images at different times."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bevcli.frame import Sequence
+from bevcli.geometry.transforms import apply, inverse
+from bevcli.sequences.open import open_sequence
+from bevcli.synth.assets.catalog import Assets
+from bevcli.synth.drive import RenderedDrive
+from bevcli.synth.export import export_drive
+from bevcli.synth.random_rig import RigDistribution, draw_rig
+from bevcli.synth.rig import nuscenes_like_rig, rig_for_rendering
+
+SIZE = (512, 288)
+RANDOM = RigDistribution(random_share=1.0)
+
+
+def fov_deg(camera):
+    return np.degrees(2 * np.arctan(camera.width / 2 / camera.intrinsics[0, 0]))
+
+
+def test_rigs_lie_in_the_ranges_of_the_distribution():
+    rigs = [draw_rig(RANDOM, seed, SIZE).rig for seed in range(60)]
+    assert {len(rig.cameras) for rig in rigs} == {4, 5, 6, 7, 8}
+    cameras = [camera for rig in rigs for camera in rig.cameras]
+    assert all(camera.width <= 512 and camera.height <= 288 for camera in cameras)
+    assert all(44.9 <= fov_deg(camera) <= 110.1 for camera in cameras)
+    heights = [camera.ego_from_camera[2, 3] for camera in cameras]
+    assert 0.8 <= min(heights) < 1.0
+    assert 2.6 < max(heights) <= 2.8
+    pitches = [np.degrees(np.arcsin(camera.ego_from_camera[2, 2])) for camera in cameras]
+    assert 2.5 < np.abs(pitches).max() <= 3.01
+    tilts = [np.degrees(np.arccos(rig.ego_from_bev[2, 2])) for rig in rigs]
+    assert 1.5 < max(tilts) <= 2.84  # 2 degrees about two axes
+    assert any(camera.distortion for camera in cameras)
+
+
+def test_every_rig_can_be_rendered():
+    """The renderer refuses lenses that see too much."""
+    lenses = RigDistribution(random_share=1.0, distorted_share=1.0)
+    for seed in range(30):
+        rig_for_rendering(draw_rig(lenses, seed, (64, 36)).rig, None)
+
+
+def test_a_rig_that_looks_all_around_leaves_no_gap_between_its_cameras():
+    level = RigDistribution(random_share=1.0, front_share=0.0, yaw_jitter_deg=0.0, fov_spread=0.0)
+    for seed in range(50):
+        rig = draw_rig(level, seed, SIZE).rig
+        assert sum(fov_deg(camera) for camera in rig.cameras) >= 359.9
+
+
+def test_the_same_seed_draws_the_same_rig():
+    first, again = (draw_rig(RANDOM, 5, SIZE) for _ in range(2))
+    assert [c.intrinsics.tolist() for c in first.rig.cameras] == [c.intrinsics.tolist() for c in again.rig.cameras]
+    assert (first.delays_s, first.jpeg_quality) == (again.delays_s, again.jpeg_quality)
+
+
+def test_the_share_of_random_rigs_is_as_asked_for():
+    half = RigDistribution(random_share=0.5)
+    own = [draw_rig(half, seed, SIZE).rig.names == nuscenes_like_rig().names for seed in range(300)]
+    assert 0.4 < np.mean(own) < 0.6
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"random_share": 1.5}, "random_share is a probability"),
+        ({"fov_deg": (90.0, 60.0)}, "fov_deg goes from a smaller to a larger"),
+        ({"cameras": (0, 3)}, "cameras must be from 1 to 16"),
+        ({"delay_s": 1.0}, "delay_s must be from 0 to 0.1"),
+    ],
+)
+def test_a_wrong_distribution_is_rejected(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        RigDistribution(**wrong)
+
+
+@pytest.fixture(scope="module")
+def delayed(tmp_path_factory: pytest.TempPathFactory, assets: Assets) -> tuple[RenderedDrive, Sequence]:
+    """A drive whose left front camera takes its images 50 ms late."""
+    folder = tmp_path_factory.mktemp("delayed") / "drive"
+    delays = {"CAM_FRONT_LEFT": 0.05}
+    drive = RenderedDrive(5, frames=2, rig=nuscenes_like_rig(160, 90), assets=assets, camera_delays_s=delays)
+    export_drive(drive, folder)
+    return drive, open_sequence(folder)
+
+
+def test_a_late_camera_has_its_own_time_and_pose(delayed: tuple[RenderedDrive, Sequence]):
+    drive, sequence = delayed
+    frame = sequence.load(1)
+    assert frame.images["CAM_FRONT_LEFT"].timestamp_ns - frame.stamp.timestamp_ns == 50_000_000
+    assert frame.images["CAM_FRONT"].timestamp_ns == frame.stamp.timestamp_ns
+    expected = drive.world_from_ego(0.55)
+    np.testing.assert_allclose(frame.world_from_ego_at["CAM_FRONT_LEFT"].translation, expected.translation, atol=2e-3)
+
+
+def test_a_late_camera_sees_objects_where_they_are_then(delayed: tuple[RenderedDrive, Sequence]):
+    drive, _ = delayed
+    rendered = drive.frame(1)
+    camera, boxes = drive.rig["CAM_FRONT_LEFT"], rendered.boxes
+    view = rendered.views["CAM_FRONT_LEFT"]
+    # Pixels of an object lie around its projected centre at the time of the image.
+    states = drive.states(1)
+    pose = rendered.world_from_ego_at["CAM_FRONT_LEFT"]
+    compared = 0
+    for index, state in enumerate(states):
+        rows, columns = np.nonzero(view.objects == index)
+        near = boxes.instances == state.body.instance
+        if len(rows) < 8 or not near.any() or view.visible[index] < 0.9 * view.unoccluded[index]:
+            continue
+        center = boxes.centers[near][0] + [*(boxes.velocities[near][0] * 0.05), 0]
+        (u, v), _ = camera.project(apply(camera.camera_from_ego @ inverse(pose.matrix), center))
+        inside = columns.min() > 1 and columns.max() < camera.width - 2
+        if inside:
+            assert (columns.mean(), rows.mean()) == pytest.approx((u, v), abs=0.3 * np.ptp(columns) + 2)
+            compared += 1
+    assert compared
+
+
+def test_the_other_cameras_of_a_drive_with_a_late_one_are_unchanged(delayed, assets: Assets):
+    drive, _ = delayed
+    usual = RenderedDrive(5, frames=2, rig=nuscenes_like_rig(160, 90), assets=assets)
+    np.testing.assert_array_equal(drive.frame(1).images["CAM_BACK"], usual.frame(1).images["CAM_BACK"])
+    assert (drive.frame(1).images["CAM_FRONT_LEFT"] != usual.frame(1).images["CAM_FRONT_LEFT"]).any()

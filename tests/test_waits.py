@@ -1,0 +1,88 @@
+"""Nothing in bevcli waits for ever: each call that can wait has a time limit, or stands here with its reason."""
+
+import ast
+from pathlib import Path
+
+import bevcli
+
+ROOT = Path(bevcli.__file__).parent
+# Calls that wait without a limit, by file.
+ALLOWED = {
+    ("cli/viz.py", "process.wait"): "until the user closes the viewer's window",
+    ("viewer/web.py", "self._server.serve_forever"): "until Ctrl-C, or `close`",
+    ("recording/rrd_file.py", "select.select"): "in a daemon thread, until rerun writes or closes the pipe",
+    ("pipeline/preprocess.py", "ThreadPoolExecutor"): "the tasks only compute",
+    ("pipeline/preprocess.py", "task.result"): "the task is done",
+    ("model/kernels/compiled.py", "ThreadPoolExecutor"): "the tasks only compute",
+    ("model/kernels/compiled.py", "future.result"): "the tasks only compute",
+    ("synth/drive.py", "ThreadPoolExecutor"): "the tasks only compute",
+}
+# Methods that wait: name -> the number of arguments without a limit, and the keywords that limit it.
+METHODS = {
+    "join": (0, ("timeout",)),
+    "wait": (0, ("timeout",)),
+    "result": (0, ("timeout",)),
+    "acquire": (0, ("timeout", "blocking")),
+    "communicate": (1, ("timeout",)),
+    "get": (0, ("timeout", "block")),
+    "recv": (0, ()),
+    "accept": (0, ()),
+    "wait_for": (1, ("timeout",)),
+    "serve_forever": (9, ()),
+    "select": (3, ("timeout",)),
+}
+# Functions that wait: the keyword that limits them.
+FUNCTIONS = {
+    "subprocess.run": "timeout",
+    "subprocess.call": "timeout",
+    "subprocess.check_call": "timeout",
+    "subprocess.check_output": "timeout",
+    "urllib.request.urlopen": "timeout",
+    "urlopen": "timeout",
+    "socket.create_connection": "timeout",
+    "sqlite3.connect": "timeout",
+    "os.system": "",
+    "os.wait": "",
+    "os.waitpid": "",
+    "input": "",
+}
+
+
+def waits(tree: ast.AST) -> set[str]:
+    """The calls of a module that can wait without a limit."""
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.With):  # the end of the block waits for all tasks
+            found |= {
+                ast.unparse(item.context_expr.func)
+                for item in node.items
+                if isinstance(item.context_expr, ast.Call)
+                and ast.unparse(item.context_expr.func).endswith("PoolExecutor")
+            }
+        if not isinstance(node, ast.Call):
+            continue
+        name, keywords = ast.unparse(node.func), {keyword.arg for keyword in node.keywords}
+        limit = FUNCTIONS.get(name)
+        if limit is not None and limit not in keywords:
+            found.add(name)
+        if isinstance(node.func, ast.Attribute) and node.func.attr in METHODS:
+            most, limits = METHODS[node.func.attr]
+            if len(node.args) <= most and not keywords & set(limits):
+                found.add(name)
+    return found
+
+
+def test_every_wait_has_a_limit_or_a_reason():
+    found = {
+        (path.relative_to(ROOT).as_posix(), name)
+        for path in ROOT.rglob("*.py")
+        for name in waits(ast.parse(path.read_text()))
+    }
+    assert found == set(ALLOWED)
+
+
+def test_waits_without_a_limit_are_seen():
+    text = "thread.join()\nthread.join(3)\nfuture.result()\nsubprocess.run(x, check=True)\nlock.acquire(timeout=1)\n"
+    text += "', '.join(names)\nprocess.communicate(data)\nwith ThreadPoolExecutor(2) as pool:\n    pass\n"
+    expected = {"thread.join", "future.result", "subprocess.run", "process.communicate", "ThreadPoolExecutor"}
+    assert waits(ast.parse(text)) == expected
