@@ -2,6 +2,7 @@
 # make test       the fast tests; make test-all: all tests
 # make fuzz       6,450 broken files of every format, up to ten minutes
 # make check      lint and types; make format: fix what ruff can fix
+# make gpu-check  check bevcli on a GPU, and write gpu-report.md to paste into an issue; DEVICE=cuda:1 or DEVICE=mps
 # make bench      measure this machine and rewrite the table of docs/speed.md; nothing else should run meanwhile
 VENV := .venv
 BIN := $(VENV)/bin
@@ -12,7 +13,7 @@ ifneq ($(wildcard ../shared),)
 export BEVCLI_SHARED ?= $(abspath ../shared)
 endif
 
-.PHONY: install demo test test-all fuzz check format bench clean
+.PHONY: install demo test test-all fuzz check format bench gpu-check clean
 
 install: $(INSTALLED)
 
@@ -37,6 +38,9 @@ $(VENV)/.viewers: $(INSTALLED)
 
 bench: $(INSTALLED)
 	$(BIN)/bevcli bench --table docs/speed.md
+
+gpu-check: $(INSTALLED)
+	$(BIN)/python -m bevcli.benchmark.gpu_check --device $(or $(DEVICE),auto)
 
 fuzz: $(INSTALLED)
 	BEVCLI_FUZZ_CASES=$${BEVCLI_FUZZ_CASES:-150} $(BIN)/pytest tests/fuzz

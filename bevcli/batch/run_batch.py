@@ -150,7 +150,7 @@ def _check_folder(out: Storage, resume: bool) -> None:
     found = out.names("") - {".bevcli"}
     if found and not is_batch:
         raise OutputError(f"{out.where}: is not a batch and not empty: pass --out DIR for another folder")
-    if is_batch and not resume:
+    if is_batch and not resume and (out.names(RESULTS) or out.names(FAILED)):
         raise OutputError(f"{out.where}: has a batch already: pass --resume to go on with it, or --out DIR")
 
 

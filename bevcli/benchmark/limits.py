@@ -61,6 +61,8 @@ def wait_for(device: torch.device) -> None:
     """Returns when a GPU has finished all queued work; at once on a CPU."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
+    if device.type == "mps":
+        torch.mps.synchronize()
 
 
 def count_operations(config: BEVFormerConfig, hits_per_camera: tuple[int, ...]) -> float:

@@ -27,6 +27,7 @@ from bevcli.model.bevformer_v2 import BEVFormerV2Config
 from bevcli.model.prepared import Precision, prepare_for_inference
 from bevcli.pipeline.model_loading import Model
 from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
+from bevcli.pipeline.write_behind import write_behind
 from bevcli.recording.writer import Recording
 
 WARM_UP_FRAMES = 2  # one without and one with history
@@ -132,8 +133,8 @@ def _time_run(fast: Version, drive: MadeUpDrive, places: range) -> float:
     """Median seconds of a frame while other threads read and record, as in `bevcli run`."""
     done, preprocessor = [], Preprocessor(fast.runner.config)
     with _recording(drive, fast) as recording:
-        for frame, prediction, _ in fast.runner.run(drive, places, preprocessor, fast.state):
-            recording.log(frame, prediction)
+        steps = fast.runner.run(drive, places, preprocessor, fast.state)
+        for _ in write_behind(lambda step: recording.log(*step[:2]), steps):
             done.append(time.perf_counter())
     return median(after - before for before, after in pairwise(done))
 

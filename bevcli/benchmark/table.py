@@ -47,25 +47,34 @@ def write_table(path: Path, device: torch.device, frames: int) -> None:
     if not (begin and end):
         raise BevcliError(f"{path}: cannot find where to write the table (expected the lines {BEGIN} and {END})")
     precisions = ("bf16", "fp16") if device.type == "cuda" else ("fp32", "bf16")
-    results = [_measure(model, precision, device, frames) for model in known_models() for precision in precisions]
-    path.write_text(f"{before}{begin}\n{_table(results)}\n{end}{after}")
+    results = [measure(model, precision, device, frames) for model in known_models() for precision in precisions]
+    path.write_text(f"{before}{begin}\n{markdown_table(results)}\n{end}{after}")
 
 
-def _measure(model: str, precision: str, device: torch.device, frames: int) -> dict[str, Any]:
+def measure(
+    model: str, precision: str, device: torch.device, frames: int, limit_s: float = MODEL_TIMEOUT_S
+) -> dict[str, Any]:
+    """What `bevcli bench --against plain --json` prints, in a process of its own.
+
+    Raises BevcliError if it fails or takes longer than limit_s.
+    """
     print(f"measuring {model}, {precision} …", file=sys.stderr)
-    options = ["--model", model, "--precision", precision, "--device", device.type, "--frames", str(frames)]
+    options = ["--model", model, "--precision", precision, "--device", str(device), "--frames", str(frames)]
     command = [sys.executable, "-m", "bevcli", "bench", *options, "--against", "plain", "--json"]
     # In a separate process, so that its peak memory is that of this model.
     try:
-        answer = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, timeout=MODEL_TIMEOUT_S)
+        answer = subprocess.run(command, check=True, capture_output=True, text=True, timeout=limit_s)
     except subprocess.TimeoutExpired:
-        raise BevcliError(f"bench: {model}, {precision}: not done within {MODEL_TIMEOUT_S / 3600:.0f} h") from None
+        raise BevcliError(f"bench: {model}, {precision}: not done within {limit_s / 3600:g} h") from None
     except subprocess.CalledProcessError as error:
-        raise BevcliError(f"bench: {model}, {precision}: failed with exit code {error.returncode}") from None
-    return json.loads(answer.stdout)
+        last = (error.stderr.strip().splitlines() or ["no message"])[-1]
+        raise BevcliError(f"bench: {model}, {precision}: failed with exit code {error.returncode} ({last})") from None
+    found: dict[str, Any] = json.loads(answer.stdout)
+    return found
 
 
-def _table(results: list[dict[str, Any]]) -> str:
+def markdown_table(results: list[dict[str, Any]]) -> str:
+    """The machine and a table of results in Markdown, one row a result of `measure`."""
     machine = f"Measured on {date.today().isoformat()}: {results[0]['machine']}."
     rows = [" | ".join(column(result) for column in COLUMNS.values()) for result in results]
     lines = [" | ".join(COLUMNS), " | ".join("---" for _ in COLUMNS), *rows]

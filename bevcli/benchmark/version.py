@@ -73,7 +73,8 @@ class Version:
         self.forget_times()
 
     def _keep(self, _module: nn.Module, _inputs: tuple[object, ...], outputs: BEVFormerOutputs) -> None:
-        self.centers = outputs.box_codes[-1, 0][:, [0, 1, 4]]
+        codes = outputs.box_codes[-1, 0]
+        self.centers = torch.cat([codes[:, :2], codes[:, 4:5]], dim=-1)
         self.scores = outputs.class_logits[-1, 0].sigmoid()
 
 

@@ -21,6 +21,7 @@ from bevcli.model.image_tokens import ImageTokens, ImageTokensConfig
 from bevcli.model.pillar_projection import Pillars
 from bevcli.model.resnet import ResNet, ResNetConfig
 from bevcli.model.segmentation import SegmentationConfig, SegmentationHead, SegmentationOutputs
+from bevcli.model.upload import upload
 
 
 @dataclass(frozen=True)
@@ -217,10 +218,15 @@ class BEVFormerInputs:
         """(height, width) of the network's input, pixels."""
         return self.images.shape[-2], self.images.shape[-1]
 
-    def to(self, device: torch.device) -> BEVFormerInputs:
-        """The same inputs on a device."""
-        tensors = (getattr(self, part.name) for part in fields(self))
-        return BEVFormerInputs(*(tensor.to(device, non_blocking=True) for tensor in tensors))
+    def to(self, device: torch.device, *, keep_geometry: bool = False) -> BEVFormerInputs:
+        """The same inputs on a device.
+
+        keep_geometry: image_from_bev, has_image and rotation_deg stay on the CPU, where a prepared model reads them
+            without waiting for a GPU.
+        """
+        kept = ("image_from_bev", "has_image", "rotation_deg") if keep_geometry else ()
+        tensors = {part.name: getattr(self, part.name) for part in fields(self)}
+        return BEVFormerInputs(**{name: x if name in kept else upload(x, device) for name, x in tensors.items()})
 
 
 @dataclass(frozen=True)

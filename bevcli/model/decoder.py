@@ -181,7 +181,8 @@ class DetectionHead(nn.Module):
         """
         logits = self.class_branches[layer](query)
         code = self.box_branches[layer](query).float()
-        moved = code[..., [0, 1, 4]] + inverse_sigmoid(reference_points)
+        # Slices: a list of indices would be uploaded to a GPU, which waits for it.
+        moved = torch.cat([code[..., :2], code[..., 4:5]], dim=-1) + inverse_sigmoid(reference_points)
         refined = moved.sigmoid()
         center = refined * self.range_extent + self.range_start
         box_codes = torch.cat([center[..., :2], code[..., 2:4], center[..., 2:], code[..., 5:]], dim=-1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -32,7 +32,10 @@ class DeformableAttention(nn.Module):
 
     A query predicts where each head samples (offsets from reference points, in cells) and the weight of each sample.
     `sampling` computes the weighted sums. It has no parameters, so that a faster module can take its place.
+    `level_sizes` makes the table of level sizes; a function that keeps the table can take its place.
     """
+
+    level_sizes: Callable[[LevelShapes, torch.device], Tensor]
 
     def __init__(
         self, channels: int, query_channels: int, heads: int, points: int, levels: int = 1, maps: int = 1
@@ -55,6 +58,7 @@ class DeformableAttention(nn.Module):
         self.value_projection = nn.Linear(channels, channels)
         self.output_projection = nn.Linear(channels, channels)
         self.sampling: nn.Module = GridSampling()
+        self.level_sizes = level_sizes
         self._initialize()
 
     def predict(self, query: Tensor) -> tuple[Tensor, Tensor]:
@@ -68,6 +72,10 @@ class DeformableAttention(nn.Module):
         heads, maps, levels, points = self.shape
         weights = self.attention_weights(query).unflatten(-1, (heads, maps, levels * points)).softmax(-1)
         return offsets, weights.unflatten(-1, (levels, points))
+
+    def locations(self, reference_points: Tensor, offsets: Tensor, level_shapes: LevelShapes) -> Tensor:
+        """Reference points plus predicted offsets; see `sampling_locations`."""
+        return sampling_locations(reference_points, offsets, level_shapes, self.level_sizes)
 
     def attend(self, query: Tensor, reference_points: Tensor, tokens: Tensor, level_shapes: LevelShapes) -> Tensor:
         """The attended values of queries that sample one map each.
@@ -95,7 +103,7 @@ class DeformableAttention(nn.Module):
         offsets, weights = self.predict(query[:, :read])  # (B, read, heads, 1, predicted, P, 2)
         offsets, reference = offsets[:, :, :, 0], reference_points[:, :read, None, None, None]
         if reference_points.shape[-1] == 2:
-            locations = sampling_locations(reference, offsets, level_shapes)
+            locations = self.locations(reference, offsets, level_shapes)
         else:
             locations = reference[..., :2] + offsets / points * reference[..., 2:] * 0.5
         locations = locations.flatten(1, 3).unflatten(1, (-1, heads, levels))[:, :queries]  # (B, Q, heads, L, P, 2)
@@ -185,19 +193,29 @@ def sample_maps(values: Tensor, level_shapes: LevelShapes, locations: Tensor, we
     return result.unflatten(0, (maps, heads)).permute(0, 3, 1, 2).flatten(2)  # (G, m, heads · D)
 
 
-def sampling_locations(reference_points: Tensor, offsets: Tensor, level_shapes: LevelShapes) -> Tensor:
+def level_sizes(level_shapes: LevelShapes, device: torch.device) -> Tensor:
+    """(L, 2) float32 width and height of each level, on a device."""
+    return torch.tensor([(width, height) for height, width in level_shapes], dtype=torch.float32, device=device)
+
+
+def sampling_locations(
+    reference_points: Tensor,
+    offsets: Tensor,
+    level_shapes: LevelShapes,
+    sizes_of: Callable[[LevelShapes, torch.device], Tensor] = level_sizes,
+) -> Tensor:
     """Reference points plus offsets.
 
     Args:
         reference_points: (..., L or 1, P or 1, 2) x and y, 0 to 1 over a map; up to 1e6 behind a camera.
         offsets: (..., L, P, 2) x and y in cells of each level.
         level_shapes: (height, width) of each level.
+        sizes_of: makes the table of level sizes.
 
     Returns:
         (..., L, P, 2) float32, x and y, 0 to 1 over a map.
     """
-    widths_heights = [(width, height) for height, width in level_shapes]
-    sizes = torch.tensor(widths_heights, dtype=torch.float32, device=offsets.device)[:, None]  # (L, 1, 2)
+    sizes = sizes_of(level_shapes, offsets.device)[:, None]  # (L, 1, 2)
     # Broadcasting over a last axis of two elements takes several times as long as dividing full tensors.
     sizes = sizes.expand(offsets.shape[-3:]).contiguous()
     reference_points = reference_points.float().expand(*reference_points.shape[:-2], *offsets.shape[-2:]).contiguous()

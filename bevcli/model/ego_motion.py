@@ -12,6 +12,7 @@ from torch import Tensor
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.transforms import Array, Pose, yaw_of_quaternion
+from bevcli.model.upload import upload
 
 CAN_BUS_SIZE = 18
 
@@ -118,7 +119,7 @@ def rotate_history(history: Tensor, rotation_deg: Tensor, grid: BevGrid, center:
 
     Args:
         history: (B, Y·X, C).
-        rotation_deg: (B,).
+        rotation_deg: (B,); on the CPU it needs no wait for the history's device.
         grid: the BEV grid.
         center: centre of the rotation, see EgoMotionConfig.
 
@@ -126,7 +127,7 @@ def rotate_history(history: Tensor, rotation_deg: Tensor, grid: BevGrid, center:
         (B, Y·X, C).
     """
     rows, columns = grid.rows, grid.columns
-    row, column = _source_cells(rotation_deg, grid, center)  # (B, Y, X) each
+    row, column = _source_cells(rotation_deg, grid, center, history.device)  # (B, Y, X) each
     inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
     source = (row.clamp(0, rows - 1) * columns + column.clamp(0, columns - 1)).flatten(1)  # (B, Y·X)
     batch = torch.arange(len(history), device=history.device)[:, None]
@@ -142,8 +143,10 @@ def _history_shift(moved: Array, yaw_deg: float, grid: BevGrid) -> Array:
     return np.array([distance * np.sin(angle) / extent_x, distance * np.cos(angle) / extent_y])
 
 
-def _source_cells(rotation_deg: Tensor, grid: BevGrid, center: RotationCenter) -> tuple[Tensor, Tensor]:
-    """Row and column (B, Y, X) int64 of the old cell that each cell takes its history from.
+def _source_cells(
+    rotation_deg: Tensor, grid: BevGrid, center: RotationCenter, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """Row and column (B, Y, X) int64, on a device, of the old cell that each cell takes its history from.
 
     Computed in float32 and in halves of the map, as the released code's affine grid is, so that both choose the same
     cell where a source lies midway between two.
@@ -153,9 +156,11 @@ def _source_cells(rotation_deg: Tensor, grid: BevGrid, center: RotationCenter) -
     rotation = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()], -1).unflatten(-1, (2, 2))
     pivot = torch.tensor(_center_cells(grid, center), device=half.device).double() - half
     translation = (pivot - rotation @ pivot).float() / half  # (B, 2)
-    by_x, by_y = (rotation.float() / half[:, None]).unbind(-1)  # (B, 2) each
-    x = torch.arange(grid.columns, device=half.device) + 0.5 - half[0]  # (X,)
-    y = torch.arange(grid.rows, device=half.device) + 0.5 - half[1]  # (Y,)
+    scaled = rotation.float() / half[:, None]  # (B, 2, 2)
+    affine = upload(torch.cat([scaled, translation[..., None]], dim=-1), device)  # (B, 2, 3)
+    by_x, by_y, translation = affine.unbind(-1)  # (B, 2) each
+    x = torch.arange(grid.columns, device=device) + 0.5 - grid.columns / 2  # (X,)
+    y = torch.arange(grid.rows, device=device) + 0.5 - grid.rows / 2  # (Y,)
     turned = [by_x[:, i, None, None] * x + by_y[:, i, None, None] * y[:, None] for i in (0, 1)]
     source_x, source_y = (part + translation[:, i, None, None] for i, part in enumerate(turned))
     row = (((source_y + 1) * grid.rows - 1) / 2).round().long()

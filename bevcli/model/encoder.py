@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.deformable_attention import DeformableAttention, FeatureMaps, LevelShapes, sampling_locations
+from bevcli.model.deformable_attention import DeformableAttention, FeatureMaps, LevelShapes
 from bevcli.model.ego_motion import EgoMotionConfig
 from bevcli.model.feed_forward import FeedForward
 from bevcli.model.pillar_projection import PillarHits
@@ -179,7 +179,7 @@ class TemporalSelfAttention(nn.Module):
         maps = bev_maps.shape[1]
         offsets, weights = self.attention.predict(torch.cat([bev_maps[:, 0], query + position], dim=-1))
         reference = reference_points.transpose(1, 2)[:, :, None, :, None, None]  # (B, Y·X, 1, 2, 1, 1, 2)
-        locations = sampling_locations(reference, offsets, self.level_shapes)  # (B, Y·X, heads, 2, 1, P, 2)
+        locations = self.attention.locations(reference, offsets, self.level_shapes)  # (B, Y·X, heads, 2, 1, P, 2)
         sampled = self.attention.sample(
             bev_maps.flatten(0, 1),
             self.level_shapes,
@@ -231,7 +231,7 @@ class SpatialCrossAttention(nn.Module):
         pillar_points = hits.reference_points.shape[1]
         reference = hits.reference_points.repeat(1, self.points // pillar_points, 1)  # point p: height p mod Z
         offsets, weights = offsets[:, :, 0].index_select(0, hits.cell), weights[:, :, 0].index_select(0, hits.cell)
-        return sampling_locations(reference[:, None, None], offsets, level_shapes), weights
+        return self.attention.locations(reference[:, None, None], offsets, level_shapes), weights
 
 
 def normalized_centers(grid: BevGrid) -> Tensor:

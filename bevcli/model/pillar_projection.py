@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.geometry.bev_grid import BevGrid
+from bevcli.model.upload import upload
 
 # Metres. A point nearer than this, or behind the camera, is not visible and is projected as if it lay at this depth.
 MIN_DEPTH = 1e-5
@@ -90,7 +91,7 @@ def project_points(image_from_bev: Tensor, points: Tensor) -> tuple[Tensor, Tens
 def project_pillars(
     image_from_bev: Tensor, pillars: Tensor, image_size: tuple[int, int], has_image: Tensor
 ) -> PillarProjection:
-    """Projects the pillars' points into every camera.
+    """Projects the pillars' points into every camera, on the device of the pillars.
 
     Args:
         image_from_bev: (B, N, 4, 4) float32, bev metres to pixels of the network's input.
@@ -98,20 +99,37 @@ def project_pillars(
         image_size: (height, width) of the network's input, padding included, pixels.
         has_image: (B, N) bool; a camera without an image sees nothing.
     """
-    pixels, depth = project_points(image_from_bev.float()[:, :, None, None], pillars.float())
+    device = pillars.device
+    image_from_bev = upload(image_from_bev.float(), device)
+    pixels, depth = project_points(image_from_bev[:, :, None, None], pillars.float())
     height, width = image_size
-    points = pixels / pixels.new_tensor([width, height])  # (B, N, Y·X, Z, 2)
+    points = torch.stack([pixels[..., 0] / width, pixels[..., 1] / height], dim=-1)  # (B, N, Y·X, Z, 2)
     inside = ((points > 0) & (points < 1)).all(-1) & (depth > MIN_DEPTH)
-    return PillarProjection(points, inside & has_image[:, :, None, None])
+    return PillarProjection(points, inside & upload(has_image, device)[:, :, None, None])
 
 
 def find_hits(projection: PillarProjection) -> PillarHits:
-    """The pairs of a camera and a cell that it sees; attention is computed for these only."""
+    """The pairs of a camera and a cell that it sees; attention is computed for these only.
+
+    The CPU reads the counts of the cameras from the device and waits for these, and for nothing else.
+    """
     hit = projection.hit
-    batch, camera, cell = hit.nonzero(as_tuple=True)
+    _, cameras, cells = hit.shape
+    hits_per_camera = tuple(hit.sum(-1).flatten().tolist())
+    index = _true_positions(hit.flatten(), sum(hits_per_camera))  # in B·N·Y·X
+    batch = index // (cameras * cells)
     return PillarHits(
-        cell=batch * hit.shape[-1] + cell,
-        reference_points=projection.reference_points[batch, camera, cell],
-        hits_per_camera=tuple(hit.sum(-1).flatten().tolist()),
+        cell=batch * cells + index % cells,
+        reference_points=projection.reference_points.flatten(0, 2).index_select(0, index),
+        hits_per_camera=hits_per_camera,
         cameras_per_cell=hit.sum(1).flatten(),
     )
+
+
+def _true_positions(mask: Tensor, count: int) -> Tensor:
+    """The positions (count,) int64 of the `count` true elements of a mask (K,), as `nonzero` without its wait."""
+    order = mask.cumsum(0)  # from 1, at the true elements
+    # All false elements write to one more place at the end, which is cut off.
+    place = (order - 1).masked_fill(~mask, count)
+    positions = order.new_empty(count + 1).scatter_(0, place, torch.arange(len(mask), device=mask.device))
+    return positions[:count]

@@ -27,6 +27,7 @@ from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.encoder import EncoderLayer, SpatialCrossAttention
 from bevcli.model.kernels.compiled import CompiledDeformableConvolution, CompiledSampling, load_compiled
 from bevcli.model.kernels.onednn import use_onednn
+from bevcli.model.kernels.tables import Tables
 from bevcli.model.pillar_projection import PillarHits, Pillars
 from bevcli.model.resnet import Bottleneck, ResNet
 from bevcli.model.track_queries import FrameMotion, TrackQueries
@@ -141,9 +142,12 @@ def _prepare(model: BEVFormerBase, device: torch.device, images_dtype: torch.dty
         model.decoder.layers[0].self_attention = ConstantSelfAttention(model.decoder)
     for part in (model.backbone, model.neck):
         part.to(images_dtype)
-    for module in model.encoder.modules():
+    tables = Tables()
+    for module in model.modules():
         if isinstance(module, SpatialCrossAttention):
             module.attention.value_projection.to(images_dtype)
+        if isinstance(module, DeformableAttention):
+            module.level_sizes = tables.level_sizes
     _check_finite(model)
     if device.type == "cpu":
         use_onednn(model)
@@ -160,7 +164,10 @@ def _check_finite(model: nn.Module) -> None:
 
 
 class CachedPillars(Pillars):
-    """Projects the pillars again only when calibration, poses or images are not those of the last call."""
+    """Projects the pillars again only when calibration, poses or images are not those of the last call.
+
+    The comparison needs no wait for a GPU where `image_from_bev` and `has_image` are on the CPU.
+    """
 
     _inputs: tuple[Tensor, Tensor, tuple[int, int]] | None = None
     _hits: PillarHits
@@ -239,19 +246,26 @@ def choose_kernels(model: BEVFormerBase, device: torch.device, *, gradients: boo
     fusion = getattr(model, "fusion", None)
     for part in (model.backbone, model.neck, *([] if fusion is None else [fusion])):
         part.to(memory_format=torch.channels_last)
+    tables = Tables()
     for module in model.modules():
         if isinstance(module, DeformableAttention):
-            module.sampling = fastest_sampling(device, gradients=gradients)
+            module.sampling = fastest_sampling(device, tables, gradients=gradients)
 
 
-def fastest_sampling(device: torch.device, *, gradients: bool = False) -> nn.Module:
-    """The fastest module for `DeformableAttention.sampling` on a device. gradients: whether it needs them."""
+def fastest_sampling(device: torch.device, tables: Tables, *, gradients: bool = False) -> nn.Module:
+    """The fastest module for `DeformableAttention.sampling` on a device.
+
+    Args:
+        device: CPU, GPU or another one, such as "mps", which gets the plain module.
+        tables: shared by the modules of a model.
+        gradients: whether the module needs them.
+    """
     if device.type == "cpu":
         return CompiledSampling()
     if device.type == "cuda" and find_spec("triton") and not gradients:
         from bevcli.model.kernels.triton_attention import TritonSampling  # only where Triton is installed
 
-        return TritonSampling()
+        return TritonSampling(tables)
     return GridSampling()
 
 

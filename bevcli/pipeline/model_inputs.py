@@ -37,7 +37,8 @@ def model_inputs(
     same = all(torch.equal(index, indices[0]) for index in indices)
     motions = [_motion(prepared, pose, config) for prepared, pose in zip(frames, previous_poses, strict=True)]
     return BEVFormerInputs(
-        images=torch.cat([prepared.images for prepared in frames]),
+        # Copying the images of a single frame would take milliseconds.
+        images=frames[0].images if len(frames) == 1 else torch.cat([prepared.images for prepared in frames]),
         image_from_bev=torch.cat([prepared.image_from_bev for prepared in frames]).float(),
         camera_index=indices[0] if same else torch.stack(indices),
         has_image=torch.cat([prepared.has_image for prepared in frames]),

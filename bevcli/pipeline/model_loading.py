@@ -110,7 +110,8 @@ def load_model(
             "demo") or a FILE.toml. None takes the model that the weights fit, or "demo" where there are no weights.
         weights: an official .pth as published, or a .safetensors. None takes the weights of the package, which only
             "demo" has.
-        device: "auto" takes a GPU where there is one, else the CPU; or "cpu", "cuda", "cuda:1".
+        device: "auto" takes a CUDA GPU where there is one, else the CPU; or "cpu", "cuda", "cuda:1", or "mps", the GPU
+            of a Mac, which nobody has tried yet.
         precision: "fp32", "bf16" or "fp16". None takes fp32 on a CPU and bf16 on a GPU.
         untrained: use random weights, always the same ones.
 
@@ -161,12 +162,19 @@ def _model_of(weights: Path) -> str:
 
 
 def choose_device(name: str | torch.device) -> torch.device:
-    """The device of a name: "auto" (a GPU where there is one), "cpu", "cuda" or "cuda:N". Raises BevcliError."""
+    """The device of a name: "auto" (a CUDA GPU where there is one), "cpu", "cuda", "cuda:N" or "mps".
+
+    Raises BevcliError if the name is unknown or there is no such device.
+    """
     if isinstance(name, torch.device):
         return name
     numbered = re.fullmatch(r"cuda:(\d+)", name)
-    if name not in ("auto", "cpu", "cuda") and not numbered:
-        raise BevcliError(f'--device {name}: unknown device (expected "auto", "cpu", "cuda" or "cuda:N")')
+    if name not in ("auto", "cpu", "cuda", "mps") and not numbered:
+        raise BevcliError(f'--device {name}: unknown device (expected "auto", "cpu", "cuda", "cuda:N" or "mps")')
+    if name == "mps":
+        if not torch.backends.mps.is_available():
+            raise BevcliError("--device mps: PyTorch sees no Apple GPU here (use --device cpu)")
+        return torch.device(name)
     available = torch.cuda.is_available()
     if name.startswith("cuda") and not available:
         raise BevcliError(

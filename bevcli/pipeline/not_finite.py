@@ -9,22 +9,6 @@ from dataclasses import fields, is_dataclass
 import torch
 from torch import Tensor, nn
 
-from bevcli.model.bevformer import BEVFormerOutputs
-
-
-def is_finite(outputs: BEVFormerOutputs, images: Tensor) -> bool:
-    """Whether the BEV map, the class logits and the box codes are finite; on a CPU also the input images.
-
-    The ReLU of oneDNN, which is used on a CPU, turns NaN into zero, so NaN in the images may not reach the outputs.
-    Weights are checked when they are read and when they are prepared. What is not seen: numbers inside of the backbone
-    that grow beyond the range of their type and that ReLU then turns into zeros.
-    """
-    checked = [outputs.bev, outputs.class_logits[-1], outputs.box_codes[-1]]
-    if outputs.bev.device.type == "cpu":
-        checked.append(images)
-    extremes = torch.stack([end.float() for tensor in checked for end in torch.aminmax(tensor)])
-    return bool(torch.isfinite(extremes).all())
-
 
 def origin(model: nn.Module, step: Callable[[], object]) -> str:
     """Where numbers stop being finite: an input, or the first module whose output has NaN or infinity.

@@ -28,7 +28,7 @@ class PreparedFrame:
         frame: the frame as it was read, but for the bev frame of its rig: see `BevFrameConfig.level`.
         assignment: the N cameras and the model cameras whose embeddings they use.
         scales: (N,) pixels of the resized image per pixel of the camera's image.
-        images: (1, N, 3, H, W) float32, normalised; zero where an image is missing.
+        images: (1, N, 3, H, W) float32, normalised; zero where an image is missing. Uploaded ahead to a CUDA GPU.
         image_from_bev: (1, N, 4, 4) float64, to network pixels.
         camera_index: (N,) int64, index of each camera's embedding.
         has_image: (1, N) bool.

@@ -20,6 +20,7 @@ from bevcli.pipeline.runner import Runner, StepOptions
 from bevcli.pipeline.state_file import save_state
 from bevcli.pipeline.tracking import track as track_boxes
 from bevcli.pipeline.tracking import without_identities
+from bevcli.pipeline.write_behind import write_behind
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.writer import LiveSink
 
@@ -197,16 +198,20 @@ def _run_from(
             done = count == len(sequence.stamps)  # nothing comes after the last frame
             saver.save(RunState(state.facts, count, RunnerState() if done else runner, parts, summary.state()))
 
+    def write(step: tuple[Frame, Prediction, RunnerState]) -> float:
+        """The seconds that writing the frame took."""
+        nonlocal is_whole
+        is_whole, writing_began = False, time.perf_counter()
+        files.write(*step[:2])
+        return time.perf_counter() - writing_began
+
     with files:
         try:
             began = time.perf_counter()
             steps = _steps(model, sequence, asked, options.cameras, track=options.track, start=count, state=runner)
-            for frame, prediction, after in steps:
-                is_whole = False
-                writing_began = time.perf_counter()
-                files.write(frame, prediction)
+            for (frame, prediction, after), recording_s in write_behind(write, steps):
                 now = time.perf_counter()
-                summary.add(frame, prediction, recording_s=now - writing_began, whole_s=now - began)
+                summary.add(frame, prediction, recording_s=recording_s, whole_s=now - began)
                 count, runner, is_whole, began = count + 1, after, True, now
                 if saver.is_due(runner):
                     save()

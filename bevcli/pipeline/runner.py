@@ -22,12 +22,13 @@ from bevcli.model.segmentation import decode_maps
 from bevcli.model.track_boxes import decode_tracks
 from bevcli.model.uniad import UniAD, UniADConfig, UniADOutputs
 from bevcli.pipeline.attention import AttentionProbe, attention_view, probe_cells
-from bevcli.pipeline.not_finite import is_finite, origin
+from bevcli.pipeline.not_finite import origin
 from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
 from bevcli.pipeline.read_ahead import read_ahead
 from bevcli.pipeline.stage_clock import StageClock
 from bevcli.pipeline.temporal import Memory, temporal_model
 from bevcli.pipeline.tracking import without_identities
+from bevcli.pipeline.transfer import ImageUploader, read_back
 
 _AUTOCAST = {"bf16": torch.bfloat16, "fp16": torch.float16}
 
@@ -101,13 +102,14 @@ class Runner:
             with self._autocast(), probe or contextlib.nullcontext():
                 before, later = None if state is None else state.memory, self._usable(prepared, upcoming)
                 outputs, memory = self.temporal_model.step(prepared, before, later)
-                if not is_finite(outputs, prepared.images):
+                found, is_finite = read_back(outputs, prepared.images)
+                if not is_finite:
                     where = origin(self.model, lambda: self.temporal_model.step(prepared, before, later))
                     lost = self._prediction(prepared, started_anew, Boxes3D.empty(), None, not_finite=where)
                     return self._restarted(state), lost
-            boxes = self._boxes(outputs)
+            boxes = self._boxes(found)
             self.clock.mark("box_decoding")
-            segmentation = self._segmentation(outputs)
+            segmentation = self._segmentation(found)
         view = None if probe is None else attention_view(probe, prepared, self.config)
         prediction = self._prediction(prepared, started_anew, boxes, outputs.bev[0], view, segmentation)
         return BevState(memory, frame.stamp), prediction
@@ -119,9 +121,10 @@ class Runner:
 
         A model that looks ahead sees the later ones of these places.
         """
+        upload_images = ImageUploader(self.device)
 
         def prepare(place: int) -> PreparedFrame:
-            return preprocessor(sequence.load(place))
+            return upload_images(preprocessor(sequence.load(place)))
 
         ahead = self.temporal_model.later_frames if self.options.temporal else 0
         for prepared, upcoming in with_upcoming(read_ahead(prepare, places), ahead):

@@ -32,7 +32,7 @@ class StageClock:
         clock.read()
 
     Time is attributed by marks: the time since the last mark belongs to the stage of the new mark. On a GPU, marks are
-    events in its queue, and only `read` waits for the GPU.
+    events in its queue, and only `read` waits for the GPU. On "mps", every mark waits for it.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class StageClock:
             stages: module name -> stage that is marked when the module ends.
             starts: module name -> stage that is marked before the module begins.
         """
-        self._on_gpu = device.type == "cuda"
+        self._device = device
         self._marks: list[tuple[str, float | torch.cuda.Event]] = []
         self._hooks: list[RemovableHandle] = []
         modules = dict(model.named_modules())
@@ -80,18 +80,20 @@ class StageClock:
 
     def read(self) -> Mapping[str, float]:
         """Stage -> seconds, of the last step."""
-        if self._on_gpu:
-            torch.cuda.synchronize()
+        if self._device.type == "cuda":
+            torch.cuda.current_stream(self._device).synchronize()
         seconds: dict[str, float] = {}
         for (_, before), (stage, now) in zip(self._marks, self._marks[1:], strict=False):
             seconds[stage] = seconds.get(stage, 0.0) + _between(before, now)
         return seconds
 
     def _now(self) -> float | torch.cuda.Event:
-        if not self._on_gpu:
+        if self._device.type == "mps":
+            torch.mps.synchronize()  # its queue has no events that could be read later
+        if self._device.type != "cuda":
             return time.perf_counter()
         event = torch.cuda.Event(enable_timing=True)
-        event.record()
+        event.record(torch.cuda.current_stream(self._device))
         return event
 
 

@@ -23,6 +23,7 @@ from bevcli.model.bevformer_v2 import BEVFormerV2, WindowFrame
 from bevcli.model.deformable_attention import FeatureMaps, LevelShapes
 from bevcli.model.track_queries import FrameMotion, TrackQueries
 from bevcli.model.uniad import UniAD, UniADOutputs
+from bevcli.model.upload import upload
 from bevcli.pipeline.model_inputs import model_inputs
 from bevcli.pipeline.preprocess import PreparedFrame
 
@@ -154,7 +155,8 @@ class Recurrence:
         """See `TemporalModel.step`."""
         assert memory is None or isinstance(memory, BevHistory)
         previous_pose = None if memory is None else memory.pose
-        inputs = model_inputs([prepared], [previous_pose], self.model.config).to(self.device)
+        inputs = model_inputs([prepared], [previous_pose], self.model.config)
+        inputs = inputs.to(self.device, keep_geometry=True)
         outputs = self.model(inputs, None if memory is None else memory.bev)
         return outputs, BevHistory(outputs.bev, prepared.frame.world_from_ego)
 
@@ -244,8 +246,8 @@ class Window:
         """See `TemporalModel.restarted`."""
 
     def _features(self, prepared: PreparedFrame) -> FrameFeatures:
-        images = prepared.images.to(self.device, non_blocking=True)
-        features = self.model.image_features(images, prepared.camera_index.to(self.device))
+        images, camera_index = (upload(x, self.device) for x in (prepared.images, prepared.camera_index))
+        features = self.model.image_features(images, camera_index)
         return FrameFeatures(
             stamp=prepared.frame.stamp,
             pose=prepared.frame.world_from_ego,
@@ -264,8 +266,8 @@ class Window:
         width, height = self.model.config.image.padded_size
         return WindowFrame(
             image_features=FeatureMaps(frame.tokens, frame.level_shapes),
-            image_from_bev=image_from_bev.float().to(self.device),
-            has_image=frame.has_image.to(self.device),
+            image_from_bev=image_from_bev.float(),  # on the CPU, as the model reads it
+            has_image=frame.has_image,
             image_size=(height, width),
         )
 

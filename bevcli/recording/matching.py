@@ -22,18 +22,24 @@ def detectable(ground_truth: Boxes3D, grid: BevGrid) -> Boxes3D:
     return ground_truth[inside & seen]
 
 
+Matches = tuple[NDArray[np.bool_], NDArray[np.bool_]]
+"""Which predictions (N,) are true positives, and which ground-truth boxes (M,) are found."""
+
+
 def false_and_duplicate(
-    predictions: Boxes3D, ground_truth: Boxes3D | None
+    predictions: Boxes3D, ground_truth: Boxes3D | None, matches: Matches | None = None
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which predictions (N,) are false positives, and which (N,) are a second box on an object.
 
     A duplicate is no true positive, and either the tracker marked it, or the ground truth of its class within 2 m was
     found by a better box. Without ground truth no box is a false positive, and the tracker's marks are returned.
+
+    matches: of `true_positives`, where the caller has them already.
     """
     marked = predictions.duplicates if predictions.duplicates is not None else np.zeros(len(predictions), dtype=bool)
     if ground_truth is None:
         return np.zeros(len(predictions), dtype=bool), marked
-    true, found = true_positives(predictions, ground_truth)
+    true, found = true_positives(predictions, ground_truth) if matches is None else matches
     truths = ground_truth[found]
     away = np.linalg.norm(predictions.centers[:, None, :2] - truths.centers[:, :2], axis=-1)  # (N, M)
     near = (away < MATCH_DISTANCE_M) & (predictions.classes[:, None] == truths.classes)
@@ -41,7 +47,7 @@ def false_and_duplicate(
     return ~true & ~duplicate, duplicate
 
 
-def true_positives(predictions: Boxes3D, ground_truth: Boxes3D) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def true_positives(predictions: Boxes3D, ground_truth: Boxes3D) -> Matches:
     """Match predictions (N,) and ground truth (M,) of one frame as `bevcli eval` does, at 2 m.
 
     Returns which predictions (N,) are true positives, and which ground-truth boxes (M,) are found. Predictions without

@@ -347,9 +347,9 @@ class Recording:
             if self.untrained:  # random boxes match nothing: a scene all in red would be useless
                 found = np.ones(len(truth), dtype=bool)
             else:
-                _, found = true_positives(shown, truth)
-                found |= log_boxes.other_classes(truth, self.class_names)
-                marks = Marks(*false_and_duplicate(shown, truth))
+                matches = true_positives(shown, truth)
+                marks = Marks(*false_and_duplicate(shown, truth, matches))
+                found = matches[1] | log_boxes.other_classes(truth, self.class_names)
             self._log_ground_truth(truth, found, world_from_bev, cameras)
         stream, names = self._stream, self.class_names
         ego_xy = self._moved_to_origin(prediction.world_from_ego.matrix)[:2, 3]

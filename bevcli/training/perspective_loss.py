@@ -81,7 +81,8 @@ def perspective_loss(
     logits, boxes = head(feature_maps)
     shapes = [(features.shape[-2], features.shape[-1]) for features in feature_maps]
     locations = feature_locations(shapes, image_size, logits.device)
-    class_targets, counted = torch.zeros_like(logits), has_image.flatten()[:, None].repeat(1, logits.shape[1])
+    class_targets = torch.zeros_like(logits)
+    counted = has_image.to(logits.device).flatten()[:, None].repeat(1, logits.shape[1])
     predicted, truths = [boxes[0, :0]], [boxes.new_zeros(0, BOX_NUMBERS)]  # (K_i, 8) of each image
     cameras = image_from_bev.shape[1]
     for image in has_image.flatten().nonzero()[:, 0].tolist():

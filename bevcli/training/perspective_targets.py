@@ -155,6 +155,9 @@ def project_objects(image_from_bev: Tensor, codes: Tensor, image_size: tuple[int
         codes: (G, 10) box codes (see `bevcli.model.box_coding`).
         image_size: (height, width) of the network's input, pixels.
     """
+    matrix = image_from_bev[:3].double()  # on the CPU if image_from_bev is: not every device has float64
+    camera = -torch.linalg.solve(matrix[:, :3], matrix[:, 3]).to(codes)  # its position, metres, bev frame
+    image_from_bev = image_from_bev.to(codes.device)
     points = codes[:, [0, 1, 4]]
     centers, depths = project_points(image_from_bev, points)
     outlines = _outlines(image_from_bev, codes, image_size)
@@ -164,8 +167,6 @@ def project_objects(image_from_bev: Tensor, codes: Tensor, image_size: tuple[int
     along_axis = image_from_bev[:2, :3] @ optical_axis  # the principal point
     focal = (image_from_bev[:2, :3].square().sum(-1) - along_axis.square()).sqrt().prod().sqrt()
 
-    matrix = image_from_bev[:3].double()
-    camera = -torch.linalg.solve(matrix[:, :3], matrix[:, 3]).to(codes.dtype)  # its position, metres, bev frame
     rays = points[:, :2] - camera[:2]
     rays = rays / rays.norm(dim=-1, keepdim=True).clamp(min=1e-6)
     headings = _headings(codes)

@@ -61,10 +61,10 @@ class Batch:
     targets: tuple[Targets, ...]
 
     def to(self, device: torch.device) -> Batch:
-        """A copy on a device."""
-        inputs = tuple(one.to(device) for one in self.inputs)
+        """A copy on a device. Projections and poses stay on the CPU, which reads them without waiting for a GPU."""
+        inputs = tuple(one.to(device, keep_geometry=True) for one in self.inputs)
         targets = tuple(targets.to(device) for targets in self.targets)
-        return Batch(inputs, self.world_from_bev.to(device), targets)
+        return Batch(inputs, self.world_from_bev, targets)
 
 
 def load_batch(

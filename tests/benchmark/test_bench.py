@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from importlib import resources
-from pathlib import Path
 
 import pytest
 import torch
@@ -28,37 +26,6 @@ RESULT = BenchmarkResult(
     limits=MachineLimits(gemm_gflops=200.0, copy_gbs=10.0),
     comparison=Comparison((9.0, 6.0, 5.0), 0.02, 1.0, 1e-5),
 )
-SMALL = {
-    "size = [800, 450]": "size = [160, 90]",
-    "rows = 50": "rows = 12",
-    "columns = 50": "columns = 10",
-    "channels = 256": "channels = 32",
-    "blocks = [3, 4, 6, 3]": "blocks = [1, 1, 1, 1]\nwidth = 8",
-    "queries = 900": "queries = 30",
-}
-SMALL_UNIAD = {
-    "size = [1600, 900]": "size = [160, 90]",
-    "rows = 200": "rows = 12",
-    "columns = 200": "columns = 10",
-    "channels = 256": "channels = 32",
-    "blocks = [3, 4, 23, 3]": "blocks = [1, 1, 1, 1]\nwidth = 8",
-    "queries = 901": "queries = 30",
-}
-
-
-@pytest.fixture
-def small_model_file(tmp_path: Path) -> Path:
-    return model_file(tmp_path / "small.toml", "tiny", SMALL)
-
-
-def model_file(path: Path, model: str, changes: dict[str, str]) -> Path:
-    """Writes a known model's TOML file with changed lines."""
-    text = resources.files("bevcli").joinpath(f"configs/{model}.toml").read_text()
-    for old, new in changes.items():
-        assert old in text
-        text = text.replace(old, new)
-    path.write_text(text)
-    return path
 
 
 def test_times_limit_is_frame_time_over_operations_at_peak_rate():
@@ -105,10 +72,9 @@ def test_profile_of_a_frame_in_half_precision(small_model_file, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_benchmark_of_a_uniad_times_its_map_head(tmp_path):
-    file = model_file(tmp_path / "uniad.toml", "uniad-track-map", SMALL_UNIAD)
+def test_the_benchmark_of_a_uniad_times_its_map_head(small_uniad_file):
     options = ["--frames", "1", "--against", "plain", "--json"]
-    answer = CliRunner().invoke(app, ["bench", "--model", str(file), *options], catch_exceptions=False)
+    answer = CliRunner().invoke(app, ["bench", "--model", str(small_uniad_file), *options], catch_exceptions=False)
     data = json.loads(answer.stdout)
     assert data["stages_ms"]["map head"] > 0
     assert data["share_within_0.1_m"] == 1

@@ -8,6 +8,7 @@ import torch
 from bevcli.benchmark.textbook import PaddedSampling
 from bevcli.model.deformable_attention import GridSampling
 from bevcli.model.kernels.compiled import CompiledSampling
+from bevcli.model.kernels.tables import Tables
 from bevcli.model.prepared import fastest_sampling
 
 SHAPES = ((5, 7), (3, 4), (1, 1))
@@ -90,6 +91,6 @@ def test_the_gpu_equals_the_cpu(dtype):
     gpu = torch.device("cuda")
     values, shapes, locations, weights, counts = case(32, dtype=dtype)
     on_gpu = (values.to(gpu), shapes, locations.to(gpu), weights.to(gpu), counts)
-    found = fastest_sampling(gpu)(*on_gpu).float().cpu()
+    found = fastest_sampling(gpu, Tables())(*on_gpu).float().cpu()
     expected = PLAIN(values, shapes, locations, weights, counts)
     torch.testing.assert_close(found, expected, rtol=2e-2 if dtype != torch.float32 else 1e-4, atol=1e-3)

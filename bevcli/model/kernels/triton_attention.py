@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import accumulate
 
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor, nn
 
+from bevcli.model.kernels.tables import Tables
+
 QUERIES_PER_PROGRAM = 32
 
 
 class TritonSampling(nn.Module):
     """Takes the place of `GridSampling` on a GPU, without gradients."""
+
+    def __init__(self, tables: Tables) -> None:
+        """tables: keeps the level shapes and the queries of each map on the GPU."""
+        super().__init__()
+        self.tables = tables
 
     def forward(
         self,
@@ -24,31 +32,39 @@ class TritonSampling(nn.Module):
         queries_per_map: Sequence[int],
     ) -> Tensor:
         """Arguments and result as for `GridSampling`."""
-        _, cells, heads, depth = values.shape
+        maps, cells, heads, depth = values.shape
         queries, _, levels, points, _ = locations.shape
-        counts = torch.tensor(list(queries_per_map), device=values.device)
-        map_of_query = torch.arange(len(counts), device=values.device).repeat_interleave(counts, output_size=queries)
-        shapes = torch.tensor(level_shapes, dtype=torch.int32, device=values.device)
+        ends = self.tables(list(accumulate(queries_per_map)), torch.int32, values.device)
+        shapes = self.tables(level_shapes, torch.int32, values.device)
         out = values.new_empty(queries, heads, depth, dtype=torch.float32)
-        grid = (triton.cdiv(queries, QUERIES_PER_PROGRAM), heads)
         if queries:
-            _sample[grid](
-                values.contiguous(),
-                shapes,
-                locations.float().contiguous(),
-                weights.float().contiguous(),
-                map_of_query,
-                out,
-                queries,
-                cells,
-                HEADS=heads,
-                DEPTH=depth,
-                PADDED_DEPTH=triton.next_power_of_2(depth),
-                LEVELS=levels,
-                POINTS=points,
-                BLOCK=QUERIES_PER_PROGRAM,
-            )
+            # Triton launches on the current GPU, which need not be that of the tensors.
+            with torch.cuda.device(values.device):
+                _sample[(triton.cdiv(queries, QUERIES_PER_PROGRAM), heads)](
+                    values.contiguous(),
+                    shapes,
+                    locations.float().contiguous(),
+                    weights.float().contiguous(),
+                    ends,
+                    out,
+                    queries,
+                    maps,
+                    cells,
+                    **constants(heads, depth, levels, points),
+                )
         return out.flatten(1)
+
+
+def constants(heads: int, depth: int, levels: int, points: int) -> dict[str, int]:
+    """The arguments of the kernel that it is compiled for. depth: channels of a head."""
+    return {
+        "HEADS": heads,
+        "DEPTH": depth,
+        "PADDED_DEPTH": triton.next_power_of_2(depth),
+        "LEVELS": levels,
+        "POINTS": points,
+        "BLOCK": QUERIES_PER_PROGRAM,
+    }
 
 
 @triton.jit
@@ -57,9 +73,10 @@ def _sample(  # type: ignore[no-untyped-def]
     shapes,
     locations,
     weights,
-    map_of_query,
+    ends,
     out,
     queries,
+    maps,
     cells,
     HEADS: tl.constexpr,
     DEPTH: tl.constexpr,
@@ -68,13 +85,19 @@ def _sample(  # type: ignore[no-untyped-def]
     POINTS: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """One program sums the samples of BLOCK queries in one head; tensors are laid out as for `GridSampling`."""
+    """One program sums the samples of BLOCK queries in one head; tensors are laid out as for `GridSampling`.
+
+    ends: (maps,) int32, for each map the number of queries up to and with its own.
+    """
     query = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     head = tl.program_id(1)
     channel = tl.arange(0, PADDED_DEPTH)
     exists = query < queries
     has_channel = channel < DEPTH
-    first_cell = tl.load(map_of_query + query, exists, 0) * cells
+    map_of_query = tl.zeros((BLOCK,), tl.int64)
+    for index in range(maps - 1):
+        map_of_query += (query >= tl.load(ends + index)).to(tl.int64)
+    first_cell = map_of_query * cells
     total = tl.zeros((BLOCK, PADDED_DEPTH), tl.float32)
     for level in range(LEVELS):
         height = tl.load(shapes + 2 * level)

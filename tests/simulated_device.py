@@ -1,0 +1,176 @@
+"""A GPU that is not there: tensors that claim to be on it, hold their numbers on the CPU, and record every wait.
+
+    with SimulatedDevice("cuda:1") as device:
+        result = model.to(device.device)(x.to(device.device))
+    device.waits
+
+An operator that would fail on the device fails here too: one whose tensors are on two devices, and on "mps" any that
+uses float64. Kernels of other libraries see no numbers: replace them by the plain operation.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+from torch.utils._pytree import tree_flatten, tree_map
+
+CPU = torch.device("cpu")
+# Functions that read numbers back, to answer with a Python value or to find out a shape.
+READING = {
+    torch.Tensor.item, torch.Tensor.tolist, torch.Tensor.cpu, torch.Tensor.__bool__, torch.Tensor.__int__,
+    torch.Tensor.__float__, torch.Tensor.__index__, torch.Tensor.nonzero, torch.nonzero, torch.equal,
+    torch.Tensor.equal, torch.masked_select, torch.unique, torch.allclose, torch.isin,
+}  # fmt: skip
+REPEATING = {torch.repeat_interleave, torch.Tensor.repeat_interleave}
+MAKING = {torch.tensor, torch.as_tensor, torch.Tensor.new_tensor}  # from Python numbers
+INDEXING = {torch.Tensor.__getitem__, torch.Tensor.__setitem__}
+
+
+class OnDevice(torch.Tensor):
+    """A tensor that claims to be on a simulated device.
+
+    Attributes:
+        held: its numbers, a plain tensor of the same memory.
+        home: the device.
+    """
+
+    held: Tensor
+    home: SimulatedDevice
+
+
+class SimulatedDevice(TorchFunctionMode):
+    """Runs what is asked for on its device on the CPU.
+
+    Attributes:
+        device: what its tensors claim.
+        waits: each operation for which the CPU would wait for the device, in order.
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__()
+        self.device = torch.device(name)
+        self.waits: list[str] = []
+
+    def tensor(self, held: Tensor) -> Tensor:
+        """A tensor of these numbers on the device."""
+        if held.dtype == torch.float64 and self.device.type == "mps":
+            raise TypeError("mps has no float64")
+        made = held.as_subclass(OnDevice)
+        made.held, made.home = held, self
+        return made
+
+    def __torch_function__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = dict(kwargs or {})
+        if function is torch.Tensor.to and not any(isinstance(x, Tensor) for x in args[1:]):
+            return self._to(*args, **kwargs)
+        tensors = [leaf for leaf in tree_flatten((args, kwargs))[0] if isinstance(leaf, Tensor)]
+        ours = {id(x.held): x for x in tensors if isinstance(x, OnDevice)}
+        device = None if kwargs.get("device") is None else torch.device(kwargs["device"])
+        comes = device is not None and device.type == self.device.type
+        if not ours and not comes:
+            return function(*args, **kwargs)
+        if function is torch._has_compatible_shallow_copy_type:
+            return False  # `Module.to` makes new parameters
+        if function == torch.Tensor.device.__get__:
+            return self.device
+        self._check(function, tensors, args, kwargs)
+        if comes:
+            assert device is not None
+            self.check(device)
+            if function in MAKING:
+                self.waits.append(f"{function.__name__}(…, device=…)")
+            kwargs["device"] = CPU
+        found = function(*tree_map(_held, args), **tree_map(_held, kwargs))
+        if function is torch.Tensor.cpu:
+            return found.clone()
+
+        def on_device(value: Any) -> Any:
+            if id(value) in ours:
+                return ours[id(value)]  # was changed in place
+            return self.tensor(value) if isinstance(value, Tensor) else value
+
+        return tree_map(on_device, found)
+
+    def check(self, device: torch.device) -> None:
+        """PyTorch takes a device without a number for the current one, the first: that is the wrong one for cuda:1."""
+        if device != self.device:
+            raise RuntimeError(f"a tensor for {device}, but the model is on {self.device}")
+
+    def _check(self, function: Any, tensors: list[Tensor], args: Any, kwargs: Any) -> None:
+        """Raises an error where the device would; notes where the CPU would wait."""
+        name = getattr(function, "__name__", str(function))
+        if function is torch.Tensor.numpy:
+            raise TypeError(f"a tensor on {self.device} cannot become an array")
+        if function is torch.Tensor.copy_:
+            if not kwargs.get("non_blocking") and len({isinstance(x, OnDevice) for x in args[:2]}) == 2:
+                self.waits.append(name)
+            return
+        if function in INDEXING:
+            parts = args[1] if isinstance(args[1], tuple) else (args[1],)
+            if any(isinstance(x, list) or (isinstance(x, Tensor) and not isinstance(x, OnDevice)) for x in parts):
+                self.waits.append("index of the CPU")
+            if any(isinstance(x, Tensor) and x.dtype == torch.bool for x in parts):
+                self.waits.append("index of a mask")
+        elif any(not isinstance(x, OnDevice) and x.ndim for x in tensors):
+            raise RuntimeError(f"{name}: tensors on {self.device} and on the CPU")
+        by_tensor = function in REPEATING and isinstance(args[1], Tensor) and kwargs.get("output_size") is None
+        if function in READING or by_tensor:
+            self.waits.append(name)
+
+    def _to(self, tensor: Tensor, *args: Any, **kwargs: Any) -> Tensor:
+        kwargs.pop("copy", None)
+        device, dtype, non_blocking, memory_format = torch._C._nn._parse_to(*args, **kwargs)
+        held = _held(tensor)
+        changed = held.to(dtype=dtype or held.dtype, memory_format=memory_format or torch.preserve_format)
+        there, comes = isinstance(tensor, OnDevice), device is not None and device.type == self.device.type
+        if comes:
+            self.check(device)
+        if there and (device is None or comes):
+            return tensor if changed is held else self.tensor(changed)
+        if comes:
+            if not (non_blocking and getattr(tensor, "is_pinned_here", False)):
+                self.waits.append("upload")
+            return self.tensor(changed.detach().clone())
+        if there:
+            self.waits.append("copy to the CPU")
+        return changed
+
+
+def _held(value: Any) -> Any:
+    return value.held if isinstance(value, OnDevice) else value
+
+
+@contextlib.contextmanager
+def simulated(name: str, monkeypatch: Any, sample: Callable[..., None]) -> Iterator[SimulatedDevice]:
+    """A simulated device. What only a real one has is replaced: pinned memory, events, streams, the Triton kernel.
+
+    sample: takes the place of the launch of the Triton kernel, see `sample_plainly`.
+    """
+    device = SimulatedDevice(name)
+
+    def pinned(tensor: Tensor) -> Tensor:
+        copy = tensor.clone()
+        copy.is_pinned_here = True  # type: ignore[attr-defined]
+        return copy
+
+    def on_cpu(tensors: list[Tensor]) -> list[Tensor]:
+        device.waits.append("results")
+        return [_held(tensor) for tensor in tensors]
+
+    monkeypatch.setattr("bevcli.model.upload.pinned", pinned)
+    monkeypatch.setattr("bevcli.pipeline.transfer._on_cpu", on_cpu)
+    monkeypatch.setattr("bevcli.pipeline.stage_clock.StageClock._now", lambda clock: 0.0)
+    monkeypatch.setattr("bevcli.pipeline.stage_clock.StageClock.read", lambda clock: {})
+    if device.device.type == "cuda":
+        from bevcli.model.kernels import triton_attention
+
+        launch = {"__getitem__": lambda kernel, grid: sample}
+        monkeypatch.setattr(triton_attention, "_sample", type("Kernel", (), launch)())
+        monkeypatch.setattr(torch.cuda, "device", lambda which: contextlib.nullcontext(device.check(which)))
+    with device:
+        yield device
