@@ -82,8 +82,6 @@ def test_a_training_that_is_asked_to_stop_leaves_a_checkpoint_to_resume_from(tmp
     resumed = trainer(tmp_path / "part", resume=True)
     assert resumed.done == 1
     resumed.run()
-    again = load_file(tmp_path / "killed" / "weights.safetensors")
-    assert all(torch.equal(again[name], exported[name]) for name in exported)
     assert_same_weights(whole, resumed)
 
 
@@ -154,6 +152,8 @@ def test_a_training_with_all_options_on_resumes_exactly_too(tmp_path: Path) -> N
     resumed = with_all_options(tmp_path / "killed", resume=True)
     assert resumed.done == 1
     resumed.run()
+    again = load_file(tmp_path / "killed" / "weights.safetensors")
+    assert all(torch.equal(again[name], exported[name]) for name in exported)
     assert_same_weights(whole, resumed)
 
 
