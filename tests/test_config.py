@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import pytest
 
-from bevcli.config import TRAINING, known_models, load_config, load_table
+from bevcli.config import TRAINING, as_table, config_of_table, known_models, load_config, load_table
 from bevcli.errors import ConfigError
 from bevcli.model.bevformer_v2 import BEVFormerV2Config
 from bevcli.model.uniad import UniADConfig
@@ -196,3 +197,10 @@ def test_the_architecture_of_a_file_is_named(tmp_path: Path) -> None:
         with pytest.raises(ConfigError) as error:
             load_config(path)
         assert message in str(error.value)
+
+
+@pytest.mark.parametrize("name", known_models())
+def test_the_contents_of_a_model_file_come_back_from_its_configuration(name: str) -> None:
+    config = load_config(name)
+    contents = json.loads(json.dumps(as_table(config)))
+    assert config_of_table(contents, name) == config

@@ -41,8 +41,8 @@ class Model:
         left_out: what of that file is for training only and was left out; "" for nothing.
         tracker: the parameters of the tracker, the table [tracking] of the model's TOML file.
         not_read: classes and functions in the weights file whose objects were not read.
-        facts: metadata in the weights file.
         engine: the program that computes it: "torch", or for an exported file "onnxruntime" or "openvino".
+        facts: metadata in the weights file.
     """
 
     network: BEVFormerBase
@@ -53,8 +53,8 @@ class Model:
     left_out: str = ""
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     not_read: tuple[str, ...] = ()
-    facts: Mapping[str, str] = field(default_factory=dict)
     engine: Literal["torch"] | EngineName = "torch"
+    facts: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def config(self) -> BEVFormerConfig:
@@ -71,13 +71,6 @@ class Model:
         """Whether the weights are random: boxes and maps are then meaningless."""
         return self.weights is None
 
-    def rig_notes(self, rig: CameraRig) -> tuple[str, ...]:
-        """What of a rig is far from the training of the weights, one line each; nothing for random weights."""
-        if self.untrained:
-            return ()
-        stated = facts_note(self.facts, self.config)
-        return (*([stated] if stated else []), *rig_notes(rig, self.config))
-
     @property
     def is_exported(self) -> bool:
         """Whether the network is an exported file, whose parts cannot be observed, trained or exported again."""
@@ -93,6 +86,13 @@ class Model:
     def contents(self) -> dict[str, Any]:
         """The contents of the model's TOML file, [training] excluded."""
         return as_table(self.config, self.tracker)
+
+    def rig_notes(self, rig: CameraRig) -> tuple[str, ...]:
+        """What of a rig is far from the training of the weights, one line each; nothing for random weights."""
+        if self.untrained:
+            return ()
+        stated = facts_note(self.facts, self.config)
+        return (*([stated] if stated else []), *rig_notes(rig, self.config))
 
     @cached_property
     def config_hash(self) -> str:
