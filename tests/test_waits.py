@@ -33,10 +33,6 @@ ALLOWED = {
     ("model/kernels/compiled.py", "future.result"): "the tasks only compute",
     ("synth/drive.py", "ThreadPoolExecutor"): "the tasks only compute",
     ("robustness/sequences.py", "ThreadPoolExecutor"): "the tasks only compute",
-    ("batch/drives.py", "ThreadPoolExecutor"): "as long as the storage takes to list its folders",
-    ("batch/run_batch.py", "ThreadPoolExecutor"): "as long as the storage takes for its small files",
-    ("batch/results.py", "ThreadPoolExecutor"): "as long as the storage takes for its small files",
-    ("batch/find_like.py", "ThreadPoolExecutor"): "as long as the storage takes for its small files",
 }
 # Methods that wait: name -> the number of arguments without a limit, and the keywords that limit it.
 METHODS = {
