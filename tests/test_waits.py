@@ -8,6 +8,22 @@ import bevcli
 ROOT = Path(bevcli.__file__).parent
 # Calls that wait without a limit, by file.
 ALLOWED = {
+    (
+        "batch/drives.py",
+        "ThreadPoolExecutor",
+    ): "the tasks read files; packages of object stores have time limits of their own",
+    (
+        "batch/find_like.py",
+        "ThreadPoolExecutor",
+    ): "the tasks read files; packages of object stores have time limits of their own",
+    (
+        "batch/results.py",
+        "ThreadPoolExecutor",
+    ): "the tasks read files; packages of object stores have time limits of their own",
+    (
+        "batch/run_batch.py",
+        "ThreadPoolExecutor",
+    ): "the tasks read files; packages of object stores have time limits of their own",
     ("cli/viz.py", "process.wait"): "until the user closes the viewer's window",
     ("viewer/web.py", "self._server.serve_forever"): "until Ctrl-C, or `close`",
     ("recording/rrd_file.py", "select.select"): "in a daemon thread, until rerun writes or closes the pipe",
@@ -16,6 +32,7 @@ ALLOWED = {
     ("model/kernels/compiled.py", "ThreadPoolExecutor"): "the tasks only compute",
     ("model/kernels/compiled.py", "future.result"): "the tasks only compute",
     ("synth/drive.py", "ThreadPoolExecutor"): "the tasks only compute",
+    ("robustness/sequences.py", "ThreadPoolExecutor"): "the tasks only compute",
 }
 # Methods that wait: name -> the number of arguments without a limit, and the keywords that limit it.
 METHODS = {

@@ -208,7 +208,7 @@ def read_record(content: bytes | None) -> Record | None:
     """A stored record; None if there is none, or it is broken: its drive is then run again."""
     try:
         record = None if content is None else json.loads(content)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     return record if isinstance(record, dict) and isinstance(record.get("result"), str) else None
 
@@ -262,7 +262,7 @@ def _read_marker(content: bytes | None) -> tuple[int, str]:
     try:
         marker = {} if content is None else json.loads(content)
         return int(marker.get("attempt", 0)), str(marker.get("error", ""))
-    except (ValueError, TypeError, AttributeError):
+    except (ValueError, TypeError, AttributeError, RecursionError, OverflowError):
         return 0, ""
 
 

@@ -121,10 +121,11 @@ def test_alternated_iterators_give_one_item_each_in_turn() -> None:
 
 
 def test_a_training_with_all_options_on_resumes_exactly_too(tmp_path: Path) -> None:
-    """Updates on every frame, alternating batches, query groups, the dense and the perspective loss."""
+    """Updates on every frame, alternating batches, query groups, averaged weights, the dense and perspective loss."""
     settings = replace(
         SHORT, steps=3, evaluate_every=3, checkpoint_every=1, clips=ClipConfig(2, 2, 0.0, "all", in_turn=2),
         dense_loss=DenseLossConfig(1.0), perspective_loss=PerspectiveLossConfig(1.0),
+        optimizer=replace(SHORT.optimizer, average=0.9),
     )  # fmt: skip
 
     def with_all_options(out: Path, resume: bool = False) -> Trainer:
@@ -144,10 +145,15 @@ def test_a_training_with_all_options_on_resumes_exactly_too(tmp_path: Path) -> N
     assert {key.partition(".")[0] for key in keys} == {"model", "dense_reader", "perspective_head"}
     exported = load_file(tmp_path / "whole" / "weights.safetensors")
     assert exported.keys() == whole.job.model.state_dict().keys()
+    key = "detection_head.class_branches.0.0.weight"  # what is released is the average, not the last weights
+    assert key in exported
+    assert not torch.equal(exported[key], whole.job.model.state_dict()[key])
     run_and_kill(with_all_options(tmp_path / "killed"), after=1)
     resumed = with_all_options(tmp_path / "killed", resume=True)
     assert resumed.done == 1
     resumed.run()
+    again = load_file(tmp_path / "killed" / "weights.safetensors")
+    assert all(torch.equal(again[name], exported[name]) for name in exported)
     assert_same_weights(whole, resumed)
 
 
