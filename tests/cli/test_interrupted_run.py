@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 from memory_drive import MemorySequence
 from test_run import MINI_TOML
 
@@ -183,6 +184,7 @@ def run_in_fork(folder: Path, arguments: list[str]) -> None:
         os.dup2(output.fileno(), 1)
         os.dup2(output.fileno(), 2)
     sys.argv = arguments
+    torch.set_num_threads(1)  # as `start`: the last bits of a result depend on the number of threads
     run_app()
 
 

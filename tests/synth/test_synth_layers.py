@@ -1,4 +1,4 @@
-"""The parts of the rendered world import in one direction: assets < world < render < rig < drive < export."""
+"""The parts of the rendered world import in one direction, from the last of LAYERS to the first."""
 
 import ast
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import bevcli.synth
 
 ROOT = Path(bevcli.synth.__file__).parent
-LAYERS = ("assets", "world", "render", "rig", "drive", "export")
+LAYERS = ("assets", "world", "render", "rig", "random_rig", "drive", "export")
 
 
 def test_parts_import_only_from_lower_parts():
