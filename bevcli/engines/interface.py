@@ -48,6 +48,9 @@ def input_ports(config: BEVFormerConfig, cameras: int) -> tuple[Port, ...]:
     cells = grid.rows * grid.columns
     pad = ", ".join(f"{value:g}" for value in pad_value_bgr(config))
     quaternion = "quaternion w x y z" if config.ego_motion.can_bus_quaternion == "wxyz" else "quaternion w w w w"
+    # Of pixels whose centres have whole numbers, see `ImageConfig.half_pixel_shift`.
+    shifted = ", u = scale * u of the camera + (scale - 1) / 2, v likewise," if image.half_pixel_shift else ""
+    level = f", level, {config.bev_frame.height_m:g} m above the ground" if config.bev_frame.level else ""
     names = ", ".join(f"{index} {name}" for index, name in enumerate(config.cameras))
     return (
         Port(
@@ -63,7 +66,7 @@ def input_ports(config: BEVFormerConfig, cameras: int) -> tuple[Port, ...]:
             (1, cameras, 4, 4),
             torch.float32,
             "(1, N, 4, 4): from (x, y, z, 1) in metres of the bev frame to (u d, v d, d, 1), with pixel (u, v) of the "
-            "resized image and depth d in metres. Bev frame: x to the right, y ahead, z up.",
+            f"resized image{shifted} and depth d in metres. Bev frame: x to the right, y ahead, z up{level}.",
         ),
         Port("camera_index", (cameras,), torch.int64, f"(N,): the camera embedding of each image: {names}."),
         Port(
@@ -197,6 +200,8 @@ def metadata(
         "max_gap_s": config.max_gap_s,
         "use_shift": config.ego_motion.shift,
         "use_rotation": config.ego_motion.rotation,
+        "half_pixel_shift": image.half_pixel_shift,
+        "bev_frame": {"level": config.bev_frame.level, "height_m": config.bev_frame.height_m},
         "cameras_per_cell": slots,
         "config": contents,
         "untrained": untrained,

@@ -185,4 +185,4 @@ ExportedBEVFormer(Path({str(small_file)!r}), "openvino")
 def command(*arguments: str) -> str:
     done = CliRunner().invoke(app, list(arguments))
     assert done.exit_code == 0, (arguments, done.output, done.exception)
-    return done.output
+    return done.stdout
