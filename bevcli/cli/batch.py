@@ -209,7 +209,7 @@ def batch(
     images: Annotated[
         Literal["jpeg", "av1"],
         typer.Option(
-            help="jpeg keeps the bytes of the image files; av1 makes recordings smaller and needs bevcli[video].",
+            help="jpeg keeps the bytes of the image files; av1 makes recordings smaller and needs bevcli\\[video].",
             rich_help_panel=OUTPUT,
         ),
     ] = "jpeg",

@@ -45,7 +45,7 @@ def export_onnx(
     """Write one recurrent step of MODEL as an ONNX file of standard operators, without plugins.
 
     The number of cameras is fixed, the batch is one; calibrations are inputs. The file's metadata documents every
-    input and output. docs/deploy.md shows how to run it. Needs pip install 'bevcli[onnx]'.
+    input and output. docs/deploy.md shows how to run it. Needs pip install 'bevcli\\[onnx]'.
     """
     from bevcli.benchmark.exported import check_exported, difference_lines
     from bevcli.engines.export_onnx import export_onnx as write_onnx

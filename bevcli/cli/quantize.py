@@ -36,7 +36,7 @@ def quantize(
     """Write a copy of an exported model whose backbone and neck compute in INT8, for CPUs.
 
     `bevcli run`, `validate` and `bench` take the new file as `--model`. Check the accuracy on drives of your own with
-    `bevcli validate`. Needs pip install 'bevcli[onnx]'.
+    `bevcli validate`. Needs pip install 'bevcli\\[onnx]'.
     """
     from bevcli.benchmark.exported import compare_exported, difference_lines
     from bevcli.engines.exported import ExportedBEVFormer

@@ -171,7 +171,7 @@ def run(
     images: Annotated[
         Literal["jpeg", "av1"],
         typer.Option(
-            help="jpeg keeps the bytes of the image files; av1 makes the recording smaller and needs bevcli[video].",
+            help="jpeg keeps the bytes of the image files; av1 makes the recording smaller and needs bevcli\\[video].",
             rich_help_panel=RECORDING,
         ),
     ] = "jpeg",

@@ -68,10 +68,13 @@ class DeformableAttention(nn.Module):
             Offsets (..., heads, maps, L, P, 2) float32, x and y in cells; weights (..., heads, maps, L, P), whose sum
             over levels and points is 1 for each head and map.
         """
-        offsets = self.sampling_offsets(query).float().unflatten(-1, (*self.shape, 2))
+        return self.as_samples(self.sampling_offsets(query), self.attention_weights(query))
+
+    def as_samples(self, offsets: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
+        """Offsets (..., heads · maps · L · P · 2) and logits (..., heads · maps · L · P) in the form of `predict`."""
         heads, maps, levels, points = self.shape
-        weights = self.attention_weights(query).unflatten(-1, (heads, maps, levels * points)).softmax(-1)
-        return offsets, weights.unflatten(-1, (levels, points))
+        weights = logits.unflatten(-1, (heads, maps, levels * points)).softmax(-1)
+        return offsets.float().unflatten(-1, (*self.shape, 2)), weights.unflatten(-1, (levels, points))
 
     def locations(self, reference_points: Tensor, offsets: Tensor, level_shapes: LevelShapes) -> Tensor:
         """Reference points plus predicted offsets; see `sampling_locations`."""

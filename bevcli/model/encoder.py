@@ -177,7 +177,7 @@ class TemporalSelfAttention(nn.Module):
         """
         batch, cells, _ = query.shape
         maps = bev_maps.shape[1]
-        offsets, weights = self.attention.predict(torch.cat([bev_maps[:, 0], query + position], dim=-1))
+        offsets, weights = self.predict(query, position, bev_maps[:, 0])
         reference = reference_points.transpose(1, 2)[:, :, None, :, None, None]  # (B, Y·X, 1, 2, 1, 1, 2)
         locations = self.attention.locations(reference, offsets, self.level_shapes)  # (B, Y·X, heads, 2, 1, P, 2)
         sampled = self.attention.sample(
@@ -189,6 +189,10 @@ class TemporalSelfAttention(nn.Module):
         )  # (B·2·Y·X, C)
         mean = sampled.unflatten(0, (batch, 2, cells)).mean(1)
         return self.dropout(self.attention.output_projection(mean))
+
+    def predict(self, query: Tensor, position: Tensor, history: Tensor) -> tuple[Tensor, Tensor]:
+        """Offsets and weights of the samples, from the history (B, Y·X, C) and the query at the same cell."""
+        return self.attention.predict(torch.cat([history, query + position], dim=-1))
 
 
 class SpatialCrossAttention(nn.Module):

@@ -24,7 +24,7 @@ from bevcli.model.bevformer_v2 import BEVFormerV2, WindowFrame
 from bevcli.model.decoder import Decoder, DecoderLayer
 from bevcli.model.deformable_attention import DeformableAttention, FeatureMaps, GridSampling
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
-from bevcli.model.encoder import EncoderLayer, SpatialCrossAttention
+from bevcli.model.encoder import EncoderLayer, SpatialCrossAttention, TemporalSelfAttention
 from bevcli.model.kernels.compiled import CompiledDeformableConvolution, CompiledSampling, load_compiled
 from bevcli.model.kernels.onednn import use_onednn
 from bevcli.model.kernels.tables import Tables
@@ -90,6 +90,7 @@ class PreparedBEVFormerV2(BEVFormerV2):
     """A BEVFormerV2 for inference on one device: see `PreparedBEVFormer`.
 
     The first temporal self-attention of the encoder is constant too, because no ego-motion enters the BEV queries.
+    In the others the queries take the place of the history.
     """
 
     def __init__(self, model: BEVFormerV2, device: torch.device, precision: Precision) -> None:
@@ -98,6 +99,10 @@ class PreparedBEVFormerV2(BEVFormerV2):
         self.images_dtype = DTYPES[precision]
         self.eval().requires_grad_(False)
         self.encoder.layers[0].temporal_self_attention = ConstantTemporalSelfAttention(self)
+        for layer in self.encoder.layers[1:]:
+            assert isinstance(layer, EncoderLayer)
+            attention = OwnQueriesAttention(layer.temporal_self_attention, self.bev_queries.position())
+            layer.temporal_self_attention = attention
         _prepare(self, device, self.images_dtype)
 
     def image_features(self, images: Tensor, camera_index: Tensor) -> FeatureMaps:
@@ -223,6 +228,32 @@ class ConstantTemporalSelfAttention(nn.Module):
     def forward(self, query: Tensor, position: Tensor, bev_maps: Tensor, reference_points: Tensor) -> Tensor:
         """Arguments as for `TemporalSelfAttention`, of which only the shape of the query is read -> (B, Y·X, C)."""
         return self.attended.expand_as(query)
+
+
+class OwnQueriesAttention(TemporalSelfAttention):
+    """A temporal self-attention that never has a history: both maps are the queries.
+
+    Offsets and weights are a linear function of (query, query + position). The products with the query are added up
+    beforehand, and those with the position computed.
+    """
+
+    constant: Tensor
+
+    def __init__(self, attention: TemporalSelfAttention, position: Tensor) -> None:
+        """position: (Y·X, C), position embedding of the cells."""
+        nn.Module.__init__(self)
+        self.__dict__.update(copy.copy(attention).__dict__)
+        layers = (attention.attention.sampling_offsets, attention.attention.attention_weights)
+        of_history, of_query = torch.cat([layer.weight for layer in layers]).chunk(2, dim=1)
+        bias = torch.cat([layer.bias for layer in layers])
+        self.sizes = [layer.out_features for layer in layers]
+        self.both = nn.Linear(of_query.shape[1], of_query.shape[0], bias=False, device="meta")
+        self.both.weight = nn.Parameter(of_history + of_query, requires_grad=False)
+        self.register_buffer("constant", position @ of_query.T + bias, persistent=False)  # (Y·X, both sizes)
+
+    def predict(self, query: Tensor, position: Tensor, history: Tensor) -> tuple[Tensor, Tensor]:
+        """As `TemporalSelfAttention.predict`; reads the query only."""
+        return self.attention.as_samples(*(self.both(query) + self.constant).split(self.sizes, dim=-1))
 
 
 class BiasedDeformableConvolution(nn.Module):

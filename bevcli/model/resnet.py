@@ -60,6 +60,11 @@ class ResNet(nn.Module):
         self.stages = nn.ModuleList(stages)
         nn.init.kaiming_normal_(self.conv1.weight, mode="fan_out", nonlinearity="relu")
 
+    def freeze(self, stages: int) -> None:
+        """Keeps the weights of the stem and of the first stages, so many, in a training; with 0 nothing is frozen."""
+        for part in [self.conv1, self.bn1, *self.stages[:stages]] if stages else []:
+            part.requires_grad_(False)
+
     def forward(self, images: Tensor) -> list[Tensor]:
         """images: (B, 3, H, W), H and W multiples of 32 -> (B, C_s, H / 2^(s+1), W / 2^(s+1)) for each output stage."""
         # ReLU and max-pooling commute; the published order applies ReLU before pooling, to four times as many cells.

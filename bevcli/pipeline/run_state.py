@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import torch
 
@@ -25,6 +25,14 @@ from bevcli.pipeline.tracking import TrackerState
 SHARE = 0.02  # of the run's time that saving may take
 ASSUMED_BYTES_PER_S, ASSUMED_S = 3e8, 0.002  # how long the first save takes
 HASHED_BYTES = 1 << 24  # files up to this size are hashed; of larger ones size and modification time count
+
+
+class _HasFacts(Protocol):
+    @property
+    def facts(self) -> Mapping[str, str]: ...
+
+
+State = TypeVar("State", bound=_HasFacts)
 
 
 @dataclass(frozen=True)
@@ -79,17 +87,26 @@ def run_facts(model: Model, sequence: Sequence, options: object) -> dict[str, st
 
 def open_state(folder: RunFolder, facts: Mapping[str, str]) -> RunState | None:
     """The state to go on from, None if the folder has no run. Raises OutputError if its run was another one."""
+    state = saved_state(folder, facts, RunState, "a run")
+    if state is None and folder.has_files():
+        raise OutputError(f"{folder.path}: --resume: its run saved no state; pass --force to start anew")
+    return state
+
+
+def saved_state(folder: RunFolder, facts: Mapping[str, str], kind: type[State], what: str) -> State | None:
+    """The state of a kind in a folder, None if there is none.
+
+    Raises OutputError if it is damaged, of another kind, or of a run with other facts. what: whose state it is.
+    """
     path = folder.state_path
     if not path.exists():
-        if folder.has_files():
-            raise OutputError(f"{folder.path}: --resume: its run saved no state; pass --force to start anew")
         return None
     try:
         state = load_state(path)
     except InputError as error:
         raise OutputError(f"--resume: {error}; pass --force to start anew") from None
-    if not isinstance(state, RunState):
-        raise OutputError(f"--resume: {path}: is not the state of a run; pass --force to start anew")
+    if not isinstance(state, kind):
+        raise OutputError(f"--resume: {path}: is not the state of {what}; pass --force to start anew")
     check_same_run(folder.path, state.facts, facts)
     return state
 

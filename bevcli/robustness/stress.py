@@ -16,6 +16,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.pipeline.model_loading import Model
 from bevcli.pipeline.preprocess import Preprocessor
 from bevcli.pipeline.run_folder import RunFolder
+from bevcli.pipeline.run_state import saved_state
 from bevcli.pipeline.runner import Runner, StepOptions
 from bevcli.pipeline.state_file import load_state, save_state
 from bevcli.robustness.conditions import CORRUPTIONS, Condition, choose_conditions
@@ -23,7 +24,7 @@ from bevcli.robustness.contact_sheet import SheetOptions
 from bevcli.robustness.lost_images import LostImage
 from bevcli.robustness.results import ConditionScores, StressResults
 from bevcli.robustness.sequences import FrameStore, KeptFrames, split_scenes
-from bevcli.robustness.stress_files import StressState, open_stress_state, stress_facts, write_figures, write_results
+from bevcli.robustness.stress_files import StressState, stress_facts, write_figures, write_results
 from bevcli.training.validation import boxes_ego
 
 
@@ -105,7 +106,7 @@ def stress(
     scenes = [KeptFrames(scene, store) for drive in drives for scene in split_scenes(drive)]
     facts = stress_facts(model, drives, options)
     with RunFolder(out, force=force, resume=resume) as folder:
-        state = open_stress_state(folder, facts) if resume else None
+        state = saved_state(folder, facts, StressState, "a stress test") if resume else None
         if state is None:
             folder.remove_written()
             state = StressState(facts)

@@ -7,12 +7,12 @@ import os
 from collections.abc import Sequence as Items
 from dataclasses import dataclass
 
-from bevcli.errors import InputError, OutputError
+from bevcli.errors import OutputError
 from bevcli.frame import Sequence
 from bevcli.pipeline.model_loading import Model
 from bevcli.pipeline.run_folder import RunFolder
-from bevcli.pipeline.run_state import check_same_run, run_facts
-from bevcli.pipeline.state_file import digest, load_state
+from bevcli.pipeline.run_state import run_facts
+from bevcli.pipeline.state_file import digest
 from bevcli.robustness.conditions import Condition
 from bevcli.robustness.contact_sheet import SheetOptions, write_contact_sheet
 from bevcli.robustness.results import ConditionScores, StressResults
@@ -45,21 +45,6 @@ def stress_facts(model: Model, drives: Items[Sequence], options: object) -> dict
     if len(each) > 1:
         facts |= {name: digest(tuple(one[name] for one in each))[:12] for name in _INPUT_FACTS}
     return facts | {"drives": ", ".join(drive.name for drive in drives)}
-
-
-def open_stress_state(folder: RunFolder, facts: dict[str, str]) -> StressState | None:
-    """The state to go on from, None if there is none. Raises OutputError if the test was another one."""
-    path = folder.state_path
-    if not path.exists():
-        return None
-    try:
-        state = load_state(path)
-    except InputError as error:
-        raise OutputError(f"--resume: {error}; pass --force to start anew") from None
-    if not isinstance(state, StressState):
-        raise OutputError(f"--resume: {path}: is not the state of a stress test; pass --force to start anew")
-    check_same_run(folder.path, state.facts, facts)
-    return state
 
 
 def write_results(folder: RunFolder, results: StressResults, against: StressResults | None) -> None:

@@ -39,6 +39,7 @@ class TrainingConfig(LossConfigs):
         evaluate_every: steps between evaluations.
         checkpoint_every: steps between checkpoints.
         freeze_batch_norm: keep the running statistics of batch norms, for fine-tuning.
+        frozen_stages: the backbone's stem and its first stages, so many, keep their weights; 0 trains all of it.
         loaders: threads that read batches ahead, one step's batches each. Use several if a GPU waits for data.
         weights_dtype: data type of weights.safetensors.
         clips: how clips are drawn.
@@ -52,6 +53,7 @@ class TrainingConfig(LossConfigs):
     evaluate_every: int = 1000
     checkpoint_every: int = 250
     freeze_batch_norm: bool = False
+    frozen_stages: int = 0
     loaders: int = 1
     weights_dtype: Literal["float32", "float16"] = "float32"
     clips: ClipConfig = field(default_factory=ClipConfig)
@@ -64,6 +66,8 @@ class TrainingConfig(LossConfigs):
             raise ValueError(
                 "steps, evaluate_every, checkpoint_every and loaders must be positive, held_out not negative"
             )
+        if self.frozen_stages < 0:
+            raise ValueError("frozen_stages must not be negative")
 
 
 @dataclass(frozen=True)
@@ -135,6 +139,7 @@ def prepare_training(
     model = build_model(model_config)
     if weights is not None:
         load_weights(weights, model, resample=True)
+    model.backbone.freeze(config.frozen_stages)
     return TrainingJob(model, config, drives, evaluated, out, device, seed, join_process_group(device))
 
 

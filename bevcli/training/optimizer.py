@@ -51,7 +51,10 @@ class OptimizerConfig:
 
 
 def make_optimizer(trained: nn.Module, backbone: nn.Module, config: OptimizerConfig) -> torch.optim.AdamW:
-    """AdamW with two parameter groups: everything in `trained` except the backbone, and the backbone."""
+    """AdamW with two parameter groups: everything in `trained` except the backbone, and the backbone.
+
+    Frozen parameters get no gradient, so that it leaves them alone.
+    """
     in_backbone = {id(parameter) for parameter in backbone.parameters()}
     others = [parameter for parameter in trained.parameters() if id(parameter) not in in_backbone]
     groups = [{"params": others, "share": 1.0}, {"params": list(backbone.parameters()), "share": config.backbone_share}]

@@ -25,6 +25,13 @@ def test_version():
     assert bevcli_command("--version").stdout.strip() == f"bevcli {bevcli.__version__}"
 
 
+@pytest.mark.parametrize(
+    ("command", "extra"), [("run", "video"), ("batch", "video"), ("export-onnx", "onnx"), ("quantize", "onnx")]
+)
+def test_help_names_the_extras_that_a_command_needs(command, extra):
+    assert f"bevcli[{extra}]" in bevcli_command(command, "--help").stdout
+
+
 def test_a_mistake_in_usage_exits_2():
     assert bevcli_command("run").returncode == 2
 

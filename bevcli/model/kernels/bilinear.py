@@ -11,6 +11,7 @@ from numba import types
 from numba.extending import overload
 
 from bevcli.jit import njit
+from bevcli.model.kernels.vectors import sum_samples
 
 
 def as_float32(number: object) -> np.float32:
@@ -83,16 +84,14 @@ def sample_maps(values, level_shapes, locations, weights, map_of_query, out, beg
     For each head of a query, the indices of all corners are computed before any is read, so that the reads overlap.
     """
     heads, levels, points = weights.shape[1:]
-    # Unsigned: for a signed index, each read would check whether it counts from the array's end.
-    depth = np.uint64(values.shape[3])
-    flat = values.reshape(-1)
-    step = heads * values.shape[3]
-    corners = np.empty((levels * points, 4), np.uint64)
+    depth = values.shape[3]
+    flat, sums = values.reshape(-1), out.reshape(-1)
+    step = heads * depth
+    corners = np.empty((levels * points, 4), np.int64)
     shares = np.empty((levels * points, 4), np.float32)
-    total = np.empty(depth, np.float32)
     for query in range(begin, end):
         for head in range(heads):
-            first = map_of_query[query] * values.shape[1] * step + head * values.shape[3]
+            first = map_of_query[query] * values.shape[1] * step + head * depth
             for level in range(levels):
                 height, width = level_shapes[level]
                 for point in range(points):
@@ -111,18 +110,7 @@ def sample_maps(values, level_shapes, locations, weights, map_of_query, out, beg
                     for corner in range(4):
                         shares[tap, corner] = weight * corner_shares[corner]
                 first += height * width * step
-            total[:] = 0
-            for tap in range(levels * points):
-                a, b, c, d = corners[tap, 0], corners[tap, 1], corners[tap, 2], corners[tap, 3]
-                share_a, share_b, share_c, share_d = shares[tap, 0], shares[tap, 1], shares[tap, 2], shares[tap, 3]
-                for channel in range(depth):
-                    total[channel] += (
-                        share_a * as_float32(flat[a + channel])
-                        + share_b * as_float32(flat[b + channel])
-                        + share_c * as_float32(flat[c + channel])
-                        + share_d * as_float32(flat[d + channel])
-                    )
-            out[query, head] = total
+            sum_samples(flat, corners, shares, sums, (query * heads + head) * depth, depth)
 
 
 @njit(nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
