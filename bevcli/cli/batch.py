@@ -6,7 +6,7 @@ import signal
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,7 +14,6 @@ from bevcli.cli.input_options import (
     AllowOutsideOption,
     CalibrationOption,
     ClassMapOption,
-    DeviceOption,
     EveryOption,
     FramesOption,
     GroundTruthOption,
@@ -34,12 +33,24 @@ from bevcli.cli.input_options import (
     parse_rate,
     parse_topics,
 )
+from bevcli.cli.run_options import (
+    MODEL,
+    BevOption,
+    CameraOption,
+    DeviceOption,
+    ImagesOption,
+    PrecisionOption,
+    RecordOption,
+    TemporalOption,
+    UntrainedOption,
+    WeightsOption,
+)
 from bevcli.cli.stop_signals import StopSignals
 
 if TYPE_CHECKING:
     from bevcli.batch.worker import Record
 
-MODEL, OUTPUT, WORKERS = "Model", "Output", "Workers"
+OUTPUT, WORKERS = "Output", "Workers"
 SOME_FAILED = 3  # exit code
 
 
@@ -109,47 +120,18 @@ def batch(
             show_default=False,
         ),
     ] = None,
-    weights: Annotated[
-        Path | None,
-        typer.Option(
-            help="An official .pth file or a .safetensors file. Default: the weights in the package (demo only).",
-            rich_help_panel=MODEL,
-            show_default=False,
-        ),
-    ] = None,
-    untrained: Annotated[
-        bool,
-        typer.Option(
-            "--untrained", help="Use random weights; all outputs are labelled UNTRAINED.", rich_help_panel=MODEL
-        ),
-    ] = False,
+    weights: WeightsOption = None,
+    untrained: UntrainedOption = False,
     device: DeviceOption = "auto",
-    precision: Annotated[
-        Literal["fp32", "bf16", "fp16"] | None,
-        typer.Option(
-            help="Precision of the image features. Default: fp32 on a CPU, bf16 on a GPU.",
-            rich_help_panel=MODEL,
-            show_default=False,
-        ),
-    ] = None,
-    temporal: Annotated[
-        bool,
-        typer.Option("--temporal/--no-temporal", help="Use the frames before (and after).", rich_help_panel=MODEL),
-    ] = True,
+    precision: PrecisionOption = None,
+    temporal: TemporalOption = True,
     track: Annotated[
         bool,
         typer.Option(
             "--track/--no-track", help="Give boxes identities over time, and write tracks.csv.", rich_help_panel=MODEL
         ),
     ] = True,
-    camera: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=MODEL_CAMERA",
-            help="Use the embedding of MODEL_CAMERA for camera NAME. Repeatable.",
-            rich_help_panel=MODEL,
-        ),
-    ] = None,
+    camera: CameraOption = None,
     frames: FramesOption = None,
     rate: RateOption = None,
     every: EveryOption = None,
@@ -202,21 +184,9 @@ def batch(
             rich_help_panel=OUTPUT,
         ),
     ] = 0.25,
-    record: Annotated[
-        Literal["minimal", "standard", "full"],
-        typer.Option(help="How much the recordings contain.", rich_help_panel=OUTPUT),
-    ] = "standard",
-    images: Annotated[
-        Literal["jpeg", "av1"],
-        typer.Option(
-            help="jpeg keeps the bytes of the image files; av1 makes recordings smaller and needs bevcli\\[video].",
-            rich_help_panel=OUTPUT,
-        ),
-    ] = "jpeg",
-    bev: Annotated[
-        str,
-        typer.Option(help="How the BEV features are drawn: norm, pca, channel:K or none.", rich_help_panel=OUTPUT),
-    ] = "pca",
+    record: RecordOption = "standard",
+    images: ImagesOption = "jpeg",
+    bev: BevOption = "pca",
 ) -> None:
     """Run BEVFormer on many DRIVES, each exactly as `bevcli run` does, on this machine or a Ray cluster.
 

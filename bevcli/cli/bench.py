@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from bevcli.cli.input_options import DeviceOption, EngineOption, complete_model
+from bevcli.cli.input_options import complete_model
+from bevcli.cli.run_options import DeviceOption, EngineOption, PrecisionOption
 
 
 def bench(
@@ -20,10 +21,7 @@ def bench(
     ] = "tiny",
     device: DeviceOption = "auto",
     engine: EngineOption = None,
-    precision: Annotated[
-        Literal["fp32", "bf16", "fp16"] | None,
-        typer.Option(help="Default: fp32 on the CPU, bf16 on a GPU.", show_default=False),
-    ] = None,
+    precision: PrecisionOption = None,
     frames: Annotated[int, typer.Option(min=1, help="Number of timed frames, after the warm-up.")] = 5,
     against: Annotated[
         Literal["plain"] | None,

@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from bevcli.cli.input_options import DeviceOption, complete_model, parse_position
+from bevcli.cli.input_options import complete_model, parse_position
+from bevcli.cli.run_options import DeviceOption
 
 DEFAULT_FRAME = 10
 

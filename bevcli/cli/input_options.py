@@ -9,17 +9,6 @@ import typer
 
 PANEL = "Input"
 
-DeviceOption = Annotated[
-    str,
-    typer.Option(
-        metavar="auto|cpu|cuda|cuda:N|mps",
-        help="auto uses a CUDA GPU if there is one; cuda:1 is the second one; mps is the GPU of a Mac (untried).",
-    ),
-]
-EngineOption = Annotated[
-    Literal["onnxruntime", "openvino"] | None,
-    typer.Option(help="Program that runs a FILE.onnx. Default: onnxruntime.", show_default=False),
-]
 SceneOption = Annotated[str | None, typer.Option(help="Only this scene, such as scene-0103.", rich_help_panel=PANEL)]
 StrictOption = Annotated[
     bool,

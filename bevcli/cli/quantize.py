@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from bevcli.cli.input_options import EngineOption
+from bevcli.cli.run_options import EngineOption
 
 
 def quantize(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,9 +13,7 @@ from bevcli.cli.input_options import (
     AllowOutsideOption,
     CalibrationOption,
     ClassMapOption,
-    DeviceOption,
     EgoMotionOption,
-    EngineOption,
     EveryOption,
     ExtrinsicsOption,
     FramesOption,
@@ -39,12 +37,26 @@ from bevcli.cli.input_options import (
     parse_rate,
     parse_topics,
 )
+from bevcli.cli.run_options import (
+    MODEL,
+    RECORDING,
+    BevOption,
+    CameraOption,
+    DeviceOption,
+    EngineOption,
+    ImagesOption,
+    PrecisionOption,
+    RecordOption,
+    TemporalOption,
+    UntrainedOption,
+    WeightsOption,
+)
 
 if TYPE_CHECKING:
     from bevcli.frame import Frame, Prediction, Sequence
     from bevcli.pipeline.model_loading import Model
 
-MODEL, OUTPUT, RECORDING = "Model", "Output", "Recording"
+OUTPUT = "Output"
 
 
 def run(
@@ -62,34 +74,12 @@ def run(
             show_default=False,
         ),
     ] = None,
-    weights: Annotated[
-        Path | None,
-        typer.Option(
-            help="An official .pth file or a .safetensors file. Default: the weights in the package (demo only).",
-            rich_help_panel=MODEL,
-            show_default=False,
-        ),
-    ] = None,
-    untrained: Annotated[
-        bool,
-        typer.Option(
-            "--untrained", help="Use random weights; all outputs are labelled UNTRAINED.", rich_help_panel=MODEL
-        ),
-    ] = False,
+    weights: WeightsOption = None,
+    untrained: UntrainedOption = False,
     device: DeviceOption = "auto",
     engine: EngineOption = None,
-    precision: Annotated[
-        Literal["fp32", "bf16", "fp16"] | None,
-        typer.Option(
-            help="Precision of the image features. Default: fp32 on a CPU, bf16 on a GPU.",
-            rich_help_panel=MODEL,
-            show_default=False,
-        ),
-    ] = None,
-    temporal: Annotated[
-        bool,
-        typer.Option("--temporal/--no-temporal", help="Use the frames before (and after).", rich_help_panel=MODEL),
-    ] = True,
+    precision: PrecisionOption = None,
+    temporal: TemporalOption = True,
     track: Annotated[
         bool,
         typer.Option(
@@ -98,15 +88,7 @@ def run(
             rich_help_panel=MODEL,
         ),
     ] = True,
-    camera: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=MODEL_CAMERA",
-            help="Use the embedding of MODEL_CAMERA for camera NAME. Repeatable. Default: the model's camera of the "
-            "same name, else the one with the nearest viewing direction.",
-            rich_help_panel=MODEL,
-        ),
-    ] = None,
+    camera: CameraOption = None,
     frames: FramesOption = None,
     rate: RateOption = None,
     every: EveryOption = None,
@@ -164,21 +146,9 @@ def run(
             "--live", help="Open a viewer that shows the recording while it is written.", rich_help_panel=RECORDING
         ),
     ] = False,
-    record: Annotated[
-        Literal["minimal", "standard", "full"],
-        typer.Option(help="How much the recording contains.", rich_help_panel=RECORDING),
-    ] = "standard",
-    images: Annotated[
-        Literal["jpeg", "av1"],
-        typer.Option(
-            help="jpeg keeps the bytes of the image files; av1 makes the recording smaller and needs bevcli\\[video].",
-            rich_help_panel=RECORDING,
-        ),
-    ] = "jpeg",
-    bev: Annotated[
-        str,
-        typer.Option(help="How the BEV features are drawn: norm, pca, channel:K or none.", rich_help_panel=RECORDING),
-    ] = "pca",
+    record: RecordOption = "standard",
+    images: ImagesOption = "jpeg",
+    bev: BevOption = "pca",
     probe: Annotated[
         list[str] | None,
         typer.Option(

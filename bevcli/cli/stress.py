@@ -10,7 +10,6 @@ import typer
 
 from bevcli.cli.input_options import (
     ClassMapOption,
-    DeviceOption,
     FramesOption,
     SceneOption,
     SplitOption,
@@ -19,6 +18,7 @@ from bevcli.cli.input_options import (
     parse_class_map,
     parse_frames,
 )
+from bevcli.cli.run_options import MODEL, DeviceOption, EngineOption, PrecisionOption, TemporalOption, WeightsOption
 
 if TYPE_CHECKING:
     from bevcli.frame import Sequence
@@ -35,27 +35,16 @@ def stress(
         str | None,
         typer.Option(
             autocompletion=complete_model,
-            help="A model name or a FILE.toml. Default: the model that WEIGHTS fit, else demo.",
+            help="A model name, a FILE.toml or a FILE.onnx. Default: the model that WEIGHTS fit, else demo.",
+            rich_help_panel=MODEL,
             show_default=False,
         ),
     ] = None,
-    weights: Annotated[
-        Path | None,
-        typer.Option(
-            help="An official .pth file or a .safetensors file. Default: the weights in the package (demo only).",
-            show_default=False,
-        ),
-    ] = None,
+    weights: WeightsOption = None,
     device: DeviceOption = "auto",
-    precision: Annotated[
-        Literal["fp32", "bf16", "fp16"] | None,
-        typer.Option(
-            help="Precision of the image features. Default: fp32 on a CPU, bf16 on a GPU.", show_default=False
-        ),
-    ] = None,
-    temporal: Annotated[
-        bool, typer.Option("--temporal/--no-temporal", help="Use the frames before (and after).")
-    ] = True,
+    engine: EngineOption = None,
+    precision: PrecisionOption = None,
+    temporal: TemporalOption = True,
     rendered: Annotated[
         str | None,
         typer.Option(metavar="SEEDS", help="Use rendered drives with these seeds: A:B (B excluded), or A,B,C."),
@@ -160,7 +149,7 @@ def stress(
     other = None if against is None else read_results(against)
     if bool(sequence) == (rendered is not None):
         raise InputError("choose the drives: give either SEQUENCE folders or --rendered SEEDS, not both")
-    loaded = load_model(model, weights, device=device, precision=precision)
+    loaded = load_model(model, weights, device=device, precision=precision, engine=engine)
     part = parse_frames(frames)
 
     def opened() -> list[Sequence]:

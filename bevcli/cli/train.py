@@ -9,7 +9,8 @@ from typing import Annotated, Any
 
 import typer
 
-from bevcli.cli.input_options import DeviceOption, complete_model
+from bevcli.cli.input_options import complete_model
+from bevcli.cli.run_options import DeviceOption
 
 
 def train(

@@ -7,19 +7,15 @@ from typing import Annotated
 
 import typer
 
-from bevcli.cli.input_options import DeviceOption, EngineOption, complete_model
+from bevcli.cli.input_options import complete_model
+from bevcli.cli.run_options import DeviceOption, EngineOption, TemporalOption, WeightsOption
 
 
 def validate(
     model: Annotated[
         str, typer.Argument(autocompletion=complete_model, help="A model name, a FILE.toml or a FILE.onnx.")
     ],
-    weights: Annotated[
-        Path | None,
-        typer.Option(
-            help="Official .pth, or .safetensors. Default: the weights in the package (demo only).", show_default=False
-        ),
-    ] = None,
+    weights: WeightsOption = None,
     data: Annotated[
         list[Path] | None, typer.Option(metavar="DIR", help="A sequence with ground truth. Repeatable.")
     ] = None,
@@ -39,9 +35,7 @@ def validate(
     cache: Annotated[Path, typer.Option(metavar="DIR", help="Folder that keeps rendered drives.")] = Path(
         "runs/drives"
     ),
-    temporal: Annotated[
-        bool, typer.Option("--temporal/--no-temporal", help="Use the BEV map of the previous frame.")
-    ] = True,
+    temporal: TemporalOption = True,
     max_range: Annotated[
         float | None,
         typer.Option(
