@@ -28,13 +28,14 @@ from bevcli.pipeline.cpu_memory import keep_freed_memory
 # Ray Data holds only one line of text per drive in its object store.
 OBJECT_STORE_BYTES = 100 << 20
 CONNECT_S = 15.0  # for the connection to a cluster
+# How waiting threads behave, see `bevcli.cli.main`. A worker reads it when it loads PyTorch.
+_WORKER_ENVIRONMENT = {"OMP_WAIT_POLICY": "PASSIVE"}
 # Settings that Ray reads from the environment: no telemetry, no logs on the terminal.
 _ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_DATA_DISABLE_PROGRESS_BARS": "1",
     "RAY_DATA_LOG_LEVEL": "CRITICAL",
     "RAY_BACKEND_LOG_LEVEL": "fatal",
-    "OMP_WAIT_POLICY": "PASSIVE",
 }
 # On this machine, Ray's processes then listen on 127.0.0.1 only.
 _LOOPBACK = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
@@ -137,7 +138,8 @@ def _ray(workers: Workers) -> Iterator[Any]:
     on_terminate = signal.getsignal(signal.SIGTERM)
     try:
         with _without_stderr():
-            ray.init(log_to_driver=False, logging_level=logging.ERROR, **options)
+            environment = {"env_vars": _WORKER_ENVIRONMENT}
+            ray.init(log_to_driver=False, logging_level=logging.ERROR, runtime_env=environment, **options)
     except Exception as error:  # Ray raises errors of many types where it cannot start or connect
         where = f"the cluster {workers.address} cannot be reached" if workers.address else "cannot be started"
         raise BevcliError(f"Ray: {where} ({_first_line(error)})") from None

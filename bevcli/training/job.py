@@ -139,7 +139,6 @@ def prepare_training(
     model = build_model(model_config)
     if weights is not None:
         load_weights(weights, model, resample=True)
-    model.backbone.freeze(config.frozen_stages)
     return TrainingJob(model, config, drives, evaluated, out, device, seed, join_process_group(device))
 
 

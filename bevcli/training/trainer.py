@@ -45,6 +45,7 @@ class Trainer:
     def __init__(self, job: TrainingJob, *, resume: bool = False) -> None:
         """Prepares model and optimizer. Raises WeightsError if the checkpoint to resume from is missing or wrong."""
         self.job = job
+        job.model.backbone.freeze(job.config.frozen_stages)
         self._losses = FrameLosses(job.model, job.config)
         self.trained = nn.ModuleDict({"model": job.model, **self._losses.auxiliary_heads}).to(job.device)
         self.optimizer = make_optimizer(self.trained, job.model.backbone, job.config.optimizer)

@@ -170,9 +170,7 @@ def test_a_worker_that_cannot_start_ends_the_batch_with_one_line(tmp_path):
 @pytest.fixture
 def s3(tmp_path, monkeypatch):
     """An S3 server on this machine with the bucket "fleet"; the environment names it."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     url = f"http://127.0.0.1:{port}"
     for name, value in {
         "AWS_ENDPOINT_URL": url,
@@ -236,6 +234,37 @@ def test_drives_and_results_in_s3(s3, tmp_path):
     found = command(tmp_path, "find-like", "d000", "--frame", "1", "--in", "s3://fleet/out", "--count", "2")
     assert found.returncode == 0, found.stderr
     assert s3.exists("fleet/out/find-like.html")
+
+
+def test_a_batch_runs_on_a_cluster_that_is_up_already(tmp_path, monkeypatch):
+    (tmp_path / "mini.toml").write_text(MINI_TOML)
+    write_fleet(tmp_path / "drives", 4, frames=2)
+    ray = [sys.executable, "-m", "ray.scripts.scripts"]
+    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)  # workers get it from the batch
+    port = str(free_port())
+    started = subprocess.run(
+        [*ray, "start", "--head", "--port", port, "--num-cpus", "2", "--node-ip-address", "127.0.0.1",
+         "--include-dashboard", "false", "--disable-usage-stats", "--temp-dir", str(tmp_path / "ray")],
+        cwd=tmp_path, capture_output=True, text=True, timeout=200, check=False,
+    )  # fmt: skip
+    assert started.returncode == 0, started.stderr
+    try:
+        done = command(tmp_path, *BATCH, "--ray", f"127.0.0.1:{port}", "--workers", "2")
+    finally:
+        subprocess.run([*ray, "stop", "--force"], capture_output=True, timeout=200, check=False)
+    assert done.returncode == 0, done.stderr
+    command(tmp_path, *BATCH[:2], "--out", "alone", *BATCH[4:], "--workers", "1")
+    alone = results_of(tmp_path / "alone")
+    for name, folder in results_of(tmp_path / "out").items():
+        assert (folder / "predictions.json").read_bytes() == (alone[name] / "predictions.json").read_bytes()
+    assert len(alone) == 4
+
+
+def free_port() -> int:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return free.getsockname()[1]
 
 
 def test_a_local_batch_listens_on_this_machine_only(tmp_path):

@@ -170,6 +170,15 @@ def test_every_parameter_receives_a_gradient_that_is_not_zero(tmp_path: Path) ->
     assert parameters_without_gradient(one) == []
 
 
+def test_frozen_stages_keep_their_weights(tmp_path: Path) -> None:
+    trained = trainer(tmp_path, settings=replace(SHORT, frozen_stages=1))
+    before = {name: value.clone() for name, value in trained.job.model.backbone.named_parameters()}
+    trained.run()
+    changed = {name for name, value in trained.job.model.backbone.named_parameters() if not value.equal(before[name])}
+    assert not [name for name in changed if name.startswith(("conv1", "bn1", "stages.0."))]
+    assert [name for name in changed if name.startswith("stages.1.")]
+
+
 def test_training_and_validation_leave_no_hooks_on_the_model(tmp_path: Path) -> None:
     settings = replace(SHORT, steps=2, evaluate_every=1, perspective_loss=PerspectiveLossConfig(1.0))
     one = trainer(tmp_path, settings=settings)
