@@ -59,6 +59,7 @@ def _camera_ports(config: BEVFormerConfig, cameras: int) -> tuple[Port, ...]:
     cropped = "" if image.crop is None else f", cropped to columns {left} to {right - 1} and rows {top} to {bottom - 1}"
     level = f", level, {config.bev_frame.height_m:g} m above the ground" if config.bev_frame.level else ""
     names = ", ".join(f"{index} {name}" for index, name in enumerate(config.cameras))
+    lead: tuple[int, ...]
     if isinstance(config, BEVFormerV2Config):
         axes, lead = "1, F, N", (1, len(config.frames), cameras)
         bev_frame = "the current frame's bev frame"

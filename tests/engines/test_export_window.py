@@ -109,6 +109,7 @@ def test_an_interrupted_run_of_a_file_is_resumed_with_its_window(window_files, t
         assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_int8_is_close_to_float32(window_files, tmp_path):
     file, config = window_files[WINDOW], load_model(window_files[WINDOW]).config
     quantize(file, calibration_images(config, 6, [DRIVE], 4), tmp_path / "int8.onnx")
@@ -129,6 +130,7 @@ def test_models_that_have_no_exported_form_are_refused(cropping_model, tmp_path)
     assert not (tmp_path / "none.onnx").exists()
 
 
+@pytest.mark.slow
 def test_commands_export_check_and_time_a_window(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     text = resources.files("bevcli").joinpath("configs/v2-t2.toml").read_text()
