@@ -1,6 +1,7 @@
 """Fixtures of several tests: a tiny model, and the folder of the reference data."""
 
 import os
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -8,9 +9,12 @@ import torch
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import CLASSES
+from bevcli.model.bev_fusion import BevFusionConfig
 from bevcli.model.bevformer import BEVFormer, BEVFormerConfig, ImageConfig
+from bevcli.model.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config
 from bevcli.model.decoder import DecoderConfig
 from bevcli.model.encoder import EncoderConfig
+from bevcli.model.fpn import FPNConfig
 from bevcli.model.resnet import ResNetConfig
 from bevcli.pipeline.camera_assignment import NUSCENES_YAWS_DEG
 
@@ -49,3 +53,20 @@ def mini_model(mini_config) -> BEVFormer:
         for parameter in model.parameters():
             parameter.add_(0.05 * torch.randn_like(parameter))
     return model
+
+
+@pytest.fixture(scope="session")
+def window_model(mini_config):
+    """A function: frames of the window -> a small BEVFormerV2; models of as many frames have the same weights."""
+
+    def make(*frames: int) -> BEVFormerV2:
+        settings = {field.name: getattr(mini_config, field.name) for field in fields(mini_config)}
+        changes = {"ego_motion": NO_EGO_MOTION, "neck": FPNConfig(levels=5), "fusion": BevFusionConfig(2, 48)}
+        torch.manual_seed(0)
+        model = BEVFormerV2(BEVFormerV2Config(**{**settings, **changes}, frames=frames)).eval()
+        with torch.no_grad():
+            for parameter in model.parameters():
+                parameter.add_(0.05 * torch.randn_like(parameter))
+        return model
+
+    return make

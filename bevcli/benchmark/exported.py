@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from bevcli.benchmark.comparison import NEAR_M
 from bevcli.engines.engine import EngineName
-from bevcli.engines.exported import ExportedBEVFormer
+from bevcli.engines.exported import load_exported
 from bevcli.frame import Sequence
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerOutputs
 from bevcli.model.prepared import prepare_for_inference
@@ -59,12 +59,12 @@ def check_exported(
         InputError: a frame cannot be read.
     """
     network = prepare_for_inference(model.network, torch.device("cpu"))
-    yield from _differences((network, ExportedBEVFormer(file, engine)), sequence)
+    yield from _differences((network, load_exported(file, engine)), sequence)
 
 
 def compare_exported(file: Path, other: Path, sequence: Sequence, engine: EngineName) -> Iterator[FrameDifference]:
     """As `check_exported`, for two exported files of one model."""
-    yield from _differences((ExportedBEVFormer(other, engine), ExportedBEVFormer(file, engine)), sequence)
+    yield from _differences((load_exported(other, engine), load_exported(file, engine)), sequence)
 
 
 def _differences(networks: tuple[BEVFormerBase, BEVFormerBase], sequence: Sequence) -> Iterator[FrameDifference]:

@@ -10,7 +10,7 @@ from torch import nn
 
 from bevcli.benchmark.limits import wait_for
 from bevcli.benchmark.made_up import MadeUpDrive
-from bevcli.engines.exported import ExportedBEVFormer
+from bevcli.engines.exported import ExportedModel
 from bevcli.frame import Prediction
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerOutputs
 from bevcli.pipeline.preprocess import PreparedFrame
@@ -56,8 +56,8 @@ class Version:
 
         Their image features are copies, which saves the time of those steps.
         """
-        if self.state is None or not isinstance(self.state.memory, FeatureWindow):
-            return
+        if self.state is None or not isinstance(self.state.memory, FeatureWindow) or not self.state.memory.frames:
+            return  # nothing of one frame is kept for the next
         seen = self.state.memory.frames[-1]
         earlier = (
             replace(seen, stamp=stamp, pose=drive.pose(stamp.index)) for stamp in drive.stamps[: seen.stamp.index]
@@ -81,7 +81,7 @@ class Version:
 
 def fine_stages(model: BEVFormerBase) -> tuple[dict[str, str], dict[str, str]]:
     """The `stages` and `starts` of a StageClock that tells the parts of the encoder apart."""
-    if isinstance(model, ExportedBEVFormer):
+    if isinstance(model, ExportedModel):
         return {"engine": "engine"}, {"engine": "input"}
     stages = {"backbone": "backbone", "neck": "neck", "decoder": "decoder and head"}
     parts = {

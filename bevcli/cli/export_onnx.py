@@ -9,7 +9,9 @@ import typer
 
 
 def export_onnx(
-    model: Annotated[str, typer.Argument(help="tiny, small, base, demo, or a FILE.toml.")],
+    model: Annotated[
+        str, typer.Argument(help="tiny, small, base, demo, v2-t1-base, v2-t1, v2-t2, v2-t8, or a FILE.toml.")
+    ],
     weights: Annotated[
         Path | None,
         typer.Option(
@@ -42,10 +44,11 @@ def export_onnx(
         ),
     ] = None,
 ) -> None:
-    """Write one recurrent step of MODEL as an ONNX file of standard operators, without plugins.
+    """Write one step of MODEL as an ONNX file of standard operators, without plugins.
 
-    The number of cameras is fixed, the batch is one; calibrations are inputs. The file's metadata documents every
-    input and output. docs/deploy.md shows how to run it. Needs pip install 'bevcli\\[onnx]'.
+    The number of cameras is fixed, the batch is one; calibrations are inputs. What the model remembers is an input and
+    an output: the BEV map, or with v2 models image features. The file's metadata documents every input and output.
+    docs/deploy.md shows how to run it. Needs pip install 'bevcli\\[onnx]'.
     """
     from bevcli.benchmark.exported import check_exported, difference_lines
     from bevcli.engines.export_onnx import export_onnx as write_onnx

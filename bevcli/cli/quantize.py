@@ -39,13 +39,13 @@ def quantize(
     `bevcli validate`. Needs pip install 'bevcli\\[onnx]'.
     """
     from bevcli.benchmark.exported import compare_exported, difference_lines
-    from bevcli.engines.exported import ExportedBEVFormer
+    from bevcli.engines.exported import load_exported
     from bevcli.engines.quantize import quantize as write_quantized
     from bevcli.errors import OutputError
     from bevcli.pipeline.calibration_images import calibration_images
     from bevcli.sequences.open import open_sequence
 
-    network = ExportedBEVFormer(model, engine or "onnxruntime")
+    network = load_exported(model, engine or "onnxruntime")
     config = network.config
     target = model.with_name(f"{model.stem}-int8.onnx") if out is None else out
     if target.exists() and not force:

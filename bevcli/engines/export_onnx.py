@@ -14,11 +14,13 @@ from typing import Any
 import torch
 
 from bevcli.config import as_table
-from bevcli.engines.export_parts import DeformableConvolution, ExportedStep
+from bevcli.engines.export_parts import DeformableConvolution
+from bevcli.engines.export_step import ExportedStep, RecurrentStep, WindowStep
 from bevcli.engines.interface import Port, input_ports, metadata, output_ports
 from bevcli.engines.packages import require
 from bevcli.errors import BevcliError, OutputError
 from bevcli.model.bevformer import BEVFormer, BEVFormerBase
+from bevcli.model.bevformer_v2 import BEVFormerV2
 from bevcli.model.uniad import UniAD
 
 NAME_SCOPES = "pkg.torch.onnx.name_scopes"  # the exporter's note of the modules that a node comes from
@@ -40,10 +42,11 @@ def export_onnx(
     untrained: bool = False,
     bundled: bool = False,
 ) -> None:
-    """Writes one recurrent step of a model as an ONNX file of standard operators.
+    """Writes one step of a BEVFormer or a BEVFormerV2 as an ONNX file of standard operators.
 
-    The number of cameras is fixed, and the batch is one. Projections are inputs, so that the file serves any rig with
-    this number of cameras. The file's metadata documents every input and output.
+    The file of a BEVFormer takes the BEV map of the previous frame, that of a BEVFormerV2 the image features of the
+    window's earlier frames. The number of cameras is fixed, and the batch is one. Projections are inputs, so that the
+    file serves any rig with this number of cameras. The file's metadata documents every input and output.
 
     Args:
         network: the plain model, `Model.network`.
@@ -60,8 +63,8 @@ def export_onnx(
         bundled: whether the weights are those of the package, for the metadata.
 
     Raises:
-        BevcliError: the extra bevcli[onnx] is not installed, the opset is too old, or the model is a BEVFormerV2 or a
-            UniAD.
+        BevcliError: the extra bevcli[onnx] is not installed, the opset is too old, or the model is a UniAD or looks at
+            later frames.
         OutputError: the file cannot be written.
     """
     require("onnx", "onnxscript")
@@ -73,16 +76,12 @@ def export_onnx(
             f"--deformable-convolution {deformable_convolution}"
         )
     config = network.config
-    if not isinstance(network, BEVFormer) or isinstance(network, UniAD) or config.image.crop is not None:
-        raise BevcliError(
-            f"{config.name}: BEVFormerV2, UniAD and models that crop images cannot be exported yet "
-            "(expected a recurrent BEVFormer, such as tiny, small, base or demo)"
-        )
+    kind = _step_of(network)
     count = len(config.cameras) if cameras is None else cameras
     slots = min(cameras_per_cell, count)
     inputs = input_ports(config, count)
-    outputs = output_ports(config, decode=decode)
-    step = ExportedStep(network, deformable_convolution, slots, decode=decode).eval()
+    outputs = output_ports(config, count, decode=decode)
+    step = kind(network, deformable_convolution, slots, decode=decode).eval()
     with _quiet(), torch.no_grad():
         program = torch.onnx.export(
             step,
@@ -106,6 +105,25 @@ def export_onnx(
         onnx.save(proto, str(out))
     except OSError as error:
         raise OutputError(f"{out}: cannot be written: {error.strerror}") from error
+
+
+def _step_of(network: BEVFormerBase) -> type[ExportedStep]:
+    """The exported form of a model. Raises BevcliError for a model that has none."""
+    config = network.config
+    if isinstance(network, UniAD):
+        raise BevcliError(
+            f"{config.name}: a UniAD cannot be exported: the number of its tracks changes from frame to frame "
+            "(expected a BEVFormer or a BEVFormerV2, such as tiny, base, demo or v2-t2)"
+        )
+    if isinstance(network, BEVFormerV2):
+        if network.config.later_frames:
+            raise BevcliError(
+                f"{config.name}: a model that looks at later frames cannot be exported: frames is "
+                f"{list(network.config.frames)} (expected a window that ends with 0, the current frame)"
+            )
+        return WindowStep
+    assert isinstance(network, BEVFormer)
+    return RecurrentStep
 
 
 def _document(proto: object, inputs: tuple[Port, ...], outputs: tuple[Port, ...]) -> None:

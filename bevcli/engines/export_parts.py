@@ -1,11 +1,7 @@
-"""The step of the model in the form that is exported to ONNX: the same numbers, standard operators only.
-
-The plain model knows nothing of this. `ExportedStep` is a copy of it whose parts that ONNX cannot express are replaced.
-"""
+"""The parts of a model that ONNX cannot express, in the form that is exported: the same numbers, standard operators."""
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,86 +9,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from bevcli.model.bevformer import BEVFormer, BEVFormerConfig
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, split_offsets_and_mask
-from bevcli.model.encoder import EncoderLayer, SpatialCrossAttention
+from bevcli.model.encoder import SpatialCrossAttention
 from bevcli.model.pillar_projection import PillarProjection
-from bevcli.model.prepared import fold_batch_norms
 
 DeformableConvolution = Literal["operator", "gridsample"]
-
-
-class ExportedStep(nn.Module):
-    """One step of a BEVFormer for batches of one: `BEVFormer.forward` with flat inputs and outputs.
-
-    The images enter before normalisation, and the history enters as a tensor that is ignored where `use_previous` is
-    false, because a graph has no optional inputs.
-    """
-
-    image_mean: Tensor
-    image_std: Tensor
-
-    def __init__(
-        self, model: BEVFormer, deformable_convolution: DeformableConvolution, slots: int, *, decode: bool
-    ) -> None:
-        """A copy of the model, with its parts replaced; the model itself stays unchanged. slots: see `slot_hits`."""
-        super().__init__()
-        self.network = copy.deepcopy(model).cpu().float().eval().requires_grad_(False)
-        self.config, self.slots, self.decode = model.config, slots, decode
-        fold_batch_norms(self.network, torch.device("meta"))  # for no device: with standard operators
-        replace_parts(self.network, deformable_convolution)
-        image = self.config.image
-        self.register_buffer("image_mean", torch.tensor(image.mean)[:, None, None])
-        self.register_buffer("image_std", torch.tensor(image.std)[:, None, None])
-
-    def forward(
-        self,
-        images: Tensor,
-        image_from_bev: Tensor,
-        camera_index: Tensor,
-        has_image: Tensor,
-        can_bus: Tensor,
-        shift: Tensor,
-        rotation: Tensor,
-        previous_bev: Tensor,
-        use_previous: Tensor,
-    ) -> tuple[Tensor, ...]:
-        """One step; `bevcli.engines.interface` documents every input and output."""
-        network = self.network
-        feature_maps = network.neck(network.backbone(self._normalized(images)))
-        bev_query = network.bev_queries(can_bus)
-        position = network.bev_queries.position()
-        history = network.align_history(previous_bev, rotation)
-        centers = network.encoder.cell_centers.expand(1, 2, -1, -1)
-        reference_points = torch.where(use_previous, network.encoder.reference_points(shift), centers)
-        projection = network.pillars.project(image_from_bev, (images.shape[2], images.shape[3]), has_image)
-        hits = slot_hits(projection, self.slots)
-        image_features = network.image_tokens(feature_maps, camera_index)
-        if network.calibration_embedding is not None:
-            image_size = images.shape[2], images.shape[3]
-            image_features = network.calibration_embedding(image_features, image_from_bev, image_size)
-        with_history = torch.stack([history, bev_query], dim=1)
-        bev = bev_query
-        for layer in network.encoder.layers:
-            assert isinstance(layer, EncoderLayer)
-            bev_maps = torch.where(use_previous, with_history, torch.stack([bev, bev], dim=1))
-            bev = layer(bev, position, bev_maps, reference_points, image_features, hits)
-        class_logits, box_codes, _ = network.decoder(bev, network.detection_head)
-        outputs = [bev, class_logits[-1], box_codes[-1], hits.most_cameras]
-        if network.segmentation_head is not None:
-            segmentation = network.segmentation_head(bev, position)
-            outputs += [segmentation.mask_logits[-1], segmentation.class_logits[-1]]
-        if self.decode:
-            outputs += decode_boxes(class_logits[-1], box_codes[-1], self.config)
-        return tuple(outputs)
-
-    def _normalized(self, images: Tensor) -> Tensor:
-        """(1, N, H, W, 3) BGR, 0 to 255 -> (N, 3, H, W), as the backbone takes them."""
-        planes = images[0].permute(0, 3, 1, 2)
-        if self.config.image.color_order == "rgb":
-            planes = planes.flip(1)
-        return (planes - self.image_mean) / self.image_std
 
 
 @dataclass(frozen=True)
@@ -205,26 +127,3 @@ def replace_parts(part: nn.Module, deformable_convolution: DeformableConvolution
             setattr(part, name, DeformConvOperator(child))
         else:
             replace_parts(child, deformable_convolution)
-
-
-def decode_boxes(class_logits: Tensor, box_codes: Tensor, config: BEVFormerConfig) -> tuple[Tensor, Tensor, Tensor]:
-    """`bevcli.model.box_coding.decode` for a batch of one, in the graph.
-
-    Args:
-        class_logits: (1, Q, classes).
-        box_codes: (1, Q, 10).
-        config: of the model.
-
-    Returns:
-        Boxes (1, K, 9): centre x, y, z and length, width, height in metres, yaw in radians, velocity x, y in m/s, all
-        in the bev frame; scores (1, K), falling; classes (1, K) int64.
-    """
-    classes = len(config.classes)
-    scores = class_logits.sigmoid().flatten(1)  # (1, Q · classes)
-    best, index = scores.topk(min(config.decoder.max_boxes, scores.shape[1]))
-    code = box_codes[0].index_select(0, index[0] // classes)[None]  # (1, K, 10)
-    x, y, log_width, log_length, z, log_height, sin, cos, *velocity = code.unbind(-1)
-    # The code's angle a is clockwise from -y: yaw = -a - pi / 2, whose sine is -cos a and whose cosine is -sin a.
-    yaw = torch.atan2(-cos, -sin)
-    sizes = [log.exp() for log in (log_length, log_width, log_height)]
-    return torch.stack([x, y, z, *sizes, yaw, *velocity], dim=-1), best, index % classes

@@ -1,14 +1,13 @@
-"""An exported file in the place of a BEVFormer."""
+"""An exported file in the place of a BEVFormer or a BEVFormerV2."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -16,7 +15,9 @@ from bevcli.config import config_of_table
 from bevcli.engines.engine import ENGINES, Engine, EngineName
 from bevcli.engines.interface import METADATA
 from bevcli.errors import WeightsError
-from bevcli.model.bevformer import BEVFormer, BEVFormerConfig, BEVFormerInputs, BEVFormerOutputs
+from bevcli.model.bevformer import BEVFormer, BEVFormerBase, BEVFormerConfig, BEVFormerInputs, BEVFormerOutputs
+from bevcli.model.bevformer_v2 import BEVFormerV2Config, WindowFrame
+from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.segmentation import SegmentationOutputs
 from bevcli.parsing.documents import parse_json
 
@@ -61,32 +62,20 @@ def read_metadata(metadata: Mapping[str, str], file: Path) -> ExportedFile:
     return ExportedFile(config, contents, slots, untrained is not False, bundled is True, precision)
 
 
-class ExportedBEVFormer(BEVFormer):
-    """An exported file, run by an engine on the CPU. A `Runner` takes it in the place of a BEVFormer.
+class ExportedModel(BEVFormerBase):
+    """An exported file, run by an engine on the CPU: what those of all models share. `load_exported` makes one.
 
-    It has no parts to look into: sampling points of the attentions and times of single stages are not available.
+    A `Runner` takes it in the place of a model. It has no parts to look into: sampling points of the attentions and
+    times of single stages are not available.
     """
 
     digest: Tensor
 
-    def __init__(self, file: Path, engine: EngineName, threads: int | None = None) -> None:
-        """Loads the file.
-
-        Args:
-            file: of `bevcli export-onnx` or `bevcli quantize`.
-            engine: the program that runs it.
-            threads: that it uses; None takes PyTorch's number.
-
-        Raises:
-            BevcliError: the engine is not installed.
-            WeightsError: the file is missing, cannot be loaded, or is not of `bevcli export-onnx`.
-            ConfigError: the model in its metadata is wrong.
-        """
-        nn.Module.__init__(self)  # not BEVFormer's, which would make its parts
-        self.file = file
-        self.engine: Engine = ENGINES[engine](file, torch.get_num_threads() if threads is None else threads)
-        self.metadata = read_metadata(self.engine.metadata, file)
-        self.config = self.metadata.config
+    def __init__(self, file: Path, engine: Engine, metadata: ExportedFile) -> None:
+        """engine: with the file. metadata: of the file."""
+        nn.Module.__init__(self)  # not the model's, which would make its parts
+        self.file, self.engine, self.metadata = file, engine, metadata
+        self.config = metadata.config
         with file.open("rb") as stream:
             digest = hashlib.file_digest(stream, "sha256").digest()
         # The only state of this module: it tells a resumed run whether the weights are the same.
@@ -97,27 +86,21 @@ class ExportedBEVFormer(BEVFormer):
         """N, the number of cameras that the file was exported for."""
         return self.engine.input_shapes["images"][1]
 
-    def forward(self, inputs: BEVFormerInputs, history: Tensor | None = None) -> BEVFormerOutputs:
-        """As `BEVFormer.forward`, for batches of one; class logits and box codes are those of the last layer."""
-        self.check_cameras(inputs.images.shape[1])
-        grid = self.config.bev_grid
-        previous = torch.zeros(1, grid.rows * grid.columns, self.config.channels) if history is None else history
+    def run(self, inputs: BEVFormerInputs, others: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The outputs of the file, by name. others: its inputs beyond, or instead of, images and cameras."""
+        self._check_cameras(inputs.images.shape[1])
         feed = {
             "images": raw_images(inputs.images, self.config),
             "image_from_bev": inputs.image_from_bev,
             "camera_index": inputs.camera_index,
             "has_image": inputs.has_image,
-            "can_bus": inputs.can_bus,
-            "shift": inputs.shift,
-            "rotation": inputs.rotation_deg,
-            "previous_bev": previous,
-            "use_previous": torch.tensor([history is not None]),
+            **others,
         }
         found = self.engine({name: tensor.cpu().numpy() for name, tensor in feed.items()})
-        self.check_overlap(int(found["most_cameras_per_cell"][0]))
-        return as_outputs(found)
+        self._check_overlap(int(found["most_cameras_per_cell"][0]))
+        return {name: torch.from_numpy(value) for name, value in found.items()}
 
-    def check_cameras(self, count: int) -> None:
+    def _check_cameras(self, count: int) -> None:
         """Raises WeightsError unless the file was exported for this number of cameras."""
         if count != self.cameras:
             raise WeightsError(
@@ -125,7 +108,7 @@ class ExportedBEVFormer(BEVFormer):
                 f"export it with --cameras {count}"
             )
 
-    def check_overlap(self, most: int) -> None:
+    def _check_overlap(self, most: int) -> None:
         """Raises WeightsError where more cameras see one cell than the file has slots for."""
         slots = self.metadata.cameras_per_cell
         if most > slots:
@@ -133,6 +116,86 @@ class ExportedBEVFormer(BEVFormer):
                 f"{self.file}: takes {slots} cameras that see the same BEV cell, but the sequence has {most}: "
                 f"export it with --cameras-per-cell {most}"
             )
+
+
+class ExportedBEVFormer(ExportedModel, BEVFormer):
+    """An exported BEVFormer."""
+
+    def forward(self, inputs: BEVFormerInputs, history: Tensor | None = None) -> BEVFormerOutputs:
+        """As `BEVFormer.forward`, for batches of one; class logits and box codes are those of the last layer."""
+        grid = self.config.bev_grid
+        previous = torch.zeros(1, grid.rows * grid.columns, self.config.channels) if history is None else history
+        motion = {"can_bus": inputs.can_bus, "shift": inputs.shift, "rotation": inputs.rotation_deg}
+        memory = {"previous_bev": previous, "use_previous": torch.tensor([history is not None])}
+        return as_outputs(self.run(inputs, motion | memory))
+
+
+@dataclass(frozen=True)
+class ExportedWindowOutputs(BEVFormerOutputs):
+    """What one step of an exported BEVFormerV2 computes.
+
+    Attributes:
+        image_features: of the current frame, for the steps of the next frames; None for a window of one frame.
+    """
+
+    image_features: FeatureMaps | None = None
+
+
+class ExportedBEVFormerV2(ExportedModel):
+    """An exported BEVFormerV2, whose window ends with the current frame."""
+
+    config: BEVFormerV2Config
+
+    def forward(self, inputs: BEVFormerInputs, earlier: Sequence[WindowFrame | None] = ()) -> ExportedWindowOutputs:
+        """As `BEVFormerV2.forward`, for batches of one; class logits and box codes are those of the last layer.
+
+        Args:
+            inputs: of the current frame; the ego-motion is not read.
+            earlier: the other frames of the window, in their order; None for one that does not exist.
+        """
+        absent = self._absent(inputs)
+        frames = [absent if frame is None else frame for frame in earlier]
+        window = {
+            "image_from_bev": torch.stack([*(frame.image_from_bev for frame in frames), inputs.image_from_bev], dim=1),
+            "has_image": torch.stack([*(frame.has_image for frame in frames), inputs.has_image], dim=1),
+        }
+        if frames:
+            window["previous_features"] = torch.stack([frame.image_features.tokens for frame in frames])
+        found = self.run(inputs, window)
+        features = FeatureMaps(found["image_features"], self.config.level_shapes) if frames else None
+        return ExportedWindowOutputs(**vars(as_outputs(found)), image_features=features)
+
+    def _absent(self, inputs: BEVFormerInputs) -> WindowFrame:
+        """The place of a frame that does not exist: no camera has an image."""
+        levels, channels = self.config.level_shapes, self.config.channels
+        tokens = torch.zeros(self.cameras, sum(height * width for height, width in levels), channels)
+        return WindowFrame(
+            image_features=FeatureMaps(tokens, levels),
+            image_from_bev=torch.zeros_like(inputs.image_from_bev),
+            has_image=torch.zeros_like(inputs.has_image),
+            image_size=inputs.image_size,
+        )
+
+
+def load_exported(
+    file: Path, engine: EngineName, threads: int | None = None
+) -> ExportedBEVFormer | ExportedBEVFormerV2:
+    """Loads an exported file.
+
+    Args:
+        file: of `bevcli export-onnx` or `bevcli quantize`.
+        engine: the program that runs it.
+        threads: that it uses; None takes PyTorch's number.
+
+    Raises:
+        BevcliError: the engine is not installed.
+        WeightsError: the file is missing, cannot be loaded, or is not of `bevcli export-onnx`.
+        ConfigError: the model in its metadata is wrong.
+    """
+    loaded: Engine = ENGINES[engine](file, torch.get_num_threads() if threads is None else threads)
+    metadata = read_metadata(loaded.metadata, file)
+    kind = ExportedBEVFormerV2 if isinstance(metadata.config, BEVFormerV2Config) else ExportedBEVFormer
+    return kind(file, loaded, metadata)
 
 
 def raw_images(images: Tensor, config: BEVFormerConfig) -> Tensor:
@@ -144,9 +207,8 @@ def raw_images(images: Tensor, config: BEVFormerConfig) -> Tensor:
     return pixels.contiguous()
 
 
-def as_outputs(values: Mapping[str, np.ndarray]) -> BEVFormerOutputs:
+def as_outputs(found: Mapping[str, Tensor]) -> BEVFormerOutputs:
     """The outputs of an exported file as those of a model with one decoder layer."""
-    found = {name: torch.from_numpy(value) for name, value in values.items()}
     segmentation = None
     if "mask_logits" in found:
         segmentation = SegmentationOutputs(

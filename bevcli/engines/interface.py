@@ -12,6 +12,7 @@ from torch import Tensor
 
 from bevcli import __version__
 from bevcli.model.bevformer import BEVFormerConfig
+from bevcli.model.bevformer_v2 import BEVFormerV2Config
 from bevcli.model.segmentation import STUFF_CLASSES
 
 # The part of the metadata that bevcli itself reads, to run the file: the contents of the model's TOML file as JSON,
@@ -42,39 +43,101 @@ class Port:
 
 
 def input_ports(config: BEVFormerConfig, cameras: int) -> tuple[Port, ...]:
-    """The inputs, in the order of the arguments of `ExportedStep.forward`. cameras: N."""
-    image, grid = config.image, config.bev_grid
+    """The inputs, in the order of the arguments of the step's `forward`. cameras: N."""
+    if isinstance(config, BEVFormerV2Config):
+        features = _features_port(config, cameras)
+        return _camera_ports(config, cameras) + (() if features is None else (features,))
+    return _camera_ports(config, cameras) + _history_ports(config)
+
+
+def _camera_ports(config: BEVFormerConfig, cameras: int) -> tuple[Port, ...]:
+    """The images of the current frame, and the cameras in it or, for a BEVFormerV2, in every frame of its window."""
+    image = config.image
     width, height = image.padded_size
-    cells = grid.rows * grid.columns
+    left, top, right, bottom = image.crop_box
     pad = ", ".join(f"{value:g}" for value in pad_value_bgr(config))
-    quaternion = "quaternion w x y z" if config.ego_motion.can_bus_quaternion == "wxyz" else "quaternion w w w w"
-    # Of pixels whose centres have whole numbers, see `ImageConfig.half_pixel_shift`.
-    shifted = ", u = scale * u of the camera + (scale - 1) / 2, v likewise," if image.half_pixel_shift else ""
+    cropped = "" if image.crop is None else f", cropped to columns {left} to {right - 1} and rows {top} to {bottom - 1}"
     level = f", level, {config.bev_frame.height_m:g} m above the ground" if config.bev_frame.level else ""
     names = ", ".join(f"{index} {name}" for index, name in enumerate(config.cameras))
+    lead: tuple[int, ...]
+    if isinstance(config, BEVFormerV2Config):
+        axes, lead = "1, F, N", (1, len(config.frames), cameras)
+        bev_frame = "the current frame's bev frame"
+        window = (
+            f" For the cameras of each of the window's F frames, which are, relative to the current one: "
+            f"{_listed(config.frames)}."
+        )
+        absent = (
+            " All false for a frame that does not exist, such as before a scene's first frame or before a gap in time "
+            "of more than max_gap_s: the BEV map of the next frame takes the place of its own."
+        )
+    else:
+        axes, lead = "1, N", (1, cameras)
+        bev_frame, window, absent = "the bev frame", "", ""
     return (
         Port(
             "images",
             (1, cameras, height, width, 3),
             torch.float32,
             f"(1, N, H, W, 3): undistorted images, channels B G R, 0 to 255, not normalised. Each image is resized by "
-            f"min({image.size[0]} / width, {image.size[1]} / height) as float32 and written to the top left corner; "
-            f"all other pixels are {pad}.",
+            f"min({image.size[0]} / width, {image.size[1]} / height) as float32{cropped} and written to the top left "
+            f"corner; all other pixels are {pad}.",
         ),
         Port(
             "image_from_bev",
-            (1, cameras, 4, 4),
+            (*lead, 4, 4),
             torch.float32,
-            "(1, N, 4, 4): from (x, y, z, 1) in metres of the bev frame to (u d, v d, d, 1), with pixel (u, v) of the "
-            f"resized image{shifted} and depth d in metres. Bev frame: x to the right, y ahead, z up{level}.",
+            f"({axes}, 4, 4): from (x, y, z, 1) in metres of {bev_frame} to (u d, v d, d, 1), with {_pixel(config)} "
+            f"and depth d in metres. Bev frame: x to the right, y ahead, z up{level}.{window}",
         ),
         Port("camera_index", (cameras,), torch.int64, f"(N,): the camera embedding of each image: {names}."),
         Port(
             "has_image",
-            (1, cameras),
+            lead,
             torch.bool,
-            "(1, N): false for a camera without an image, which then sees nothing.",
+            f"({axes}): false for a camera without an image, which then sees nothing.{absent}",
         ),
+    )
+
+
+def _pixel(config: BEVFormerConfig) -> str:
+    """The pixels of the network's input, and how those of the camera's image become them."""
+    image = config.image
+    if image.crop is None and not image.half_pixel_shift:
+        return "pixel (u, v) of the resized image"
+    # Of pixels whose centres have whole numbers, see `ImageConfig.half_pixel_shift`.
+    shift = " + (scale - 1) / 2" if image.half_pixel_shift else ""
+    corner = zip("uv", image.crop_box, strict=False)
+    moved = ", ".join(f"{axis} = scale * {axis} of the camera{shift}{f' - {at}' if at else ''}" for axis, at in corner)
+    return f"pixel (u, v) of the {'resized' if image.crop is None else 'cropped'} image, {moved},"
+
+
+def _features_port(config: BEVFormerV2Config, cameras: int) -> Port | None:
+    """The image features of the window's earlier frames; None for a window of one frame."""
+    if len(config.frames) == 1:
+        return None
+    return Port(
+        "previous_features",
+        (len(config.frames) - 1, *_features_shape(config, cameras)),
+        torch.float32,
+        f"(F - 1, N, S, C): the output image_features of the window's earlier frames {_listed(config.frames[:-1])}, in "
+        "this order; ignored for a frame that does not exist.",
+    )
+
+
+def _features_shape(config: BEVFormerV2Config, cameras: int) -> tuple[int, int, int]:
+    return cameras, sum(height * width for height, width in config.level_shapes), config.channels
+
+
+def _listed(frames: tuple[int, ...]) -> str:
+    return ", ".join(map(str, frames))
+
+
+def _history_ports(config: BEVFormerConfig) -> tuple[Port, ...]:
+    """Ego-motion and history of a BEVFormer."""
+    cells = config.bev_grid.rows * config.bev_grid.columns
+    quaternion = "quaternion w x y z" if config.ego_motion.can_bus_quaternion == "wxyz" else "quaternion w w w w"
+    return (
         Port(
             "can_bus",
             (1, 18),
@@ -102,8 +165,8 @@ def input_ports(config: BEVFormerConfig, cameras: int) -> tuple[Port, ...]:
     )
 
 
-def output_ports(config: BEVFormerConfig, *, decode: bool) -> tuple[Port, ...]:
-    """The outputs, in the order of the results of `ExportedStep.forward`."""
+def output_ports(config: BEVFormerConfig, cameras: int, *, decode: bool) -> tuple[Port, ...]:
+    """The outputs, in the order of the results of the step's `forward`. cameras: N."""
     cells = config.bev_grid.rows * config.bev_grid.columns
     queries, classes = config.decoder.queries, len(config.classes)
     ports = [
@@ -154,6 +217,15 @@ def output_ports(config: BEVFormerConfig, *, decode: bool) -> tuple[Port, ...]:
             Port("scores", (1, count), torch.float32, "(1, K): 0 to 1, falling."),
             Port("classes", (1, count), torch.int64, "(1, K): index into the metadata's classes."),
         ]
+    if isinstance(config, BEVFormerV2Config) and len(config.frames) > 1:
+        ports.append(
+            Port(
+                "image_features",
+                _features_shape(config, cameras),
+                torch.float32,
+                "(N, S, C): of the current frame's images, for previous_features of the next frames.",
+            )
+        )
     return tuple(ports)
 
 
@@ -191,6 +263,7 @@ def metadata(
         "classes": config.classes,
         "cameras": config.cameras,
         "image_size": image.size,
+        "crop": image.crop_box,
         "padded_size": image.padded_size,
         "pad_value_bgr": pad_value_bgr(config),
         "x_range_m": grid.x_range_m,
@@ -207,6 +280,8 @@ def metadata(
         "untrained": untrained,
         "bundled": bundled,
     }
+    if isinstance(config, BEVFormerV2Config):
+        facts["window"] = config.frames
     names = {
         "model": config.name,
         "precision": "fp32",

@@ -13,7 +13,7 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.bev_queries import BevQueries
 from bevcli.model.calibration_embedding import CalibrationEmbedding
 from bevcli.model.decoder import Decoder, DecoderConfig, DetectionHead
-from bevcli.model.deformable_attention import FeatureMaps
+from bevcli.model.deformable_attention import FeatureMaps, LevelShapes
 from bevcli.model.ego_motion import EgoMotionConfig, rotate_history
 from bevcli.model.encoder import Encoder, EncoderConfig
 from bevcli.model.fpn import FPN, FPNConfig
@@ -181,6 +181,15 @@ class BEVFormerConfig:
     def encoder_levels(self) -> int:
         """Number of the neck's levels that the BEV encoder attends to, the finest ones."""
         return min(self.neck.levels, self.image_tokens.level_embeddings)
+
+    @property
+    def level_shapes(self) -> LevelShapes:
+        """(height, width) of each of these levels."""
+        width, height = self.image.padded_size
+        strides = [2 ** (stage + 1) for stage in sorted(self.backbone.output_stages)]
+        while len(strides) < self.neck.levels:
+            strides.append(2 * strides[-1])
+        return tuple((-(-height // stride), -(-width // stride)) for stride in strides[: self.encoder_levels])
 
     @property
     def map_classes(self) -> tuple[str, ...]:

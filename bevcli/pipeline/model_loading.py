@@ -15,7 +15,7 @@ import torch
 from bevcli.checkpoints import bundled_weights, inspect, load_weights
 from bevcli.config import TRACKING, as_table, known_models, load_config, load_table, settings_of_table
 from bevcli.engines.engine import EngineName
-from bevcli.engines.exported import SUFFIX, ExportedBEVFormer
+from bevcli.engines.exported import SUFFIX, ExportedModel, load_exported
 from bevcli.errors import BevcliError, WeightsError
 from bevcli.geometry.cameras import CameraRig
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
@@ -78,7 +78,7 @@ class Model:
 
     def require_parts(self, what: str) -> None:
         """Raises BevcliError for an exported file. what: needs the network's parts, such as "--probe"."""
-        if isinstance(self.network, ExportedBEVFormer):
+        if isinstance(self.network, ExportedModel):
             raise BevcliError(
                 f"{what}: not available for {self.network.file}, an exported file: use {self.name} by its name"
             )
@@ -111,7 +111,7 @@ class Model:
     @cached_property
     def prepared(self) -> BEVFormerBase:
         """The network on its device, made ready for inference on the first use: same results, faster."""
-        if isinstance(self.network, ExportedBEVFormer):
+        if isinstance(self.network, ExportedModel):
             return self.network
         assert self.precision != "int8"
         return prepare_for_inference(self.network, self.device, self.precision)
@@ -209,7 +209,7 @@ def _load_exported(
         )
     if str(device) not in ("auto", "cpu"):
         raise BevcliError(f"--device {device}: {file} runs on the CPU: leave out the option")
-    network = ExportedBEVFormer(file, engine)
+    network = load_exported(file, engine)
     found = network.metadata
     return Model(
         network,

@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from bevcli.engines.exported import ExportedBEVFormer
+from bevcli.engines.exported import ExportedModel
 from bevcli.frame import AttentionView, BevMap, Frame, FrameStamp, Prediction, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerOutputs
@@ -178,7 +178,7 @@ class Runner:
         return usable
 
     def _probe(self) -> AttentionProbe | None:
-        if not self.options.ask_attention or isinstance(self.model, ExportedBEVFormer):
+        if not self.options.ask_attention or isinstance(self.model, ExportedModel):
             return None
         cells = probe_cells(self.options.probes, self.config.bev_grid)
         return AttentionProbe(self.model, self.config.encoder.layers - 1, cells.to(self.device))

@@ -16,10 +16,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bevcli.engines.exported import ExportedBEVFormerV2, ExportedWindowOutputs
 from bevcli.frame import FrameStamp
 from bevcli.geometry.transforms import Array, Pose, inverse
 from bevcli.model.bevformer import BEVFormer, BEVFormerBase, BEVFormerOutputs
-from bevcli.model.bevformer_v2 import BEVFormerV2, WindowFrame
+from bevcli.model.bevformer_v2 import BEVFormerV2, BEVFormerV2Config, WindowFrame
 from bevcli.model.deformable_attention import FeatureMaps, LevelShapes
 from bevcli.model.track_queries import FrameMotion, TrackQueries
 from bevcli.model.uniad import UniAD, UniADOutputs
@@ -134,6 +135,8 @@ def temporal_model(model: BEVFormerBase, device: torch.device) -> TemporalModel:
     """The model with the memory of its kind."""
     if isinstance(model, BEVFormerV2):
         return Window(model, device)
+    if isinstance(model, ExportedBEVFormerV2):
+        return ExportedWindow(model)
     if isinstance(model, UniAD):
         return TrackRecurrence(model, device)
     assert isinstance(model, BEVFormer)
@@ -208,21 +211,60 @@ class TrackRecurrence:
         return FrameMotion(torch.from_numpy(bev_from_previous_bev).float().to(self.device), seconds)
 
 
-class Window:
-    """A BEVFormerV2: a window of frames, whose images pass the backbone once."""
+class FrameWindow:
+    """What the windows of a BEVFormerV2 and of an exported one share: which frames they see, and from where."""
 
-    def __init__(self, model: BEVFormerV2, device: torch.device) -> None:
-        self.model, self.device = model, device
+    def __init__(self, config: BEVFormerV2Config) -> None:
+        self.config = config
 
     @property
     def later_frames(self) -> int:
         """See `TemporalModel`."""
-        return self.model.config.later_frames
+        return self.config.later_frames
 
     @property
     def uses_history(self) -> bool:
         """See `TemporalModel`."""
-        return len(self.model.config.frames) > 1
+        return len(self.config.frames) > 1
+
+    def restarted(self, memory: Memory) -> None:
+        """See `TemporalModel.restarted`."""
+
+    def past(self, known: Sequence[FrameFeatures], now: FrameStamp) -> list[FrameFeatures]:
+        """The known frames before the current one that the window reaches."""
+        past = [frame for frame in known if frame.stamp.timestamp_ns < now.timestamp_ns]
+        return past[len(past) - min(self.config.past_frames, len(past)) :]
+
+    def placed(
+        self, frames: Sequence[FrameFeatures], current: PreparedFrame, places: Sequence[int]
+    ) -> list[WindowFrame | None]:
+        """The frames at these places, seen from the bev frame of the current one; None where there is no frame."""
+        return [self._placed(frames[place], current) if 0 <= place < len(frames) else None for place in places]
+
+    def kept(self, frames: Sequence[FrameFeatures], current: int) -> FeatureWindow:
+        """What the next frame needs, which is one frame less of the past. current: place of the current frame."""
+        return FeatureWindow(tuple(frames[max(0, current + 1 - self.config.past_frames) :]))
+
+    def _placed(self, frame: FrameFeatures, current: PreparedFrame) -> WindowFrame:
+        image_from_bev = frame.image_from_bev
+        if frame.stamp != current.frame.stamp:
+            moved = other_bev_from_bev(current.frame.world_from_ego, frame.pose, current.frame.rig.ego_from_bev)
+            image_from_bev = image_from_bev @ torch.from_numpy(moved)
+        width, height = self.config.image.padded_size
+        return WindowFrame(
+            image_features=FeatureMaps(frame.tokens, frame.level_shapes),
+            image_from_bev=image_from_bev.float(),  # on the CPU, as the model reads it
+            has_image=frame.has_image,
+            image_size=(height, width),
+        )
+
+
+class Window(FrameWindow):
+    """A BEVFormerV2: a window of frames, whose images pass the backbone once."""
+
+    def __init__(self, model: BEVFormerV2, device: torch.device) -> None:
+        super().__init__(model.config)
+        self.model, self.device = model, device
 
     def step(
         self, prepared: PreparedFrame, memory: Memory | None, upcoming: Sequence[PreparedFrame]
@@ -230,46 +272,49 @@ class Window:
         """See `TemporalModel.step`."""
         assert memory is None or isinstance(memory, FeatureWindow)
         known = {} if memory is None else {frame.stamp: frame for frame in memory.frames}
-        now, config = prepared.frame.stamp, self.model.config
-        past = [frame for frame in known.values() if frame.stamp.timestamp_ns < now.timestamp_ns]
-        past = past[len(past) - min(config.past_frames, len(past)) :]
+        past = self.past(list(known.values()), prepared.frame.stamp)
         present = [known.get(one.frame.stamp) or self._features(one) for one in (prepared, *upcoming)]
         frames, current = (*past, *present), len(past)
-        places = [current + offset for offset in config.frames]
-        outputs: BEVFormerOutputs = self.model(
-            [self._placed(frames[place], prepared) if 0 <= place < len(frames) else None for place in places]
-        )
-        # The next frame needs one frame less of the past.
-        return outputs, FeatureWindow(frames[max(0, current + 1 - config.past_frames) :])
-
-    def restarted(self, memory: Memory) -> None:
-        """See `TemporalModel.restarted`."""
+        places = [current + offset for offset in self.config.frames]
+        outputs: BEVFormerOutputs = self.model(self.placed(frames, prepared, places))
+        return outputs, self.kept(frames, current)
 
     def _features(self, prepared: PreparedFrame) -> FrameFeatures:
         images, camera_index = (upload(x, self.device) for x in (prepared.images, prepared.camera_index))
-        features = self.model.image_features(images, camera_index)
-        return FrameFeatures(
-            stamp=prepared.frame.stamp,
-            pose=prepared.frame.world_from_ego,
-            tokens=features.tokens,
-            level_shapes=features.level_shapes,
-            image_from_bev=prepared.image_from_bev,
-            has_image=prepared.has_image,
-        )
+        return frame_features(prepared, self.model.image_features(images, camera_index))
 
-    def _placed(self, frame: FrameFeatures, current: PreparedFrame) -> WindowFrame:
-        """The frame, seen from the bev frame of the current one."""
-        image_from_bev = frame.image_from_bev
-        if frame.stamp != current.frame.stamp:
-            moved = other_bev_from_bev(current.frame.world_from_ego, frame.pose, current.frame.rig.ego_from_bev)
-            image_from_bev = image_from_bev @ torch.from_numpy(moved)
-        width, height = self.model.config.image.padded_size
-        return WindowFrame(
-            image_features=FeatureMaps(frame.tokens, frame.level_shapes),
-            image_from_bev=image_from_bev.float(),  # on the CPU, as the model reads it
-            has_image=frame.has_image,
-            image_size=(height, width),
-        )
+
+class ExportedWindow(FrameWindow):
+    """An exported BEVFormerV2: the image features of the current frame come out of its step."""
+
+    def __init__(self, model: ExportedBEVFormerV2) -> None:
+        super().__init__(model.config)
+        self.model = model
+
+    def step(
+        self, prepared: PreparedFrame, memory: Memory | None, upcoming: Sequence[PreparedFrame]
+    ) -> tuple[BEVFormerOutputs, FeatureWindow]:
+        """See `TemporalModel.step`."""
+        assert memory is None or isinstance(memory, FeatureWindow)
+        past = self.past(() if memory is None else memory.frames, prepared.frame.stamp)
+        places = [len(past) + offset for offset in self.config.frames[:-1]]
+        inputs = model_inputs([prepared], [None], self.config)
+        outputs: ExportedWindowOutputs = self.model(inputs, self.placed(past, prepared, places))
+        found = outputs.image_features
+        present = [] if found is None else [frame_features(prepared, found)]
+        return outputs, self.kept([*past, *present], len(past))
+
+
+def frame_features(prepared: PreparedFrame, features: FeatureMaps) -> FrameFeatures:
+    """What a window keeps of a frame."""
+    return FrameFeatures(
+        stamp=prepared.frame.stamp,
+        pose=prepared.frame.world_from_ego,
+        tokens=features.tokens,
+        level_shapes=features.level_shapes,
+        image_from_bev=prepared.image_from_bev,
+        has_image=prepared.has_image,
+    )
 
 
 def other_bev_from_bev(world_from_ego: Pose, other_world_from_ego: Pose, ego_from_bev: Array) -> Array:

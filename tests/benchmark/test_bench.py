@@ -10,8 +10,11 @@ import torch
 from typer.testing import CliRunner
 
 from bevcli.benchmark.limits import MachineLimits
+from bevcli.benchmark.made_up import MadeUpDrive
 from bevcli.benchmark.result import BenchmarkResult, Comparison
+from bevcli.benchmark.version import Version
 from bevcli.cli.main import app
+from bevcli.pipeline.preprocess import Preprocessor
 
 RESULT = BenchmarkResult(
     model="tiny",
@@ -89,3 +92,11 @@ def test_on_a_gpu_the_stages_add_up_to_the_frame(small_model_file):
     inside = set(data["stages_ms"]) - {"decode", "preprocess", "recording"}
     assert sum(data["stages_ms"][stage] for stage in inside) <= 1.2 * max(data["frame_ms_spread"])
     assert data["share_within_0.1_m"] > 0.5
+
+
+@pytest.mark.parametrize(("frames", "filled"), [((0,), []), ((-2, -1, 0), [0, 1, 2])])
+def test_a_window_is_filled_after_one_frame(window_model, frames, filled):
+    version, drive = Version(window_model(*frames), torch.device("cpu")), MadeUpDrive(3)
+    version.step(Preprocessor(version.runner.config)(drive.load(2)))
+    version.fill_window(drive)
+    assert [frame.stamp.index for frame in version.state.memory.frames] == filled

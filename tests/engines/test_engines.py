@@ -16,7 +16,7 @@ from bevcli.cli.main import app
 from bevcli.config import as_table
 from bevcli.engines.engine import ENGINES
 from bevcli.engines.export_onnx import export_onnx
-from bevcli.engines.exported import ExportedBEVFormer, raw_images
+from bevcli.engines.exported import load_exported, raw_images
 from bevcli.engines.quantize import quantize
 from bevcli.errors import BevcliError, ConfigError, WeightsError
 from bevcli.pipeline.model_loading import load_model
@@ -61,7 +61,7 @@ def _model():
 
 @pytest.mark.parametrize("engine", list(ENGINES))
 def test_an_engine_equals_the_model_with_and_without_history(small_file, engine):
-    exported, model = ExportedBEVFormer(small_file, engine), _model()
+    exported, model = load_exported(small_file, engine), _model()
     history = torch.randn(1, 48, 32, generator=torch.Generator().manual_seed(1))
     for previous in (None, history):
         with torch.inference_mode():
@@ -82,7 +82,7 @@ def test_a_file_tells_its_model_and_that_its_weights_are_random(small_file):
 @pytest.mark.parametrize("engine", list(ENGINES))
 def test_int8_is_close_to_float32_and_only_the_image_features_are_rounded(small_file, int8_file, engine):
     assert load_model(int8_file).precision == "int8"
-    exact, rounded = (ExportedBEVFormer(file, engine) for file in (small_file, int8_file))
+    exact, rounded = (load_exported(file, engine) for file in (small_file, int8_file))
     with torch.inference_mode():
         expected, found = exact(small_inputs()).bev, rounded(small_inputs()).bev
     difference = (found - expected).norm() / expected.norm()
@@ -102,16 +102,14 @@ def test_more_cameras_on_a_cell_than_the_file_has_slots_for_are_an_error(small_f
     inputs.image_from_bev[:, 1] = inputs.image_from_bev[:, 0]  # both cameras look the same way
     with torch.inference_mode():
         expected = model(inputs).bev
-        torch.testing.assert_close(
-            ExportedBEVFormer(small_file, "onnxruntime")(inputs).bev, expected, rtol=1e-4, atol=1e-4
-        )
+        torch.testing.assert_close(load_exported(small_file, "onnxruntime")(inputs).bev, expected, rtol=1e-4, atol=1e-4)
     one = tmp_path / "one.onnx"
     proto = onnx.load(small_file)
     for entry in proto.metadata_props:
         entry.value = "1" if entry.key == "cameras_per_cell" else entry.value
     onnx.save(proto, one)
     with pytest.raises(WeightsError, match=r"takes 1 cameras .* has 2: export it with --cameras-per-cell 2"):
-        ExportedBEVFormer(one, "onnxruntime")(inputs)
+        load_exported(one, "onnxruntime")(inputs)
 
 
 def test_a_model_in_the_metadata_is_checked_like_a_model_file(small_file, tmp_path):
@@ -174,8 +172,8 @@ def watch(event, arguments):
         print("CONNECTION", event, arguments, file=sys.stderr)
 sys.addaudithook(watch)
 from pathlib import Path
-from bevcli.engines.exported import ExportedBEVFormer
-ExportedBEVFormer(Path({str(small_file)!r}), "openvino")
+from bevcli.engines.exported import load_exported
+load_exported(Path({str(small_file)!r}), "openvino")
 """
     done = subprocess.run([sys.executable, "-c", watched], capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stderr

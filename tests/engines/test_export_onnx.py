@@ -14,7 +14,7 @@ import torch
 from bevcli.benchmark.exported import check_exported
 from bevcli.engines.engine import ENGINES
 from bevcli.engines.export_onnx import export_onnx
-from bevcli.engines.exported import ExportedBEVFormer
+from bevcli.engines.exported import load_exported
 from bevcli.errors import BevcliError, WeightsError
 from bevcli.model.box_coding import decode
 from bevcli.pipeline.model_loading import Model, load_model
@@ -47,7 +47,7 @@ def demo_file(tmp_path_factory) -> Path:
 
 def test_a_file_equals_the_model_with_and_without_history(small_file):
     model = small_model()
-    exported = ExportedBEVFormer(small_file, "onnxruntime")
+    exported = load_exported(small_file, "onnxruntime")
     history = torch.randn(1, 48, 32, generator=torch.Generator().manual_seed(1))
     for previous in (None, history):
         with torch.inference_mode():
@@ -59,7 +59,7 @@ def test_a_file_equals_the_model_with_and_without_history(small_file):
 
 def test_a_camera_without_an_image_sees_nothing(small_file):
     model = small_model()
-    exported = ExportedBEVFormer(small_file, "onnxruntime")
+    exported = load_exported(small_file, "onnxruntime")
     inputs = small_inputs()
     inputs.has_image[:] = False
     with torch.inference_mode():
@@ -68,7 +68,7 @@ def test_a_camera_without_an_image_sees_nothing(small_file):
 
 def test_decoded_boxes_equal_the_decoder_of_the_library(small_file):
     model = small_model()
-    exported = ExportedBEVFormer(small_file, "onnxruntime")
+    exported = load_exported(small_file, "onnxruntime")
     found: dict[str, np.ndarray] = {}
     exported.engine.register_forward_hook(lambda module, arguments, outputs: found.update(outputs))
     with torch.inference_mode():
@@ -142,6 +142,6 @@ def test_mistakes_are_named(small_file, tmp_path):
     (tmp_path / "broken.onnx").write_bytes(b"no model")
     for engine in ENGINES:
         with pytest.raises(WeightsError, match="cannot load it"):
-            ExportedBEVFormer(tmp_path / "broken.onnx", engine)
+            load_exported(tmp_path / "broken.onnx", engine)
         with pytest.raises(WeightsError, match="No such file"):
-            ExportedBEVFormer(tmp_path / "missing.onnx", engine)
+            load_exported(tmp_path / "missing.onnx", engine)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import gc
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,32 +12,12 @@ from memory_drive import MemorySequence, WithoutImages
 from runs import CPU, run
 
 from bevcli.geometry.transforms import Pose, inverse
-from bevcli.model.bev_fusion import BevFusionConfig
-from bevcli.model.bevformer import BEVFormerConfig
-from bevcli.model.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config, fill_window
-from bevcli.model.fpn import FPNConfig
+from bevcli.model.bevformer_v2 import fill_window
 from bevcli.pipeline.model_loading import Model
 from bevcli.pipeline.preprocess import Preprocessor
 from bevcli.pipeline.run import run_into_folder
 from bevcli.pipeline.runner import Runner
 from bevcli.pipeline.temporal import other_bev_from_bev
-
-
-@pytest.fixture(scope="module")
-def window_model(mini_config: BEVFormerConfig):
-    """A function: frames of the window -> a small BEVFormerV2; models of as many frames have the same weights."""
-
-    def make(*frames: int) -> BEVFormerV2:
-        settings = {field.name: getattr(mini_config, field.name) for field in fields(mini_config)}
-        changes = {"ego_motion": NO_EGO_MOTION, "neck": FPNConfig(levels=5), "fusion": BevFusionConfig(2, 48)}
-        torch.manual_seed(0)
-        model = BEVFormerV2(BEVFormerV2Config(**{**settings, **changes}, frames=frames)).eval()
-        with torch.no_grad():
-            for parameter in model.parameters():
-                parameter.add_(0.05 * torch.randn_like(parameter))
-        return model
-
-    return make
 
 
 def assert_same(one, other):
