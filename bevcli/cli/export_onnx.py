@@ -15,7 +15,7 @@ def export_onnx(
     weights: Annotated[
         Path | None,
         typer.Option(
-            help="An official .pth or a .safetensors file. Default: the weights in the package (demo only).",
+            help="An official .pth or a .safetensors file. Default: the weights in the package (demo and demo-rigs only).",
             show_default=False,
         ),
     ] = None,
