@@ -7,19 +7,15 @@ from typing import Annotated, Literal
 
 import typer
 
+from bevcli.cli.run_options import UntrainedOption, WeightsOption
+
 
 def export_onnx(
     model: Annotated[
-        str, typer.Argument(help="tiny, small, base, demo, v2-t1-base, v2-t1, v2-t2, v2-t8, or a FILE.toml.")
+        str, typer.Argument(help="tiny, small, base, demo, demo-rigs, v2-t1-base, v2-t1, v2-t2, v2-t8, or a FILE.toml.")
     ],
-    weights: Annotated[
-        Path | None,
-        typer.Option(
-            help="An official .pth or a .safetensors file. Default: the weights in the package (demo and demo-rigs only).",
-            show_default=False,
-        ),
-    ] = None,
-    untrained: Annotated[bool, typer.Option("--untrained", help="Use random weights.")] = False,
+    weights: WeightsOption = None,
+    untrained: UntrainedOption = False,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Default: MODEL.onnx.", show_default=False)] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite the file if it exists.")] = False,
     opset: Annotated[int, typer.Option(min=17, help="Version of the ONNX operators.")] = 19,
