@@ -184,12 +184,7 @@ def s3(tmp_path, monkeypatch):
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
     try:
-        deadline = time.monotonic() + 60
-        while time.monotonic() < deadline:
-            with socket.socket() as probe:
-                if probe.connect_ex(("127.0.0.1", port)) == 0:
-                    break
-            time.sleep(0.1)
+        wait_for_port(port, 60)
         import s3fs
 
         system = s3fs.S3FileSystem()
@@ -239,26 +234,36 @@ def test_drives_and_results_in_s3(s3, tmp_path):
 def test_a_batch_runs_on_a_cluster_that_is_up_already(tmp_path, monkeypatch):
     (tmp_path / "mini.toml").write_text(MINI_TOML)
     write_fleet(tmp_path / "drives", 4, frames=2)
-    ray = [sys.executable, "-m", "ray.scripts.scripts"]
     monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)  # workers get it from the batch
-    port = str(free_port())
-    started = subprocess.run(
-        [*ray, "start", "--head", "--port", port, "--num-cpus", "2", "--node-ip-address", "127.0.0.1",
-         "--include-dashboard", "false", "--disable-usage-stats", "--temp-dir", str(tmp_path / "ray")],
-        cwd=tmp_path, capture_output=True, text=True, timeout=200, check=False,
+    port = free_port()
+    cluster = subprocess.Popen(
+        [sys.executable, "-m", "ray.scripts.scripts", "start", "--head", "--block", "--port", str(port),
+         "--num-cpus", "2", "--node-ip-address", "127.0.0.1", "--include-dashboard", "false", "--disable-usage-stats"],
+        cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
-    assert started.returncode == 0, started.stderr
     try:
+        wait_for_port(port, 120)
         done = command(tmp_path, *BATCH, "--ray", f"127.0.0.1:{port}", "--workers", "2")
     finally:
-        subprocess.run([*ray, "stop", "--force"], capture_output=True, timeout=200, check=False)
+        cluster.terminate()
+        cluster.wait(60)
     assert done.returncode == 0, done.stderr
     command(tmp_path, *BATCH[:2], "--out", "alone", *BATCH[4:], "--workers", "1")
     alone = results_of(tmp_path / "alone")
     for name, folder in results_of(tmp_path / "out").items():
         assert (folder / "predictions.json").read_bytes() == (alone[name] / "predictions.json").read_bytes()
     assert len(alone) == 4
+
+
+def wait_for_port(port: int, seconds: float) -> None:
+    """Returns when something listens on a port of this machine, or after a time."""
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        with socket.socket() as probe:
+            if probe.connect_ex(("127.0.0.1", port)) == 0:
+                return
+        time.sleep(0.1)
 
 
 def free_port() -> int:
