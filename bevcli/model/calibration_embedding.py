@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.model.deformable_attention import FeatureMaps
+from bevcli.model.upload import upload
 
 RAY_FEATURES = 9
 HIDDEN = 64
@@ -42,7 +43,7 @@ class CalibrationEmbedding(nn.Module):
 
         Args:
             image_features: tokens (B·N, S, C) of B·N images.
-            image_from_bev: (B, N, 4, 4) float32, bev metres to pixels of the network's input.
+            image_from_bev: (B, N, 4, 4) float32, bev metres to pixels of the network's input, on the CPU or the device.
             image_size: (height, width) of the network's input, pixels.
 
         Returns:
@@ -52,7 +53,7 @@ class CalibrationEmbedding(nn.Module):
         # In float32: half precision is too coarse for rays.
         with torch.autocast(tokens.device.type, enabled=False):
             rays = ray_features(image_from_bev.flatten(0, 1), image_features.level_shapes, image_size, self.height_m)
-            scale, shift = self.layers(rays).chunk(2, dim=-1)  # (B·N, S, C) each
+            scale, shift = self.layers(upload(rays, tokens.device)).chunk(2, dim=-1)  # (B·N, S, C) each
         return FeatureMaps((tokens * (1 + scale) + shift).to(tokens.dtype), image_features.level_shapes)
 
 
