@@ -55,13 +55,17 @@ def cropping_model(window_model):
 
 
 @pytest.fixture(scope="module")
-def window_files(cropping_model, tmp_path_factory) -> dict[tuple[int, ...], Path]:
-    """The files of models with one frame and with three."""
-    folder, files = tmp_path_factory.mktemp("windows"), {}
-    for frames in ((0,), WINDOW):
-        files[frames] = folder / f"window-of-{len(frames)}.onnx"
-        export_onnx(cropping_model(*frames), files[frames], decode=True, untrained=True)
-    return files
+def window_file(cropping_model, tmp_path_factory):
+    """A function: frames of the window -> the file of that model, exported when it is first asked for."""
+    folder = tmp_path_factory.mktemp("windows")
+
+    def file_of(frames: tuple[int, ...] = WINDOW) -> Path:
+        file = folder / f"window-of-{len(frames)}.onnx"
+        if not file.exists():
+            export_onnx(cropping_model(*frames), file, decode=True, untrained=True)
+        return file
+
+    return file_of
 
 
 def agree(differences: list[FrameDifference], frames: int) -> None:
@@ -71,16 +75,16 @@ def agree(differences: list[FrameDifference], frames: int) -> None:
 
 
 @pytest.mark.parametrize("engine", list(ENGINES))
-@pytest.mark.parametrize("frames", [(0,), WINDOW])
-def test_a_file_equals_the_model_over_a_drive(cropping_model, window_files, frames, engine):
-    differences = list(check_exported(window_files[frames], Model(cropping_model(*frames)), DRIVE, engine))
+@pytest.mark.parametrize("frames", [pytest.param((0,), marks=pytest.mark.slow), WINDOW])
+def test_a_file_equals_the_model_over_a_drive(cropping_model, window_file, frames, engine):
+    differences = list(check_exported(window_file(frames), Model(cropping_model(*frames)), DRIVE, engine))
     agree(differences, 7)
     assert max(row.bev for row in differences) < 1e-4
 
 
-@pytest.mark.parametrize("frames", [(0,), WINDOW])
-def test_a_file_documents_its_window_and_all_inputs_and_outputs(window_files, frames):
-    proto = onnx.load(window_files[frames])
+@pytest.mark.parametrize("frames", [pytest.param((0,), marks=pytest.mark.slow), WINDOW])
+def test_a_file_documents_its_window_and_all_inputs_and_outputs(window_file, frames):
+    proto = onnx.load(window_file(frames))
     assert {node.domain for node in proto.graph.node} <= {"", "ai.onnx"}
     documented = {entry.key: entry.value for entry in proto.metadata_props}
     for values, key in ((proto.graph.input, "inputs"), (proto.graph.output, "outputs")):
@@ -100,8 +104,8 @@ def test_the_levels_of_the_image_features_follow_from_the_configuration(cropping
     assert features.level_shapes == model.config.level_shapes
 
 
-def test_an_interrupted_run_of_a_file_is_resumed_with_its_window(window_files, tmp_path):
-    model = load_model(window_files[WINDOW])
+def test_an_interrupted_run_of_a_file_is_resumed_with_its_window(window_file, tmp_path):
+    model = load_model(window_file())
     run_into_folder(model, DRIVE, tmp_path / "whole")
     run_into_folder(model, DRIVE, tmp_path / "cut", should_stop=iter([*[False] * 5, True]).__next__)
     run_into_folder(model, DRIVE, tmp_path / "cut", resume=True)
@@ -110,8 +114,8 @@ def test_an_interrupted_run_of_a_file_is_resumed_with_its_window(window_files, t
 
 
 @pytest.mark.slow
-def test_int8_is_close_to_float32(window_files, tmp_path):
-    file, config = window_files[WINDOW], load_model(window_files[WINDOW]).config
+def test_int8_is_close_to_float32(window_file, tmp_path):
+    file, config = window_file(), load_model(window_file()).config
     quantize(file, calibration_images(config, 6, [DRIVE], 4), tmp_path / "int8.onnx")
     differences = list(compare_exported(tmp_path / "int8.onnx", file, DRIVE, "onnxruntime"))
     assert 1e-5 < max(row.logits for row in differences) < 0.1
