@@ -153,8 +153,7 @@ class ExportedBEVFormerV2(ExportedModel):
             inputs: of the current frame; the ego-motion is not read.
             earlier: the other frames of the window, in their order; None for one that does not exist.
         """
-        absent = self._absent(inputs)
-        frames = [absent if frame is None else frame for frame in earlier]
+        frames = [self._absent(inputs) if frame is None else frame for frame in earlier]
         window = {
             "image_from_bev": torch.stack([*(frame.image_from_bev for frame in frames), inputs.image_from_bev], dim=1),
             "has_image": torch.stack([*(frame.has_image for frame in frames), inputs.has_image], dim=1),
@@ -167,10 +166,9 @@ class ExportedBEVFormerV2(ExportedModel):
 
     def _absent(self, inputs: BEVFormerInputs) -> WindowFrame:
         """The place of a frame that does not exist: no camera has an image."""
-        levels, channels = self.config.level_shapes, self.config.channels
-        tokens = torch.zeros(self.cameras, sum(height * width for height, width in levels), channels)
+        tokens = torch.zeros(self.engine.input_shapes["previous_features"][1:])
         return WindowFrame(
-            image_features=FeatureMaps(tokens, levels),
+            image_features=FeatureMaps(tokens, self.config.level_shapes),
             image_from_bev=torch.zeros_like(inputs.image_from_bev),
             has_image=torch.zeros_like(inputs.has_image),
             image_size=inputs.image_size,

@@ -29,7 +29,7 @@ def case(depth: int = 4, counts: tuple[int, ...] = (200, 0, 3), dtype: torch.dty
     return values, SHAPES, locations, weights, counts
 
 
-@pytest.mark.parametrize("depth", [1, 8, 32, 33, 48, 64])
+@pytest.mark.parametrize("depth", [1, 4, 8, 32, 33, 48, 64])
 @pytest.mark.parametrize("sampling", [PADDED, COMPILED])
 def test_sampling_modules_equal_the_plain_one(sampling, depth):
     inputs = case(depth)
