@@ -4,23 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
-import numpy as np
-
 from bevcli.frame import Frame, Sequence
 from bevcli.geometry.cameras import Camera, CameraRig
-from bevcli.geometry.transforms import Array, rigid
+from bevcli.geometry.pose_noise import camera_pose_noise
 from bevcli.robustness.draws import Draws
 from bevcli.robustness.sequences import ChangedSequence
-
-TRANSLATION_M = 0.05  # standard deviation per level and axis
 
 
 class CalibrationNoise(ChangedSequence):
     """A sequence whose cameras state wrong poses, the same ones for a whole scene.
 
-    Level L adds normal noise to each axis of each camera: rotation with a variance of L degrees², translation with a
-    standard deviation of 5 L cm, both in the camera frame. BEVFormer's paper has the levels 1 to 4.
+    `camera_pose_noise` describes the levels.
     """
 
     def __init__(self, sequence: Sequence, level: int, draws: Draws) -> None:
@@ -39,11 +33,3 @@ class CalibrationNoise(ChangedSequence):
     def _with_noise(self, camera: Camera, scene: str) -> Camera:
         noise = camera_pose_noise(self._level, self._draws.generator(scene, camera.name))
         return replace(camera, ego_from_camera=camera.ego_from_camera @ noise)
-
-
-def camera_pose_noise(level: int, random: np.random.Generator) -> Array:
-    """(4, 4) camera_from_noisy_camera, metres, see `CalibrationNoise`."""
-    rotation_deg = np.sqrt(level) * random.standard_normal(3)
-    translation = TRANSLATION_M * level * random.standard_normal(3)
-    rotation, _ = cv2.Rodrigues(np.radians(rotation_deg))
-    return rigid(translation, rotation)

@@ -1,6 +1,6 @@
-"""Image augmentation: photometric distortion, exposure, noise, missing images and grid mask.
+"""Augmentation: photometric distortion, exposure, noise, missing images, grid mask, and noise on the calibration.
 
-Boxes, maps and calibration stay as they are.
+Boxes and maps stay as they are.
 """
 
 from __future__ import annotations
@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bevcli.frame import CameraImage, Frame
+from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.geometry.pose_noise import camera_pose_noise
+from bevcli.geometry.transforms import Array
 
 MAX_BRIGHTNESS = 32.0  # added to pixel values of 0 to 255
 CONTRAST_RANGE = SATURATION_RANGE = (0.5, 1.5)  # factors
@@ -32,6 +35,8 @@ class AugmentationConfig:
         white_balance: largest relative change of a camera's red and blue; constant over a clip.
         noise: largest standard deviation of the noise, of pixel values 0 to 255. Half of the clips have noise.
         drop_image: probability (0 to 1) that an image is missing. A frame keeps at least one image.
+        calibration_share: probability (0 to 1) that a clip has noise on the poses of its cameras; constant over a clip.
+        calibration_noise: largest level of that noise (`camera_pose_noise`), drawn uniformly from 0.
     """
 
     photometric: float = 0.5
@@ -40,12 +45,18 @@ class AugmentationConfig:
     white_balance: float = 0.0
     noise: float = 0.0
     drop_image: float = 0.0
+    calibration_share: float = 0.0
+    calibration_noise: float = 4.0
 
     def __post_init__(self) -> None:
-        if not all(0 <= share <= 1 for share in (self.photometric, self.grid_mask, self.drop_image)):
-            raise ValueError("photometric, grid_mask and drop_image are probabilities, from 0 to 1")
-        if min(self.exposure, self.white_balance, self.noise) < 0 or self.white_balance >= 1:
-            raise ValueError("exposure, white_balance and noise must not be negative, white_balance must be below 1")
+        shares = (self.photometric, self.grid_mask, self.drop_image, self.calibration_share)
+        if not all(0 <= share <= 1 for share in shares):
+            raise ValueError("photometric, grid_mask, drop_image and calibration_share are probabilities, from 0 to 1")
+        if min(self.exposure, self.white_balance, self.noise, self.calibration_noise) < 0 or self.white_balance >= 1:
+            raise ValueError(
+                "exposure, white_balance, noise and calibration_noise must not be negative, and white_balance must be "
+                "below 1"
+            )
 
 
 class ImageVariation:
@@ -84,6 +95,31 @@ class ImageVariation:
         blue, red = 1 + self._random.uniform(-1, 1, 2) * self._config.white_balance
         gains = np.array([blue, 1.0, red]) * 2.0**stops
         return (np.arange(256)[None, :, None] * gains).clip(0, 255).round().astype(np.uint8)
+
+
+class CalibrationVariation:
+    """Noise on the poses of the cameras of one clip, drawn once."""
+
+    def __init__(self, config: AugmentationConfig, random: np.random.Generator) -> None:
+        noisy = config.calibration_share > 0 and random.random() < config.calibration_share
+        self._level = random.uniform(0, config.calibration_noise) if noisy else 0.0
+        self._random = random
+        self._noise: dict[str, Array] = {}
+        self._noisy: tuple[CameraRig, CameraRig] | None = None  # a rig as it was read, and with noise
+
+    def __call__(self, frame: Frame) -> Frame:
+        """A copy of the frame whose cameras state wrong poses, or the frame itself. Frames share their noisy rig."""
+        if not self._level:
+            return frame
+        if self._noisy is None or self._noisy[0] is not frame.rig:
+            cameras = tuple(self._with_noise(camera) for camera in frame.rig.cameras)
+            self._noisy = (frame.rig, replace(frame.rig, cameras=cameras))
+        return replace(frame, rig=self._noisy[1])
+
+    def _with_noise(self, camera: Camera) -> Camera:
+        if camera.name not in self._noise:
+            self._noise[camera.name] = camera_pose_noise(self._level, self._random)
+        return replace(camera, ego_from_camera=camera.ego_from_camera @ self._noise[camera.name])
 
 
 def distort_images(frame: Frame, probability: float, random: np.random.Generator) -> Frame:

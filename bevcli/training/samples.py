@@ -16,7 +16,13 @@ from bevcli.geometry.transforms import inverse
 from bevcli.model.bevformer import BEVFormerConfig, BEVFormerInputs
 from bevcli.pipeline.model_inputs import model_inputs
 from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
-from bevcli.training.augmentation import AugmentationConfig, ImageVariation, distort_images, mask_images
+from bevcli.training.augmentation import (
+    AugmentationConfig,
+    CalibrationVariation,
+    ImageVariation,
+    distort_images,
+    mask_images,
+)
 from bevcli.training.clips import Clip
 from bevcli.training.detection_targets import DetectionTargets, box_targets, detection_targets
 from bevcli.training.drives import Drives
@@ -132,6 +138,6 @@ def _load_clip(
     random: np.random.Generator,
 ) -> list[PreparedFrame]:
     sequence, preprocess = drives.open(clip.drive), Preprocessor(config)
-    vary = ImageVariation(augmentation, random)
-    frames = (vary(sequence.load(index)) for index in clip.frames)
+    vary_images, vary_rig = ImageVariation(augmentation, random), CalibrationVariation(augmentation, random)
+    frames = (vary_rig(vary_images(sequence.load(index))) for index in clip.frames)
     return [preprocess(distort_images(frame, augmentation.photometric, random)) for frame in frames]

@@ -10,8 +10,9 @@ from memory_drive import MemorySequence
 from bevcli.frame import Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.ego_motion import Kinematics
+from bevcli.geometry.pose_noise import camera_pose_noise
 from bevcli.geometry.transforms import Pose, inverse
-from bevcli.robustness.calibration_noise import CalibrationNoise, camera_pose_noise
+from bevcli.robustness.calibration_noise import CalibrationNoise
 from bevcli.robustness.draws import Draws
 from bevcli.robustness.ego_motion_faults import EgoMotionLost, TimeOffsets, motion_during
 from bevcli.robustness.lost_images import CameraCrash, FrameLost
