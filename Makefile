@@ -1,5 +1,5 @@
 # make demo       run the model on samples/street; the recording is runs/street/recording.rrd
-# make test       the fast tests; make test-all: all tests
+# make test       the fast tests, in two processes of one thread each; make test-all: all tests
 # make fuzz       6,450 broken files of every format, up to ten minutes
 # make check      lint and types; make format: fix what ruff can fix
 # make gpu-check  check bevcli on a GPU, and write gpu-report.md to paste into an issue; DEVICE=cuda:1 or DEVICE=mps
@@ -26,7 +26,7 @@ demo: $(INSTALLED)
 	$(BIN)/bevcli run samples/street --out runs/street --force
 
 test: $(INSTALLED)
-	$(BIN)/pytest -m "not slow and not gpu"
+	OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses 2 --dist loadfile -m "not slow and not gpu"
 
 test-all: $(VENV)/.viewers
 	$(BIN)/pytest

@@ -19,12 +19,13 @@ from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
 from bevcli.model.bevformer_v2 import BEVFormerV2Config
 from bevcli.model.deformable_attention import GridSampling
 from bevcli.model.prepared import prepare_for_inference
+from bevcli.model.uniad import UniADConfig
 from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
 from bevcli.pipeline.runner import Runner, StepOptions
 
 CPU = torch.device("cpu")
 FRAMES = 3
-MODELS = [name for name in known_models() if not name.startswith("uniad")]  # its tracks are not simulated
+MODELS = known_models()
 
 
 def small_version(name: str) -> BEVFormerConfig:
@@ -91,7 +92,8 @@ def sample_plainly(values, shapes, locations, weights, ends, out, queries, maps,
 )
 def test_a_step_computes_on_its_device_and_waits_for_hits_and_results_only(name, device_name, monkeypatch):
     """The cells that each camera sees are counted anew when its projection changes; BEVFormerV2 projects every frame
-    of its window. The CPU reads these counts and the results, and waits for nothing else."""
+    of its window. The CPU reads these counts and the results, and waits for nothing else. Only the tracks of a UniAD
+    are chosen on the CPU, which reads them several times a frame."""
     config = small_version(name)
     model, prepared = made_up_model(config), frames(config)
     expected = run(model, CPU, prepared, [])
@@ -102,7 +104,7 @@ def test_a_step_computes_on_its_device_and_waits_for_hits_and_results_only(name,
         np.testing.assert_allclose(theirs.scores, ours.scores, atol=1e-4)
     window = getattr(config, "frames", (0,))
     projections = sum(0 <= FRAMES - 1 + offset < FRAMES for offset in window)
-    if device_name == "cuda:1":
+    if device_name == "cuda:1" and not isinstance(config, UniADConfig):
         assert device.waits == ["tolist"] * projections + ["results"]
 
 

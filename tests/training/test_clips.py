@@ -1,4 +1,4 @@
-"""Drawing of clips, and image augmentation."""
+"""Drawing of clips."""
 
 from __future__ import annotations
 
@@ -6,11 +6,9 @@ from collections import Counter
 
 import numpy as np
 import pytest
-import torch
 from memory_drive import MemorySequence
 
 from bevcli.errors import InputError
-from bevcli.training.augmentation import distort, distort_images, mask_images
 from bevcli.training.clips import ClipConfig, draw_clips, draw_frames
 
 
@@ -66,27 +64,3 @@ def test_the_clips_of_a_batch_have_the_same_length_and_some_batches_are_short() 
         lengths[len(clips[0].frames)] += 1
     assert set(lengths) == {1, 2, 3}
     assert lengths[3] / 300 == pytest.approx(0.7, abs=0.1)
-
-
-def test_probability_zero_leaves_images_unchanged() -> None:
-    frame, random = MemorySequence(1).load(0), np.random.default_rng(0)
-    assert distort_images(frame, 0.0, random) is frame
-    images = torch.ones(1, 2, 3, 8, 8)
-    mask_images(images, 0.0, random)
-    assert (images == 1).all()
-
-
-def test_distortion_changes_the_image_and_is_reproducible() -> None:
-    pixels = np.full((4, 4, 3), (40, 90, 160), dtype=np.uint8)
-    changed = distort(pixels, 1.0, np.random.default_rng(1))
-    assert changed.dtype == np.uint8
-    assert not np.array_equal(changed, pixels)
-    assert np.array_equal(changed, distort(pixels, 1.0, np.random.default_rng(1)))
-
-
-def test_the_grid_mask_covers_about_a_quarter() -> None:
-    images = torch.ones(2, 6, 3, 64, 64)
-    mask_images(images, 1.0, np.random.default_rng(0))
-    covered = (images == 0).float().mean((-1, -2, -3))
-    assert ((covered > 0.05) & (covered < 0.6)).all()
-    assert covered.mean().item() == pytest.approx(0.25, abs=0.1)

@@ -1,0 +1,92 @@
+"""Augmentation of images and of the calibration."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from memory_drive import MemorySequence
+
+from bevcli.training.augmentation import (
+    AugmentationConfig,
+    CalibrationVariation,
+    ImageVariation,
+    distort,
+    distort_images,
+    mask_images,
+)
+
+NONE = AugmentationConfig(photometric=0, grid_mask=0)
+
+
+def test_probability_zero_leaves_images_unchanged() -> None:
+    frame, random = MemorySequence(1).load(0), np.random.default_rng(0)
+    assert distort_images(frame, 0.0, random) is frame
+    images = torch.ones(1, 2, 3, 8, 8)
+    mask_images(images, 0.0, random)
+    assert (images == 1).all()
+
+
+def test_distortion_changes_the_image_and_is_reproducible() -> None:
+    pixels = np.full((4, 4, 3), (40, 90, 160), dtype=np.uint8)
+    changed = distort(pixels, 1.0, np.random.default_rng(1))
+    assert changed.dtype == np.uint8
+    assert not np.array_equal(changed, pixels)
+    assert np.array_equal(changed, distort(pixels, 1.0, np.random.default_rng(1)))
+
+
+def test_the_grid_mask_covers_about_a_quarter() -> None:
+    images = torch.ones(2, 6, 3, 64, 64)
+    mask_images(images, 1.0, np.random.default_rng(0))
+    covered = (images == 0).float().mean((-1, -2, -3))
+    assert ((covered > 0.05) & (covered < 0.6)).all()
+    assert covered.mean().item() == pytest.approx(0.25, abs=0.1)
+
+
+def test_images_and_calibration_stay_as_they_are_unless_the_config_says_otherwise() -> None:
+    frame, random = MemorySequence(1).load(0), np.random.default_rng(0)
+    assert ImageVariation(NONE, random)(frame) is frame
+    assert CalibrationVariation(NONE, random)(frame) is frame
+
+
+def test_exposure_and_white_balance_are_constant_over_a_clip_and_differ_between_cameras() -> None:
+    sequence, config = MemorySequence(2), AugmentationConfig(0, 0, exposure=1.0, white_balance=0.2)
+    vary = ImageVariation(config, np.random.default_rng(0))
+    gains = []
+    for frame in (sequence.load(0), sequence.load(1)):
+        changed = vary(frame)
+        gains.append(
+            [
+                changed.images[name].pixels_bgr[dark].mean() / image.pixels_bgr[dark].mean()
+                for name, image in frame.images.items()
+                if (dark := image.pixels_bgr < 100).any()  # brighter pixels may be clipped
+            ]
+        )
+    np.testing.assert_allclose(gains[0], gains[1], rtol=0.02)
+    assert np.std(gains[0]) > 0.05
+
+
+def test_some_images_are_dropped_but_never_all_of_a_frame() -> None:
+    frame, random = MemorySequence(1).load(0), np.random.default_rng(0)
+    counts = [len(ImageVariation(AugmentationConfig(drop_image=0.5), random)(frame).images) for _ in range(100)]
+    assert 2.5 < np.mean(counts) < 3.5
+    assert len(ImageVariation(AugmentationConfig(drop_image=1.0), random)(frame).images) == 1
+
+
+def test_the_poses_of_cameras_have_the_same_noise_in_all_frames_of_a_clip() -> None:
+    sequence, config = MemorySequence(2), AugmentationConfig(calibration_share=1.0, calibration_noise=2.0)
+    vary = CalibrationVariation(config, np.random.default_rng(0))
+    first, second = vary(sequence.load(0)), vary(sequence.load(1))
+    assert first.rig is second.rig
+    for camera, noisy in zip(sequence.rig.cameras, first.rig.cameras, strict=True):
+        moved = np.linalg.inv(camera.ego_from_camera) @ noisy.ego_from_camera
+        assert 0 < np.linalg.norm(moved[:3, 3]) < 0.6
+        assert 0 < np.degrees(np.arccos((np.trace(moved[:3, :3]) - 1) / 2)) < 8
+        assert np.array_equal(camera.intrinsics, noisy.intrinsics)
+
+
+def test_a_share_of_the_clips_has_calibration_noise() -> None:
+    frame, random = MemorySequence(1).load(0), np.random.default_rng(0)
+    config = AugmentationConfig(calibration_share=0.25)
+    noisy = [CalibrationVariation(config, random)(frame) is not frame for _ in range(200)]
+    assert np.mean(noisy) == pytest.approx(0.25, abs=0.08)
