@@ -3,6 +3,7 @@
 In the order of a batch:
 
     storage             folders on this machine and in object stores (fsspec URLs)
+    nuscenes_url        nuScenes roots in object stores: tables once a machine, images scene by scene
     drives              arguments -> list of drives, each with a hash of its input
     job                 what every drive is run with, and the hash of it
     worker              one drive: fetch, run, score, land its results; attempts are counted

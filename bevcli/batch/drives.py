@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from bevcli.batch.nuscenes_url import copy_tables, versions_at
 from bevcli.batch.storage import StoredFile, expand, is_url, open_storage
 from bevcli.errors import BevcliError, InputError
 from bevcli.parsing.files import MIB, read_text
@@ -60,7 +61,7 @@ def find_drives(
     """All drives of arguments, and notes for the user.
 
     Args:
-        texts: paths, URLs and glob patterns. A local nuScenes root gives one drive per scene.
+        texts: paths, URLs and glob patterns. A nuScenes root gives one drive per scene.
         choice: the part of a nuScenes root.
         listed: called with the number of drives whose files have been listed so far.
 
@@ -85,23 +86,23 @@ def _drives_of(source: str, choice: NuScenesChoice) -> Iterator[Drive]:
     path = source if is_url(source) else str(Path(source.removeprefix("file://")).absolute())
     drive = Drive(path, _safe_name(path))
     try:
-        if not is_url(path) and Path(path).is_dir() and is_nuscenes_root(Path(path)):
-            yield from _scenes(drive, choice)
-            return
         storage = open_storage(path)
-        files = storage.files()
-        if is_url(path) and any(re.fullmatch(r"v1\.[^/]*/scene\.json", file.name) for file in files):
-            raise InputError(f"{path}: nuScenes roots are read from local folders only: mount or copy it")
-        yield replace(drive, input_hash=_hash(drive.name, None, files))
+        if versions_at(storage) if is_url(path) else is_nuscenes_root(Path(path)):
+            yield from _scenes(drive, choice)
+        else:
+            yield replace(drive, input_hash=_hash(drive.name, None, storage.files()))
     except BevcliError as error:
         yield replace(drive, problem=str(error))
 
 
 def _scenes(root: Drive, choice: NuScenesChoice) -> Iterator[Drive]:
     """A drive per scene. Of the input, the tables count."""
-    tables = tables_of(Path(root.source), choice.version)
+    if is_url(root.source):
+        tables, files = copy_tables(root.source, choice.version)
+    else:
+        tables = tables_of(Path(root.source), choice.version)
+        files = open_storage(str(tables)).files()
     index, _ = open_index(tables)
-    files = open_storage(str(tables)).files()
     for number in chosen_scenes(index, tables, choice):
         scene = str(index.scenes.names[number])
         yield Drive(root.source, _safe_name(scene), scene, _hash(tables.name, scene, files))

@@ -11,7 +11,8 @@ import os
 import re
 import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol
@@ -22,6 +23,7 @@ from bevcli.parsing.files import read_bytes
 _URL = re.compile(r"(?P<protocol>[a-z][a-z0-9+.-]+)://", re.IGNORECASE)
 # The packages that fsspec needs for a protocol.
 _PACKAGES = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "abfs": "adlfs", "az": "adlfs"}
+FETCHING_THREADS = 16  # copying small files from an object store is waiting
 LARGEST_RECORD = 1 << 28  # bytes of a small file that is read as a whole
 
 
@@ -76,8 +78,11 @@ class Storage(Protocol):
         """
         ...
 
-    def fetch(self, local: Path) -> None:
-        """Copies the folder, or the file that it is, to a local path. Raises InputError."""
+    def fetch(self, local: Path, names: Sequence[str] | None = None) -> None:
+        """Copies the folder, or the file that it is, to a local path. Raises InputError.
+
+        names: only these files of the folder; those that are missing are left out.
+        """
         ...
 
 
@@ -173,7 +178,7 @@ class LocalFolder:
         except OSError as error:
             raise OutputError(f"{self.path / name}: cannot be written ({error.strerror})") from None
 
-    def fetch(self, local: Path) -> None:
+    def fetch(self, local: Path, names: Sequence[str] | None = None) -> None:
         """See `Storage`."""
         raise AssertionError("a local folder is read where it is")
 
@@ -235,19 +240,30 @@ class RemoteFolder:
                 self._system.put_file(str(path), self._path(f"{name}/{path.relative_to(folder).as_posix()}"))
         shutil.rmtree(folder)
 
-    def fetch(self, local: Path) -> None:
+    def fetch(self, local: Path, names: Sequence[str] | None = None) -> None:
         """See `Storage`."""
-        with _one_line(self.where, InputError):
-            if self._system.isfile(self._root):
+        with _one_line(self.where, InputError), ThreadPoolExecutor(FETCHING_THREADS) as pool:
+            if names is None and self._system.isfile(self._root):
                 local.parent.mkdir(parents=True, exist_ok=True)
                 self._system.get_file(self._root, str(local))
                 return
-            for name in self._system.find(self._root):
-                inside = PurePosixPath(name[len(self._root) + 1 :])
-                if ".." in inside.parts or inside.is_absolute():
-                    raise InputError(f"{self.where}: {inside}: leads out of the folder")
-                (local / inside).parent.mkdir(parents=True, exist_ok=True)
-                self._system.get_file(name, str(local / inside))
+            wanted = names
+            if wanted is None:
+                wanted = [name[len(self._root) + 1 :] for name in self._system.find(self._root)]
+            for copied in [pool.submit(self._fetch_file, name, local, names is not None) for name in wanted]:
+                copied.result()
+
+    def _fetch_file(self, name: str, local: Path, may_be_missing: bool) -> None:
+        inside = PurePosixPath(name)
+        if ".." in inside.parts or inside.is_absolute():
+            raise InputError(f"{self.where}: {inside}: leads out of the folder")
+        (local / inside).parent.mkdir(parents=True, exist_ok=True)
+        try:
+            self._system.get_file(self._path(name), str(local / inside))
+        except FileNotFoundError:
+            (local / inside).unlink(missing_ok=True)  # some file systems make it first
+            if not may_be_missing:
+                raise
 
     def _path(self, name: str) -> str:
         return f"{self._root}/{name}"

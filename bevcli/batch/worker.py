@@ -20,6 +20,7 @@ import torch
 from bevcli.batch.drives import Drive
 from bevcli.batch.embeddings import FramePooling
 from bevcli.batch.job import Job
+from bevcli.batch.nuscenes_url import fetch_scene
 from bevcli.batch.storage import LocalFolder, is_url, open_storage
 from bevcli.errors import BevcliError
 from bevcli.evaluation.evaluate import Scores, evaluate
@@ -30,6 +31,7 @@ from bevcli.pipeline.run import run_into_folder
 from bevcli.pipeline.run_folder import SUMMARY
 from bevcli.pipeline.run_summary import RunSummary
 from bevcli.pipeline.state_file import save_state
+from bevcli.sequences.nuscenes.choice import NuScenesChoice
 from bevcli.sequences.open import open_sequence
 
 Record = dict[str, Any]  # what is known of a drive after it was run; a row of batch.parquet
@@ -98,7 +100,7 @@ class Worker:
             raise BevcliError(drive.problem)
         job, began = self._job, time.perf_counter()
         with self._scratch(result) as (aside, inputs):
-            path = _fetched(drive.source, inputs)
+            path = _fetched(drive, job, inputs)
             fetched = time.perf_counter()
             try:
                 sequence = open_sequence(path, **job.reading_of(drive.scene))
@@ -234,12 +236,16 @@ def _score_columns(scores: Scores) -> Record:
     return {**defined, "ground_truth_boxes": scores.detection.ground_truth_count}
 
 
-def _fetched(source: str, inputs: Path) -> Path:
+def _fetched(drive: Drive, job: Job, inputs: Path) -> Path:
     """A local path of a drive's input; of a URL, a copy with the same name."""
-    if not is_url(source):
-        return Path(source)
-    local = inputs / source.rstrip("/").rpartition("/")[2]
-    open_storage(source).fetch(local)
+    if not is_url(drive.source):
+        return Path(drive.source)
+    local = inputs / drive.source.rpartition("/")[2]
+    if drive.scene is None:
+        open_storage(drive.source).fetch(local)
+    else:
+        choice = NuScenesChoice(job.reading.get("version"), drive.scene, sweeps=job.reading.get("sweeps", False))
+        fetch_scene(drive.source, choice, local)
     return local
 
 

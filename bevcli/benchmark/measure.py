@@ -9,11 +9,12 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
+from typing import TypeVar
 
 import torch
 
@@ -29,6 +30,8 @@ from bevcli.pipeline.model_loading import Model
 from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
 from bevcli.pipeline.write_behind import write_behind
 from bevcli.recording.writer import Recording
+
+T = TypeVar("T")
 
 WARM_UP_FRAMES = 2  # one without and one with history
 MIN_RUN_FRAMES = 3  # of the run with reading and recording; the times between them are measured
@@ -137,10 +140,16 @@ def _time_stages(fast: Version, drive: MadeUpDrive, first: int, timed: range) ->
 def _time_run(fast: Version, drive: MadeUpDrive, places: range) -> float:
     """Median seconds of a frame while other threads read and record, as in `bevcli run`."""
     done, preprocessor = [], Preprocessor(fast.runner.config)
+
+    def timed(steps: Iterable[T]) -> Iterator[T]:
+        for step in steps:
+            done.append(time.perf_counter())
+            yield step
+
     with _recording(drive, fast) as recording:
         steps = fast.runner.run(drive, places, preprocessor, fast.state)
-        for _ in write_behind(lambda step: recording.log(*step[:2]), steps):
-            done.append(time.perf_counter())
+        for _ in write_behind(lambda step: recording.log(*step[:2]), timed(steps)):
+            pass
     return median(after - before for before, after in pairwise(done))
 
 

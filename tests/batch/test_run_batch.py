@@ -6,9 +6,12 @@ import os
 import shutil
 from dataclasses import replace
 
+import cv2
 import fsspec
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from sequences.nuscenes_tables import Size, write_tables
 from small_fleet import MINI_TOML, make_job, results_of, write_drive, write_fleet
 
 from bevcli.batch import worker as worker_module
@@ -199,6 +202,33 @@ def test_urls_are_copied_and_removed_and_results_go_to_urls(batch, fleet, tmp_pa
         memory.rm("/fleet", recursive=True)
         memory.rm("/results", recursive=True)
     assert not list((tmp_path / "scratch").iterdir())
+
+
+def test_a_nuscenes_root_at_a_url_gives_the_bytes_of_a_local_one(batch, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "scratch"))
+    (tmp_path / "scratch").mkdir()
+    root = tmp_path / "root"
+    write_tables(root / "v1.0-mini", Size(scenes=2, samples=2, objects=1))
+    for place, data in enumerate(json.loads((root / "v1.0-mini/sample_data.json").read_text())):
+        if data["is_key_frame"] and "CAM_" in data["filename"] and place % 5:  # some images are missing
+            (root / data["filename"]).parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(root / data["filename"]), np.full((900, 1600, 3), place % 200, np.uint8))
+    memory = fsspec.filesystem("memory")
+    memory.put(str(root), "/root", recursive=True)
+    try:
+        remote = batch(["memory://root"], out=tmp_path / "remote")
+    finally:
+        memory.rm("/root", recursive=True)
+    assert [record["error"] for record in remote.records] == ["", ""]
+    assert [record["scene"] for record in remote.records] == ["scene-0001", "scene-0002"]
+    batch([str(root)], out=tmp_path / "local")
+    local = results_of(tmp_path / "local")
+    for name, folder in results_of(tmp_path / "remote").items():
+        assert (folder / "predictions.json").read_bytes() == (local[name] / "predictions.json").read_bytes()
+    assert not list((tmp_path / "scratch").iterdir())
+    (tables,) = (tmp_path / "cache/bevcli/nuscenes-tables").iterdir()
+    assert [path.name for path in tables.iterdir()] == ["v1.0-mini"]
 
 
 def test_the_report_needs_no_other_file_and_contains_no_markup_of_a_drive(batch, fleet, tmp_path):

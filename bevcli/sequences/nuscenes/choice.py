@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,11 +46,15 @@ def is_nuscenes_root(path: Path) -> bool:
 
 def tables_of(root: Path, version: str | None) -> Path:
     """The folder with a version's tables. Raises InputError if it is missing, or if the choice is not unique."""
-    versions = _versions(root)
+    return root / choose_version(root, _versions(root), version)
+
+
+def choose_version(root: object, versions: Sequence[str], version: str | None) -> str:
+    """The version with a name, or the only one. root: for messages. Raises InputError as `tables_of`."""
     if version is None and len(versions) == 1:
-        return root / versions[0]
+        return versions[0]
     if version in versions:
-        return root / version
+        return version
     found = ", ".join(versions) or "none"
     wanted = f'has no version "{version}"' if version else "has several versions"
     raise InputError(f"{root}: {wanted} (found: {found}): choose one with --version")
