@@ -71,7 +71,7 @@ class PreparedBEVFormer(BEVFormer):
 
     The precision applies to the path of the images: backbone, neck, image tokens and their values. BEV queries,
     sampling locations, decoder and heads stay in float32: they are a small part of the work, and rounding them would
-    move boxes by decimetres. Autocast around a prepared model has no effect.
+    move boxes (docs/speed.md has the figures). Autocast around a prepared model has no effect.
     """
 
     def __init__(self, model: BEVFormer, device: torch.device, precision: Precision) -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import copy
+
 import pytest
 import torch
 from small_model import small_inputs, small_model
 from torch import nn
 
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
+from bevcli.model.feed_forward import FeedForward
 from bevcli.model.kernels import onednn as onednn_layers
 from bevcli.model.kernels.compiled import CompiledDeformableConvolution
 from bevcli.model.kernels.onednn import FusedBottleneck, PackedLinear, has_onednn, use_onednn
@@ -29,8 +32,18 @@ def test_a_packed_linear_layer_equals_a_linear_layer(rows, bias):
         linear = nn.Linear(48, 20, bias).to(dtype)
         x = torch.randn(*rows, 48, dtype=dtype)
         with torch.inference_mode():
-            found = PackedLinear(linear.weight, linear.bias)(x)
+            found = PackedLinear(linear)(x)
             torch.testing.assert_close(found, linear(x), atol=TOLERANCE[dtype], rtol=TOLERANCE[dtype])
+
+
+@pytest.mark.parametrize("activation", ["relu", "gelu"])
+def test_a_packed_feed_forward_network_equals_the_plain_one(activation):
+    for dtype in dtypes():
+        plain = FeedForward(32, 64, 0.1, activation).to(dtype).eval().requires_grad_(False)
+        packed, x = nn.Sequential(copy.deepcopy(plain)), torch.randn(2, 300, 32, dtype=dtype)
+        use_onednn(packed)
+        with torch.inference_mode():
+            torch.testing.assert_close(packed(x), plain(x), atol=TOLERANCE[dtype], rtol=TOLERANCE[dtype])
 
 
 @pytest.mark.parametrize("style", ["pytorch", "caffe"])

@@ -6,12 +6,13 @@ them, a model keeps its own layers.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
 from bevcli.model.bev_fusion import FusionBlock
+from bevcli.model.feed_forward import FeedForward
 from bevcli.model.resnet import Bottleneck
 
 
@@ -24,16 +25,17 @@ def has_onednn(dtype: torch.dtype) -> bool:
 
 
 class PackedLinear(nn.Module):
-    """A linear layer with its weight in oneDNN's own layout."""
+    """A linear layer with its weight in oneDNN's own layout, and an activation in the same pass."""
 
-    def __init__(self, weight: Tensor, bias: Tensor | None) -> None:
+    def __init__(self, layer: nn.Linear, activation: Literal["none", "relu", "gelu"] = "none") -> None:
         super().__init__()
-        self.weight, self.bias = weight, bias
-        self.packed = torch.ops.mkldnn._reorder_linear_weight(weight)
+        self.weight, self.bias = layer.weight, layer.bias
+        self.packed = torch.ops.mkldnn._reorder_linear_weight(layer.weight)
+        self.activation = activation, [], "none" if activation == "gelu" else ""
 
     def forward(self, x: Tensor) -> Tensor:
         """x: (..., in) -> (..., out)."""
-        return torch.ops.mkldnn._linear_pointwise(x, self.packed, self.bias, "none", [], "")
+        return torch.ops.mkldnn._linear_pointwise(x, self.packed, self.bias, *self.activation)
 
 
 class ActivatedConvolution(nn.Module):
@@ -92,8 +94,11 @@ def use_onednn(part: nn.Module) -> None:
         elif isinstance(child, FusionBlock) and has_onednn(child.conv1.weight.dtype):
             child = FusedFusionBlock(child)
             setattr(part, name, child)
+        if isinstance(child, FeedForward) and has_onednn(child.expand.weight.dtype):
+            both = PackedLinear(child.expand, child.activation), PackedLinear(child.reduce)
+            setattr(part, name, nn.Sequential(*both))  # dropout has no effect in inference
         # Not the subclass of nn.Linear in multi-head attention, which reads the weight of that layer itself.
-        if type(child) is nn.Linear and has_onednn(child.weight.dtype):
-            setattr(part, name, PackedLinear(child.weight, child.bias))
+        elif type(child) is nn.Linear and has_onednn(child.weight.dtype):
+            setattr(part, name, PackedLinear(child))
         else:
             use_onednn(child)
