@@ -45,6 +45,9 @@ def validate(
     tracking: Annotated[
         bool, typer.Option("--tracking", help="Also run the tracker and score its tracks: AMOTA, identity switches.")
     ] = False,
+    each: Annotated[
+        bool, typer.Option("--each", help="Also score each drive alone, with the mean and the lowest mAP.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")] = False,
     device: DeviceOption = "auto",
     engine: EngineOption = None,
@@ -63,6 +66,7 @@ def validate(
     from bevcli.pipeline.runner import Runner, StepOptions
     from bevcli.training.drives import count_frames, open_drives, parse_seeds
     from bevcli.training.job import rig_for_drives
+    from bevcli.training.validation import drives_table
     from bevcli.training.validation import validate as validate_model
 
     loaded = load_model(model, weights, device=device, engine=engine)
@@ -71,13 +75,21 @@ def validate(
     runner = Runner(loaded.prepared, loaded.device, StepOptions(loaded.precision, temporal))
     with Progress(count_frames(drives), "frames") as progress:
         scores = validate_model(
-            runner, drives, max_range, loaded.tracker if tracking else None, after_frame=progress.advance
+            runner,
+            drives,
+            max_range,
+            loaded.tracker if tracking else None,
+            after_frame=progress.advance,
+            each_drive=each,
         )
     if as_json:
         content = scores_to_dict(scores.detection, scores.config, scores.segmentation)
         content |= {} if scores.tracking is None else {"tracking": tracking_to_dict(scores.tracking)}
+        content |= {"drives": [drive.to_dict() for drive in scores.drives]} if each else {}
         print(json.dumps(content, indent=1))
     else:
         print(f"drives  {len(drives)}\n\n{scores_table(scores.detection, scores.segmentation)}")
         if scores.tracking is not None:
             print(f"\n{tracking_table(scores.tracking)}")
+        if each:
+            print(f"\n{drives_table(scores.drives)}")

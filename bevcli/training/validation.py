@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from statistics import fmean
 
 import numpy as np
 
@@ -24,6 +25,27 @@ from bevcli.training.drives import Drives
 
 
 @dataclass(frozen=True)
+class DriveScores:
+    """The detection scores of one drive alone, over the classes that it has.
+
+    Attributes:
+        name: of the drive.
+        cameras: the number of its cameras.
+        mean_ap: mAP, 0 to 1; NaN without ground truth.
+        nd_score: NDS, 0 to 1; NaN without ground truth.
+    """
+
+    name: str
+    cameras: int
+    mean_ap: float
+    nd_score: float
+
+    def to_dict(self) -> dict[str, str | int | float | None]:
+        """For JSON, which has no NaN."""
+        return {name: None if value != value else value for name, value in vars(self).items()}
+
+
+@dataclass(frozen=True)
 class Validation:
     """Scores over all frames of several drives.
 
@@ -32,12 +54,14 @@ class Validation:
         detection: AP, errors and NDS.
         segmentation: IoU by class; None if the model or the drives have no maps.
         tracking: AMOTA and the metrics that come with it; None without a tracker.
+        drives: the scores of each drive alone; empty if they were not asked for.
     """
 
     config: DetectionConfig
     detection: DetectionScores
     segmentation: SegmentationScores | None
     tracking: TrackingScores | None = None
+    drives: tuple[DriveScores, ...] = ()
 
     def summary(self) -> dict[str, float]:
         """mAP, NDS and mAVE (m/s) over the classes that have ground truth, and IoU by class; NaN if not measured."""
@@ -63,6 +87,8 @@ def validate(
     max_range_m: float | None = None,
     tracker: TrackerConfig | None = None,
     after_frame: Callable[[], None] = lambda: None,
+    *,
+    each_drive: bool = False,
 ) -> Validation:
     """Runs every frame of the drives and scores the frames that have ground truth.
 
@@ -70,18 +96,21 @@ def validate(
         max_range_m: ignore boxes beyond this distance, metres; by default beyond the nearest side of the BEV grid.
         tracker: parameters of the tracker whose tracks are scored; None scores no tracks.
         after_frame: called after each frame.
+        each_drive: score each drive alone too.
     """
     range_m = runner.config.bev_grid.nearest_side_m if max_range_m is None else max_range_m
     config = DetectionConfig().cut_at(range_m)
     predictions, truths, maps = [], [], []
     tracks: list[_TrackedFrame] = []
+    of_drives: list[DriveScores] = []
     for index in range(len(drives)):
-        sequence = drives.open(index)
+        sequence, first, cameras = drives.open(index), len(truths), 0
         steps = runner.run(sequence, range(len(sequence.stamps)), Preprocessor(runner.config))
         results = ((frame, prediction) for frame, prediction, _ in steps)
         if tracker is not None:
             results = ((frame, prediction) for frame, prediction, _ in track(tracker, results))
         for frame, prediction in results:
+            cameras = len(frame.rig.cameras)
             if frame.ground_truth is not None:
                 if tracker is not None:
                     tracks.append(_tracked_frame(index, frame, frame.ground_truth, prediction))
@@ -91,12 +120,28 @@ def validate(
             if prediction.segmentation is not None and frame.ground_truth_map is not None:
                 maps.append((prediction.segmentation, frame.ground_truth_map))
             after_frame()
+        if each_drive:
+            table = evaluate_detections(predictions[first:], truths[first:], config).overall
+            table = table.of_classes_with_ground_truth()
+            of_drives.append(DriveScores(sequence.name, cameras, table.mean_ap, table.nd_score))
     return Validation(
         config,
         evaluate_detections(predictions, truths, config),
         evaluate_segmentation(maps) if maps else None,
         None if tracker is None else _score_tracks(tracks, TrackingConfig().cut_at(range_m)),
+        tuple(of_drives),
     )
+
+
+def drives_table(drives: Sequence[DriveScores]) -> str:
+    """A line for each drive, and the mean and the lowest mAP of the drives with ground truth."""
+    width = max(len("drive"), *(len(drive.name) for drive in drives))
+    lines = [f"{'drive':{width}}  cameras    mAP    NDS"]
+    lines += [f"{one.name:{width}}  {one.cameras:7}  {one.mean_ap:.3f}  {one.nd_score:.3f}" for one in drives]
+    scored = [one.mean_ap for one in drives if not math.isnan(one.mean_ap)]
+    if scored:
+        lines.append(f"mAP: mean {fmean(scored):.3f}, lowest {min(scored):.3f}")
+    return "\n".join(lines)
 
 
 def boxes_ego(frame: Frame, ground_truth: Boxes3D, prediction: Prediction) -> tuple[Boxes3D, Boxes3D]:

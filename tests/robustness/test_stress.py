@@ -16,7 +16,7 @@ from bevcli.pipeline.run import run
 from bevcli.pipeline.runner import Runner
 from bevcli.robustness.conditions import choose_conditions
 from bevcli.robustness.stress import StressOptions, stress
-from bevcli.training.validation import validate
+from bevcli.training.validation import drives_table, validate
 
 FRAMES = 3
 NAMES = ("clean", "frame_lost", "snow", "calibration_noise", "ego_motion_lost", "frame_rate")
@@ -76,8 +76,13 @@ def test_every_condition_is_scored_and_changes_the_predictions(whole):
 
 
 def test_the_clean_scores_are_those_of_validate(whole, model, drives):
-    summary = validate(Runner(model.prepared, model.device), DrivesInMemory(drives)).summary()
+    together = validate(Runner(model.prepared, model.device), DrivesInMemory(drives), each_drive=True)
+    summary = together.summary()
     assert content(whole)["conditions"][0]["nd_score"] == pytest.approx(summary["NDS"], abs=1e-9)
+    second = validate(Runner(model.prepared, model.device), DrivesInMemory(drives[1:])).summary()
+    assert [(drive.name, drive.cameras) for drive in together.drives] == [("memory", 6), ("second", 6)]
+    assert (together.drives[1].mean_ap, together.drives[1].nd_score) == (second["mAP"], second["NDS"])
+    assert drives_table(together.drives).splitlines()[-1].startswith("mAP: mean 0.")
 
 
 def test_an_interrupted_test_that_is_resumed_gives_the_same_bytes(whole, model, drives, tmp_path):
