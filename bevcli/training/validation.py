@@ -100,7 +100,9 @@ def validate(
     """
     range_m = runner.config.bev_grid.nearest_side_m if max_range_m is None else max_range_m
     config = DetectionConfig().cut_at(range_m)
-    predictions, truths, maps = [], [], []
+    predictions: list[Boxes3D] = []
+    truths: list[Boxes3D] = []
+    maps = []
     tracks: list[_TrackedFrame] = []
     of_drives: list[DriveScores] = []
     for index in range(len(drives)):

@@ -31,7 +31,7 @@ class PackedLinear(nn.Module):
         super().__init__()
         self.weight, self.bias = layer.weight, layer.bias
         self.packed = torch.ops.mkldnn._reorder_linear_weight(layer.weight)
-        self.activation = activation, [], "none" if activation == "gelu" else ""
+        self.activation: tuple[str, list[float], str] = (activation, [], "none" if activation == "gelu" else "")
 
     def forward(self, x: Tensor) -> Tensor:
         """x: (..., in) -> (..., out)."""

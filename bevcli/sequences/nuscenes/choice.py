@@ -53,7 +53,7 @@ def choose_version(root: object, versions: Sequence[str], version: str | None) -
     """The version with a name, or the only one. root: for messages. Raises InputError as `tables_of`."""
     if version is None and len(versions) == 1:
         return versions[0]
-    if version in versions:
+    if version is not None and version in versions:
         return version
     found = ", ".join(versions) or "none"
     wanted = f'has no version "{version}"' if version else "has several versions"
