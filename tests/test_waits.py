@@ -24,6 +24,10 @@ ALLOWED = {
         "batch/run_batch.py",
         "ThreadPoolExecutor",
     ): "the tasks read files; packages of object stores have time limits of their own",
+    (
+        "batch/storage.py",
+        "ThreadPoolExecutor",
+    ): "the tasks read files; packages of object stores have time limits of their own",
     ("cli/viz.py", "process.wait"): "until the user closes the viewer's window",
     ("viewer/web.py", "self._server.serve_forever"): "until Ctrl-C, or `close`",
     ("recording/rrd_file.py", "select.select"): "in a daemon thread, until rerun writes or closes the pipe",

@@ -250,10 +250,9 @@ class RemoteFolder:
             wanted = names
             if wanted is None:
                 wanted = [name[len(self._root) + 1 :] for name in self._system.find(self._root)]
-            for copied in [pool.submit(self._fetch_file, name, local, names is not None) for name in wanted]:
-                copied.result()
+            list(pool.map(lambda name: self._fetch_file(name, local, may_be_missing=names is not None), wanted))
 
-    def _fetch_file(self, name: str, local: Path, may_be_missing: bool) -> None:
+    def _fetch_file(self, name: str, local: Path, *, may_be_missing: bool) -> None:
         inside = PurePosixPath(name)
         if ".." in inside.parts or inside.is_absolute():
             raise InputError(f"{self.where}: {inside}: leads out of the folder")
