@@ -32,6 +32,7 @@ try:
 except Exception as error:
     sys.exit(" ".join(str(error).split()))
 """
+CUT_SHORT = b"trailing bytes in rrd stream"  # logged by rerun, which raises no error here
 CHECK_MEMORY = 1 << 30  # bytes, beside four times the file's size
 # rerun's allocator sets aside 1 GiB at its start, which would count. In KiB.
 CHECK_ENVIRONMENT = {"MIMALLOC_ARENA_RESERVE": "65536"}
@@ -92,6 +93,8 @@ def _check(file: Path, path: Path) -> None:
     """Raises InputError, which names `path`, unless all of a file can be read."""
     memory = CHECK_MEMORY + 4 * file.stat().st_size
     done = _run([sys.executable, "-c", CHECK, str(file), str(memory)], path)
+    if done.returncode == 0 and CUT_SHORT in done.stderr:
+        raise InputError(f"{path}: the recording cannot be read: it is damaged (rerun does not read all of it)")
     if done.returncode:
         lines = done.stderr.decode(errors="replace").strip().splitlines() if done.returncode == 1 else []
         reason = lines[-1].replace(str(file), path.name) if lines else "rerun ends when it reads it"

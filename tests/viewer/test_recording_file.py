@@ -138,6 +138,21 @@ def test_damaged_data_never_ends_the_process(recording, tmp_path, place):
     assert "\n" not in message
 
 
+@pytest.mark.parametrize("message", [0, 2, 5])
+def test_a_message_of_unknown_kind_is_damage_and_not_the_end_of_the_recording(recording, tmp_path, message):
+    content = bytearray(recording.read_bytes())
+    start = recording_file.FILE_HEADER
+    for _ in range(message):
+        start += recording_file.MESSAGE_HEADER.size + recording_file.MESSAGE_HEADER.unpack_from(content, start)[1]
+    content[start] ^= 0x55
+    (tmp_path / "damaged.rrd").write_bytes(content)
+    with (
+        pytest.raises(InputError, match="damaged.rrd: the recording cannot be read: it is damaged"),
+        open_recording(tmp_path / "damaged.rrd"),
+    ):
+        pass
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems do not limit the memory of a process")
 def test_the_process_that_reads_a_recording_first_has_one_gigabyte(recording):
     greedy = recording_file.CHECK.replace("try:\n    for", "bytearray(1200 << 20)\ntry:\n    for")
