@@ -147,7 +147,7 @@ def test_a_message_of_unknown_kind_is_damage_and_not_the_end_of_the_recording(re
     content[start] ^= 0x55
     (tmp_path / "damaged.rrd").write_bytes(content)
     with (
-        pytest.raises(InputError, match="damaged.rrd: the recording cannot be read: it is damaged"),
+        pytest.raises(InputError, match="the recording cannot be read: it is damaged"),
         open_recording(tmp_path / "damaged.rrd"),
     ):
         pass
