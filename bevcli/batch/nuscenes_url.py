@@ -14,7 +14,7 @@ from pathlib import Path
 
 from bevcli.batch.storage import Storage, StoredFile, open_storage
 from bevcli.errors import InputError
-from bevcli.sequences.nuscenes.cache import open_index
+from bevcli.sequences.nuscenes.cache import open_index, user_cache
 from bevcli.sequences.nuscenes.choice import NuScenesChoice, choose_version, chosen_scenes
 from bevcli.sequences.nuscenes.frames import keyframes, sweep_frames
 
@@ -34,7 +34,7 @@ def copy_tables(url: str, version: str | None) -> tuple[Path, list[StoredFile]]:
     storage = open_storage(f"{url}/{chosen}")
     files = storage.files()
     facts = repr((url, [(file.name, file.size, file.version) for file in files]))
-    tables = _cache() / hashlib.sha256(facts.encode()).hexdigest()[:16] / chosen
+    tables = user_cache() / "nuscenes-tables" / hashlib.sha256(facts.encode()).hexdigest()[:16] / chosen
     if not tables.is_dir():
         unfinished = tables.parent / f"{uuid.uuid4().hex[:8]}.new"
         try:
@@ -61,8 +61,3 @@ def fetch_scene(url: str, choice: NuScenesChoice, local: Path) -> None:
     local.mkdir(parents=True)
     (local / tables.name).symlink_to(tables)
     open_storage(url).fetch(local, sorted(images | {f"can_bus/{choice.scene}_pose.json"}))
-
-
-def _cache() -> Path:
-    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return root / "bevcli" / "nuscenes-tables"

@@ -9,12 +9,11 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
-from typing import TypeVar
 
 import torch
 
@@ -23,15 +22,15 @@ from bevcli.benchmark.limits import count_operations, measure_limits
 from bevcli.benchmark.made_up import MadeUpDrive, made_up_model
 from bevcli.benchmark.result import BenchmarkResult
 from bevcli.benchmark.version import Version
+from bevcli.frame import Frame, Prediction
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
 from bevcli.model.bevformer_v2 import BEVFormerV2Config
 from bevcli.model.prepared import Precision, prepare_for_inference
 from bevcli.pipeline.model_loading import Model
 from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
+from bevcli.pipeline.runner import BevState
 from bevcli.pipeline.write_behind import write_behind
 from bevcli.recording.writer import Recording
-
-T = TypeVar("T")
 
 WARM_UP_FRAMES = 2  # one without and one with history
 MIN_RUN_FRAMES = 3  # of the run with reading and recording; the times between them are measured
@@ -139,18 +138,16 @@ def _time_stages(fast: Version, drive: MadeUpDrive, first: int, timed: range) ->
 
 def _time_run(fast: Version, drive: MadeUpDrive, places: range) -> float:
     """Median seconds of a frame while other threads read and record, as in `bevcli run`."""
-    done, preprocessor = [], Preprocessor(fast.runner.config)
-
-    def timed(steps: Iterable[T]) -> Iterator[T]:
-        for step in steps:
-            done.append(time.perf_counter())
-            yield step
-
+    made, preprocessor = [], Preprocessor(fast.runner.config)
     with _recording(drive, fast) as recording:
-        steps = fast.runner.run(drive, places, preprocessor, fast.state)
-        for _ in write_behind(lambda step: recording.log(*step[:2]), timed(steps)):
+
+        def record(step: tuple[Frame, Prediction, BevState | None]) -> None:
+            made.append(time.perf_counter())  # recording begins as soon as the model has made the step
+            recording.log(*step[:2])
+
+        for _ in write_behind(record, fast.runner.run(drive, places, preprocessor, fast.state)):
             pass
-    return median(after - before for before, after in pairwise(done))
+    return median(after - before for before, after in pairwise(made))
 
 
 @contextlib.contextmanager

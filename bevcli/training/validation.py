@@ -106,13 +106,12 @@ def validate(
     tracks: list[_TrackedFrame] = []
     of_drives: list[DriveScores] = []
     for index in range(len(drives)):
-        sequence, first, cameras = drives.open(index), len(truths), 0
+        sequence, first = drives.open(index), len(truths)
         steps = runner.run(sequence, range(len(sequence.stamps)), Preprocessor(runner.config))
         results = ((frame, prediction) for frame, prediction, _ in steps)
         if tracker is not None:
             results = ((frame, prediction) for frame, prediction, _ in track(tracker, results))
         for frame, prediction in results:
-            cameras = len(frame.rig.cameras)
             if frame.ground_truth is not None:
                 if tracker is not None:
                     tracks.append(_tracked_frame(index, frame, frame.ground_truth, prediction))
@@ -125,7 +124,7 @@ def validate(
         if each_drive:
             table = evaluate_detections(predictions[first:], truths[first:], config).overall
             table = table.of_classes_with_ground_truth()
-            of_drives.append(DriveScores(sequence.name, cameras, table.mean_ap, table.nd_score))
+            of_drives.append(DriveScores(sequence.name, len(sequence.rig.cameras), table.mean_ap, table.nd_score))
     return Validation(
         config,
         evaluate_detections(predictions, truths, config),

@@ -44,10 +44,14 @@ def open_index(tables: Path) -> tuple[NuScenesIndex, str]:
     return index, f"the index of the nuScenes tables is cached in {folder}"
 
 
+def user_cache() -> Path:
+    """The folder of all caches of bevcli, $XDG_CACHE_HOME/bevcli (default ~/.cache/bevcli)."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "bevcli"
+
+
 def _cache_folder(tables: Path) -> Path:
-    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     name = hashlib.sha256(str(tables.resolve()).encode()).hexdigest()[:16]
-    return root / "bevcli" / "nuscenes" / f"{tables.name}-{name}"
+    return user_cache() / "nuscenes" / f"{tables.name}-{name}"
 
 
 def _fingerprint(tables: Path) -> str:
