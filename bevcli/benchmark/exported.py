@@ -72,7 +72,7 @@ def _differences(networks: tuple[BEVFormerBase, BEVFormerBase], sequence: Sequen
     outputs = [_Latest(network) for network in networks]
     runners = [Runner(network, cpu) for network in networks]
     states = [None, None]
-    preprocess = Preprocessor(networks[0].config)
+    preprocess = Preprocessor(networks[1].config)  # of the exported file, whose images have one size
     for place, stamp in enumerate(sequence.stamps):
         prepared = preprocess(sequence.load(place))
         if not prepared.frame.images:

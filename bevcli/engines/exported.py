@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -59,6 +59,8 @@ def read_metadata(metadata: Mapping[str, str], file: Path) -> ExportedFile:
         )
     precision: Literal["fp32", "int8"] = "int8" if metadata["precision"] == "int8" else "fp32"
     config = config_of_table(contents, str(file))
+    # The file's images have one size, for every rig.
+    config = replace(config, image=replace(config.image, focal_px=None, max_pixels=None))
     return ExportedFile(config, contents, slots, untrained is not False, bundled is True, precision)
 
 

@@ -45,7 +45,7 @@ def image_features(trace: Trace) -> Figure:
         heading_inches=1.45,
     )
     grid = figure.add_gridspec(rows, len(names), wspace=0.04, hspace=0.22, left=0.06, right=0.99, bottom=0.02)
-    width, height = trace.config.image.padded_size
+    height, width = trace.prepared.images.shape[-2:]
     for column, name in enumerate(names):
         axes = figure.add_subplot(grid[0, column])
         show_camera(axes, trace.frame, name)

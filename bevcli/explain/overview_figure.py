@@ -63,7 +63,7 @@ def _images_and_features(figure: Figure, trace: Trace) -> None:
     names = trace.prepared.assignment.cameras[:MOST_CAMERAS]
     lengths = trace.feature_maps[0].norm(dim=1).float().cpu().numpy()
     low, high = np.percentile(lengths, (2, 99.5))
-    width, height = trace.config.image.padded_size
+    height, width = trace.prepared.images.shape[-2:]
     for place, name in enumerate(names):
         bottom = 0.79 - 0.127 * (place + 1)
         camera = trace.frame.rig[name]

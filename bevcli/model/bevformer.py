@@ -41,6 +41,10 @@ class ImageConfig:
             that pixel u goes to (u + 0.5) * scale - 0.5. If false, it goes to u * scale, as the published weights were
             trained, which is 0.3 pixels off where 1600 pixels become 512.
         crop: (left, top, right, bottom) in pixels of the resized image: the part that the network sees. None for all.
+        focal_px: images of wide cameras become larger than `size`: their median focal length becomes this, in pixels
+            of the network's input, so that objects at the same distance have the same size for every rig
+            (`bevcli.pipeline.preprocess.image_for_rig`). None: `size` holds for every rig.
+        max_pixels: with `focal_px`, images become larger only as long as all images of a frame have no more pixels.
     """
 
     size: tuple[int, int]
@@ -51,6 +55,8 @@ class ImageConfig:
     resize: Literal["linear", "area"] = "linear"
     half_pixel_shift: bool = False
     crop: tuple[int, int, int, int] | None = None
+    focal_px: float | None = None
+    max_pixels: int | None = None
 
     def __post_init__(self) -> None:
         if min(self.size) < 1 or min(self.std) <= 0 or self.pad_divisor < 1:
@@ -58,6 +64,13 @@ class ImageConfig:
         left, top, right, bottom = self.crop_box
         if not (0 <= left < right <= self.size[0] and 0 <= top < bottom <= self.size[1]):
             raise ValueError("crop must be left, top, right, bottom inside size, left < right and top < bottom")
+        if (self.focal_px is None) != (self.max_pixels is None):
+            raise ValueError("focal_px and max_pixels must be given together")
+        if self.focal_px is not None and self.max_pixels is not None:
+            if self.crop is not None:
+                raise ValueError("crop and focal_px exclude each other: with focal_px the size depends on the rig")
+            if self.focal_px <= 0 or self.max_pixels < 1:
+                raise ValueError("focal_px and max_pixels must be positive")
 
     @property
     def crop_box(self) -> tuple[int, int, int, int]:

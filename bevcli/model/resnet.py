@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -42,11 +43,18 @@ class ResNetConfig:
 
 
 class ResNet(nn.Module):
-    """Images to feature maps of the configured output stages; the four stages have the strides 4, 8, 16 and 32."""
+    """Images to feature maps of the configured output stages; the four stages have the strides 4, 8, 16 and 32.
+
+    Attributes:
+        output_stages: the stages (1 to 4) whose maps are returned.
+        frozen_maps: computes the maps of the first stages in place of the stem and these stages, during a training
+            that keeps their weights.
+    """
 
     def __init__(self, config: ResNetConfig) -> None:
         super().__init__()
         self.output_stages = config.output_stages
+        self.frozen_maps: Callable[[Tensor], list[Tensor]] | None = None
         width = config.width
         self.conv1 = nn.Conv2d(3, width, 7, stride=2, padding=3, bias=False)
         self.bn1 = nn.BatchNorm2d(width)
@@ -67,14 +75,17 @@ class ResNet(nn.Module):
 
     def forward(self, images: Tensor) -> list[Tensor]:
         """images: (B, 3, H, W), H and W multiples of 32 -> (B, C_s, H / 2^(s+1), W / 2^(s+1)) for each output stage."""
-        # ReLU and max-pooling commute; the published order applies ReLU before pooling, to four times as many cells.
-        x = F.relu(self.pool(self.bn1(self.conv1(images))))
-        maps = []
-        for stage, blocks in enumerate(self.stages, start=1):
+        maps: list[Tensor] = []
+        if self.frozen_maps is not None:
+            maps = self.frozen_maps(images)
+            x = maps[-1]
+        else:
+            # ReLU and max-pooling commute; the published order applies ReLU before pooling, to four times the cells.
+            x = F.relu(self.pool(self.bn1(self.conv1(images))))
+        for blocks in self.stages[len(maps) :]:
             x = blocks(x)
-            if stage in self.output_stages:
-                maps.append(x)
-        return maps
+            maps.append(x)
+        return [maps[stage - 1] for stage in self.output_stages]
 
 
 class Bottleneck(nn.Module):

@@ -133,7 +133,7 @@ def _samples(
     if samples is None:
         return {}
     chosen = (samples.cell == cell).nonzero()[:, 0].tolist()
-    size = np.array(config.image.padded_size, dtype=np.float64)
+    size = np.array(prepared.images.shape[:-3:-1], dtype=np.float64)  # (width, height)
     result = {}
     for row in chosen:
         index = int(samples.camera[row])

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+import torch.nn.functional as F
+from torch import Tensor
 
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import Pose
@@ -38,7 +40,7 @@ def model_inputs(
     motions = [_motion(prepared, pose, config) for prepared, pose in zip(frames, previous_poses, strict=True)]
     return BEVFormerInputs(
         # Copying the images of a single frame would take milliseconds.
-        images=frames[0].images if len(frames) == 1 else torch.cat([prepared.images for prepared in frames]),
+        images=frames[0].images if len(frames) == 1 else _together([prepared.images for prepared in frames]),
         image_from_bev=torch.cat([prepared.image_from_bev for prepared in frames]).float(),
         camera_index=indices[0] if same else torch.stack(indices),
         has_image=torch.cat([prepared.has_image for prepared in frames]),
@@ -46,6 +48,13 @@ def model_inputs(
         shift=torch.from_numpy(np.stack([motion.shift for motion in motions])),
         rotation_deg=torch.tensor([motion.rotation_deg for motion in motions], dtype=torch.float32),
     )
+
+
+def _together(images: list[Tensor]) -> Tensor:
+    """Images (1, N, 3, H, W) of several frames, padded with zeros at right and bottom to the largest of them."""
+    height, width = (max(of_frame.shape[axis] for of_frame in images) for axis in (-2, -1))
+    padded = [F.pad(one, (0, width - one.shape[-1], 0, height - one.shape[-2])) for one in images]
+    return torch.cat(padded)
 
 
 def _motion(prepared: PreparedFrame, previous_pose: Pose | None, config: BEVFormerConfig) -> EgoMotionInputs:

@@ -55,12 +55,13 @@ class Preprocessor:
         self._rig: CameraRig | None = None
         self._model_rig: CameraRig
         self._assignment = CameraAssignment((), ())
+        self._image = config.image
 
     def __call__(self, frame: Frame) -> PreparedFrame:
         """The frame with its images undistorted, resized, normalised and padded, and the matching projections."""
         self._use_rig(frame.rig)
         frame = frame if frame.rig is self._model_rig else replace(frame, rig=self._model_rig)
-        image, names = self.config.image, self._assignment.cameras
+        image, names = self._image, self._assignment.cameras
         width, height = image.padded_size
         images = torch.zeros(1, len(names), 3, height, width)
 
@@ -93,6 +94,37 @@ class Preprocessor:
         self._rig, bev_frame = rig, self.config.bev_frame
         self._model_rig = level_rig(rig, bev_frame.height_m) if bev_frame.level else rig
         self._assignment = assign_cameras(rig, self.config.cameras, self._chosen_cameras)
+        self._image = image_for_rig(rig, self.config.image)
+
+
+def image_for_rig(rig: CameraRig, image: ImageConfig) -> ImageConfig:
+    """How the images of a rig become the network's input: in a size of its own where the model has a `focal_px`.
+
+    The size is then the smallest that holds all resized images. They fit inside `image.size`, or are larger by one
+    factor for all cameras, at most up to `focal_px` and `max_pixels`.
+    """
+    if image.focal_px is None or image.max_pixels is None or not rig.cameras:
+        return image
+    enlargement = rig_enlargement(rig, image)
+    return replace(image, size=_common_size(rig, image, enlargement), focal_px=None, max_pixels=None)
+
+
+def rig_enlargement(rig: CameraRig, image: ImageConfig) -> float:
+    """How many times larger than inside `image.size` the images of a rig are, at least 1: see `image_for_rig`."""
+    if image.focal_px is None or image.max_pixels is None or not rig.cameras:
+        return 1.0
+    focal = np.median([network_scale(camera, image) * camera.intrinsics[0, 0] for camera in rig.cameras])
+    width, height = _common_size(rig, image, 1.0)
+    affordable = np.sqrt(image.max_pixels / (len(rig.cameras) * width * height))
+    return float(max(1.0, min(image.focal_px / focal, affordable)))
+
+
+def _common_size(rig: CameraRig, image: ImageConfig, enlargement: float) -> tuple[int, int]:
+    """(width, height) of the smallest image that holds every camera's, each scaled to fit and then enlarged."""
+    scales = [enlargement * network_scale(camera, image) for camera in rig.cameras]
+    width = max(round(scale * camera.width) for scale, camera in zip(scales, rig.cameras, strict=True))
+    height = max(round(scale * camera.height) for scale, camera in zip(scales, rig.cameras, strict=True))
+    return width, height
 
 
 def network_scale(camera: Camera, image: ImageConfig) -> float:

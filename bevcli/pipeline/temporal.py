@@ -250,7 +250,7 @@ class FrameWindow:
         if frame.stamp != current.frame.stamp:
             moved = other_bev_from_bev(current.frame.world_from_ego, frame.pose, current.frame.rig.ego_from_bev)
             image_from_bev = image_from_bev @ torch.from_numpy(moved)
-        width, height = self.config.image.padded_size
+        height, width = current.images.shape[-2:]
         return WindowFrame(
             image_features=FeatureMaps(frame.tokens, frame.level_shapes),
             image_from_bev=image_from_bev.float(),  # on the CPU, as the model reads it

@@ -6,11 +6,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.frame import Sequence
 from bevcli.sequences.selection import scenes_of
-from bevcli.training.drives import Drives, camera_counts_of
+from bevcli.training.drives import Drives, InputShape, input_shapes_of
+
+_CHOICE = 8  # drives among which the other clips of a batch are drawn, at least
 
 
 @dataclass(frozen=True)
@@ -63,16 +66,28 @@ def draw_clips(drives: Drives, config: ClipConfig, random: np.random.Generator, 
     if frames > 1 and random.random() < config.short_share:
         frames = int(random.integers(1, frames))
     clips: list[Clip] = []
-    counts = camera_counts_of(drives)
+    shapes = input_shapes_of(drives)
     for _ in range(config.batch):
-        if clips and counts is not None:  # a batch needs the same number of cameras in all its clips
-            alike = np.flatnonzero(np.array(counts) == counts[clips[0].drive])
+        if clips and shapes is not None:
+            alike = _similar_drives(shapes, clips[0].drive)
             drive = int(alike[random.integers(len(alike))])
         else:
             drive = int(random.integers(len(drives)))
         leave_out = with_gap and config.learn == "last"
         clips.append(Clip(drive, draw_frames(drives.open(drive), frames, random, with_gap=leave_out)))
     return clips
+
+
+def _similar_drives(shapes: tuple[InputShape, ...], drive: int) -> NDArray[np.intp]:
+    """Drives that go into one batch with a drive: with as many cameras, and of these those with the nearest sizes.
+
+    The images of a batch are padded to the largest. At least `_CHOICE` drives, where so many have as many cameras.
+    """
+    counts, heights, widths = np.array(shapes).T
+    differences = np.abs(heights - heights[drive]) + np.abs(widths - widths[drive])
+    alike = counts == counts[drive]
+    nearest = np.sort(differences[alike])[:_CHOICE]
+    return np.flatnonzero(alike & (differences <= nearest[-1]))
 
 
 def draw_frames(

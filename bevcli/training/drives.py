@@ -7,13 +7,15 @@ import os
 import shutil
 import threading
 from collections.abc import Sequence as Items
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
 from bevcli.errors import InputError
 from bevcli.frame import Sequence
 from bevcli.geometry.cameras import CameraRig
-from bevcli.model.bevformer import BEVFormerConfig
+from bevcli.model.bevformer import BEVFormerConfig, ImageConfig
+from bevcli.pipeline.preprocess import image_for_rig, network_scale, rig_enlargement
 from bevcli.sequences.open import open_sequence
 from bevcli.synth.assets.catalog import Assets
 from bevcli.synth.drive import RenderedDrive
@@ -24,12 +26,14 @@ from bevcli.synth.rig import nuscenes_like_rig
 
 FIRST_HELD_OUT_SEED = 1_000_000  # drives from this seed on are for evaluation only
 FRAMES_PER_DRIVE = 20
+InputShape = tuple[int, int, int]  # cameras, height, width
 
 
 class Drives(Protocol):
     """A list of drives. Several threads may open them at the same time.
 
-    It may have an attribute `camera_counts`, the number of cameras of each drive. Without it all drives have the same.
+    It may have an attribute `input_shapes`: for each drive the number of cameras, and height and width of the network's
+    input in pixels. Without it all drives have the same.
     """
 
     def __len__(self) -> int: ...
@@ -75,16 +79,17 @@ class RenderedDrives:
         config: BEVFormerConfig,
         rig: CameraRig | RigDistribution | None = None,
     ) -> None:
-        size = width, height = config.image.size
+        image, (width, height) = config.image, config.image.size
         name = f"{width}x{height}"
         if isinstance(rig, RigDistribution):
-            self._rigs = [draw_rig(rig, seed, size) for seed in seeds]
+            self._rigs = [_enlarged(draw_rig(rig, seed, image.size), image) for seed in seeds]
             name += f"-rigs-{rig.digest}"
+            name += "" if image.focal_px is None else f"-{image.focal_px:g}px-{image.max_pixels}"
         else:
-            found = nuscenes_like_rig(width, height) if rig is None else _fitting(rig, size)
+            found = nuscenes_like_rig(width, height) if rig is None else _fitting(rig, image)
             self._rigs = [DrawnRig(found)] * len(seeds)
             name += "" if rig is None else f"-rig-{_digest(found)}"
-        self.camera_counts = tuple(len(drawn.rig.cameras) for drawn in self._rigs)
+        self.input_shapes = tuple(_input_shape(drawn.rig, image) for drawn in self._rigs)
         self._folders = [cache / name / f"{seed:06d}" for seed in seeds]
         self._seeds = tuple(seeds)
         self._config = config
@@ -129,10 +134,22 @@ class RenderedDrives:
             shutil.rmtree(unfinished)  # another process has rendered the same drive meanwhile
 
 
-def _fitting(rig: CameraRig, size: tuple[int, int]) -> CameraRig:
-    """The rig with each camera's images scaled to fit inside a size (width, height) in pixels."""
-    cameras = tuple(camera.scaled(min(size[0] / camera.width, size[1] / camera.height)) for camera in rig.cameras)
-    return CameraRig(cameras, rig.ego_from_bev, rig.ego_from_bev_assumed)
+def _fitting(rig: CameraRig, image: ImageConfig) -> CameraRig:
+    """The rig with each camera's images in the size in which the network sees them."""
+    sized = image_for_rig(rig, image)
+    return replace(rig, cameras=tuple(camera.scaled(network_scale(camera, sized)) for camera in rig.cameras))
+
+
+def _enlarged(drawn: DrawnRig, image: ImageConfig) -> DrawnRig:
+    """A rig drawn for images of `image.size`, with images as much larger as the network sees them."""
+    factor = rig_enlargement(drawn.rig, image)
+    cameras = tuple(camera.scaled(factor) for camera in drawn.rig.cameras)
+    return replace(drawn, rig=replace(drawn.rig, cameras=cameras))
+
+
+def _input_shape(rig: CameraRig, image: ImageConfig) -> InputShape:
+    width, height = image_for_rig(rig, image).padded_size
+    return len(rig.cameras), height, width
 
 
 def _digest(rig: CameraRig) -> str:
@@ -144,17 +161,17 @@ def _digest(rig: CameraRig) -> str:
     return hashlib.sha256(repr((parts, rig.ego_from_bev.tolist())).encode()).hexdigest()[:8]
 
 
-def camera_counts_of(drives: Drives) -> tuple[int, ...] | None:
-    """The number of cameras of each drive; None where all have the same."""
-    counts = getattr(drives, "camera_counts", None)
-    return counts if counts is not None and len(set(counts)) > 1 else None
+def input_shapes_of(drives: Drives) -> tuple[InputShape, ...] | None:
+    """Of each drive the number of cameras, height and width of the network's input; None where all have the same."""
+    shapes = getattr(drives, "input_shapes", None)
+    return shapes if shapes is not None and len(set(shapes)) > 1 else None
 
 
 class _Subset:
     def __init__(self, drives: Drives, indices: range) -> None:
         self._drives, self._indices = drives, indices
-        counts = camera_counts_of(drives)
-        self.camera_counts = None if counts is None else tuple(counts[index] for index in indices)
+        shapes = input_shapes_of(drives)
+        self.input_shapes = None if shapes is None else tuple(shapes[index] for index in indices)
 
     def __len__(self) -> int:
         return len(self._indices)

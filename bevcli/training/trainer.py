@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from typing import TypeVar
 
 import numpy as np
@@ -21,6 +22,7 @@ from bevcli.training.checkpoint import load_checkpoint, save_checkpoint, save_we
 from bevcli.training.clip_forward import forward_clip
 from bevcli.training.clips import draw_clips
 from bevcli.training.frame_losses import FrameLosses
+from bevcli.training.frozen_stages import FrozenStages
 from bevcli.training.job import CHECKPOINT, TrainingJob
 from bevcli.training.learning_curves import LearningCurve, draw_learning_curves
 from bevcli.training.optimizer import clip_gradients, make_optimizer, set_learning_rate, update_average
@@ -56,6 +58,10 @@ class Trainer:
         if resume:
             self.done = load_checkpoint(job.out / CHECKPOINT, self.trained, self.optimizer, self._average)
         choose_kernels(job.model, job.device, gradients=True)
+        self._frozen: FrozenStages | None = None
+        if job.config.frozen_stages and job.config.freeze_batch_norm:
+            dtype = torch.bfloat16 if computes_in_bfloat16(job.device) else torch.float32
+            self._frozen = FrozenStages(job.model.backbone, job.config.frozen_stages, dtype)
         if job.group.leads:
             self._loss_curve = LearningCurve(job.out / "loss.csv", self.done)
             self._validation_curve = LearningCurve(job.out / "validation.csv", self.done)
@@ -121,7 +127,8 @@ class Trainer:
         rate = config.optimizer.learning_rate_at(self.done, config.steps)
         set_learning_rate(self.optimizer, rate)
         gpus = [job.device] if job.device.type == "cuda" else []
-        with torch.random.fork_rng(gpus), self._losses.watching(job.model):
+        frozen = nullcontext() if self._frozen is None else self._frozen.used_by(job.model.backbone)
+        with torch.random.fork_rng(gpus), self._losses.watching(job.model), frozen:
             torch.manual_seed(int(np.random.SeedSequence(self._seeds(self.done)).generate_state(1)[0]))  # for dropout
             clips = [self._clip_losses(batch.to(job.device)) for batch in batches]
             rows = [self._update(losses) for losses in alternated(clips)]

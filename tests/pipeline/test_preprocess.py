@@ -3,11 +3,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import torch
 from memory_drive import MemorySequence, WithoutImages, make_camera, make_rig
 
 from bevcli.geometry.cameras import CameraRig, Distortion
 from bevcli.geometry.transforms import Pose, apply, inverse
-from bevcli.pipeline.preprocess import Preprocessor
+from bevcli.pipeline.model_inputs import model_inputs
+from bevcli.pipeline.preprocess import Preprocessor, image_for_rig
 
 
 def textbook_image(pixels, image):
@@ -123,3 +125,51 @@ def test_projections_follow_the_resized_image_to_a_fraction_of_a_pixel(mini_conf
     point_bev = apply(inverse(sequence.rig.ego_from_bev) @ camera.ego_from_camera, in_camera)
     u, v, d, _ = prepared.image_from_bev[0, 0].numpy() @ [*point_bev, 1]
     assert seen == pytest.approx((u / d, v / d), abs=0.1)
+
+
+def wide_rig(half_width_over_focal: float, count: int = 3) -> CameraRig:
+    cameras = tuple(make_camera(f"CAM_{index}", 90.0 * index) for index in range(count))
+    focal = 160 / half_width_over_focal
+    lens = np.array([[focal, 0, 160], [0, focal, 90], [0, 0, 1]])
+    return CameraRig(tuple(replace(camera, intrinsics=lens) for camera in cameras), make_rig().ego_from_bev)
+
+
+def test_images_of_wide_cameras_are_enlarged_to_the_models_focal_length(mini_config):
+    config = replace(mini_config, image=replace(mini_config.image, focal_px=120.0, max_pixels=10**6))
+    sequence = MemorySequence(rig=wide_rig(2.0))  # 80 pixels of focal length, 40 in images of the model's size
+    prepared = Preprocessor(config)(sequence.load(0))
+    assert prepared.scales == pytest.approx((1.5, 1.5, 1.5))
+    assert prepared.images.shape == (1, 3, 3, 288, 480)
+    camera = prepared.frame.rig["CAM_0"]
+    expected, _ = camera.project_ego([12.0, 1.0, 0.5])
+    point_bev = apply(inverse(prepared.frame.rig.ego_from_bev), [12.0, 1.0, 0.5])
+    u, v, d, _ = prepared.image_from_bev[0, 0].numpy() @ [*point_bev, 1]
+    assert (u / d, v / d) == pytest.approx(1.5 * expected, abs=1e-3)
+
+
+def test_images_are_enlarged_only_as_far_as_max_pixels_allows(mini_config):
+    image = replace(mini_config.image, focal_px=120.0, max_pixels=4 * 3 * 160 * 90)
+    assert image_for_rig(wide_rig(2.0, count=3), image).size == (320, 180)
+    width, height = image_for_rig(wide_rig(2.0, count=6), image).size
+    assert width * height * 6 == pytest.approx(image.max_pixels, rel=0.02)
+
+
+def test_images_of_long_focal_lengths_keep_the_models_size(mini_config):
+    image = replace(mini_config.image, focal_px=120.0, max_pixels=10**6)
+    assert image_for_rig(wide_rig(0.5), image).size == mini_config.image.size
+    assert image_for_rig(wide_rig(2.0), mini_config.image) is mini_config.image
+    with pytest.raises(ValueError, match="must be given together"):
+        replace(mini_config.image, focal_px=120.0)
+    with pytest.raises(ValueError, match="exclude each other"):
+        replace(image, crop=(0, 0, 10, 10))
+
+
+def test_frames_with_images_of_different_sizes_form_one_batch(mini_config):
+    config = replace(mini_config, image=replace(mini_config.image, focal_px=120.0, max_pixels=10**6))
+    prepared = [Preprocessor(config)(MemorySequence(rig=wide_rig(wide)).load(0)) for wide in (2.0, 1.0)]
+    batch = model_inputs(prepared, [None, None], config)
+    assert batch.images.shape == (2, 3, 3, 288, 480)
+    height, width = prepared[1].images.shape[-2:]
+    torch.testing.assert_close(batch.images[1, ..., :height, :width], prepared[1].images[0])
+    assert (batch.images[1, ..., height:, :] == 0).all()
+    assert (batch.images[1, ..., width:] == 0).all()

@@ -64,3 +64,13 @@ def test_the_clips_of_a_batch_have_the_same_length_and_some_batches_are_short() 
         lengths[len(clips[0].frames)] += 1
     assert set(lengths) == {1, 2, 3}
     assert lengths[3] / 300 == pytest.approx(0.7, abs=0.1)
+
+
+def test_the_clips_of_a_batch_have_as_many_cameras_and_similar_image_sizes() -> None:
+    drives, random = Drives(MemorySequence(5), 40), np.random.default_rng(0)
+    sizes = [(4 + index % 2, 96 + 32 * (index // 2), 160) for index in range(40)]
+    drives.input_shapes = tuple(sizes)
+    for _ in range(50):
+        shapes = [sizes[clip.drive] for clip in draw_clips(drives, ClipConfig(frames=2, batch=4), random)]
+        assert len({cameras for cameras, _, _ in shapes}) == 1
+        assert max(height for _, height, _ in shapes) - min(height for _, height, _ in shapes) <= 16 * 32

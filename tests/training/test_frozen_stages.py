@@ -1,0 +1,45 @@
+"""Frozen stages of a backbone in a training."""
+
+from __future__ import annotations
+
+import torch
+
+from bevcli.model.resnet import ResNet, ResNetConfig
+from bevcli.training.frozen_stages import FrozenStages
+
+
+def made_backbone() -> ResNet:
+    torch.manual_seed(3)
+    backbone = ResNet(ResNetConfig(blocks=(1, 2, 1, 1), output_stages=(2, 3), width=8))
+    for name, values in backbone.named_buffers():
+        if "running" in name:
+            values.uniform_(0.5, 1.5)
+    for parameter in backbone.parameters():
+        if parameter.ndim == 1:
+            torch.nn.init.uniform_(parameter, 0.5, 1.5)
+    return backbone.eval()
+
+
+def test_frozen_stages_give_the_same_maps_and_gradients() -> None:
+    backbone, images = made_backbone(), torch.randn(3, 3, 64, 96)
+    backbone.freeze(2)
+    frozen = FrozenStages(backbone, 2, torch.float32)
+    results = []
+    for context in (frozen.used_by(backbone), torch.enable_grad()):
+        with context:
+            maps = backbone(images)
+        backbone.zero_grad()
+        maps[-1].square().sum().backward()
+        gradients = [parameter.grad for parameter in backbone.parameters() if parameter.grad is not None]
+        results.append([*maps, *gradients])
+    assert len(results[0]) > 8
+    for found, expected in zip(*results, strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4)
+    assert backbone.frozen_maps is None
+
+
+def test_frozen_stages_add_nothing_to_the_state_of_the_backbone() -> None:
+    backbone = made_backbone()
+    names = set(backbone.state_dict())
+    with FrozenStages(backbone, 1, torch.float32).used_by(backbone):
+        assert set(backbone.state_dict()) == names
