@@ -26,6 +26,15 @@ def export_onnx(
     cameras: Annotated[
         int | None, typer.Option(min=1, help="Number of cameras. Default: the model's.", show_default=False)
     ] = None,
+    rig: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="A calibration.json: the file is for its number of cameras and, with demo-rigs, in the image size for "
+            "its fields of view.",
+            show_default=False,
+        ),
+    ] = None,
     cameras_per_cell: Annotated[
         int,
         typer.Option(min=1, help="Number of cameras that may see one BEV cell; more cost time (nuScenes needs 2)."),
@@ -48,12 +57,18 @@ def export_onnx(
     """
     from bevcli.benchmark.exported import check_exported, difference_lines
     from bevcli.engines.export_onnx import export_onnx as write_onnx
-    from bevcli.errors import OutputError
+    from bevcli.errors import BevcliError, OutputError
     from bevcli.pipeline.model_loading import load_model
+    from bevcli.sequences.files.calibration_file import read_calibration
     from bevcli.sequences.open import open_sequence
 
     loaded = load_model(model, weights, device="cpu", untrained=untrained)
     loaded.require_parts("bevcli export-onnx")
+    if rig is not None:
+        if cameras is not None:
+            raise BevcliError("--rig states the number of cameras: leave --cameras out")
+        own_rig = read_calibration(rig)
+        loaded, cameras = loaded.for_rig(own_rig), len(own_rig.cameras)
     target = Path(f"{loaded.name}.onnx") if out is None else out
     if target.exists() and not force:
         raise OutputError(f"{target}: already exists; choose another name, or pass --force to overwrite it")

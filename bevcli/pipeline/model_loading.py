@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -21,6 +22,7 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
 from bevcli.model.build import build_model
 from bevcli.model.prepared import Precision, prepare_for_inference
+from bevcli.pipeline.preprocess import image_for_rig
 from bevcli.pipeline.tracking import TrackerConfig
 from bevcli.pipeline.training_rigs import facts_note, rig_notes
 
@@ -86,6 +88,12 @@ class Model:
     def contents(self) -> dict[str, Any]:
         """The contents of the model's TOML file, [training] excluded."""
         return as_table(self.config, self.tracker)
+
+    def for_rig(self, rig: CameraRig) -> Model:
+        """The model with images of one size, that of a rig, for an exported file: see `ImageConfig.focal_px`."""
+        network = copy.copy(self.network)  # the copy has the same weights
+        network.config = replace(self.config, image=image_for_rig(rig, self.config.image))
+        return replace(self, network=network)
 
     def rig_notes(self, rig: CameraRig) -> tuple[str, ...]:
         """What of a rig is far from the training of the weights, one line each; nothing for random weights."""

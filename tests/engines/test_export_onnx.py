@@ -5,25 +5,28 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from memory_drive import MemorySequence, make_rig
 
 from bevcli.benchmark.exported import check_exported
 from bevcli.engines.engine import ENGINES
 from bevcli.engines.export_onnx import export_onnx
-from bevcli.engines.exported import load_exported
+from bevcli.engines.exported import load_exported, read_metadata
 from bevcli.errors import BevcliError, WeightsError
 from bevcli.model.box_coding import decode
+from bevcli.model.resnet import ResNetConfig
 from bevcli.pipeline.model_loading import Model, load_model
 from bevcli.pipeline.run import run
 from bevcli.sequences.open import open_sequence
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
 import original_reference as original
-from small_model import small_inputs, small_model
+from small_model import small_config, small_inputs, small_model
 
 onnx = pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
@@ -64,6 +67,21 @@ def test_a_camera_without_an_image_sees_nothing(small_file):
     inputs.has_image[:] = False
     with torch.inference_mode():
         torch.testing.assert_close(exported(inputs).bev, model(inputs).bev, rtol=1e-4, atol=1e-4)
+
+
+def test_a_file_for_a_rig_of_wide_cameras_has_larger_images(tmp_path):
+    image = replace(small_config().image, focal_px=115.2, max_pixels=10**6)
+    network = small_model(image=image, backbone=ResNetConfig((1, 1, 1, 1), output_stages=(3, 4), width=8))
+    rig = make_rig({"FRONT": 0.0, "BACK": 180.0})
+    model = Model(network).for_rig(rig)
+    assert (model.config.image.size, network.config.image.size) == ((144, 81), (96, 64))
+    export_onnx(model.network, tmp_path / "wide.onnx", contents=model.contents(), cameras=2)
+    differences = list(check_exported(tmp_path / "wide.onnx", Model(network), MemorySequence(2, rig=rig)))
+    assert max(row.logits for row in differences) < 1e-3
+    assert max(row.bev for row in differences) < 1e-4
+    metadata = {entry.key: entry.value for entry in onnx.load(tmp_path / "wide.onnx").metadata_props}
+    metadata["config"] = json.dumps(Model(network).contents())
+    assert read_metadata(metadata, tmp_path).config.image == small_config().image  # of one size for every rig
 
 
 def test_decoded_boxes_equal_the_decoder_of_the_library(small_file):
