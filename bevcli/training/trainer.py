@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from bevcli.errors import BevcliError
 from bevcli.model.bevformer_v2 import BEVFormerV2
 from bevcli.model.prepared import choose_kernels
+from bevcli.pipeline.cpu_memory import trim_memory
 from bevcli.pipeline.model_loading import choose_precision
 from bevcli.pipeline.read_ahead import read_ahead
 from bevcli.pipeline.runner import Runner, StepOptions
@@ -83,6 +84,7 @@ class Trainer:
         remaining = range(self.done, config.steps)
         for batches in read_ahead(self._load, remaining, depth=config.loaders, threads=config.loaders):
             row = self._step(batches)
+            trim_memory()
             self.done += 1
             stopped = stop()
             if not self.job.group.leads:
