@@ -27,7 +27,7 @@ class FrozenStages:
         self._dtype = dtype
         part = copy.deepcopy(backbone)
         part.stages = nn.ModuleList(part.stages[:stages])
-        part.output_stages = tuple(range(1, stages + 1))
+        part.output_stages = tuple(range(1, len(part.stages) + 1))
         part.eval().requires_grad_(False)
         fold_batch_norms(part, self._device)
         part.to(dtype, memory_format=torch.channels_last)  # type: ignore[call-overload]

@@ -73,4 +73,4 @@ def test_the_clips_of_a_batch_have_as_many_cameras_and_similar_image_sizes() -> 
     for _ in range(50):
         shapes = [sizes[clip.drive] for clip in draw_clips(drives, ClipConfig(frames=2, batch=4), random)]
         assert len({cameras for cameras, _, _ in shapes}) == 1
-        assert max(height for _, height, _ in shapes) - min(height for _, height, _ in shapes) <= 16 * 32
+        assert max(height for _, height, _ in shapes) - min(height for _, height, _ in shapes) <= 8 * 32

@@ -38,6 +38,15 @@ def test_frozen_stages_give_the_same_maps_and_gradients() -> None:
     assert backbone.frozen_maps is None
 
 
+def test_more_frozen_stages_than_the_backbone_has_are_all_of_it() -> None:
+    backbone, images = made_backbone(), torch.randn(1, 3, 64, 96)
+    with FrozenStages(backbone, 4, torch.float32).used_by(backbone):
+        found = backbone(images)
+    for one, expected in zip(found, backbone(images), strict=True):
+        torch.testing.assert_close(one, expected, rtol=1e-3, atol=1e-4)
+        assert not one.requires_grad
+
+
 def test_frozen_stages_add_nothing_to_the_state_of_the_backbone() -> None:
     backbone = made_backbone()
     names = set(backbone.state_dict())
