@@ -12,7 +12,7 @@ from bevcli.cli.run_options import UntrainedOption, WeightsOption
 
 def export_onnx(
     model: Annotated[
-        str, typer.Argument(help="tiny, small, base, demo, demo-rigs, v2-t1-base, v2-t1, v2-t2, v2-t8, or a FILE.toml.")
+        str, typer.Argument(help="tiny, small, base, demo, v2-t1-base, v2-t1, v2-t2, v2-t8, or a FILE.toml.")
     ],
     weights: WeightsOption = None,
     untrained: UntrainedOption = False,
@@ -30,8 +30,8 @@ def export_onnx(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="A calibration.json: the file is for its number of cameras and, with demo-rigs, in the image size for "
-            "its fields of view.",
+            help="A calibration.json: the file is for its number of cameras and, with demo, in the image size for "
+            "their fields of view.",
             show_default=False,
         ),
     ] = None,

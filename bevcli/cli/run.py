@@ -68,8 +68,8 @@ def run(
         str | None,
         typer.Option(
             autocompletion=complete_model,
-            help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, uniad-track-map, demo, demo-rigs, a FILE.toml or "
-            "a FILE.onnx of `bevcli export-onnx`. Default: the model that WEIGHTS fit, else demo.",
+            help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, uniad-track-map, demo, a FILE.toml or a "
+            "FILE.onnx of `bevcli export-onnx`. Default: the model that WEIGHTS fit, else demo.",
             rich_help_panel=MODEL,
             show_default=False,
         ),

@@ -26,7 +26,7 @@ EngineOption = Annotated[
 WeightsOption = Annotated[
     Path | None,
     typer.Option(
-        help="An official .pth file or a .safetensors file. Default: the weights in the package (demo, demo-rigs).",
+        help="An official .pth file or a .safetensors file. Default: the weights in the package (demo).",
         rich_help_panel=MODEL,
         show_default=False,
     ),

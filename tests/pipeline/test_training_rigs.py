@@ -41,14 +41,14 @@ def test_the_rig_of_the_training_needs_no_note():
 
 def test_cameras_unlike_those_of_the_training_are_told_on_one_line_with_the_cost():
     rig = nuscenes_like_rig()
-    higher = [replace(c, ego_from_camera=rigid((0, 0, 0.7)) @ c.ego_from_camera) for c in rig.cameras]
+    higher = [replace(c, ego_from_camera=rigid((0, 0, 2.0)) @ c.ego_from_camera) for c in rig.cameras]
     (note,) = rig_notes(CameraRig(tuple(higher), rig.ego_from_bev), load_config("demo"))
-    assert "camera heights 2.2 to 2.3 m (1.5 to 1.6 m)" in note
+    assert "camera heights 3.5 to 3.6 m (0.8 to 2.8 m)" in note
     assert "; measured: mAP" in note
     assert "\n" not in note
-    five = [replace(make_camera(f"C{k}", 72.0 * k), name=f"C{k}") for k in range(5)]
-    (note,) = rig_notes(CameraRig(tuple(five), rig.ego_from_bev), load_config("demo"))
-    assert "5 cameras (6)" in note
+    three = [replace(make_camera(f"C{k}", 120.0 * k), name=f"C{k}") for k in range(3)]
+    (note,) = rig_notes(CameraRig(tuple(three), rig.ego_from_bev), load_config("demo"))
+    assert "3 cameras (4 to 8)" in note
 
 
 def test_a_tilted_bev_frame_is_told_by_what_the_weights_expect():
