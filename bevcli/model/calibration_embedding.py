@@ -79,7 +79,7 @@ def ray_features(
         pixels = _cell_centers(level_rows, level_columns, image_size).to(matrix)  # (S_l, 3)
         rays = (bev_from_image[:, None] * pixels[:, None]).sum(-1)  # (K, S_l, 3), of depth 1 m
         above_ground = (center[:, None, 2] + height_m).clamp(min=0.1)
-        to_ground = (-rays[..., 2] / above_ground).clamp(0, 1 / _NEAREST_M)[..., None]  # inverse depth of the ground
+        to_ground = (-rays[..., 2] / above_ground).clamp(0.0, 1 / _NEAREST_M)[..., None]  # inverse depth of the ground
         directions = rays / torch.linalg.norm(rays, dim=-1, keepdim=True)
         cells = focal * level_columns / image_size[1]
         of_camera = torch.cat([center / _METRES, torch.log(cells / _FOCAL)[:, None]], dim=-1)[:, None]

@@ -19,6 +19,7 @@ from bevcli.engines.export_onnx import export_onnx
 from bevcli.engines.exported import load_exported, read_metadata
 from bevcli.errors import BevcliError, WeightsError
 from bevcli.model.box_coding import decode
+from bevcli.model.image_tokens import ImageTokensConfig
 from bevcli.model.resnet import ResNetConfig
 from bevcli.pipeline.model_loading import Model, load_model
 from bevcli.pipeline.run import run
@@ -69,9 +70,13 @@ def test_a_camera_without_an_image_sees_nothing(small_file):
         torch.testing.assert_close(exported(inputs).bev, model(inputs).bev, rtol=1e-4, atol=1e-4)
 
 
-def test_a_file_for_a_rig_of_wide_cameras_has_larger_images(tmp_path):
+def test_a_file_for_a_rig_of_wide_cameras_has_larger_images_and_embeds_the_calibration(tmp_path):
     image = replace(small_config().image, focal_px=115.2, max_pixels=10**6)
-    network = small_model(image=image, backbone=ResNetConfig((1, 1, 1, 1), output_stages=(3, 4), width=8))
+    network = small_model(
+        image=image,
+        backbone=ResNetConfig((1, 1, 1, 1), output_stages=(3, 4), width=8),
+        image_tokens=ImageTokensConfig(level_embeddings=3, calibration_embedding=True),
+    )
     rig = make_rig({"FRONT": 0.0, "BACK": 180.0})
     model = Model(network).for_rig(rig)
     assert (model.config.image.size, network.config.image.size) == ((144, 81), (96, 64))
