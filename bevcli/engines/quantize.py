@@ -99,7 +99,7 @@ def quantized_nodes(graph: Any) -> list[str]:
 
 
 class _Frames:
-    """Feeds the images of one frame after another to ONNX Runtime; the other inputs are zero."""
+    """Feeds the images of one frame after another to ONNX Runtime; matrices are the identity, other inputs zero."""
 
     def __init__(self, proto: Any, images: Iterable[np.ndarray]) -> None:
         import onnx
@@ -108,7 +108,10 @@ class _Frames:
         for value in proto.graph.input:
             kind = value.type.tensor_type
             shape = [dimension.dim_value for dimension in kind.shape.dim]
-            self._rest[value.name] = np.zeros(shape, onnx.helper.tensor_dtype_to_np_dtype(kind.elem_type))
+            rest = np.zeros(shape, onnx.helper.tensor_dtype_to_np_dtype(kind.elem_type))
+            if shape[-2:] == [4, 4]:  # an embedding of the calibration divides by the determinant
+                rest += np.eye(4, dtype=rest.dtype)
+            self._rest[value.name] = rest
         self._images: Iterator[np.ndarray] = iter(images)
 
     def get_next(self) -> Mapping[str, np.ndarray] | None:

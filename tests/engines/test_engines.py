@@ -19,6 +19,8 @@ from bevcli.engines.export_onnx import export_onnx
 from bevcli.engines.exported import load_exported, raw_images
 from bevcli.engines.quantize import quantize
 from bevcli.errors import BevcliError, ConfigError, WeightsError
+from bevcli.model.image_tokens import ImageTokensConfig
+from bevcli.model.resnet import ResNetConfig
 from bevcli.pipeline.model_loading import load_model
 from bevcli.pipeline.run import run
 from bevcli.pipeline.tracking import TrackerConfig
@@ -36,7 +38,7 @@ STREET = Path(__file__).parents[2] / "samples" / "street"
 @pytest.fixture(scope="module")
 def small_file(tmp_path_factory) -> Path:
     """A small model without deformable convolutions, which OpenVINO lacks, for two cameras; its weights are random."""
-    model = small_model(backbone=_plain_backbone())
+    model = _model()
     file = tmp_path_factory.mktemp("small") / "small.onnx"
     export_onnx(model, file, contents=as_table(model.config, TrackerConfig(birth_score=0.5)), untrained=True)
     return file
@@ -49,14 +51,11 @@ def int8_file(small_file) -> Path:
     return file
 
 
-def _plain_backbone():
-    from bevcli.model.resnet import ResNetConfig
-
-    return ResNetConfig((1, 1, 1, 1), "pytorch", output_stages=(3, 4), deformable_stages=(), width=8)
-
-
 def _model():
-    return small_model(backbone=_plain_backbone())
+    return small_model(
+        backbone=ResNetConfig((1, 1, 1, 1), "pytorch", output_stages=(3, 4), deformable_stages=(), width=8),
+        image_tokens=ImageTokensConfig(level_embeddings=3, calibration_embedding=True),
+    )
 
 
 @pytest.mark.parametrize("engine", list(ENGINES))
