@@ -24,12 +24,11 @@ from bevcli.batch.job import Job
 from bevcli.batch.worker import Record, Worker, use_threads
 from bevcli.errors import BevcliError
 from bevcli.pipeline.cpu_memory import keep_freed_memory
+from bevcli.pipeline.cpu_threads import THREAD_SETTINGS
 
 # Ray Data holds only one line of text per drive in its object store.
 OBJECT_STORE_BYTES = 100 << 20
 CONNECT_S = 15.0  # for the connection to a cluster
-# How waiting threads behave, see `bevcli.cli.main`. A worker reads it when it loads PyTorch.
-_WORKER_ENVIRONMENT = {"OMP_WAIT_POLICY": "PASSIVE"}
 # Settings that Ray reads from the environment: no telemetry, no logs on the terminal.
 _ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",
@@ -138,7 +137,7 @@ def _ray(workers: Workers) -> Iterator[Any]:
     on_terminate = signal.getsignal(signal.SIGTERM)
     try:
         with _without_stderr():
-            environment = {"env_vars": _WORKER_ENVIRONMENT}
+            environment = {"env_vars": THREAD_SETTINGS}
             ray.init(log_to_driver=False, logging_level=logging.ERROR, runtime_env=environment, **options)
     except Exception as error:  # Ray raises errors of many types where it cannot start or connect
         where = f"the cluster {workers.address} cannot be reached" if workers.address else "cannot be started"

@@ -34,6 +34,7 @@ from bevcli.cli.viz import viz
 from bevcli.cli.weights import weights_app
 from bevcli.errors import BevcliError, WaitError
 from bevcli.pipeline.cpu_memory import keep_freed_memory
+from bevcli.pipeline.cpu_threads import THREAD_SETTINGS
 
 app = typer.Typer(
     help="Run BEVFormer on sequences from any camera rig, and look at the results.",
@@ -81,9 +82,8 @@ app.add_typer(weights_app, name="weights")
 
 def run_app() -> None:
     """The console entry point: a user's mistake is one line on stderr and exit code 1, never a traceback."""
-    # PyTorch reads this when it is loaded. Its threads then sleep while they wait instead of spinning, which would slow
-    # down a busy machine.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    for name, value in THREAD_SETTINGS.items():
+        os.environ.setdefault(name, value)
     keep_freed_memory()
     try:
         try:

@@ -6,8 +6,8 @@ import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import Literal
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from bevcli.geometry.cameras import Camera, CameraRig, level_rig
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.model.bevformer import BEVFormerConfig, ImageConfig
 from bevcli.pipeline.camera_assignment import CameraAssignment, assign_cameras
+from bevcli.pipeline.resize import resize_and_normalize, resize_taps
 
 
 @dataclass(frozen=True)
@@ -156,19 +157,18 @@ def write_network_image(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: 
     """
     height, width = pixels_bgr.shape[:2]
     scale = min(image.size[0] / width, image.size[1] / height)
-    new_width, new_height = round(width * scale), round(height * scale)
     # "area" averages, which is only defined for shrinking; enlarged images are always interpolated.
-    interpolation = cv2.INTER_AREA if image.resize == "area" and scale < 1 else cv2.INTER_LINEAR
-    resized = cv2.resize(pixels_bgr.astype(np.float32), (new_width, new_height), interpolation=interpolation)
+    method: Literal["linear", "area"] = "area" if image.resize == "area" and scale < 1 else "linear"
     left, top, right, bottom = image.crop_box
-    cropped = resized[top:bottom, left:right]
-    if image.color_order == "rgb":
-        cropped = cropped[..., ::-1]
-    planes = cropped.transpose(2, 0, 1)
-    mean, std = (np.asarray(values, dtype=np.float32)[:, None, None] for values in (image.mean, image.std))
-    region = out[:, : planes.shape[1], : planes.shape[2]]
-    np.subtract(planes, mean, out=region)
-    np.divide(region, std, out=region)
+    resize_and_normalize(
+        pixels_bgr,
+        resize_taps(height, round(height * scale), method)[top:bottom],
+        resize_taps(width, round(width * scale), method)[left:right],
+        np.asarray(image.mean, dtype=np.float32),
+        np.asarray(image.std, dtype=np.float32),
+        out,
+        reverse_channels=image.color_order == "rgb",
+    )
 
 
 def image_from_bev(frame: Frame, camera_name: str) -> Array:
