@@ -14,11 +14,13 @@ import torch
 from memory_drive import MemorySequence, make_rig
 
 from bevcli.benchmark.exported import check_exported
+from bevcli.config import load_config
 from bevcli.engines.engine import ENGINES
 from bevcli.engines.export_onnx import export_onnx
 from bevcli.engines.exported import load_exported, read_metadata
 from bevcli.errors import BevcliError, WeightsError
 from bevcli.model.box_coding import decode
+from bevcli.model.ego_motion import rotate_history
 from bevcli.model.image_tokens import ImageTokensConfig
 from bevcli.model.resnet import ResNetConfig
 from bevcli.pipeline.model_loading import Model, load_model
@@ -103,6 +105,29 @@ def test_decoded_boxes_equal_the_decoder_of_the_library(small_file):
     np.testing.assert_allclose(np.exp(1j * boxes[0, :, 6]), np.exp(1j * expected.yaws), atol=1e-5)
     np.testing.assert_allclose(boxes[0, :, 7:], expected.velocities, atol=1e-6)
     assert [model.config.classes[index] for index in classes[0]] == list(expected.classes)
+
+
+class Rotation(torch.nn.Module):
+    """The rotation of base's history alone."""
+
+    def forward(self, history, rotation_deg):
+        config = load_config("base")
+        return rotate_history(history, rotation_deg, config.bev_grid, config.ego_motion.history_rotation_center)
+
+
+def test_the_history_is_rotated_to_the_same_cells(tmp_path):
+    """Each cell takes the nearest old one. OpenVINO rounds otherwise where two are equally near (docs/deploy.md)."""
+    grid, rotation, file = load_config("base").bev_grid, Rotation().eval(), tmp_path / "rotation.onnx"
+    index = torch.arange(1.0, grid.rows * grid.columns + 1)[None, :, None]  # 0: from outside the map
+    names = {"input_names": ["history", "rotation_deg"], "output_names": ["rotated"]}
+    torch.onnx.export(rotation, (index, torch.zeros(1)), file, dynamo=True, opset_version=19, verbose=False, **names)
+    engines = {name: engine(file, 1) for name, engine in ENGINES.items()}
+    for angle in np.linspace(-9, 9, 61, dtype=np.float32):
+        feed = {"history": index.numpy(), "rotation_deg": angle[None]}
+        expected = rotation(index, torch.from_numpy(angle[None])).numpy()
+        differs = {name: engine(feed)["rotated"] != expected for name, engine in engines.items()}
+        assert not differs["onnxruntime"].any()
+        assert differs["openvino"].sum() <= 20
 
 
 def test_a_file_holds_standard_operators_only_and_documents_every_input_and_output(small_file):
