@@ -22,6 +22,7 @@ from bevcli.recording.colors import (
     class_color,
 )
 from bevcli.recording.labels import labels_in_scene
+from bevcli.recording.strips import strips_2d
 
 MOVING_M_S = 0.5  # slower objects get no velocity arrow
 THIN, THICK = rr.Radius.ui_points(0.8), rr.Radius.ui_points(1.6)
@@ -111,7 +112,7 @@ def log_boxes_bev(stream: rr.RecordingStream, boxes: Boxes3D, marks: Marks, clas
     """Writes predicted boxes (in the bev frame) into the BEV view."""
     colors = box_colors(boxes, class_names)
     outlines, headings = footprints(boxes)
-    strips = [*outlines, *headings]
+    strips = strips_2d([*outlines, *headings])
     doubled = np.concatenate([colors, colors])
     stream.log(entities.BEV_BOXES, rr.LineStrips2D(strips, colors=doubled, radii=THICK, draw_order=30))
     moving = np.linalg.norm(boxes.velocities, axis=-1) > MOVING_M_S
@@ -134,7 +135,7 @@ def log_ground_truth_bev(stream: rr.RecordingStream, truth: Boxes3D, found: np.n
     for entity, chosen in ((entities.BEV_GROUND_TRUTH, found), (entities.BEV_MISSED, ~found)):
         outlines, headings = footprints(truth[chosen])
         doubled = np.tile(_with_alpha(colors[chosen], 200), (2, 1))
-        strips = [*outlines, *headings]
+        strips = strips_2d([*outlines, *headings])
         stream.log(entity, rr.LineStrips2D(strips, colors=doubled, radii=THIN, draw_order=20))
 
 

@@ -14,6 +14,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, apply
 from bevcli.recording import entities
 from bevcli.recording.log_boxes import THIN, box_colors
+from bevcli.recording.strips import strips_2d, strips_3d
 
 PAST_S = 5.0  # length of a trail
 AHEAD_S = 1.0  # how far ahead a trail shows where the object will be at its present velocity
@@ -112,12 +113,12 @@ class TrackLog:
             trail = [past] if len(past) > 1 else []
             own_colors = [(*colors[i], opacity) for opacity in (AHEAD_OPACITY, PAST_OPACITY, PAST_OPACITY)]
             self._log_style(entity, name, own_colors)
-            self._stream.log(entity, rr.LineStrips3D.from_fields(strips=[ahead[i], outlines[i], *trail]))
+            self._stream.log(entity, rr.LineStrips3D.from_fields(strips=strips_3d([ahead[i], outlines[i], *trail])))
             shown.add(entity)
             flat += [apply(bev_from_world, strip)[:, :2] * (1, -1) for strip in (ahead[i], *trail)]
             flat_colors += own_colors[:: 2 if trail else 3]
         self._stream.log(
-            entities.BEV_TRACKS, rr.LineStrips2D(flat, colors=flat_colors or None, radii=THIN, draw_order=25)
+            entities.BEV_TRACKS, rr.LineStrips2D(strips_2d(flat), colors=flat_colors or None, radii=THIN, draw_order=25)
         )
         for entity in self._shown - shown:
             self._stream.log(entity, rr.Clear(recursive=False))
