@@ -73,10 +73,9 @@ def resize_and_normalize(
     channels. out: (3, h or more, w or more). reverse_channels: whether the first channel becomes the last.
     """
     lines = np.ascontiguousarray(pixels).reshape(len(pixels), -1)
-    planes = out[::-1] if reverse_channels else out
     if reverse_channels:
-        mean, std = mean[::-1].copy(), std[::-1].copy()
-    _resample(lines, rows.first, rows.weights, columns.first, columns.weights, mean, std, planes)
+        mean, std, out = mean[::-1].copy(), std[::-1].copy(), out[::-1]
+    _resample(lines, rows.first, rows.weights, columns.first, columns.weights, mean, std, out)
 
 
 @njit(nogil=True, error_model="numpy", fastmath={"contract"})

@@ -108,17 +108,21 @@ def test_decoded_boxes_equal_the_decoder_of_the_library(small_file):
 
 
 class Rotation(torch.nn.Module):
-    """The rotation of base's history alone."""
+    """The rotation of a model's history alone."""
+
+    def __init__(self, config):
+        super().__init__()
+        self.grid, self.center = config.bev_grid, config.ego_motion.history_rotation_center
 
     def forward(self, history, rotation_deg):
-        config = load_config("base")
-        return rotate_history(history, rotation_deg, config.bev_grid, config.ego_motion.history_rotation_center)
+        return rotate_history(history, rotation_deg, self.grid, self.center)
 
 
 def test_the_history_is_rotated_to_the_same_cells(tmp_path):
     """Each cell takes the nearest old one. OpenVINO rounds otherwise where two are equally near (docs/deploy.md)."""
-    grid, rotation, file = load_config("base").bev_grid, Rotation().eval(), tmp_path / "rotation.onnx"
-    index = torch.arange(1.0, grid.rows * grid.columns + 1)[None, :, None]  # 0: from outside the map
+    config, file = load_config("base"), tmp_path / "rotation.onnx"
+    rotation, cells = Rotation(config).eval(), config.bev_grid.rows * config.bev_grid.columns
+    index = torch.arange(1.0, cells + 1)[None, :, None]  # 0: from outside the map
     names = {"input_names": ["history", "rotation_deg"], "output_names": ["rotated"]}
     torch.onnx.export(rotation, (index, torch.zeros(1)), file, dynamo=True, opset_version=19, verbose=False, **names)
     engines = {name: engine(file, 1) for name, engine in ENGINES.items()}
