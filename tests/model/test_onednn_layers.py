@@ -13,9 +13,9 @@ from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.feed_forward import FeedForward
 from bevcli.model.kernels import onednn as onednn_layers
 from bevcli.model.kernels.compiled import CompiledDeformableConvolution
-from bevcli.model.kernels.onednn import FusedBottleneck, PackedLinear, has_onednn, use_onednn
-from bevcli.model.prepared import prepare_for_inference
-from bevcli.model.resnet import Bottleneck
+from bevcli.model.kernels.onednn import FusedBottleneck, PackedConvolution, PackedLinear, has_onednn, use_onednn
+from bevcli.model.prepared import fold_batch_norms, prepare_for_inference
+from bevcli.model.resnet import Bottleneck, ResNet, ResNetConfig
 
 pytestmark = pytest.mark.skipif(not has_onednn(torch.float32), reason="this build of PyTorch has no oneDNN")
 TOLERANCE = {torch.float32: 1e-4, torch.bfloat16: 0.1}
@@ -67,8 +67,39 @@ def test_a_fused_bottleneck_equals_a_bottleneck(style, in_channels, stride, defo
             whole = nn.Sequential(block)
             use_onednn(whole)
             assert isinstance(whole[0], FusedBottleneck)
-            torch.testing.assert_close(whole(x), expected, atol=TOLERANCE[dtype], rtol=TOLERANCE[dtype])
-        assert torch.equal(x, before)
+            found = whole(x)
+            torch.testing.assert_close(found, expected, atol=TOLERANCE[dtype], rtol=TOLERANCE[dtype])
+        if isinstance(block.downsample, nn.Identity):
+            assert found.data_ptr() == x.data_ptr()
+        else:
+            assert torch.equal(x, before)
+
+
+@pytest.mark.parametrize("groups", [1, 4])
+def test_a_packed_convolution_takes_inputs_of_every_size(groups):
+    for dtype in dtypes():
+        plain = nn.Conv2d(16, 24, 3, stride=2, padding=1, dilation=2, groups=groups).to(dtype).requires_grad_(False)
+        packed = nn.Sequential(copy.deepcopy(plain))
+        use_onednn(packed)
+        assert isinstance(packed[0], PackedConvolution)
+        for batch, height, width in ((6, 15, 25), (1, 15, 25), (2, 8, 40), (6, 15, 25)):
+            x = torch.randn(batch, 16, height, width, dtype=dtype)
+            with torch.inference_mode():
+                torch.testing.assert_close(packed(x), plain(x), atol=TOLERANCE[dtype], rtol=TOLERANCE[dtype])
+
+
+def test_residual_blocks_do_not_write_over_the_maps_that_a_backbone_returns():
+    backbone = ResNet(ResNetConfig((2, 2, 2, 2), output_stages=(1, 2, 3, 4), width=8)).eval().requires_grad_(False)
+    for module in backbone.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            nn.init.normal_(module.weight)
+    fold_batch_norms(backbone, torch.device("cpu"))
+    fast, images = nn.Sequential(copy.deepcopy(backbone)), torch.randn(2, 3, 64, 96)
+    use_onednn(fast)
+    before = images.clone()
+    with torch.inference_mode():
+        torch.testing.assert_close(fast(images), backbone(images), atol=1e-4, rtol=1e-4)
+    assert torch.equal(images, before)
 
 
 def test_without_onednn_a_model_keeps_its_layers(monkeypatch):

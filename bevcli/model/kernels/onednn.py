@@ -1,12 +1,15 @@
 """Layers run by oneDNN on a CPU, for inference: weights are packed once, ReLU and sums are fused into convolutions.
 
+A residual block adds its last convolution to the shortcut in place: with few channels such a convolution mostly waits
+for memory, and new memory for the result would be one more array to pass through.
+
 The operators are those that PyTorch's compiler uses for convolutions and linear layers. Where a build of PyTorch lacks
 them, a model keeps its own layers.
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -15,11 +18,19 @@ from bevcli.model.bev_fusion import FusionBlock
 from bevcli.model.feed_forward import FeedForward
 from bevcli.model.resnet import Bottleneck
 
+OPERATORS = (
+    "_convolution_pointwise",
+    "_convolution_pointwise_",
+    "_is_mkldnn_bf16_supported",
+    "_linear_pointwise",
+    "_reorder_convolution_weight",
+    "_reorder_linear_weight",
+)
+
 
 def has_onednn(dtype: torch.dtype) -> bool:
     """Whether this build of PyTorch and this CPU can run these layers in a dtype."""
-    operators = ("_convolution_pointwise", "_linear_pointwise", "_reorder_linear_weight", "_is_mkldnn_bf16_supported")
-    if not torch.backends.mkldnn.is_available() or not all(hasattr(torch.ops.mkldnn, name) for name in operators):
+    if not torch.backends.mkldnn.is_available() or not all(hasattr(torch.ops.mkldnn, name) for name in OPERATORS):
         return False
     return dtype == torch.float32 or (dtype == torch.bfloat16 and torch.ops.mkldnn._is_mkldnn_bf16_supported())
 
@@ -38,20 +49,33 @@ class PackedLinear(nn.Module):
         return torch.ops.mkldnn._linear_pointwise(x, self.packed, self.bias, *self.activation)
 
 
-class ActivatedConvolution(nn.Module):
-    """relu(convolution(x)), or relu(convolution(x) + shortcut), in one pass."""
+class PackedConvolution(nn.Module):
+    """A convolution with its weight in the layout that oneDNN wants for the size of its input, and a ReLU if wanted."""
 
-    def __init__(self, convolution: nn.Conv2d) -> None:
+    packed: Tensor
+
+    def __init__(self, convolution: nn.Conv2d, activation: Literal["none", "relu"] = "none") -> None:
         super().__init__()
-        self.weight, self.bias = convolution.weight, convolution.bias
-        self.geometry = (list(convolution.padding), list(convolution.stride), list(convolution.dilation), 1)
+        self.weight, self.bias, self.activation = convolution.weight, convolution.bias, activation
+        geometry = convolution.padding, convolution.stride, convolution.dilation
+        self.geometry = (*map(list, geometry), convolution.groups)
+        self.packed_for: torch.Size | None = None
 
-    def forward(self, x: Tensor, shortcut: Tensor | None = None) -> Tensor:
-        """x: (B, in, H, W), shortcut: (B, out, H', W') -> (B, out, H', W')."""
-        convolve: Any = torch.ops.mkldnn._convolution_pointwise
-        if shortcut is None:
-            return convolve(x, self.weight, self.bias, *self.geometry, "relu", [], "")
-        return convolve.binary(x, shortcut, self.weight, self.bias, *self.geometry, "add", 1.0, "relu", [], "")
+    def forward(self, x: Tensor) -> Tensor:
+        """x: (B, in, H, W) -> (B, out, H', W'), channels last."""
+        arguments = x, self._packed(x.shape), self.bias, *self.geometry
+        return torch.ops.mkldnn._convolution_pointwise(*arguments, self.activation, [], "")
+
+    def add_to(self, shortcut: Tensor, x: Tensor) -> Tensor:
+        """activation(convolution(x) + shortcut), (B, out, H', W'), in the memory of the shortcut."""
+        arguments = shortcut, x, self._packed(x.shape), self.bias, *self.geometry
+        return torch.ops.mkldnn._convolution_pointwise_.binary(*arguments, "add", 1.0, self.activation, [], "")
+
+    def _packed(self, input_size: torch.Size) -> Tensor:
+        if self.packed_for != input_size:
+            pack = torch.ops.mkldnn._reorder_convolution_weight
+            self.packed, self.packed_for = pack(self.weight.detach(), *self.geometry, list(input_size)), input_size
+        return self.packed
 
 
 class FusedBottleneck(nn.Module):
@@ -59,17 +83,19 @@ class FusedBottleneck(nn.Module):
 
     def __init__(self, block: Bottleneck) -> None:
         super().__init__()
-        assert isinstance(block.conv1, nn.Conv2d)
-        self.conv1, self.conv3 = ActivatedConvolution(block.conv1), ActivatedConvolution(block.conv3)
+        self.conv1, self.conv3 = PackedConvolution(block.conv1, "relu"), PackedConvolution(block.conv3, "relu")
         if isinstance(block.conv2, nn.Conv2d):
-            self.conv2: nn.Module = ActivatedConvolution(block.conv2)
+            self.conv2: nn.Module = PackedConvolution(block.conv2, "relu")
         else:
             self.conv2 = nn.Sequential(block.conv2, nn.ReLU(inplace=True))  # a deformable convolution
+            use_onednn(self.conv2)
         self.downsample = block.downsample
+        use_onednn(self.downsample)
 
     def forward(self, x: Tensor) -> Tensor:
-        """As `Bottleneck.forward`."""
-        return self.conv3(self.conv2(self.conv1(x)), self.downsample(x))
+        """As `Bottleneck.forward`. Without a `downsample` the result is written over x."""
+        y = self.conv2(self.conv1(x))
+        return self.conv3.add_to(self.downsample(x), y)
 
 
 class FusedFusionBlock(nn.Module):
@@ -77,28 +103,41 @@ class FusedFusionBlock(nn.Module):
 
     def __init__(self, block: FusionBlock) -> None:
         super().__init__()
-        self.conv1, self.conv2 = ActivatedConvolution(block.conv1), ActivatedConvolution(block.conv2)
+        self.conv1, self.conv2 = PackedConvolution(block.conv1, "relu"), PackedConvolution(block.conv2, "relu")
         self.downsample = block.downsample
+        use_onednn(self.downsample)
 
     def forward(self, x: Tensor) -> Tensor:
-        """As `FusionBlock.forward`."""
-        return self.conv2(self.conv1(x), self.downsample(x))
+        """As `FusionBlock.forward`. Without a `downsample` the result is written over x."""
+        y = self.conv1(x)
+        return self.conv2.add_to(self.downsample(x), y)
 
 
 def use_onednn(part: nn.Module) -> None:
-    """Replaces the linear layers and the residual blocks of a module, in place. Batch norms must be folded already."""
+    """Replaces convolutions, linear layers and residual blocks of a module, in place, for inference.
+
+    Batch norms must be folded already.
+    """
     for name, child in part.named_children():
-        if isinstance(child, Bottleneck) and has_onednn(child.conv1.weight.dtype):
-            child = FusedBottleneck(child)
-            setattr(part, name, child)
-        elif isinstance(child, FusionBlock) and has_onednn(child.conv1.weight.dtype):
-            child = FusedFusionBlock(child)
-            setattr(part, name, child)
-        if isinstance(child, FeedForward) and has_onednn(child.expand.weight.dtype):
-            both = PackedLinear(child.expand, child.activation), PackedLinear(child.reduce)
-            setattr(part, name, nn.Sequential(*both))  # dropout has no effect in inference
-        # Not the subclass of nn.Linear in multi-head attention, which reads the weight of that layer itself.
-        elif type(child) is nn.Linear and has_onednn(child.weight.dtype):
-            setattr(part, name, PackedLinear(child))
-        else:
+        fast = _fast(child)
+        if fast is None:
             use_onednn(child)
+        else:
+            setattr(part, name, fast)
+
+
+def _fast(layer: nn.Module) -> nn.Module | None:
+    """What takes the place of a layer; None where it stays."""
+    parameter = next(layer.parameters(), None)
+    if parameter is None or not has_onednn(parameter.dtype):
+        return None
+    if isinstance(layer, Bottleneck):
+        return FusedBottleneck(layer)
+    if isinstance(layer, FusionBlock):
+        return FusedFusionBlock(layer)
+    if isinstance(layer, FeedForward):  # dropout has no effect in inference
+        return nn.Sequential(PackedLinear(layer.expand, layer.activation), PackedLinear(layer.reduce))
+    # Not subclasses, such as the layer in multi-head attention whose weight is read by its owner.
+    if type(layer) is nn.Linear:
+        return PackedLinear(layer)
+    return PackedConvolution(layer) if type(layer) is nn.Conv2d else None
