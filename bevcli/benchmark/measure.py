@@ -33,7 +33,10 @@ from bevcli.pipeline.write_behind import write_behind
 from bevcli.recording.writer import Recording
 
 WARM_UP_FRAMES = 2  # one without and one with history
-MIN_RUN_FRAMES = 3  # of the run with reading and recording; the times between them are measured
+MIN_RUN_FRAMES = 4  # of a run with reading and recording; the times between them are measured, but for the last
+RUN_FRAMES = 12  # of a run if frames are short
+RUNS = 6  # that take turns with the model alone if frames are short
+TURNS_S = 30.0  # for all turns if frames are short; with slow models one run
 
 
 @dataclass(frozen=True)
@@ -69,10 +72,10 @@ def run_benchmark(settings: BenchmarkSettings) -> BenchmarkResult:
     fast = Version(network, device)
     first = config.past_frames if isinstance(config, BEVFormerV2Config) else 0
     timed, run = first + WARM_UP_FRAMES, first + WARM_UP_FRAMES + settings.frames
-    drive = MadeUpDrive(run + max(settings.frames, MIN_RUN_FRAMES))
+    drive = MadeUpDrive(run + 2 * RUNS * max(settings.frames, RUN_FRAMES))
     stages = _time_stages(fast, drive, first, range(timed, run))
     frame_s, peak = tuple(fast.seconds), _peak_memory(device)
-    run_frame_s = _time_run(fast, drive, range(run, len(drive.stamps)))
+    run_frame_s, run_over_model = _time_runs(fast, drive, run, max(settings.frames, MIN_RUN_FRAMES))
     if settings.profile is not None:
         _write_profile(fast, _prepared(drive, config, 0), settings.profile)
     comparison = None
@@ -88,6 +91,7 @@ def run_benchmark(settings: BenchmarkSettings) -> BenchmarkResult:
         stages_s=stages,
         frame_s=frame_s,
         run_frame_s=run_frame_s,
+        run_over_model=run_over_model,
         peak_memory_bytes=peak,
         operations=count_operations(config, _hits(model, _prepared(drive, config, 0))),
         limits=limits.fastest(measure_limits(device, settings.precision)),
@@ -136,18 +140,43 @@ def _time_stages(fast: Version, drive: MadeUpDrive, first: int, timed: range) ->
     return {stage: tuple(seconds) for stage, seconds in times.items()}
 
 
-def _time_run(fast: Version, drive: MadeUpDrive, places: range) -> float:
-    """Median seconds of a frame while other threads read and record, as in `bevcli run`."""
-    made, preprocessor = [], Preprocessor(fast.runner.config)
+def _time_runs(fast: Version, drive: MadeUpDrive, place: int, frames: int) -> tuple[float, float]:
+    """Median seconds of a frame in whole runs, and how many times as long that is as a frame of the model alone.
+
+    Both take turns, because the speed of a machine that others use changes within seconds.
+
+    Args:
+        fast: the model; it has seen the frames before.
+        drive: its frames from `place` on are used, each once.
+        place: index of the first frame.
+        frames: of a run, at least.
+    """
+    frame_s = median(fast.seconds)
+    frames = max(frames, min(RUN_FRAMES, round(TURNS_S / RUNS / 2 / frame_s)))
+    runs = max(1, min(RUNS, round(TURNS_S / (2 * frames * frame_s))))
+    preprocessor = Preprocessor(fast.runner.config)
+    fast.forget_times()
+    in_runs: list[float] = []
     with _recording(drive, fast) as recording:
+        for first in range(place, place + 2 * frames * runs, 2 * frames):
+            for alone in range(first, first + frames):
+                fast.step(preprocessor(drive.load(alone)))
+            in_runs += _time_run(fast, drive, range(first + frames, first + 2 * frames), recording)
+    return median(in_runs), median(in_runs) / median(fast.seconds)
 
-        def record(step: tuple[Frame, Prediction, BevState | None]) -> None:
-            made.append(time.perf_counter())  # recording begins as soon as the model has made the step
-            recording.log(*step[:2])
 
-        for _ in write_behind(record, fast.runner.run(drive, places, preprocessor, fast.state)):
-            pass
-    return median(after - before for before, after in pairwise(made))
+def _time_run(fast: Version, drive: MadeUpDrive, places: range, recording: Recording) -> list[float]:
+    """Seconds of each frame while other threads read and record, as in `bevcli run`."""
+    made: list[float] = []
+    preprocessor = Preprocessor(fast.runner.config)
+
+    def record(step: tuple[Frame, Prediction, BevState | None]) -> None:
+        made.append(time.perf_counter())  # recording begins as soon as the model has made the step
+        recording.log(*step[:2])
+
+    for _ in write_behind(record, fast.runner.run(drive, places, preprocessor, fast.state)):
+        pass
+    return [after - before for before, after in pairwise(made[:-1])]  # beside the last frame none is read
 
 
 @contextlib.contextmanager

@@ -38,6 +38,7 @@ class BenchmarkResult:
         stages_s: stage -> seconds of each frame; no two stages ran at the same time.
         frame_s: seconds of the model's step for each frame, from network inputs to boxes.
         run_frame_s: median seconds of a frame in a whole run, where other threads decode, preprocess and record.
+        run_over_model: the same, divided by the time of the model alone, which took turns with the runs.
         peak_memory_bytes: of the process on a CPU, of tensors on a GPU.
         operations: arithmetic operations of one frame.
         limits: the machine's peak throughput.
@@ -52,6 +53,7 @@ class BenchmarkResult:
     stages_s: Mapping[str, tuple[float, ...]]
     frame_s: tuple[float, ...]
     run_frame_s: float
+    run_over_model: float
     peak_memory_bytes: int
     operations: float
     limits: MachineLimits
@@ -81,6 +83,7 @@ class BenchmarkResult:
             "frame_ms": round(1000 * frame_s, 3),
             "frame_ms_spread": [round(1000 * min(self.frame_s), 3), round(1000 * max(self.frame_s), 3)],
             "run_frame_ms": round(1000 * self.run_frame_s, 3),
+            "run_over_model": round(self.run_over_model, 3),
             "fps": round(1 / frame_s, 4),
             "peak_memory_mb": round(self.peak_memory_bytes / 1e6, 1),
             "operations_g": round(self.operations / 1e9, 2),
@@ -108,11 +111,11 @@ class BenchmarkResult:
             low, middle, high = (1000 * seconds for seconds in (min(times), median(times), max(times)))
             lines.append(f"{stage:<22}{middle:>10.1f}  {low:.1f} to {high:.1f}")
         frame_s, gemm = median(self.frame_s), self.limits.gemm_gflops
-        run_ms, run_ratio, memory = 1000 * self.run_frame_s, self.run_frame_s / frame_s, self.peak_memory_bytes / 1e6
+        run_ms, memory = 1000 * self.run_frame_s, self.peak_memory_bytes / 1e6
         lines += [
             "",
             f"model alone                {1 / frame_s:.3g} frames per second",
-            f"with reading, recording    {run_ms:.0f} ms per frame, {run_ratio:.2f} times the model alone",
+            f"with reading, recording    {run_ms:.0f} ms per frame, {self.run_over_model:.2f} times the model alone",
             f"operations                 {self.operations / 1e9:.0f} G per frame; "
             f"the frame takes {self.times_limit:.2f} times their time at the peak rate",
             f"peak rate                  {gemm:.0f} G operations per second (matrix products), "

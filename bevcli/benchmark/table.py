@@ -29,7 +29,7 @@ COLUMNS: Mapping[str, Callable[[dict[str, Any]], str]] = {
     "times the limit": lambda r: f"{r['limits']['times_limit']:.2f}",
     "G operations": lambda r: f"{r['operations_g']:.0f}",
     "matrix products, G/s": lambda r: f"{r['limits']['gemm_gflops']:.0f}",
-    "run / model": lambda r: f"{r['run_frame_ms'] / r['frame_ms']:.2f}",
+    "run / model": lambda r: f"{r['run_over_model']:.2f}",
     "memory, MB": lambda r: f"{r['peak_memory_mb']:.0f}",
     "boxes within 0.1 m": lambda r: f"{r['share_within_0.1_m']:.1%}",
     "largest score difference": lambda r: f"{r['max_score_difference']:.1g}",

@@ -24,6 +24,7 @@ RESULT = BenchmarkResult(
     stages_s={"backbone": (1.0, 3.0, 2.0)},
     frame_s=(2.0, 4.0, 3.0),
     run_frame_s=3.3,
+    run_over_model=1.1,
     peak_memory_bytes=2_000_000,
     operations=400e9,
     limits=MachineLimits(gemm_gflops=200.0, copy_gbs=10.0),
@@ -42,17 +43,25 @@ def test_speedup_is_the_ratio_of_medians():
 
 def test_the_text_contains_the_derived_numbers():
     text = RESULT.text()
-    for words in ("1.50 times their time", "0.333 frames per second", "2.00 times the prepared model's", "100.0%"):
+    for words in (
+        "1.50 times their time",
+        "0.333 frames per second",
+        "1.10 times the model alone",
+        "2.00 times the prepared model's",
+        "100.0%",
+    ):
         assert words in text
 
 
-def test_json_of_a_whole_benchmark(small_model_file):
+def test_json_of_a_whole_benchmark(small_model_file, monkeypatch):
+    monkeypatch.setattr("bevcli.benchmark.measure.RUNS", 2)
     arguments = ["bench", "--model", str(small_model_file), "--frames", "1", "--against", "plain", "--json"]
     answer = CliRunner().invoke(app, arguments, catch_exceptions=False)
     data = json.loads(answer.stdout)
     assert set(data) >= {
-        "model", "device", "precision", "stages_ms", "frame_ms", "fps", "peak_memory_mb", "operations_g", "limits",
-        "plain_frame_ms", "speedup", "max_box_difference_m", "share_within_0.1_m", "max_score_difference",
+        "model", "device", "precision", "stages_ms", "frame_ms", "run_over_model", "fps", "peak_memory_mb",
+        "operations_g", "limits", "plain_frame_ms", "speedup", "max_box_difference_m", "share_within_0.1_m",
+        "max_score_difference",
     }  # fmt: skip
     assert set(data["limits"]) == {"gemm_gflops", "copy_gbs", "times_limit"}
     assert list(data["stages_ms"]) == [

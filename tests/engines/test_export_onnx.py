@@ -158,7 +158,7 @@ def test_published_models_equal_ours_over_a_real_drive(name, shared, tmp_path):
     drive = open_sequence(shared / "data" / "nuscenes-scene-0103", rate_hz=2.0, frames=slice(0, 4))
     model = Model(original.rule_model(name, "both"))
     export_onnx(model.network, tmp_path / "model.onnx")
-    # In small, our plain and our prepared model already differ by 1.8e-3, in one frame.
+    # In small, the logits of both differ by 2.5e-3 or more from those of the model in float64.
     agree(tmp_path / "model.onnx", model, drive, logits=3e-3 if name == "small" else 1e-3)
 
 
