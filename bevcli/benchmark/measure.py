@@ -146,7 +146,7 @@ def _time_runs(fast: Version, drive: MadeUpDrive, place: int, frames: int) -> tu
     Both take turns, because the speed of a machine that others use changes within seconds.
 
     Args:
-        fast: the model; it has seen the frames before.
+        fast: the model; it has seen the frames before `place`, and afterwards all that are used.
         drive: its frames from `place` on are used, each once.
         place: index of the first frame.
         frames: of a run, at least.
@@ -174,8 +174,8 @@ def _time_run(fast: Version, drive: MadeUpDrive, places: range, recording: Recor
         made.append(time.perf_counter())  # recording begins as soon as the model has made the step
         recording.log(*step[:2])
 
-    for _ in write_behind(record, fast.runner.run(drive, places, preprocessor, fast.state)):
-        pass
+    for step, _ in write_behind(record, fast.runner.run(drive, places, preprocessor, fast.state)):
+        fast.state = step[2]
     return [after - before for before, after in pairwise(made[:-1])]  # beside the last frame none is read
 
 

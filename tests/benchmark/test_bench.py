@@ -9,6 +9,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
+from bevcli.benchmark import measure
 from bevcli.benchmark.limits import MachineLimits
 from bevcli.benchmark.made_up import MadeUpDrive
 from bevcli.benchmark.result import BenchmarkResult, Comparison
@@ -109,3 +110,22 @@ def test_a_window_is_filled_after_one_frame(window_model, frames, filled):
     version.step(Preprocessor(version.runner.config)(drive.load(2)))
     version.fill_window(drive)
     assert [frame.stamp.index for frame in version.state.memory.frames] == filled
+
+
+def test_runs_and_the_model_alone_take_turns_without_a_gap(window_model, monkeypatch):
+    monkeypatch.setattr(measure, "RUN_FRAMES", 4)
+    monkeypatch.setattr(measure, "RUNS", 2)
+    version, drive = Version(window_model(-1, 0), torch.device("cpu")), MadeUpDrive(17)
+    version.step(Preprocessor(version.runner.config)(drive.load(0)))
+    step, seen = version.runner.step, []
+
+    def watched(*arguments):
+        state, prediction = step(*arguments)
+        seen.append((prediction.stamp.index, prediction.started_anew))
+        return state, prediction
+
+    monkeypatch.setattr(version.runner, "step", watched)
+    run_s, ratio = measure._time_runs(version, drive, 1, 4)
+    assert seen == [(place, "") for place in range(1, 17)]
+    assert run_s > 0
+    assert ratio > 0
