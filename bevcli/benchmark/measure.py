@@ -161,14 +161,15 @@ def _time_runs(fast: Version, drive: MadeUpDrive, place: int, frames: int) -> tu
         for first in range(place, place + 2 * frames * runs, 2 * frames):
             for alone in range(first, first + frames):
                 fast.step(preprocessor(drive.load(alone)))
-            in_runs += _time_run(fast, drive, range(first + frames, first + 2 * frames), recording)
+            in_runs += _time_run(fast, drive, range(first + frames, first + 2 * frames), preprocessor, recording)
     return median(in_runs), median(in_runs) / median(fast.seconds)
 
 
-def _time_run(fast: Version, drive: MadeUpDrive, places: range, recording: Recording) -> list[float]:
+def _time_run(
+    fast: Version, drive: MadeUpDrive, places: range, preprocessor: Preprocessor, recording: Recording
+) -> list[float]:
     """Seconds of each frame while other threads read and record, as in `bevcli run`."""
     made: list[float] = []
-    preprocessor = Preprocessor(fast.runner.config)
 
     def record(step: tuple[Frame, Prediction, BevState | None]) -> None:
         made.append(time.perf_counter())  # recording begins as soon as the model has made the step

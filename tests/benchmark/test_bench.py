@@ -55,7 +55,7 @@ def test_the_text_contains_the_derived_numbers():
 
 
 def test_json_of_a_whole_benchmark(small_model_file, monkeypatch):
-    monkeypatch.setattr("bevcli.benchmark.measure.RUNS", 2)
+    monkeypatch.setattr(measure, "RUNS", 2)
     arguments = ["bench", "--model", str(small_model_file), "--frames", "1", "--against", "plain", "--json"]
     answer = CliRunner().invoke(app, arguments, catch_exceptions=False)
     data = json.loads(answer.stdout)

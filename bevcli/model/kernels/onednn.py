@@ -88,9 +88,7 @@ class FusedBottleneck(nn.Module):
             self.conv2: nn.Module = PackedConvolution(block.conv2, "relu")
         else:
             self.conv2 = nn.Sequential(block.conv2, nn.ReLU(inplace=True))  # a deformable convolution
-            use_onednn(self.conv2)
         self.downsample = block.downsample
-        use_onednn(self.downsample)
 
     def forward(self, x: Tensor) -> Tensor:
         """As `Bottleneck.forward`. Without a `downsample` the result is written over x."""
@@ -105,7 +103,6 @@ class FusedFusionBlock(nn.Module):
         super().__init__()
         self.conv1, self.conv2 = PackedConvolution(block.conv1, "relu"), PackedConvolution(block.conv2, "relu")
         self.downsample = block.downsample
-        use_onednn(self.downsample)
 
     def forward(self, x: Tensor) -> Tensor:
         """As `FusionBlock.forward`. Without a `downsample` the result is written over x."""
@@ -120,17 +117,15 @@ def use_onednn(part: nn.Module) -> None:
     """
     for name, child in part.named_children():
         fast = _fast(child)
-        if fast is None:
-            use_onednn(child)
-        else:
-            setattr(part, name, fast)
+        setattr(part, name, fast)
+        use_onednn(fast)
 
 
-def _fast(layer: nn.Module) -> nn.Module | None:
-    """What takes the place of a layer; None where it stays."""
+def _fast(layer: nn.Module) -> nn.Module:
+    """What takes the place of a layer: the layer itself where oneDNN has nothing for it, or not in this dtype."""
     parameter = next(layer.parameters(), None)
     if parameter is None or not has_onednn(parameter.dtype):
-        return None
+        return layer
     if isinstance(layer, Bottleneck):
         return FusedBottleneck(layer)
     if isinstance(layer, FusionBlock):
@@ -140,4 +135,4 @@ def _fast(layer: nn.Module) -> nn.Module | None:
     # Not subclasses, such as the layer in multi-head attention whose weight is read by its owner.
     if type(layer) is nn.Linear:
         return PackedLinear(layer)
-    return PackedConvolution(layer) if type(layer) is nn.Conv2d else None
+    return PackedConvolution(layer) if type(layer) is nn.Conv2d else layer
