@@ -1,56 +1,77 @@
-# make demo       run the model on samples/street; the recording is runs/street/recording.rrd
+# make demo       run the model on samples/street; installs what a user needs; the recording is runs/street/recording.rrd
+# make install    what a developer needs
 # make test       the fast tests, in two processes of one thread each; make test-all: all tests
+# make docs       the site of the documents in build/site
 # make fuzz       6,450 broken files of every format, up to ten minutes
 # make check      lint and types; make format: fix what ruff can fix
 # make gpu-check  check bevcli on a GPU, and write gpu-report.md to paste into an issue; DEVICE=cuda:1 or DEVICE=mps
 # make bench      measure this machine and rewrite the table of docs/speed.md; nothing else should run meanwhile
 VENV := .venv
 BIN := $(VENV)/bin
-INSTALLED := $(VENV)/.installed
+USER := $(VENV)/.user
+DEVELOPER := $(VENV)/.developer
+WRITER := $(VENV)/.docs
+VIEWERS := $(VENV)/.viewers
+# Files are compiled when they are first imported: a demo imports few of them.
+PIP := $(BIN)/pip install --quiet --no-compile --constraint constraints.txt
 
 # Reference data that is not in this repository (real nuScenes frames, reference numbers). Tests skip without it.
 ifneq ($(wildcard ../shared),)
 export BEVCLI_SHARED ?= $(abspath ../shared)
 endif
 
-.PHONY: install demo test test-all fuzz check format bench gpu-check clean
+.PHONY: install demo test test-all docs fuzz check format bench gpu-check clean
 
-install: $(INSTALLED)
+install: $(DEVELOPER)
 
-$(INSTALLED): pyproject.toml constraints.txt
+$(USER): pyproject.toml constraints.txt
 	test -x $(BIN)/python || python3 -m venv $(VENV)
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev,onnx,openvino]'
+	$(PIP) --editable .
 	touch $@
 
-demo: $(INSTALLED)
-	$(BIN)/bevcli run samples/street --out runs/street --force
+$(DEVELOPER): $(USER)
+	$(PIP) --editable '.[dev,onnx,openvino]'
+	touch $@
 
-test: $(INSTALLED)
-	OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses 2 --dist loadfile -m "not slow and not gpu"
+$(WRITER): $(USER)
+	$(PIP) --editable '.[docs]'
+	touch $@
 
-test-all: $(VENV)/.viewers
-	$(BIN)/pytest
-
-$(VENV)/.viewers: $(INSTALLED)
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev,notebook,onnx,openvino]' playwright
+$(VIEWERS): $(DEVELOPER)
+	$(PIP) --editable '.[dev,docs,notebook,onnx,openvino,triton]' playwright
 	.ci/install-viewers
 	touch $@
 
-bench: $(INSTALLED)
+demo: $(USER)
+	$(BIN)/bevcli run samples/street --out runs/street --force
+
+# Compiled modules are kept, also where the environment says not to: programs that tests start import in a third of the time.
+test test-all: export PYTHONDONTWRITEBYTECODE :=
+
+test: $(DEVELOPER)
+	OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder -m "not slow and not gpu"
+
+test-all: $(VIEWERS)
+	$(BIN)/pytest
+
+docs: $(WRITER)
+	$(BIN)/sphinx-build --fail-on-warning --quiet -c docs/site -d build/doctrees -b html . build/site
+
+bench: $(DEVELOPER)
 	$(BIN)/bevcli bench --table docs/speed.md
 
-gpu-check: $(INSTALLED)
+gpu-check: $(DEVELOPER)
 	$(BIN)/python -m bevcli.benchmark.gpu_check --device $(or $(DEVICE),auto)
 
-fuzz: $(INSTALLED)
+fuzz: $(DEVELOPER)
 	BEVCLI_FUZZ_CASES=$${BEVCLI_FUZZ_CASES:-150} $(BIN)/pytest tests/fuzz
 
-check: $(INSTALLED)
+check: $(DEVELOPER)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-format: $(INSTALLED)
+format: $(DEVELOPER)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 

@@ -16,78 +16,53 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from bevcli._version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from bevcli.errors import BevcliError
-    from bevcli.evaluation.evaluate import evaluate
-    from bevcli.frame import MAP_CLASSES, BevMap, CameraImage, Frame, FrameStamp, Prediction, Sequence
-    from bevcli.geometry.boxes import Boxes3D
-    from bevcli.geometry.cameras import Camera, CameraRig
-    from bevcli.geometry.transforms import Pose
-    from bevcli.pipeline.model_loading import Model, load_model
-    from bevcli.pipeline.run import RunOptions, run, run_into_folder
-    from bevcli.recording.options import RecordingOptions
-    from bevcli.recording.writer import Recording
-    from bevcli.rig.check_calibration import check_calibration
-    from bevcli.sequences.open import open_sequence
-    from bevcli.synth.export import render
-    from bevcli.viewer.notebook import show
+    from bevcli.errors import BevcliError as BevcliError
+    from bevcli.evaluation.evaluate import evaluate as evaluate
+    from bevcli.frame import (
+        MAP_CLASSES as MAP_CLASSES,
+        BevMap as BevMap,
+        CameraImage as CameraImage,
+        Frame as Frame,
+        FrameStamp as FrameStamp,
+        Prediction as Prediction,
+        Sequence as Sequence,
+    )
+    from bevcli.geometry.boxes import Boxes3D as Boxes3D
+    from bevcli.geometry.cameras import Camera as Camera, CameraRig as CameraRig
+    from bevcli.geometry.transforms import Pose as Pose
+    from bevcli.inference.load import Model as Model, load_model as load_model
+    from bevcli.inference.run import run as run
+    from bevcli.recording.options import RecordingOptions as RecordingOptions
+    from bevcli.recording.writer import Recording as Recording
+    from bevcli.rig.check_calibration import check_calibration as check_calibration
+    from bevcli.runs.run_into_folder import RunOptions as RunOptions, run_into_folder as run_into_folder
+    from bevcli.sequences.open import open_sequence as open_sequence
+    from bevcli.synth.export import render as render
+    from bevcli.viewer.recording_file import show as show
 
-# The public names, and the modules that define them.
-_MODULES = {
-    "MAP_CLASSES": "bevcli.frame",
-    "BevMap": "bevcli.frame",
-    "BevcliError": "bevcli.errors",
-    "Boxes3D": "bevcli.geometry.boxes",
-    "Camera": "bevcli.geometry.cameras",
-    "CameraImage": "bevcli.frame",
-    "CameraRig": "bevcli.geometry.cameras",
-    "Frame": "bevcli.frame",
-    "FrameStamp": "bevcli.frame",
-    "Model": "bevcli.pipeline.model_loading",
-    "Pose": "bevcli.geometry.transforms",
-    "Prediction": "bevcli.frame",
-    "Recording": "bevcli.recording.writer",
-    "RecordingOptions": "bevcli.recording.options",
-    "RunOptions": "bevcli.pipeline.run",
-    "Sequence": "bevcli.frame",
-    "check_calibration": "bevcli.rig.check_calibration",
-    "evaluate": "bevcli.evaluation.evaluate",
-    "load_model": "bevcli.pipeline.model_loading",
-    "open_sequence": "bevcli.sequences.open",
-    "render": "bevcli.synth.export",
-    "run": "bevcli.pipeline.run",
-    "run_into_folder": "bevcli.pipeline.run",
-    "show": "bevcli.viewer.notebook",
+# The public names by the modules that define them.
+_NAMES = {
+    "bevcli.errors": "BevcliError",
+    "bevcli.evaluation.evaluate": "evaluate",
+    "bevcli.frame": "BevMap CameraImage Frame FrameStamp MAP_CLASSES Prediction Sequence",
+    "bevcli.geometry.boxes": "Boxes3D",
+    "bevcli.geometry.cameras": "Camera CameraRig",
+    "bevcli.geometry.transforms": "Pose",
+    "bevcli.inference.load": "Model load_model",
+    "bevcli.inference.run": "run",
+    "bevcli.recording.options": "RecordingOptions",
+    "bevcli.recording.writer": "Recording",
+    "bevcli.rig.check_calibration": "check_calibration",
+    "bevcli.runs.run_into_folder": "RunOptions run_into_folder",
+    "bevcli.sequences.open": "open_sequence",
+    "bevcli.synth.export": "render",
+    "bevcli.viewer.recording_file": "show",
 }
-
-__all__ = [
-    "MAP_CLASSES",
-    "BevMap",
-    "BevcliError",
-    "Boxes3D",
-    "Camera",
-    "CameraImage",
-    "CameraRig",
-    "Frame",
-    "FrameStamp",
-    "Model",
-    "Pose",
-    "Prediction",
-    "Recording",
-    "RecordingOptions",
-    "RunOptions",
-    "Sequence",
-    "check_calibration",
-    "evaluate",
-    "load_model",
-    "open_sequence",
-    "render",
-    "run",
-    "run_into_folder",
-    "show",
-]
+_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
+__all__ = list(_MODULES)
 
 
 def __getattr__(name: str) -> Any:

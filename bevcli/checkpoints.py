@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
 from importlib import resources
 from pathlib import Path
 
@@ -13,24 +14,16 @@ from torch import Tensor
 
 from bevcli.config import known_models, load_config
 from bevcli.errors import WeightsError
-from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
-from bevcli.model.build import build_model
-from bevcli.model.official_keys import from_official, is_official, unused_keys
+from bevcli.model.config import ModelConfig
+from bevcli.model.network import Network
+from bevcli.model.official_keys import from_official, is_official
+from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.parsing.pickles import Placeholder
-from bevcli.parsing.pth import StoredTensor, read_pth
-from bevcli.parsing.safetensors_file import read_safetensors
+from bevcli.parsing.pth import StoredTensor, read_pth, read_safetensors
 
 # The types of numbers that weights may have, and the end of the only keys whose numbers are integers.
 FLOATS = (torch.float32, torch.float16, torch.bfloat16, torch.float64)
 INTEGER_KEY = "num_batches_tracked"
-
-
-# Parts of the official BEVFormerV2 files that only its training uses: a head on the image features, and further groups
-# of object queries.
-_PERSPECTIVE_HEAD = "fcos3d_bbox_head."
-_CALIBRATION_EMBEDDING = "calibration_embedding."
-_OBJECT_QUERIES = "decoder.query_embedding"
-OFFICIAL_QUERIES = 900  # of all published models; a group of BEVFormerV2 has as many
 
 
 @dataclass(frozen=True)
@@ -49,7 +42,7 @@ class KeyReport:
 
     @property
     def fits(self) -> bool:
-        """Whether there are no differences."""
+        """True where nothing differs."""
         return not (self.missing or self.unexpected or self.misshapen)
 
     def describe(self) -> str:
@@ -78,35 +71,18 @@ class Checkpoint:
     left_out: str = ""
     not_read: tuple[str, ...] = ()
 
+    @cached_property
+    def models(self) -> tuple[str, ...]:
+        """Names of the known models that the state dict fits."""
+        return fitting_models(self.state)
 
-@dataclass(frozen=True)
-class CheckpointSummary:
-    """What a weights file contains.
-
-    Attributes:
-        path: the file.
-        models: names of the known models that it fits.
-        official: whether the file uses the key names of the released code.
-        tensors: number of tensors.
-        parameters: number of values in all tensors, running statistics of batch norms included.
-        file_bytes: size of the file.
-        facts: metadata in the file, such as its epoch.
-        left_out: what of the file is for training only and is not counted; "" for nothing.
-        not_read: classes and functions in the file whose objects were not read.
-    """
-
-    path: Path
-    models: tuple[str, ...]
-    official: bool
-    tensors: int
-    parameters: int
-    file_bytes: int
-    facts: Mapping[str, str]
-    left_out: str = ""
-    not_read: tuple[str, ...] = ()
+    @property
+    def parameters(self) -> int:
+        """Number of values in all tensors, running statistics of batch norms included."""
+        return sum(tensor.numel() for tensor in self.state.values())
 
 
-def load_weights(path: Path, model: BEVFormerBase, *, resample: bool = False) -> Checkpoint:
+def load_weights(path: Path, model: TemporalModel, *, resample: bool = False) -> Checkpoint:
     """Loads a weights file into a model, in place. Keys and shapes must be exactly those of the model.
 
     Args:
@@ -119,62 +95,37 @@ def load_weights(path: Path, model: BEVFormerBase, *, resample: bool = False) ->
     """
     checkpoint = read_checkpoint(path)
     if resample:
-        state = model.bev_queries.resampled(checkpoint.state, "bev_queries.")
-        added = {key: value for key, value in model.state_dict().items() if key.startswith(_CALIBRATION_EMBEDDING)}
-        checkpoint = replace(checkpoint, state=added | dict(state))
+        assert isinstance(model, Network)
+        checkpoint = replace(checkpoint, state=model.resampled(checkpoint.state))
     require_fit(checkpoint, model.config.name, model.state_dict())
     model.load_state_dict(dict(checkpoint.state))
     return checkpoint
 
 
 def require_fit(checkpoint: Checkpoint, model: str, expected: Mapping[str, Tensor]) -> None:
-    """Raises WeightsError where a weights file does not fit a model.
-
-    Args:
-        checkpoint: the contents of the weights file.
-        model: the model's name.
-        expected: the model's state dict.
-    """
+    """Raises WeightsError where a weights file does not fit a model. expected: the model's state dict."""
     report = compare(checkpoint.state, expected)
     if report.fits:
         return
-    others = fitting_models(checkpoint.state)
-    if others:
-        raise WeightsError(
-            f"{checkpoint.path}: expected weights of model {model}, found those of {' or '.join(others)}"
-        )
+    if checkpoint.models:
+        others = " or ".join(checkpoint.models)
+        raise WeightsError(f"{checkpoint.path}: expected weights of model {model}, found those of {others}")
     raise WeightsError(f"{checkpoint.path}: does not fit model {model} nor any known one; {report.describe()}")
 
 
-def convert(source: Path, destination: Path) -> CheckpointSummary:
-    """Writes a weights file as .safetensors with our key names.
+def convert(source: Path, destination: Path) -> Checkpoint:
+    """Writes a weights file as .safetensors with our key names; returns what it then contains.
 
     Raises WeightsError where the file fits none of the known models.
     """
     checkpoint = read_checkpoint(source)
-    models = fitting_models(checkpoint.state)
-    if not models:
+    if not checkpoint.models:
         raise WeightsError(f"{source}: fits none of the known models ({', '.join(known_models())})")
     if destination.suffix != ".safetensors":
         raise WeightsError(f"{destination}: expected a file name that ends in .safetensors")
     tensors = {key: tensor.contiguous() for key, tensor in checkpoint.state.items()}
-    safetensors.torch.save_file(tensors, destination, {**checkpoint.facts, "model": models[0]})
-    return inspect(destination)
-
-
-def inspect(path: Path) -> CheckpointSummary:
-    """What a weights file contains."""
-    checkpoint = read_checkpoint(path)
-    return CheckpointSummary(
-        path=path,
-        models=fitting_models(checkpoint.state),
-        official=checkpoint.official,
-        tensors=len(checkpoint.state),
-        parameters=sum(tensor.numel() for tensor in checkpoint.state.values()),
-        file_bytes=path.stat().st_size,
-        facts=checkpoint.facts,
-        left_out=checkpoint.left_out,
-    )
+    safetensors.torch.save_file(tensors, destination, {**checkpoint.facts, "model": checkpoint.models[0]})
+    return read_checkpoint(destination)
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
@@ -191,13 +142,10 @@ def read_checkpoint(path: Path) -> Checkpoint:
     else:
         state, facts, not_read = _read_pth(path)
     _check_numbers(path, state)
-    if not is_official(state):
-        return Checkpoint(path, state, official=False, facts=facts, not_read=not_read)
-    unused = unused_keys(state)
-    state, left_out = _without_training_parts(from_official(state))
-    if unused:
-        left_out = f"{len(unused)} keys, such as {unused[0]}"
-    return Checkpoint(path, state, official=True, facts=facts, left_out=left_out, not_read=not_read)
+    official, left_out = is_official(state), ""
+    if official:
+        state, left_out = from_official(state)
+    return Checkpoint(path, state, official, facts, left_out, not_read)
 
 
 def bundled_weights(model: str) -> Path | None:
@@ -223,27 +171,18 @@ def compare(state: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> KeyR
 
 def fitting_models(state: Mapping[str, Tensor]) -> tuple[str, ...]:
     """Names of the known models that a state dict fits."""
-    return tuple(name for name in known_models() if compare(state, expected_state(load_config(name))).fits)
+    return tuple(name for name in known_models() if compare(state, _expected_of(name)).fits)
 
 
-def expected_state(config: BEVFormerConfig) -> dict[str, Tensor]:
+@cache
+def _expected_of(model: str) -> Mapping[str, Tensor]:
+    return expected_state(load_config(model))
+
+
+def expected_state(config: ModelConfig) -> dict[str, Tensor]:
     """The state dict that a model needs, with tensors that have a shape but no contents."""
     with torch.device("meta"):
         return build_model(config).state_dict()
-
-
-def _without_training_parts(state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
-    """A state dict of an official file without the parts that only training uses, and these parts in words."""
-    head = [key for key in state if key.startswith(_PERSPECTIVE_HEAD)]
-    kept = {key: tensor for key, tensor in state.items() if key not in head}
-    parts = [f"{len(head)} keys {_PERSPECTIVE_HEAD}*"] if head else []
-    queries = state.get(_OBJECT_QUERIES)
-    if queries is not None and queries.ndim == 2:
-        groups, rest = divmod(len(queries), OFFICIAL_QUERIES)
-        if groups > 1 and not rest:
-            kept[_OBJECT_QUERIES] = queries[:OFFICIAL_QUERIES].clone()
-            parts.append(f"{groups - 1} of {groups} groups of object queries")
-    return kept, " and ".join(parts)
 
 
 def _read_pth(path: Path) -> tuple[dict[str, Tensor], dict[str, str], tuple[str, ...]]:
@@ -256,25 +195,18 @@ def _read_pth(path: Path) -> tuple[dict[str, Tensor], dict[str, str], tuple[str,
             f"{path}: is not safe to read: its tensors are hidden behind code ({hidden:.100}), which was not run "
             "(expected tensors by name, at the top level or under state_dict)"
         )
-    if not isinstance(state, dict) or not state or not all(_is_tensor(key, value) for key, value in state.items()):
+    named = state.items() if isinstance(state, dict) else ()
+    if not named or not all(isinstance(key, str) and isinstance(value, StoredTensor) for key, value in named):
         raise WeightsError(
             f"{path}: contains no state dict (expected tensors by name, at the top level or under state_dict)"
         )
     meta = contents.get("meta")
-    facts = (
-        {}
-        if not isinstance(meta, dict)
-        else {key: _fact(meta[key]) for key in ("epoch", "iter", "time") if key in meta}
-    )
+    facts = {key: _fact(meta.get(key)) for key in ("epoch", "iter", "time")} if isinstance(meta, dict) else {}
     return file.tensors(state), {key: fact for key, fact in facts.items() if fact}, file.left_out
 
 
-def _is_tensor(key: object, value: object) -> bool:
-    return isinstance(key, str) and isinstance(value, StoredTensor)
-
-
 def _placeholders(state: object) -> str:
-    """What stands in place of tensors: the class or function of the first placeholder, "" for none."""
+    """The class or function of the first placeholder in place of a tensor, "" for none."""
     values = state.items() if isinstance(state, dict) else [("", state)]
     for key, value in values:
         if isinstance(value, Placeholder):

@@ -13,22 +13,19 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
+import msgspec
+
 from bevcli.errors import ConfigError
-from bevcli.model.bevformer import BEVFormerConfig
-from bevcli.model.bevformer_v2 import BEVFormerV2Config
-from bevcli.model.uniad import UniADConfig
+from bevcli.model.config import ModelConfig
+from bevcli.model.temporal_model import TemporalModel
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import read_text
+from bevcli.registry import entries, load
 
 T = TypeVar("T")
 
-# The key that says which model a file configures, and its values. A file without it configures a BEVFormer.
+# The key that names the registered model that a file configures. A file without it configures a BEVFormer.
 ARCHITECTURE = "architecture"
-ARCHITECTURES: dict[str, type[BEVFormerConfig]] = {
-    "BEVFormer": BEVFormerConfig,
-    "BEVFormerV2": BEVFormerV2Config,
-    "UniAD": UniADConfig,
-}
 
 TRACKING = "tracking"  # the table of a model's file with the parameters of the tracker
 TRAINING = "training"  # the table of a model's file with the settings of its training, which the model does not need
@@ -40,23 +37,23 @@ def known_models() -> tuple[str, ...]:
     return tuple(sorted(Path(file.name).stem for file in files if file.name.endswith(".toml")))
 
 
-def load_config(name_or_path: str | Path) -> BEVFormerConfig:
+def load_config(name_or_path: str | Path) -> ModelConfig:
     """The configuration of a known model ("tiny"), or of a file whose name ends in .toml.
 
     Raises ConfigError where there is none, or where its contents are wrong.
     """
-    text, file = _read_model(str(name_or_path))
-    return config_of_table(_parse(text, file), file)
+    return config_of_table(*_read_model(str(name_or_path)))
 
 
-def config_of_table(table: dict[str, Any], file: str) -> BEVFormerConfig:
+def config_of_table(table: dict[str, Any], file: str) -> ModelConfig:
     """The configuration in the parsed contents of a model's file. Raises ConfigError, which names `file`."""
-    architecture = table.get(ARCHITECTURE, "BEVFormer")
-    if architecture not in list(ARCHITECTURES):
-        expected = " or ".join(f'"{name}"' for name in ARCHITECTURES)
+    architecture, known = table.get(ARCHITECTURE, ModelConfig.architecture), list(entries("bevcli.models"))
+    if architecture not in known:
+        expected = " or ".join(f'"{name}"' for name in known)
         raise ConfigError(f'{file}: "{ARCHITECTURE}" must be {expected}, but is {architecture!r:.60}')
     settings = {key: table[key] for key in table if key not in (TRACKING, TRAINING, ARCHITECTURE)}
-    config = _dataclass(settings, ARCHITECTURES[architecture], file, "")
+    model: type[TemporalModel] = load("bevcli.models", architecture)
+    config = _dataclass(settings, model.config_class, file, "")
     if not re.fullmatch(r"[\w][\w. +-]{0,99}", config.name):
         expected = "up to 100 letters, digits and - . + _, because it names folders"
         raise ConfigError(f'{file}: "name" is {config.name!r:.60} (expected {expected})')
@@ -68,8 +65,8 @@ def load_table(name_or_path: str | Path, table: str, kind: type[T]) -> T:
 
     Raises ConfigError where there is no such file, or where its contents are wrong.
     """
-    text, file = _read_model(str(name_or_path))
-    return settings_of_table(_parse(text, file), table, kind, file)
+    contents, file = _read_model(str(name_or_path))
+    return settings_of_table(contents, table, kind, file)
 
 
 def settings_of_table(contents: dict[str, Any], table: str, kind: type[T], file: str) -> T:
@@ -80,13 +77,12 @@ def settings_of_table(contents: dict[str, Any], table: str, kind: type[T], file:
     return _dataclass(settings, kind, file, f"{table}.")
 
 
-def as_table(config: BEVFormerConfig, tracking: object = None) -> dict[str, Any]:
+def as_table(config: ModelConfig, tracking: object = None) -> dict[str, Any]:
     """The contents of the file of a model, from which `config_of_table` makes the same configuration.
 
     tracking: the dataclass of the table TRACKING; None for no such table.
     """
-    names = {kind: name for name, kind in ARCHITECTURES.items()}
-    table = {ARCHITECTURE: names[type(config)], **_plain(config)}
+    table = {ARCHITECTURE: config.architecture, **_plain(config)}
     return table if tracking is None else table | {TRACKING: _plain(tracking)}
 
 
@@ -102,26 +98,20 @@ def _plain(settings: Any) -> dict[str, Any]:
     return found
 
 
-def _parse(text: str, file: str) -> dict[str, Any]:
-    return parse_toml(text, file, ConfigError)
-
-
-def _read_model(name: str) -> tuple[str, str]:
-    """Text and name of the TOML file of a known model, or of a file whose name ends in .toml."""
+def _read_model(name: str) -> tuple[dict[str, Any], str]:
+    """Contents and name of the TOML file of a known model, or of a file whose name ends in .toml."""
+    known = ", ".join(known_models())
     if name.endswith(".toml"):
-        path = Path(name)
+        path, file = Path(name), name
         if not path.is_file():
-            raise ConfigError(f"{path}: file not found; known models are {', '.join(known_models())}")
-        return _read(path), name
-    if name not in known_models():
-        known = ", ".join(known_models())
-        raise ConfigError(f'unknown model "{name}"; expected one of {known}, or a FILE.toml')
-    file = f"{name}.toml"
-    return resources.files("bevcli").joinpath("configs", file).read_text(encoding="utf-8"), file
-
-
-def _read(path: Path) -> str:
-    return read_text(path, TOML_BYTES, error=ConfigError)
+            raise ConfigError(f"{path}: file not found; known models are {known}")
+        text = read_text(path, TOML_BYTES, error=ConfigError)
+    else:
+        if name not in known_models():
+            raise ConfigError(f'unknown model "{name}"; expected one of {known}, or a FILE.toml')
+        file = f"{name}.toml"
+        text = resources.files("bevcli").joinpath("configs", file).read_text(encoding="utf-8")
+    return parse_toml(text, file, ConfigError), file
 
 
 def _dataclass(table: dict[str, Any], kind: type[T], file: str, prefix: str) -> T:
@@ -146,41 +136,19 @@ def _dataclass(table: dict[str, Any], kind: type[T], file: str, prefix: str) -> 
 def _value(value: Any, kind: Any, file: str, key: str) -> Any:
     if dataclasses.is_dataclass(kind) and isinstance(value, dict):
         return _dataclass(value, typing.cast(type, kind), file, f"{key}.")
-    if not _fits(value, kind):
-        raise ConfigError(f'{file}: "{key}" must be {_describe(kind)}, but is {value!r}')
-    return _converted(value, kind)
+    try:
+        if _is_finite(value):
+            return msgspec.convert(value, kind)
+    except msgspec.ValidationError:
+        pass
+    raise ConfigError(f'{file}: "{key}" must be {_describe(kind)}, but is {value!r}')
 
 
-def _fits(value: Any, kind: Any) -> bool:
-    """Whether a TOML value fits a type: a scalar, Literal, tuple, or a union of these."""
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin is Literal:
-        return value in arguments and not isinstance(value, bool)
-    if origin in (typing.Union, types.UnionType):
-        return any(_fits(value, argument) for argument in arguments)
-    if origin is tuple:
-        if not isinstance(value, list):
-            return False
-        kinds = _element_kinds(arguments, len(value))
-        return len(kinds) == len(value) and all(map(_fits, value, kinds))
-    if kind is float:
-        return type(value) in (int, float) and math.isfinite(value)
-    return type(value) is kind
-
-
-def _converted(value: Any, kind: Any) -> Any:
-    """A fitting value converted to a type: lists to tuples, integers to floats."""
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin in (typing.Union, types.UnionType):
-        return _converted(value, next(argument for argument in arguments if _fits(value, argument)))
-    if origin is tuple:
-        return tuple(map(_converted, value, _element_kinds(arguments, len(value))))
-    return float(value) if kind is float else value
-
-
-def _element_kinds(arguments: tuple[Any, ...], length: int) -> tuple[Any, ...]:
-    """The types of a tuple's elements; tuple[int, ...] has any length."""
-    return (arguments[0],) * length if arguments[-1] is Ellipsis else arguments
+def _is_finite(value: Any) -> bool:
+    """False for NaN and infinity, also in a list."""
+    if isinstance(value, list):
+        return all(map(_is_finite, value))
+    return not isinstance(value, float) or math.isfinite(value)
 
 
 def _describe(kind: Any) -> str:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -116,7 +118,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class DriveFacts:
-    """What a drive states about itself beyond its frames.
+    """Statements of a drive about itself, beyond its frames.
 
     Attributes:
         rendered: whether `bevcli render` made its images.
@@ -128,27 +130,33 @@ class DriveFacts:
 
 
 class Sequence(Protocol):
-    """A drive: frames in order. The readers in `bevcli.sequences` follow this protocol.
-
-    A sequence may have an attribute `facts`, see `facts_of`.
+    """A drive: frames in order. A reader inherits it for the attributes that have a default.
 
     Attributes:
         name: of the drive, for output folders and titles.
         rig: the cameras of the first frame; `Frame.rig` holds each frame's own (nuScenes' scenes differ).
+        stamps: identity and time of each frame, in order. No image is decoded for this.
         has_ego_motion: whether poses are known. If not, every pose is the identity, and boxes can be given in the ego
             frame only.
         notes: assumptions and defaults that the user should be told once.
+        facts: statements of the drive about itself.
     """
 
     name: str
     rig: CameraRig
+    stamps: tuple[FrameStamp, ...]
     has_ego_motion: bool
-    notes: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+    facts: DriveFacts = DriveFacts()
 
     @property
-    def stamps(self) -> tuple[FrameStamp, ...]:
-        """Identity and time of each frame, in order. No image is decoded for this."""
-        ...
+    def input_files(self) -> tuple[Path, ...]:
+        """The files that a resumed run needs unchanged, such as tables and bags; image files are not among them."""
+        return ()
+
+    def image_files(self, place: int) -> tuple[Path, ...]:
+        """The image files and videos of the frame at a place; none where its images are in `input_files`."""
+        return ()
 
     def load(self, place: int) -> Frame:
         """The frame at a place (0 to len(stamps) - 1), with decoded images. Called in order, from one thread.
@@ -158,10 +166,26 @@ class Sequence(Protocol):
         ...
 
 
-def facts_of(sequence: Sequence) -> DriveFacts:
-    """The attribute `facts` of a sequence; a sequence without it states nothing."""
-    facts = getattr(sequence, "facts", None)
-    return facts if isinstance(facts, DriveFacts) else DriveFacts()
+class DerivedSequence(Sequence):
+    """A sequence made from another one, with all that the other states. A subclass changes some of it."""
+
+    def __init__(self, sequence: Sequence) -> None:
+        self.sequence = sequence
+        self.name, self.rig, self.stamps = sequence.name, sequence.rig, sequence.stamps
+        self.has_ego_motion, self.notes, self.facts = sequence.has_ego_motion, sequence.notes, sequence.facts
+
+    @property
+    def input_files(self) -> tuple[Path, ...]:
+        """Those of the other sequence."""
+        return self.sequence.input_files
+
+    def image_files(self, place: int) -> tuple[Path, ...]:
+        """Those of the other sequence."""
+        return self.sequence.image_files(place)
+
+    def load(self, place: int) -> Frame:
+        """The frame of the other sequence at a place."""
+        return self.sequence.load(place)
 
 
 @dataclass(frozen=True)
@@ -192,7 +216,7 @@ class Probe:
 
 @dataclass(frozen=True)
 class AttentionView:
-    """What the attentions of the last encoder layer sampled.
+    """Samples of the attentions of the last encoder layer.
 
     Attributes:
         history_weight: (rows, columns) 0 to 1, the share of the previous BEV map in what temporal self-attention
@@ -202,6 +226,32 @@ class AttentionView:
 
     history_weight: Array | None = None
     probes: tuple[Probe, ...] = ()
+
+
+class StartReason(Enum):
+    """A reason to step without history."""
+
+    HISTORY_OFF = "history is off"
+    NO_HISTORY = "the model uses no history"
+    FIRST_FRAME = "first frame"
+    NEW_SCENE = "new scene"
+    GAP = "gap"
+
+
+@dataclass(frozen=True)
+class NewStart:
+    """A step without history. Its text is "first frame", "gap of 2.5 s" and so on.
+
+    Attributes:
+        reason: for it.
+        gap_s: time since the frame before, with StartReason.GAP.
+    """
+
+    reason: StartReason
+    gap_s: float = 0.0
+
+    def __str__(self) -> str:
+        return f"gap of {self.gap_s:.1f} s" if self.reason is StartReason.GAP else self.reason.value
 
 
 @dataclass(frozen=True)
@@ -216,7 +266,7 @@ class Prediction:
         grid: the BEV grid.
         bev: (Y·X, C) tensor, the BEV feature map; cell index row * columns + column, rows from the smallest y. None
             where the frame has no image or its numbers are not finite.
-        started_anew: why no history was used ("first frame", "new scene", …), "" where it was used.
+        started_anew: the reason why no history was used; None where it was used.
         camera_embeddings: camera of the rig -> camera of the model whose embedding it took, in the model's order.
         skipped: whether the frame has no image at all: no boxes, and the state was passed on.
         not_finite: the part of the model where numbers became NaN or infinite, such as "encoder layer 3 (…)": the frame
@@ -232,7 +282,7 @@ class Prediction:
     world_from_ego: Pose
     grid: BevGrid
     bev: Tensor | None
-    started_anew: str
+    started_anew: NewStart | None
     camera_embeddings: Mapping[str, str] = field(default_factory=dict)
     skipped: bool = False
     not_finite: str = ""

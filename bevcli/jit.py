@@ -17,24 +17,18 @@ from typing import Any
 
 import numba
 
-_NO_CACHE = "cannot cache function"
-
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """`numba.njit(cache=True, **options)`, with a temporary cache or none where numba finds no place for it."""
 
     def compiled(function: Callable[..., Any]) -> Any:
-        try:
-            return numba.njit(cache=True, **options)(function)
-        except RuntimeError as error:
-            if _NO_CACHE not in str(error):
-                raise
-        if not _temporary_cache():
-            return numba.njit(**options)(function)
-        try:
-            return numba.njit(cache=True, **options)(function)
-        except RuntimeError:
-            return numba.njit(**options)(function)
+        for is_cached in (lambda: True, _temporary_cache):
+            try:
+                return numba.njit(cache=is_cached(), **options)(function)
+            except RuntimeError as error:
+                if "cannot cache function" not in str(error):
+                    raise
+        return numba.njit(**options)(function)
 
     return compiled
 

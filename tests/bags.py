@@ -180,8 +180,7 @@ def write_mcap(path: Path, messages: Iterator[Message] | list[Message], *, chunk
 
 def write_rosbag2(folder: Path, messages: Iterator[Message] | list[Message], storage: str = "sqlite3") -> Path:
     """A rosbag2 folder with metadata.yaml and a .db3 or .mcap file."""
-    from rosbags.rosbag2 import StoragePlugin
-    from rosbags.rosbag2 import Writer as BagWriter
+    from rosbags.rosbag2 import StoragePlugin, Writer as BagWriter
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)

@@ -1,5 +1,6 @@
-"""Fixtures of several tests: a tiny model, and the folder of the reference data."""
+"""A tiny model, the folder of the reference data, and how two workers share the tests."""
 
+import gc
 import os
 from dataclasses import fields
 from pathlib import Path
@@ -9,14 +10,48 @@ import torch
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import CLASSES
-from bevcli.model.bev_fusion import BevFusionConfig
-from bevcli.model.bevformer import BEVFormer, BEVFormerConfig, ImageConfig
-from bevcli.model.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config
+from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer_v2.bev_fusion import BevFusionConfig
+from bevcli.model.bevformer_v2.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config
+from bevcli.model.camera_assignment import NUSCENES_YAWS_DEG
+from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.decoder import DecoderConfig
 from bevcli.model.encoder import EncoderConfig
 from bevcli.model.fpn import FPNConfig
 from bevcli.model.resnet import ResNetConfig
-from bevcli.pipeline.camera_assignment import NUSCENES_YAWS_DEG
+from bevcli.viewer import recording_file
+
+# Files that one worker runs, because they share what takes long: imports for the export, processes to fork from.
+TOGETHER = {
+    **dict.fromkeys(("test_engines", "test_export_onnx", "test_export_window"), "export"),
+    **dict.fromkeys(("test_interrupted_run", "test_process_group"), "processes"),
+}
+# What takes longest comes first, so that no worker ends with it.
+FIRST = ("export", "processes", "test_fuzz", "test_equals_original", "test_resume", "test_drive", "test_demo_model")
+
+
+def group_of(file: str) -> str:
+    return TOGETHER.get(Path(file).stem, Path(file).stem)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    rank = {group: place for place, group in enumerate(FIRST)}
+    items.sort(key=lambda item: rank.get(group_of(item.location[0]), len(rank)))
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()  # the modules stay: the garbage collector need not visit their million objects again and again
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
+    from xdist.scheduler import LoadFileScheduling
+
+    class GroupScheduling(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return group_of(super()._split_scope(nodeid))
+
+    return GroupScheduling(config, log)
 
 
 @pytest.fixture(scope="session")
@@ -28,10 +63,16 @@ def shared() -> Path:
     return Path(folder)
 
 
+@pytest.fixture
+def unchecked_recordings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`open_recording` starts no process that reads all of a recording: the test does so itself."""
+    monkeypatch.setattr(recording_file, "_check", lambda file, path: None)
+
+
 @pytest.fixture(scope="session")
-def mini_config() -> BEVFormerConfig:
+def mini_config() -> ModelConfig:
     """A BEVFormer with all its parts, so small that a step takes milliseconds."""
-    return BEVFormerConfig(
+    return ModelConfig(
         name="mini",
         classes=CLASSES,
         cameras=tuple(NUSCENES_YAWS_DEG),

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from bevcli.frame import CameraImage, Frame, FrameStamp
+from bevcli.frame import CameraImage, Frame, FrameStamp, Sequence
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import GRAVITY, Kinematics
 from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
-from bevcli.pipeline.camera_assignment import NUSCENES_YAWS_DEG
+from bevcli.model.camera_assignment import NUSCENES_YAWS_DEG
 
 
 def make_camera(name: str, yaw_deg: float, width: int = 320, height: int = 180) -> Camera:
@@ -25,11 +25,10 @@ def make_rig(yaws_deg: dict[str, float] | None = None) -> CameraRig:
     return CameraRig(tuple(make_camera(name, yaw) for name, yaw in yaws_deg.items()), default_ego_from_bev())
 
 
-class MemorySequence:
-    """A drive of noise images on a gentle curve, in memory, as a `Sequence`."""
+class MemorySequence(Sequence):
+    """A drive of noise images on a gentle curve, in memory."""
 
     name = "memory"
-    notes = ()
     has_ego_motion = True
 
     def __init__(self, count: int = 4, rig: CameraRig | None = None, scenes: str = "aaaaaaaaaa", step_s: float = 0.5):

@@ -8,7 +8,7 @@ import torch
 from memory_drive import MemorySequence
 
 from bevcli.config import load_config
-from bevcli.frame import AttentionView, CameraSamples, Frame, Prediction, Probe
+from bevcli.frame import AttentionView, CameraSamples, Frame, NewStart, Prediction, Probe, StartReason
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import inverse
@@ -50,7 +50,7 @@ def predict(frame: Frame) -> Prediction:
         world_from_ego=frame.world_from_ego,
         grid=GRID,
         bev=torch.tensor(random.normal(size=(GRID.rows * GRID.columns, 16)), dtype=torch.float32),
-        started_anew="" if frame.stamp.index else "first frame",
+        started_anew=None if frame.stamp.index else NewStart(StartReason.FIRST_FRAME),
         stage_seconds={"backbone": 0.2, "encoder": 0.1},
         attention=AttentionView(
             np.full((GRID.rows, GRID.columns), 0.5),

@@ -11,7 +11,11 @@ uses float64. Kernels of other libraries see no numbers: replace them by the pla
 from __future__ import annotations
 
 import contextlib
+import sys
 from collections.abc import Callable, Iterator
+from importlib.machinery import ModuleSpec
+from importlib.util import find_spec
+from types import ModuleType
 from typing import Any
 
 import torch
@@ -145,6 +149,23 @@ def _held(value: Any) -> Any:
     return value.held if isinstance(value, OnDevice) else value
 
 
+def provide_triton(monkeypatch: Any) -> None:
+    """Puts the parts of Triton that surround a kernel in the place of a Triton that is not installed."""
+    if find_spec("triton") is not None:
+        return
+    triton, language = ModuleType("triton"), ModuleType("triton.language")
+    triton.__spec__ = ModuleSpec("triton", loader=None)
+    parts = {
+        "language": language,
+        "jit": lambda kernel: kernel,
+        "cdiv": lambda count, size: -(-count // size),
+        "next_power_of_2": lambda number: 1 << (number - 1).bit_length(),
+    }
+    vars(triton).update(parts)
+    monkeypatch.setitem(sys.modules, "triton", triton)
+    monkeypatch.setitem(sys.modules, "triton.language", language)
+
+
 @contextlib.contextmanager
 def simulated(name: str, monkeypatch: Any, sample: Callable[..., None]) -> Iterator[SimulatedDevice]:
     """A simulated device. What only a real one has is replaced: pinned memory, events, streams, the Triton kernel.
@@ -163,10 +184,11 @@ def simulated(name: str, monkeypatch: Any, sample: Callable[..., None]) -> Itera
         return [_held(tensor) for tensor in tensors]
 
     monkeypatch.setattr("bevcli.model.upload.pinned", pinned)
-    monkeypatch.setattr("bevcli.pipeline.transfer._on_cpu", on_cpu)
-    monkeypatch.setattr("bevcli.pipeline.stage_clock.StageClock._now", lambda clock: 0.0)
-    monkeypatch.setattr("bevcli.pipeline.stage_clock.StageClock.read", lambda clock: {})
+    monkeypatch.setattr("bevcli.inference.transfer._on_cpu", on_cpu)
+    monkeypatch.setattr("bevcli.inference.stage_clock.StageClock._now", lambda clock: 0.0)
+    monkeypatch.setattr("bevcli.inference.stage_clock.StageClock.read", lambda clock: {})
     if device.device.type == "cuda":
+        provide_triton(monkeypatch)
         from bevcli.model.kernels import triton_attention
 
         launch = {"__getitem__": lambda kernel, grid: sample}

@@ -1,8 +1,5 @@
-"""A fleet of small drives, and a model whose step takes milliseconds."""
+"""A fleet of small drives."""
 
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,40 +9,12 @@ from recorded_drive import with_truth
 
 from bevcli.batch.job import Job
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
-from bevcli.pipeline.camera_assignment import NUSCENES_YAWS_DEG
-from bevcli.pipeline.run import RunOptions
+from bevcli.inference.options import ModelOptions
+from bevcli.model.camera_assignment import NUSCENES_YAWS_DEG
 from bevcli.recording.options import RecordingOptions
+from bevcli.runs.run_into_folder import RunOptions
 from bevcli.sequences.native.writer import NativeWriter
 
-MINI_TOML = """
-name = "mini"
-classes = ["car", "truck", "construction_vehicle", "bus", "trailer",
-  "barrier", "motorcycle", "bicycle", "pedestrian", "traffic_cone"]
-cameras = ["CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT"]
-channels = 16
-[image]
-size = [80, 45]
-color_order = "rgb"
-mean = [123.0, 116.0, 103.0]
-std = [58.0, 57.0, 57.0]
-[bev_grid]
-rows = 8
-columns = 8
-[backbone]
-blocks = [1, 1, 1, 1]
-width = 4
-[encoder]
-layers = 1
-attention_heads = 2
-[decoder]
-layers = 1
-attention_heads = 2
-queries = 20
-max_boxes = 10
-[tracking]
-birth_score = 0.0
-keep_score = 0.0
-"""
 RIG = CameraRig(
     tuple(make_camera(name, yaw, 80, 45) for name, yaw in NUSCENES_YAWS_DEG.items()), default_ego_from_bev()
 )
@@ -85,29 +54,9 @@ def write_fleet(folder: Path, count: int, frames: int = 3, *, truth: bool = Fals
 def make_job(out: Path | str, toml: Path, **options) -> Job:
     """A job as the command line makes it."""
     run = RunOptions(recording=RecordingOptions(score=0.0))
-    reading = {"rate_hz": None, "ego_motion": "required"}
-    return Job(str(out), str(toml), untrained=True, device="cpu", reading=reading, run=run, **options)
+    return Job(str(out), ModelOptions(str(toml), untrained=True, device="cpu"), run=run, **options)
 
 
 def results_of(out: Path) -> dict[str, Path]:
     """Name of a drive -> folder of its results."""
     return {path.name.rpartition("-")[0]: path for path in (out / "drives").iterdir()}
-
-
-def start(folder: Path, *arguments: str) -> subprocess.Popen:
-    """`bevcli …` in a folder, with one thread per process."""
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "bevcli", *arguments]
-    return subprocess.Popen(
-        command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-    )
-
-
-def command(folder: Path, *arguments: str, timeout: float = 300) -> subprocess.CompletedProcess:
-    """The finished `bevcli …`."""
-    process = start(folder, *arguments)
-    try:
-        out, err = process.communicate(timeout=timeout)
-    finally:
-        process.kill()
-    return subprocess.CompletedProcess(process.args, process.returncode, out, err)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 import math
 import pickle
@@ -18,7 +19,6 @@ from bevcli.checkpoints import (
     convert,
     expected_state,
     fitting_models,
-    inspect,
     load_weights,
     read_checkpoint,
     require_fit,
@@ -27,9 +27,9 @@ from bevcli.cli.main import app
 from bevcli.config import known_models, load_config
 from bevcli.errors import WeightsError
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.build import build_model
 from bevcli.model.official_keys import from_official
 from bevcli.model.parts import model_parts
+from bevcli.model.temporal_model import build_model
 
 sys.path.insert(0, str(Path(__file__).parent / "model"))
 
@@ -63,7 +63,7 @@ def saved(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("model", ["tiny", "small", "base"])
 def test_official_keys_map_one_to_one_to_the_keys_of_our_model(model: str) -> None:
     state = {key: torch.empty(shape, device="meta") for key, shape in KEYS[model].items()}
-    report = compare(from_official(state), expected_state(load_config(model)))
+    report = compare(from_official(state)[0], expected_state(load_config(model)))
     assert report.fits, report.describe()
 
 
@@ -85,8 +85,8 @@ def official_v2(model: str, tmp_path: Path, **changes: tuple[int, ...]) -> Path:
 
 
 @pytest.mark.parametrize("model", V2_MODELS)
-def test_parts_of_official_v2_files_for_training_only_are_named_and_left_out(model: str, tmp_path: Path) -> None:
-    summary = inspect(official_v2(model, tmp_path))
+def test_parts_of_v2_files_for_training_are_named_and_left_out(model: str, tmp_path: Path) -> None:
+    summary = read_checkpoint(official_v2(model, tmp_path))
     assert model in summary.models
     assert set(summary.models) <= {model, "v2-t1-base", "v2-t1"}  # these two differ only in what is left out
     groups = "" if model == "v2-t1-base" else " and 10 of 11 groups of object queries"
@@ -105,10 +105,8 @@ def official_uniad(tmp_path: Path, *, version_1_0: bool) -> Path:
 
 
 @pytest.mark.parametrize(("version_1_0", "left_out"), [(False, 132), (True, 137)])
-def test_keys_of_official_uniad_files_without_effect_are_left_out(
-    version_1_0: bool, left_out: int, tmp_path: Path
-) -> None:
-    summary = inspect(official_uniad(tmp_path, version_1_0=version_1_0))
+def test_keys_of_uniad_files_without_effect_are_left_out(version_1_0: bool, left_out: int, tmp_path: Path) -> None:
+    summary = read_checkpoint(official_uniad(tmp_path, version_1_0=version_1_0))
     assert summary.models == ("uniad-track-map",)
     assert summary.left_out.startswith(f"{left_out} keys, such as ")
 
@@ -125,21 +123,28 @@ def test_weights_inspect_names_what_is_left_out(tmp_path: Path) -> None:
     assert "left out        363 keys fcos3d_bbox_head.* and 10 of 11 groups" in answer.stdout
 
 
+def test_weights_inspect_names_objects_that_were_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "small.pth"
+    torch.save({"state_dict": small_model().state_dict(), "meta": {"date": datetime.datetime(2022, 8, 16)}}, path)
+    answer = CliRunner().invoke(app, ["weights", "inspect", str(path)], catch_exceptions=False)
+    assert "not read        _codecs.encode, datetime.datetime (objects that are no weights" in answer.stdout
+    assert read_checkpoint(path).not_read == ("_codecs.encode", "datetime.datetime")
+
+
 def test_a_state_dict_fits_its_own_model_alone() -> None:
-    assert fitting_models(from_official(official_state("small"))) == ("small",)
+    assert fitting_models(from_official(official_state("small"))[0]) == ("small",)
 
 
 def test_different_official_keys_stay_different() -> None:
-    assert len(from_official(official_state("base"))) == len(official_state("base")) - 1  # without code_weights
+    assert len(from_official(official_state("base"))[0]) == len(official_state("base")) - 1  # without code_weights
 
 
-def test_the_summary_of_an_official_file_holds_model_and_metadata(official_tiny: Path) -> None:
-    summary = inspect(official_tiny)
+def test_the_summary_of_a_file_holds_model_and_metadata(official_tiny: Path) -> None:
+    summary = read_checkpoint(official_tiny)
     assert summary.models == ("tiny",)
     assert summary.official
     assert summary.facts == {"epoch": "24"}
-    assert summary.tensors == len(KEYS["tiny"]) - 1
-    assert summary.file_bytes == official_tiny.stat().st_size
+    assert len(summary.state) == len(KEYS["tiny"]) - 1
 
 
 @pytest.mark.parametrize("suffix", [".safetensors", ".pth"])
@@ -249,7 +254,7 @@ def test_a_file_that_does_not_contain_weights_is_an_error(tmp_path: Path, suffix
     path = tmp_path / f"file{suffix}"
     path.write_bytes(contents)
     with pytest.raises(WeightsError) as caught:
-        inspect(path)
+        read_checkpoint(path)
     assert f"file{suffix}: " in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -258,7 +263,7 @@ def test_code_in_a_file_is_an_error_and_does_not_run(tmp_path: Path, capsys: pyt
     for path, save in ((tmp_path / "a.pth", torch.save), (tmp_path / "b.pth", _pickle)):
         save({"state_dict": {"weight": Evil()}}, path)
         with pytest.raises(WeightsError, match="safe to read"):
-            inspect(path)
+            read_checkpoint(path)
     assert "ran" not in capsys.readouterr().out
 
 
@@ -267,12 +272,12 @@ def test_a_file_without_a_state_dict_is_an_error(tmp_path: Path, contents: objec
     path = tmp_path / "other.pth"
     torch.save(contents, path)
     with pytest.raises(WeightsError, match="contains no state dict"):
-        inspect(path)
+        read_checkpoint(path)
 
 
 def test_the_error_for_a_missing_file_names_it(tmp_path: Path) -> None:
     with pytest.raises(WeightsError, match=r"nothing\.pth: weights file not found"):
-        inspect(tmp_path / "nothing.pth")
+        read_checkpoint(tmp_path / "nothing.pth")
 
 
 def test_every_parameter_of_a_model_belongs_to_one_part() -> None:
@@ -309,6 +314,7 @@ def test_weights_inspect_gives_file_and_parts_as_json(official_tiny: Path) -> No
     command = ["weights", "inspect", str(official_tiny), "--model", "tiny", "--json"]
     data = json.loads(CliRunner().invoke(app, command, catch_exceptions=False).stdout)
     assert (data["models"], data["model"]) == (["tiny"], "tiny")
+    assert data["file_bytes"] == official_tiny.stat().st_size
     assert data["model_parameters"] == sum(part["parameters"] for part in data["parts"]) < data["parameters"]
     queries = next(part for part in data["parts"] if part["name"] == "BEV queries")
     assert queries == {

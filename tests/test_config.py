@@ -11,8 +11,8 @@ import pytest
 
 from bevcli.config import TRAINING, as_table, config_of_table, known_models, load_config, load_table
 from bevcli.errors import ConfigError
-from bevcli.model.bevformer_v2 import BEVFormerV2Config
-from bevcli.model.uniad import UniADConfig
+from bevcli.model.bevformer_v2.bevformer_v2 import BEVFormerV2Config
+from bevcli.model.uniad.uniad import UniADConfig
 
 
 @dataclass(frozen=True)
@@ -200,7 +200,7 @@ def test_the_architecture_of_a_file_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", known_models())
-def test_the_contents_of_a_model_file_come_back_from_its_configuration(name: str) -> None:
+def test_a_model_files_contents_come_back_from_its_configuration(name: str) -> None:
     config = load_config(name)
     contents = json.loads(json.dumps(as_table(config)))
     assert config_of_table(contents, name) == config

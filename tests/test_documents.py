@@ -10,11 +10,12 @@ from typing import Any
 import pytest
 import typer
 import yaml
+from test_layers import LEVEL
 
 from bevcli.cli.main import app
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")] + sorted(ROOT.glob("docs/*.md"))
+DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
 # These two describe earlier versions, whose commands and files may be gone.
 OF_TODAY = [path for path in DOCUMENTS if path.name not in ("CHANGELOG.md", "history.md")]
 
@@ -72,7 +73,8 @@ def options_of_all_commands(command: Any) -> set[str]:
     return option_names(command).union(*map(options_of_all_commands, getattr(command, "commands", {}).values()))
 
 
-@each(OF_TODAY)
+# docs/extend.md adds a command of its own: tests/test_extend.py runs it.
+@each([path for path in OF_TODAY if path.name != "extend.md"])
 def test_shown_commands_and_options_are_known(document: Path) -> None:
     for line in shown_commands(document):
         words = shlex.split(line, comments=True)[1:]
@@ -98,6 +100,31 @@ def test_files_of_the_repository_in_the_prose_exist(document: Path) -> None:
             assert (ROOT / span).exists(), span
 
 
+def rooms_of_the_readme() -> list[str]:
+    """The folders and modules of bevcli/ in the README's list, in its order; subfolders as "model/kernels"."""
+    [block] = re.findall(r"^bevcli/\n(.*?)^```", (ROOT / "README.md").read_text(), flags=re.MULTILINE | re.DOTALL)
+    rooms: list[str] = []
+    for line in block.splitlines():
+        indent, names = re.match(r"( +)(\S+(?: \S+)*)", line).groups()  # type: ignore[union-attr]
+        inside = "" if indent == "  " else next(f"{room}/" for room in reversed(rooms) if "/" not in room)
+        rooms += [f"{inside}{name.rstrip('/')}" for name in names.split()]
+    return rooms
+
+
+def test_readme_lists_every_folder_and_module_once() -> None:
+    package = ROOT / "bevcli"
+    found = [path.name for path in package.iterdir() if path.is_dir() and path.name not in ("__pycache__", "samples")]
+    found += [path.stem for path in package.glob("*.py")]
+    rooms = rooms_of_the_readme()
+    assert sorted(room for room in rooms if "/" not in room) == sorted(found)
+    assert all((package / room).is_dir() for room in rooms if "/" in room)
+
+
+def test_readme_lists_rooms_in_the_order_of_layers() -> None:
+    levels = [LEVEL[room] for room in rooms_of_the_readme() if room in LEVEL]
+    assert levels == sorted(levels)
+
+
 def make_targets() -> set[str]:
     return set(re.findall(r"^([a-z][\w-]*):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE))
 
@@ -108,7 +135,7 @@ def test_make_targets_in_the_prose_exist(document: Path) -> None:
     assert mentioned <= make_targets()
 
 
-def test_the_workflow_calls_make_targets_on_two_versions_of_python() -> None:
+def test_the_workflow_calls_make_targets_on_two_pythons() -> None:
     workflow = yaml.safe_load((ROOT / ".github/workflows/test.yml").read_text())
     job = workflow["jobs"]["test"]
     assert job["strategy"]["matrix"]["python"] == ["3.11", "3.13"]

@@ -11,7 +11,7 @@ import pytest
 
 import bevcli
 
-CODE = "import bevcli.model.kernels.bilinear, bevcli.synth.assets.triangles; print('ok')"
+CODE = "import bevcli.model.kernels.bilinear, bevcli.synth.render.rasteriser; print('ok')"
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def start(root: Path, temporary: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_without_a_writable_place_the_cache_is_a_private_temporary_folder(read_only, tmp_path):
+def test_without_a_writable_place_the_cache_is_a_private_folder(read_only, tmp_path):
     (tmp_path / "temporary").mkdir()
     done = start(read_only, tmp_path / "temporary")
     assert (done.returncode, done.stdout) == (0, "ok\n"), done.stderr

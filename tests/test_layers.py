@@ -1,6 +1,10 @@
-"""Who may import whom: a file imports from its own package and from lower layers only, and no imports form a cycle."""
+"""Who may import whom: a file imports from its own package and from lower layers only, and no imports form a cycle.
+
+Tests have short names.
+"""
 
 import ast
+import re
 from pathlib import Path
 
 import bevcli
@@ -8,7 +12,8 @@ import bevcli
 ROOT = Path(bevcli.__file__).parent
 # From the lowest to the highest; names in one set may not import each other.
 LAYERS = (
-    {"duration", "errors", "findings"},
+    {"_version", "duration", "errors", "findings"},
+    {"options", "registry"},
     {"parsing", "jit", "waiting"},
     {"geometry"},
     {"frame"},
@@ -20,7 +25,8 @@ LAYERS = (
     {"evaluation"},
     {"recording"},
     {"viewer"},
-    {"pipeline"},
+    {"inference"},
+    {"runs"},
     {"rig", "synth", "batch"},
     {"training", "benchmark", "explain"},
     {"robustness"},
@@ -63,7 +69,60 @@ def test_files_import_from_lower_layers_only():
 
 
 def test_no_imports_form_a_cycle():
-    left = {module: imports(path) - {"bevcli", module} for module, path in FILES.items() if module != "bevcli"}
+    left = {module: imports(path) - {module} for module, path in FILES.items() if module != "bevcli"}
     while free := {module for module, needed in left.items() if not needed & left.keys()}:
         left = {module: needed for module, needed in left.items() if module not in free}
     assert not left, f"these modules import each other: {sorted(left)}"
+
+
+def test_names_of_tests_have_at_most_60_characters() -> None:
+    files = sorted((ROOT.parent / "tests").rglob("test_*.py"))
+    names = [name for path in files for name in re.findall(r"^ *def (test_\w+)", path.read_text(), flags=re.MULTILINE)]
+    assert len(names) > 1000
+    assert [name for name in names if len(name) > 60] == []
+
+
+def functions(path: Path) -> list[ast.FunctionDef | ast.AsyncFunctionDef]:
+    nodes = ast.walk(ast.parse(path.read_text()))
+    return [node for node in nodes if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+
+
+def test_no_function_has_more_than_10_parameters() -> None:
+    wrong = []
+    for module, path in FILES.items():
+        for function in functions(path):
+            taken = function.args
+            names = [each.arg for each in (*taken.posonlyargs, *taken.args, *taken.kwonlyargs)]
+            compiled = any("jit" in ast.unparse(each) for each in function.decorator_list)  # kernels, which take arrays
+            if len(set(names) - {"self", "cls"}) > 10 and not compiled and "kernels" not in module:
+                wrong.append(f"{module}.{function.name}: {len(names)}")
+    assert not wrong
+
+
+# A command or a program, which the text names in backticks.
+COMMAND = re.compile(r"`[a-z-]+ [^`]*`")
+FLAG = re.compile(r"(?<![\w-])--[a-z]")
+
+
+def library_texts(path: Path) -> list[str]:
+    """The texts of a file, but for arguments of programs and spellings of options."""
+    tree = ast.parse(path.read_text())
+    spellings = {id(each.value) for each in ast.walk(tree) if isinstance(each, ast.keyword) and each.arg == "flag"}
+    formatted = [node for node in ast.walk(tree) if isinstance(node, ast.JoinedStr)]
+    parts = {id(part) for text in formatted for part in text.values}
+    plain = [node for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+    texts = ["".join(getattr(part, "value", "") if isinstance(part, ast.Constant) else "X" for part in text.values)
+             for text in formatted]  # fmt: skip
+    texts += [node.value for node in plain if id(node) not in spellings | parts]
+    return [text for text in texts if not re.fullmatch(r"--[\w-]+", text)]
+
+
+def test_the_library_names_arguments_and_no_flags() -> None:
+    wrong = []
+    for module, path in FILES.items():
+        # These define flags, and a program with its own.
+        if module.startswith("bevcli.cli.") or module in ("bevcli.options", "bevcli.benchmark.gpu_check"):
+            continue
+        texts = [text for text in library_texts(path) if ":root" not in text]  # CSS
+        wrong += [f"{module}: {text:.100}" for text in texts if FLAG.search(COMMAND.sub("", text))]
+    assert not wrong

@@ -1,21 +1,28 @@
-"""The drives of a batch: from arguments and lists to single drives, each with a hash of its input."""
+"""The drives of a batch: from arguments and lists to single drives, each with a hash of its input.
+
+Every scene of a nuScenes root in an object store needs the tables of its version, so each machine keeps one copy of
+them, in $XDG_CACHE_HOME/bevcli/nuscenes-tables (default ~/.cache). Images are copied scene by scene.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+import shutil
+import uuid
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from bevcli.batch.nuscenes_url import copy_tables, versions_at
-from bevcli.batch.storage import StoredFile, expand, is_url, open_storage
+from bevcli.batch.storage import RemoteFolder, Storage, StoredFile, expand, is_url, open_storage
 from bevcli.errors import BevcliError, InputError
 from bevcli.parsing.files import MIB, read_text
-from bevcli.sequences.nuscenes.cache import open_index
-from bevcli.sequences.nuscenes.choice import NuScenesChoice, chosen_scenes, is_nuscenes_root, tables_of
+from bevcli.sequences.nuscenes.cache import open_index, user_cache
+from bevcli.sequences.nuscenes.choice import choose_version, chosen_scenes, keyframes, sweep_frames, tables_of
+from bevcli.sequences.nuscenes.format import NuScenesOptions, is_nuscenes_root
 
 LISTING_THREADS = 32  # listing a folder in an object store is waiting
 LONGEST_NAME = 80
@@ -56,54 +63,49 @@ def read_list(path: Path) -> list[str]:
 
 
 def find_drives(
-    texts: Sequence[str], choice: NuScenesChoice = NuScenesChoice(), listed: Callable[[int], None] = lambda count: None
+    texts: Sequence[str],
+    options: NuScenesOptions = NuScenesOptions(),
 ) -> tuple[list[Drive], tuple[str, ...]]:
-    """All drives of arguments, and notes for the user.
+    """All drives of arguments in order, each input once, and notes for the user.
+
+    A drive whose input cannot be listed has its `problem`.
 
     Args:
         texts: paths, URLs and glob patterns. A nuScenes root gives one drive per scene.
-        choice: the part of a nuScenes root.
-        listed: called with the number of drives whose files have been listed so far.
+        options: the part of a nuScenes root.
 
-    Returns:
-        The drives in order, each input once. A drive whose input cannot be listed has its `problem`.
-
-    Raises:
-        InputError: a pattern matches nothing, or there are no drives.
+    Raises InputError where a pattern matches nothing, or there are no drives.
     """
     sources = dict.fromkeys(source.rstrip("/") or source for text in texts for source in expand(text))
-    drives: list[Drive] = []
     with ThreadPoolExecutor(LISTING_THREADS) as pool:
-        for found in pool.map(lambda source: list(_drives_of(source, choice)), sources):
-            drives += found
-            listed(len(drives))
+        drives = [drive for found in pool.map(lambda s: list(_drives_of(s, options)), sources) for drive in found]
     if not drives:
-        raise InputError("there are no drives (expected paths, URLs or patterns, or --list FILE)")
+        raise InputError("there are no drives (expected paths, URLs or patterns, or `listed=FILE`)")
     return _without_copies(drives)
 
 
-def _drives_of(source: str, choice: NuScenesChoice) -> Iterator[Drive]:
+def _drives_of(source: str, options: NuScenesOptions) -> Iterator[Drive]:
     path = source if is_url(source) else str(Path(source.removeprefix("file://")).absolute())
     drive = Drive(path, _safe_name(path))
     try:
         storage = open_storage(path)
-        if versions_at(storage) if is_url(path) else is_nuscenes_root(Path(path)):
-            yield from _scenes(drive, choice)
+        if _versions_at(storage) if is_url(path) else is_nuscenes_root(Path(path)):
+            yield from _scenes(drive, options)
         else:
             yield replace(drive, input_hash=_hash(drive.name, None, storage.files()))
     except BevcliError as error:
         yield replace(drive, problem=str(error))
 
 
-def _scenes(root: Drive, choice: NuScenesChoice) -> Iterator[Drive]:
+def _scenes(root: Drive, options: NuScenesOptions) -> Iterator[Drive]:
     """A drive per scene. Of the input, the tables count."""
     if is_url(root.source):
-        tables, files = copy_tables(root.source, choice.version)
+        tables, files = _copy_tables(root.source, options.version)
     else:
-        tables = tables_of(Path(root.source), choice.version)
+        tables = tables_of(Path(root.source), options.version)
         files = open_storage(str(tables)).files()
     index, _ = open_index(tables)
-    for number in chosen_scenes(index, tables, choice):
+    for number in chosen_scenes(index, tables, options.split):
         scene = str(index.scenes.names[number])
         yield Drive(root.source, _safe_name(scene), scene, _hash(tables.name, scene, files))
 
@@ -132,3 +134,47 @@ def _without_copies(drives: list[Drive]) -> tuple[list[Drive], tuple[str, ...]]:
     if len(notes) > 3:
         notes = [*notes[:3], f"{len(notes) - 3} more copies are run once"]
     return list(kept.values()), tuple(notes)
+
+
+def _versions_at(storage: Storage) -> list[str]:
+    """The names of the nuScenes versions in a folder, such as "v1.0-mini"; empty if it is no root."""
+    folders = sorted(name for name in storage.names("") if name.startswith("v1."))
+    return [name for name in folders if "scene.json" in storage.names(name)]
+
+
+def _copy_tables(url: str, version: str | None) -> tuple[Path, list[StoredFile]]:
+    """A local copy of a version's tables, and the files that it was made from. It is copied anew if one has changed.
+
+    Raises InputError if the version is missing, or the choice is not unique.
+    """
+    chosen = choose_version(url, _versions_at(RemoteFolder(url)), version)
+    storage = RemoteFolder(f"{url}/{chosen}")
+    files = storage.files()
+    facts = repr((url, [(file.name, file.size, file.version) for file in files]))
+    tables = user_cache() / "nuscenes-tables" / hashlib.sha256(facts.encode()).hexdigest()[:16] / chosen
+    if not tables.is_dir():
+        unfinished = tables.parent / f"{uuid.uuid4().hex[:8]}.new"
+        try:
+            storage.fetch(unfinished)
+            os.rename(unfinished, tables)
+        except OSError as error:
+            if not tables.is_dir():  # else another worker was faster
+                raise InputError(f"{tables}: the tables cannot be copied there ({error.strerror})") from None
+        finally:
+            shutil.rmtree(unfinished, ignore_errors=True)
+    return tables, files
+
+
+def fetch_scene(url: str, options: NuScenesOptions, name: str, local: Path) -> None:
+    """Make a local root with one scene: its tables, images, and CAN bus data if there are any. Raises InputError.
+
+    name: of the scene. An image that is missing in the store is missing in the local root too.
+    """
+    tables, _ = _copy_tables(url, options.version)
+    index, _ = open_index(tables)
+    (scene,) = chosen_scenes(index, tables, None, name)
+    frames = sweep_frames(index, scene) if options.sweeps else keyframes(index, scene)
+    images = {index.images.files[row].decode() for _, _, rows in frames for row in rows}
+    local.mkdir(parents=True)
+    (local / tables.name).symlink_to(tables)
+    RemoteFolder(url).fetch(local, sorted(images | {f"can_bus/{name}_pose.json"}))

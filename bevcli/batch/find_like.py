@@ -1,4 +1,4 @@
-"""`find_like`: the frames of a batch that are most similar to one frame, by the distance of their vectors."""
+"""A vector per frame, the BEV features pooled over the grid, and the frames of a batch that are most similar to one."""
 
 from __future__ import annotations
 
@@ -12,32 +12,80 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from bevcli.batch.embeddings import EMBEDDINGS, Embeddings, read_embeddings
+from bevcli.batch.job import READING_THREADS, RESULTS
 from bevcli.batch.report import page
-from bevcli.batch.results import READING_THREADS, LocalCopy
 from bevcli.batch.storage import LocalFolder, Storage
-from bevcli.batch.worker import RESULTS
 from bevcli.errors import BevcliError, InputError
+from bevcli.frame import Frame, Prediction
 from bevcli.geometry.transforms import Array
-from bevcli.pipeline.run_files import RECORDING
+from bevcli.runs.files import RECORDING
+from bevcli.runs.state import load_state, save_state
 from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.video import draw_frame_at
 
 THUMBNAIL_WIDTH, JPEG_QUALITY = 640, 80  # pixels, percent
-_QUERY = "the frame that is searched for"
+EMBEDDINGS = "embeddings.safetensors"
+
+
+@dataclass(frozen=True)
+class Embeddings:
+    """The vectors of a drive.
+
+    Attributes:
+        frames: (F,) int64 indices of the frames.
+        timestamps_ns: (F,) int64.
+        vectors: (F, 2 C) float32: the mean of each of the C channels of the BEV features over all cells, then the
+            standard deviations.
+        model: name of the model and hash of its weights. Vectors of different models cannot be compared.
+    """
+
+    frames: NDArray[np.int64]
+    timestamps_ns: NDArray[np.int64]
+    vectors: NDArray[np.float32]
+    model: str
+
+
+class FramePooling:
+    """Collects the vectors of a run, frame by frame. Frames without BEV features are left out."""
+
+    def __init__(self, model: str) -> None:
+        self._model = model
+        self._rows: list[tuple[int, int, NDArray[np.float32]]] = []
+
+    def add(self, frame: Frame, prediction: Prediction) -> None:
+        """Add a frame."""
+        if prediction.bev is None or prediction.skipped or prediction.not_finite:
+            return
+        features = prediction.bev.float().reshape(-1, prediction.bev.shape[-1])  # (rows * columns, C)
+        vector = np.concatenate([features.mean(dim=0).cpu().numpy(), features.std(dim=0).cpu().numpy()])
+        self._rows.append((frame.stamp.index, frame.stamp.timestamp_ns, vector))
+
+    def write(self, folder: Path) -> None:
+        """Write embeddings.safetensors into a folder. Raises OutputError."""
+        rows = self._rows
+        vectors = np.array([vector for _, _, vector in rows]) if rows else np.zeros((0, 0), dtype=np.float32)
+        frames, times = (np.array([row[i] for row in rows], dtype=np.int64) for i in range(2))
+        save_state(folder / EMBEDDINGS, Embeddings(frames, times, vectors, self._model))
+
+
+def read_embeddings(path: Path) -> Embeddings:
+    """The vectors in a file of `FramePooling.write`. Raises InputError."""
+    if not path.is_file():
+        raise InputError(f"{path}: is missing (expected a result of `bevcli batch --embed`)")
+    found = load_state(path, Embeddings)
+    frames = (found.frames.shape, found.timestamps_ns.shape, found.vectors.shape[:1])
+    if found.vectors.ndim != 2 or len(set(frames)) != 1:
+        raise InputError(
+            f"{path}: does not contain the vectors of a drive (expected a result of `bevcli batch --embed`)"
+        )
+    return found
 
 
 @dataclass(frozen=True)
 class SimilarFrame:
-    """A frame of a batch.
-
-    Attributes:
-        result: name of the folder of its drive's results.
-        frame: its index.
-        timestamp_ns: its time.
-        similarity: -1 to 1, 1 for an equal vector.
-    """
+    """A frame of a batch. result: folder of its drive's results. similarity: -1 to 1, 1 for an equal vector."""
 
     result: str
     frame: int
@@ -50,7 +98,7 @@ class Query:
     """The frame that is searched for.
 
     Attributes:
-        result: name of the folder of its drive's results; the name of the folder for a run outside of the batch.
+        result: name of the folder of its drive's results.
         frame: its index.
         embeddings: of its drive.
         recording: of its drive; None if it is in the batch.
@@ -68,7 +116,7 @@ class Query:
         if not len(places):
             frames = self.embeddings.frames
             found = f"{frames.min()} to {frames.max()}" if len(frames) else "none"
-            raise InputError(f"--frame {self.frame}: {self.result} has no vector of this frame (found frames {found})")
+            raise InputError(f"`frame={self.frame}`: {self.result} has no vector of this frame (found frames {found})")
         return self.embeddings.vectors[places[0]].astype(np.float64)
 
 
@@ -97,21 +145,19 @@ def find_like(query: Query, batch: Storage, count: int = 12, per_drive: int = 3)
     Each dimension of the vectors is scaled to mean 0 and standard deviation 1 over all frames of the batch; the
     similarity is the cosine of two scaled vectors. The frame itself is left out.
 
-    Args:
-        query: of `open_query`.
-        batch: the folder of a batch that was run with `embed`.
-        count: number of frames.
-        per_drive: at most this many frames of each drive.
-
-    Raises:
-        InputError: the batch has no vectors, or they are of another model.
+    per_drive: at most this many frames of each drive. Raises InputError where the batch has no vectors, or they are of
+    another model.
     """
     results = sorted(batch.names(RESULTS))
+
+    def read(result: str) -> Embeddings | None:
+        return _embeddings(batch, result) if EMBEDDINGS in batch.names(f"{RESULTS}/{result}") else None
+
     with ThreadPoolExecutor(READING_THREADS) as pool:
-        read = pool.map(lambda result: _embeddings_if_any(batch, result), results)
-        drives = [(result, found) for result, found in zip(results, read, strict=True) if found is not None]
+        read_all = zip(results, pool.map(read, results), strict=True)
+        drives = [(result, found) for result, found in read_all if found is not None]
     if not drives:
-        raise InputError(f"{batch.where}: no drive has {EMBEDDINGS} (expected a batch with --embed)")
+        raise InputError(f"{batch.where}: no drive has {EMBEDDINGS} (expected one of `bevcli batch --embed`)")
     same = (query.embeddings.model, query.embeddings.vectors.shape[1])
     comparable = [(result, found) for result, found in drives if (found.model, found.vectors.shape[1]) == same]
     if not comparable:
@@ -140,7 +186,7 @@ def find_like(query: Query, batch: Storage, count: int = 12, per_drive: int = 3)
 
 def similar_frames_page(query: Query, batch: Storage, found: Sequence[SimilarFrame]) -> str:
     """A page with a thumbnail of each frame, as HTML."""
-    figures = [_figure(batch, query.result, query.frame, _QUERY, query.recording)]
+    figures = [_figure(batch, query.result, query.frame, "the frame that is searched for", query.recording)]
     figures += [_figure(batch, each.result, each.frame, f"similarity {each.similarity:.3f}") for each in found]
     title = f"Frames like frame {query.frame} of {query.result}"
     body = f'<h1>{escape(title)}</h1><p class="soft">in {escape(batch.where)}</p>'
@@ -149,14 +195,14 @@ def similar_frames_page(query: Query, batch: Storage, found: Sequence[SimilarFra
 
 def _figure(batch: Storage, result: str, frame: int, text: str, recording: Path | None = None) -> str:
     image = _thumbnail(batch, result, frame, recording)
-    picture = f'<img alt="" src="data:image/jpeg;base64,{image}">' if image else '<p class="none">no recording</p>'
-    return f"<figure>{picture}<figcaption>{escape(result)}, frame {frame}</figcaption>{escape(text)}</figure>"
+    shown = f'<img alt="" src="data:image/jpeg;base64,{image}">' if image else '<p class="none">no recording</p>'
+    return f"<figure>{shown}<figcaption>{escape(result)}, frame {frame}</figcaption>{escape(text)}</figure>"
 
 
 def _thumbnail(batch: Storage, result: str, frame: int, recording: Path | None) -> str:
     """A frame of a recording, as base64 of a JPEG; "" where the recording cannot be read."""
     try:
-        with LocalCopy(batch, f"{RESULTS}/{result}/{RECORDING}") as copy, open_recording(recording or copy) as file:
+        with batch.copied(f"{RESULTS}/{result}/{RECORDING}") as copy, open_recording(recording or copy) as file:
             image = draw_frame_at(file.path, frame)
     except BevcliError:
         return ""
@@ -177,9 +223,5 @@ def _similarity(vector: Array, vectors: np.ndarray) -> Array:
 
 
 def _embeddings(batch: Storage, result: str) -> Embeddings:
-    with LocalCopy(batch, f"{RESULTS}/{result}/{EMBEDDINGS}") as path:
+    with batch.copied(f"{RESULTS}/{result}/{EMBEDDINGS}") as path:
         return read_embeddings(path)
-
-
-def _embeddings_if_any(batch: Storage, result: str) -> Embeddings | None:
-    return _embeddings(batch, result) if EMBEDDINGS in batch.names(f"{RESULTS}/{result}") else None

@@ -1,31 +1,44 @@
-"""Job: what every drive of a batch is run with."""
+"""Job: the model and the options that every drive of a batch is run with."""
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from bevcli import __version__
-from bevcli.model.prepared import Precision
-from bevcli.pipeline.model_loading import Model, load_model
-from bevcli.pipeline.run import RunOptions
+from bevcli._version import __version__
+from bevcli.batch.drives import Drive
+from bevcli.batch.storage import is_url
+from bevcli.errors import InputError
+from bevcli.frame import Sequence
+from bevcli.inference.load import Model, load_model
+from bevcli.inference.options import ModelOptions
+from bevcli.options import defaults, gather
+from bevcli.runs.options import RunOptions
+from bevcli.sequences.format import check_options, format_of, option_classes
+from bevcli.sequences.open import open_sequence
+from bevcli.sequences.options import FormatOptions, SequenceOptions
 
-# Options of `open_sequence` that apply to nuScenes roots only.
-NUSCENES_OPTIONS = ("version", "sweeps")
+RESULTS, FAILED, ATTEMPTS = "drives", "failed", ".bevcli/attempts"  # folders of a batch
+SCORE_BINS = 20  # of the histogram of a drive's scores, from 0 to 1
+READING_THREADS = 16  # small files of a batch
+Record = dict[str, Any]  # of a drive after it was run; a row of batch.parquet
+Own = TypeVar("Own", bound=FormatOptions)
 
 
 @dataclass(frozen=True)
 class Job:
-    """What every drive of a batch is run with. On a cluster, the paths in it must exist on every machine.
+    """The model and the options of a batch. On a cluster, the paths in it must exist on every machine.
 
     Attributes:
         out: path or URL of the batch's folder.
-        model, weights, untrained, device, precision: of `load_model`.
-        reading: options of `open_sequence`, without `scene`.
+        model: options of `load_model`.
+        source: options of `open_sequence`; the scene is that of the drive.
+        own: options of formats; a format that is missing has its defaults.
         run: options of `run_into_folder`.
         embed: whether a vector per frame is written.
         evaluate: whether drives with ground truth are scored.
@@ -33,12 +46,9 @@ class Job:
     """
 
     out: str
-    model: str | None = None
-    weights: Path | None = None
-    untrained: bool = False
-    device: str = "auto"
-    precision: Precision | None = None
-    reading: Mapping[str, Any] = field(default_factory=dict)
+    model: ModelOptions = field(default_factory=ModelOptions)
+    source: SequenceOptions = field(default_factory=SequenceOptions)
+    own: tuple[FormatOptions, ...] = ()
     run: RunOptions = field(default_factory=RunOptions)
     embed: bool = False
     evaluate: bool = False
@@ -46,28 +56,52 @@ class Job:
 
     def load_model(self, device: str | None = None) -> Model:
         """The model with its weights. device: another one than the job's. Raises BevcliError."""
-        device = self.device if device is None else device
-        return load_model(self.model, self.weights, device=device, precision=self.precision, untrained=self.untrained)
+        return load_model(options=self.model if device is None else replace(self.model, device=device))
 
-    def reading_of(self, scene: str | None) -> dict[str, Any]:
-        """The options of `open_sequence` for a drive; scene: of a nuScenes root, None for other inputs."""
-        options = {name: value for name, value in self.reading.items() if scene or name not in NUSCENES_OPTIONS}
-        return {**options, "scene": scene}
+    def own_of(self, kind: type[Own]) -> Own:
+        """The own options of a format. kind: their dataclass."""
+        return next((each for each in self.own if type(each) is kind), kind())
+
+    def open(self, path: Path, scene: str | None) -> Sequence:
+        """A drive, or a scene of it. Raises InputError."""
+        own = self.own_of(format_of(path).options)
+        return open_sequence(path, replace(self.source, scene=scene), **vars(own))
+
+    def check_options(self, drives: Iterable[Drive]) -> None:
+        """Raise InputError for an option that no format of the drives has. One at a URL may have any format."""
+        if any(is_url(drive.source) for drive in drives):
+            return
+        found = set()
+        for drive in drives:
+            with contextlib.suppress(InputError):  # a drive that cannot be opened becomes a row with its error
+                found.add(format_of(Path(drive.source)))
+        if found:
+            given = {name: value for own in self.own for name, value in vars(own).items()}
+            check_options(given, found, "the drives of the batch")
 
     def hash(self, model: Model) -> str:
         """SHA-256 of what the results of a drive depend on, its input excepted. model: of `load_model`, any device."""
+        reading = {name: _fact(value) for part in (self.source, *self.own) for name, value in vars(part).items()}
         facts = {
             "version": __version__,
             "model": model.config_hash,
             "weights": model.weights_hash,
-            "device": self.device,
-            "precision": self.precision,
-            "reading": {name: _fact(value) for name, value in sorted(self.reading.items())},
-            "run": {name: _fact(value) for name, value in sorted(vars(self.run).items())},
+            "device": self.model.device,
+            "precision": self.model.precision,
+            "reading": reading,
+            "run": {name: _fact(value) for name, value in vars(self.run).items()},
             "embed": self.embed,
             "evaluate": self.evaluate,
         }
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+
+
+def all_own_options(values: Mapping[str, Any]) -> tuple[FormatOptions, ...]:
+    """The own options of every format, from the options of all formats by name. Relative paths become absolute."""
+    given = {name: value.absolute() if isinstance(value, Path) else value for name, value in values.items()}
+    return tuple(
+        gather(kind, None, {name: given[name] for name in defaults(kind) if name in given}) for kind in option_classes()
+    )
 
 
 def _fact(value: object) -> str:

@@ -4,159 +4,120 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import importlib
-import importlib.util
-import json
 import logging
 import os
 import signal
 import socket
-import sys
 import threading
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from bevcli.batch.drives import Drive
-from bevcli.batch.job import Job
-from bevcli.batch.worker import Record, Worker, use_threads
+from bevcli.batch.job import Job, Record
+from bevcli.batch.options import Workers, ray_is_installed
+from bevcli.batch.worker import Worker, use_threads
 from bevcli.errors import BevcliError
-from bevcli.pipeline.cpu_memory import keep_freed_memory
-from bevcli.pipeline.cpu_threads import THREAD_SETTINGS
+from bevcli.inference.cpu_settings import THREAD_SETTINGS, keep_freed_memory
 
-# Ray Data holds only one line of text per drive in its object store.
-OBJECT_STORE_BYTES = 100 << 20
+OBJECT_STORE_BYTES = 100 << 20  # it holds a drive and a record per worker
 CONNECT_S = 15.0  # for the connection to a cluster
-# Settings that Ray reads from the environment: no telemetry, no logs on the terminal.
-_ENVIRONMENT = {
-    "RAY_USAGE_STATS_ENABLED": "0",
-    "RAY_DATA_DISABLE_PROGRESS_BARS": "1",
-    "RAY_DATA_LOG_LEVEL": "CRITICAL",
-    "RAY_BACKEND_LOG_LEVEL": "fatal",
-}
+# Settings that Ray reads from the environment: no telemetry, and no messages on stdout, such as that a worker died. The
+# record of its drive says it, if it cannot be run at all.
+_ENVIRONMENT = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_DEDUP_LOGS_SKIP_REGEX": ".*"}
 # On this machine, Ray's processes then listen on 127.0.0.1 only.
 _LOOPBACK = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
 
 
-@dataclass(frozen=True)
-class Workers:
-    """How many workers there are, and what each of them may use.
-
-    Attributes:
-        count: number of workers; None: as many as the resources allow.
-        threads: CPU threads of each; None: on this machine the cores divided by the workers, on a cluster 1.
-        gpus: share of a GPU of each; None: 1 if there are GPUs and the job uses them, else 0.
-        address: of a Ray cluster; None: this machine.
-    """
-
-    count: int | None = None
-    threads: int | None = None
-    gpus: float | None = None
-    address: str | None = None
-
-
-def is_installed() -> bool:
-    """Whether Ray is installed."""
-    return importlib.util.find_spec("ray") is not None
-
-
 def run_on_ray(job: Job, job_hash: str, drives: Sequence[Drive], workers: Workers) -> Iterator[Record]:
-    """Runs drives on Ray and yields their records as they are done.
+    """Run drives on Ray and yield their records as they are done.
 
     A worker that dies is replaced, and its drive is run again.
 
     Raises BevcliError where Ray is not installed or cannot be started, the cluster is lost, or a worker cannot load the
     model or write into the batch's folder.
     """
-    if not is_installed():
-        raise BevcliError("Ray is not installed: run pip install 'bevcli[ray]', or pass --workers 1")
+    if not ray_is_installed():
+        raise BevcliError("Ray is not installed: run pip install 'bevcli[ray]', or pass `count=1`")
     settings = _ENVIRONMENT if workers.address else _ENVIRONMENT | _LOOPBACK
     for name, value in settings.items():
         os.environ.setdefault(name, value)
     with _ray(workers) as ray:
         count, threads, gpus = _sizes(ray, job, workers, len(drives))
-        if not gpus and job.device == "auto":
-            job = dataclasses.replace(job, device="cpu")
-        rows = [{"drive": json.dumps(dataclasses.asdict(drive))} for drive in drives]
-        dataset = ray.data.from_items(rows, override_num_blocks=len(rows)).map_batches(
-            _RayWorker,
-            fn_constructor_kwargs={"job": job, "job_hash": job_hash, "threads": threads},
-            compute=ray.data.ActorPoolStrategy(
-                min_size=1, max_size=count, initial_size=count, max_tasks_in_flight_per_actor=1
-            ),
-            batch_size=1,
-            num_cpus=threads,
-            num_gpus=gpus,
-        )
+        if not gpus and job.model.device == "auto":
+            job = dataclasses.replace(job, model=dataclasses.replace(job.model, device="cpu"))
+        remote = ray.remote(num_cpus=threads, num_gpus=gpus, max_restarts=-1, max_task_retries=-1)(_RayWorker)
+        idle = [remote.remote(job, job_hash, threads) for _ in range(count)]
+        # Only a worker that has started gets a drive: a cluster may have no room for all of them yet.
+        running = {worker.problem.remote(): worker for worker in idle}
+        left, waiting = list(reversed(drives)), len(drives)
         try:
-            for batch in dataset.iter_batches(batch_size=None, prefetch_batches=0):
-                for text in batch["record"]:
-                    yield _checked(json.loads(str(text)))
+            while waiting:
+                (done,), _ = ray.wait(list(running))
+                worker, record = running.pop(done), ray.get(done)
+                if record is not None:
+                    if record.get("problem"):
+                        raise BevcliError(str(record["problem"]))
+                    waiting -= 1
+                    yield record
+                if left:
+                    running[worker.run.remote(left.pop())] = worker
         except ray.exceptions.RayError as error:
-            raise BevcliError(f"Ray stopped ({_first_line(error)}); `--resume` goes on") from None
+            raise BevcliError(f"Ray stopped ({_first_line(error)}); `resume=True` goes on") from None
 
 
 class _RayWorker:
-    """A `Worker` in the form that Ray Data calls: a batch of one drive in, its record out."""
+    """A `Worker` in a process of Ray. A BevcliError is a record with its text as `problem`."""
 
     def __init__(self, job: Job, job_hash: str, threads: int) -> None:
         keep_freed_memory()
         use_threads(threads)
-        self._worker: Worker | None = None
-        self._problem = ""
+        self._problem: Record | None = None
         try:
             self._worker = Worker(job, job_hash)
         except BevcliError as error:  # an exception here would make Ray start the worker again and again
-            self._problem = str(error)
+            self._problem = {"problem": str(error)}
 
-    def __call__(self, batch: dict[str, Any]) -> dict[str, Any]:
-        record: Record = {"problem": self._problem}
-        if self._worker is not None:
-            try:
-                record = self._worker.run(Drive(**json.loads(str(batch["drive"][0]))))
-            except BevcliError as error:
-                record = {"problem": str(error)}
-        return {"record": np.array([json.dumps(record)])}
+    def problem(self) -> Record | None:
+        """The reason why the worker cannot run drives, or None."""
+        return self._problem
+
+    def run(self, drive: Drive) -> Record:
+        """See `Worker.run`."""
+        try:
+            return self._worker.run(drive)
+        except BevcliError as error:
+            return {"problem": str(error)}
 
 
 @contextlib.contextmanager
 def _ray(workers: Workers) -> Iterator[Any]:
     """Ray, connected to the cluster or started for this batch: on the loopback interface, without dashboard."""
     import ray
-    import ray.data
-
-    ray_worker: Any = importlib.import_module("ray._private.worker")
 
     if workers.address is not None:
         _check_reachable(workers.address)
-    local = {"num_cpus": _cores(), "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
-    local |= {"object_store_memory": OBJECT_STORE_BYTES}
-    options: dict[str, Any] = {"address": workers.address} if workers.address else {"address": "local", **local}
+    options: dict[str, Any] = {"address": workers.address}
+    if not workers.address:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        options = {"address": "local", "num_cpus": cores, "include_dashboard": False}
+        options |= {"_node_ip_address": "127.0.0.1", "object_store_memory": OBJECT_STORE_BYTES}
     on_terminate = signal.getsignal(signal.SIGTERM)
+    environment = {"env_vars": THREAD_SETTINGS}
     try:
-        with _without_stderr():
-            environment = {"env_vars": THREAD_SETTINGS}
-            ray.init(log_to_driver=False, logging_level=logging.ERROR, runtime_env=environment, **options)
+        ray.init(log_to_driver=False, logging_level=logging.ERROR, runtime_env=environment, **options)
     except Exception as error:  # Ray raises errors of many types where it cannot start or connect
         where = f"the cluster {workers.address} cannot be reached" if workers.address else "cannot be started"
         raise BevcliError(f"Ray: {where} ({_first_line(error)})") from None
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, on_terminate)  # Ray installs its own handler
-    ray.data.DataContext.get_current().enable_progress_bars = False
-    printing = ray_worker.print_to_stdstream
-    # Ray prints on stdout that a worker died. The record of its drive says it, if it cannot be run at all.
-    ray_worker.print_to_stdstream = lambda *_, **__: None
     try:
         yield ray
     finally:
         ray.shutdown()
-        ray_worker.print_to_stdstream = printing
 
 
 def _check_reachable(address: str) -> None:
-    """Raises BevcliError where nothing listens at HOST:PORT; Ray would wait for minutes. "auto" is not checked."""
+    """Raise BevcliError where nothing listens at HOST:PORT; Ray would wait for minutes. "auto" is not checked."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not (host and port.isdecimal()):
         return
@@ -166,27 +127,13 @@ def _check_reachable(address: str) -> None:
         raise BevcliError(f"Ray: the cluster {address} cannot be reached ({_first_line(error)})") from None
 
 
-@contextlib.contextmanager
-def _without_stderr() -> Iterator[None]:
-    """Discards what this process writes to stderr: Ray's C++ code reports its log level there."""
-    sys.stderr.flush()
-    kept = os.dup(2)
-    try:
-        with open(os.devnull, "wb") as nothing:
-            os.dup2(nothing.fileno(), 2)
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-
-
 def _sizes(ray: Any, job: Job, workers: Workers, drives: int) -> tuple[int, int, float]:
     """Number of workers, and threads and GPUs of each. Raises BevcliError where there are too few resources."""
     resources = ray.cluster_resources()
     cores, gpus = int(resources.get("CPU", 0)), float(resources.get("GPU", 0))
-    share = workers.gpus if workers.gpus is not None else float(gpus > 0 and job.device != "cpu")
+    share = workers.gpus if workers.gpus is not None else float(gpus > 0 and job.model.device != "cpu")
     if share > gpus:
-        raise BevcliError(f"--gpus-per-worker {share:g}: Ray has {gpus:g} GPUs: pass 0 to run on CPUs")
+        raise BevcliError(f"`gpus={share:g}`: Ray has {gpus:g} GPUs: pass 0 to run on CPUs")
     count = workers.count
     if count is None:
         count = int(gpus / share) if share else cores // (workers.threads or 1)
@@ -196,19 +143,9 @@ def _sizes(ray: Any, job: Job, workers: Workers, drives: int) -> tuple[int, int,
     if count > possible:
         raise BevcliError(
             f"{count} workers with {threads} threads and {share:g} GPUs each: Ray has {cores} cores and {gpus:g} GPUs: "
-            f"pass --workers {max(1, possible)}"
+            f"pass `count={max(1, possible)}`"
         )
     return count, threads, share
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _checked(record: Record) -> Record:
-    if record.get("problem"):
-        raise BevcliError(str(record["problem"]))
-    return record
 
 
 def _first_line(error: Exception) -> str:

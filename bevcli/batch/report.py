@@ -8,16 +8,18 @@ from html import escape
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from bevcli import __version__
-from bevcli.batch.charts import bars, histogram
-from bevcli.batch.worker import RESULTS, SCORE_BINS, Record
+from bevcli._version import __version__
+from bevcli.batch.job import RESULTS, SCORE_BINS, Record
 from bevcli.duration import duration
 from bevcli.geometry.boxes import CLASSES
-from bevcli.pipeline.model_loading import Model
+from bevcli.inference.load import Model
 
 WORST = 10  # drives in the table of the worst ones
 MOST_ERRORS = 50  # rows in the table of errors
+WIDTH, HEIGHT = 420, 180  # of a chart
+_LEFT, _RIGHT, _TOP, _BOTTOM = 44, 24, 10, 36
 STYLE = """
 :root { color-scheme: light dark; --page: #fcfcfb; --text: #1d1d1b; --soft: #6b6a66; --line: #dddcd6;
   --card: #ffffff; --bar: #2f6db5; --bad: #b3261e; }
@@ -41,11 +43,12 @@ th, td { text-align: left; padding: 5px 10px 5px 0; border-bottom: 1px solid var
 td.number, th.number { text-align: right; font-variant-numeric: tabular-nums; }
 td:first-child { white-space: nowrap; } img { max-width: 100%; border-radius: 4px; display: block; }
 """
-_ERROR_TITLES = {"trans_err": "Translation errors", "orient_err": "Orientation errors", "vel_err": "Velocity errors"}
-_ERROR_LABELS = {
-    "trans_err": "translation error of a drive, metres",
-    "orient_err": "orientation error of a drive, radians",
-    "vel_err": "velocity error of a drive, m/s",
+# Key of the scores -> title and axis of its histogram.
+_SCORE_CHARTS = {
+    "mean_ap": ("mAP", "mAP of a drive, classes with ground truth"),
+    "trans_err": ("Translation errors", "translation error of a drive, metres"),
+    "orient_err": ("Orientation errors", "orientation error of a drive, radians"),
+    "vel_err": ("Velocity errors", "velocity error of a drive, m/s"),
 }
 
 
@@ -59,13 +62,7 @@ def page(title: str, body: str) -> str:
 
 
 def write_report(records: Sequence[Record], metrics: dict[str, Any] | None, model: Model) -> str:
-    """The page about a batch, as HTML.
-
-    Args:
-        records: of the drives that are done or have failed.
-        metrics: of `joint_metrics`, None if no drive was scored.
-        model: that the drives were run with.
-    """
+    """The page about a batch, as HTML. metrics: of `joint_metrics`, None if no drive was scored."""
     done = [record for record in records if not record.get("error")]
     failed = [record for record in records if record.get("error")]
     untrained = '<p class="bad">UNTRAINED: random weights, the boxes are meaningless</p>' if model.untrained else ""
@@ -90,11 +87,8 @@ def _cards(done: Sequence[Record], failed: Sequence[Record], metrics: dict[str, 
         present = metrics["classes_with_ground_truth"]
         cards += [(f"mAP, {metrics['drives']:,} drives together", _number(present["mean_ap"]))]
         cards += [(f"NDS, {metrics['drives']:,} drives together", _number(present["nd_score"]))]
-    return '<div class="cards">' + "".join(_card(*card) for card in cards) + "</div>"
-
-
-def _card(name: str, value: str) -> str:
-    return f'<div class="card"><b>{escape(value)}</b><span class="soft">{escape(name)}</span></div>'
+    shown = [f'<div class="card"><b>{value}</b><span class="soft">{escape(name)}</span></div>' for name, value in cards]
+    return f'<div class="cards">{"".join(shown)}</div>'
 
 
 def _distributions(done: Sequence[Record]) -> str:
@@ -107,16 +101,11 @@ def _distributions(done: Sequence[Record]) -> str:
     ]
     scored = [r["scores"] for r in done if r.get("scores")]
     if scored:
-        figures.append(("mAP", histogram(_known(scored, "mean_ap"), "mAP of a drive, classes with ground truth")))
-        figures += [
-            (_ERROR_TITLES[name], histogram(_known(scored, name), label)) for name, label in _ERROR_LABELS.items()
-        ]
+        for key, (title, label) in _SCORE_CHARTS.items():
+            known = [scores[key] for scores in scored if scores.get(key) is not None]
+            figures.append((title, histogram(known, label)))
     charts = "".join(f"<figure><figcaption>{escape(n)}</figcaption>{svg}</figure>" for n, svg in figures)
     return f'<h2>Distributions over drives</h2><div class="charts">{charts}</div>'
-
-
-def _known(scored: Sequence[dict[str, Any]], name: str) -> list[float]:
-    return [scores[name] for scores in scored if scores.get(name) is not None]
 
 
 def _classes(done: Sequence[Record]) -> str:
@@ -124,16 +113,12 @@ def _classes(done: Sequence[Record]) -> str:
     for record in done:
         counts.update(record["boxes_by_class"])
     names = [*CLASSES, *sorted(counts.keys() - set(CLASSES))]
-    rows = [(name, f"{counts[name]:,}") for name in names]
-    return f"<h2>Boxes by class</h2>{_table(('class', 'boxes'), rows, numbers=(1,), is_narrow=True)}"
+    rows = [(escape(name), f"{counts[name]:,}") for name in names]
+    return f"<h2>Boxes by class</h2>{_table(('class', 'boxes'), rows, (1,), 'narrow')}"
 
 
 def worst_drives(done: Sequence[Record]) -> tuple[list[Record], str]:
-    """The worst drives, the worst first, and what makes a drive bad.
-
-    With ground truth: the lowest mAP. Without any: the most frames with missing images or numbers that are not finite,
-    then the lowest mean score.
-    """
+    """The worst drives, the worst first, and the criterion in words."""
     scored = [r for r in done if r.get("scores") and r["scores"].get("mean_ap") is not None]
     if scored:
         return sorted(scored, key=lambda r: r["scores"]["mean_ap"])[:WORST], "lowest mAP over classes with ground truth"
@@ -161,44 +146,80 @@ def _worst(done: Sequence[Record]) -> str:
         row = [escape(record["drive"]), *numbers, f"{_mean_score(record):.2f}", str(problems), str(record["frames"])]
         rows.append((*row, f"{link} <code>bevcli viz {escape(path)}</code>"))
     head = ("drive", "mAP", "NDS", "ATE m", "mean score", "missing images, NaN", "frames", "")
-    table = _table(head, rows, numbers=range(1, 7), is_html=True)
+    table = _table(head, rows, range(1, 7))
     return f'<h2>Worst drives</h2><p class="soft">{meaning}</p>{table}'
 
 
 def _errors(failed: Sequence[Record]) -> str:
     if not failed:
         return "<h2>Errors</h2><p>No drive has failed.</p>"
-    rows = [(r["drive"], r["source"], str(r["attempts"]), r["error"]) for r in failed[:MOST_ERRORS]]
+    rows = [
+        tuple(escape(str(record[key])) for key in ("drive", "source", "attempts", "error"))
+        for record in failed[:MOST_ERRORS]
+    ]
     more = len(failed) - MOST_ERRORS
     note = f'<p class="soft">{more:,} more are in batch.csv</p>' if more > 0 else ""
-    table = _table(("drive", "input", "attempts", "error"), rows, numbers=(2,))
+    table = _table(("drive", "input", "attempts", "error"), rows, (2,))
     return f"<h2>Errors</h2><p>Failed drives: {len(failed):,}</p>{table}{note}"
 
 
-def _table(
-    head: Sequence[str],
-    rows: Sequence[Sequence[str]],
-    numbers: Sequence[int] = (),
-    *,
-    is_html: bool = False,
-    is_narrow: bool = False,
-) -> str:
-    """A table.
-
-    numbers: columns with numbers. is_html: whether the cells are HTML already. is_narrow: only as wide as its cells.
-    """
-
-    def cell(kind: str, place: int, text: str) -> str:
-        return f'<{kind} class="{"number" if place in numbers else "text"}">{text}</{kind}>'
-
-    lines = ["".join(cell("th", place, escape(text)) for place, text in enumerate(head))]
-    for row in rows:
-        lines.append("".join(cell("td", place, text if is_html else escape(text)) for place, text in enumerate(row)))
-    kind = "narrow" if is_narrow else "wide"
-    return (
-        f'<div class="scroll"><table class="{kind}">' + "".join(f"<tr>{line}</tr>" for line in lines) + "</table></div>"
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int], kind: str = "wide") -> str:
+    """A table. rows: cells as HTML. numbers: columns with numbers. kind: "narrow" is only as wide as its cells."""
+    lines = [("th", [escape(text) for text in head]), *(("td", row) for row in rows)]
+    classes = ["number" if place in numbers else "text" for place in range(len(head))]
+    body = "".join(
+        "<tr>" + "".join(f'<{tag} class="{c}">{text}</{tag}>' for c, text in zip(classes, row, strict=True)) + "</tr>"
+        for tag, row in lines
     )
+    return f'<div class="scroll"><table class="{kind}">{body}</table></div>'
 
 
 def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f}"
+
+
+def histogram(values: ArrayLike, label: str, bins: int = 24) -> str:
+    """A histogram of numbers. label: of the horizontal axis, with its unit."""
+    numbers = np.asarray(values, dtype=np.float64)
+    numbers = numbers[np.isfinite(numbers)]
+    if not len(numbers):
+        return '<p class="none">no values</p>'
+    low, high = float(numbers.min()), float(numbers.max())
+    if low == high:
+        low, high = (max(low - 0.5, 0) if low >= 0 else low - 0.5), high + 0.5
+    counts, edges = np.histogram(numbers, bins, (low, high))
+    return bars(counts.tolist(), edges, label)
+
+
+def bars(counts: Sequence[float], edges: ArrayLike, label: str) -> str:
+    """N bars with N + 1 edges on the horizontal axis."""
+    ends = np.asarray(edges, dtype=np.float64)
+    top = max(max(counts, default=0), 1)
+    span = float(ends[-1] - ends[0])
+    inner_width, inner_height = WIDTH - _LEFT - _RIGHT, HEIGHT - _TOP - _BOTTOM
+    base = HEIGHT - _BOTTOM
+
+    def x_of(value: float) -> float:
+        return _LEFT + (value - float(ends[0])) / span * inner_width
+
+    parts = []
+    for count, low, high in zip(counts, ends[:-1], ends[1:], strict=True):
+        height = count / top * inner_height
+        left, right = x_of(low), x_of(high)
+        title = f"<title>{_short(low)} to {_short(high)}: {_short(count)}</title>"
+        parts.append(
+            f'<rect x="{left + 0.5:.1f}" y="{base - height:.1f}" width="{max(right - left - 1, 1):.1f}" '
+            f'height="{height:.1f}">{title}</rect>'
+        )
+    for value in np.linspace(ends[0], ends[-1], 5):
+        parts.append(f'<text x="{x_of(float(value)):.1f}" y="{base + 14}" text-anchor="middle">{_short(value)}</text>')
+    parts.append(f'<text x="{_LEFT - 6}" y="{_TOP + 8}" text-anchor="end">{_short(top)}</text>')
+    parts.append(f'<text x="{_LEFT - 6}" y="{base}" text-anchor="end">0</text>')
+    parts.append(f'<line x1="{_LEFT}" y1="{base}" x2="{WIDTH - _RIGHT}" y2="{base}"/>')
+    middle = _LEFT + inner_width / 2
+    parts.append(f'<text x="{middle}" y="{HEIGHT - 6}" text-anchor="middle">{escape(label)}</text>')
+    return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(label)}">{"".join(parts)}</svg>'
+
+
+def _short(value: float) -> str:
+    return f"{value:,.0f}" if abs(value) >= 100 or float(value).is_integer() else f"{value:.3g}"

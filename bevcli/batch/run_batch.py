@@ -1,38 +1,61 @@
-"""`run_batch`: skips drives that are done, hands the others to workers, and writes the tables and the report."""
+"""`run_batch`: skip drives that are done, hand the others to workers, and write the tables and the report."""
 
 from __future__ import annotations
 
 import contextlib
+import csv
+import io
 import json
 from collections import Counter
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from bevcli.batch.drives import Drive
-from bevcli.batch.job import Job
+from bevcli.batch.job import ATTEMPTS, FAILED, READING_THREADS, RESULTS, Job, Record
 from bevcli.batch.ray_workers import Workers, run_on_ray
 from bevcli.batch.report import write_report
-from bevcli.batch.results import READING_THREADS, joint_metrics, to_csv, to_parquet
 from bevcli.batch.storage import LocalFolder, Storage, open_storage
-from bevcli.batch.worker import ATTEMPTS, FAILED, RECORD, RESULTS, Record, StoppedError, Worker, read_record
+from bevcli.batch.worker import MATCHES, RECORD, StoppedError, Worker, read_record
 from bevcli.errors import OutputError
-from bevcli.pipeline.model_loading import Model
-from bevcli.pipeline.run_folder import folder_lock
+from bevcli.evaluation.config import ERRORS, DetectionConfig
+from bevcli.evaluation.joint import DriveMatches, score_jointly
+from bevcli.evaluation.scores_report import scores_to_dict
+from bevcli.frame import MAP_CLASSES
+from bevcli.geometry.boxes import CLASSES
+from bevcli.inference.load import Model
+from bevcli.runs.folder import folder_lock
+from bevcli.runs.state import load_state
 
 PARQUET, CSV, METRICS, REPORT = "batch.parquet", "batch.csv", "metrics.json", "report.html"
 DESCRIPTION = "batch.json"  # says that a folder is a batch
 
+_COUNTS = ("attempts", "frames", "boxes", "tracks", "dropped_images", "skipped_frames", "not_finite_frames")
+COLUMNS: dict[str, pa.DataType] = {
+    **dict.fromkeys(("drive", "source", "scene", "result", "error"), pa.string()),
+    **dict.fromkeys(_COUNTS, pa.int64()),
+    **dict.fromkeys(("seconds", "frames_per_second", "fetch_seconds"), pa.float64()),
+    "output_bytes": pa.int64(),
+    **{f"boxes_{name}": pa.int64() for name in CLASSES},
+    **dict.fromkeys(("mean_ap", "nd_score", *ERRORS, *(f"iou_{name}" for name in MAP_CLASSES)), pa.float64()),
+    "ground_truth_boxes": pa.int64(),
+    "not_scored": pa.string(),
+}
+
 
 @dataclass(frozen=True)
 class BatchSummary:
-    """What a batch did.
+    """Summary of a batch.
 
     Attributes:
         records: of all drives that are done or have failed, in the order of the drives.
         drives: number of drives of the batch.
         skipped: number of drives that were done or had failed before.
-        stopped: whether the batch was stopped before its end.
+        stopped: before its end.
         files: paths or URLs of the files of the batch.
     """
 
@@ -76,15 +99,15 @@ def run_batch(
     after_drive: Callable[[Record], None] = lambda record: None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> BatchSummary:
-    """Runs a model over many drives, each as `run_into_folder` does.
+    """Run a model over many drives, each as `run_into_folder` does.
 
     The folder gets drives/NAME-HASH/ with the files of `bevcli run` for each drive, failed/NAME-HASH.json for each
     drive that failed, batch.parquet, batch.csv, report.html and, if drives were scored, metrics.json. The hash is that
     of a drive's input, the model, the weights and the options.
 
     Args:
-        job: what the drives are run with.
-        model: the job's model, of `job.load_model`; with `workers` on any device.
+        job: the model and the options.
+        model: of `job.load_model`; with `workers` on any device.
         drives: of `find_drives`.
         workers: on Ray; None runs one drive after another in this process.
         resume: skip drives that are done or have failed, and go on with the others.
@@ -95,8 +118,10 @@ def run_batch(
 
     Raises:
         OutputError: the folder has a batch already, is in use by another one, or cannot be written.
+        InputError: no drive has the format of an option.
         BevcliError: see `Worker` and `run_on_ray`.
     """
+    job.check_options(drives)
     out, job_hash = open_storage(job.out), job.hash(model)
     with folder_lock(out.path) if isinstance(out, LocalFolder) else contextlib.nullcontext():
         _check_folder(out, resume)
@@ -149,9 +174,9 @@ def _check_folder(out: Storage, resume: bool) -> None:
     is_batch = out.read(DESCRIPTION) is not None
     found = out.names("") - {".bevcli"}
     if found and not is_batch:
-        raise OutputError(f"{out.where}: is not a batch and not empty: pass --out DIR for another folder")
+        raise OutputError(f"{out.where}: is not a batch and not empty: pass `out=DIR` for another folder")
     if is_batch and not resume and (out.names(RESULTS) or out.names(FAILED)):
-        raise OutputError(f"{out.where}: has a batch already: pass --resume to go on with it, or --out DIR")
+        raise OutputError(f"{out.where}: has a batch already: pass `resume=True` to go on with it, or `out=DIR`")
 
 
 def _known_records(out: Storage, drives: Sequence[Drive], job_hash: str, retry_failed: bool) -> dict[str, Record]:
@@ -179,3 +204,51 @@ def _write_tables(out: Storage, records: Sequence[Record], model: Model) -> tupl
     for name, content in files.items():
         out.write(name, content)
     return tuple(f"{out.where}/{name}" for name in files)
+
+
+def row(record: Record) -> dict[str, Any]:
+    """The columns of a drive; None for what is not known, such as metrics without ground truth."""
+    boxes = record.get("boxes_by_class")
+    flat = {**record, **(record.get("scores") or {})}
+    if boxes is not None:
+        flat |= {f"boxes_{name}": boxes.get(name, 0) for name in CLASSES}
+    return {name: flat.get(name) for name in COLUMNS}
+
+
+def to_parquet(records: Sequence[Record]) -> bytes:
+    """batch.parquet: one row per drive, in the order of the records."""
+    table = pa.Table.from_pylist([row(record) for record in records], schema=pa.schema(list(COLUMNS.items())))
+    buffer = io.BytesIO()
+    pq.write_table(table, buffer)
+    return buffer.getvalue()
+
+
+def to_csv(records: Sequence[Record]) -> bytes:
+    """batch.csv: the same columns; an empty field for what is not known."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(row(record) for record in records)
+    return text.getvalue().encode()
+
+
+def joint_metrics(out: Storage, records: Sequence[Record], range_m: float) -> dict[str, Any] | None:
+    """The scores over all frames of all drives with ground truth, with the keys of `bevcli eval --json`, or None.
+
+    Boxes of all drives are scored together: the result is not a mean of the drives' scores. range_m: distance beyond
+    which nothing was scored. Raises InputError where the matches of a drive cannot be read.
+    """
+    scored = [record for record in records if record.get("scores")]
+    if not scored:
+        return None
+    with ThreadPoolExecutor(READING_THREADS) as pool:
+        matches = list(pool.map(lambda record: _read_matches(out, record), scored))
+    config = DetectionConfig().cut_at(range_m)
+    detection, segmentation = score_jointly(matches, config)
+    notes = (f"{len(scored)} drives are scored together; nothing beyond {range_m:g} m is scored",)
+    return {"drives": len(scored), **scores_to_dict(detection, config, segmentation, notes)}
+
+
+def _read_matches(out: Storage, record: Record) -> DriveMatches:
+    with out.copied(f"{RESULTS}/{record['result']}/{MATCHES}") as path:
+        return load_state(path, DriveMatches)

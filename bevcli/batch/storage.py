@@ -10,12 +10,13 @@ import glob
 import os
 import re
 import shutil
+import tempfile
 import uuid
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, Protocol
+from typing import Any
 
 from bevcli.errors import BevcliError, InputError, OutputError
 from bevcli.parsing.files import read_bytes
@@ -34,7 +35,7 @@ class StoredFile:
     Attributes:
         name: path relative to the folder, with "/".
         size: bytes.
-        version: what changes when its contents are replaced: modification time, or the store's checksum.
+        version: modification time or the store's checksum, which change with the contents.
     """
 
     name: str
@@ -42,52 +43,8 @@ class StoredFile:
     version: str
 
 
-class Storage(Protocol):
-    """A folder. Names are relative paths with "/".
-
-    Attributes:
-        where: the path or URL, for messages.
-    """
-
-    where: str
-
-    def files(self) -> list[StoredFile]:
-        """All files below the folder, sorted by name; of a file, the file itself. Raises InputError."""
-        ...
-
-    def names(self, folder: str) -> set[str]:
-        """The entries of a subfolder, empty without it. Raises InputError."""
-        ...
-
-    def read(self, name: str) -> bytes | None:
-        """The contents of a small file, None if it is missing. Raises InputError."""
-        ...
-
-    def write(self, name: str, content: bytes) -> None:
-        """Writes a file. Readers see the old or the new contents. Raises OutputError."""
-        ...
-
-    def remove(self, name: str) -> None:
-        """Removes a file or a subfolder, if it is there. Raises OutputError."""
-        ...
-
-    def land(self, folder: Path, name: str, last: str) -> None:
-        """Moves a local folder to a name that is free. Raises OutputError.
-
-        last: the file of the folder that says that it is whole; it never exists without the others.
-        """
-        ...
-
-    def fetch(self, local: Path, names: Sequence[str] | None = None) -> None:
-        """Copies the folder, or the file that it is, to a local path. Raises InputError.
-
-        names: only these files of the folder; those that are missing are left out.
-        """
-        ...
-
-
 def is_url(text: str) -> bool:
-    """Whether a text names a folder in an object store. file:// is a local path."""
+    """A text names a folder in an object store. file:// is a local path."""
     return bool(_URL.match(text)) and not text.startswith("file://")
 
 
@@ -112,13 +69,18 @@ def expand(pattern: str) -> list[str]:
 
 
 class LocalFolder:
-    """A folder on this machine, as a `Storage`."""
+    """A folder on this machine. Names are relative paths with "/".
+
+    Attributes:
+        path: the folder.
+        where: the path or URL, for messages.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path, self.where = path, str(path)
 
     def files(self) -> list[StoredFile]:
-        """See `Storage`."""
+        """All files below the folder, sorted by name; of a file, the file itself. Raises InputError."""
         if self.path.is_file():
             return [_stored(self.path, self.path.name)]
         found = []
@@ -131,7 +93,7 @@ class LocalFolder:
         return sorted(found, key=lambda file: file.name)
 
     def names(self, folder: str) -> set[str]:
-        """See `Storage`."""
+        """The entries of a subfolder, empty without it. Raises InputError."""
         try:
             return set(os.listdir(self.path / folder))
         except (FileNotFoundError, NotADirectoryError):
@@ -140,12 +102,17 @@ class LocalFolder:
             raise InputError(f"{self.path / folder}: cannot be read ({error.strerror})") from None
 
     def read(self, name: str) -> bytes | None:
-        """See `Storage`."""
+        """The contents of a small file, None if it is missing. Raises InputError."""
         path = self.path / name
         return read_bytes(path, LARGEST_RECORD) if path.is_file() else None
 
+    @contextlib.contextmanager
+    def copied(self, name: str) -> Iterator[Path]:
+        """A file on this machine; of an object store, a temporary copy. Raises InputError where it is missing."""
+        yield self.path / name
+
     def write(self, name: str, content: bytes) -> None:
-        """See `Storage`."""
+        """Write a file. Readers see the old or the new contents. Raises OutputError."""
         path = self.path / name
         fresh = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}.new")
         try:
@@ -158,7 +125,7 @@ class LocalFolder:
             raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
 
     def remove(self, name: str) -> None:
-        """See `Storage`."""
+        """Remove a file or a subfolder, if it is there. Raises OutputError."""
         path = self.path / name
         try:
             if path.is_dir() and not path.is_symlink():
@@ -171,20 +138,19 @@ class LocalFolder:
             raise OutputError(f"{path}: cannot be removed ({error.strerror})") from None
 
     def land(self, folder: Path, name: str, last: str) -> None:
-        """See `Storage`. The folder must be on the same file system."""
+        """Move a local folder to a name that is free, on the same file system. Raises OutputError.
+
+        last: the file of the folder that says that it is whole; it never exists without the others.
+        """
         try:
             (self.path / name).parent.mkdir(parents=True, exist_ok=True)
             os.rename(folder, self.path / name)
         except OSError as error:
             raise OutputError(f"{self.path / name}: cannot be written ({error.strerror})") from None
 
-    def fetch(self, local: Path, names: Sequence[str] | None = None) -> None:
-        """See `Storage`."""
-        raise AssertionError("a local folder is read where it is")
-
 
 class RemoteFolder:
-    """A folder in an object store, as a `Storage`. Raises BevcliError where a package is not installed."""
+    """A folder in an object store, see `LocalFolder`. Raises BevcliError where a package is not installed."""
 
     def __init__(self, where: str) -> None:
         self.where = where.rstrip("/")
@@ -192,19 +158,16 @@ class RemoteFolder:
         self._root = str(path).rstrip("/")
 
     def files(self) -> list[StoredFile]:
-        """See `Storage`."""
+        """See `LocalFolder`."""
         with _one_line(self.where, InputError):
             self._system.invalidate_cache()
             found = self._system.find(self._root, detail=True)
-        if list(found) == [self._root]:
-            return [_described(PurePosixPath(self._root).name, found[self._root])]
-        return sorted(
-            (_described(name[len(self._root) + 1 :], facts) for name, facts in found.items()),
-            key=lambda file: file.name,
-        )
+        own_name = PurePosixPath(self._root).name  # where the folder is a file
+        described = [_described(name[len(self._root) + 1 :] or own_name, facts) for name, facts in found.items()]
+        return sorted(described, key=lambda file: file.name)
 
     def names(self, folder: str) -> set[str]:
-        """See `Storage`."""
+        """See `LocalFolder`."""
         with _one_line(f"{self.where}/{folder}", InputError):
             try:
                 self._system.invalidate_cache()
@@ -214,25 +177,36 @@ class RemoteFolder:
         return {PurePosixPath(name).name for name in found}
 
     def read(self, name: str) -> bytes | None:
-        """See `Storage`."""
+        """See `LocalFolder`."""
         with _one_line(f"{self.where}/{name}", InputError):
             try:
                 return bytes(self._system.cat_file(self._path(name)))
             except FileNotFoundError:
                 return None
 
+    @contextlib.contextmanager
+    def copied(self, name: str) -> Iterator[Path]:
+        """See `LocalFolder`."""
+        content = self.read(name)
+        if content is None:
+            raise InputError(f"{self.where}/{name}: is missing")
+        with tempfile.TemporaryDirectory(prefix="bevcli-") as folder:
+            path = Path(folder, Path(name).name)
+            path.write_bytes(content)
+            yield path
+
     def write(self, name: str, content: bytes) -> None:
-        """See `Storage`."""
+        """See `LocalFolder`."""
         with _one_line(f"{self.where}/{name}", OutputError):
             self._system.pipe_file(self._path(name), content)
 
     def remove(self, name: str) -> None:
-        """See `Storage`."""
+        """See `LocalFolder`."""
         with _one_line(f"{self.where}/{name}", OutputError), contextlib.suppress(FileNotFoundError):
             self._system.rm(self._path(name), recursive=True)
 
     def land(self, folder: Path, name: str, last: str) -> None:
-        """See `Storage`. An object store cannot rename a folder: the file `last` is uploaded last."""
+        """See `LocalFolder`. An object store cannot rename a folder: the file `last` is uploaded last."""
         files = [path for path in folder.rglob("*") if path.is_file()]
         files.sort(key=lambda path: path == folder / last)
         with _one_line(f"{self.where}/{name}", OutputError):
@@ -241,15 +215,16 @@ class RemoteFolder:
         shutil.rmtree(folder)
 
     def fetch(self, local: Path, names: Sequence[str] | None = None) -> None:
-        """See `Storage`."""
+        """Copy the folder, or the file that it is, to a local path. Raises InputError.
+
+        names: only these files of the folder; those that are missing are left out.
+        """
         with _one_line(self.where, InputError), ThreadPoolExecutor(FETCHING_THREADS) as pool:
             if names is None and self._system.isfile(self._root):
                 local.parent.mkdir(parents=True, exist_ok=True)
                 self._system.get_file(self._root, str(local))
                 return
-            wanted = names
-            if wanted is None:
-                wanted = [name[len(self._root) + 1 :] for name in self._system.find(self._root)]
+            wanted = [file.name for file in self.files()] if names is None else names
             list(pool.map(lambda name: self._fetch_file(name, local, may_be_missing=names is not None), wanted))
 
     def _fetch_file(self, name: str, local: Path, *, may_be_missing: bool) -> None:
@@ -266,6 +241,9 @@ class RemoteFolder:
 
     def _path(self, name: str) -> str:
         return f"{self._root}/{name}"
+
+
+Storage = LocalFolder | RemoteFolder
 
 
 def _stored(path: Path, name: str) -> StoredFile:
@@ -300,12 +278,12 @@ def _filesystem(url: str) -> tuple[Any, str]:
 
 @contextlib.contextmanager
 def _one_line(where: str, kind: type[BevcliError]) -> Iterator[None]:
-    """Makes one error of one line of what the packages of object stores raise, which have errors of many types."""
+    """Make one error of one line of what the packages of object stores raise, which have errors of many types."""
     try:
         yield
-    except (BevcliError, FileNotFoundError, ImportError) as error:
-        if isinstance(error, FileNotFoundError):
-            raise kind(f"{where}: is missing") from None
+    except FileNotFoundError:
+        raise kind(f"{where}: is missing") from None
+    except (BevcliError, ImportError):
         raise
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__

@@ -11,35 +11,30 @@ import time
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 import torch
 
-from bevcli.batch.drives import Drive
-from bevcli.batch.embeddings import FramePooling
-from bevcli.batch.job import Job
-from bevcli.batch.nuscenes_url import fetch_scene
-from bevcli.batch.storage import LocalFolder, is_url, open_storage
+from bevcli.batch.drives import Drive, fetch_scene
+from bevcli.batch.find_like import FramePooling
+from bevcli.batch.job import ATTEMPTS, FAILED, RESULTS, SCORE_BINS, Job, Record
+from bevcli.batch.storage import LocalFolder, RemoteFolder, is_url, open_storage
 from bevcli.errors import BevcliError
 from bevcli.evaluation.evaluate import Scores, evaluate
 from bevcli.evaluation.joint import DriveMatches
 from bevcli.frame import Frame, Prediction
-from bevcli.pipeline.model_loading import Model
-from bevcli.pipeline.run import run_into_folder
-from bevcli.pipeline.run_folder import SUMMARY
-from bevcli.pipeline.run_summary import RunSummary
-from bevcli.pipeline.state_file import save_state
-from bevcli.sequences.nuscenes.choice import NuScenesChoice
-from bevcli.sequences.open import open_sequence
-
-Record = dict[str, Any]  # what is known of a drive after it was run; a row of batch.parquet
+from bevcli.inference.load import Model
+from bevcli.runs.folder import SUMMARY
+from bevcli.runs.run_into_folder import run_into_folder
+from bevcli.runs.state import save_state
+from bevcli.runs.summary import RunSummary
+from bevcli.sequences.native.format import NativeOptions
+from bevcli.sequences.nuscenes.format import NuScenesOptions
 
 RECORD = "drive.json"  # in the folder of a drive's results: its record. A folder with it is whole.
 MATCHES = "matches.safetensors"  # in the folder of a drive's results: for the joint metrics
-RESULTS, FAILED, ATTEMPTS = "drives", "failed", ".bevcli/attempts"
-SCORE_BINS = 20  # of the histogram of scores, from 0 to 1
 _SCRATCH = "bevcli-batch-"
 
 
@@ -48,10 +43,7 @@ class StoppedError(Exception):
 
 
 class Worker:
-    """Runs drives; the model is loaded once. model: of `job.load_model`, if it is loaded already.
-
-    Raises BevcliError where the model, its weights, the device or the output folder cannot be used.
-    """
+    """Runs drives with a model that is loaded once. Raises BevcliError where the model or `out` cannot be used."""
 
     def __init__(self, job: Job, job_hash: str, model: Model | None = None) -> None:
         self._job, self._job_hash = job, job_hash
@@ -60,7 +52,7 @@ class Worker:
         _remove_scratch_of_dead_workers()
 
     def run(self, drive: Drive, should_stop: Callable[[], bool] = lambda: False) -> Record:
-        """Runs a drive until it is done or has failed too often, and returns its record, which is also stored.
+        """Run a drive until it is done or has failed too often, and returns its record, which is also stored.
 
         An attempt is counted before it starts, so that a drive that kills its worker is not tried for ever.
 
@@ -75,7 +67,7 @@ class Worker:
         while attempt <= self._job.retries:
             attempt += 1
             died = f"the worker died in attempt {attempt} of {self._job.retries + 1} (out of memory, or a crash)"
-            self._out.write(marker, json.dumps({"attempt": attempt, "error": died}).encode())
+            self._out.write(marker, msgspec.json.encode((attempt, died)))
             try:
                 record = self._attempt(drive, result, attempt, should_stop)
             except StoppedError:
@@ -103,12 +95,15 @@ class Worker:
             path = _fetched(drive, job, inputs)
             fetched = time.perf_counter()
             try:
-                sequence = open_sequence(path, **job.reading_of(drive.scene))
-                counts = _Counts(job.run.recording.score)
+                sequence = job.open(path, drive.scene)
+                histogram = np.zeros(SCORE_BINS, dtype=np.int64)  # of the boxes that are shown
                 pooling = FramePooling(f"{self._model.name}, {self._model.weights_hash}") if job.embed else None
 
                 def after_frame(frame: Frame, prediction: Prediction) -> None:
-                    counts.add(prediction)
+                    scores = prediction.boxes.scores
+                    if scores is not None:
+                        shown = scores[scores >= job.run.recording.score]
+                        np.add(histogram, np.histogram(shown, SCORE_BINS, (0, 1))[0], out=histogram)
                     if pooling is not None:
                         pooling.add(frame, prediction)
 
@@ -132,7 +127,7 @@ class Worker:
                 "frames_per_second": round(summary.frames / seconds, 4),
                 "fetch_seconds": round(fetched - began, 3),
                 "output_bytes": sum(file.stat().st_size for file in aside.rglob("*") if file.is_file()),
-                "score_histogram": counts.histogram.tolist(),
+                "score_histogram": histogram.tolist(),
                 "scores": None if scores is None else _score_columns(scores),
                 "not_scored": why_not,
             }
@@ -149,8 +144,8 @@ class Worker:
         """The scores of a drive's predictions, or None and why there are none; "" without ground truth."""
         if not self._job.evaluate or not (drive.scene or (path / "ground_truth.json").is_file()):
             return None, ""
-        version = self._job.reading.get("version") if drive.scene else None
-        class_map = self._job.reading.get("class_map")
+        version = self._job.own_of(NuScenesOptions).version if drive.scene else None
+        class_map = self._job.own_of(NativeOptions).class_map
         range_m = self._model.config.bev_grid.nearest_side_m
         try:
             scores = evaluate(aside, path, range_m, scene=drive.scene, version=version, class_map=class_map)
@@ -179,7 +174,7 @@ class Worker:
             shutil.rmtree(aside, ignore_errors=True)
 
     def _check_device(self) -> None:
-        """Ends this process if its GPU no longer works: after some errors, CUDA fails until the process is replaced."""
+        """End this process if its GPU no longer works: after some errors, CUDA fails until the process is replaced."""
         if self._model.device.type == "cuda":
             try:
                 torch.zeros(1, device=self._model.device).cpu()
@@ -188,22 +183,9 @@ class Worker:
 
 
 def use_threads(count: int) -> None:
-    """Sets the number of CPU threads of this process."""
+    """Set the number of CPU threads of this process."""
     torch.set_num_threads(count)
     cv2.setNumThreads(count)
-
-
-class _Counts:
-    """Histogram of the scores of the boxes that are shown."""
-
-    def __init__(self, score: float) -> None:
-        self._score = score
-        self.histogram = np.zeros(SCORE_BINS, dtype=np.int64)
-
-    def add(self, prediction: Prediction) -> None:
-        scores = prediction.boxes.scores
-        if scores is not None:
-            self.histogram += np.histogram(scores[scores >= self._score], SCORE_BINS, (0, 1))[0]
 
 
 def read_record(content: bytes | None) -> Record | None:
@@ -222,9 +204,8 @@ def _about(drive: Drive, result: str) -> Record:
 def _summary_columns(summary: RunSummary) -> Record:
     facts = summary.to_dict()
     counts = {name: facts[name] for name in ("frames", "boxes", "boxes_by_class", "tracks")}
-    lists = {"dropped_images": "dropped_pictures", "skipped_frames": "skipped_frames"}
-    lists |= {"not_finite_frames": "not_finite_frames"}
-    return counts | {column: len(facts[name]) for column, name in lists.items()}  # type: ignore[arg-type]
+    lists = ("dropped_images", "skipped_frames", "not_finite_frames")
+    return counts | {name: len(facts[name]) for name in lists}  # type: ignore[arg-type]
 
 
 def _score_columns(scores: Scores) -> Record:
@@ -242,10 +223,9 @@ def _fetched(drive: Drive, job: Job, inputs: Path) -> Path:
         return Path(drive.source)
     local = inputs / drive.source.rpartition("/")[2]
     if drive.scene is None:
-        open_storage(drive.source).fetch(local)
+        RemoteFolder(drive.source).fetch(local)
     else:
-        choice = NuScenesChoice(job.reading.get("version"), drive.scene, sweeps=job.reading.get("sweeps", False))
-        fetch_scene(drive.source, choice, local)
+        fetch_scene(drive.source, job.own_of(NuScenesOptions), drive.scene, local)
     return local
 
 
@@ -265,10 +245,10 @@ def _rewrite_paths(aside: Path, where: str) -> None:
 
 
 def _read_marker(content: bytes | None) -> tuple[int, str]:
+    """Number and error of the last attempt; 0 without one."""
     try:
-        marker = {} if content is None else json.loads(content)
-        return int(marker.get("attempt", 0)), str(marker.get("error", ""))
-    except (ValueError, TypeError, AttributeError, RecursionError, OverflowError):
+        return msgspec.json.decode(content or b'[0, ""]', type=tuple[int, str])
+    except (msgspec.MsgspecError, ValueError, RecursionError):
         return 0, ""
 
 

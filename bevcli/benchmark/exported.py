@@ -7,17 +7,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from bevcli.benchmark.comparison import NEAR_M
-from bevcli.engines.engine import EngineName
+from bevcli.benchmark.versions import NEAR_M
 from bevcli.engines.exported import load_exported
 from bevcli.frame import Sequence
-from bevcli.model.bevformer import BEVFormerBase, BEVFormerOutputs
-from bevcli.model.prepared import prepare_for_inference
-from bevcli.pipeline.model_loading import Model
-from bevcli.pipeline.preprocess import Preprocessor
-from bevcli.pipeline.runner import Runner
+from bevcli.inference.load import Model
+from bevcli.inference.preprocess import Preprocessor
+from bevcli.inference.runner import Runner
+from bevcli.model.prepare import prepare_for_inference
+from bevcli.model.segmentation import SegmentationOutputs
+from bevcli.model.step import ModelOutputs
+from bevcli.model.temporal_model import TemporalModel
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class FrameDifference:
 
 
 def check_exported(
-    file: Path, model: Model, sequence: Sequence, engine: EngineName = "onnxruntime"
+    file: Path, model: Model, sequence: Sequence, engine: str = "onnxruntime"
 ) -> Iterator[FrameDifference]:
     """Runs both over a drive, each with the state of its own last frame, and yields the differences frame by frame.
 
@@ -54,22 +55,22 @@ def check_exported(
         sequence: the drive. Frames without any image are left out.
         engine: the program that runs the file.
 
-    Raises:
-        WeightsError: the file cannot be loaded.
-        InputError: a frame cannot be read.
+    Raises WeightsError where the file cannot be loaded, InputError where a frame cannot be read.
     """
     network = prepare_for_inference(model.network, torch.device("cpu"))
     yield from _differences((network, load_exported(file, engine)), sequence)
 
 
-def compare_exported(file: Path, other: Path, sequence: Sequence, engine: EngineName) -> Iterator[FrameDifference]:
+def compare_exported(file: Path, other: Path, sequence: Sequence, engine: str) -> Iterator[FrameDifference]:
     """As `check_exported`, for two exported files of one model."""
     yield from _differences((load_exported(other, engine), load_exported(file, engine)), sequence)
 
 
-def _differences(networks: tuple[BEVFormerBase, BEVFormerBase], sequence: Sequence) -> Iterator[FrameDifference]:
+def _differences(networks: tuple[TemporalModel, TemporalModel], sequence: Sequence) -> Iterator[FrameDifference]:
     cpu = torch.device("cpu")
-    outputs = [_Latest(network) for network in networks]
+    outputs: dict[int, ModelOutputs] = {}  # of the last step of each network
+    for number, network in enumerate(networks):
+        network.observed.register_forward_hook(lambda *call, number=number: outputs.update({number: call[2]}))
     runners = [Runner(network, cpu) for network in networks]
     states = [None, None]
     preprocess = Preprocessor(networks[1].config)  # of the exported file, whose images have one size
@@ -78,18 +79,16 @@ def _differences(networks: tuple[BEVFormerBase, BEVFormerBase], sequence: Sequen
         if not prepared.frame.images:
             continue
         states = [runner.step(state, prepared)[0] for runner, state in zip(runners, states, strict=True)]  # type: ignore[misc]
-        yield compare_outputs(stamp.index, *(latest.outputs for latest in outputs))
+        yield compare_outputs(stamp.index, outputs[0], outputs[1])
 
 
-def compare_outputs(frame: int, ours: BEVFormerOutputs, theirs: BEVFormerOutputs) -> FrameDifference:
+def compare_outputs(frame: int, ours: ModelOutputs, theirs: ModelOutputs) -> FrameDifference:
     """The largest differences of the last decoder layer, the BEV map and the segmentation of a frame."""
     codes = (ours.box_codes[-1] - theirs.box_codes[-1]).abs()
     center = [0, 1, 4]
     distances = codes[..., center].norm(dim=-1)
     others = [index for index in range(codes.shape[-1]) if index not in center]
-    masks = 0.0
-    if ours.segmentation is not None and theirs.segmentation is not None:
-        masks = _largest(*(_probabilities(outputs) for outputs in (ours, theirs)))
+    probabilities = [_probabilities(one.segmentation) for one in (ours, theirs) if one.segmentation is not None]
     return FrameDifference(
         frame=frame,
         bev=_largest(ours.bev, theirs.bev),
@@ -97,7 +96,7 @@ def compare_outputs(frame: int, ours: BEVFormerOutputs, theirs: BEVFormerOutputs
         box_m=distances.max().item(),
         near=(distances <= NEAR_M).float().mean().item(),
         code=codes[..., others].max().item(),
-        masks=masks,
+        masks=_largest(*probabilities) if len(probabilities) == 2 else 0.0,
     )
 
 
@@ -113,21 +112,8 @@ def difference_lines(differences: list[FrameDifference]) -> list[str]:
     return ["  ".join(f"{text:>9}" for text in row) for row in (heads, *rows, largest)]
 
 
-class _Latest:
-    """Keeps the outputs of a network's last call."""
-
-    outputs: BEVFormerOutputs
-
-    def __init__(self, network: nn.Module) -> None:
-        network.register_forward_hook(self._keep)
-
-    def _keep(self, network: nn.Module, inputs: object, outputs: BEVFormerOutputs) -> None:
-        self.outputs = outputs
-
-
-def _probabilities(outputs: BEVFormerOutputs) -> Tensor:
-    assert outputs.segmentation is not None
-    return outputs.segmentation.mask_logits[-1].sigmoid() * outputs.segmentation.class_logits[-1].sigmoid()[..., None]
+def _probabilities(segmentation: SegmentationOutputs) -> Tensor:
+    return segmentation.mask_logits[-1].sigmoid() * segmentation.class_logits[-1].sigmoid()[..., None]
 
 
 def _largest(one: Tensor, other: Tensor) -> float:

@@ -23,18 +23,16 @@ from typing import Any, get_args
 
 import torch
 
-from bevcli import __version__
-from bevcli.benchmark.comparison import NEAR_M
+from bevcli._version import __version__
 from bevcli.benchmark.made_up import MadeUpDrive, made_up_model
 from bevcli.benchmark.measure import describe_machine
-from bevcli.benchmark.table import markdown_table, measure
-from bevcli.benchmark.textbook import textbook_version
-from bevcli.benchmark.version import Version
+from bevcli.benchmark.result import markdown_table, measure
+from bevcli.benchmark.versions import Version, difference, largest_differences, textbook_version
 from bevcli.config import known_models, load_config
 from bevcli.errors import BevcliError
-from bevcli.model.prepared import Precision, prepare_for_inference
-from bevcli.pipeline.model_loading import choose_device
-from bevcli.pipeline.preprocess import Preprocessor
+from bevcli.inference.load import choose_device
+from bevcli.inference.preprocess import Preprocessor
+from bevcli.model.prepare import Precision, prepare_for_inference
 
 ROOT = Path(__file__).parents[2]  # of the repository
 PRECISIONS: tuple[Precision, ...] = get_args(Precision)
@@ -90,7 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def gpu_of(name: str) -> torch.device:
-    """The device to check. "auto" takes a CUDA GPU, else the GPU of a Mac. Raises BevcliError if there is neither."""
+    """The device to check; "auto" takes a CUDA GPU, else the GPU of a Mac. Raises BevcliError if there is neither."""
     if name == "auto" and not torch.cuda.is_available():
         if not torch.backends.mps.is_available():
             raise BevcliError(f"gpu-check: PyTorch {torch.__version__} sees no GPU here, so there is nothing to check")
@@ -147,22 +145,19 @@ def compare_all(device: torch.device, models: tuple[str, ...]) -> str:
         try:
             rows = json.loads(_run(command, f"model {model}").splitlines()[-1])
         except CheckFailed as failure:
-            passed, rows = False, []
-            lines.append(f"| {model} | | | | | {' '.join(str(failure).split())[-300:].replace('|', '/')} |")
+            rows = [{"precision": "", "error": " ".join(str(failure).split())[-300:].replace("|", "/")}]
         for row in rows:
-            error = row.get("error", "")
-            passed = passed and not error
-            numbers = [f"{row[name]:.3g}" if name in row else "" for name in ("distance_m", "score")]
-            share = f"{row['share']:.1%}" if "share" in row else ""
-            lines.append(f"| {model} | {row['precision']} | {share} | {numbers[0]} | {numbers[1]} | {error} |")
-    table = "\n".join(lines)
+            passed = passed and "error" not in row
+            formats = {"share": ".1%", "distance_m": ".3g", "score": ".3g", "error": ""}
+            cells = [format(row[name], kind) if name in row else "" for name, kind in formats.items()]
+            lines.append(f"| {' | '.join([model, row['precision'], *cells])} |")
     if not passed:
-        raise CheckFailed(table)
-    return table
+        raise CheckFailed("\n".join(lines))
+    return "\n".join(lines)
 
 
 def compare(name: str, device: torch.device) -> list[dict[str, Any]]:
-    """One row a precision: the model on the device against the plain model on the CPU.
+    """Compare device and CPU outputs; return one row per precision.
 
     A row has `share` (of the boxes within 0.1 m), `distance_m` and `score` (the largest differences), and `error` where
     they are too large or the model failed.
@@ -174,27 +169,26 @@ def compare(name: str, device: torch.device) -> list[dict[str, Any]]:
     expected = []
     for frame in frames:
         plain.step(frame)
-        expected.append((plain.centers, plain.scores))
+        expected.append(plain.queries)
     rows = []
     for precision in PRECISIONS:
         row: dict[str, Any] = {"precision": precision}
         try:
             fast = Version(prepare_for_inference(model, device, precision), device)
-            distances, scores = [], []
-            for frame, (expected_centers, expected_scores) in zip(frames, expected, strict=True):
+            found = []
+            for frame, queries in zip(frames, expected, strict=True):
                 fast.step(frame)
-                distances.append((fast.centers.float().cpu() - expected_centers).norm(dim=-1))
-                scores.append((fast.scores.float().cpu() - expected_scores).abs().max())
-            row |= _differences(torch.cat(distances), float(torch.stack(scores).max()))
+                found.append(difference(fast.queries, queries))
+            row |= _differences(found)
         except Exception as error:  # whatever a GPU raises is what the report is for
             row["error"] = f"{type(error).__name__}: {' '.join(str(error).split())[:200].replace('|', '/')}"
         rows.append(row)
     return rows
 
 
-def _differences(distances_m: torch.Tensor, score: float) -> dict[str, Any]:
-    share = float((distances_m <= NEAR_M).float().mean())  # NaN is not near
-    row: dict[str, Any] = {"share": share, "distance_m": float(distances_m.max()), "score": score}
+def _differences(frames: Sequence[tuple[torch.Tensor, torch.Tensor]]) -> dict[str, Any]:
+    distance_m, share, score = largest_differences(frames)
+    row: dict[str, Any] = {"share": share, "distance_m": distance_m, "score": score}
     if not (share >= MIN_SHARE_WITHIN_TENTH_M and score <= MAX_SCORE_DIFFERENCE):
         row["error"] = "differs too much"
     return row
@@ -231,7 +225,7 @@ def bench(device: torch.device, models: tuple[str, ...]) -> str:
 
 
 def _run(command: list[str], what: str) -> str:
-    """What a process printed. Raises CheckFailed if it fails or takes too long."""
+    """The output of a process. Raises CheckFailed if it fails or takes too long."""
     try:
         answer = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=LIMIT_S)
     except subprocess.TimeoutExpired:

@@ -9,16 +9,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
-from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
-from bevcli.model.bevformer_v2 import BEVFormerV2
-from bevcli.model.build import build_model
-from bevcli.model.deformable_attention import FeatureMaps
+from bevcli.model.config import ModelConfig
+from bevcli.model.network import build_network
 from bevcli.model.pillar_projection import PillarHits
-from bevcli.model.prepared import DTYPES, Precision
-from bevcli.model.uniad import UniAD
+from bevcli.model.prepare import DTYPES, Precision
 
 # Edge of the square matrices and floats of the copied block: large enough for full speed, small enough to be quick.
 CPU_EDGE, GPU_EDGE = 2048, 8192
@@ -65,31 +61,24 @@ def wait_for(device: torch.device) -> None:
         torch.mps.synchronize()
 
 
-def count_operations(config: BEVFormerConfig, hits_per_camera: tuple[int, ...]) -> float:
+def count_operations(config: ModelConfig, hits_per_camera: tuple[int, ...]) -> float:
     """Arithmetic operations of one frame with history; a multiplication and an addition are two.
 
-    Counts matrix products, convolutions, attention and sampling of the plain model. The shapes are enough for this:
-    nothing is computed.
-
-    Args:
-        config: the model.
-        hits_per_camera: number of BEV cells that each camera sees.
+    Counts matrix products, convolutions, attention and sampling of the plain model, from the shapes alone.
+    hits_per_camera: number of BEV cells that each camera sees.
     """
     counter = FlopCounterMode(display=False, custom_mapping={torch.ops.aten.grid_sampler_2d: _sampling_operations})
+    grid, cameras, total = config.bev_grid, len(hits_per_camera), sum(hits_per_camera)
     with torch.device("meta"), counter:
-        model: BEVFormerBase = build_model(config).eval().requires_grad_(False)
+        model = build_network(config).eval().requires_grad_(False)
         width, height = config.image.padded_size
-        images = torch.empty(1, len(hits_per_camera), 3, height, width)
-        features = model.image_features(images, torch.zeros(len(hits_per_camera), dtype=torch.int64))
-        if isinstance(model, BEVFormerV2):
-            # Every frame of the window is encoded anew; its images were seen before.
-            maps = [_encode(model, features, hits_per_camera, history=False) for _ in model.config.frames]
-            bev = maps[0] if model.fusion is None else model.fusion(maps)
-        else:
-            bev = _encode(model, features, hits_per_camera, history=True)
-        model.decoder(bev, model.detection_head)
-        if isinstance(model, UniAD):
-            model.map_head(bev)
+        hits = PillarHits(
+            cell=torch.zeros(total, dtype=torch.int64),
+            reference_points=torch.empty(total, grid.pillar_points, 2),
+            hits_per_camera=hits_per_camera,
+            cameras_per_cell=torch.ones(grid.rows * grid.columns, dtype=torch.int64),
+        )
+        model.run_on_shapes(torch.empty(1, cameras, 3, height, width), torch.zeros(cameras, dtype=torch.int64), hits)
     return float(counter.get_total_flops())
 
 
@@ -103,20 +92,6 @@ def _best_seconds(work: Callable[[], object], device: torch.device) -> float:
         wait_for(device)
         best = min(best, time.perf_counter() - began)
     return best
-
-
-def _encode(model: BEVFormerBase, features: FeatureMaps, hits_per_camera: tuple[int, ...], *, history: bool) -> Tensor:
-    """The encoder on tensors of the right shapes."""
-    grid, total = model.config.bev_grid, sum(hits_per_camera)
-    hits = PillarHits(
-        cell=torch.zeros(total, dtype=torch.int64),
-        reference_points=torch.empty(total, grid.pillar_points, 2),
-        hits_per_camera=hits_per_camera,
-        cameras_per_cell=torch.ones(grid.rows * grid.columns, dtype=torch.int64),
-    )
-    query = model.bev_queries(torch.empty(1, 18))
-    before = torch.empty(1, grid.rows * grid.columns, model.config.channels) if history else None
-    return model.encoder(query, model.bev_queries.position(), features, hits, before, torch.empty(1, 2))
 
 
 def _sampling_operations(*_shapes: Any, out_val: Any = None, out_shape: Any = None, **_options: Any) -> int:

@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from torch import nn
 
-from bevcli.frame import CameraImage, Frame, FrameStamp
+from bevcli.frame import CameraImage, Frame, FrameStamp, Sequence
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import GRAVITY, Kinematics
 from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
-from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
-from bevcli.model.build import build_model
-from bevcli.pipeline.camera_assignment import NUSCENES_YAWS_DEG
+from bevcli.model.camera_assignment import NUSCENES_YAWS_DEG
+from bevcli.model.config import ModelConfig
+from bevcli.model.network import Network, build_network
 
 WIDTH, HEIGHT = 1600, 900
 FOCAL_LENGTH = 1266.0  # pixels, of all nuScenes cameras but the one at the back
@@ -29,14 +29,13 @@ RESIDUAL_GAIN = 0.25  # of the backbone's blocks, whose initial gain is zero
 USUAL_DEVIATION = 57.0  # standard deviation of images, grey levels; other values of `image.std` scale the first layer
 
 
-class MadeUpDrive:
-    """A `Sequence` of any length with moving vehicle and JPEG images.
+class MadeUpDrive(Sequence):
+    """A drive of any length with moving vehicle and JPEG images.
 
     The cameras' directions and lenses are those of nuScenes, so that the cameras see as many BEV cells.
     """
 
     name = "made-up"
-    notes: tuple[str, ...] = ()
     has_ego_motion = True
 
     def __init__(self, frames: int) -> None:
@@ -69,7 +68,7 @@ class MadeUpDrive:
         return CameraImage(stamp.timestamp_ns, pixels.astype(np.uint8, copy=False), encoded, "image/jpeg")
 
 
-def made_up_model(config: BEVFormerConfig) -> BEVFormerBase:
+def made_up_model(config: ModelConfig) -> Network:
     """A model with random weights, the same at every call.
 
     Weights that are initialised to zero get small random numbers, so that every part affects the result and an error
@@ -77,7 +76,7 @@ def made_up_model(config: BEVFormerConfig) -> BEVFormerBase:
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(SEED)
-        model: BEVFormerBase = build_model(config).eval()
+        model = build_network(config).eval()
         with torch.no_grad():
             for name, parameter in model.named_parameters():
                 if name.endswith("bn3.weight"):

@@ -10,26 +10,24 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
 
 import torch
 
-from bevcli.benchmark.comparison import compare_with_plain
 from bevcli.benchmark.limits import count_operations, measure_limits
 from bevcli.benchmark.made_up import MadeUpDrive, made_up_model
+from bevcli.benchmark.options import BenchOptions
 from bevcli.benchmark.result import BenchmarkResult
-from bevcli.benchmark.version import Version
+from bevcli.benchmark.versions import Version, compare_with_plain
 from bevcli.frame import Frame, Prediction
-from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
-from bevcli.model.bevformer_v2 import BEVFormerV2Config
-from bevcli.model.prepared import Precision, prepare_for_inference
-from bevcli.pipeline.model_loading import Model
-from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
-from bevcli.pipeline.runner import BevState
-from bevcli.pipeline.write_behind import write_behind
+from bevcli.inference.background import write_behind
+from bevcli.inference.load import Model
+from bevcli.inference.preprocess import Preprocessor
+from bevcli.inference.runner import BevState
+from bevcli.model.config import ModelConfig
+from bevcli.model.prepare import Precision, prepare_for_inference
 from bevcli.recording.writer import Recording
 
 WARM_UP_FRAMES = 2  # one without and one with history
@@ -39,53 +37,40 @@ RUNS = 6  # that take turns with the model alone if frames are short
 TURNS_S = 30.0  # for all turns if frames are short; with slow models one run
 
 
-@dataclass(frozen=True)
-class BenchmarkSettings:
-    """What is measured.
+def run_benchmark(
+    config: ModelConfig, device: torch.device, precision: Precision, options: BenchOptions, exported: Model | None
+) -> BenchmarkResult:
+    """Runs all measurements one after another. Nothing else should run on the machine.
 
-    Attributes:
-        config: the model.
-        device: where it runs.
-        precision: of the prepared model.
-        frames: number of timed frames, after the warm-up.
-        against_plain: whether the plain version is timed too, and the results compared.
-        profile: where to write PyTorch's profile of one frame (Chrome's trace format), None for no profile.
-        exported: an exported file of the model, which is timed with its own weights and precision; None for PyTorch.
+    precision: of the prepared model. exported: an exported file of the model, which is timed with its own weights and
+    precision; None for PyTorch.
     """
-
-    config: BEVFormerConfig
-    device: torch.device
-    precision: Precision
-    frames: int = 5
-    against_plain: bool = False
-    profile: Path | None = None
-    exported: Model | None = None
-
-
-def run_benchmark(settings: BenchmarkSettings) -> BenchmarkResult:
-    """Runs all measurements one after another. Nothing else should run on the machine."""
-    config, device = settings.config, settings.device
-    limits = measure_limits(device, settings.precision)
+    limits = measure_limits(device, precision)
     model = made_up_model(config)
-    exported = settings.exported
-    network = prepare_for_inference(model, device, settings.precision) if exported is None else exported.prepared
+    network = prepare_for_inference(model, device, precision) if exported is None else exported.prepared
     fast = Version(network, device)
-    first = config.past_frames if isinstance(config, BEVFormerV2Config) else 0
-    timed, run = first + WARM_UP_FRAMES, first + WARM_UP_FRAMES + settings.frames
-    drive = MadeUpDrive(run + 2 * RUNS * max(settings.frames, RUN_FRAMES))
+    first = config.past_frames
+    timed, run = first + WARM_UP_FRAMES, first + WARM_UP_FRAMES + options.frames
+    drive = MadeUpDrive(run + 2 * RUNS * max(options.frames, RUN_FRAMES))
     stages = _time_stages(fast, drive, first, range(timed, run))
     frame_s, peak = tuple(fast.seconds), _peak_memory(device)
-    run_frame_s, run_over_model = _time_runs(fast, drive, run, max(settings.frames, MIN_RUN_FRAMES))
-    if settings.profile is not None:
-        _write_profile(fast, _prepared(drive, config, 0), settings.profile)
+    run_frame_s, run_over_model = _time_runs(fast, drive, run, max(options.frames, MIN_RUN_FRAMES))
+    preprocessor = Preprocessor(config)
+    prepared = preprocessor(drive.load(0))
+    if options.profile is not None:
+        with torch.profiler.profile() as profile:
+            fast.step(prepared)
+        profile.export_chrome_trace(str(options.profile))
     comparison = None
-    if settings.against_plain:
-        frames = (_prepared(drive, config, place) for place in range(settings.frames))
+    if options.against == "plain":
+        frames = (preprocessor(drive.load(place)) for place in range(options.frames))
         comparison, frame_s = compare_with_plain(model, fast, frames)
+    size = (prepared.images.shape[-2], prepared.images.shape[-1])
+    hits = model.pillars(prepared.image_from_bev, size, prepared.has_image)
     return BenchmarkResult(
         model=config.name,
         device=device.type,
-        precision=settings.precision if exported is None else exported.precision,
+        precision=precision if exported is None else exported.precision,
         engine="torch" if exported is None else exported.engine,
         machine=describe_machine(device),
         stages_s=stages,
@@ -93,8 +78,8 @@ def run_benchmark(settings: BenchmarkSettings) -> BenchmarkResult:
         run_frame_s=run_frame_s,
         run_over_model=run_over_model,
         peak_memory_bytes=peak,
-        operations=count_operations(config, _hits(model, _prepared(drive, config, 0))),
-        limits=limits.fastest(measure_limits(device, settings.precision)),
+        operations=count_operations(config, hits.hits_per_camera),
+        limits=limits.fastest(measure_limits(device, precision)),
         comparison=comparison,
     )
 
@@ -112,19 +97,16 @@ def describe_machine(device: torch.device) -> str:
 
 
 def _time_stages(fast: Version, drive: MadeUpDrive, first: int, timed: range) -> dict[str, tuple[float, ...]]:
-    """Seconds of each stage of the timed frames, after a warm-up; no two stages run at the same time.
-
-    first: the frame that the warm-up begins with. After it the model has all the history that it uses.
-    """
+    """Seconds of each stage of the timed frames, after a warm-up from frame `first` on; no two stages run together."""
     preprocessor = Preprocessor(fast.runner.config)
     times: dict[str, list[float]] = defaultdict(list)
     with _recording(drive, fast) as recording:
         for place in range(first, timed.stop):
             if place == first + 1:
-                fast.fill_window(drive)
+                fast.fill_past(drive)
             if place == timed.start:
                 times.clear()
-                fast.forget_times()
+                fast.seconds = []
             marks = [time.perf_counter()]
             frame = drive.load(place)
             marks.append(time.perf_counter())
@@ -143,19 +125,14 @@ def _time_stages(fast: Version, drive: MadeUpDrive, first: int, timed: range) ->
 def _time_runs(fast: Version, drive: MadeUpDrive, place: int, frames: int) -> tuple[float, float]:
     """Median seconds of a frame in whole runs, and how many times as long that is as a frame of the model alone.
 
-    Both take turns, because the speed of a machine that others use changes within seconds.
-
-    Args:
-        fast: the model; it has seen the frames before `place`, and afterwards all that are used.
-        drive: its frames from `place` on are used, each once.
-        place: index of the first frame.
-        frames: of a run, at least.
+    Both take turns, because the speed of a machine that others use changes within seconds. The frames of the drive are
+    used once each, from `place` on; the model has seen those before. frames: of a run, at least.
     """
     frame_s = median(fast.seconds)
     frames = max(frames, min(RUN_FRAMES, round(TURNS_S / RUNS / 2 / frame_s)))
     runs = max(1, min(RUNS, round(TURNS_S / (2 * frames * frame_s))))
     preprocessor = Preprocessor(fast.runner.config)
-    fast.forget_times()
+    fast.seconds = []
     in_runs: list[float] = []
     with _recording(drive, fast) as recording:
         for first in range(place, place + 2 * frames * runs, 2 * frames):
@@ -183,27 +160,9 @@ def _time_run(
 @contextlib.contextmanager
 def _recording(drive: MadeUpDrive, fast: Version) -> Iterator[Recording]:
     """A recording with the default options in a temporary folder."""
-    untrained = Model(fast.runner.model)
-    with (
-        tempfile.TemporaryDirectory(prefix="bevcli-bench-") as folder,
-        Recording(Path(folder) / "recording.rrd", drive, untrained) as recording,
-    ):
+    folder = tempfile.TemporaryDirectory(prefix="bevcli-bench-")
+    with folder, Recording(Path(folder.name) / "recording.rrd", drive, Model(fast.runner.model)) as recording:
         yield recording
-
-
-def _write_profile(fast: Version, prepared: PreparedFrame, path: Path) -> None:
-    with torch.profiler.profile() as profile:
-        fast.step(prepared)
-    profile.export_chrome_trace(str(path))
-
-
-def _prepared(drive: MadeUpDrive, config: BEVFormerConfig, place: int) -> PreparedFrame:
-    return Preprocessor(config)(drive.load(place))
-
-
-def _hits(model: BEVFormerBase, prepared: PreparedFrame) -> tuple[int, ...]:
-    size = (prepared.images.shape[-2], prepared.images.shape[-1])
-    return model.pillars(prepared.image_from_bev, size, prepared.has_image).hits_per_camera
 
 
 def _peak_memory(device: torch.device) -> int:

@@ -2,29 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from bevcli.cli.input_options import (
-    AllowOutsideOption,
-    CalibrationOption,
-    ClassMapOption,
-    EgoMotionOption,
-    ExtrinsicsOption,
-    GroundTruthOption,
-    IntrinsicsOption,
-    SceneOption,
-    SplitOption,
-    StrictOption,
-    SweepsOption,
-    TopicOption,
-    TopicsOption,
-    VersionOption,
-    parse_class_map,
-    parse_topics,
-)
+from bevcli.cli.bridge import Part
+from bevcli.sequences.format import option_classes
+from bevcli.sequences.options import SequenceOptions, WriteOptions
 
 
 def convert(
@@ -36,21 +22,9 @@ def convert(
         ),
     ],
     out: Annotated[Path, typer.Argument(metavar="OUT_SEQUENCE", help="The native sequence folder to write.")],
-    strict: StrictOption = False,
-    scene: SceneOption = None,
-    version: VersionOption = None,
-    split: SplitOption = None,
-    sweeps: SweepsOption = False,
-    intrinsics: IntrinsicsOption = None,
-    extrinsics: ExtrinsicsOption = None,
-    calibration: CalibrationOption = None,
-    ego_motion: EgoMotionOption = None,
-    topic: TopicOption = None,
-    topics: TopicsOption = None,
-    ground_truth: GroundTruthOption = True,
-    class_map: ClassMapOption = None,
-    allow_outside: AllowOutsideOption = False,
-    force: Annotated[bool, typer.Option("--force", help="Overwrite an existing sequence in OUT_SEQUENCE.")] = False,
+    options: Annotated[SequenceOptions, Part(only=("strict", "scene", "ground_truth", "allow_outside"))],
+    format_options: Annotated[dict[str, Any], Part(classes=option_classes)],
+    written: WriteOptions,
 ) -> None:
     """Write any input as a native sequence folder.
 
@@ -58,37 +32,17 @@ def convert(
     """
     from bevcli.cli.progress import Progress
     from bevcli.errors import OutputError
-    from bevcli.frame import facts_of
     from bevcli.sequences.native.writer import NativeWriter
     from bevcli.sequences.open import open_sequence
 
     if out.resolve() == source.resolve() or out.resolve() in source.resolve().parents:
         raise OutputError(f"{out}: contains the input: choose another folder")
-    sequence = open_sequence(
-        source,
-        ego_motion="optional",
-        strict=strict,
-        scene=scene,
-        version=version,
-        split=split,
-        sweeps=sweeps,
-        intrinsics=intrinsics,
-        extrinsics=extrinsics,
-        calibration=calibration,
-        ego_motion_file=ego_motion,
-        topics=parse_topics(topic),
-        topics_file=topics,
-        ground_truth=ground_truth,
-        class_map=parse_class_map(class_map),
-        allow_outside=allow_outside,
-    )
-    for note in sequence.notes:
-        typer.echo(f"note: {note}", err=True)
+    sequence = open_sequence(source, replace(options, ego_motion="optional"), **format_options)
     count = len(sequence.stamps)
     gaps = 0
     with (
-        NativeWriter(out, with_ego_motion=sequence.has_ego_motion, force=force, facts=facts_of(sequence)) as writer,
-        Progress(count, "frames") as progress,
+        NativeWriter(out, with_ego_motion=sequence.has_ego_motion, force=written.force, facts=sequence.facts) as writer,
+        Progress(count, "frames", sequence.notes) as progress,
     ):
         for place in range(count):
             frame = sequence.load(place)

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated
+from bevcli.inference.options import ModelOptions
+from bevcli.recording.options import RecordingOptions
+from bevcli.runs.options import OutputOptions, RunOptions
+from bevcli.sequences.options import SequenceOptions
+from bevcli.synth.options import DemoOptions, RenderOptions
+from bevcli.viewer.options import ViewOptions
 
-import typer
-
-RESOLUTION = "800x450"
+RESOLUTION = (800, 450)
 
 
-def demo(
-    out: Annotated[Path, typer.Option(help="Folder for the drive and the results.")] = Path("runs/demo"),
-    seed: Annotated[
-        int, typer.Option(min=0, help="Seed of the drive. The model was trained on seeds below 1000000 only.")
-    ] = 1_000_001,
-    frames: Annotated[int, typer.Option(min=1, help="Number of frames, two per second.")] = 8,
-    view: Annotated[bool, typer.Option("--view/--no-view", help="Open the viewer at the end.")] = True,
-    force: Annotated[bool, typer.Option("--force", help="Replace an earlier demo in OUT.")] = False,
-) -> None:
+def demo(options: DemoOptions) -> None:
     """Render a short drive, run BEVFormer on it and open the recording.
 
     The demo model was trained on rendered drives only.
@@ -27,8 +21,8 @@ def demo(
     from bevcli.cli.run import run
     from bevcli.cli.viz import viz
 
-    drive, results = out / "drive", out / "results"
-    render(drive, seed=seed, frames=frames, resolution=RESOLUTION, force=force)
-    run(drive, out=results, force=force)
-    if view:
-        viz(results / "recording.rrd")
+    drive, results = options.out / "drive", OutputOptions(options.out / "results", options.force)
+    render(drive, RenderOptions(options.seed, options.frames, resolution=RESOLUTION, force=options.force))
+    run(drive, ModelOptions(), RunOptions(), RecordingOptions(), SequenceOptions(), results, {})
+    if options.view:
+        viz(options.out / "results/recording.rrd", ViewOptions())

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from bevcli.batch.options import FindLikeOptions
 
 
 def find_like(
@@ -15,16 +16,7 @@ def find_like(
             help="The drive of the frame: its name in the batch, or a result folder of `bevcli batch --embed`."
         ),
     ],
-    frame: Annotated[int, typer.Option("--frame", metavar="K", help="The index of the frame.")],
-    batch: Annotated[str, typer.Option("--in", metavar="BATCH_DIR", help="Folder or URL of a batch with --embed.")],
-    count: Annotated[int, typer.Option("--count", min=1, help="Number of frames.")] = 12,
-    per_drive: Annotated[int, typer.Option("--per-drive", min=1, help="At most this many frames of each drive.")] = 3,
-    html: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="The page with thumbnails. Default: find-like.html in the batch.", show_default=False
-        ),
-    ] = None,
+    options: FindLikeOptions,
 ) -> None:
     """List the frames of all drives of a batch that are most similar to frame K of RUN.
 
@@ -35,9 +27,9 @@ def find_like(
     from bevcli.batch.storage import open_storage
     from bevcli.errors import OutputError
 
-    storage = open_storage(batch)
-    query = open_query(run, frame, storage)
-    found = find_like(query, storage, count, per_drive)
+    storage, html = open_storage(options.batch), options.html
+    query = open_query(run, options.frame, storage)
+    found = find_like(query, storage, options.count, options.per_drive)
     width = max((len(each.result) for each in found), default=0)
     print(f"{'similarity':>10}  {'drive':<{width}}  frame")
     for each in found:

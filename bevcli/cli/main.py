@@ -8,35 +8,62 @@ from __future__ import annotations
 
 import os
 import sys
-from typing import Annotated
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
-from bevcli import __version__
-from bevcli.cli.batch import batch
-from bevcli.cli.bench import bench
-from bevcli.cli.convert import convert
-from bevcli.cli.demo import demo
-from bevcli.cli.eval import evaluate
-from bevcli.cli.explain import explain
-from bevcli.cli.export import export
-from bevcli.cli.export_onnx import export_onnx
-from bevcli.cli.find_like import find_like
-from bevcli.cli.project_debug import project_debug
-from bevcli.cli.quantize import quantize
-from bevcli.cli.render import render
-from bevcli.cli.run import run
-from bevcli.cli.samples import samples
-from bevcli.cli.stress import stress
-from bevcli.cli.train import train
-from bevcli.cli.validate import validate
-from bevcli.cli.viz import viz
-from bevcli.cli.weights import weights_app
+from bevcli._version import __version__
+from bevcli.cli.bridge import command
 from bevcli.errors import BevcliError, WaitError
-from bevcli.pipeline.cpu_memory import keep_freed_memory
-from bevcli.pipeline.cpu_threads import THREAD_SETTINGS
+from bevcli.inference.cpu_settings import THREAD_SETTINGS, keep_freed_memory
+from bevcli.registry import entries, load
+
+GROUP = "bevcli.commands"
+
+
+class _Commands(Mapping[str, Any]):
+    """The commands of the entry points by name, each imported when it is asked for. loaded: further commands."""
+
+    def __init__(self, loaded: Mapping[str, Any]) -> None:
+        self._loaded = dict(loaded)
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self._loaded and name in entries(GROUP):
+            self._loaded[name] = click_command(name, load(GROUP, name))
+        return self._loaded[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter({**entries(GROUP), **self._loaded})
+
+    def __len__(self) -> int:
+        return len({**entries(GROUP), **self._loaded})
+
+
+class _Group(TyperGroup):
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.commands: Any = _Commands(self.commands)
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """The names of all commands; imports none of them."""
+        return list(self.commands)
+
+
+def click_command(name: str, found: Any) -> Any:
+    """The command of an entry point: a function, which may take dataclasses of options, or a Typer with several."""
+    app = found
+    if not isinstance(found, typer.Typer):
+        app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+        app.command(name)(command(found))
+    made = typer.main.get_command(app)
+    made.name = name
+    return made
+
 
 app = typer.Typer(
+    cls=_Group,
     help="Run BEVFormer on sequences from any camera rig, and look at the results.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -57,27 +84,6 @@ def root(
     ] = False,
 ) -> None:
     """Run BEVFormer on sequences from any camera rig, and look at the results."""
-
-
-app.command()(batch)
-app.command()(bench)
-app.command()(convert)
-app.command()(demo)
-app.command("eval")(evaluate)
-app.command()(explain)
-app.command()(export)
-app.command()(export_onnx)
-app.command()(find_like)
-app.command()(project_debug)
-app.command()(quantize)
-app.command()(render)
-app.command()(run)
-app.command()(samples)
-app.command()(stress)
-app.command()(train)
-app.command()(validate)
-app.command()(viz)
-app.add_typer(weights_app, name="weights")
 
 
 def run_app() -> None:

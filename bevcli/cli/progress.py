@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 import sys
 import time
-from types import TracebackType
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, TextIO
 
+from bevcli.cli.bridge import as_flags
 from bevcli.duration import duration
 
 if TYPE_CHECKING:
@@ -26,11 +27,12 @@ class Progress:
     Args:
         total: the amount of work, in units.
         unit: the plural of the unit, such as "frames".
+        notes: printed at the start, each once.
         stream: where to write; stderr if None.
     """
 
-    def __init__(self, total: int, unit: str, stream: TextIO | None = None) -> None:
-        self.total, self.unit = total, unit
+    def __init__(self, total: int, unit: str, notes: Iterable[str] = (), stream: TextIO | None = None) -> None:
+        self.total, self.unit, self._notes = total, unit, dict.fromkeys(notes)
         self.stream = sys.stderr if stream is None else stream
         self.done = 0
         self.skipped = 0
@@ -42,11 +44,11 @@ class Progress:
             self._bar = _bar(self.stream)
             self._bar.add_task("", total=self.total, state=self.state())
             self._bar.start()
+        for note in self._notes:
+            self.message(f"note: {note}")
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         if self._bar is not None:
             self._bar.stop()
 
@@ -65,7 +67,8 @@ class Progress:
         self.advance(count)
 
     def message(self, text: str) -> None:
-        """Prints a line, above the bar if there is one."""
+        """Print a line, above the bar if there is one. The command's arguments in backticks become flags."""
+        text = as_flags(text)
         if self._bar is not None:
             self._bar.console.print(text, markup=False, highlight=False, emoji=False, soft_wrap=True)
         else:

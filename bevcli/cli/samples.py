@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from bevcli.errors import OutputError
 
 NAME = "street"
 
@@ -17,23 +20,15 @@ def samples(
 
     An existing DIR/street is left as it is.
     """
-    import shutil
-
-    from bevcli.errors import OutputError
-
     target = out / NAME
     if target.exists():
         typer.echo(f"{target}: exists already")
         return
+    package = Path(__file__).parents[1]
+    installed = package / "samples" / NAME
     try:
-        shutil.copytree(_source(), target)
+        # An editable installation has the sample beside the package.
+        shutil.copytree(installed if installed.is_dir() else package.parent / "samples" / NAME, target)
     except OSError as error:
         raise OutputError(f"{target}: cannot be written ({error.strerror or error})") from None
     typer.echo(f"{target}: copied; run `bevcli run {target}`")
-
-
-def _source() -> Path:
-    """The sample in an installed package, or in the clone that an editable installation refers to."""
-    package = Path(__file__).parents[1]
-    installed = package / "samples" / NAME
-    return installed if installed.is_dir() else package.parent / "samples" / NAME

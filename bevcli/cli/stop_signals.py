@@ -5,15 +5,21 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from types import FrameType, TracebackType
+from types import FrameType
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class StopSignals:
-    """`with StopSignals() as signals:`; the command asks `signals.received()` and ends. A second signal kills it."""
+    """`with StopSignals("frame") as signals:`; the command asks `signals.received()` and ends. A second one kills it.
 
-    def __init__(self) -> None:
+    Args:
+        work: the piece of work that is finished first, for the message.
+        at_once: for work in other processes: the first signal raises KeyboardInterrupt.
+    """
+
+    def __init__(self, work: str, *, at_once: bool = False) -> None:
+        self._work, self._at_once = work, at_once
         self._number = 0
         self._before: dict[signal.Signals, object] = {}
 
@@ -22,14 +28,12 @@ class StopSignals:
             self._before = {number: signal.signal(number, self._receive) for number in SIGNALS}
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)  # type: ignore[arg-type]
 
     def received(self) -> bool:
-        """Whether a signal has come."""
+        """True once a signal has come."""
         return self._number != 0
 
     @property
@@ -41,4 +45,6 @@ class StopSignals:
         self._number = number
         for each in SIGNALS:
             signal.signal(each, signal.SIG_DFL)
-        os.write(2, b"\nstopping after this frame; once more to stop at once\n")
+        if self._at_once:
+            raise KeyboardInterrupt
+        os.write(2, f"\nstopping after this {self._work}; once more to stop at once\n".encode())

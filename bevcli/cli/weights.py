@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from bevcli.cli.bridge import Json, Part, command
+from bevcli.engines.options import FileOptions
+
 if TYPE_CHECKING:
-    from bevcli.checkpoints import CheckpointSummary
+    from bevcli.checkpoints import Checkpoint
     from bevcli.model.parts import ModelPart
 
 weights_app = typer.Typer(help="Inspect and convert weights files.", no_args_is_help=True)
 
 
 @weights_app.command()
+@command
 def inspect(
     file: Annotated[
         Path | None, typer.Argument(help="An official .pth as published, or a .safetensors.", show_default=False)
@@ -27,7 +32,7 @@ def inspect(
             show_default=False,
         ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Print what FILE contains: the models that it fits, tensors, size and metadata.
 
@@ -35,7 +40,6 @@ def inspect(
     detection head, …) with the shapes of their weights and the number of their parameters.
     """
     from bevcli.checkpoints import expected_state, read_checkpoint, require_fit
-    from bevcli.checkpoints import inspect as inspect_file
     from bevcli.config import load_config
     from bevcli.model.parts import model_parts
 
@@ -43,78 +47,63 @@ def inspect(
         raise typer.BadParameter("give FILE, or --model NAME, or both")
     data: dict[str, object] = {}
     texts = []
-    if file is not None:
-        summary = inspect_file(file)
-        data |= _as_data(summary)
-        texts.append(_as_text(summary))
+    checkpoint = None if file is None else read_checkpoint(file)
+    if checkpoint is not None:
+        data |= _as_data(checkpoint)
+        texts.append(_as_text(checkpoint))
     if model is not None:
         config = load_config(model)
-        if file is not None:
-            require_fit(read_checkpoint(file), config.name, expected_state(config))
+        if checkpoint is not None:
+            require_fit(checkpoint, config.name, expected_state(config))
         parts = model_parts(config)
-        data |= _parts_as_data(config.name, parts)
+        data |= {"model": config.name, "model_parameters": sum(part.parameters for part in parts)}
+        data["parts"] = [asdict(part) for part in parts]
         texts.append(_parts_as_text(config.name, parts))
     print(json.dumps(data, indent=1) if as_json else "\n\n".join(texts))
 
 
 @weights_app.command()
+@command
 def convert(
     source: Annotated[Path, typer.Argument(help="An official .pth as published, or a .safetensors.")],
     destination: Annotated[Path, typer.Argument(help="The .safetensors to write.")],
-    force: Annotated[bool, typer.Option("--force", help="Overwrite DESTINATION if it exists.")] = False,
+    options: Annotated[FileOptions, Part(only=("force",))],
 ) -> None:
     """Write SOURCE as .safetensors with our key names; it must fit one of our models."""
     from bevcli.checkpoints import convert as convert_file
-    from bevcli.errors import OutputError
 
-    if destination.exists() and not force:
-        raise OutputError(f"{destination}: already exists; choose another name, or pass --force to overwrite it")
-    print(_as_text(convert_file(source, destination)))
+    print(_as_text(convert_file(source, options.target(destination))))
 
 
-def _as_data(summary: CheckpointSummary) -> dict[str, object]:
+def _as_data(checkpoint: Checkpoint) -> dict[str, object]:
     return {
-        "file": str(summary.path),
-        "models": list(summary.models),
-        "official_key_names": summary.official,
-        "tensors": summary.tensors,
-        "parameters": summary.parameters,
-        "file_bytes": summary.file_bytes,
-        "left_out": summary.left_out,
-        "states": dict(summary.facts),
-        "not_read": list(summary.not_read),
+        "file": str(checkpoint.path),
+        "models": list(checkpoint.models),
+        "official_key_names": checkpoint.official,
+        "tensors": len(checkpoint.state),
+        "parameters": checkpoint.parameters,
+        "file_bytes": checkpoint.path.stat().st_size,
+        "left_out": checkpoint.left_out,
+        "states": dict(checkpoint.facts),
+        "not_read": list(checkpoint.not_read),
     }
 
 
-def _as_text(summary: CheckpointSummary) -> str:
-    lines = [
-        f"{summary.path}: {summary.file_bytes / 1e6:.1f} MB, {summary.tensors} tensors, "
-        f"{summary.parameters / 1e6:.1f} M values",
-        f"  key names       {'the original BEVFormer' if summary.official else 'bevcli'}",
-        f"  fits            {', '.join(summary.models) or 'none of our models'}",
+def _as_text(checkpoint: Checkpoint) -> str:
+    not_read = ", ".join(checkpoint.not_read)
+    rows = [
+        ("key names", "the original BEVFormer" if checkpoint.official else "bevcli"),
+        ("fits", ", ".join(checkpoint.models) or "none of our models"),
+        ("left out", checkpoint.left_out and f"{checkpoint.left_out}, which only training uses"),
+        *checkpoint.facts.items(),
+        ("not read", not_read and f"{not_read} (objects that are no weights; nothing was run)"),
     ]
-    if summary.left_out:
-        lines.append(f"  left out        {summary.left_out}, which only training uses")
-    lines += [f"  {name:<15} {value}" for name, value in summary.facts.items()]
-    if summary.not_read:
-        lines.append(f"  not read        {', '.join(summary.not_read)} (objects that are no weights; nothing was run)")
+    size, values = checkpoint.path.stat().st_size / 1e6, checkpoint.parameters / 1e6
+    lines = [
+        f"{checkpoint.path}: {size:.1f} MB, {len(checkpoint.state)} tensors, {values:.1f} M values",
+        *(f"  {name:<15} {value}" for name, value in rows if value),
+    ]
     return "\n".join(lines)
-
-
-def _parts_as_data(model: str, parts: tuple[ModelPart, ...]) -> dict[str, object]:
-    return {
-        "model": model,
-        "model_parameters": sum(part.parameters for part in parts),
-        "parts": [
-            {
-                "name": part.name,
-                "modules": list(part.modules),
-                "parameters": part.parameters,
-                "shapes": [list(shape) for shape in part.shapes],
-            }
-            for part in parts
-        ],
-    }
 
 
 def _parts_as_text(model: str, parts: tuple[ModelPart, ...]) -> str:

@@ -2,24 +2,52 @@
 
 from __future__ import annotations
 
+import importlib
+import sys
 from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from torch import nn
 
-from bevcli.engines.packages import import_openvino, require
-from bevcli.errors import WeightsError
+from bevcli.errors import BevcliError, WeightsError
 
-EngineName = Literal["onnxruntime", "openvino"]
 Arrays = Mapping[str, np.ndarray]
 
 LARGEST_BYTES = 2**31  # protobuf's own limit, which every file of `bevcli export-onnx` keeps
 
 
+def require(*names: str, extra: str = "onnx") -> None:
+    """Raises BevcliError where one of these packages is not installed. extra: of bevcli, which installs them."""
+    missing = [name for name in names if find_spec(name) is None]
+    if missing:
+        raise BevcliError(f"{', '.join(missing)}: not installed; run pip install 'bevcli[{extra}]'")
+
+
+def import_openvino() -> Any:
+    """The package openvino, without its telemetry.
+
+    When it is imported for the first time, openvino sends a message to Google Analytics by the package
+    openvino_telemetry. Without that package it takes a stub, which sends nothing.
+    """
+    hidden = "openvino_telemetry"
+    before = sys.modules.get(hidden)
+    sys.modules[hidden] = None  # type: ignore[assignment]  # import then raises ImportError
+    try:
+        return importlib.import_module("openvino")
+    finally:
+        if before is None:
+            del sys.modules[hidden]
+        else:
+            sys.modules[hidden] = before
+
+
 class Engine(nn.Module):
     """An exported file, loaded. A module without parameters, so that its time can be measured like any other part's.
+
+    An engine is an entry point of `bevcli.engines`: a subclass, made from the file and a number of threads.
 
     Attributes:
         metadata: of the file: text by name.
@@ -31,6 +59,10 @@ class Engine(nn.Module):
     input_shapes: Mapping[str, tuple[int, ...]]
     outputs: tuple[str, ...]
 
+    def __init__(self, file: Path, threads: int) -> None:
+        """Raises BevcliError where the program is not installed, WeightsError for a file that it cannot load."""
+        super().__init__()
+
     def forward(self, feed: Arrays) -> dict[str, np.ndarray]:
         """One step. feed: every input by name. Returns every output by name."""
         raise NotImplementedError
@@ -40,8 +72,7 @@ class OnnxRuntimeEngine(Engine):
     """ONNX Runtime on the CPU, in the precision of the file."""
 
     def __init__(self, file: Path, threads: int) -> None:
-        """Raises BevcliError without ONNX Runtime, WeightsError for a file that it cannot load."""
-        super().__init__()
+        super().__init__(file, threads)
         require("onnxruntime")
         import onnxruntime
 
@@ -68,8 +99,7 @@ class OpenVinoEngine(Engine):
     """OpenVINO on the CPU, in the precision of the file."""
 
     def __init__(self, file: Path, threads: int) -> None:
-        """Raises BevcliError without OpenVINO, WeightsError for a file that it cannot load."""
-        super().__init__()
+        super().__init__(file, threads)
         require("openvino", "onnx", extra="openvino")
         import onnx
 
@@ -96,12 +126,6 @@ class OpenVinoEngine(Engine):
         """See `Engine`."""
         found = self.request.infer(dict(feed), share_inputs=True)
         return {name: found[name] for name in self.outputs}
-
-
-ENGINES: Mapping[str, type[OnnxRuntimeEngine | OpenVinoEngine]] = {
-    "onnxruntime": OnnxRuntimeEngine,
-    "openvino": OpenVinoEngine,
-}
 
 
 def check_size(file: Path) -> None:

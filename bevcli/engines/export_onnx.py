@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import logging
 import re
 import warnings
@@ -13,15 +14,14 @@ from typing import Any
 
 import torch
 
+from bevcli._version import __version__
 from bevcli.config import as_table
-from bevcli.engines.export_parts import DeformableConvolution
-from bevcli.engines.export_step import ExportedStep, RecurrentStep, WindowStep
-from bevcli.engines.interface import Port, input_ports, metadata, output_ports
-from bevcli.engines.packages import require
+from bevcli.engines.engine import require
+from bevcli.engines.options import OnnxOptions
 from bevcli.errors import BevcliError, OutputError
-from bevcli.model.bevformer import BEVFormer, BEVFormerBase
-from bevcli.model.bevformer_v2 import BEVFormerV2
-from bevcli.model.uniad import UniAD
+from bevcli.model.export_form import ExportForm, Port, pad_value_bgr
+from bevcli.model.temporal_model import TemporalModel
+from bevcli.options import gather
 
 NAME_SCOPES = "pkg.torch.onnx.name_scopes"  # the exporter's note of the modules that a node comes from
 
@@ -30,65 +30,56 @@ MIN_OPSET = {"operator": 19, "gridsample": 17}
 
 
 def export_onnx(
-    network: BEVFormerBase,
+    network: TemporalModel,
     out: Path,
+    options: OnnxOptions | None = None,
     *,
-    opset: int = 19,
-    deformable_convolution: DeformableConvolution = "operator",
-    cameras: int | None = None,
-    cameras_per_cell: int = 2,
-    decode: bool = False,
     contents: Mapping[str, Any] | None = None,
     untrained: bool = False,
     bundled: bool = False,
+    **changes: Any,
 ) -> None:
-    """Writes one step of a BEVFormer or a BEVFormerV2 as an ONNX file of standard operators.
+    """Write one step of a model as an ONNX file of standard operators.
 
-    The file of a BEVFormer takes the BEV map of the previous frame, that of a BEVFormerV2 the image features of the
-    window's earlier frames. The number of cameras is fixed, and the batch is one. Projections are inputs, so that the
+    The memory of the previous frame enters the file: the BEV map of a recurrence, or the image features of the earlier
+    frames of a window. The number of cameras is fixed, and the batch is one. Projections are inputs, so that the
     file serves any rig with this number of cameras. The file's metadata documents every input and output.
 
     Args:
         network: the plain model, `Model.network`.
         out: the file to write.
-        opset: version of the operators.
-        deformable_convolution: "operator" uses DeformConv (opset 19), "gridsample" writes it with GridSample, for
-            runtimes without it. Models without deformable convolutions are the same in both.
-        cameras: number of cameras of the rig. None takes the model's own.
-        cameras_per_cell: the number of cameras that may see one cell of the BEV map; at most two of nuScenes' do. The
-            file fails on a rig where more see one. Its time for spatial cross-attention is proportional to it.
-        decode: add the outputs boxes, scores and classes.
+        options: default `OnnxOptions()`; its `rig` and `check` are for `bevcli export-onnx`.
         contents: of the model's TOML file, for the metadata. None takes those of the network's configuration.
         untrained: whether the weights are random, for the metadata.
         bundled: whether the weights are those of the package, for the metadata.
+        changes: options as keywords.
 
     Raises:
-        BevcliError: the extra bevcli[onnx] is not installed, the opset is too old, or the model is a UniAD or looks at
-            later frames.
+        BevcliError: the extra bevcli[onnx] is not installed, the opset is too old, or the model has no exported
+            form, because it looks at later frames or because its memory grows.
         OutputError: the file cannot be written.
     """
     require("onnx", "onnxscript")
     import onnx
 
-    if opset < MIN_OPSET[deformable_convolution]:
+    chosen = gather(OnnxOptions, options, changes)
+    if chosen.opset < MIN_OPSET[chosen.deformable_convolution]:
         raise BevcliError(
-            f"--opset {opset}: expected {MIN_OPSET[deformable_convolution]} or newer with "
-            f"--deformable-convolution {deformable_convolution}"
+            f"`opset={chosen.opset}`: expected {MIN_OPSET[chosen.deformable_convolution]} or newer with "
+            f"`deformable_convolution={chosen.deformable_convolution}`"
         )
     config = network.config
-    kind = _step_of(network)
-    count = len(config.cameras) if cameras is None else cameras
-    slots = min(cameras_per_cell, count)
-    inputs = input_ports(config, count)
-    outputs = output_ports(config, count, decode=decode)
-    step = kind(network, deformable_convolution, slots, decode=decode).eval()
+    form = network.export_form(config, len(config.cameras) if chosen.cameras is None else chosen.cameras)
+    slots = min(chosen.cameras_per_cell, form.cameras)
+    inputs, outputs = form.inputs, form.outputs(decode=chosen.decode)
+    step = form.step(network, chosen.deformable_convolution, slots, decode=chosen.decode).eval()
     with _quiet(), torch.no_grad():
         program = torch.onnx.export(
             step,
-            tuple(port.example() for port in inputs),
+            tuple(torch.zeros(port.shape, dtype=port.dtype) for port in inputs),
             input_names=[port.name for port in inputs],
             output_names=[port.name for port in outputs],
-            opset_version=opset,
+            opset_version=chosen.opset,
             dynamo=True,
             optimize=False,  # its pattern matching takes minutes; runtimes do the same when they load the file
             verbose=False,
@@ -97,7 +88,7 @@ def export_onnx(
     proto = program.model_proto
     _document(proto, inputs, outputs)
     contents = as_table(config) if contents is None else contents
-    facts = metadata(config, inputs, outputs, contents, slots=slots, untrained=untrained, bundled=bundled)
+    facts = metadata(form, outputs, contents, slots=slots, untrained=untrained, bundled=bundled)
     onnx.helper.set_model_props(proto, facts)
     onnx.checker.check_model(proto, full_check=True)
     try:
@@ -107,23 +98,52 @@ def export_onnx(
         raise OutputError(f"{out}: cannot be written: {error.strerror}") from error
 
 
-def _step_of(network: BEVFormerBase) -> type[ExportedStep]:
-    """The exported form of a model. Raises BevcliError for a model that has none."""
-    config = network.config
-    if isinstance(network, UniAD):
-        raise BevcliError(
-            f"{config.name}: a UniAD cannot be exported: the number of its tracks changes from frame to frame "
-            "(expected a BEVFormer or a BEVFormerV2, such as tiny, base, demo or v2-t2)"
-        )
-    if isinstance(network, BEVFormerV2):
-        if network.config.later_frames:
-            raise BevcliError(
-                f"{config.name}: a model that looks at later frames cannot be exported: frames is "
-                f"{list(network.config.frames)} (expected a window that ends with 0, the current frame)"
-            )
-        return WindowStep
-    assert isinstance(network, BEVFormer)
-    return RecurrentStep
+def metadata(
+    form: ExportForm,
+    outputs: tuple[Port, ...],
+    contents: Mapping[str, Any],
+    *,
+    slots: int,
+    untrained: bool,
+    bundled: bool,
+) -> dict[str, str]:
+    """The metadata of a file: text, or JSON where a value is not a name.
+
+    outputs: of the file. slots: the number of cameras that may see one cell. The others as for `export_onnx`.
+    """
+    config, image, grid = form.config, form.config.image, form.config.bev_grid
+    facts = {
+        "inputs": {port.name: port.meaning for port in form.inputs},
+        "outputs": {port.name: port.meaning for port in outputs},
+        "classes": config.classes,
+        "cameras": config.cameras,
+        "image_size": image.size,
+        "crop": image.crop_box,
+        "padded_size": image.padded_size,
+        "pad_value_bgr": pad_value_bgr(config),
+        "x_range_m": grid.x_range_m,
+        "y_range_m": grid.y_range_m,
+        "bev_rows_columns": (grid.rows, grid.columns),
+        "rate_hz": config.rate_hz,
+        "max_gap_s": config.max_gap_s,
+        "use_shift": config.ego_motion.shift,
+        "use_rotation": config.ego_motion.rotation,
+        "half_pixel_shift": image.half_pixel_shift,
+        "bev_frame": {"level": config.bev_frame.level, "height_m": config.bev_frame.height_m},
+        "cameras_per_cell": slots,
+        "config": contents,
+        "untrained": untrained,
+        "bundled": bundled,
+        **form.facts(),
+    }
+    names = {
+        "model": config.name,
+        "precision": "fp32",
+        "bevcli_version": __version__,
+        "resize": image.resize,
+        "can_bus_quaternion": config.ego_motion.can_bus_quaternion,
+    }
+    return names | {key: json.dumps(value) for key, value in facts.items()}
 
 
 def _document(proto: object, inputs: tuple[Port, ...], outputs: tuple[Port, ...]) -> None:
@@ -147,14 +167,12 @@ def _part(node: object) -> str:
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
     """Keeps the exporter's notes about other packages and its own internals from the terminal."""
-    loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
-    levels = [logger.level for logger in loggers]
-    for logger in loggers:
+    levels = {logger: logger.level for logger in map(logging.getLogger, ("torch.onnx", "onnxscript", "onnx_ir"))}
+    for logger in levels:
         logger.setLevel(logging.ERROR)
     try:
-        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"), contextlib.redirect_stdout(io.StringIO()):
             yield
     finally:
-        for logger, level in zip(loggers, levels, strict=True):
+        for logger, level in levels.items():
             logger.setLevel(level)

@@ -1,32 +1,37 @@
-"""An exported file in the place of a BEVFormer or a BEVFormerV2."""
+"""An exported file in the place of a model."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from bevcli.config import config_of_table
-from bevcli.engines.engine import ENGINES, Engine, EngineName
-from bevcli.engines.interface import METADATA
+from bevcli.engines.engine import Engine
 from bevcli.errors import WeightsError
-from bevcli.model.bevformer import BEVFormer, BEVFormerBase, BEVFormerConfig, BEVFormerInputs, BEVFormerOutputs
-from bevcli.model.bevformer_v2 import BEVFormerV2Config, WindowFrame
-from bevcli.model.deformable_attention import FeatureMaps
+from bevcli.model.config import ModelConfig
 from bevcli.model.segmentation import SegmentationOutputs
+from bevcli.model.step import ModelOutputs, PreparedFrame
+from bevcli.model.temporal_model import Memory, TemporalModel, model_class
 from bevcli.parsing.documents import parse_json
+from bevcli.registry import load
 
 SUFFIX = ".onnx"
+
+# The part of the metadata that bevcli itself reads, to run the file: the contents of the model's TOML file as JSON,
+# the number of cameras that may see one cell, whether the weights are random or those of the package, and the precision
+# of backbone and neck.
+METADATA = ("config", "cameras_per_cell", "untrained", "bundled", "precision")
 
 
 @dataclass(frozen=True)
 class ExportedFile:
-    """What the metadata of an exported file says of its model.
+    """The metadata of an exported file that describes its model.
 
     Attributes:
         config: of the model.
@@ -37,7 +42,7 @@ class ExportedFile:
         precision: of backbone and neck, "fp32" or "int8".
     """
 
-    config: BEVFormerConfig
+    config: ModelConfig
     contents: dict[str, Any]
     cameras_per_cell: int
     untrained: bool
@@ -64,20 +69,31 @@ def read_metadata(metadata: Mapping[str, str], file: Path) -> ExportedFile:
     return ExportedFile(config, contents, slots, untrained is not False, bundled is True, precision)
 
 
-class ExportedModel(BEVFormerBase):
-    """An exported file, run by an engine on the CPU: what those of all models share. `load_exported` makes one.
+@dataclass(frozen=True)
+class ExportedOutputs(ModelOutputs):
+    """The outputs of an exported file, those of a model with one decoder layer.
 
-    A `Runner` takes it in the place of a model. It has no parts to look into: sampling points of the attentions and
-    times of single stages are not available.
+    Attributes:
+        found: every output of the file by name.
     """
 
+    found: Mapping[str, Tensor] = field(default_factory=dict)
+
+
+class ExportedModel(TemporalModel):
+    """An exported file, run by an engine on the CPU. `load_exported` makes one.
+
+    It has no parts to look into: sampling points of the attentions and times of single stages are not available.
+    """
+
+    stages: Mapping[str, str] = {"engine": "engine"}
+    device = torch.device("cpu")
     digest: Tensor
 
     def __init__(self, file: Path, engine: Engine, metadata: ExportedFile) -> None:
-        """engine: with the file. metadata: of the file."""
-        nn.Module.__init__(self)  # not the model's, which would make its parts
+        super().__init__(metadata.config)
         self.file, self.engine, self.metadata = file, engine, metadata
-        self.config = metadata.config
+        self.form = model_class(self.config).export_form(self.config, self.cameras)
         with file.open("rb") as stream:
             digest = hashlib.file_digest(stream, "sha256").digest()
         # The only state of this module: it tells a resumed run whether the weights are the same.
@@ -88,130 +104,53 @@ class ExportedModel(BEVFormerBase):
         """N, the number of cameras that the file was exported for."""
         return self.engine.input_shapes["images"][1]
 
-    def run(self, inputs: BEVFormerInputs, others: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """The outputs of the file, by name. others: its inputs beyond, or instead of, images and cameras."""
-        self._check_cameras(inputs.images.shape[1])
-        feed = {
-            "images": raw_images(inputs.images, self.config),
-            "image_from_bev": inputs.image_from_bev,
-            "camera_index": inputs.camera_index,
-            "has_image": inputs.has_image,
-            **others,
-        }
-        found = self.engine({name: tensor.cpu().numpy() for name, tensor in feed.items()})
-        self._check_overlap(int(found["most_cameras_per_cell"][0]))
-        return {name: torch.from_numpy(value) for name, value in found.items()}
-
-    def _check_cameras(self, count: int) -> None:
-        """Raises WeightsError unless the file was exported for this number of cameras."""
+    def step(
+        self, prepared: PreparedFrame, memory: Memory | None, upcoming: Sequence[PreparedFrame] = ()
+    ) -> tuple[ExportedOutputs, Memory]:
+        """See `TemporalModel`. Raises WeightsError unless the file was exported for the frame's number of cameras."""
+        count = prepared.images.shape[1]
         if count != self.cameras:
             raise WeightsError(
                 f"{self.file}: takes {self.cameras} cameras, but the sequence has {count}: "
-                f"export it with --cameras {count}"
+                f"use `bevcli export-onnx --cameras {count}`"
             )
+        outputs: ExportedOutputs = self(self.form.feed(prepared, memory))
+        return outputs, self.form.memory(prepared, memory, outputs.found)
 
-    def _check_overlap(self, most: int) -> None:
-        """Raises WeightsError where more cameras see one cell than the file has slots for."""
-        slots = self.metadata.cameras_per_cell
+    def forward(self, feed: Mapping[str, Tensor]) -> ExportedOutputs:
+        """The outputs of the file. feed: its inputs by name, see `ExportForm.feed`.
+
+        Raises WeightsError where more cameras see one cell than the file has slots for.
+        """
+        found = self.engine({name: tensor.cpu().numpy() for name, tensor in feed.items()})
+        most, slots = int(found["most_cameras_per_cell"][0]), self.metadata.cameras_per_cell
         if most > slots:
             raise WeightsError(
                 f"{self.file}: takes {slots} cameras that see the same BEV cell, but the sequence has {most}: "
-                f"export it with --cameras-per-cell {most}"
+                f"use `bevcli export-onnx --cameras-per-cell {most}`"
             )
+        tensors = {name: torch.from_numpy(value) for name, value in found.items()}
+        segmentation = None
+        if "mask_logits" in found:
+            masks, classes = tensors["mask_logits"][None], tensors["mask_class_logits"][None]
+            segmentation = SegmentationOutputs(masks, classes, locations=torch.zeros(0, 1, 0, 4))
+        logits, codes = tensors["class_logits"][None], tensors["box_codes"][None]
+        return ExportedOutputs(tensors["bev"], logits, codes, segmentation, tensors)
 
 
-class ExportedBEVFormer(ExportedModel, BEVFormer):
-    """An exported BEVFormer."""
-
-    def forward(self, inputs: BEVFormerInputs, history: Tensor | None = None) -> BEVFormerOutputs:
-        """As `BEVFormer.forward`, for batches of one; class logits and box codes are those of the last layer."""
-        grid = self.config.bev_grid
-        previous = torch.zeros(1, grid.rows * grid.columns, self.config.channels) if history is None else history
-        motion = {"can_bus": inputs.can_bus, "shift": inputs.shift, "rotation": inputs.rotation_deg}
-        memory = {"previous_bev": previous, "use_previous": torch.tensor([history is not None])}
-        return as_outputs(self.run(inputs, motion | memory))
-
-
-@dataclass(frozen=True)
-class ExportedWindowOutputs(BEVFormerOutputs):
-    """What one step of an exported BEVFormerV2 computes.
-
-    Attributes:
-        image_features: of the current frame, for the steps of the next frames; None for a window of one frame.
-    """
-
-    image_features: FeatureMaps | None = None
-
-
-class ExportedBEVFormerV2(ExportedModel):
-    """An exported BEVFormerV2, whose window ends with the current frame."""
-
-    config: BEVFormerV2Config
-
-    def forward(self, inputs: BEVFormerInputs, earlier: Sequence[WindowFrame | None] = ()) -> ExportedWindowOutputs:
-        """As `BEVFormerV2.forward`, for batches of one; class logits and box codes are those of the last layer.
-
-        Args:
-            inputs: of the current frame; the ego-motion is not read.
-            earlier: the other frames of the window, in their order; None for one that does not exist.
-        """
-        frames = [self._absent(inputs) if frame is None else frame for frame in earlier]
-        window = {
-            "image_from_bev": torch.stack([*(frame.image_from_bev for frame in frames), inputs.image_from_bev], dim=1),
-            "has_image": torch.stack([*(frame.has_image for frame in frames), inputs.has_image], dim=1),
-        }
-        if frames:
-            window["previous_features"] = torch.stack([frame.image_features.tokens for frame in frames])
-        found = self.run(inputs, window)
-        features = FeatureMaps(found["image_features"], self.config.level_shapes) if frames else None
-        return ExportedWindowOutputs(**vars(as_outputs(found)), image_features=features)
-
-    def _absent(self, inputs: BEVFormerInputs) -> WindowFrame:
-        """The place of a frame that does not exist: no camera has an image."""
-        tokens = torch.zeros(self.engine.input_shapes["previous_features"][1:])
-        return WindowFrame(
-            image_features=FeatureMaps(tokens, self.config.level_shapes),
-            image_from_bev=torch.zeros_like(inputs.image_from_bev),
-            has_image=torch.zeros_like(inputs.has_image),
-            image_size=inputs.image_size,
-        )
-
-
-def load_exported(
-    file: Path, engine: EngineName, threads: int | None = None
-) -> ExportedBEVFormer | ExportedBEVFormerV2:
+def load_exported(file: Path, engine: str, threads: int | None = None) -> ExportedModel:
     """Loads an exported file.
 
     Args:
         file: of `bevcli export-onnx` or `bevcli quantize`.
-        engine: the program that runs it.
+        engine: the program that runs it, an entry point of `bevcli.engines`.
         threads: that it uses; None takes PyTorch's number.
 
     Raises:
-        BevcliError: the engine is not installed.
+        BevcliError: the engine is unknown or not installed.
         WeightsError: the file is missing, cannot be loaded, or is not of `bevcli export-onnx`.
         ConfigError: the model in its metadata is wrong.
     """
-    loaded: Engine = ENGINES[engine](file, torch.get_num_threads() if threads is None else threads)
-    metadata = read_metadata(loaded.metadata, file)
-    kind = ExportedBEVFormerV2 if isinstance(metadata.config, BEVFormerV2Config) else ExportedBEVFormer
-    return kind(file, loaded, metadata)
-
-
-def raw_images(images: Tensor, config: BEVFormerConfig) -> Tensor:
-    """(1, N, 3, H, W) as the model takes them -> (1, N, H, W, 3) B G R, 0 to 255, as an exported file takes them."""
-    image = config.image
-    pixels = images.movedim(2, -1) * torch.tensor(image.std) + torch.tensor(image.mean)
-    if image.color_order == "rgb":
-        pixels = pixels.flip(-1)
-    return pixels.contiguous()
-
-
-def as_outputs(found: Mapping[str, Tensor]) -> BEVFormerOutputs:
-    """The outputs of an exported file as those of a model with one decoder layer."""
-    segmentation = None
-    if "mask_logits" in found:
-        segmentation = SegmentationOutputs(
-            found["mask_logits"][None], found["mask_class_logits"][None], torch.zeros(0, 1, 0, 4)
-        )
-    return BEVFormerOutputs(found["bev"], found["class_logits"][None], found["box_codes"][None], segmentation)
+    start: type[Engine] = load("bevcli.engines", engine)
+    loaded = start(file, torch.get_num_threads() if threads is None else threads)
+    return ExportedModel(file, loaded, read_metadata(loaded.metadata, file))

@@ -9,15 +9,14 @@ from __future__ import annotations
 
 import logging
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bevcli.engines.engine import check_size
+from bevcli.engines.engine import check_size, require
 from bevcli.engines.exported import read_metadata
-from bevcli.engines.packages import require
 from bevcli.errors import OutputError, WeightsError
 
 QUANTIZED_PARTS = ("backbone", "neck")
@@ -51,10 +50,9 @@ def quantize(file: Path, images: Iterable[np.ndarray], out: Path) -> None:
     metadata = {entry.key: entry.value for entry in proto.metadata_props}
     if read_metadata(metadata, file).precision != "fp32":
         raise WeightsError(f"{file}: is quantised already (expected a file of bevcli export-onnx)")
-    nodes = quantized_nodes(proto.graph)
-    level, logger = logging.ERROR, logging.getLogger()
+    logger = logging.getLogger()
     before = logger.level
-    logger.setLevel(level)  # its advice about models that have not been simplified
+    logger.setLevel(logging.ERROR)  # against advice about models that have not been simplified
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".quantize-", dir=out.parent) as folder:
@@ -62,10 +60,10 @@ def quantize(file: Path, images: Iterable[np.ndarray], out: Path) -> None:
             quantize_static(
                 proto,
                 str(fresh),
-                _Frames(proto, images),
+                _reader(proto, images),
                 quant_format=QuantFormat.QDQ,
                 op_types_to_quantize=list(QUANTIZED_OPERATORS),
-                nodes_to_quantize=nodes,
+                nodes_to_quantize=quantized_nodes(proto.graph),
                 per_channel=True,
                 activation_type=QuantType.QUInt8,
                 weight_type=QuantType.QInt8,
@@ -88,42 +86,30 @@ def quantized_nodes(graph: Any) -> list[str]:
     found = []
     for node in graph.node:
         parts = node.name.partition("/")[0].split(".")
-        is_sum_of_maps = node.op_type == "Add" and not constants.intersection(node.input)
-        if (
-            parts[0] in QUANTIZED_PARTS
-            and not DEFORMABLE.intersection(parts)
-            and (node.op_type in ("Conv", "MaxPool") or is_sum_of_maps)
-        ):
+        computes = node.op_type in ("Conv", "MaxPool") or (
+            node.op_type == "Add" and not constants.intersection(node.input)  # a sum of maps
+        )
+        if computes and parts[0] in QUANTIZED_PARTS and not DEFORMABLE.intersection(parts):
             found.append(node.name)
     return found
 
 
-class _Frames:
-    """Feeds the images of one frame after another to ONNX Runtime; matrices are the identity, other inputs zero."""
+def _reader(proto: Any, images: Iterable[np.ndarray]) -> Any:
+    """The inputs for one frame after another; matrices are the identity, other inputs but the images zero."""
+    import onnx
+    from onnxruntime.quantization import CalibrationDataReader
 
-    def __init__(self, proto: Any, images: Iterable[np.ndarray]) -> None:
-        import onnx
+    rest = {}
+    for value in proto.graph.input:
+        kind = value.type.tensor_type
+        shape = [dimension.dim_value for dimension in kind.shape.dim]
+        rest[value.name] = np.zeros(shape, onnx.helper.tensor_dtype_to_np_dtype(kind.elem_type))
+        if shape[-2:] == [4, 4]:  # an embedding of the calibration divides by the determinant
+            rest[value.name] += np.eye(4, dtype=rest[value.name].dtype)
+    feeds = (rest | {"images": image} for image in images)
 
-        self._rest = {}
-        for value in proto.graph.input:
-            kind = value.type.tensor_type
-            shape = [dimension.dim_value for dimension in kind.shape.dim]
-            rest = np.zeros(shape, onnx.helper.tensor_dtype_to_np_dtype(kind.elem_type))
-            if shape[-2:] == [4, 4]:  # an embedding of the calibration divides by the determinant
-                rest += np.eye(4, dtype=rest.dtype)
-            self._rest[value.name] = rest
-        self._images: Iterator[np.ndarray] = iter(images)
+    class Frames(CalibrationDataReader):
+        def get_next(self) -> Mapping[str, np.ndarray] | None:
+            return next(feeds, None)
 
-    def get_next(self) -> Mapping[str, np.ndarray] | None:
-        """The inputs for the next frame, None after the last."""
-        images = next(self._images, None)
-        return None if images is None else self._rest | {"images": images}
-
-    def __iter__(self) -> _Frames:
-        return self
-
-    def __next__(self) -> Mapping[str, np.ndarray]:
-        feed = self.get_next()
-        if feed is None:
-            raise StopIteration
-        return feed
+    return Frames()

@@ -1,26 +1,22 @@
-"""Scores of predictions: the nuScenes detection metrics, and IoU of BEV maps.
+"""Scores of predictions: the nuScenes detection and tracking metrics, and IoU of BEV maps.
 
-The entry point:
-    evaluate            reads predictions and ground truth, scores them; the result is printed, stored or plotted
+    evaluate            the entry point: reads predictions and ground truth, scores them; prints or plots the result
 
 Input:
     inputs              predictions and ground truth from files, folders or a nuScenes root
     submission          results_nusc.json, read and written
-    pairing             which frames of the two belong together, and their boxes in one frame of reference
+    pairing             the frames of the two that belong together, and their boxes in one frame of reference
 
 Metrics; they read no files:
-    config              all parameters of the detection score
-    detection           boxes of many frames -> AP, mAP, true-positive errors, NDS
-    detection_scores    the result of `detection`
-    scored_boxes        the boxes of many frames as one array
-    matching            greedy matching of predictions and ground truth, the devkit's rule
-    precision_recall    precision and errors as functions of recall
+    config              all parameters of the detection and the tracking score
+    detection           boxes of many frames -> AP, mAP, true-positive errors, NDS; the result is in `detection_scores`
+    matching            the boxes of many frames as one array, and their greedy matching, the devkit's rule
+    tracking            AMOTA and the numbers that come with it
     segmentation        IoU of BEV maps
     joint               scores of several drives together, from the matching of each
 
 Output:
-    scores_report       scores as a dict for JSON and as a table for the terminal
-    plots               precision and recall, errors by range
-    bev_sheet           missed ground truth and false positives seen from above
-    export_csv, export_kitti    boxes in the formats of other tools
+    scores_report       scores as a dict for JSON and as tables for the terminal
+    plots               precision and recall, errors by range, missed ground truth and false positives from above
+    export              boxes in the formats of other tools
 """

@@ -1,10 +1,11 @@
-"""Parameters of the detection score: nuScenes' detection_cvpr_2019, and bins for additional tables."""
+"""Parameters of the detection score (nuScenes' detection_cvpr_2019) and of the tracking score (tracking_nips_2019)."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 from bevcli.errors import ConfigError
 from bevcli.geometry.boxes import CLASSES
@@ -26,11 +27,31 @@ UNDEFINED_ERRORS = {
 
 
 @dataclass(frozen=True)
-class DetectionConfig:
-    """Parameters of the detection score; the defaults are the devkit's.
+class ClassRanges:
+    """The ranges of a score.
 
     Attributes:
         class_ranges_m: by class, the distance from the ego vehicle on the ground below which it is scored, metres.
+    """
+
+    class_ranges_m: Mapping[str, float]
+
+    def cut_at(self, max_range_m: float) -> Self:
+        """The same score with all class ranges cut at max_range_m. Raises ConfigError if it is not positive."""
+        if not max_range_m > 0:
+            raise ConfigError(f"the largest range is not positive (expected more than 0 m, found {max_range_m:g})")
+        return replace(self, class_ranges_m={name: min(m, max_range_m) for name, m in self.class_ranges_m.items()})
+
+    def unlimited(self) -> Self:
+        """The same score without class ranges: the devkit's score of boxes without an ego pose."""
+        return replace(self, class_ranges_m=dict.fromkeys(self.class_ranges_m, math.inf))
+
+
+@dataclass(frozen=True)
+class DetectionConfig(ClassRanges):
+    """Parameters of the detection score; the defaults are the devkit's.
+
+    Attributes:
         distances_m: matching distances of the centres on the ground, metres; one AP each.
         error_distance_m: the matching distance for true-positive errors and recall, metres.
         min_recall: precision at lower recall is ignored, 0 to 1.
@@ -49,14 +70,36 @@ class DetectionConfig:
     range_bins_m: tuple[tuple[float, float], ...] = ((0, 10), (10, 20), (20, 30), (30, 40), (40, 50))
     visibility_bins: tuple[tuple[float, float], ...] = ((0.0, 0.4), (0.4, 0.6), (0.6, 0.8), (0.8, 1.0))
 
-    def cut_at(self, max_range_m: float) -> DetectionConfig:
-        """The same score with all class ranges cut at max_range_m. Raises ConfigError if it is not positive."""
-        if not max_range_m > 0:
-            raise ConfigError(f"the largest range is not positive (expected more than 0 m, found {max_range_m:g})")
-        cut = {name: min(limit, max_range_m) for name, limit in self.class_ranges_m.items()}
+    def cut_at(self, max_range_m: float) -> Self:
+        """The same score with all class ranges and bins cut at max_range_m. Raises ConfigError as `ClassRanges`."""
         bins = tuple((low, min(high, max_range_m)) for low, high in self.range_bins_m if low < max_range_m)
-        return replace(self, class_ranges_m=cut, range_bins_m=bins)
+        return replace(super().cut_at(max_range_m), range_bins_m=bins)
 
-    def unlimited(self) -> DetectionConfig:
-        """The same score without class ranges: what the devkit computes for boxes without an ego pose."""
-        return replace(self, class_ranges_m=dict.fromkeys(self.class_ranges_m, math.inf))
+
+# The seven tracking classes, with the distance from the ego vehicle up to which each is scored, in metres.
+TRACKING_RANGES_M = {
+    "bicycle": 40.0, "bus": 50.0, "car": 50.0, "motorcycle": 40.0, "pedestrian": 40.0, "trailer": 50.0, "truck": 50.0,
+}  # fmt: skip
+TRACKING_CLASSES = tuple(TRACKING_RANGES_M)
+
+
+@dataclass(frozen=True)
+class TrackingConfig(ClassRanges):
+    """All parameters of the tracking metrics; the defaults are the nuScenes devkit's.
+
+    Attributes:
+        match_distance_m: centres that are closer on the ground can match.
+        recall_levels: number of recall levels from `min_recall` to 1 over which AMOTA and AMOTP are means.
+        min_recall: the lowest recall level.
+        frame_period_s: duration that one frame counts in tid and lgd, whatever the timestamps are.
+        mostly_tracked, mostly_lost: an object counts as mostly tracked when it is matched in at least, and as mostly
+            lost when it is matched in less than, this share of its frames.
+    """
+
+    class_ranges_m: Mapping[str, float] = field(default_factory=lambda: dict(TRACKING_RANGES_M))
+    match_distance_m: float = 2.0
+    recall_levels: int = 40
+    min_recall: float = 0.1
+    frame_period_s: float = 0.5
+    mostly_tracked: float = 0.8
+    mostly_lost: float = 0.2

@@ -14,10 +14,9 @@ from bevcli.evaluation.detection_scores import (
     RangeScores,
     ScoreTable,
     VisibilityRecall,
+    recall_curve,
 )
-from bevcli.evaluation.matching import ClassMatches, match_class
-from bevcli.evaluation.precision_recall import recall_curve
-from bevcli.evaluation.scored_boxes import ScoredBoxes, gather
+from bevcli.evaluation.matching import ClassMatches, ScoredBoxes, gather, match_class
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, wrap_angle
 
@@ -55,13 +54,9 @@ def evaluate_detections(
 def score_matches(
     frame_count: int, matches: tuple[ClassMatches, ...], unmeasured: tuple[str, ...], config: DetectionConfig
 ) -> DetectionScores:
-    """The scores of a matching.
+    """The scores of a matching, by class.
 
-    Args:
-        frame_count: number of frames.
-        matches: by class.
-        unmeasured: names of errors that are left out, because no ground truth has the quantity.
-        config: parameters of the score, those of the matching.
+    unmeasured: names of errors that are left out, because no ground truth has the quantity. config: of the matching.
     """
 
     def table(parts: Sequence[ClassMatches]) -> ScoreTable:
@@ -147,11 +142,8 @@ def _unmeasured(truth: Boxes3D) -> tuple[str, ...]:
     if not len(truth):
         return ()
     assert truth.attributes is not None
-    unknown = {
-        "vel_err": np.isnan(truth.velocities).any(axis=1).all(),
-        "attr_err": (truth.attributes == "").all(),
-    }
-    return tuple(name for name, is_unknown in unknown.items() if is_unknown)
+    unknown = {"vel_err": np.isnan(truth.velocities).any(axis=1), "attr_err": truth.attributes == ""}
+    return tuple(name for name, each in unknown.items() if each.all())
 
 
 def _recall_by_visibility(matches: Sequence[ClassMatches], config: DetectionConfig) -> tuple[VisibilityRecall, ...]:

@@ -9,21 +9,19 @@ from pathlib import Path
 from statistics import median
 from typing import Any, TypeVar
 
-from bevcli.evaluation.config import DetectionConfig
+from bevcli.evaluation.config import ClassRanges, DetectionConfig, TrackingConfig
 from bevcli.evaluation.detection import evaluate_detections
 from bevcli.evaluation.detection_scores import DetectionScores
 from bevcli.evaluation.inputs import ScoredInput, open_ground_truth, open_predictions, without_cycles_in_racks
 from bevcli.evaluation.pairing import FramePairs, pair_frames
-from bevcli.evaluation.scores_report import scores_table, scores_to_dict
+from bevcli.evaluation.scores_report import scores_table, scores_to_dict, tracking_table, tracking_to_dict
 from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmentation
-from bevcli.evaluation.tracking.config import TrackingConfig
-from bevcli.evaluation.tracking.report import tracking_table, tracking_to_dict
 from bevcli.evaluation.tracking.scoring import TrackingScores, evaluate_tracking
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.sequences.files.class_names import count_other_classes, other_classes_note
-from bevcli.sequences.nuscenes.choice import NuScenesChoice
+from bevcli.sequences.nuscenes.format import NuScenesOptions
 
-Config = TypeVar("Config", DetectionConfig, TrackingConfig)
+Config = TypeVar("Config", bound=ClassRanges)
 
 
 @dataclass(frozen=True)
@@ -61,8 +59,12 @@ class Scores:
 
     def write_plots(self, folder: Path | str) -> list[Path]:
         """Write plots as PNG files into a folder, made where it is missing; return their paths. Raises OutputError."""
-        from bevcli.evaluation.bev_sheet import draw_bev_sheet  # only plots need matplotlib
-        from bevcli.evaluation.plots import draw_errors_by_range, draw_precision_recall, save_figures
+        from bevcli.evaluation.plots import (
+            draw_bev_sheet,  # only plots need matplotlib
+            draw_errors_by_range,
+            draw_precision_recall,
+            save_figures,
+        )
 
         figures = {
             "precision_recall.png": draw_precision_recall(self.detection),
@@ -108,7 +110,7 @@ def evaluate(
             identities.
         ConfigError: max_range is not positive.
     """
-    truth = open_ground_truth(Path(ground_truth), NuScenesChoice(version, scene, split), class_map)
+    truth = open_ground_truth(Path(ground_truth), NuScenesOptions(version, split), scene, class_map)
     found = open_predictions(Path(predictions), class_map)
     pairs = pair_frames(found.boxes, truth.boxes, count_missing=count_missing)
     pairs = without_cycles_in_racks(pairs, truth.bicycle_racks)
@@ -117,18 +119,22 @@ def evaluate(
     config = _config(DetectionConfig(), pairs, limit)
     detection = evaluate_detections(_with_attributes(pairs.predictions), pairs.ground_truth, config, pairs.ego_xy)
     segmentation, map_notes = _score_maps(found, truth, pairs)
-    notes = [*pairs.notes, *map_notes, *_other_class_notes(pairs)]
     tracks, track_notes = None, list[str]()
     if tracking:
         tracks, track_notes = _score_tracks(pairs, _config(TrackingConfig(), pairs, limit))
+    limits = _range_notes(max_range, model_range, pairs)
+    notes = (*pairs.notes, *map_notes, *_other_class_notes(pairs), *limits, *_detection_notes(detection), *track_notes)
+    return Scores(pairs, config, detection, segmentation, tracks, notes)
+
+
+def _range_notes(max_range: float | None, model_range: float | None, pairs: FramePairs) -> Iterator[str]:
     if max_range is None and not pairs.ego_pose_known:
-        notes.append('no frame has "world_from_ego": class ranges are not applied (--max-range M applies them)')
+        yield 'no frame has "world_from_ego": class ranges are not applied (`max_range=M` applies them)'
     if model_range is not None:
-        notes.append(
+        yield (
             f"nothing beyond {model_range:g} m is scored: the BEV grid of the model that made the predictions ends "
-            "there (--max-range M sets another limit)"
+            "there (`max_range=M` sets another limit)"
         )
-    return Scores(pairs, config, detection, segmentation, tracks, (*notes, *_detection_notes(detection), *track_notes))
 
 
 def _config(config: Config, pairs: FramePairs, max_range: float | None) -> Config:
@@ -148,11 +154,8 @@ def _score_tracks(pairs: FramePairs, config: TrackingConfig) -> tuple[TrackingSc
             f"tracks are scored in the {pairs.frame_of_reference} frame: gaps in tracks are interpolated there, not in "
             "the world frame"
         )
-    gaps = [
-        (later.timestamp_ns - earlier.timestamp_ns) / 1e9
-        for earlier, later in pairwise(sorted(stamps, key=lambda stamp: (stamp.scene, stamp.timestamp_ns)))
-        if later.scene == earlier.scene
-    ]
+    ordered = pairwise(sorted(stamps, key=lambda stamp: (stamp.scene, stamp.timestamp_ns)))
+    gaps = [(b.timestamp_ns - a.timestamp_ns) / 1e9 for a, b in ordered if a.scene == b.scene]
     if gaps and not 0.8 < median(gaps) / config.frame_period_s < 1.25:
         notes.append(
             f"frames are {median(gaps):.2g} s apart, but TID and LGD count {config.frame_period_s:g} s for each of "
@@ -210,22 +213,20 @@ def _other_class_notes(pairs: FramePairs) -> Iterator[str]:
             yield other_classes_note(others, side)
 
 
-def _detection_notes(detection: DetectionScores) -> list[str]:
-    notes = []
+def _detection_notes(detection: DetectionScores) -> Iterator[str]:
     if not detection.prediction_count:
-        notes.append("the predictions contain no box within the class ranges: every score is 0")
+        yield "the predictions contain no box within the class ranges: every score is 0"
     classes = detection.overall.classes
     absent = [name for name, scores in classes.items() if not scores.ground_truth_count]
     if len(absent) == len(classes):
-        notes.append("the ground truth contains no box that is scored: every score is 0")
+        yield "the ground truth contains no box that is scored: every score is 0"
     elif absent:
         present = detection.overall.of_classes_with_ground_truth()
-        notes.append(
+        yield (
             f"no ground truth of {', '.join(absent)}: these classes have AP 0 in mAP and NDS, as in the nuScenes "
             f"devkit; without them mAP {present.mean_ap:.3f}, NDS {present.nd_score:.3f}"
         )
     if detection.unmeasured:
         names = {"vel_err": "velocities", "attr_err": "attributes"}
-        what = " or ".join(names[name] for name in detection.unmeasured)
-        notes.append(f"the ground truth has no {what}: NDS is the mean without that error")
-    return notes
+        missing = " or ".join(names[name] for name in detection.unmeasured)
+        yield f"the ground truth has no {missing}: NDS is the mean without that error"

@@ -18,7 +18,8 @@ from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes
 from bevcli.sequences.files.class_names import ClassNames
 from bevcli.sequences.files.map_folder import MapFolder, open_maps
 from bevcli.sequences.nuscenes.cache import open_index
-from bevcli.sequences.nuscenes.choice import NuScenesChoice, chosen_scenes, is_nuscenes_root, tables_of
+from bevcli.sequences.nuscenes.choice import chosen_scenes, tables_of
+from bevcli.sequences.nuscenes.format import NuScenesOptions, is_nuscenes_root
 from bevcli.sequences.nuscenes.index import NuScenesIndex
 
 
@@ -55,22 +56,25 @@ def open_predictions(path: Path, class_map: Mapping[str, str] | None = None) -> 
 
 
 def open_ground_truth(
-    path: Path, choice: NuScenesChoice = NuScenesChoice(), class_map: Mapping[str, str] | None = None
+    path: Path,
+    options: NuScenesOptions = NuScenesOptions(),
+    scene: str | None = None,
+    class_map: Mapping[str, str] | None = None,
 ) -> ScoredInput:
     """Read a boxes file, the ground_truth.json in a sequence folder, or a nuScenes root.
 
-    Maps are in ground_truth_map/ next to the file. choice: the part of a nuScenes root; its scene also
-    selects frames of a boxes file. class_map: names in a boxes file -> the ten classes. Raises
-    InputError where the ground truth is missing or wrong.
+    Maps are in ground_truth_map/ next to the file. options: the part of a nuScenes root. scene: selects frames of a
+    root or a boxes file. class_map: names in a boxes file -> the ten classes. Raises InputError where the ground truth
+    is missing or wrong.
     """
     if path.is_dir() and is_nuscenes_root(path):
-        return _open_nuscenes(path, choice)
+        return _open_nuscenes(path, options, scene)
     file = path / "ground_truth.json" if path.is_dir() else path
     boxes = read_boxes(file, ClassNames(class_map))
-    if choice.scene is not None:
-        kept = tuple(frame for frame in boxes.frames if frame.stamp.scene == choice.scene)
+    if scene is not None:
+        kept = tuple(frame for frame in boxes.frames if frame.stamp.scene == scene)
         if not kept:
-            raise InputError(f'{file}: has no scene "{choice.scene}"')
+            raise InputError(f'{file}: has no scene "{scene}"')
         boxes = replace(boxes, frames=kept)
     return ScoredInput(boxes, _maps_next_to(file, "ground_truth_map"))
 
@@ -84,11 +88,8 @@ def without_cycles_in_racks(pairs: FramePairs, bicycle_racks: Mapping[str, Boxes
         return pairs
     assert pairs.frame_of_reference == "world"
     racks = [bicycle_racks.get(token or "", Boxes3D.empty()) for token in pairs.sample_tokens]
-    return replace(
-        pairs,
-        predictions=tuple(map(_outside, pairs.predictions, racks)),
-        ground_truth=tuple(map(_outside, pairs.ground_truth, racks)),
-    )
+    found, true = (tuple(map(_outside, side, racks)) for side in (pairs.predictions, pairs.ground_truth))
+    return replace(pairs, predictions=found, ground_truth=true)
 
 
 def _outside(boxes: Boxes3D, racks: Boxes3D) -> Boxes3D:
@@ -107,12 +108,12 @@ def _maps_next_to(file: Path, name: str) -> MapFolder | None:
     return open_maps(folder) if folder.is_dir() else None
 
 
-def _open_nuscenes(root: Path, choice: NuScenesChoice) -> ScoredInput:
-    tables = tables_of(root, choice.version)
+def _open_nuscenes(root: Path, options: NuScenesOptions, only: str | None) -> ScoredInput:
+    tables = tables_of(root, options.version)
     index, _ = open_index(tables)
     frames: list[FrameBoxes] = []
     racks = {}
-    for scene in chosen_scenes(index, tables, choice):
+    for scene in chosen_scenes(index, tables, options.split, only):
         for sample in range(*index.scenes.first_sample[scene : scene + 2]):
             frames.append(_nuscenes_frame(index, scene, sample, len(frames), tables))
             racks[frames[-1].extras["sample_token"]] = index.bicycle_racks(sample)

@@ -11,15 +11,14 @@ from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import score_matches
 from bevcli.evaluation.detection_scores import DetectionScores
 from bevcli.evaluation.evaluate import Scores
-from bevcli.evaluation.matching import ClassMatches, descending_scores
-from bevcli.evaluation.scored_boxes import ScoredBoxes
+from bevcli.evaluation.matching import ClassMatches, ScoredBoxes, descending_scores
 from bevcli.evaluation.segmentation import SegmentationScores
 from bevcli.geometry.boxes import Boxes3D
 
 
 @dataclass(frozen=True)
 class DriveMatches:
-    """What the joint scores need of one drive.
+    """The part of one drive's scores that the joint scores need.
 
     Attributes:
         frame_count: number of frames that were scored.
@@ -35,7 +34,7 @@ class DriveMatches:
 
     @staticmethod
     def of(scores: Scores) -> DriveMatches:
-        """What the joint scores need of the scores of a drive."""
+        """The part of the scores of a drive."""
         found = scores.detection
         return DriveMatches(found.frame_count, found.matches, found.unmeasured, scores.segmentation)
 
@@ -45,9 +44,7 @@ def score_jointly(
 ) -> tuple[DetectionScores, SegmentationScores | None]:
     """The scores over all frames of the drives: AP of all boxes together, not a mean of the drives' scores.
 
-    Args:
-        drives: at least one.
-        config: the parameters with which every drive was matched.
+    drives: at least one. config: the parameters with which every drive was matched.
     """
     matches = tuple(_merged([drive.matches[i] for drive in drives]) for i in range(len(config.class_ranges_m)))
     measured = [set(drive.unmeasured) for drive in drives if any(len(part.ground_truth) for part in drive.matches)]
@@ -62,10 +59,8 @@ def _merged(parts: Sequence[ClassMatches]) -> ClassMatches:
     """The matching of one class in all drives. Equal scores stay in the order of a joint matching."""
     ascending = [part.predictions[np.arange(len(part.predictions))[::-1]] for part in parts]
     starts = np.cumsum([0, *(len(part.ground_truth) for part in parts)])
-    matched = np.concatenate(
-        [np.where(p.matched < 0, -1, p.matched + start)[:, ::-1] for p, start in zip(parts, starts, strict=False)],
-        axis=1,
-    )
+    moved = [np.where(p.matched < 0, -1, p.matched + start) for p, start in zip(parts, starts, strict=False)]
+    matched = np.concatenate([indices[:, ::-1] for indices in moved], axis=1)
     counts = np.concatenate([part.counts[:, ::-1] for part in parts], axis=1)
     predictions = _concatenated(ascending)
     assert predictions.boxes.scores is not None

@@ -2,14 +2,69 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.evaluation.config import DetectionConfig
-from bevcli.evaluation.scored_boxes import ScoredBoxes
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
+
+# Value of an optional column in frames that do not have it.
+_UNKNOWN = {
+    "scores": np.float64(np.nan),
+    "attributes": np.str_(""),
+    "instances": np.str_(""),
+    "track_scores": np.float64(np.nan),
+    "duplicates": np.bool_(False),
+    "visibilities": np.float64(np.nan),
+    "num_points": np.int64(-1),
+}
+
+
+@dataclass(frozen=True)
+class ScoredBoxes:
+    """N boxes of many frames.
+
+    Attributes:
+        boxes: with all optional columns.
+        frames: (N,), index of each box's frame.
+        ranges_m: (N,), distance from the ego vehicle on the ground, metres.
+    """
+
+    boxes: Boxes3D
+    frames: NDArray[np.int64]
+    ranges_m: Array
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, selection: NDArray[Any]) -> ScoredBoxes:
+        """The boxes selected by a mask (N,) bool or by indices."""
+        return ScoredBoxes(self.boxes[selection], self.frames[selection], self.ranges_m[selection])
+
+
+def gather(frames: Sequence[Boxes3D], ego_xy: Array) -> ScoredBoxes:
+    """The boxes of F frames as one array.
+
+    ego_xy: (F, 2), the ego vehicle's position in the frame of reference of each frame's boxes, metres.
+    """
+    indices = np.repeat(np.arange(len(frames)), [len(boxes) for boxes in frames])
+    filled = [boxes for boxes in frames if len(boxes)] or [Boxes3D.empty()]
+    columns: dict[str, Any] = {
+        column.name: np.concatenate([_column(boxes, column.name) for boxes in filled]) for column in fields(Boxes3D)
+    }
+    boxes = Boxes3D(**columns)
+    ranges = np.linalg.norm(boxes.centers[:, :2] - ego_xy[indices], axis=1)
+    return ScoredBoxes(boxes, indices, ranges)
+
+
+def _column(boxes: Boxes3D, name: str) -> NDArray[Any]:
+    values = getattr(boxes, name)
+    return np.full(len(boxes), _UNKNOWN[name]) if values is None else values
 
 
 @dataclass(frozen=True)
@@ -37,8 +92,9 @@ class ClassMatches:
 
         A true positive counts where its ground truth is, a false positive where it is itself, so that no pair is split.
         """
-        truth_inside = _inside(self.ground_truth.ranges_m, low_m, high_m)
-        prediction_inside = _inside(self.predictions.ranges_m, low_m, high_m)
+        truth_inside, prediction_inside = (
+            (side.ranges_m >= low_m) & (side.ranges_m < high_m) for side in (self.ground_truth, self.predictions)
+        )
         counts = np.broadcast_to(prediction_inside, self.matched.shape).copy()
         is_match = self.matched >= 0
         counts[is_match] = truth_inside[self.matched[is_match]]
@@ -112,7 +168,3 @@ def _indices_by_frame(frames: NDArray[np.int64], frame_count: int) -> NDArray[np
     table = np.full((frame_count, int(counts.max())), -1)
     table[frames[order], np.arange(len(frames)) - starts[frames[order]]] = order
     return table
-
-
-def _inside(values: Array, low: float, high: float) -> NDArray[np.bool_]:
-    return (values >= low) & (values < high)

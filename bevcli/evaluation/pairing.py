@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -50,15 +51,22 @@ class FramePairs:
         return self.reference_from_ego[:, :2, 3]
 
 
-# Keys that identify a frame, the most reliable first; the first one with common values is used.
-_KEYS: tuple[tuple[str, Callable[[FrameBoxes], Hashable]], ...] = (
-    ("sample_token", lambda frame: frame.extras.get("sample_token")),
-    ("scene and timestamp_ns", lambda frame: (frame.stamp.scene, frame.stamp.timestamp_ns)),
-    ("timestamp_ns", lambda frame: frame.stamp.timestamp_ns),
-    ("scene and frame index", lambda frame: (frame.stamp.scene, frame.stamp.index)),
-    ("frame index", lambda frame: frame.stamp.index),
+class _Key(NamedTuple):
+    """A key that identifies a frame."""
+
+    name: str
+    of: Callable[[FrameBoxes], Hashable]
+    is_reliable: bool
+
+
+# The most reliable first; the first one with common values is used.
+_KEYS = (
+    _Key("sample_token", lambda frame: frame.extras.get("sample_token"), True),
+    _Key("scene and timestamp_ns", lambda frame: (frame.stamp.scene, frame.stamp.timestamp_ns), True),
+    _Key("timestamp_ns", lambda frame: frame.stamp.timestamp_ns, False),
+    _Key("scene and frame index", lambda frame: (frame.stamp.scene, frame.stamp.index), False),
+    _Key("frame index", lambda frame: frame.stamp.index, False),
 )
-_RELIABLE = ("sample_token", "scene and timestamp_ns")
 
 
 def pair_frames(predictions: BoxesFile, ground_truth: BoxesFile, *, count_missing: bool = False) -> FramePairs:
@@ -69,8 +77,8 @@ def pair_frames(predictions: BoxesFile, ground_truth: BoxesFile, *, count_missin
     are transformed to the world frame. Raises InputError where the files have no frame in common, or a pose for the
     transformation is missing.
     """
-    matched_by, pairs = _common_frames(predictions.frames, ground_truth.frames)
-    notes = _notes(matched_by, len(pairs), len(predictions.frames), len(ground_truth.frames), count_missing)
+    key, pairs = _common_frames(predictions.frames, ground_truth.frames)
+    notes = _notes(key, len(pairs), len(predictions.frames), len(ground_truth.frames), count_missing)
     if count_missing:
         paired = {id(true) for _, true in pairs}
         missing = [true for true in ground_truth.frames if id(true) not in paired]
@@ -92,25 +100,25 @@ def pair_frames(predictions: BoxesFile, ground_truth: BoxesFile, *, count_missin
         prediction_stamps=tuple(prediction.stamp for prediction, _ in pairs),
         ground_truth_stamps=tuple(true.stamp for _, true in pairs),
         sample_tokens=tuple(true.extras.get("sample_token") for _, true in pairs),
-        matched_by=matched_by,
+        matched_by=key.name,
         notes=notes,
     )
 
 
 def _common_frames(
     predictions: Sequence[FrameBoxes], ground_truth: Sequence[FrameBoxes]
-) -> tuple[str, list[tuple[FrameBoxes, FrameBoxes]]]:
+) -> tuple[_Key, list[tuple[FrameBoxes, FrameBoxes]]]:
     for name, side in (("predictions", predictions), ("ground truth", ground_truth)):
         if not side:
             raise InputError(f"the {name} contain no frame (expected at least one)")
-    for matched_by, key in _KEYS:
-        of_truth, of_predictions = ([key(frame) for frame in side] for side in (ground_truth, predictions))
+    for key in _KEYS:
+        of_truth, of_predictions = ([key.of(frame) for frame in side] for side in (ground_truth, predictions))
         if _ambiguous(of_truth) or _ambiguous(of_predictions):
             continue
         truth = dict(zip(of_truth, ground_truth, strict=True))
         pairs = [(one, truth[k]) for one, k in zip(predictions, of_predictions, strict=True) if k in truth]
         if pairs:
-            return matched_by, pairs
+            return key, pairs
     raise InputError(
         f"predictions and ground truth have no frame in common: predictions start with {_described(predictions[0])}, "
         f"ground truth with {_described(ground_truth[0])}: check that both belong to the same drive"
@@ -164,12 +172,14 @@ def _reference_from_ego(reference: str, world_from_ego: Pose | None, ego_from_be
     return np.eye(4)
 
 
-def _notes(matched_by: str, pairs: int, predictions: int, ground_truth: int, count_missing: bool) -> tuple[str, ...]:
+def _notes(key: _Key, pairs: int, predictions: int, ground_truth: int, count_missing: bool) -> tuple[str, ...]:
     notes = []
-    if matched_by not in _RELIABLE:
-        notes.append(f"timestamps or scenes differ between the files: frames are matched by {matched_by}")
+    if not key.is_reliable:
+        notes.append(f"timestamps or scenes differ between the files: frames are matched by {key.name}")
     if pairs < ground_truth:
-        treatment = "all their boxes count as missed" if count_missing else "left out (--count-missing counts them)"
+        treatment = (
+            "all their boxes count as missed" if count_missing else "left out (`count_missing=True` counts them)"
+        )
         notes.append(f"{ground_truth - pairs} of {ground_truth} ground-truth frames have no prediction: {treatment}")
     if pairs < predictions:
         notes.append(f"{predictions - pairs} of {predictions} predicted frames have no ground truth: left out")

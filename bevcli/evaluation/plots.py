@@ -1,18 +1,26 @@
-"""Plots of detection scores: precision and recall, and errors by range."""
+"""Plots of detection scores: precision and recall, errors by range, misses and false positives from above."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Polygon
+from numpy.typing import NDArray
 
 from bevcli.errors import OutputError
-from bevcli.evaluation.config import ERRORS
-from bevcli.evaluation.detection_scores import ClassScores, DetectionScores
-from bevcli.evaluation.precision_recall import RECALLS
+from bevcli.evaluation.config import ERRORS, DetectionConfig
+from bevcli.evaluation.detection_scores import RECALLS, ClassScores, DetectionScores
+from bevcli.evaluation.matching import ClassMatches, ScoredBoxes
+from bevcli.evaluation.pairing import FramePairs
+from bevcli.geometry.transforms import Array, apply, inverse
 
 # Colours of classes on a white background.
 PLOT_COLORS = {
@@ -53,9 +61,8 @@ def save_figures(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
 def draw_precision_recall(detection: DetectionScores) -> Figure:
     """One panel a class, with one curve for each matching distance."""
     table = detection.overall
-    figure = titled_figure(
-        (15, 7), "Precision and recall by class", f"mAP {table.mean_ap:.3f}, one curve for each matching distance"
-    )
+    subtitle = f"mAP {table.mean_ap:.3f}, one curve for each matching distance"
+    figure = titled_figure((15, 7), "Precision and recall by class", subtitle)
     panels = figure.subplots(2, (len(table.classes) + 1) // 2, sharex=True, sharey=True)
     for axes, (name, scores) in zip(panels.flat, table.classes.items(), strict=False):
         _draw_precision_recall(axes, name, scores)
@@ -71,9 +78,8 @@ def draw_precision_recall(detection: DetectionScores) -> Figure:
 def draw_errors_by_range(detection: DetectionScores) -> Figure:
     """AP and the five true-positive errors by distance from the ego vehicle, for each class and their mean."""
     bins = [part for part in detection.by_range if part.table.classes]
-    figure = titled_figure(
-        (15, 8.5), "AP and errors by range", "thick: mean of the classes; no point where nothing was found"
-    )
+    subtitle = "thick: mean of the classes; no point where nothing was found"
+    figure = titled_figure((15, 8.5), "AP and errors by range", subtitle)
     panels = figure.subplots(2, 3, sharex=True)
     middles = [(part.low_m + part.high_m) / 2 for part in bins]
     for axes, error in zip(panels.flat, (None, *ERRORS), strict=True):
@@ -99,8 +105,7 @@ def _draw_precision_recall(axes: Axes, name: str, scores: ClassScores) -> None:
     for (distance, curve), color in zip(scores.curves.items(), _DISTANCE_COLORS, strict=False):
         reached = curve.score > 0
         axes.plot(RECALLS[reached], curve.precision[reached], color=color, linewidth=2, label=f"{distance:g} m")
-    axes.set_xlim(0, 1)
-    axes.set_ylim(0, 1.02)
+    axes.set(xlim=(0, 1), ylim=(0, 1.02))
     axes.grid(color=_GRID_COLOR)
     aps = " · ".join(f"{ap:.2f}" for ap in scores.aps.values())
     text = f"{scores.ground_truth_count} boxes, APs {aps}" if scores.ground_truth_count else "no ground truth"
@@ -114,3 +119,136 @@ def _value(scores: ClassScores | None, error: str | None) -> float:
     if error is None:
         return scores.mean_ap
     return scores.errors[error] if scores.recall > 0 else np.nan
+
+
+WORST_FRAMES = 4
+MAX_DOTS = 1500
+_MISSED, _FALSE, _FOUND = "#d62728", "#ff9d1e", "#3a9a4b"
+
+
+class _Outcome(NamedTuple):
+    """One class above the score threshold with the largest F1: missed (G,) bool, false positives (P,) bool."""
+
+    matches: ClassMatches
+    missed: NDArray[np.bool_]
+    false_positives: NDArray[np.bool_]
+
+
+def draw_bev_sheet(detection: DetectionScores, config: DetectionConfig, pairs: FramePairs) -> Figure:
+    """Draw all missed ground truths and false positives as dots, and below them the frames with most, as boxes.
+
+    Each class is cut at the score with the largest F1 at the error distance: an application would keep these boxes. The
+    vehicle's forward direction is up.
+    """
+    row = config.distances_m.index(config.error_distance_m)
+    outcomes = [_best_outcome(matches, row) for matches in detection.matches]
+    limit = f"{config.error_distance_m:g} m"
+    figure = titled_figure(
+        (12, 10),
+        "Missed ground truth and false positives, seen from above",
+        f"score threshold: largest F1 of each class at {limit}; forward is up, rings every 10 m",
+    )
+    grid = figure.add_gridspec(2, 2 * WORST_FRAMES, height_ratios=(2, 1.15))
+    radius = _radius(detection)
+    missed = {matches.name: matches.ground_truth[chosen] for matches, chosen, _ in outcomes}
+    false = {matches.name: matches.predictions[chosen] for matches, _, chosen in outcomes}
+    for place, (title, parts) in enumerate((("missed", missed), ("false positives", false))):
+        axes = figure.add_subplot(grid[0, place * WORST_FRAMES : (place + 1) * WORST_FRAMES])
+        _draw_dots(axes, title, parts, pairs.reference_from_ego, radius)
+    for place, frame in enumerate(_worst_frames(outcomes)):
+        _draw_frame(figure.add_subplot(grid[1, 2 * place : 2 * place + 2]), frame, outcomes, pairs, radius)
+    heading = {"title": "class: missed / false positives", "title_fontsize": 9}
+    handles = _legend(missed, false)
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=9, frameon=False, **heading)
+    return figure
+
+
+def _best_outcome(matches: ClassMatches, row: int) -> _Outcome:
+    """Cut a class at the score with the largest F1. row: index of the matching distance."""
+    is_match = matches.matched[row] >= 0
+    f1 = 2 * np.cumsum(is_match) / (np.arange(1, len(is_match) + 1) + len(matches.ground_truth))
+    kept = np.arange(len(is_match)) < (int(f1.argmax()) + 1 if is_match.any() else 0)
+    missed = np.ones(len(matches.ground_truth), dtype=bool)
+    missed[matches.matched[row][kept & is_match]] = False
+    return _Outcome(matches, missed, kept & ~is_match)
+
+
+def _legend(missed: Mapping[str, ScoredBoxes], false: Mapping[str, ScoredBoxes]) -> list[Line2D]:
+    dots = [
+        Line2D([], [], color=PLOT_COLORS[name], marker="o", ls="", label=f"{name} {len(part)} / {len(false[name])}")
+        for name, part in missed.items()
+    ]
+    outlines = ((_FOUND, "found"), (_MISSED, "missed"), (_FALSE, "false positive"))
+    return dots + [Line2D([], [], color=color, label=label) for color, label in outlines]
+
+
+def _radius(detection: DetectionScores) -> float:
+    """The radius that is drawn, metres: that of the farthest box, at most 100."""
+    ranges = [part.ranges_m for match in detection.matches for part in (match.ground_truth, match.predictions)]
+    farthest = max((float(values.max()) for values in ranges if len(values)), default=10.0)
+    return min(10 * np.ceil(farthest / 10), 100.0)
+
+
+def _worst_frames(outcomes: list[_Outcome]) -> list[int]:
+    counts: Counter[int] = Counter()
+    for matches, missed, false_positives in outcomes:
+        counts.update(matches.ground_truth.frames[missed].tolist())
+        counts.update(matches.predictions.frames[false_positives].tolist())
+    return [frame for frame, _ in counts.most_common(WORST_FRAMES)]
+
+
+def _draw_dots(
+    axes: Axes, title: str, parts: Mapping[str, ScoredBoxes], reference_from_ego: Array, radius: float
+) -> None:
+    centers_ego, colors = [np.zeros((0, 3))], []
+    for name, part in parts.items():
+        ego_from_reference = inverse(reference_from_ego)[part.frames]
+        turned = np.einsum("nij,nj->ni", ego_from_reference[:, :3, :3], part.boxes.centers)
+        centers_ego.append(turned + ego_from_reference[:, :3, 3])
+        colors += [PLOT_COLORS[name]] * len(part)
+    points = _in_plot(np.concatenate(centers_ego))
+    # A random subset in random order, so that no class hides another.
+    shown = np.random.default_rng(0).permutation(len(points))[:MAX_DOTS]
+    x, y = points[shown].T
+    axes.scatter(x, y, s=16, c=[colors[place] for place in shown], alpha=0.8, linewidths=0, zorder=3)
+    _draw_ground(axes, radius)
+    thinned = f", {MAX_DOTS} shown" if len(points) > MAX_DOTS else ""
+    axes.set_title(f"{len(points)} {title}{thinned}", fontsize=12)
+
+
+def _draw_frame(axes: Axes, frame: int, outcomes: list[_Outcome], pairs: FramePairs, radius: float) -> None:
+    ego_from_reference = inverse(pairs.reference_from_ego[frame])
+    counts = [0, 0]
+    for outcome in outcomes:
+        truth, found = outcome.matches.ground_truth, outcome.matches.predictions
+        truth_here, found_here = truth.frames == frame, found.frames == frame
+        _draw_boxes(axes, truth[truth_here & ~outcome.missed], ego_from_reference, _FOUND, "-")
+        _draw_boxes(axes, truth[truth_here & outcome.missed], ego_from_reference, _MISSED, "-")
+        _draw_boxes(axes, found[found_here & outcome.false_positives], ego_from_reference, _FALSE, "--")
+        counts[0] += int((truth_here & outcome.missed).sum())
+        counts[1] += int((found_here & outcome.false_positives).sum())
+    _draw_ground(axes, radius)
+    stamp = pairs.ground_truth_stamps[frame]
+    scene = f"{stamp.scene} " if stamp.scene else ""
+    axes.set_title(f"{scene}frame {stamp.index}\n{counts[0]} missed, {counts[1]} false positives", fontsize=10)
+
+
+def _draw_boxes(axes: Axes, part: ScoredBoxes, ego_from_reference: Array, color: str, style: str) -> None:
+    outlines = [_in_plot(apply(ego_from_reference, corners[:4])) for corners in part.boxes.corners()]
+    closed = [np.concatenate([outline, outline[:1]]) for outline in outlines]
+    axes.add_collection(LineCollection(closed, colors=color, linestyles=style, linewidths=1.3, zorder=3))
+
+
+def _draw_ground(axes: Axes, radius: float) -> None:
+    """Range rings every 10 m, and the ego vehicle."""
+    for ring in np.arange(10, radius + 1, 10):
+        axes.add_patch(Circle((0, 0), ring, fill=False, color="#dddddd", linewidth=0.8, zorder=1))
+    ego = np.array([[3.8, 0.0, 0], [2.6, 0.95, 0], [-1.0, 0.95, 0], [-1.0, -0.95, 0], [2.6, -0.95, 0]])
+    axes.add_patch(Polygon(_in_plot(ego), color="#333333", zorder=4))
+    axes.set(xlim=(-radius, radius), ylim=(-radius, radius), aspect="equal")
+    axes.axis("off")
+
+
+def _in_plot(points_ego: Array) -> Array:
+    """Points (N, 3) in the ego frame -> (N, 2) in the plot: x of the ego frame is up, y is left."""
+    return np.stack([-points_ego[:, 1], points_ego[:, 0]], axis=-1)

@@ -7,8 +7,9 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from bevcli.evaluation.config import ERRORS, DetectionConfig
-from bevcli.evaluation.detection_scores import ClassScores, DetectionScores, RangeScores, ScoreTable, VisibilityRecall
+from bevcli.evaluation.detection_scores import DetectionScores, ScoreTable, VisibilityRecall
 from bevcli.evaluation.segmentation import SegmentationScores
+from bevcli.evaluation.tracking.scoring import METRICS, TrackingScores
 
 _ERROR_HEADS = ("ATE m", "ASE", "AOE rad", "AVE m/s", "AAE")
 
@@ -28,7 +29,9 @@ def scores_to_dict(
             "mean_ap": present.mean_ap,
             "nd_score": present.nd_score,
         },
-        "by_range": [_range_to_dict(part) for part in detection.by_range],
+        "by_range": [
+            {"from_m": part.low_m, "to_m": part.high_m, **_table_to_dict(part.table)} for part in detection.by_range
+        ],
         "recall_by_visibility": [_visibility_to_dict(part) for part in detection.by_visibility],
         "iou": None if segmentation is None else dict(segmentation.iou),
         "frames": detection.frame_count,
@@ -45,7 +48,7 @@ def scores_to_dict(
             "mean_ap_weight": config.mean_ap_weight,
         },
     }
-    return _finite(content)
+    return finite(content)
 
 
 def scores_table(detection: DetectionScores, segmentation: SegmentationScores | None = None) -> str:
@@ -75,10 +78,6 @@ def _table_to_dict(table: ScoreTable) -> dict[str, Any]:
     }
 
 
-def _range_to_dict(part: RangeScores) -> dict[str, Any]:
-    return {"from_m": part.low_m, "to_m": part.high_m, **_table_to_dict(part.table)}
-
-
 def _visibility_to_dict(part: VisibilityRecall) -> dict[str, Any]:
     return {
         "from": part.low,
@@ -90,12 +89,12 @@ def _visibility_to_dict(part: VisibilityRecall) -> dict[str, Any]:
     }
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
     """The value with None in place of NaN and infinity, which JSON does not have."""
     if isinstance(value, dict):
-        return {key: _finite(entry) for key, entry in value.items()}
+        return {key: finite(entry) for key, entry in value.items()}
     if isinstance(value, list):
-        return [_finite(entry) for entry in value]
+        return [finite(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
@@ -103,16 +102,12 @@ def _classes(detection: DetectionScores) -> str:
     table = detection.overall
     distances = [f"AP@{distance:g}m" for distance in next(iter(table.classes.values())).aps]
     rows = [("class", "boxes", "AP", *distances, "recall", *_ERROR_HEADS)]
-    rows += [_class_row(name, scores) for name, scores in table.classes.items()]
+    for name, scores in table.classes.items():
+        numbers = (scores.mean_ap, *scores.aps.values(), scores.recall, *(scores.errors[error] for error in ERRORS))
+        rows.append((name, str(scores.ground_truth_count), *map(_number, numbers)))
     means = [_number(table.errors[name]) for name in ERRORS]
     rows.append(("all", str(detection.ground_truth_count), _number(table.mean_ap), *[""] * len(distances), "", *means))
     return f"{aligned(rows)}\n\nmAP {_number(table.mean_ap)}   NDS {_number(table.nd_score)}"
-
-
-def _class_row(name: str, scores: ClassScores) -> tuple[str, ...]:
-    aps = [_number(ap) for ap in scores.aps.values()]
-    errors = [_number(scores.errors[error]) for error in ERRORS]
-    return (name, str(scores.ground_truth_count), _number(scores.mean_ap), *aps, _number(scores.recall), *errors)
 
 
 def _ranges(detection: DetectionScores) -> str:
@@ -152,5 +147,53 @@ def aligned(rows: Iterable[Sequence[str]]) -> str:
     )
 
 
-def _number(value: float) -> str:
-    return "-" if math.isnan(value) else f"{value:.3f}"
+def _number(value: float, digits: int = 3) -> str:
+    return "-" if math.isnan(value) else f"{value:.{digits}f}"
+
+
+# Column -> metric and number of decimals, in two tables.
+_QUALITY = {
+    "AMOTA": ("amota", 3), "AMOTP m": ("amotp", 3), "MOTA": ("mota", 3), "MOTP m": ("motp", 3), "recall": ("recall", 3),
+    "MOTAR": ("motar", 3), "GT": ("gt", 0), "MT": ("mt", 0), "ML": ("ml", 0),
+}  # fmt: skip
+_ERRORS = {
+    "TP": ("tp", 0), "FP": ("fp", 0), "FN": ("fn", 0), "IDS": ("ids", 0), "FRAG": ("frag", 0), "FAF": ("faf", 1),
+    "TID s": ("tid", 2), "LGD s": ("lgd", 2),
+}  # fmt: skip
+
+
+def tracking_table(scores: TrackingScores) -> str:
+    """The tracking metrics by class, and their sums or means over the classes, in two tables."""
+    overall = scores.overall
+    rows = {**{name: scored.metrics for name, scored in scores.classes.items()}, "all": overall}
+    tables = []
+    for columns in (_QUALITY, _ERRORS):
+        cells = [[_number(values[metric], digits) for metric, digits in columns.values()] for values in rows.values()]
+        tables.append(aligned([("class", *columns), *((name, *row) for name, row in zip(rows, cells, strict=True))]))
+    switches = overall["ids"] / scores.scenes if scores.scenes else math.nan
+    heading = (
+        f"AMOTA {_number(overall['amota'])}   AMOTP {_number(overall['amotp'])} m   "
+        f"identity switches {_number(switches, 1)} per scene (scenes: {scores.scenes}, frames: {scores.frames})"
+    )
+    return "\n\n".join([*tables, heading])
+
+
+def tracking_to_dict(scores: TrackingScores) -> dict[str, Any]:
+    """The tracking metrics as a dict for JSON; undefined numbers are None. docs/scoring.md explains the keys."""
+    config = scores.config
+    content = {
+        "label_metrics": {
+            name: {label: scored.metrics[name] for label, scored in scores.classes.items()} for name in METRICS
+        },
+        **scores.overall,
+        "best_thresholds": {name: scored.best_threshold for name, scored in scores.classes.items()},
+        "scenes": scores.scenes,
+        "frames": scores.frames,
+        "cfg": {
+            "class_range": {name: float(limit) for name, limit in config.class_ranges_m.items()},
+            "dist_th_tp": config.match_distance_m,
+            "num_thresholds": config.recall_levels,
+            "min_recall": config.min_recall,
+        },
+    }
+    return finite(content)

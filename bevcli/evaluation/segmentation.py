@@ -44,19 +44,13 @@ def evaluate_segmentation(
     intersection, union, count = np.zeros(len(names)), np.zeros(len(names)), 0
     for prediction, truth in pairs:
         found, true = _at_ground_truth_cells(prediction, truth)
-        found_is, true_is = (
-            (cells[:, None] & _bits(bev_map, names)) > 0 for cells, bev_map in ((found, prediction), (true, truth))
-        )  # (cells, classes)
+        bits = [np.array([bev_map.classes.get(name, 0) for name in names], np.uint8) for bev_map in (prediction, truth)]
+        found_is, true_is = (found[:, None] & bits[0]) > 0, (true[:, None] & bits[1]) > 0  # (cells, classes)
         intersection += (found_is & true_is).sum(axis=0)
         union += (found_is | true_is).sum(axis=0)
         count += 1
     both, either = (dict(zip(names, counts.tolist(), strict=True)) for counts in (intersection, union))
     return SegmentationScores(both, either, count)
-
-
-def _bits(bev_map: BevMap, names: tuple[str, ...]) -> NDArray[np.uint8]:
-    """The bits of classes in a map, 0 for those that it does not have."""
-    return np.array([bev_map.classes.get(name, 0) for name in names], dtype=np.uint8)
 
 
 def _at_ground_truth_cells(prediction: BevMap, truth: BevMap) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:

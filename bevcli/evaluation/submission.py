@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.evaluation.tracking.config import TRACKING_CLASSES
+from bevcli.evaluation.config import TRACKING_CLASSES
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.transforms import rotation_from_quaternion, yaw_of_rotation
@@ -33,21 +33,19 @@ class SubmissionWriter:
     """
 
     def __init__(self, path: Path, resume_at: int | None = None, *, tracking: bool = False) -> None:
-        self._objects = tracking_submission_boxes if tracking else submission_boxes
+        self._boxes = tracking_submission_boxes if tracking else submission_boxes
         self.file = IncrementalJson(path, json.dumps({"meta": META})[:-1] + ', "results": {', _TAIL, resume_at)
 
     def write(self, frame: FrameBoxes) -> None:
         """Add a frame, its boxes in the world frame. A frame without a sample token (no keyframe) is left out."""
         token = frame.extras.get("sample_token")
         if token is not None:
-            self.file.append(self._objects(frame.boxes, token), f"frame {frame.stamp.index}", key=token)
+            self.file.append(self._boxes(frame.boxes, token), f"frame {frame.stamp.index}", key=token)
 
     def __enter__(self) -> SubmissionWriter:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.file.close()
 
 
@@ -61,11 +59,8 @@ def submission_boxes(boxes: Boxes3D, sample_token: str) -> list[dict[str, Any]]:
     best = boxes if boxes.scores is None else boxes[np.argsort(-boxes.scores, kind="stable")[:MAX_BOXES]]
     attributes = attributes_by_speed(best) if best.attributes is None else best.attributes
     scores = np.zeros(0) if best.scores is None else best.scores
-    named = zip(best.classes.tolist(), scores.tolist(), attributes.tolist(), strict=True)
-    return [
-        {**placed, "detection_name": name, "detection_score": score, "attribute_name": attribute}
-        for placed, (name, score, attribute) in zip(_placed_boxes(best, sample_token), named, strict=True)
-    ]
+    names = ("detection_name", "detection_score", "attribute_name")
+    return _objects(best, sample_token, names, (best.classes, scores, attributes))
 
 
 def tracking_submission_boxes(boxes: Boxes3D, sample_token: str) -> list[dict[str, Any]]:
@@ -79,39 +74,23 @@ def tracking_submission_boxes(boxes: Boxes3D, sample_token: str) -> list[dict[st
     assert tracked.instances is not None
     assert tracked.track_scores is not None
     best = np.argsort(-tracked.track_scores, kind="stable")[:MAX_BOXES]
-    named = zip(
-        tracked.instances[best].tolist(),
-        tracked.classes[best].tolist(),
-        tracked.track_scores[best].tolist(),
-        strict=True,
-    )
-    return [
-        {**placed, "tracking_id": instance, "tracking_name": name, "tracking_score": score}
-        for placed, (instance, name, score) in zip(_placed_boxes(tracked[best], sample_token), named, strict=True)
-    ]
+    columns = (tracked.instances[best], tracked.classes[best], tracked.track_scores[best])
+    return _objects(tracked[best], sample_token, ("tracking_id", "tracking_name", "tracking_score"), columns)
 
 
-def _placed_boxes(boxes: Boxes3D, sample_token: str) -> list[dict[str, Any]]:
-    """The keys that detection and tracking submissions share."""
-    half_yaws = boxes.yaws / 2
-    rows = zip(
-        boxes.centers.tolist(),
-        boxes.sizes_lwh[:, [1, 0, 2]].tolist(),
-        np.cos(half_yaws).tolist(),
-        np.sin(half_yaws).tolist(),
-        np.nan_to_num(boxes.velocities, nan=0.0).tolist(),
-        strict=True,
-    )
-    return [
-        {
-            "sample_token": sample_token,
-            "translation": center,
-            "size": size_wlh,
-            "rotation": [w, 0.0, 0.0, z],
-            "velocity": velocity,
-        }
-        for center, size_wlh, w, z, velocity in rows
-    ]
+def _objects(
+    boxes: Boxes3D, sample_token: str, names: tuple[str, ...], columns: tuple[NDArray[Any], ...]
+) -> list[dict[str, Any]]:
+    """The keys that detection and tracking submissions share, and those of `names`, with a column each."""
+    none = np.zeros(len(boxes))
+    shared = {
+        "translation": boxes.centers,
+        "size": boxes.sizes_lwh[:, [1, 0, 2]],
+        "rotation": np.stack([np.cos(boxes.yaws / 2), none, none, np.sin(boxes.yaws / 2)], axis=-1),
+        "velocity": np.nan_to_num(boxes.velocities, nan=0.0),
+    }
+    rows = zip(*(column.tolist() for column in (*shared.values(), *columns)), strict=True)
+    return [{"sample_token": sample_token, **dict(zip((*shared, *names), row, strict=True))} for row in rows]
 
 
 def write_submission(boxes: BoxesFile, path: Path, *, tracking: bool = False) -> None:
@@ -129,7 +108,7 @@ def write_submission(boxes: BoxesFile, path: Path, *, tracking: bool = False) ->
         raise InputError('a nuScenes submission needs a "sample_token" in every frame: run on a nuScenes root')
     if tracking and all(frame.boxes.track_scores is None for frame in boxes.frames):
         raise InputError(
-            'a nuScenes tracking submission needs boxes with "instance" and "track_score": run with --track'
+            'a nuScenes tracking submission needs boxes with "instance" and "track_score": use `bevcli run --track`'
         )
     with SubmissionWriter(path, tracking=tracking) as writer:
         for frame in boxes.frames:
@@ -137,7 +116,7 @@ def write_submission(boxes: BoxesFile, path: Path, *, tracking: bool = False) ->
 
 
 def is_submission(path: Path) -> bool:
-    """Whether the beginning of a file is that of a submission; False where it cannot be read."""
+    """True if a file begins like a submission; False where it cannot be read."""
     try:
         with open_regular(existing(path)) as file:
             head = file.read(_PEEK_BYTES)
@@ -177,15 +156,12 @@ def _box_object(row: Any, where: str) -> dict[str, Any]:
     missing = [key for key in needed if not isinstance(row, dict) or key not in row]
     if missing:
         raise InputError(f'{where}: "{missing[0]}" is missing')
-    size = row["size"]
-    names = {"class": row[own[0]], "score": row[own[1]]}
-    extras = (
-        {"instance": row["tracking_id"], "track_score": row["tracking_score"]}
-        if tracking
-        else {"attribute": row["attribute_name"]}
-    )
+    size, extras = row["size"], {"attribute": row.get("attribute_name")}
+    if tracking:
+        extras = {"instance": row["tracking_id"], "track_score": row["tracking_score"]}
     return {
-        **names,
+        "class": row[own[0]],
+        "score": row[own[1]],
         **extras,
         "center": row["translation"],
         "size_lwh": [size[1], size[0], size[2]] if isinstance(size, list) and len(size) == 3 else size,

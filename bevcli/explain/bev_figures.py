@@ -1,29 +1,37 @@
-"""Figures of the steps in the BEV plane: queries, temporal self-attention, encoder layers, recurrence."""
+"""Figures of the steps in the BEV plane: queries, ego-motion, temporal self-attention, encoder layers, recurrence."""
 
 from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Polygon, Rectangle
 
 from bevcli.explain.drawing import (
     ACCENT,
+    FAINT,
     GREY,
     INK,
+    LEAST_SCORE,
     SECOND,
-    bev_axes,
-    confident,
+    THIRD,
+    arrow,
+    bev_panel,
+    color_bar,
     cosine_to,
     feature_colors,
+    grid_lines,
     mark_cell,
     outline_boxes,
+    paper,
     show_bev,
     show_camera,
+    table_text,
     titled_figure,
+    vehicle_outline,
 )
 from bevcli.explain.trace import Trace
+from bevcli.geometry.transforms import rotation_about_z
 
 MOST_LAYERS = 3  # of the encoder: the first, one in the middle, the last
 
@@ -42,19 +50,19 @@ def bev_queries(trace: Trace) -> Figure:
         heading_inches=1.6,
     )
     spec = figure.add_gridspec(1, 3, wspace=0.14, bottom=0.08)
-    axes = figure.add_subplot(spec[0])
-    bev_axes(axes, trace, f"The grid: index {trace.cell[0]} · {grid.columns} + {trace.cell[1]} = {trace.cell_index}")
-    _draw_grid_lines(axes, trace)
-    axes = figure.add_subplot(spec[1])
-    bev_axes(axes, trace, "Learned queries, as colours (PCA)")
+    index = f"{trace.cell[0]} · {grid.columns} + {trace.cell[1]} = {trace.cell_index}"
+    _draw_row_and_column(bev_panel(figure, spec[0], trace, f"The grid: index {index}"), trace)
+    axes = bev_panel(figure, spec[1], trace, "Learned queries, as colours (PCA)")
     show_bev(axes, trace, feature_colors([trace.cell_map(trace.bev_embedding)])[0])
-    mark_cell(axes, trace, least_m=1.5)
-    axes = figure.add_subplot(spec[2])
-    bev_axes(axes, trace, "Similarity of position embeddings")
+    mark_cell(axes, trace)
+    axes = bev_panel(figure, spec[2], trace, "Similarity of position embeddings")
     similarity = cosine_to(trace.cell_map(trace.position), trace.cell)
     image = show_bev(axes, trace, similarity, cmap="RdBu_r", vmin=-1, vmax=1)
-    mark_cell(axes, trace, least_m=1.5)
-    _inner_bar(axes, image, (-1, 0, 1))
+    mark_cell(axes, trace)
+    inset = axes.inset_axes((0.05, 0.05, 0.35, 0.035), zorder=15)
+    bar = figure.colorbar(image, cax=inset, orientation="horizontal", ticks=(-1, 0, 1))
+    bar.ax.xaxis.set_ticks_position("top")
+    bar.ax.tick_params(labelsize=10, colors=INK, length=2)
     return figure
 
 
@@ -64,11 +72,11 @@ def temporal_attention(trace: Trace) -> Figure:
     assert trace.prediction.attention is not None
     (_, before), (_, now) = trace.recent[-2:]
     assert before.bev is not None
-    shift = trace.inputs.shift[0].cpu().numpy() * _extent(trace)
+    shift = trace.inputs.shift[0].cpu().numpy() * trace.extent_m
     rotation = float(trace.inputs.rotation_deg[0])
-    maps = feature_colors([trace.cell_map(part) for part in (trace.outputs.bev[0], before.bev, trace.aligned_history)])
-    current, history, aligned = maps
-    aligned[(trace.cell_map(trace.aligned_history) == 0).all(-1)] = 255
+    maps = [trace.cell_map(part) for part in (trace.outputs.bev[0], before.bev, trace.aligned_history)]
+    current, history, aligned = feature_colors(maps)
+    aligned[(maps[2] == 0).all(-1)] = 255
     figure = titled_figure(
         5.3,
         "Temporal self-attention: the previous BEV map, aligned by ego-motion",
@@ -78,27 +86,21 @@ def temporal_attention(trace: Trace) -> Figure:
         heading_inches=1.6,
     )
     spec = figure.add_gridspec(1, 4, wspace=0.1, left=0.04, right=0.955, bottom=0.06)
-    panels = [figure.add_subplot(spec[i]) for i in range(4)]
     titles = ("1  Previous map", "2  Rotated and shifted", "3  Current map", "4  Weight of history")
-    for axes, title in zip(panels, titles, strict=True):
-        bev_axes(axes, trace, title)
-        if axes is not panels[0]:
-            axes.set_ylabel("")
-            axes.set_yticklabels([])
+    panels = [bev_panel(figure, spec[i], trace, title, y_labels=i == 0) for i, title in enumerate(titles)]
     show_bev(panels[0], trace, history)
-    outline_boxes(panels[0], confident(before.boxes), INK, style="--", halo=True)
+    outline_boxes(panels[0], before.boxes.scored(LEAST_SCORE), INK, style="--", halo=True)
     (x0, x1), (y0, y1) = trace.grid.x_range_m, trace.grid.y_range_m
     moved = (x0 - shift[0], x1 - shift[0], y0 - shift[1], y1 - shift[1])
     panels[1].imshow(aligned, extent=moved, origin="lower", interpolation="nearest", zorder=0)
-    panels[1].set_xlim(x0, x1)
-    panels[1].set_ylim(y0, y1)
+    panels[1].set(xlim=(x0, x1), ylim=(y0, y1))
     show_bev(panels[2], trace, current)
     for axes in panels[1:3]:
-        outline_boxes(axes, confident(now.boxes), INK, halo=True)
+        outline_boxes(axes, now.boxes.scored(LEAST_SCORE), INK, halo=True)
     weight = trace.prediction.attention.history_weight
     assert weight is not None
     image = show_bev(panels[3], trace, weight, cmap="RdBu_r", vmin=0, vmax=1)
-    outline_boxes(panels[3], confident(now.boxes), INK, width=1.2)
+    outline_boxes(panels[3], now.boxes.scored(LEAST_SCORE), INK, width=1.2)
     bounds = panels[3].get_position()
     bar = figure.colorbar(image, cax=figure.add_axes((0.963, bounds.y0 + 0.12, 0.009, 0.44)), ticks=(0, 0.5, 1))
     bar.ax.set_yticklabels(["0 current", "0.5", "1 history"], fontsize=9, color=GREY, rotation=90, va="center")
@@ -112,7 +114,7 @@ def encoder_layers(trace: Trace) -> Figure:
     maps = [trace.cell_map(query), *(trace.cell_map(trace.layer_maps[place]) for place in places)]
     colors = [*feature_colors(maps[:1]), *feature_colors(maps[1:])]
     titles = ["Before: BEV queries", *(f"After layer {place + 1}" for place in places)]
-    boxes = confident(trace.prediction.boxes)
+    boxes = trace.prediction.boxes.scored(LEAST_SCORE)
     figure = titled_figure(
         8.9,
         "The encoder: empty queries become a map of the surroundings",
@@ -122,20 +124,16 @@ def encoder_layers(trace: Trace) -> Figure:
     )
     spec = figure.add_gridspec(2, len(maps), wspace=0.06, hspace=0.16, left=0.05, right=0.95, bottom=0.06)
     for column, (features, image, title) in enumerate(zip(maps, colors, titles, strict=True)):
-        top, bottom = (figure.add_subplot(spec[row, column]) for row in range(2))
-        bev_axes(top, trace, title)
+        top = bev_panel(figure, spec[0, column], trace, title, y_labels=column == 0)
         show_bev(top, trace, image)
-        bev_axes(bottom, trace, "")
+        bottom = bev_panel(figure, spec[1, column], trace, "", y_labels=column == 0)
         shown = show_bev(bottom, trace, cosine_to(features, trace.cell), cmap="RdBu_r", vmin=-1, vmax=1)
         top.set_xlabel("")
         for axes in (top, bottom):
-            mark_cell(axes, trace, least_m=1.5)
+            mark_cell(axes, trace)
             if column:
                 outline_boxes(axes, boxes, INK, width=1.0, halo=axes is top)
-                axes.set_ylabel("")
-                axes.set_yticklabels([])
-    bar = figure.colorbar(shown, cax=figure.add_axes((0.958, 0.12, 0.01, 0.24)), ticks=(-1, 0, 1))
-    bar.ax.tick_params(labelsize=10, colors=GREY)
+    color_bar(figure, shown, (0.958, 0.12, 0.01, 0.24), (-1, 0, 1))
     return figure
 
 
@@ -156,42 +154,27 @@ def recurrence(trace: Trace) -> Figure:
     )
     for column, ((frame, prediction), image) in enumerate(zip(recent, colors, strict=True)):
         seconds = (frame.stamp.timestamp_ns - trace.frame.stamp.timestamp_ns) / 1e9
-        show_camera(
-            figure.add_subplot(spec[0, column]), frame, front, f"frame {frame.stamp.index}   t = {seconds:.1f} s"
-        )
-        axes = figure.add_subplot(spec[1, column])
-        bev_axes(axes, trace, "")
+        title = f"frame {frame.stamp.index}   t = {seconds:.1f} s"
+        show_camera(figure.add_subplot(spec[0, column]), frame, front, title)
+        axes = bev_panel(figure, spec[1, column], trace, "", y_labels=column == 0)
         show_bev(axes, trace, image)
-        outline_boxes(axes, confident(prediction.boxes), INK, halo=True)
+        outline_boxes(axes, prediction.boxes.scored(LEAST_SCORE), INK, halo=True)
         if column:
-            axes.set_ylabel("")
-            axes.set_yticklabels([])
-            axes.annotate(
-                "",
-                (0.0, 0.5),
-                xytext=(-0.13, 0.5),
-                xycoords="axes fraction",
-                zorder=30,
-                arrowprops={"arrowstyle": "simple,head_width=1.1,head_length=0.8", "fc": ACCENT, "ec": "white"},
-            )
+            props = {"arrowstyle": "simple,head_width=1.1,head_length=0.8", "fc": ACCENT, "ec": "white"}
+            axes.annotate("", (0.0, 0.5), (-0.13, 0.5), xycoords="axes fraction", zorder=30, arrowprops=props)
     return figure
 
 
-def _draw_grid_lines(axes: Axes, trace: Trace) -> None:
+def _draw_row_and_column(axes: Axes, trace: Trace) -> None:
+    """The lines of the grid, and the row and the column of the followed cell."""
     grid = trace.grid
-    for low, cells, size, draw in (
-        (grid.x_range_m[0], grid.columns, grid.cell_size_m[0], axes.axvline),
-        (grid.y_range_m[0], grid.rows, grid.cell_size_m[1], axes.axhline),
-    ):
-        step = max(1, cells // 64)
-        for line in range(0, cells + 1, step):
-            draw(low + line * size, color="#dfe2e8", lw=0.6, zorder=1)
+    grid_lines(axes, grid, "#dfe2e8", 0.6, most=64)
     x, y = trace.cell_center
     size_x, size_y = grid.cell_size_m
     wide, high = grid.columns * size_x, grid.rows * size_y
     axes.add_patch(Rectangle((grid.x_range_m[0], y - size_y / 2), wide, size_y, fc=SECOND, alpha=0.28, zorder=2))
     axes.add_patch(Rectangle((x - size_x / 2, grid.y_range_m[0]), size_x, high, fc=ACCENT, alpha=0.28, zorder=2))
-    mark_cell(axes, trace, least_m=1.5)
+    mark_cell(axes, trace)
     right, bottom = grid.x_range_m[1] - 0.02 * wide, grid.y_range_m[0] + 0.04 * high
     labels = (
         (right, y, f"row {trace.cell[0]}", SECOND, "right"),
@@ -199,17 +182,86 @@ def _draw_grid_lines(axes: Axes, trace: Trace) -> None:
     )
     for label_x, label_y, text, color, align in labels:
         label = axes.text(label_x, label_y, text, color=color, ha=align, va="center", fontsize=11, fontweight="bold")
-        label.set_bbox({"boxstyle": "round,pad=0.2", "fc": "white", "ec": "none", "alpha": 0.9})
-        label.set_zorder(12)
+        label.set(bbox=paper(0.2, 0.9), zorder=12)
 
 
-def _inner_bar(axes: Axes, image: AxesImage, ticks: tuple[float, ...]) -> None:
-    inset = axes.inset_axes((0.05, 0.05, 0.35, 0.035), zorder=15)
-    bar = axes.figure.colorbar(image, cax=inset, orientation="horizontal", ticks=ticks)
-    bar.ax.xaxis.set_ticks_position("top")
-    bar.ax.tick_params(labelsize=10, colors=INK, length=2)
+# Name, unit, and how many of the 18 numbers it has.
+GROUPS = (
+    ("position change x, y, z (world)", "m", 3),
+    ("quaternion", "", 4),
+    ("acceleration x, y, z", "m/s²", 3),
+    ("rotation rate x, y, z", "rad/s", 3),
+    ("velocity x, y, z", "m/s", 3),
+    ("heading", "rad", 1),
+    ("heading change", "°", 1),
+)
+COLORS = (ACCENT, "#7b3ff2", SECOND, "#b7791f", THIRD, "#c2185b", "#0f766e")
 
 
-def _extent(trace: Trace) -> np.ndarray:
-    grid = trace.grid
-    return np.array([grid.x_range_m[1] - grid.x_range_m[0], grid.y_range_m[1] - grid.y_range_m[0]])
+def can_bus(trace: Trace) -> Figure:
+    """The 18 can-bus numbers with bars, and the motion of the vehicle that they describe."""
+    figure = titled_figure(
+        7.9,
+        "Ego-motion: the 18 can-bus numbers, the shift and the rotation",
+        "Left: the numbers that become one embedding, which is added to every BEV query. Bars are scaled per group.\n"
+        "Right: the same motion seen from above. It gives the shift and the rotation of the history map.",
+        heading_inches=1.5,
+    )
+    spec = figure.add_gridspec(1, 2, width_ratios=(1.25, 1), wspace=0.06, left=0.015, right=0.985, bottom=0.075)
+    _draw_numbers(figure.add_subplot(spec[0]), trace)
+    _draw_motion(figure.add_subplot(spec[1]), trace)
+    return figure
+
+
+def _draw_numbers(axes: Axes, trace: Trace) -> None:
+    values = trace.inputs.can_bus[0].cpu().numpy()
+    axes.set(xlim=(0, 10), ylim=(len(values) + 0.1, -0.6))
+    axes.axis("off")
+    write = table_text(axes)
+    start = 0
+    for place, (name, unit, count) in enumerate(GROUPS):
+        group = values[start : start + count]
+        largest = max(float(np.abs(group).max()), 1e-9)
+        if place % 2 == 0:
+            axes.add_patch(Rectangle((0, start - 0.5), 10, count, fc="#f5f6f8", ec="none"))
+        if name == "quaternion":
+            name += " w, x, y, z" if trace.config.ego_motion.can_bus_quaternion == "wxyz" else " w, w, w, w"
+        write(0.75, start + (count - 1) / 2, name, fontsize=12.5)
+        for offset, value in enumerate(group):
+            row = start + offset
+            write(0.15, row, f"{row}", fontsize=10.5, color=GREY)
+            write(6.1, row, f"{round(float(value), 3) + 0.0:.3f}", ha="right", family="monospace")
+            write(6.25, row, unit, fontsize=11, color=GREY)
+            width = 1.25 * float(value) / largest
+            axes.add_patch(Rectangle((8.5, row - 0.3), width, 0.6, fc=COLORS[place], ec="none", alpha=0.85))
+        start += count
+    axes.plot([8.5, 8.5], [-0.5, len(values) - 0.5], color=GREY, lw=0.8)
+
+
+def _draw_motion(axes: Axes, trace: Trace) -> None:
+    share = trace.inputs.shift[0].cpu().numpy()
+    moved, turned = share * trace.extent_m, float(trace.inputs.rotation_deg[0])
+    outline = vehicle_outline(trace.frame)
+    before = outline @ rotation_about_z(np.radians(-turned))[:2, :2].T - moved
+    reach = max(5.0, float(np.abs(moved).max()) + 3.5)
+    (x, y), high = -moved / 2, reach * 1.08
+    axes.set(xlim=(x - reach, x + reach), ylim=(y - high, y + high), aspect="equal")
+    grid_lines(axes, trace.grid, "#e7e9ee", 0.8)
+    axes.add_patch(Polygon(before, fc="none", ec=GREY, lw=1.8, ls="--", zorder=5))
+    axes.add_patch(Polygon(outline, fc="#fde3dc", ec=ACCENT, lw=2.2, zorder=4, alpha=0.95))
+    if np.hypot(*moved) > 0.05:
+        arrow(axes, -moved, (0, 0), 2.6, size=20, zorder=6)
+    cells = share * (trace.grid.columns, trace.grid.rows)
+    lines = (
+        f"shift  ({share[0]:+.4f}, {share[1]:+.4f}) of the map\n"
+        f"        = ({moved[0]:+.2f}, {moved[1]:+.2f}) m = ({cells[0]:+.2f}, {cells[1]:+.2f}) cells\n"
+        f"rotation  {turned:+.2f}° (counter-clockwise positive)"
+    )
+    if trace.prediction.started_anew:
+        lines = f"no history ({trace.prediction.started_anew}):\nno shift, no rotation"
+    text = axes.text(0.03, 0.03, lines, transform=axes.transAxes, fontsize=12, color=INK, zorder=9, linespacing=1.5)
+    text.set_bbox({"boxstyle": "round,pad=0.45", "fc": "white", "ec": FAINT})
+    axes.set_title("Vehicle: previous frame dashed, current frame solid", fontsize=13, color=INK, loc="left", pad=7)
+    axes.tick_params(labelsize=10, colors=GREY, length=3)
+    axes.set_xlabel("x, m (bev frame)", fontsize=11, color=GREY)
+    axes.spines[:].set_color(FAINT)

@@ -7,20 +7,23 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 
 from bevcli.explain.drawing import (
     ACCENT,
-    FAINT,
     GREY,
     INK,
     SECOND,
     bare,
     bev_axes,
+    color_bar,
+    legend,
     mark_cell,
+    outline,
+    paper,
     project_bev,
     show_bev,
     show_camera,
+    show_lengths,
     titled_figure,
 )
 from bevcli.explain.trace import Trace
@@ -34,9 +37,7 @@ HEIGHT_COLORS = ("#7b3ff2", "#1f8fe0", "#1fae6a", "#f2a900", "#e4572e", "#c2185b
 def image_features(trace: Trace) -> Figure:
     """The neck's feature maps over the images."""
     names = trace.prepared.assignment.cameras[:MOST_CAMERAS]
-    shapes = [tuple(part.shape[-3:]) for part in trace.feature_maps]
-    levels = len(shapes)
-    rows = levels + 1
+    rows = len(trace.feature_maps) + 1
     figure = titled_figure(
         1.35 + 1.42 * rows,
         "Image features: what the backbone and the neck make of the images",
@@ -45,25 +46,18 @@ def image_features(trace: Trace) -> Figure:
         heading_inches=1.45,
     )
     grid = figure.add_gridspec(rows, len(names), wspace=0.04, hspace=0.22, left=0.06, right=0.99, bottom=0.02)
-    height, width = trace.prepared.images.shape[-2:]
     for column, name in enumerate(names):
         axes = figure.add_subplot(grid[0, column])
         show_camera(axes, trace.frame, name)
         axes.title.set_fontsize(10)
     for row, maps in enumerate(trace.feature_maps, start=1):
         lengths = maps.norm(dim=1).float().cpu().numpy()  # (N, H_l, W_l)
-        low, high = np.percentile(lengths, (2, 99.5))
-        channels, map_height, map_width = shapes[row - 1]
-        for column, name in enumerate(names):
+        for column in range(len(names)):
             axes = figure.add_subplot(grid[row, column])
-            camera = trace.frame.rig[name]
-            scale = trace.prepared.scales[column]
-            axes.imshow(lengths[column], extent=(0, width, height, 0), cmap="magma", vmin=low, vmax=high)
-            axes.set_xlim(0, camera.width * scale)
-            axes.set_ylim(camera.height * scale, 0)
-            bare(axes)
+            show_lengths(axes, trace, lengths, column)
             if column == 0:
-                axes.set_ylabel(f"level {row}\n{channels} × {map_height} × {map_width}", fontsize=11, color=INK)
+                shape = " × ".join(map(str, maps.shape[-3:]))
+                axes.set_ylabel(f"level {row}\n{shape}", fontsize=11, color=INK)
     return figure
 
 
@@ -88,14 +82,9 @@ def pillars(trace: Trace) -> Figure:
             _empty(axes, "no further camera sees this cell" if cameras else "no camera sees this cell")
     axes = figure.add_subplot(grid[:, 1])
     _draw_camera_counts(axes, trace)
-    handles = [
-        axes.plot([], [], "o", color=_height_color(i), ms=9, label=f"z = {z:.2f} m")[0]
-        for i, z in reversed(list(enumerate(heights)))
-    ]
-    legend = axes.legend(
-        handles=handles, title="pillar points", loc="lower right", fontsize=11, title_fontsize=11, framealpha=0.95
-    )
-    legend.set_zorder(20)
+    for i, z in reversed(list(enumerate(heights))):
+        axes.plot([], [], "o", color=_height_color(i), ms=9, label=f"z = {z:.2f} m")
+    legend(axes, title="pillar points", title_fontsize=11)
     return figure
 
 
@@ -113,7 +102,6 @@ def spatial_attention(trace: Trace) -> Figure:
         f"Cell at x = {x:.1f} m, y = {y:.1f} m, last encoder layer, all heads and feature levels. Crosses: projected "
         "pillar points.\nDots: learned sampling points around them; larger and brighter dots have a larger attention "
         "weight.",
-        heading_inches=1.55,
     )
     grid = figure.add_gridspec(rows, 2, wspace=0.03, hspace=0.14, bottom=0.02, left=0.012, right=0.935)
     if not cameras:
@@ -125,15 +113,11 @@ def spatial_attention(trace: Trace) -> Figure:
         show_camera(whole, trace.frame, name)
         show_camera(zoomed, trace.frame, name, "enlarged")
         window = _zoom_window(trace, name, samples[name])
-        whole.add_patch(Rectangle(window[:2], *window[2:], fc="none", ec="white", lw=3))
-        whole.add_patch(Rectangle(window[:2], *window[2:], fc="none", ec=ACCENT, lw=1.6))
+        outline(whole, window, (3, 1.6))
         _draw_samples(whole, trace, name, samples[name], largest, size=30)
         dots = _draw_samples(zoomed, trace, name, samples[name], largest, size=160)
-        zoomed.set_xlim(window[0], window[0] + window[2])
-        zoomed.set_ylim(window[1] + window[3], window[1])
-    bar = figure.colorbar(dots, cax=figure.add_axes((0.944, 0.08, 0.011, 0.6)))
-    bar.set_label("attention weight", fontsize=11, color=GREY)
-    bar.ax.tick_params(labelsize=10, colors=GREY)
+        zoomed.set(xlim=(window[0], window[0] + window[2]), ylim=(window[1] + window[3], window[1]))
+    color_bar(figure, dots, (0.944, 0.08, 0.011, 0.6)).set_label("attention weight", fontsize=11, color=GREY)
     return figure
 
 
@@ -170,43 +154,32 @@ def _draw_camera_counts(axes: Axes, trace: Trace) -> None:
     colors = ListedColormap(shades[: most + 1] if most < len(shades) else shades)
     bev_axes(axes, trace, "Number of cameras that see each BEV cell")
     image = show_bev(axes, trace, counts, cmap=colors, vmin=-0.5, vmax=colors.N - 0.5)
-    mark_cell(axes, trace, least_m=1.5)
-    x, y = trace.cell_center
-    axes.annotate(
-        f"followed cell\nrow {trace.cell[0]}, column {trace.cell[1]}",
-        (x, y),
-        xytext=(-14, 14),
-        textcoords="offset points",
-        ha="right",
-        fontsize=12,
-        color=ACCENT,
-        fontweight="bold",
-        zorder=12,
-        bbox={"boxstyle": "round,pad=0.25", "fc": "white", "ec": "none", "alpha": 0.85},
-    )
+    mark_cell(axes, trace)
+    text = f"followed cell\nrow {trace.cell[0]}, column {trace.cell[1]}"
+    label = axes.annotate(text, tuple(trace.cell_center), (-14, 14), textcoords="offset points", ha="right", zorder=12)
+    label.set(fontsize=12, color=ACCENT, fontweight="bold", bbox=paper(0.25, 0.85))
     bar = axes.figure.colorbar(image, ax=axes, ticks=range(colors.N), shrink=0.55, pad=0.02)
     bar.ax.tick_params(labelsize=11, colors=GREY, length=0)
 
 
 def _zoom_window(trace: Trace, name: str, samples: CameraSamples) -> tuple[float, float, float, float]:
     """Left, top, width, height of the part that holds the most weight, in the image's aspect."""
-    camera = trace.frame.rig[name]
-    points, weights = _inside(samples, camera.width, camera.height)
+    whole = np.array([trace.frame.rig[name].width, trace.frame.rig[name].height], dtype=np.float64)
+    points, weights = _inside(samples, whole)
     if not len(points):
-        return 0.0, 0.0, float(camera.width), float(camera.height)
+        return 0.0, 0.0, float(whole[0]), float(whole[1])
     center = np.average(points, axis=0, weights=np.maximum(weights, 1e-9))
-    order = np.sort(np.abs(points - center) / (camera.width, camera.height), axis=0)
-    share = float(np.clip(2.2 * order[int(0.8 * (len(order) - 1))].max(), 0.15, 0.42))
-    size = np.array([camera.width, camera.height]) * share
-    corner = np.clip(center - size / 2, 0, np.array([camera.width, camera.height]) - size)
-    return float(corner[0]), float(corner[1]), float(size[0]), float(size[1])
+    order = np.sort(np.abs(points - center) / whole, axis=0)
+    size = whole * np.clip(2.2 * order[int(0.8 * (len(order) - 1))].max(), 0.15, 0.42)
+    x, y = np.clip(center - size / 2, 0, whole - size)
+    return float(x), float(y), float(size[0]), float(size[1])
 
 
 def _draw_samples(
     axes: Axes, trace: Trace, name: str, samples: CameraSamples, largest: float, size: float
 ) -> PathCollection:
     camera = trace.frame.rig[name]
-    points, weights = _inside(samples, camera.width, camera.height)
+    points, weights = _inside(samples, np.array([camera.width, camera.height], dtype=np.float64))
     order = np.argsort(weights)
     shares = weights[order] / largest
     own, visible = project_bev(trace.frame, camera, trace.grid.pillars()[trace.cell])
@@ -219,10 +192,10 @@ def _draw_samples(
     return dots
 
 
-def _inside(samples: CameraSamples, width: int, height: int) -> tuple[Array, Array]:
+def _inside(samples: CameraSamples, size: Array) -> tuple[Array, Array]:
     """The samples within the image, pixels (K, 2) and weights (K,)."""
     with np.errstate(invalid="ignore"):
-        inside = ((samples.pixels >= 0) & (samples.pixels < (width, height))).all(-1)
+        inside = ((samples.pixels >= 0) & (samples.pixels < size)).all(-1)
     return samples.pixels[inside], samples.weights[inside]
 
 
@@ -234,5 +207,3 @@ def _empty(axes: Axes, text: str) -> None:
     bare(axes)
     axes.set_facecolor("#f6f7f9")
     axes.text(0.5, 0.5, text, ha="center", va="center", fontsize=14, color=GREY, transform=axes.transAxes)
-    for spine in axes.spines.values():
-        spine.set_color(FAINT)

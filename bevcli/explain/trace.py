@@ -14,13 +14,13 @@ from bevcli.errors import InputError
 from bevcli.frame import Frame, Prediction, Sequence
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.transforms import Array, inverse
-from bevcli.model.bevformer import BEVFormer, BEVFormerBase, BEVFormerConfig, BEVFormerInputs, BEVFormerOutputs
+from bevcli.inference.preprocess import Preprocessor
+from bevcli.inference.runner import BevState, Runner, StepOptions
+from bevcli.model.config import ModelConfig
+from bevcli.model.network import Network
 from bevcli.model.pillar_projection import project_pillars
-from bevcli.model.uniad import UniAD
-from bevcli.pipeline.model_inputs import model_inputs
-from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
-from bevcli.pipeline.runner import BevState, Runner, StepOptions
-from bevcli.pipeline.temporal import BevHistory
+from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame
+from bevcli.model.temporal_model import TemporalModel
 
 RECENT = 4  # frames that the figure of the recurrence shows, the traced one included
 DEFAULT_DISTANCE_M = 10.0  # of the default cell, ahead of the vehicle, where no box is
@@ -46,11 +46,11 @@ class Trace:
         cell: row and column of the BEV cell that the figures follow.
     """
 
-    config: BEVFormerConfig
+    config: ModelConfig
     recent: tuple[tuple[Frame, Prediction], ...]
     prepared: PreparedFrame
-    inputs: BEVFormerInputs
-    outputs: BEVFormerOutputs
+    inputs: ModelInputs
+    outputs: ModelOutputs
     feature_maps: tuple[Tensor, ...]
     bev_embedding: Tensor
     position: Tensor
@@ -76,6 +76,11 @@ class Trace:
         return self.config.bev_grid
 
     @property
+    def extent_m(self) -> Array:
+        """(2,) extent of the grid along x and y, metres."""
+        return np.diff([self.grid.x_range_m, self.grid.y_range_m])[:, 0]
+
+    @property
     def cell_index(self) -> int:
         """Index of the followed cell in Y·X."""
         return self.cell[0] * self.grid.columns + self.cell[1]
@@ -92,17 +97,17 @@ class Trace:
 
 
 def trace(
-    model: BEVFormerBase, device: torch.device, sequence: Sequence, place: int, cell_xy: tuple[float, float] | None
+    model: TemporalModel, device: torch.device, sequence: Sequence, place: int, cell_xy: tuple[float, float] | None
 ) -> Trace:
     """Runs the model over the frames of one scene up to a place, with its recurrent state, and traces the last one.
 
     model: the plain model, not a prepared one. place: index in `sequence.stamps`.
     cell_xy: x, y of the cell to follow, metres, bev frame; None takes the cell under the best box ahead of the
-    vehicle. Raises InputError when the cell lies outside the grid, when the frame has no image, or for a BEVFormerV2 or
-    a UniAD.
+    vehicle. Raises InputError when the cell lies outside the grid, when the frame has no image, or for a model without
+    figures.
     """
-    if not isinstance(model, BEVFormer) or isinstance(model, UniAD):
-        kind = "UniAD" if isinstance(model, UniAD) else "BEVFormerV2"
+    if not model.is_explained:
+        kind = model.config.architecture
         raise InputError(
             f"model {model.config.name} is a {kind}: the figures show BEVFormer's recurrence "
             f"(use tiny, small, base or demo; docs/bevformer.md explains {kind})"
@@ -165,15 +170,13 @@ def _traced_step(
     cell: tuple[int, int],
 ) -> Trace:
     model, config, grid = runner.model, runner.config, runner.config.bev_grid
-    assert isinstance(model, BEVFormer)
+    assert isinstance(model, Network)
     x, y = grid.cell_centers()[cell]
     runner.options = replace(runner.options, ask_attention=True, probes=((float(x), float(y)),))
-    with _outputs_of(model, model.neck, *model.encoder.layers) as outputs:
+    with _seen(model, model.neck, model.encoder, *model.encoder.layers) as (arguments, outputs):
         _, prediction = runner.step(state, prepared)
-    used = None if state is None or prediction.started_anew else state.memory
-    assert used is None or isinstance(used, BevHistory)
-    inputs = model_inputs([prepared], [None if used is None else used.pose], config).to(runner.device)
-    aligned = None if used is None else model.align_history(used.bev, inputs.rotation_deg)[0]
+    inputs: ModelInputs = arguments[model][0][0].to(runner.device)
+    history = arguments[model.encoder][1]["history"]
     position, _ = model.decoder.query_embedding[: config.decoder.queries].chunk(2, dim=-1)
     return Trace(
         config=config,
@@ -185,14 +188,14 @@ def _traced_step(
         bev_embedding=model.bev_queries.embedding,
         position=model.bev_queries.position(),
         layer_maps=tuple(outputs[layer][0] for layer in model.encoder.layers),
-        aligned_history=aligned,
+        aligned_history=None if history is None else history[0],
         first_reference_points=model.decoder.reference_points(position).sigmoid(),
         visible=_visible_points(inputs, config),
         cell=cell,
     )
 
 
-def _visible_points(inputs: BEVFormerInputs, config: BEVFormerConfig) -> Tensor:
+def _visible_points(inputs: ModelInputs, config: ModelConfig) -> Tensor:
     """(N, Y·X, Z) bool, which pillar points each camera sees."""
     points = torch.as_tensor(config.bev_grid.pillars(), dtype=torch.float32, device=inputs.images.device)
     height, width = inputs.images.shape[-2:]
@@ -200,16 +203,17 @@ def _visible_points(inputs: BEVFormerInputs, config: BEVFormerConfig) -> Tensor:
 
 
 @contextmanager
-def _outputs_of(*modules: nn.Module) -> Iterator[dict]:
-    """A dict that is filled with each module's output while the context is open."""
+def _seen(*modules: nn.Module) -> Iterator[tuple[dict, dict]]:
+    """Two dicts that are filled with each module's arguments (positional, by name) and output inside the context."""
+    arguments: dict = {}
     outputs: dict = {}
 
-    def keep(module: nn.Module, _: object, output: object) -> None:
-        outputs[module] = output
+    def keep(module: nn.Module, positional: object, by_name: object, output: object) -> None:
+        arguments[module], outputs[module] = (positional, by_name), output
 
-    handles = [module.register_forward_hook(keep) for module in modules]
+    handles = [module.register_forward_hook(keep, with_kwargs=True) for module in modules]
     try:
-        yield outputs
+        yield arguments, outputs
     finally:
         for handle in handles:
             handle.remove()

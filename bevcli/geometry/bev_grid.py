@@ -69,3 +69,9 @@ class BevGrid:
         cell = np.floor((p - low) / np.array(self.cell_size_m)).astype(np.int64)[..., ::-1]
         inside = ((cell >= 0) & (cell < np.array([self.rows, self.columns]))).all(-1)
         return np.where(inside[..., None], cell, -1)
+
+
+def rectangle(x_range_m: tuple[float, float], y_range_m: tuple[float, float]) -> Array:
+    """(4, 3) corners of an area at z = 0, metres: counter-clockwise from the smallest x and y."""
+    (x0, x1), (y0, y1) = x_range_m, y_range_m
+    return np.array([[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0]])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -58,7 +58,13 @@ class Boxes3D:
     def __getitem__(self, selection: ArrayLike | slice) -> Boxes3D:
         """The boxes of a mask (N,) bool, an index array or a slice."""
         key = selection if isinstance(selection, slice) else np.asarray(selection)
-        return self._map(lambda column: column[key])
+        columns = {field.name: getattr(self, field.name) for field in fields(self)}
+        chosen: dict[str, Any] = {name: None if c is None else c[key] for name, c in columns.items()}
+        return replace(self, **chosen)
+
+    def scored(self, least: float) -> Boxes3D:
+        """The boxes with a score of at least `least`; all boxes where they have no scores."""
+        return self if self.scores is None else self[self.scores >= least]
 
     @staticmethod
     def empty() -> Boxes3D:
@@ -96,19 +102,8 @@ class Boxes3D:
     def corners(self) -> Array:
         """(N, 8, 3) corners, metres: bottom four counter-clockwise from front left, then the top four likewise."""
         half = self.sizes_lwh[:, None, :] / 2
-        signs = np.array(
-            [
-                [1, 1, -1],
-                [-1, 1, -1],
-                [-1, -1, -1],
-                [1, -1, -1],
-                [1, 1, 1],
-                [-1, 1, 1],
-                [-1, -1, 1],
-                [1, -1, 1],
-            ]
-        )
-        local = half * signs
+        signs = [[x, y, z] for z in (-1, 1) for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
+        local = half * np.array(signs)
         c, s = np.cos(self.yaws)[:, None], np.sin(self.yaws)[:, None]
         x = c * local[..., 0] - s * local[..., 1]
         y = s * local[..., 0] + c * local[..., 1]
@@ -138,11 +133,6 @@ class Boxes3D:
         }
         return {name: column.tolist() for name, column in columns.items() if column is not None}
 
-    def _map(self, change: Callable[[NDArray], NDArray]) -> Boxes3D:
-        columns = {f.name: getattr(self, f.name) for f in fields(self)}
-        changed: dict[str, Any] = {name: None if c is None else change(c) for name, c in columns.items()}
-        return replace(self, **changed)
-
 
 # The twelve edges of `Boxes3D.corners`, as pairs of corner indices.
 BOX_EDGES = (
@@ -157,11 +147,9 @@ _MOVING_AND_STILL = {
     "construction_vehicle": ("vehicle.moving", "vehicle.parked"),
     "bus": ("vehicle.moving", "vehicle.stopped"),
     "trailer": ("vehicle.moving", "vehicle.parked"),
-    "barrier": ("", ""),
     "motorcycle": ("cycle.with_rider", "cycle.without_rider"),
     "bicycle": ("cycle.with_rider", "cycle.without_rider"),
     "pedestrian": ("pedestrian.moving", "pedestrian.standing"),
-    "traffic_cone": ("", ""),
 }
 
 
@@ -171,9 +159,5 @@ def attributes_by_speed(boxes: Boxes3D) -> NDArray[np.str_]:
     Classes without attributes get "". A box with unknown velocity counts as standing.
     """
     moving = np.linalg.norm(boxes.velocities, axis=1) > MOVING_MPS
-    none = ("", "")
-    names = [
-        _MOVING_AND_STILL.get(str(name), none)[0 if fast else 1]
-        for name, fast in zip(boxes.classes, moving, strict=True)
-    ]
-    return np.array(names, dtype=np.str_)
+    choices = [_MOVING_AND_STILL.get(str(name), ("", "")) for name in boxes.classes]
+    return np.array([pair[0 if fast else 1] for pair, fast in zip(choices, moving, strict=True)], dtype=np.str_)

@@ -120,8 +120,5 @@ def derive_kinematics(
     rates = np.stack(
         [skew[:, 2, 1] - skew[:, 1, 2], skew[:, 0, 2] - skew[:, 2, 0], skew[:, 1, 0] - skew[:, 0, 1]], axis=-1
     )
-    return (
-        np.einsum("tji,tj->ti", rotations, acceleration),
-        rates / 2,
-        np.einsum("tji,tj->ti", rotations, velocity),
-    )
+    accelerations, velocities = (np.einsum("tji,tj->ti", rotations, each) for each in (acceleration, velocity))
+    return accelerations, rates / 2, velocities

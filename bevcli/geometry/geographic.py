@@ -17,7 +17,7 @@ EAST_DEG = 90.0
 
 @dataclass(frozen=True)
 class GeoOrigin:
-    """Where the world frame of a drive is on Earth (WGS 84). Its z axis points up.
+    """Place of a drive's world frame on Earth (WGS 84). Its z axis points up.
 
     Attributes:
         latitude_deg: latitude of the world frame's origin, degrees, north is positive.

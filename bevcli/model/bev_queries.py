@@ -37,12 +37,8 @@ class BevQueries(nn.Module):
     def resampled(self, state: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
         """A state dict whose BEV queries are interpolated to this grid, which covers the same area.
 
-        Args:
-            state: state dict of a model, unchanged.
-            prefix: what the keys of the BEV queries begin with, such as "bev_queries.".
-
-        Returns:
-            The state dict; as it was where it holds no BEV queries or where these fit already.
+        It is the same state dict where that holds no BEV queries or where these fit already.
+        prefix: of the keys of the BEV queries, such as "bev_queries.".
         """
         row_key, column_key, key = (f"{prefix}{name}" for name in ("row_embedding", "column_embedding", "embedding"))
         if not {row_key, column_key, key} <= set(state):

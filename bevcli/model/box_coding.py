@@ -10,17 +10,16 @@ import numpy as np
 
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, wrap_angle
-from bevcli.model.bevformer import BEVFormerConfig, BEVFormerOutputs
+from bevcli.model.config import ModelConfig
+from bevcli.model.step import ModelOutputs
 
 
-def decode(outputs: BEVFormerOutputs, config: BEVFormerConfig) -> list[Boxes3D]:
+def decode(outputs: ModelOutputs, config: ModelConfig) -> list[Boxes3D]:
     """The boxes with the best scores of the last decoder layer, by falling score, bev frame.
 
-    There is no non-maximum suppression: training matches each object to one query. A query gives one box for each of
-    its classes that is among the best scores.
-
-    Returns:
-        One Boxes3D for each batch element, with at most config.decoder.max_boxes boxes.
+    One Boxes3D for each batch element, with at most config.decoder.max_boxes boxes. There is no non-maximum
+    suppression: training matches each object to one query. A query gives one box for each of its classes that is among
+    the best scores.
     """
     classes = np.asarray(config.classes)
     scores = outputs.class_logits[-1].detach().float().sigmoid().flatten(1)  # (B, Q · classes)

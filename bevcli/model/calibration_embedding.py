@@ -21,8 +21,8 @@ class CalibrationEmbedding(nn.Module):
 
     A small network sees the ray of the feature in the bev frame, the camera's position, its focal length in cells of
     the feature map, and the depth at which the ray meets the ground. With these the model can turn the size of an
-    object in the image into a distance, for any camera. BEVDepth's camera-aware depth network and PETR's position
-    embedding of rays have the same purpose. The last layer starts at zero: an untrained embedding changes nothing.
+    object in the image into a distance, for any camera, as BEVDepth and PETR do in other ways. The last layer starts
+    at zero: an untrained embedding changes nothing.
     """
 
     def __init__(self, channels: int, height_m: float) -> None:
@@ -33,21 +33,16 @@ class CalibrationEmbedding(nn.Module):
             nn.Linear(RAY_FEATURES, HIDDEN), nn.GELU(), nn.Linear(HIDDEN, HIDDEN), nn.GELU(),
             nn.Linear(HIDDEN, 2 * channels),
         )  # fmt: skip
-        last = self.layers[-1]
-        assert isinstance(last, nn.Linear)
-        nn.init.zeros_(last.weight)
-        nn.init.zeros_(last.bias)
+        for parameter in self.layers[-1].parameters():
+            nn.init.zeros_(parameter)
 
     def forward(self, image_features: FeatureMaps, image_from_bev: Tensor, image_size: tuple[int, int]) -> FeatureMaps:
-        """Scaled and shifted tokens.
+        """Scaled and shifted tokens, of the same shape and dtype.
 
         Args:
             image_features: tokens (B·N, S, C) of B·N images.
             image_from_bev: (B, N, 4, 4) float32, bev metres to pixels of the network's input, on the CPU or the device.
             image_size: (height, width) of the network's input, pixels.
-
-        Returns:
-            Tokens of the same shape and dtype.
         """
         tokens = image_features.tokens
         # In float32: half precision is too coarse for rays.

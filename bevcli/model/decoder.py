@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -79,16 +80,12 @@ class Decoder(nn.Module):
     def forward(
         self, bev: Tensor, head: DetectionHead, queries: ObjectQueries | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """What the queries find in the BEV map.
+        """Class logits (L, B, Q, classes) and box codes (L, B, Q, 10) of all L layers; the last queries (B, Q, C).
 
         Args:
             bev: (B, Y·X, C).
             head: class and box branches of the layers.
             queries: None takes the learned ones, in training mode those of all groups, one group after another.
-
-        Returns:
-            Class logits (L, B, Q, classes) and box codes (L, B, Q, 10) of all L layers; the queries (B, Q, C) after
-            the last layer.
         """
         groups = self.training_groups if self.training else 1
         queries = self.object_queries(len(bev), groups) if queries is None else queries
@@ -113,14 +110,18 @@ class DecoderLayer(nn.Module):
     """Self-attention among the object queries, deformable cross-attention to the BEV map, feed-forward network."""
 
     def __init__(
-        self, config: DecoderConfig, channels: int, bev_shape: tuple[int, int], attention_levels: int = 1
+        self,
+        config: DecoderConfig,
+        channels: int,
+        bev_shape: tuple[int, int],
+        attention: Callable[[int, int, int, int], DeformableAttention] = DeformableAttention,
     ) -> None:
-        """Random weights. attention_levels: levels that the cross-attention is built for, although there is one map."""
+        """Random weights. attention: makes the cross-attention from channels, query channels, heads and points."""
         super().__init__()
         self.level_shapes = (bev_shape,)
         heads, dropout = config.attention_heads, config.dropout
         self.self_attention = nn.MultiheadAttention(channels, heads, dropout, batch_first=True)
-        self.cross_attention = DeformableAttention(channels, channels, heads, config.points, attention_levels)
+        self.cross_attention = attention(channels, channels, heads, config.points)
         self.feed_forward = FeedForward(channels, config.feed_forward_width, dropout)
         self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(3))
         self.dropout = nn.Dropout(dropout)
@@ -129,17 +130,14 @@ class DecoderLayer(nn.Module):
     def forward(
         self, query: Tensor, position: Tensor, reference_points: Tensor, bev: Tensor, groups: int = 1
     ) -> Tensor:
-        """The refined queries.
+        """The refined queries (B, Q, C).
 
         Args:
             query: (B, Q, C), contents of the queries.
             position: (B, Q, C), positions of the queries.
-            reference_points: (B, Q, 2) x, y, 0 to 1 over the map; or (B, Q, 4) with the extent along x and y.
+            reference_points: (B, Q, 2) x, y, 0 to 1 over the map, or of another `attention` also the extent.
             bev: (B, Y·X, C).
             groups: number of groups of queries; queries of different groups do not attend to each other.
-
-        Returns:
-            (B, Q, C).
         """
         query = self.norms[0](query + self.dropout(self._attend_to_queries(query, position, groups)))
         attended = self.cross_attention.attend(query + position, reference_points, bev, self.level_shapes)
@@ -162,22 +160,20 @@ class DetectionHead(nn.Module):
     def __init__(self, layers: int, channels: int, classes: int, grid: BevGrid) -> None:
         super().__init__()
         self.class_branches = nn.ModuleList(_class_branch(channels, classes) for _ in range(layers))
-        self.box_branches = nn.ModuleList(_box_branch(channels) for _ in range(layers))
+        self.box_branches = nn.ModuleList(branch(channels, 3, BOX_CODE_SIZE) for _ in range(layers))
         ranges = torch.tensor([grid.x_range_m, grid.y_range_m, grid.z_range_m])
         self.register_buffer("range_start", ranges[:, 0], persistent=False)
         self.register_buffer("range_extent", ranges[:, 1] - ranges[:, 0], persistent=False)
 
     def forward(self, layer: int, query: Tensor, reference_points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Classes and boxes of a decoder layer's queries.
+        """Class logits (B, Q, classes), box codes (B, Q, 10) and refined reference points (B, Q, 3) of a decoder layer.
+
+        The centres of the boxes, in metres, are the refined reference points, 0 to 1 over the range.
 
         Args:
             layer: index of the decoder layer.
             query: (B, Q, C), output of that layer.
             reference_points: (B, Q, 3), input of that layer, 0 to 1 over the range.
-
-        Returns:
-            Class logits (B, Q, classes); box codes (B, Q, 10) with the centre in metres; the refined reference points
-            (B, Q, 3), which are that centre, 0 to 1 over the range.
         """
         logits = self.class_branches[layer](query)
         code = self.box_branches[layer](query).float()
@@ -196,25 +192,13 @@ def inverse_sigmoid(x: Tensor) -> Tensor:
 
 
 def _class_branch(channels: int, classes: int) -> nn.Sequential:
-    branch = nn.Sequential(
-        nn.Linear(channels, channels),
-        nn.LayerNorm(channels),
-        nn.ReLU(),
-        nn.Linear(channels, channels),
-        nn.LayerNorm(channels),
-        nn.ReLU(),
-        nn.Linear(channels, classes),
-    )
-    # Prior of the focal loss: untrained, every class scores 0.01.
-    nn.init.constant_(branch[-1].bias, -math.log(99))  # type: ignore[arg-type]
-    return branch
+    hidden = [(nn.Linear(channels, channels), nn.LayerNorm(channels), nn.ReLU()) for _ in range(2)]
+    last = nn.Linear(channels, classes)
+    nn.init.constant_(last.bias, -math.log(99))  # prior of the focal loss: untrained, every class scores 0.01
+    return nn.Sequential(*hidden[0], *hidden[1], last)
 
 
-def _box_branch(channels: int) -> nn.Sequential:
-    return nn.Sequential(
-        nn.Linear(channels, channels),
-        nn.ReLU(),
-        nn.Linear(channels, channels),
-        nn.ReLU(),
-        nn.Linear(channels, BOX_CODE_SIZE),
-    )
+def branch(channels: int, layers: int, outputs: int) -> nn.Sequential:
+    """Linear layers with ReLU between them: (..., C) -> (..., outputs)."""
+    hidden = [module for _ in range(layers - 1) for module in (nn.Linear(channels, channels), nn.ReLU())]
+    return nn.Sequential(*hidden, nn.Linear(channels, outputs))

@@ -31,8 +31,10 @@ class DeformableAttention(nn.Module):
     """The learned parts that the three deformable attentions of BEVFormer share.
 
     A query predicts where each head samples (offsets from reference points, in cells) and the weight of each sample.
-    `sampling` computes the weighted sums. It has no parameters, so that a faster module can take its place.
-    `level_sizes` makes the table of level sizes; a function that keeps the table can take its place.
+
+    Attributes:
+        sampling: computes the weighted sums, without parameters; a faster module can take its place.
+        level_sizes: makes the table of level sizes; a function that keeps the table can take its place.
     """
 
     level_sizes: Callable[[LevelShapes, torch.device], Tensor]
@@ -62,11 +64,10 @@ class DeformableAttention(nn.Module):
         self._initialize()
 
     def predict(self, query: Tensor) -> tuple[Tensor, Tensor]:
-        """query: (..., query_channels) -> where its samples lie around the reference points, and their weights.
+        """Offsets and weights of the samples of queries (..., query_channels).
 
-        Returns:
-            Offsets (..., heads, maps, L, P, 2) float32, x and y in cells; weights (..., heads, maps, L, P), whose sum
-            over levels and points is 1 for each head and map.
+        Offsets (..., heads, maps, L, P, 2) float32, x and y in cells, lie around the reference points; weights
+        (..., heads, maps, L, P) sum up to 1 over levels and points for each head and map.
         """
         return self.as_samples(self.sampling_offsets(query), self.attention_weights(query))
 
@@ -81,38 +82,25 @@ class DeformableAttention(nn.Module):
         return sampling_locations(reference_points, offsets, level_shapes, self.level_sizes)
 
     def attend(self, query: Tensor, reference_points: Tensor, tokens: Tensor, level_shapes: LevelShapes) -> Tensor:
-        """The attended values of queries that sample one map each.
-
-        A module that was built for more levels than the map has reads locations and weights as the CUDA kernel of the
-        released code does: it takes the flat list of all (query, head, level) for a list of the map's L levels. Query n
-        then gets the heads · L entries from n · heads · L on. They were predicted by query n · L / (predicted levels),
-        rounded down, and lie around that query's reference point. Their weights are not normalised again. The published
-        UniAD weights were trained in this way.
+        """The attended values (B, Q, C) of queries that sample one map each.
 
         Args:
             query: (B, Q, query_channels).
-            reference_points: (B, Q, 2) x, y, 0 to 1 over the map, or (B, Q, 4) with the extent along x and y: then
-                offsets are measured in half extents, divided by the number of points.
+            reference_points: (B, Q, 2) x, y, 0 to 1 over the map.
             tokens: (B, S, C).
             level_shapes: (height, width) of each of the L levels.
-
-        Returns:
-            (B, Q, C).
         """
         batch, queries, _ = query.shape
-        heads, _, predicted, points = self.shape
-        levels = len(level_shapes)
-        read = -(-queries * levels // predicted)  # the queries whose offsets and weights are used; all if predicted = L
-        offsets, weights = self.predict(query[:, :read])  # (B, read, heads, 1, predicted, P, 2)
-        offsets, reference = offsets[:, :, :, 0], reference_points[:, :read, None, None, None]
-        if reference_points.shape[-1] == 2:
-            locations = self.locations(reference, offsets, level_shapes)
-        else:
-            locations = reference[..., :2] + offsets / points * reference[..., 2:] * 0.5
-        locations = locations.flatten(1, 3).unflatten(1, (-1, heads, levels))[:, :queries]  # (B, Q, heads, L, P, 2)
-        weights = weights.flatten(1, 4).unflatten(1, (-1, heads, levels))[:, :queries]
+        locations, weights = self.sampling_points(query, reference_points, level_shapes)
         sampled = self.sample(tokens, level_shapes, locations.flatten(0, 1), weights.flatten(0, 1), [queries] * batch)
         return self.output_projection(sampled.unflatten(0, (batch, queries)))
+
+    def sampling_points(
+        self, query: Tensor, reference_points: Tensor, level_shapes: LevelShapes
+    ) -> tuple[Tensor, Tensor]:
+        """Locations (B, Q, heads, L, P, 2) and weights (B, Q, heads, L, P) of `attend`."""
+        offsets, weights = (predicted[:, :, :, 0] for predicted in self.predict(query))
+        return self.locations(reference_points[:, :, None, None, None], offsets, level_shapes), weights
 
     def sample(
         self,
@@ -155,7 +143,7 @@ class GridSampling(nn.Module):
         weights: Tensor,
         queries_per_map: Sequence[int],
     ) -> Tensor:
-        """M queries sample G maps.
+        """M queries sample G maps. Returns (M, heads · D) float32, whatever the dtype of the values.
 
         Args:
             values: (G, S, heads, D), the cells of a map's L levels one after another, S in all.
@@ -163,9 +151,6 @@ class GridSampling(nn.Module):
             locations: (M, heads, L, P, 2) float32, x and y, 0 to 1 over a level's map; values outside are zero.
             weights: (M, heads, L, P).
             queries_per_map: G counts, of sum M: the first queries_per_map[0] queries sample map 0, and so on.
-
-        Returns:
-            (M, heads · D) float32, whatever the dtype of the values.
         """
         counts = list(queries_per_map)
         parts = zip(values, locations.split(counts), weights.split(counts), strict=True)
@@ -173,16 +158,13 @@ class GridSampling(nn.Module):
 
 
 def sample_maps(values: Tensor, level_shapes: LevelShapes, locations: Tensor, weights: Tensor) -> Tensor:
-    """Weighted sums where every map is sampled by m queries.
+    """Weighted sums (G, m, heads · D) float32 where every map is sampled by m queries.
 
     Args:
         values: (G, S, heads, D).
         level_shapes: (height, width) of each level.
         locations: (G, m, heads, L, P, 2), x and y, 0 to 1 over a level's map; values outside are zero.
         weights: (G, m, heads, L, P).
-
-    Returns:
-        (G, m, heads · D) float32.
     """
     maps, _, heads, _ = values.shape
     result = values.new_zeros((), dtype=torch.float32)
@@ -207,16 +189,13 @@ def sampling_locations(
     level_shapes: LevelShapes,
     sizes_of: Callable[[LevelShapes, torch.device], Tensor] = level_sizes,
 ) -> Tensor:
-    """Reference points plus offsets.
+    """Reference points plus offsets: (..., L, P, 2) float32, x and y, 0 to 1 over a map.
 
     Args:
         reference_points: (..., L or 1, P or 1, 2) x and y, 0 to 1 over a map; up to 1e6 behind a camera.
         offsets: (..., L, P, 2) x and y in cells of each level.
         level_shapes: (height, width) of each level.
         sizes_of: makes the table of level sizes.
-
-    Returns:
-        (..., L, P, 2) float32, x and y, 0 to 1 over a map.
     """
     sizes = sizes_of(level_shapes, offsets.device)[:, None]  # (L, 1, 2)
     # Broadcasting over a last axis of two elements takes several times as long as dividing full tensors.

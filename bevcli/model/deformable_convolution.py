@@ -37,7 +37,7 @@ def split_offsets_and_mask(predicted: Tensor) -> tuple[Tensor, Tensor]:
 def modulated_deformable_convolution(
     x: Tensor, offsets: Tensor, mask: Tensor, weight: Tensor, stride: int = 1
 ) -> Tensor:
-    """A 3x3 convolution with padding 1 whose taps are moved and weighted at every position.
+    """A 3x3 convolution with padding 1 whose taps are moved and weighted at every position -> (B, O, H', W').
 
     Sampling is bilinear, with zeros outside x.
 
@@ -47,9 +47,6 @@ def modulated_deformable_convolution(
         mask: (B, 9, H', W').
         weight: (O, C, 3, 3).
         stride: of the output positions, in cells of x.
-
-    Returns:
-        (B, O, H', W').
     """
     taps = weight.flatten(2).unbind(-1)
     tap_y, tap_x = _tap_positions(offsets.shape[-2:], stride, x.device)  # (9, H', 1), (9, 1, W')

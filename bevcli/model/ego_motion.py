@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from bevcli.geometry.bev_grid import BevGrid
+from bevcli.geometry.ego_motion import Kinematics
 from bevcli.geometry.transforms import Array, Pose, yaw_of_quaternion
 from bevcli.model.upload import upload
 
@@ -24,7 +25,7 @@ RotationCenter = Literal["original", "center"] | tuple[float, float]
 
 @dataclass(frozen=True)
 class EgoMotionConfig:
-    """How ego-motion enters the model.
+    """The use of ego-motion in the model.
 
     The first three are the paper's switches. The others are quirks of the released code, with which its published
     weights were trained.
@@ -69,13 +70,7 @@ class EgoMotionInputs:
 
 
 def ego_motion_inputs(
-    pose: Pose,
-    previous_pose: Pose | None,
-    acceleration: ArrayLike,
-    angular_rate: ArrayLike,
-    velocity: ArrayLike,
-    grid: BevGrid,
-    config: EgoMotionConfig,
+    pose: Pose, previous_pose: Pose | None, kinematics: Kinematics, grid: BevGrid, config: EgoMotionConfig
 ) -> EgoMotionInputs:
     """The model's ego-motion inputs for one frame, computed in float64 as in the released code.
 
@@ -83,9 +78,7 @@ def ego_motion_inputs(
         pose: world_from_ego, with the sign of the quaternion as stored.
         previous_pose: world_from_ego of the previous frame. None for a scene's first frame, which has neither
             translation nor rotation, and where config.first_frame is "original" for the first frame of the run.
-        acceleration: (3,) m/s², ego frame.
-        angular_rate: (3,) rad/s, ego frame.
-        velocity: (3,) m/s, ego frame.
+        kinematics: acceleration, angular rate and velocity.
         grid: the BEV grid.
         config: how ego-motion enters the model.
     """
@@ -101,7 +94,8 @@ def ego_motion_inputs(
     w, x, y, z = np.asarray(pose.quaternion, dtype=np.float64)
     quaternion = [w, w, w, w] if config.can_bus_quaternion == "w" else [w, x, y, z]
     yaws = [np.radians(yaw_deg), turned_deg]
-    can_bus = np.concatenate([moved, quaternion, acceleration, angular_rate, velocity, yaws])
+    sensors = (kinematics.acceleration, kinematics.angular_rate, kinematics.velocity)
+    can_bus = np.concatenate([moved, quaternion, *sensors, yaws])
     return EgoMotionInputs(
         can_bus=can_bus.astype(np.float32),
         shift=(_history_shift(moved, yaw_deg, grid) * config.shift).astype(np.float32),
@@ -115,16 +109,13 @@ def heading_deg(quaternion: ArrayLike) -> float:
 
 
 def rotate_history(history: Tensor, rotation_deg: Tensor, grid: BevGrid, center: RotationCenter) -> Tensor:
-    """Rotates BEV maps; a cell takes the nearest old cell, or zero where that lies outside the map.
+    """BEV maps (B, Y·X, C), rotated; a cell takes the nearest old cell, or zero where that lies outside the map.
 
     Args:
         history: (B, Y·X, C).
         rotation_deg: (B,); on the CPU it needs no wait for the history's device.
         grid: the BEV grid.
         center: centre of the rotation, see EgoMotionConfig.
-
-    Returns:
-        (B, Y·X, C).
     """
     rows, columns = grid.rows, grid.columns
     row, column = _source_cells(rotation_deg, grid, center, history.device)  # (B, Y, X) each

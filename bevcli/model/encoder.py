@@ -50,12 +50,7 @@ class Encoder(nn.Module):
     cell_centers: Tensor
 
     def __init__(
-        self,
-        config: EncoderConfig,
-        channels: int,
-        levels: int,
-        grid: BevGrid,
-        ego_motion: EgoMotionConfig,
+        self, config: EncoderConfig, channels: int, levels: int, grid: BevGrid, ego_motion: EgoMotionConfig
     ) -> None:
         super().__init__()
         bev_shape = (grid.rows, grid.columns)
@@ -73,7 +68,7 @@ class Encoder(nn.Module):
         history: Tensor | None = None,
         shift: Tensor | None = None,
     ) -> Tensor:
-        """The BEV map.
+        """The BEV map (B, Y·X, C).
 
         Args:
             bev_query: (B, Y·X, C).
@@ -83,9 +78,6 @@ class Encoder(nn.Module):
             history: (B, Y·X, C), the previous BEV map, rotated to the current heading; None without history.
             shift: (B, 2), translation of the history (x, y) in normalised BEV coordinates; needed with history, and
                 where ego_motion.first_frame is "original".
-
-        Returns:
-            (B, Y·X, C).
         """
         # With history, all layers attend to the same two maps; without it, to their own queries twice.
         bev_maps = None if history is None else torch.stack([history, bev_query], dim=1)
@@ -131,18 +123,12 @@ class EncoderLayer(nn.Module):
         image_features: FeatureMaps,
         hits: PillarHits,
     ) -> Tensor:
-        """The refined queries.
+        """The refined queries (B, Y·X, C). Other arguments as for `Encoder.forward`.
 
         Args:
             query: (B, Y·X, C).
-            position: (Y·X, C).
             bev_maps: (B, 2, Y·X, C), history and current BEV queries; None without history.
             reference_points: (B or 1, 2, Y·X, 2) x, y, 0 to 1, in each of the two maps.
-            image_features: tokens of B·N images.
-            hits: the cells that each camera sees.
-
-        Returns:
-            (B, Y·X, C).
         """
         maps = query[:, None] if bev_maps is None else bev_maps
         query = self.norms[0](query + self.temporal_self_attention(query, position, maps, reference_points))
@@ -151,10 +137,7 @@ class EncoderLayer(nn.Module):
 
 
 class TemporalSelfAttention(nn.Module):
-    """Deformable attention of BEV queries to the history and the current BEV map (paper, section 3.4).
-
-    The results of the two maps are averaged.
-    """
+    """Deformable attention of BEV queries to history and current BEV map, averaged (paper, section 3.4)."""
 
     def __init__(self, channels: int, heads: int, points: int, bev_shape: tuple[int, int], dropout: float) -> None:
         super().__init__()
@@ -164,20 +147,21 @@ class TemporalSelfAttention(nn.Module):
         self.dropout = nn.Dropout(dropout)
 
     def forward(self, query: Tensor, position: Tensor, bev_maps: Tensor, reference_points: Tensor) -> Tensor:
-        """The attended values, without the residual.
+        """The attended values (B, Y·X, C), without the residual.
 
         Args:
             query: (B, Y·X, C).
             position: (Y·X, C).
             bev_maps: (B, 2, Y·X, C), history first; (B, 1, Y·X, C) where both are the same map.
             reference_points: (B or 1, 2, Y·X, 2) x, y, 0 to 1, in each of the two maps.
-
-        Returns:
-            (B, Y·X, C).
         """
-        batch, cells, _ = query.shape
+        offsets, weights = self.attention.predict(torch.cat([bev_maps[:, 0], query + position], dim=-1))
+        return self.sample(bev_maps, reference_points, offsets, weights)
+
+    def sample(self, bev_maps: Tensor, reference_points: Tensor, offsets: Tensor, weights: Tensor) -> Tensor:
+        """The attended values (B, Y·X, C) for given offsets and weights of the samples; see `forward`."""
+        batch, cells = offsets.shape[:2]
         maps = bev_maps.shape[1]
-        offsets, weights = self.predict(query, position, bev_maps[:, 0])
         reference = reference_points.transpose(1, 2)[:, :, None, :, None, None]  # (B, Y·X, 1, 2, 1, 1, 2)
         locations = self.attention.locations(reference, offsets, self.level_shapes)  # (B, Y·X, heads, 2, 1, P, 2)
         sampled = self.attention.sample(
@@ -189,10 +173,6 @@ class TemporalSelfAttention(nn.Module):
         )  # (B·2·Y·X, C)
         mean = sampled.unflatten(0, (batch, 2, cells)).mean(1)
         return self.dropout(self.attention.output_projection(mean))
-
-    def predict(self, query: Tensor, position: Tensor, history: Tensor) -> tuple[Tensor, Tensor]:
-        """Offsets and weights of the samples, from the history (B, Y·X, C) and the query at the same cell."""
-        return self.attention.predict(torch.cat([history, query + position], dim=-1))
 
 
 class SpatialCrossAttention(nn.Module):
@@ -208,15 +188,9 @@ class SpatialCrossAttention(nn.Module):
         self.dropout = nn.Dropout(dropout)
 
     def forward(self, query: Tensor, image_features: FeatureMaps, hits: PillarHits) -> Tensor:
-        """The attended values, without the residual; a cell that no camera sees gets the output projection's bias.
+        """Attended values (B, Y·X, C) without the residual; the output projection's bias where no camera sees a cell.
 
-        Args:
-            query: (B, Y·X, C).
-            image_features: tokens of B·N images.
-            hits: the M pairs of a camera and a cell that it sees.
-
-        Returns:
-            (B, Y·X, C).
+        query: (B, Y·X, C). image_features: tokens of B·N images. hits: the M pairs of a camera and a cell that it sees.
         """
         locations, weights = self._sampling_points(query, image_features.level_shapes, hits)
         sampled = self.attention.sample(
@@ -227,10 +201,8 @@ class SpatialCrossAttention(nn.Module):
         return self.dropout(self.attention.output_projection(mean.view_as(query)))
 
     def _sampling_points(self, query: Tensor, level_shapes: LevelShapes, hits: PillarHits) -> tuple[Tensor, Tensor]:
-        """Sampling locations (M, heads, L, P, 2) and weights (M, heads, L, P) of the hits.
-
-        A cell has the same offsets and weights in every camera, so they are predicted once for each cell.
-        """
+        """Sampling locations (M, heads, L, P, 2) and weights (M, heads, L, P) of the hits."""
+        # A cell has the same offsets and weights in every camera, so they are predicted once for each cell.
         offsets, weights = self.attention.predict(query.flatten(0, 1))  # (B·Y·X, heads, 1, L, P, 2)
         pillar_points = hits.reference_points.shape[1]
         reference = hits.reference_points.repeat(1, self.points // pillar_points, 1)  # point p: height p mod Z

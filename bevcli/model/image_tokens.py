@@ -38,14 +38,9 @@ class ImageTokens(nn.Module):
             self.camera_embedding = nn.Parameter(torch.randn(cameras, channels))
 
     def forward(self, maps: Sequence[Tensor], camera_index: Tensor) -> FeatureMaps:
-        """Flattens the levels of B·N images.
+        """Tokens (B·N, S, C) of B·N images, in the maps' dtype; S is the number of cells of all levels.
 
-        Args:
-            maps: (B·N, C, H_l, W_l), one a level.
-            camera_index: (N,) or (B, N) int64, the camera embedding of each image.
-
-        Returns:
-            Tokens (B·N, S, C) in the maps' dtype, S the cells of all levels.
+        maps: (B·N, C, H_l, W_l), one a level. camera_index: (N,) or (B, N) int64, the camera embedding of each image.
         """
         level_shapes = tuple((x.shape[-2], x.shape[-1]) for x in maps)
         levels = [x.flatten(2).transpose(1, 2) + self.level_embedding[i] for i, x in enumerate(maps)]

@@ -73,14 +73,9 @@ class Pillars(nn.Module):
 
 
 def project_points(image_from_bev: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Projects points into images.
+    """Pixels (..., 2) and depths (...) in metres of points in images.
 
-    Args:
-        image_from_bev: (..., 4, 4).
-        points: (..., 3) metres, bev frame.
-
-    Returns:
-        Pixels (..., 2), and depths (...) in metres.
+    image_from_bev: (..., 4, 4). points: (..., 3) metres, bev frame.
     """
     # Sums of products, not matmul: lower-precision matrix units would move the points by pixels.
     projected = (image_from_bev[..., :3, :3] * points[..., None, :]).sum(-1) + image_from_bev[..., :3, 3]

@@ -69,7 +69,7 @@ class ResNet(nn.Module):
         nn.init.kaiming_normal_(self.conv1.weight, mode="fan_out", nonlinearity="relu")
 
     def freeze(self, stages: int) -> None:
-        """Keeps the weights of the stem and of the first stages, so many, in a training; with 0 nothing is frozen."""
+        """Keeps the weights of the stem and of so many first stages in a training; with 0 nothing is frozen."""
         for part in [self.conv1, self.bn1, *self.stages[:stages]] if stages else []:
             part.requires_grad_(False)
 
@@ -124,6 +124,29 @@ class Bottleneck(nn.Module):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
         # An untrained block is the identity, so that deep networks train.
         nn.init.zeros_(self.bn3.weight)
+
+
+class BasicBlock(nn.Module):
+    """The residual block of ResNet-18: two 3x3 convolutions, each with batch norm, and a shortcut around them."""
+
+    def __init__(self, in_channels: int, channels: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(in_channels, channels, 3, padding=1, bias=False)
+        self.bn1 = nn.BatchNorm2d(channels)
+        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
+        self.bn2 = nn.BatchNorm2d(channels)
+        self.downsample: nn.Module = nn.Identity()
+        if in_channels != channels:
+            shortcut = nn.Conv2d(in_channels, channels, 3, padding=1, bias=False)
+            self.downsample = nn.Sequential(shortcut, nn.BatchNorm2d(channels))
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+
+    def forward(self, x: Tensor) -> Tensor:
+        """x: (B, in_channels, Y, X) -> (B, channels, Y, X)."""
+        y = F.relu(self.bn1(self.conv1(x)))
+        return F.relu(self.bn2(self.conv2(y)) + self.downsample(x))
 
 
 def _stage(in_channels: int, channels: int, blocks: int, stage: int, config: ResNetConfig) -> nn.Sequential:

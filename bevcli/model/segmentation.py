@@ -6,6 +6,7 @@ The head's location decoder gives thing queries a place, and its mask decoder tu
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +17,8 @@ from torch import Tensor, nn
 
 from bevcli.frame import MAP_CLASSES, BevMap
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.decoder import DecoderConfig, DecoderLayer, inverse_sigmoid
+from bevcli.model.decoder import DecoderConfig, DecoderLayer, branch, inverse_sigmoid
+from bevcli.model.deformable_attention import DeformableAttention
 from bevcli.model.feed_forward import FeedForward
 
 # Each stuff class has one query of its own. The thing class has many; training matches them to instances.
@@ -114,8 +116,7 @@ class SegmentationHead(nn.Module):
 class LocationDecoder(nn.Module):
     """Thing queries that attend to the BEV map and predict the centre and the extent of their things.
 
-    In the segmentation head, only the training loss uses the locations: they teach the queries where their things are
-    before masks are made.
+    In the segmentation head, only the training loss uses the locations.
     """
 
     def __init__(
@@ -126,7 +127,7 @@ class LocationDecoder(nn.Module):
         *,
         branch_layers: int = 2,
         refines_extent: bool = False,
-        attention_levels: int = 1,
+        attention: Callable[[int, int, int, int], DeformableAttention] = DeformableAttention,
     ) -> None:
         """Random weights.
 
@@ -137,17 +138,15 @@ class LocationDecoder(nn.Module):
             branch_layers: linear layers of a location branch.
             refines_extent: whether a layer refines centre and extent of the layer before, and samples inside them;
                 otherwise it refines the centre only.
-            attention_levels: see `DecoderLayer`.
+            attention: see `DecoderLayer`.
         """
         super().__init__()
         self.refines_extent = refines_extent
         # The first half of the channels is the position of a query, the second half its content.
         self.query_embedding = nn.Parameter(torch.randn(config.queries, 2 * channels))
         self.reference_points = nn.Linear(channels, 2)
-        self.layers = nn.ModuleList(
-            DecoderLayer(config, channels, bev_shape, attention_levels) for _ in range(config.layers)
-        )
-        self.location_branches = nn.ModuleList(_location_branch(channels, branch_layers) for _ in range(config.layers))
+        self.layers = nn.ModuleList(DecoderLayer(config, channels, bev_shape, attention) for _ in range(config.layers))
+        self.location_branches = nn.ModuleList(branch(channels, branch_layers, 4) for _ in range(config.layers))
 
     def forward(self, bev: Tensor) -> tuple[Tensor, Tensor]:
         """bev: (B, Y·X, C) -> thing queries (B, T, C) and locations (L, B, T, 4) of all L layers.
@@ -157,9 +156,9 @@ class LocationDecoder(nn.Module):
         position, query = self.query_embedding.expand(len(bev), -1, -1).chunk(2, dim=-1)  # (B, T, C) each
         reference_points = self.reference_points(position).sigmoid()  # (B, T, 2)
         locations = []
-        for layer, branch in zip(self.layers, self.location_branches, strict=True):
+        for layer, location_branch in zip(self.layers, self.location_branches, strict=True):
             query = layer(query, position, reference_points, bev)
-            code, refined = branch(query), reference_points.shape[-1]
+            code, refined = location_branch(query), reference_points.shape[-1]
             moved = code[..., :refined] + inverse_sigmoid(reference_points)
             location = torch.cat([moved.sigmoid(), code[..., refined:].sigmoid()], dim=-1)
             locations.append(location)
@@ -186,15 +185,9 @@ class MaskDecoderLayer(nn.Module):
         nn.init.constant_(self.class_branch.bias, -math.log(99))  # prior of the focal loss, as in the detection head
 
     def forward(self, query: Tensor, position: Tensor, bev: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """One layer of the mask decoder.
+        """Refined queries (B, Q, C), mask logits (B, Q, Y·X) and class logits (B, Q).
 
-        Args:
-            query: (B, Q, C).
-            position: (Y·X, C), position embedding of the cells.
-            bev: (B, Y·X, C).
-
-        Returns:
-            Refined queries (B, Q, C), mask logits (B, Q, Y·X) and class logits (B, Q).
+        query: (B, Q, C). position: (Y·X, C), position embedding of the cells. bev: (B, Y·X, C).
         """
         queries = split_heads(self.query_projection(query), self.heads)
         keys = split_heads(self.key_projection(bev + position), self.heads)
@@ -247,15 +240,12 @@ def decode_maps(outputs: SegmentationOutputs, config: SegmentationConfig, grid: 
 
 
 def assign_cells(probabilities: Tensor, minimum: float, scale: int) -> NDArray[np.int64]:
-    """The most probable query of each cell.
+    """The most probable query of each cell: (scale · rows, scale · columns), its index, -1 for none.
 
     Args:
         probabilities: (Q, rows, columns).
         minimum: a cell where no query has a larger probability belongs to none.
         scale: cells of the result along a side of a cell.
-
-    Returns:
-        (scale · rows, scale · columns), index of a query, -1 for none.
     """
     candidates = (probabilities.amax((1, 2)) > minimum).nonzero()[:, 0]  # the others can win no cell
     none = probabilities.new_full((1, *probabilities.shape[1:]), minimum)
@@ -273,8 +263,3 @@ def _panoptic_map(probabilities: Tensor, config: SegmentationConfig) -> Panoptic
 def _upsampled(layers: Tensor, scale: int) -> Tensor:
     """(K, rows, columns) -> (K, scale · rows, scale · columns), bilinear between the centres of the cells."""
     return F.interpolate(layers[None], scale_factor=scale, mode="bilinear", align_corners=False)[0]
-
-
-def _location_branch(channels: int, layers: int) -> nn.Sequential:
-    hidden = [module for _ in range(layers - 1) for module in (nn.Linear(channels, channels), nn.ReLU())]
-    return nn.Sequential(*hidden, nn.Linear(channels, 4))

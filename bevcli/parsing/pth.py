@@ -1,7 +1,8 @@
-"""Reads the tensors of a PyTorch file (.pth), in the zip format and in the older one, and runs nothing in it.
+"""Reads the tensors of a .safetensors file, and of a PyTorch file (.pth) in the zip format and in the older one.
 
-Tensors and plain values are read. Whatever else the file names becomes a `Placeholder`: it is neither imported nor
-called. The tensors that a pickle describes are checked against the bytes that the file has before any is made.
+Nothing in a file is run. Tensors and plain values are read. Whatever else a PyTorch file names becomes a `Placeholder`:
+it is neither imported nor called. The tensors that a pickle describes are checked against the bytes that the file has
+before any is made.
 """
 
 from __future__ import annotations
@@ -12,23 +13,25 @@ import math
 import struct
 import sys
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import safetensors
 import torch
 from torch import Tensor
 
-from bevcli.errors import WeightsError
+from bevcli.errors import BevcliError, InputError, WeightsError
 from bevcli.parsing.files import open_regular
-from bevcli.parsing.pickles import Global, PickleError, PickleReader, Placeholder
+from bevcli.parsing.pickles import Global, PickleError, Placeholder, read_pickle
 
 LARGEST_PICKLE = 32 << 20
 LARGEST_TENSORS = 8 << 30  # bytes of all tensors that are read
 MOST_DIMENSIONS = 16
+MOST_ARGUMENTS = 16  # of a call that is read
 LARGEST_SIZE = 2**40  # elements of a tensor, repeated ones included
-# What Python's zip reader raises for a damaged archive, and this module for a damaged pickle.
+# The exceptions of Python's zip reader for a damaged archive, and of this package for a damaged pickle.
 _DAMAGE = (PickleError, zipfile.BadZipFile, RuntimeError, KeyError, ValueError, OSError, EOFError, struct.error)
 _OLD_FORMAT = 0x1950A86A20F9469CFC6C  # the first number in a file of the older format
 _DTYPES = {
@@ -50,6 +53,9 @@ _ATTACKS = frozenset(("os", "posix", "nt", "subprocess", "sys", "pty", "runpy", 
 _ATTACKING_BUILTINS = frozenset(("eval", "exec", "execfile", "compile", "__import__", "open", "input"))
 
 
+_Read = Callable[[str, int], bytearray]  # the bytes of a storage, by its key and their number
+
+
 @dataclass(frozen=True)
 class PthFile:
     """The contents of a PyTorch file.
@@ -61,41 +67,27 @@ class PthFile:
 
     contents: Any
     left_out: tuple[str, ...]
-    _storages: _Storages = field(repr=False)
+    _path: Path = field(repr=False)
+    _open: Callable[[], contextlib.AbstractContextManager[_Read]] = field(repr=False)
 
     def tensors(self, stored: Mapping[str, StoredTensor]) -> dict[str, Tensor]:
         """The tensors of a state dict. Raises WeightsError where one does not fit the bytes that the file has."""
-        with self._storages:
-            return {name: self._storages.tensor(name, described) for name, described in stored.items()}
+        with self._open() as read:
+            storages = _Storages(self._path, read)
+            return {name: storages.tensor(name, described) for name, described in stored.items()}
 
     def with_tensors(self) -> Any:
         """The contents with tensors in place of `StoredTensor`.
 
         Raises WeightsError as `tensors`, and RecursionError where a list contains itself.
         """
-        with self._storages:
-            return self._filled(self.contents, "")
-
-    def _filled(self, value: Any, name: str) -> Any:
-        if isinstance(value, StoredTensor):
-            return self._storages.tensor(name, value)
-        if isinstance(value, dict):
-            return {key: self._filled(item, f"{name}.{key}".lstrip(".")) for key, item in value.items()}
-        if isinstance(value, list | tuple):
-            items = [self._filled(item, f"{name}.{place}".lstrip(".")) for place, item in enumerate(value)]
-            return items if isinstance(value, list) else tuple(items)
-        return value
+        with self._open() as read:
+            return _filled(self.contents, "", _Storages(self._path, read))
 
 
 @dataclass(frozen=True, eq=False)
 class Storage:
-    """A row of numbers in the file.
-
-    Attributes:
-        key: its name in the file.
-        dtype: of the numbers.
-        count: how many there are, by the pickle.
-    """
+    """A row of `count` numbers, by the pickle. key: its name in the file."""
 
     key: str
     dtype: torch.dtype
@@ -104,14 +96,7 @@ class Storage:
 
 @dataclass(frozen=True, eq=False)
 class StoredTensor:
-    """A tensor as the pickle describes it, not checked yet.
-
-    Attributes:
-        storage: where its numbers are.
-        offset: index of its first number.
-        shape: sizes.
-        strides: in numbers, one a dimension.
-    """
+    """A tensor as the pickle describes it, not checked yet. Offset and strides count numbers."""
 
     storage: Any
     offset: Any
@@ -131,8 +116,21 @@ def read_pth(path: Path) -> PthFile:
             raise _damaged(path, str(error)) from None
 
 
+_MADE: dict[str, Callable[..., Any]] = {
+    "collections.OrderedDict": lambda *_: {},
+    "collections.defaultdict": lambda *_: {},
+    "torch._utils._rebuild_tensor": StoredTensor,
+    "torch._utils._rebuild_tensor_v2": lambda storage, offset, shape, strides, *_: StoredTensor(
+        storage, offset, shape, strides
+    ),
+    "torch._utils._rebuild_parameter": lambda tensor, *_: tensor,
+    "torch._utils._rebuild_parameter_with_state": lambda tensor, *_: tensor,
+    "torch.Size": lambda sizes=(), *_: sizes,
+}
+
+
 class _Calls:
-    """What becomes of the calls and persistent ids in a file, and the names of what is left out."""
+    """Objects for the calls and persistent ids in a file, and the names of those that are left out."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -141,14 +139,8 @@ class _Calls:
 
     def call(self, function: Global, arguments: tuple[Any, ...]) -> Any:
         name = str(function)
-        if name in ("collections.OrderedDict", "collections.defaultdict"):
-            return {}
-        if name in ("torch._utils._rebuild_tensor_v2", "torch._utils._rebuild_tensor") and len(arguments) >= 4:
-            return StoredTensor(*arguments[:4])
-        if name in ("torch._utils._rebuild_parameter", "torch._utils._rebuild_parameter_with_state") and arguments:
-            return arguments[0]
-        if name == "torch.Size":
-            return arguments[0] if len(arguments) == 1 else ()
+        if name in _MADE:
+            return _MADE[name](*arguments[:MOST_ARGUMENTS])
         root = function.module.split(".")[0]
         builtin = root in ("builtins", "__builtin__") and function.name in _ATTACKING_BUILTINS
         if root in _ATTACKS or builtin:
@@ -176,13 +168,12 @@ class _Calls:
         return storage
 
 
-class _Storages(contextlib.ExitStack):
-    """Reads storages when a tensor needs them, each once. The file is open inside a `with` block."""
+class _Storages:
+    """Reads storages when a tensor needs them, each once."""
 
-    def __init__(self, path: Path) -> None:
-        super().__init__()
-        self._path = path
-        self._read: dict[str, Tensor] = {}
+    def __init__(self, path: Path, read: _Read) -> None:
+        self._path, self._read = path, read
+        self._loaded: dict[str, Tensor] = {}
         self._bytes = 0
 
     def tensor(self, name: str, stored: StoredTensor) -> Tensor:
@@ -199,9 +190,9 @@ class _Storages(contextlib.ExitStack):
             raise WeightsError(
                 f"{self._path}: tensor {name}: its shape {shape} reaches beyond its {storage.count} numbers in the file"
             )
-        if storage.key not in self._read:
-            self._read[storage.key] = self._load(storage)
-        return self._read[storage.key].as_strided(shape, strides, offset)
+        if storage.key not in self._loaded:
+            self._loaded[storage.key] = self._load(storage)
+        return self._loaded[storage.key].as_strided(shape, strides, offset)
 
     def _load(self, storage: Storage) -> Tensor:
         size = storage.count * storage.dtype.itemsize
@@ -211,45 +202,22 @@ class _Storages(contextlib.ExitStack):
         if not size:
             return torch.empty(0, dtype=storage.dtype)
         try:
-            data = self.read(storage.key, size)
+            data = self._read(storage.key, size)
         except _DAMAGE as error:
             raise _damaged(self._path, f"storage {storage.key}: {error}") from None
         return torch.frombuffer(data, dtype=storage.dtype)
 
-    def read(self, key: str, size: int) -> bytearray:
-        """The bytes of a storage."""
-        raise NotImplementedError
 
-
-class _ZipStorages(_Storages):
-    def __init__(self, path: Path, folder: str) -> None:
-        super().__init__(path)
-        self._folder = folder
-        self._archive: zipfile.ZipFile | None = None
-
-    def read(self, key: str, size: int) -> bytearray:
-        if self._archive is None:
-            self._archive = self.enter_context(zipfile.ZipFile(self._path))
-        return bytearray(_entry(self._archive, f"{self._folder}/data/{key}", size, size))
-
-
-class _OldStorages(_Storages):
-    """Storages of the older format: offset and byte count of each, by key."""
-
-    def __init__(self, path: Path, places: Mapping[str, tuple[int, int]]) -> None:
-        super().__init__(path)
-        self._places = places
-
-    def read(self, key: str, size: int) -> bytearray:
-        offset, found = self._places[key]
-        if found != size:
-            raise PickleError(f"has {found} bytes (expected {size})")
-        data = bytearray(size)
-        with self._path.open("rb") as file:
-            file.seek(offset)
-            if file.readinto(data) < size:
-                raise PickleError("is cut off")
-        return data
+def _filled(value: Any, name: str, storages: _Storages) -> Any:
+    """A value with tensors in place of `StoredTensor`. name: of the value, for messages."""
+    if isinstance(value, StoredTensor):
+        return storages.tensor(name, value)
+    if isinstance(value, dict):
+        return {key: _filled(item, f"{name}.{key}".lstrip("."), storages) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        items = [_filled(item, f"{name}.{place}".lstrip("."), storages) for place, item in enumerate(value)]
+        return items if isinstance(value, list) else tuple(items)
+    return value
 
 
 def _read_zip(path: Path, file: BinaryIO) -> PthFile:
@@ -261,8 +229,14 @@ def _read_zip(path: Path, file: BinaryIO) -> PthFile:
                 raise PickleError(f"its numbers have the byte order {order!r}")
         data = _entry(archive, f"{folder}/data.pkl", None, LARGEST_PICKLE)
     calls = _Calls(path)
-    contents = PickleReader(io.BytesIO(data), calls.call, calls.persistent).read()
-    return PthFile(contents, tuple(sorted(calls.left_out)), _ZipStorages(path, folder))
+    contents = read_pickle(io.BytesIO(data), calls.call, calls.persistent)
+
+    @contextlib.contextmanager
+    def open_storages() -> Iterator[_Read]:
+        with zipfile.ZipFile(path) as archive:
+            yield lambda key, size: bytearray(_entry(archive, f"{folder}/data/{key}", size, size))
+
+    return PthFile(contents, tuple(sorted(calls.left_out)), path, open_storages)
 
 
 def _entry(archive: zipfile.ZipFile, name: str, expected: int | None, largest: int) -> bytes:
@@ -281,18 +255,20 @@ def _entry(archive: zipfile.ZipFile, name: str, expected: int | None, largest: i
 
 def _read_old(path: Path, file: BinaryIO) -> PthFile:
     """magic number, protocol, system facts, contents and storage keys as pickles, then the storages."""
-    if PickleReader(file).read() != _OLD_FORMAT:
+    start = io.BytesIO(file.read(LARGEST_PICKLE))
+    if read_pickle(start) != _OLD_FORMAT:
         raise PickleError("another kind of file")
-    PickleReader(file).read()
-    facts = PickleReader(file).read()
+    read_pickle(start)
+    facts = read_pickle(start)
     if isinstance(facts, dict) and facts.get("little_endian", True) != (sys.byteorder == "little"):
         raise PickleError("its numbers have another byte order")
     calls = _Calls(path)
-    contents = PickleReader(file, calls.call, calls.persistent).read()
-    keys = PickleReader(file).read()
+    contents = read_pickle(start, calls.call, calls.persistent)
+    keys = read_pickle(start)
     if not isinstance(keys, list) or not all(isinstance(key, str) for key in keys):
         raise PickleError("the list of its storages is damaged")
-    places: dict[str, tuple[int, int]] = {}
+    file.seek(start.tell())
+    places: dict[str, int] = {}
     for key in keys:
         header = file.read(8)
         if len(header) < 8 or key not in calls.storages:
@@ -300,10 +276,23 @@ def _read_old(path: Path, file: BinaryIO) -> PthFile:
         storage = calls.storages[key]
         if struct.unpack("<q", header)[0] != storage.count:
             raise PickleError(f"storage {key:.50} has another size than the pickle states")
-        size = storage.count * storage.dtype.itemsize
-        places[key] = (file.tell(), size)
-        file.seek(size, io.SEEK_CUR)
-    return PthFile(contents, tuple(sorted(calls.left_out)), _OldStorages(path, places))
+        places[key] = file.tell()
+        file.seek(storage.count * storage.dtype.itemsize, io.SEEK_CUR)
+
+    @contextlib.contextmanager
+    def open_storages() -> Iterator[_Read]:
+        with path.open("rb") as file:
+            yield lambda key, size: _part(file, places[key], size)
+
+    return PthFile(contents, tuple(sorted(calls.left_out)), path, open_storages)
+
+
+def _part(file: BinaryIO, offset: int, size: int) -> bytearray:
+    data = bytearray(size)
+    file.seek(offset)
+    if file.readinto(data) < size:  # type: ignore[attr-defined]
+        raise PickleError("is cut off")
+    return data
 
 
 def _sizes(value: Any) -> tuple[int, ...] | None:
@@ -318,3 +307,21 @@ def _damaged(path: Path, reason: str) -> WeightsError:
         f"{path}: not a weights file that is safe to read (expected .safetensors, or a PyTorch file of tensors and "
         f"plain values): it is damaged, is another kind of file, or holds objects that could run code ({reason:.200})"
     )
+
+
+def read_safetensors(
+    path: Path, *, missing: str = "the file is missing", error: type[BevcliError] = InputError
+) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """The tensors by name, on the CPU, and the metadata.
+
+    missing: text of the message for a file that is not there.
+    error: kind of exception for a file that is missing, damaged or no regular file.
+    """
+    open_regular(path, missing=missing, error=error).close()  # the library would wait for the writer of a pipe
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            return tensors, dict(file.metadata() or {})
+    except (safetensors.SafetensorError, OSError, ValueError, RuntimeError, AttributeError) as failure:
+        reason = " ".join(str(failure).split())
+        raise error(f"{path}: not a valid safetensors file ({reason:.200})") from None

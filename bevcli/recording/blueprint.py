@@ -2,17 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.cameras import CameraRig
 from bevcli.recording import entities
-from bevcli.recording.camera_layout import camera_rows
 from bevcli.recording.colors import BACKGROUND
-from bevcli.recording.legend import legend_size
+from bevcli.recording.log_static import legend_size
+
+SIDEWAYS = np.pi / 2 + 1e-6  # a camera that looks exactly sideways belongs to the front row
+
+
+def camera_rows(rig: CameraRig) -> tuple[tuple[str, ...], ...]:
+    """The camera names of a rig in one or two rows, as `rows_by_yaw` orders them."""
+    return rows_by_yaw({camera.name: camera.yaw for camera in rig.cameras})
+
+
+def rows_by_yaw(yaws: Mapping[str, float]) -> tuple[tuple[str, ...], ...]:
+    """Camera names in one or two rows, left to right: those that look ahead, then those that look back.
+
+    In both rows the left side of the vehicle is on the left. yaws: by camera name, radians, in the ego frame.
+    """
+    ahead = sorted((name for name, yaw in yaws.items() if abs(yaw) <= SIDEWAYS), key=lambda name: -yaws[name])
+    back = sorted(yaws.keys() - set(ahead), key=lambda name: yaws[name] % (2 * np.pi))
+    return tuple(tuple(row) for row in (ahead, back) if row)
+
 
 HIDDEN = rrb.EntityBehavior(visible=False)
 EYE_M, LOOK_AT_M = (-15.0, 0.0, 10.0), (8.0, 0.0, 0.0)  # in the ego frame: behind and above, looking ahead
@@ -26,7 +46,7 @@ MAP_ZOOM = 17.0
 
 @dataclass(frozen=True)
 class LayoutFacts:
-    """What the layout depends on, besides the rig.
+    """The facts of a run that change the layout.
 
     Attributes:
         note: added to the titles of the main views, such as "untrained weights"; "" for none.
@@ -36,6 +56,7 @@ class LayoutFacts:
         on_earth: whether there is a street map view.
         legend_entries: number of entries of the legend.
         grid: of the model, None if unknown.
+        follows: whether the viewer shows the newest frame at first, instead of playing from the first one.
     """
 
     note: str = ""
@@ -45,6 +66,7 @@ class LayoutFacts:
     on_earth: bool = False
     legend_entries: int = 0
     grid: BevGrid | None = None
+    follows: bool = False
 
 
 def recording_blueprint(rig: CameraRig, facts: LayoutFacts) -> rrb.Blueprint:
@@ -61,7 +83,12 @@ def recording_blueprint(rig: CameraRig, facts: LayoutFacts) -> rrb.Blueprint:
     return rrb.Blueprint(
         rrb.Horizontal(views, _texts(facts), column_shares=[1 - TEXTS_SHARE, TEXTS_SHARE]),
         # Playback of "time" runs at the drive's own speed; `fps` is that of the timeline "frame".
-        rrb.TimePanel(state="collapsed", timeline=entities.TIME_TIMELINE, fps=facts.rate_hz),
+        rrb.TimePanel(
+            state="collapsed",
+            timeline=entities.TIME_TIMELINE,
+            fps=facts.rate_hz,
+            play_state="following" if facts.follows else None,
+        ),
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
         auto_views=False,
@@ -108,14 +135,11 @@ def _from_start() -> list[rr.VisibleTimeRange]:
 
 def _bev_tabs(titled: str, facts: LayoutFacts) -> rrb.Tabs:
     grid = facts.grid
-    margin = VIEW_MARGIN_M if grid is None else min(VIEW_MARGIN_M, *map(abs, (*grid.x_range_m, *grid.y_range_m)))
-    around = rrb.VisualBounds2D(x_range=[-margin, margin], y_range=[-margin, margin])
+    margin = VIEW_MARGIN_M if grid is None else min(VIEW_MARGIN_M, grid.nearest_side_m)
 
     def view(name: str, *without: str) -> rrb.Spatial2DView:
         contents = [f"/{entities.BEV}/**", *(f"- /{entity}/**" for entity in without)]
-        return rrb.Spatial2DView(
-            origin=entities.BEV, contents=contents, name=name, background=list(BACKGROUND), visual_bounds=around
-        )
+        return _flat(entities.BEV, name, (-margin, margin), (-margin, margin), contents=contents)
 
     features, history, segmentation = entities.BEV_FEATURES, entities.BEV_HISTORY, entities.BEV_SEGMENTATION
     views: list[rrb.View] = [
@@ -138,34 +162,29 @@ def _street_map() -> rrb.MapView:
 
 def _texts(facts: LayoutFacts) -> rrb.Vertical:
     corner = rrb.PlotLegend(rrb.Corner2D.LeftTop)
-    times = rrb.TimeSeriesView(origin=entities.STAGE_CURVES, name="Seconds per stage", plot_legend=corner)
-    counts = rrb.TimeSeriesView(origin=entities.BOX_CURVES, name="Boxes per class", plot_legend=corner)
-    speed = rrb.TimeSeriesView(origin=entities.SPEED_CURVE, name="Speed", plot_legend=corner)
+    curves = {
+        "Speed": entities.SPEED_CURVE,
+        "Boxes per class": entities.BOX_CURVES,
+        "Seconds per stage": entities.STAGE_CURVES,
+    }
+    plots = [rrb.TimeSeriesView(origin=entity, name=name, plot_legend=corner) for name, entity in curves.items()]
     columns = rrb.TextLogColumns(timeline_columns=[], text_log_columns=["loglevel", "body"])
     events = rrb.TextLogView(origin=entities.EVENTS, name="Events", columns=columns)
     about = rrb.TextDocumentView(origin=entities.RUN, name="About")
     width, height = legend_size(facts.legend_entries)
-    legend = rrb.Spatial2DView(
-        origin=entities.LEGEND,
-        name="Legend",
-        background=list(BACKGROUND),
-        visual_bounds=rrb.VisualBounds2D(x_range=[0, width], y_range=[0, height]),
-    )
-    return rrb.Vertical(
-        rrb.Tabs(speed, counts, times, active_tab=0),
-        legend,
-        rrb.Tabs(events, about, active_tab=0),
-        row_shares=[3, 3, 4],
-    )
+    legend = _flat(entities.LEGEND, "Legend", (0, width), (0, height))
+    pages = rrb.Tabs(events, about, active_tab=0)
+    return rrb.Vertical(rrb.Tabs(*plots, active_tab=0), legend, pages, row_shares=[3, 3, 4])
 
 
 def _camera(rig: CameraRig, name: str, *, probes: bool) -> rrb.Spatial2DView:
     hidden = ("pillars",) if probes else ("pillars", "probes")
-    camera = rig[name]
-    return rrb.Spatial2DView(
-        origin=entities.camera(name),
-        name=name,
-        background=list(BACKGROUND),
-        visual_bounds=rrb.VisualBounds2D(x_range=[0, camera.width], y_range=[0, camera.height]),
-        overrides={entities.overlay(name, kind): HIDDEN for kind in hidden},
-    )
+    overrides = {entities.overlay(name, kind): HIDDEN for kind in hidden}
+    return _flat(entities.camera(name), name, (0, rig[name].width), (0, rig[name].height), overrides=overrides)
+
+
+def _flat(
+    origin: str, name: str, x_range: tuple[float, float], y_range: tuple[float, float], **options: Any
+) -> rrb.Spatial2DView:
+    bounds = rrb.VisualBounds2D(x_range=x_range, y_range=y_range)
+    return rrb.Spatial2DView(origin=origin, name=name, background=list(BACKGROUND), visual_bounds=bounds, **options)

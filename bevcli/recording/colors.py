@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from itertools import cycle
 
 import cv2
@@ -60,18 +60,17 @@ def class_color(name: str, index: int) -> Color:
     return round(red * 255), round(green * 255), round(blue * 255)
 
 
-def map_colors(classes: Iterable[str]) -> dict[str, Color]:
-    """Map class -> colour, in the order of the classes. Classes that are not in MAP_COLORS take OTHER_MAP_COLORS."""
-    names = list(classes)
-    others = (name for name in names if name not in MAP_COLORS)
-    chosen = {**MAP_COLORS, **dict(zip(others, cycle(OTHER_MAP_COLORS), strict=False))}
-    return {name: chosen[name] for name in names}
+def map_colors(
+    classes: Iterable[str], named: Mapping[str, Color] = MAP_COLORS, others: Iterable[Color] = OTHER_MAP_COLORS
+) -> dict[str, Color]:
+    """Map class -> colour, in the order of the classes. Classes that are not in `named` take `others` in turn."""
+    rest = cycle(others)
+    return {name: named[name] if name in named else next(rest) for name in classes}
 
 
 def colormap(values: ArrayLike, name: str = "viridis") -> NDArray[np.uint8]:
     """Values 0 to 1 of any shape (...,) -> colours (..., 3) uint8 RGB. name: one of OpenCV's colour maps."""
-    table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], getattr(cv2, f"COLORMAP_{name.upper()}"))[
-        :, 0, ::-1
-    ]
+    levels = np.arange(256, dtype=np.uint8)[:, None]
+    table = cv2.applyColorMap(levels, getattr(cv2, f"COLORMAP_{name.upper()}"))[:, 0, ::-1]
     indices = np.clip(np.asarray(values, dtype=np.float64) * 255, 0, 255).astype(np.uint8)
     return np.ascontiguousarray(table[indices]).astype(np.uint8)

@@ -1,18 +1,129 @@
-"""Writes BEV maps into a recording: features, segmentation, history weights, probed cells."""
+"""Writes BEV maps into a recording: features as colours, segmentation, history weights, probed cells."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from bevcli.errors import InputError
 from bevcli.frame import BevMap, Probe
-from bevcli.geometry.bev_grid import BevGrid
+from bevcli.geometry.bev_grid import BevGrid, rectangle
 from bevcli.geometry.transforms import Array, apply
 from bevcli.recording import entities
-from bevcli.recording.colors import BACKGROUND, colormap, map_colors
+from bevcli.recording.colors import BACKGROUND, Color, colormap, map_colors
+
+Stamp = TypeVar("Stamp")
+Features = NDArray[np.float32]
+FITTED_ON = 2  # frames
+CELLS_FOR_FIT = 4000  # of each frame, evenly spaced
+PERCENTILES = (1.0, 99.0)  # become the darkest and the brightest colour
+
+
+@dataclass(frozen=True)
+class BevColors:
+    """A fixed mapping from features to colours.
+
+    Attributes:
+        mean: (C,) subtracted from the features.
+        basis: (C, K) projection, K 1 or 3; None takes the norm of the features (K 1).
+        low: (K,) values that become 0.
+        high: (K,) values that become 1.
+    """
+
+    mean: Features
+    basis: Features | None
+    low: Array
+    high: Array
+
+    def paint(self, features: Features) -> NDArray[np.uint8]:
+        """Features (..., C) -> (..., 3) uint8 RGB."""
+        values = _values(features, self.mean, self.basis)
+        shares = np.clip((values - self.low) / np.maximum(self.high - self.low, 1e-9), 0, 1)
+        if shares.shape[-1] == 1:
+            return colormap(shares[..., 0], "inferno")
+        return (shares * 255).astype(np.uint8)
+
+
+def fit_colors(kind: str, features: Features) -> BevColors:
+    """Fits colours to features (cells, C). kind: "norm", "pca" or "channel:K".
+
+    Raises InputError when the features have no channel K.
+    """
+    channels = features.shape[-1]
+    mean: Features = np.zeros(channels, np.float32)
+    basis: Features | None = None
+    if kind == "pca":
+        mean = features.mean(0)
+        basis = _principal_components(features - mean)
+    elif kind.startswith("channel:"):
+        chosen = int(kind.partition(":")[2])
+        if chosen >= channels:
+            raise InputError(f"`bev={kind}`: the BEV map has channels 0 to {channels - 1}")
+        basis = np.eye(channels, dtype=np.float32)[:, chosen : chosen + 1]
+    low, high = np.percentile(_values(features, mean, basis), PERCENTILES, axis=0)
+    return BevColors(mean, basis, low, high)
+
+
+class BevImages(Generic[Stamp]):
+    """Takes the features of each frame; returns the images that are ready, each with the stamp of its frame.
+
+    Attributes:
+        colors: fitted on the first frames, None before. Setting them continues an interrupted recording.
+    """
+
+    def __init__(self, kind: str) -> None:
+        self.kind = kind
+        self.colors: BevColors | None = None
+        self._waiting: list[tuple[Stamp, Features]] = []
+
+    def push(self, stamp: Stamp, features: Features) -> list[tuple[Stamp, NDArray[np.uint8]]]:
+        """Adds a frame; returns the images that are ready.
+
+        features: (rows, columns, C); the first row has the smallest y. The images are (rows, columns, 3) uint8 RGB;
+        their first row has the largest y.
+        """
+        self._waiting.append((stamp, features))
+        if self.colors is None and len(self._waiting) < FITTED_ON:
+            return []
+        return self.finish()
+
+    def finish(self) -> list[tuple[Stamp, NDArray[np.uint8]]]:
+        """The images that are not returned yet: that of the first frame, where there was no second one."""
+        if not self._waiting:
+            return []
+        if self.colors is None:
+            self.colors = fit_colors(self.kind, np.concatenate([_thinned(f) for _, f in self._waiting]))
+        colors = self.colors
+        ready = [(stamp, np.ascontiguousarray(colors.paint(f)[::-1])) for stamp, f in self._waiting]
+        self._waiting = []
+        return ready
+
+
+def _values(features: Features, mean: Features, basis: Features | None) -> Features:
+    if basis is None:
+        return np.asarray(np.linalg.norm(features, axis=-1, keepdims=True), dtype=np.float32)
+    return np.asarray((features - mean) @ basis, dtype=np.float32)
+
+
+def _thinned(features: Features) -> Features:
+    cells = features.reshape(-1, features.shape[-1])
+    return cells[:: max(1, len(cells) // CELLS_FOR_FIT)]
+
+
+def _principal_components(centered: Features) -> Features:
+    _, vectors = np.linalg.eigh(centered.T @ centered)
+    basis = vectors[:, :-4:-1]  # the three largest, largest first
+    signs = np.sign(basis[np.abs(basis).argmax(0), np.arange(basis.shape[1])])
+    # The sign of an eigenvector is arbitrary: make its largest entry positive.
+    return basis * np.where(signs == 0, 1, signs).astype(np.float32)
+
 
 GROUND_OPACITY = 110  # of 255: boxes, rings and the trajectory stay readable on the map
+PROBE_COLOR: Color = (255, 80, 220)
 BELOW_GROUND_M = 0.06  # the map is drawn below the ground, so that it does not flicker with the range rings
 
 
@@ -21,9 +132,8 @@ def log_features(stream: rr.RecordingStream, image: NDArray[np.uint8], grid: Bev
 
     image: (rows, columns, 3) RGB; the first row has the largest y.
     """
-    stream.log(entities.BEV_FEATURES, rr.Image(image, draw_order=-10), _placed(image, grid.x_range_m, grid.y_range_m))
-    ground = _on_ground(image, grid.x_range_m, grid.y_range_m, ego_from_bev, GROUND_OPACITY)
-    stream.log(entities.BEV_ON_GROUND, ground)
+    stream.log(entities.BEV_FEATURES, rr.Image(image, draw_order=-10), _placed(image, grid))
+    stream.log(entities.BEV_ON_GROUND, _on_ground(image, grid, ego_from_bev, GROUND_OPACITY))
 
 
 def log_segmentation(stream: rr.RecordingStream, segmentation: BevMap, ego_from_bev: Array) -> None:
@@ -31,10 +141,8 @@ def log_segmentation(stream: rr.RecordingStream, segmentation: BevMap, ego_from_
     colors = np.full((*segmentation.cells.shape, 3), BACKGROUND, dtype=np.uint8)
     for name, color in map_colors(segmentation.classes).items():  # where a cell has several, the last one is shown
         colors[segmentation.layer(name)] = color
-    image = rr.Image(colors, draw_order=-5)
-    stream.log(entities.BEV_SEGMENTATION, image, _placed(colors, segmentation.x_range_m, segmentation.y_range_m))
-    ground = _on_ground(colors, segmentation.x_range_m, segmentation.y_range_m, ego_from_bev, 255)
-    stream.log(entities.SEGMENTATION_ON_GROUND, ground)
+    stream.log(entities.BEV_SEGMENTATION, rr.Image(colors, draw_order=-5), _placed(colors, segmentation))
+    stream.log(entities.SEGMENTATION_ON_GROUND, _on_ground(colors, segmentation, ego_from_bev, 255))
 
 
 def log_history(stream: rr.RecordingStream, weight: Array | None, grid: BevGrid) -> None:
@@ -46,7 +154,7 @@ def log_history(stream: rr.RecordingStream, weight: Array | None, grid: BevGrid)
         stream.log(entities.BEV_HISTORY, rr.Clear(recursive=False))
         return
     image = colormap(weight[::-1], "viridis")
-    stream.log(entities.BEV_HISTORY, rr.Image(image, draw_order=-8), _placed(image, grid.x_range_m, grid.y_range_m))
+    stream.log(entities.BEV_HISTORY, rr.Image(image, draw_order=-8), _placed(image, grid))
 
 
 def log_probes(stream: rr.RecordingStream, probes: tuple[Probe, ...], ego_from_bev: Array, grid: BevGrid) -> None:
@@ -54,33 +162,23 @@ def log_probes(stream: rr.RecordingStream, probes: tuple[Probe, ...], ego_from_b
     if not probes:
         return
     centers = np.array([probe.cell_center for probe in probes])
-    radius = rr.Radius.ui_points(5.0)
-    dots = rr.Points2D(centers * (1, -1), colors=[255, 80, 220], radii=radius, draw_order=50)
+    dots = rr.Points2D(centers * (1, -1), colors=PROBE_COLOR, radii=rr.Radius.ui_points(5.0), draw_order=50)
     stream.log(entities.BEV_PROBES, dots)
     low, high = grid.pillar_heights()[[0, -1]]
     ends = np.stack([np.column_stack([centers, np.full(len(centers), z)]) for z in (low, high)], axis=1)
-    stream.log(
-        entities.PROBES,
-        rr.LineStrips3D(apply(ego_from_bev, ends).astype(np.float32), colors=[255, 80, 220], radii=0.05),
-    )
+    strips = apply(ego_from_bev, ends).astype(np.float32)
+    stream.log(entities.PROBES, rr.LineStrips3D(strips, colors=PROBE_COLOR, radii=0.05))
 
 
-def _placed(image: NDArray[np.uint8], x_range: tuple[float, float], y_range: tuple[float, float]) -> rr.Transform3D:
-    rows, columns = image.shape[:2]
+def _placed(image: NDArray[np.uint8], area: BevGrid | BevMap) -> rr.Transform3D:
+    (rows, columns), x_range, y_range = image.shape[:2], area.x_range_m, area.y_range_m
     cell = [(x_range[1] - x_range[0]) / columns, (y_range[1] - y_range[0]) / rows, 1.0]
     return rr.Transform3D(translation=[x_range[0], -y_range[1], 0], scale=cell)
 
 
-def _on_ground(
-    image: NDArray[np.uint8],
-    x_range: tuple[float, float],
-    y_range: tuple[float, float],
-    ego_from_bev: Array,
-    opacity: int,
-) -> rr.Mesh3D:
+def _on_ground(image: NDArray[np.uint8], area: BevGrid | BevMap, ego_from_bev: Array, opacity: int) -> rr.Mesh3D:
     """An image of the bev frame, whose first row has the largest y, as a rectangle on the ground of the ego frame."""
-    (x0, x1), (y0, y1) = x_range, y_range
-    corners = apply(ego_from_bev, [[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0]])
+    corners = apply(ego_from_bev, rectangle(area.x_range_m, area.y_range_m))
     corners[:, 2] = -BELOW_GROUND_M
     return rr.Mesh3D(
         vertex_positions=corners,

@@ -1,28 +1,106 @@
-"""Writes boxes into a recording: predictions and ground truth, in the 3D scene and in the BEV view."""
+"""Writes boxes into a recording: in the 3D scene, in the BEV view, on the street map; finds misses and duplicates."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 import rerun as rr
+from numpy.typing import NDArray
 
+from bevcli.evaluation.config import DetectionConfig
+from bevcli.evaluation.matching import descending_scores, gather, match_greedily
+from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import CLASSES, Boxes3D
+from bevcli.geometry.geographic import GeoOrigin
 from bevcli.geometry.transforms import Array
 from bevcli.recording import entities
+from bevcli.recording.box_lines import labels_in_scene
 from bevcli.recording.colors import (
     DUPLICATE_COLOR,
+    EGO_COLOR,
     FALSE_COLOR,
     GROUND_TRUTH_COLOR,
     MISSED_COLOR,
     OTHER_COLOR,
+    Color,
     class_color,
 )
-from bevcli.recording.labels import labels_in_scene
-from bevcli.recording.strips import strips_2d
+
+MATCH_DISTANCE_M = DetectionConfig().error_distance_m
+
+
+def detectable(ground_truth: Boxes3D, grid: BevGrid) -> Boxes3D:
+    """The ground-truth boxes, in the bev frame, that a model can find: inside its grid, with sensor points if known."""
+    inside = (grid.cell_of(ground_truth.centers[:, :2]) >= 0).all(-1)
+    points = ground_truth.num_points
+    seen = np.ones(len(ground_truth), dtype=bool) if points is None else points != 0
+    return ground_truth[inside & seen]
+
+
+class Marks(NamedTuple):
+    """N predicted boxes against M ground-truth boxes.
+
+    Attributes:
+        false: (N,) bool, the false positives: crossed out in red.
+        duplicate: (N,) bool, a second box on an object: one grey diagonal.
+        found: (M,) bool, the ground truth that a prediction matches.
+    """
+
+    false: NDArray[np.bool_]
+    duplicate: NDArray[np.bool_]
+    found: NDArray[np.bool_]
+
+
+def false_and_duplicate(predictions: Boxes3D, ground_truth: Boxes3D | None) -> Marks:
+    """The marks of predictions against the ground truth.
+
+    A duplicate is no true positive, and either the tracker marked it, or the ground truth of its class within 2 m was
+    found by a better box. Without ground truth no box is a false positive, and the tracker's marks are returned.
+    """
+    none = np.zeros(len(predictions), dtype=bool)
+    marked = none if predictions.duplicates is None else predictions.duplicates
+    if ground_truth is None:
+        return Marks(none, marked, np.zeros(0, dtype=bool))
+    true, found = true_positives(predictions, ground_truth)
+    truths = ground_truth[found]
+    away = np.linalg.norm(predictions.centers[:, None, :2] - truths.centers[:, :2], axis=-1)  # (N, M)
+    near = (away < MATCH_DISTANCE_M) & (predictions.classes[:, None] == truths.classes)
+    duplicate = ~true & (marked | near.any(-1))
+    return Marks(~true & ~duplicate, duplicate, found)
+
+
+def true_positives(predictions: Boxes3D, ground_truth: Boxes3D) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Match predictions (N,) and ground truth (M,) of one frame as `bevcli eval` does, at 2 m.
+
+    Returns (N,) bool, the true positives, and (M,) bool, the ground truth that is found. Predictions without scores
+    count as equal.
+    """
+    is_true, is_found = np.zeros(len(predictions), dtype=bool), np.zeros(len(ground_truth), dtype=bool)
+    scores = np.ones(len(predictions)) if predictions.scores is None else predictions.scores
+    origin = np.zeros((1, 2))  # ranges from the ego vehicle are not used here
+    for name in np.unique(predictions.classes):
+        predicted = np.flatnonzero(predictions.classes == name)
+        predicted = predicted[descending_scores(scores[predicted])]
+        truths = np.flatnonzero(ground_truth.classes == name)
+        one, other = gather([ground_truth[truths]], origin), gather([predictions[predicted]], origin)
+        matched = match_greedily(one, other, (MATCH_DISTANCE_M,))[0]
+        is_true[predicted[matched >= 0]] = True
+        is_found[truths[matched[matched >= 0]]] = True
+    return is_true, is_found
+
+
+def line_strips(strips: Sequence[Array], dimensions: int) -> pa.Array:
+    """Strips (points, 2 or 3) for `rr.LineStrips2D` or `rr.LineStrips3D`, which convert a list strip by strip."""
+    batch = rr.components.LineStrip2DBatch if dimensions == 2 else rr.components.LineStrip3DBatch
+    kind = batch._ARROW_DATATYPE
+    offsets = np.cumsum([0, *map(len, strips)], dtype=np.int32)
+    numbers = np.concatenate([np.zeros((0, dimensions)), *strips]).astype(np.float32).ravel()
+    points = pa.FixedSizeListArray.from_arrays(pa.array(numbers), type=kind.value_type)
+    return pa.ListArray.from_arrays(pa.array(offsets), points, type=kind)
+
 
 MOVING_M_S = 0.5  # slower objects get no velocity arrow
 THIN, THICK = rr.Radius.ui_points(0.8), rr.Radius.ui_points(1.6)
@@ -35,19 +113,6 @@ def box_colors(boxes: Boxes3D, class_names: Sequence[str]) -> np.ndarray:
     return np.array([colors[name] for name in boxes.classes], dtype=np.uint8).reshape(-1, 3)
 
 
-@dataclass(frozen=True)
-class Marks:
-    """Which of N predicted boxes are marked as wrong.
-
-    Attributes:
-        false: (N,) bool, the false positives: crossed out in red.
-        duplicate: (N,) bool, a second box on an object: one grey diagonal.
-    """
-
-    false: np.ndarray
-    duplicate: np.ndarray
-
-
 def log_boxes_3d(
     stream: rr.RecordingStream, boxes: Boxes3D, marks: Marks, class_names: Sequence[str], ego_xy: Array
 ) -> None:
@@ -58,32 +123,25 @@ def log_boxes_3d(
     ids = [1 + list(class_names).index(name) if name in class_names else 0 for name in boxes.classes]
     labels = labels_in_scene(boxes, ego_xy)
     archetype = rr.Boxes3D(**_shape(boxes), class_ids=ids, labels=labels, show_labels=True, radii=THICK)
+    track = {} if boxes.instances is None else {"track": pa.array(boxes.instances.tolist(), pa.utf8())}
     facts = rr.AnyValues(
         score=np.ones(len(boxes)) if boxes.scores is None else boxes.scores,
         velocity_x=boxes.velocities[:, 0],
         velocity_y=boxes.velocities[:, 1],
         name=_names(boxes),
-        **({} if boxes.instances is None else {"track": pa.array(boxes.instances.tolist(), pa.utf8())}),
+        **track,
     )
     stream.log(entities.BOXES, archetype, facts)
-    moving = np.linalg.norm(boxes.velocities, axis=-1) > MOVING_M_S
-    arrows = rr.Arrows3D(
-        vectors=np.column_stack([boxes.velocities[moving], np.zeros(moving.sum())]),
-        origins=boxes.centers[moving],
-        colors=box_colors(boxes[moving], class_names),
-        radii=rr.Radius.ui_points(1.2),
-    )
+    moving = boxes[np.linalg.norm(boxes.velocities, axis=-1) > MOVING_M_S]
+    vectors, colors = np.column_stack([moving.velocities, np.zeros(len(moving))]), box_colors(moving, class_names)
+    arrows = rr.Arrows3D(vectors=vectors, origins=moving.centers, colors=colors, radii=rr.Radius.ui_points(1.2))
     stream.log(entities.VELOCITY, arrows)
-    stream.log(
-        entities.FALSE_BOXES,
-        rr.LineStrips3D(_crosses(boxes[marks.false]).astype(np.float32), colors=FALSE_COLOR, radii=THICK),
-    )
-    diagonals = _crosses(boxes[marks.duplicate])[::2].astype(np.float32)
-    stream.log(entities.DUPLICATES, rr.LineStrips3D(diagonals, colors=DUPLICATE_COLOR, radii=THICK))
+    for entity, strips, color in zip((entities.FALSE_BOXES, entities.DUPLICATES), *_marks(boxes, marks), strict=True):
+        stream.log(entity, rr.LineStrips3D(strips, colors=color, radii=THICK))
 
 
 def other_classes(truth: Boxes3D, class_names: Sequence[str]) -> np.ndarray:
-    """(M,) bool, whether a ground-truth box has a class that neither nuScenes nor the model has: it is never missed."""
+    """(M,) bool, ground-truth boxes of classes that neither nuScenes nor the model has: they are never missed."""
     return ~np.isin(truth.classes, (*CLASSES, *class_names))
 
 
@@ -101,76 +159,80 @@ def log_ground_truth_3d(stream: rr.RecordingStream, truth: Boxes3D, found: np.nd
 
     found: (M,) bool. colors: (M, 3) uint8.
     """
-    pale = rr.Boxes3D(**_shape(truth[found]), colors=_with_alpha(colors[found], 150), radii=THIN)
-    stream.log(entities.GROUND_TRUTH, pale, rr.AnyValues(name=_names(truth[found])))
-    missed = truth[~found]
-    red = rr.Boxes3D(**_shape(missed), colors=MISSED_COLOR, radii=THIN)
-    stream.log(entities.MISSED, red, rr.AnyValues(name=_names(missed)))
+    pale = _with_alpha(colors[found], 150)
+    for entity, chosen, color in ((entities.GROUND_TRUTH, found, pale), (entities.MISSED, ~found, MISSED_COLOR)):
+        archetype = rr.Boxes3D(**_shape(truth[chosen]), colors=color, radii=THIN)
+        stream.log(entity, archetype, rr.AnyValues(name=_names(truth[chosen])))
 
 
 def log_boxes_bev(stream: rr.RecordingStream, boxes: Boxes3D, marks: Marks, class_names: Sequence[str]) -> None:
     """Writes predicted boxes (in the bev frame) into the BEV view."""
     colors = box_colors(boxes, class_names)
-    outlines, headings = footprints(boxes)
-    strips = strips_2d([*outlines, *headings])
     doubled = np.concatenate([colors, colors])
-    stream.log(entities.BEV_BOXES, rr.LineStrips2D(strips, colors=doubled, radii=THICK, draw_order=30))
+    stream.log(entities.BEV_BOXES, rr.LineStrips2D(footprints(boxes), colors=doubled, radii=THICK, draw_order=30))
     moving = np.linalg.norm(boxes.velocities, axis=-1) > MOVING_M_S
-    arrows = rr.Arrows2D(
-        vectors=boxes.velocities[moving] * (1, -1),
-        origins=boxes.centers[moving, :2] * (1, -1),
-        colors=colors[moving],
-        radii=rr.Radius.ui_points(1.0),
-        draw_order=31,
-    )
+    vectors, origins = boxes.velocities[moving] * (1, -1), boxes.centers[moving, :2] * (1, -1)
+    radius = rr.Radius.ui_points(1.0)
+    arrows = rr.Arrows2D(vectors=vectors, origins=origins, colors=colors[moving], radii=radius, draw_order=31)
     stream.log(entities.BEV_VELOCITY, arrows)
-    crosses = (_crosses(boxes[marks.false])[..., :2] * (1, -1)).astype(np.float32)
-    stream.log(entities.BEV_FALSE, rr.LineStrips2D(crosses, colors=FALSE_COLOR, radii=THIN, draw_order=32))
-    diagonals = (_crosses(boxes[marks.duplicate])[::2, :, :2] * (1, -1)).astype(np.float32)
-    stream.log(entities.BEV_DUPLICATES, rr.LineStrips2D(diagonals, colors=DUPLICATE_COLOR, radii=THIN, draw_order=32))
+    for entity, strips, color in zip((entities.BEV_FALSE, entities.BEV_DUPLICATES), *_marks(boxes, marks), strict=True):
+        flat = (strips[..., :2] * (1, -1)).astype(np.float32)
+        stream.log(entity, rr.LineStrips2D(flat, colors=color, radii=THIN, draw_order=32))
 
 
 def log_ground_truth_bev(stream: rr.RecordingStream, truth: Boxes3D, found: np.ndarray, colors: np.ndarray) -> None:
     """Writes ground-truth boxes (in the bev frame) into the BEV view, as `log_ground_truth_3d`."""
     for entity, chosen in ((entities.BEV_GROUND_TRUTH, found), (entities.BEV_MISSED, ~found)):
-        outlines, headings = footprints(truth[chosen])
         doubled = np.tile(_with_alpha(colors[chosen], 200), (2, 1))
-        strips = strips_2d([*outlines, *headings])
-        stream.log(entity, rr.LineStrips2D(strips, colors=doubled, radii=THIN, draw_order=20))
+        stream.log(entity, rr.LineStrips2D(footprints(truth[chosen]), colors=doubled, radii=THIN, draw_order=20))
 
 
 def _with_alpha(colors: np.ndarray, alpha: int) -> np.ndarray:
     return np.column_stack([colors, np.full(len(colors), alpha, dtype=np.uint8)])
 
 
-def footprints(boxes: Boxes3D) -> tuple[Array, Array]:
+def footprints(boxes: Boxes3D) -> pa.Array:
     """Boxes of the bev frame in the flat BEV image (x to the right, -y down, metres).
 
-    Returns closed outlines (N, 5, 2), and lines from the centre to the front (N, 2, 2).
+    N closed outlines, then N lines from the centre to the front.
     """
     ground = boxes.corners()[:, :4, :2] * (1, -1)
     outlines = np.concatenate([ground, ground[:, :1]], axis=1)
     front = (ground[:, 0] + ground[:, 3]) / 2
-    return outlines, np.stack([ground.mean(1), front], axis=1)
+    return line_strips([*outlines, *np.stack([ground.mean(1), front], axis=1)], 2)
 
 
 def _shape(boxes: Boxes3D) -> dict[str, Any]:
-    halves = boxes.yaws / 2
-    zeros = np.zeros(len(boxes))
+    halves, zeros = boxes.yaws / 2, np.zeros(len(boxes))
     quaternions = np.stack([zeros, zeros, np.sin(halves), np.cos(halves)], axis=-1)  # rerun's order is x, y, z, w
-    return {
-        "centers": boxes.centers,
-        "half_sizes": boxes.sizes_lwh / 2,
-        "quaternions": quaternions,
-        "fill_mode": "majorwireframe",
-    }
+    shape = {"centers": boxes.centers, "half_sizes": boxes.sizes_lwh / 2, "quaternions": quaternions}
+    return {**shape, "fill_mode": "majorwireframe"}
 
 
 def _names(boxes: Boxes3D) -> pa.Array:
     return pa.array([str(name) for name in boxes.classes], pa.utf8())  # typed, so that an empty list is a value too
 
 
-def _crosses(boxes: Boxes3D) -> Array:
-    """(2 N, 2, 3): the two diagonals of each box's top face."""
-    tops = boxes.corners()[:, 4:]
-    return tops[:, [[0, 2], [1, 3]]].reshape(-1, 2, 3)
+def _marks(boxes: Boxes3D, marks: Marks) -> tuple[tuple[NDArray[np.float32], ...], tuple[Color, ...]]:
+    """The diagonals (K, 2, 3) of the top faces, and their colour: two of a false positive, one of a duplicate."""
+    diagonals = boxes.corners()[:, 4:][:, [[0, 2], [1, 3]]].astype(np.float32)  # (N, 2, 2, 3)
+    return (diagonals[marks.false].reshape(-1, 2, 3), diagonals[marks.duplicate, 0]), (FALSE_COLOR, DUPLICATE_COLOR)
+
+
+def log_ego_on_map(stream: rr.RecordingStream, origin: GeoOrigin, here: Array, before: Array | None) -> None:
+    """Writes the vehicle's position, and the way from its position in the frame before.
+
+    here, before: (3,) in the sequence's world frame, metres; before is None in the first frame of a scene.
+    """
+    place = origin.latitude_longitude(here)
+    stream.log(entities.MAP_EGO, rr.GeoPoints(lat_lon=[place], radii=rr.Radius.ui_points(7.0), colors=EGO_COLOR))
+    if before is not None:
+        way = [origin.latitude_longitude(before), place]
+        line = rr.GeoLineStrings(lat_lon=[way], radii=rr.Radius.ui_points(2.0), colors=EGO_COLOR)
+        stream.log(entities.MAP_ROUTE, line)
+
+
+def log_boxes_on_map(stream: rr.RecordingStream, origin: GeoOrigin, boxes: Boxes3D, class_names: Sequence[str]) -> None:
+    """Writes the centres of boxes, in the sequence's world frame, in the colours of their classes."""
+    places, colors = origin.latitude_longitude(boxes.centers), box_colors(boxes, class_names) if len(boxes) else None
+    stream.log(entities.MAP_BOXES, rr.GeoPoints(lat_lon=places, radii=rr.Radius.ui_points(4.0), colors=colors))

@@ -14,9 +14,8 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.recording import entities
-from bevcli.recording.box_lines import lines_in_image
+from bevcli.recording.box_lines import ImageLines, box_labels, labels_2d, labels_in_image, lines_in_image
 from bevcli.recording.colors import colormap
-from bevcli.recording.labels import box_labels, labels_in_image
 from bevcli.recording.log_boxes import box_colors
 from bevcli.recording.video_images import Av1Encoder
 
@@ -47,18 +46,15 @@ class PosedCamera:
         return inverse(self.world_from_camera)
 
 
-def log_pose(stream: rr.RecordingStream, posed: PosedCamera) -> None:
-    """Writes the pose of a camera."""
-    pose = posed.world_from_camera
-    stream.log(entities.camera(posed.name), rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
-
-
 def log_image(stream: rr.RecordingStream, posed: PosedCamera, image: CameraImage | None) -> None:
     """Writes the encoded image. Without an image, the one of the frame before is cleared."""
     if image is None:
         stream.log(entities.image(posed.name), rr.Clear(recursive=False))
         return
-    contents, media_type = _encoded(image)
+    contents, media_type = image.encoded, image.media_type
+    if contents is None or media_type is None:
+        _, data = cv2.imencode(".jpg", image.pixels_bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        contents, media_type = data.tobytes(), "image/jpeg"
     stream.log(entities.image(posed.name), rr.EncodedImage(contents=contents, media_type=media_type))
 
 
@@ -74,7 +70,8 @@ class VideoImages:
         entity, name = entities.image(posed.name), posed.name
         if image is None:
             self._stream.log(entity, rr.Clear(recursive=False))
-            self._end(name)
+            if name in self._encoders:
+                self._encoders.pop(name).close()
             return
         if name not in self._encoders:
             height, width = image.pixels_bgr.shape[:2]
@@ -84,12 +81,7 @@ class VideoImages:
 
     def close(self) -> None:
         """Ends all streams."""
-        for name in list(self._encoders):
-            self._end(name)
-
-    def _end(self, name: str) -> None:
-        encoder = self._encoders.pop(name, None)
-        if encoder is not None:
+        for encoder in self._encoders.values():
             encoder.close()
 
 
@@ -98,27 +90,12 @@ def log_boxes_in_image(
 ) -> None:
     """Draws predicted boxes (in the recording's world) into the image: lines and labels."""
     name = posed.name
-    lines = lines_in_image(boxes, posed.camera, posed.camera_from_world)
     colors = box_colors(boxes, class_names)
-    stream.log(
-        entities.overlay(name, "boxes"),
-        rr.LineStrips2D(
-            lines.segments.astype(np.float32),
-            colors=colors[lines.owners],
-            radii=rr.Radius.ui_points(1.0),
-            draw_order=30,
-        ),
-    )
+    lines = lines_in_image(boxes, posed.camera, posed.camera_from_world)
+    stream.log(entities.overlay(name, "boxes"), _strips(lines, colors, 1.0, draw_order=30))
     texts = box_labels(boxes)
     places, owners = labels_in_image(lines, texts, posed.camera.width, posed.camera.height)
-    labels = rr.Points2D(
-        places,
-        labels=[texts[owner] for owner in owners],
-        colors=colors[owners],
-        radii=rr.Radius.ui_points(0.01),
-        show_labels=True,
-        draw_order=31,
-    )
+    labels = labels_2d(places, [texts[owner] for owner in owners], colors=colors[owners], draw_order=31)
     stream.log(entities.overlay(name, "boxes/labels"), labels)
 
 
@@ -127,15 +104,12 @@ def log_ground_truth_in_image(
 ) -> None:
     """Draws ground-truth boxes (in the recording's world) into the image. colors: (M, 3) uint8."""
     lines = lines_in_image(truth, posed.camera, posed.camera_from_world)
-    stream.log(
-        entities.overlay(posed.name, "ground_truth"),
-        rr.LineStrips2D(
-            lines.segments.astype(np.float32),
-            colors=colors[lines.owners],
-            radii=rr.Radius.ui_points(0.6),
-            draw_order=20,
-        ),
-    )
+    stream.log(entities.overlay(posed.name, "ground_truth"), _strips(lines, colors, 0.6, draw_order=20))
+
+
+def _strips(lines: ImageLines, colors: np.ndarray, width: float, draw_order: int) -> rr.LineStrips2D:
+    segments, radii = lines.segments.astype(np.float32), rr.Radius.ui_points(width)
+    return rr.LineStrips2D(segments, colors=colors[lines.owners], radii=radii, draw_order=draw_order)
 
 
 def log_pillar_hits(stream: rr.RecordingStream, posed: PosedCamera, points_world: Array, colors: np.ndarray) -> None:
@@ -155,17 +129,6 @@ def log_samples(stream: rr.RecordingStream, posed: PosedCamera, samples: Sequenc
     weights = np.concatenate([np.zeros(0), *(s.weights for s in samples)])
     inside = posed.camera.contains(pixels, np.ones(len(pixels)))
     shares = weights[inside] / max(float(weights.max(initial=0.0)), 1e-9)
-    points = rr.Points2D(
-        pixels[inside],
-        colors=colormap(0.25 + 0.75 * shares, "plasma"),
-        radii=rr.Radius.ui_points(1.5 + 5.0 * np.sqrt(shares)),
-        draw_order=40,
-    )
+    colors, radii = colormap(0.25 + 0.75 * shares, "plasma"), rr.Radius.ui_points(1.5 + 5.0 * np.sqrt(shares))
+    points = rr.Points2D(pixels[inside], colors=colors, radii=radii, draw_order=40)
     stream.log(entities.overlay(posed.name, "probes"), points)
-
-
-def _encoded(image: CameraImage) -> tuple[bytes, str]:
-    if image.encoded is not None and image.media_type is not None:
-        return image.encoded, image.media_type
-    _, data = cv2.imencode(".jpg", image.pixels_bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return data.tobytes(), "image/jpeg"

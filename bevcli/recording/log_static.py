@@ -1,19 +1,30 @@
-"""What a recording holds once: rig, vehicle, range rings, pillars, colours, curve names, the page "About"."""
+"""Writes the static parts of a recording: rig, vehicle, range rings, pillars, colours, legend, the page "About"."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 import numpy as np
 import rerun as rr
 
-from bevcli import __version__
-from bevcli.geometry.bev_grid import BevGrid
+from bevcli._version import __version__
+from bevcli.geometry.bev_grid import BevGrid, rectangle
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.recording import entities
-from bevcli.recording.colors import EGO_COLOR, RING_COLOR, STAGE_COLORS, class_color, colormap
+from bevcli.recording.box_lines import UNSEEN, labels_2d
+from bevcli.recording.colors import (
+    DUPLICATE_COLOR,
+    EGO_COLOR,
+    GROUND_TRUTH_COLOR,
+    MISSED_COLOR,
+    RING_COLOR,
+    STAGE_COLORS,
+    Color,
+    class_color,
+    colormap,
+    map_colors,
+)
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.vehicle import VehicleMesh, default_vehicle
 
@@ -58,38 +69,8 @@ def log_scene(
     _log_rings(stream, rig, grid)
 
 
-def log_about(
-    stream: rr.RecordingStream,
-    title: str,
-    rig: CameraRig,
-    class_names: Sequence[str],
-    options: RecordingOptions,
-    *,
-    map_classes: Sequence[str] = (),
-    untrained: bool,
-    note: str = "",
-) -> None:
-    """Writes the page "About", and the facts of the run that readers of the file need.
-
-    map_classes: of the map that the recording shows; empty for none. note: what titles say about the weights, see
-    `recording_blueprint`.
-    """
-    of_map: dict[str, Any] = {"map_classes": list(map_classes)} if map_classes else {}
-    facts = rr.AnyValues(
-        title=title,
-        untrained=untrained,
-        note=note,
-        score=options.score,
-        class_names=list(class_names),
-        camera_names=list(rig.names),
-        **of_map,
-    )
-    text = about_text(title, rig, options, untrained=untrained)
-    stream.log(entities.RUN, rr.TextDocument(text, media_type="text/markdown"), facts, static=True)
-
-
 def about_text(title: str, rig: CameraRig, options: RecordingOptions, *, untrained: bool) -> str:
-    """The page "About" in Markdown: what was run, and how to read the views."""
+    """The page "About" in Markdown: the run, and how to read the views."""
     warning = "**The weights are untrained: boxes and maps are meaningless.**\n\n" if untrained else ""
     facts = (
         f"bevcli {__version__}; {len(rig.cameras)} cameras: {', '.join(rig.names)}. "
@@ -99,16 +80,12 @@ def about_text(title: str, rig: CameraRig, options: RecordingOptions, *, untrain
 
 
 def log_curve_names(stream: rr.RecordingStream, stages: Iterable[str], class_names: Sequence[str]) -> None:
-    """Writes names and colours of the curves: seconds per stage, boxes per class."""
+    """Writes names and colours of the curves: seconds per stage, boxes per class, speed."""
     stages = list(stages)
     colors = [STAGE_COLORS[i % len(STAGE_COLORS)] for i in range(len(stages))]
     stream.log(entities.STAGE_CURVES, rr.SeriesLines(names=stages, colors=colors), static=True)
     colors = [class_color(name, i) for i, name in enumerate(class_names)]
     stream.log(entities.BOX_CURVES, rr.SeriesLines(names=list(class_names), colors=colors), static=True)
-
-
-def log_speed_style(stream: rr.RecordingStream) -> None:
-    """Writes the name and the colour of the curve of the vehicle's speed."""
     stream.log(entities.SPEED_CURVE, rr.SeriesLines(names="km/h", colors=EGO_COLOR), static=True)
 
 
@@ -116,9 +93,7 @@ def log_speed(stream: rr.RecordingStream, speed_m_s: float) -> None:
     """Writes the vehicle's speed: a curve, and a label above the vehicle in the scene."""
     km_h = 3.6 * speed_m_s
     stream.log(entities.SPEED_CURVE, rr.Scalars(km_h))
-    label = rr.Points3D(
-        [SPEED_LABEL_M], labels=f"{km_h:.0f} km/h", colors=EGO_COLOR, radii=rr.Radius.ui_points(0.01), show_labels=True
-    )
+    label = rr.Points3D([SPEED_LABEL_M], labels=f"{km_h:.0f} km/h", colors=EGO_COLOR, radii=UNSEEN, show_labels=True)
     stream.log(entities.SPEED, label)
 
 
@@ -171,14 +146,8 @@ def _log_vehicle(stream: rr.RecordingStream, rig: CameraRig, vehicle: VehicleMes
 
 def ring_distances_m(grid: BevGrid | None) -> list[int]:
     """The radii of the range rings: every 10 m up to the nearest side of the grid."""
-    reach = DEFAULT_RANGE_M if grid is None else min(map(abs, (*grid.x_range_m, *grid.y_range_m)))
+    reach = DEFAULT_RANGE_M if grid is None else grid.nearest_side_m
     return list(range(RING_STEP_M, int(reach) + 1, RING_STEP_M))
-
-
-def _border(rig: CameraRig, grid: BevGrid) -> Array:
-    """(5, 2) the closed border of the grid in the ego frame."""
-    (x0, x1), (y0, y1) = grid.x_range_m, grid.y_range_m
-    return apply(rig.ego_from_bev, [[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0], [x0, y0, 0]])[:, :2]
 
 
 def _log_rings(stream: rr.RecordingStream, rig: CameraRig, grid: BevGrid | None) -> None:
@@ -187,21 +156,17 @@ def _log_rings(stream: rr.RecordingStream, rig: CameraRig, grid: BevGrid | None)
     distances = ring_distances_m(grid)
     rings = [circle * distance for distance in distances]
     width = rr.Radius.ui_points(0.6)
-    lines = rings if grid is None else [*rings, _border(rig, grid)]
+    lines = rings
+    if grid is not None:
+        border = rectangle(grid.x_range_m, grid.y_range_m)[[0, 1, 2, 3, 0]]
+        lines = [*rings, apply(rig.ego_from_bev, border)[:, :2]]
     in_space = [np.column_stack([line, np.zeros(len(line))]) for line in lines]
     stream.log(entities.RANGE_RINGS, rr.LineStrips3D(in_space, colors=[*RING_COLOR, 140], radii=width), static=True)
     flat = [_bev_image_points(rig, line) for line in lines]
     stream.log(entities.BEV_RINGS, rr.LineStrips2D(flat, colors=RING_COLOR, radii=width, draw_order=5), static=True)
     # The labels are on the circles, ahead to the right, where they cover little.
     positions = [_bev_image_points(rig, ring[[105]])[0] for ring in rings]
-    labels = rr.Points2D(
-        positions,
-        labels=[f"{distance} m" for distance in distances],
-        colors=[150, 156, 170],
-        radii=rr.Radius.ui_points(0.01),
-        show_labels=True,
-        draw_order=6,
-    )
+    labels = labels_2d(positions, [f"{distance} m" for distance in distances], colors=[150, 156, 170], draw_order=6)
     stream.log(f"{entities.BEV_RINGS}/labels", labels, static=True)
 
 
@@ -209,3 +174,32 @@ def _bev_image_points(rig: CameraRig, points_ego: Array) -> Array:
     """Points (K, 2) on the ground in the ego frame -> (K, 2) in the flat BEV image: x to the right, -y down, metres."""
     points = apply(inverse(rig.ego_from_bev), np.column_stack([points_ego, np.zeros(len(points_ego))]))
     return points[:, :2] * (1, -1)
+
+
+COLUMNS = 2
+COLUMN_WIDTH, ROW_HEIGHT = 9.0, 1.0  # in the units of the view
+TEXT_COLOR: Color = (225, 228, 235)
+
+
+def legend_entries(class_names: Sequence[str], map_classes: Sequence[str] = ()) -> list[tuple[str, Color]]:
+    """The texts and colours of the legend. map_classes: of the model's map; empty without one."""
+    classes = [(name.replace("_", " "), class_color(name, index)) for index, name in enumerate(class_names)]
+    states = [("ground truth", GROUND_TRUTH_COLOR), ("missed, false", MISSED_COLOR), ("duplicate", DUPLICATE_COLOR)]
+    maps = [(f"map: {name.replace('_', ' ')}", color) for name, color in map_colors(map_classes).items()]
+    return [*classes, *states, *maps]
+
+
+def legend_size(entries: int) -> tuple[float, float]:
+    """Width and height of the legend with this number of entries, in the units of its view."""
+    return COLUMNS * COLUMN_WIDTH, -(-entries // COLUMNS) * ROW_HEIGHT
+
+
+def log_legend(stream: rr.RecordingStream, entries: Sequence[tuple[str, Color]]) -> None:
+    """Writes the legend: a filled circle and a text for each entry, in columns."""
+    rows = -(-len(entries) // COLUMNS)
+    places = np.array([(i // rows * COLUMN_WIDTH, (i % rows + 0.5) * ROW_HEIGHT) for i in range(len(entries))])
+    texts, colors = [text for text, _ in entries], [color for _, color in entries]
+    circles = rr.Points2D(places + (0.7, 0), colors=colors, radii=rr.Radius.ui_points(6.0))
+    stream.log(f"{entities.LEGEND}/colors", circles, static=True)
+    labels = labels_2d(places + (5.0, -0.25), texts, colors=TEXT_COLOR)  # a label is drawn below its point
+    stream.log(f"{entities.LEGEND}/texts", labels, static=True)

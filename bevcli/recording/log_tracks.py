@@ -13,8 +13,7 @@ from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, apply
 from bevcli.recording import entities
-from bevcli.recording.log_boxes import THIN, box_colors
-from bevcli.recording.strips import strips_2d, strips_3d
+from bevcli.recording.log_boxes import THIN, box_colors, line_strips
 
 PAST_S = 5.0  # length of a trail
 AHEAD_S = 1.0  # how far ahead a trail shows where the object will be at its present velocity
@@ -26,17 +25,21 @@ WIDTH = rr.Radius.ui_points(1.2)
 
 @dataclass
 class TrackHistory:
-    """Where each track was: positions on the ground, kept for PAST_S.
+    """The positions of each track on the ground, kept for PAST_S, and the entities that an interrupted recording needs.
 
     Attributes:
         scene: the scene of the last frame; a new scene has new tracks.
         times_ns: by track, the times of its positions.
         positions: by track, positions (3,) in the recording's world.
+        shown: the entities that show a track now, sorted.
+        known: the entities that have their style.
     """
 
     scene: str = ""
     times_ns: dict[str, list[int]] = field(default_factory=dict)
     positions: dict[str, list[Array]] = field(default_factory=dict)
+    shown: list[str] = field(default_factory=list)
+    known: list[str] = field(default_factory=list)
 
     def add(self, boxes: Boxes3D, stamp: FrameStamp) -> None:
         """Adds the boxes of a frame, in the recording's world; forgets what is too old."""
@@ -65,37 +68,20 @@ def track_names(boxes: Boxes3D) -> list[str]:
     return [str(instance) for instance in boxes.instances]
 
 
-@dataclass(frozen=True)
-class TrackLogState:
-    """What the tracks of an interrupted recording need to go on.
-
-    Attributes:
-        history: where each track was.
-        shown: the entities that show a track now.
-        known: the entities that have their style.
-    """
-
-    history: TrackHistory
-    shown: tuple[str, ...]
-    known: tuple[str, ...]
-
-
 class TrackLog:
     """Writes the tracks of each frame, and clears the entities of tracks without a box."""
 
     def __init__(self, stream: rr.RecordingStream, class_names: Sequence[str]) -> None:
         self._stream, self._class_names = stream, class_names
         self._history = TrackHistory()
-        self._shown: set[str] = set()
-        self._known: set[str] = set()
 
-    def state(self) -> TrackLogState:
-        """What `go_on_from` needs."""
-        return TrackLogState(deepcopy(self._history), tuple(sorted(self._shown)), tuple(sorted(self._known)))
+    def state(self) -> TrackHistory:
+        """The state that `go_on_from` needs."""
+        return deepcopy(self._history)
 
-    def go_on_from(self, state: TrackLogState) -> None:
+    def go_on_from(self, state: TrackHistory) -> None:
         """Continues the tracks of an interrupted recording."""
-        self._history, self._shown, self._known = deepcopy(state.history), set(state.shown), set(state.known)
+        self._history = deepcopy(state)
 
     def log(self, boxes: Boxes3D, stamp: FrameStamp, bev_from_world: Array) -> None:
         """Writes the tracks of boxes in the recording's world. bev_from_world: (4, 4). Without tracks: nothing."""
@@ -113,21 +99,21 @@ class TrackLog:
             trail = [past] if len(past) > 1 else []
             own_colors = [(*colors[i], opacity) for opacity in (AHEAD_OPACITY, PAST_OPACITY, PAST_OPACITY)]
             self._log_style(entity, name, own_colors)
-            self._stream.log(entity, rr.LineStrips3D.from_fields(strips=strips_3d([ahead[i], outlines[i], *trail])))
+            strips = line_strips([ahead[i], outlines[i], *trail], 3)
+            self._stream.log(entity, rr.LineStrips3D.from_fields(strips=strips))
             shown.add(entity)
             flat += [apply(bev_from_world, strip)[:, :2] * (1, -1) for strip in (ahead[i], *trail)]
             flat_colors += own_colors[:: 2 if trail else 3]
-        self._stream.log(
-            entities.BEV_TRACKS, rr.LineStrips2D(strips_2d(flat), colors=flat_colors or None, radii=THIN, draw_order=25)
-        )
-        for entity in self._shown - shown:
+        trails = rr.LineStrips2D(line_strips(flat, 2), colors=flat_colors or None, radii=THIN, draw_order=25)
+        self._stream.log(entities.BEV_TRACKS, trails)
+        for entity in set(self._history.shown) - shown:
             self._stream.log(entity, rr.Clear(recursive=False))
-        self._shown = shown
+        self._history.shown = sorted(shown)
 
     def _log_style(self, entity: str, name: str, colors: list[tuple[int, int, int, int]]) -> None:
         """Writes what does not change, once for each track: a message costs more bytes than its numbers."""
-        if entity not in self._known:
-            self._known.add(entity)
+        if entity not in self._history.known:
+            self._history.known.append(entity)
             style = rr.LineStrips3D.from_fields(colors=colors, radii=WIDTH)
             self._stream.log(entity, style, rr.AnyValues(track=name), static=True)
 

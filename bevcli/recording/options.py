@@ -2,55 +2,86 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from bevcli.errors import InputError
-from bevcli.recording.video_images import require_av
+from bevcli.options import option, options
 
 Images = Literal["jpeg", "av1"]
 Level = Literal["minimal", "standard", "full"]
 LEVELS: tuple[Level, ...] = ("minimal", "standard", "full")
 
 
-@dataclass(frozen=True)
-class RecordingOptions:
-    """What goes into a recording.
+def parse_positions(texts: list[str]) -> tuple[tuple[float, float], ...]:
+    """Positions from texts "X,Y" in metres. Raises ValueError."""
+    return tuple(map(parse_position, texts))
 
-    Attributes:
-        level: "minimal": images, boxes, ego pose, curves and events. "standard": also the BEV features, the
-            segmentation, the history map, probes and pillars (at most 25 by 25). "full": all pillars of the grid.
-        bev: how BEV features become an image: "norm", "pca", "channel:K" or "none".
-        score: boxes with a lower score are not shown.
-        probes: x, y in the bev frame, metres, of the cells whose attention is drawn.
-        vehicle_mesh: a mesh file of the ego vehicle (`vehicle.load_vehicle` says which axes it must have);
-            None draws the default car.
-        images: "jpeg": the bytes of the image files, whatever their format; images of a video as JPEG. "av1": one AV1
-            video stream for each camera, which is smaller and not lossless.
+
+def parse_position(text: str) -> tuple[float, float]:
+    """A position from a text "X,Y" in metres. Raises ValueError."""
+    try:
+        x, y = map(float, text.split(","))
+    except ValueError:
+        raise ValueError(f'"{text}" is not a position (expected X,Y in metres, such as 10,-2.5)') from None
+    return x, y
+
+
+@options("Recording")
+class RecordingOptions:
+    """Content of a recording.
 
     Raises InputError for an unknown level, kind of BEV image or format of images, and for a mesh file that does not
     exist; BevcliError for "av1" without PyAV.
     """
 
-    level: Level = "standard"
-    bev: str = "pca"
-    score: float = 0.25
-    probes: tuple[tuple[float, float], ...] = ()
-    vehicle_mesh: Path | None = None
-    images: Images = "jpeg"
+    level: Level = option(
+        default="standard",
+        help="minimal: images, boxes, ego pose, curves and events. standard: also the BEV features, the segmentation, "
+        "the history map, probes and pillars (at most 25 by 25). full: all pillars of the grid.",
+        flag="--record",
+    )
+    bev: str = option(default="pca", help="How the BEV features are drawn: norm, pca, channel:K or none.")
+    score: float = option(
+        default=0.25,
+        help="Hide and do not count boxes scored below this; predictions.json keeps all of them.",
+        panel="Output",
+        minimum=0,
+        maximum=1,
+    )
+    probes: tuple[tuple[float, float], ...] = option(
+        default=(),
+        help="Show the image points that the BEV cell at X, Y (bev frame, metres) attends to. Repeatable.",
+        flag="--probe",
+        metavar="X,Y",
+        parse=parse_positions,
+        repeatable=True,
+    )
+    vehicle_mesh: Path | None = option(
+        default=None,
+        help="Draw the ego vehicle from this mesh (.glb, .ply, .obj, …; metres, origin on the ground under the rear "
+        "axle; axes in docs/recording.md). Default: a plain car.",
+        metavar="FILE",
+    )
+    images: Images = option(
+        default="jpeg",
+        help="jpeg keeps the bytes of the image files, and writes images of a video as JPEG; av1 is one AV1 video "
+        "stream for each camera, which is smaller, not lossless, and needs bevcli\\[video].",
+    )
 
     def __post_init__(self) -> None:
         if self.level not in LEVELS:
-            raise InputError(f'--record: unknown level "{self.level}" (expected {", ".join(LEVELS)})')
+            raise InputError(f'`level`: unknown level "{self.level}" (expected {", ".join(LEVELS)})')
         if self.bev not in ("norm", "pca", "none") and self.channel is None:
-            raise InputError(f'--bev: unknown image "{self.bev}" (expected norm, pca, channel:K or none)')
+            raise InputError(f'`bev`: unknown image "{self.bev}" (expected norm, pca, channel:K or none)')
         if self.images not in ("jpeg", "av1"):
-            raise InputError(f'--images: unknown format "{self.images}" (expected jpeg or av1)')
+            raise InputError(f'`images`: unknown format "{self.images}" (expected jpeg or av1)')
         if self.images == "av1":
-            require_av("--images av1")
+            from bevcli.recording.video_images import require_av  # imports NumPy
+
+            require_av('`images="av1"`')
         if self.vehicle_mesh is not None and not self.vehicle_mesh.is_file():
-            raise InputError(f"--vehicle-mesh {self.vehicle_mesh}: there is no such file")
+            raise InputError(f"`vehicle_mesh={self.vehicle_mesh}`: there is no such file")
 
     @property
     def channel(self) -> int | None:
@@ -60,5 +91,5 @@ class RecordingOptions:
 
     @property
     def shows_internals(self) -> bool:
-        """Whether BEV features, segmentation, history, pillars and probes are written."""
+        """True if BEV features, segmentation, history, pillars and probes are written."""
         return self.level != "minimal"

@@ -58,7 +58,7 @@ class RrdFile:
         self._busy = threading.Lock()
 
     def sink(self) -> rr.FileSink:
-        """Where rerun writes to from now on. After it was passed to `set_sinks`, call `opened`.
+        """The sink that rerun writes to from now on. After it was passed to `set_sinks`, call `opened`.
 
         Call `sync` before the second one: all that comes through an earlier sink afterwards, its index, is left out.
         """
@@ -102,7 +102,7 @@ class RrdFile:
         self._raise_error()
 
     def is_deleted(self) -> bool:
-        """Whether somebody has deleted the file that is being written."""
+        """True if somebody has deleted the file that is being written."""
         return os.fstat(self._file.fileno()).st_nlink == 0
 
     def _raise_error(self) -> None:
@@ -113,7 +113,7 @@ class RrdFile:
         return WaitError(f"{self.path}: the disk has not taken the recording for {TIMEOUT_S:.0f} s")
 
     def _is_drained(self) -> bool:
-        """Whether all that is in the pipe has been written."""
+        """True if all that is in the pipe has been written."""
         if not self._busy.acquire(timeout=TIMEOUT_S):
             raise self._no_answer()
         try:

@@ -61,23 +61,16 @@ def load_vehicle(path: Path) -> VehicleMesh:
 
     Raises InputError where trimesh cannot read the file, and where it has no triangles or is longer than 50 m.
     """
-    parts = _read_parts(path)
-    counts = [len(vertices) for vertices, *_ in parts]
-    starts = np.cumsum([0, *counts[:-1]])
-    vertices = np.concatenate([vertices for vertices, *_ in parts])
+    corners, normals, faces, colors = zip(*_read_parts(path), strict=True)
+    starts = np.cumsum([0, *map(len, corners[:-1])])
+    vertices = np.concatenate(corners)
     low, high = vertices.min(0), vertices.max(0)
     if not np.isfinite(vertices).all() or not (high - low).max() <= LONGEST_M:
         size = " x ".join(f"{length:.4g}" for length in high - low)
-        raise InputError(
-            f"{path}: the vehicle's size is {size} m (expected at most {LONGEST_M:g} m; scale it to metres)"
-        )
-    return VehicleMesh(
-        vertices=vertices,
-        normals=np.concatenate([normals for _, normals, _, _ in parts]),
-        faces=np.concatenate([faces + start for (_, _, faces, _), start in zip(parts, starts, strict=True)]),
-        colors=np.concatenate([colors for *_, colors in parts]),
-        top_view=_top_view(low, high),
-    )
+        expected = f"expected at most {LONGEST_M:g} m; scale it to metres"
+        raise InputError(f"{path}: the vehicle's size is {size} m ({expected})")
+    shifted = np.concatenate([part + start for part, start in zip(faces, starts, strict=True)])
+    return VehicleMesh(vertices, np.concatenate(normals), shifted, np.concatenate(colors), _top_view(low, high))
 
 
 def _read_parts(path: Path) -> list[Part]:
@@ -118,12 +111,8 @@ def _part(mesh: trimesh.Trimesh) -> Part:
     mesh.visual = trimesh.visual.ColorVisuals(vertex_colors=np.broadcast_to(colors, (len(mesh.vertices), 4)))
     mesh = trimesh.graph.smooth_shade(mesh, angle=SMOOTH_BELOW_RAD, facet_minarea=None)
     shaded: Any = mesh.visual
-    return (
-        np.array(mesh.vertices),
-        np.array(mesh.vertex_normals),
-        np.array(mesh.faces),
-        np.array(shaded.vertex_colors, dtype=np.uint8)[:, :3],
-    )
+    colors = np.array(shaded.vertex_colors, dtype=np.uint8)[:, :3]
+    return np.array(mesh.vertices), np.array(mesh.vertex_normals), np.array(mesh.faces), colors
 
 
 def _top_view(low: Array, high: Array) -> tuple[Array, ...]:
@@ -183,10 +172,6 @@ def _joined(parts: list[tuple[Array, Color]]) -> VehicleMesh:
     triangles = np.concatenate([part for part, _ in parts])
     normals = _normals(triangles)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return VehicleMesh(
-        vertices=triangles.reshape(-1, 3),
-        normals=normals.repeat(3, axis=0),
-        faces=np.arange(3 * len(triangles)).reshape(-1, 3),
-        colors=np.concatenate([np.tile(color, (3 * len(part), 1)) for part, color in parts]).astype(np.uint8),
-        top_view=(OUTLINE, FRONT_ARROW),
-    )
+    colors = np.concatenate([np.tile(color, (3 * len(part), 1)) for part, color in parts]).astype(np.uint8)
+    faces = np.arange(3 * len(triangles)).reshape(-1, 3)
+    return VehicleMesh(triangles.reshape(-1, 3), normals.repeat(3, axis=0), faces, colors, (OUTLINE, FRONT_ARROW))

@@ -23,7 +23,7 @@ def require_av(purpose: str) -> None:
 
 
 def has_av() -> bool:
-    """Whether PyAV can be imported."""
+    """True if PyAV can be imported."""
     try:
         import av  # noqa: F401
     except ImportError:

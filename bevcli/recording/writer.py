@@ -4,81 +4,69 @@ from __future__ import annotations
 
 import threading
 import uuid
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from rerun.sinks import LogSinkLike
 
 from bevcli.errors import OutputError, WaitError
-from bevcli.frame import Frame, FrameStamp, Prediction, Sequence, facts_of
+from bevcli.frame import Frame, FrameStamp, Prediction, Sequence
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.transforms import Array, Pose, inverse, rigid
-from bevcli.recording import entities, log_bev, log_boxes, log_cameras, log_map, log_static
-from bevcli.recording.bev_images import BevColors, BevImages
+from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid
+from bevcli.recording import entities, log_bev, log_boxes, log_cameras, log_static
 from bevcli.recording.blueprint import LayoutFacts, recording_blueprint
 from bevcli.recording.colors import EGO_COLOR
-from bevcli.recording.legend import legend_entries, log_legend
-from bevcli.recording.log_boxes import Marks
+from bevcli.recording.log_bev import BevColors, BevImages
+from bevcli.recording.log_boxes import detectable, false_and_duplicate
 from bevcli.recording.log_cameras import PosedCamera, VideoImages
-from bevcli.recording.log_tracks import TrackLog, TrackLogState
-from bevcli.recording.matching import detectable, false_and_duplicate, true_positives
+from bevcli.recording.log_static import legend_entries, log_legend
+from bevcli.recording.log_tracks import TrackHistory, TrackLog
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.rrd_file import RrdFile
 from bevcli.recording.vehicle import load_vehicle
 
 if TYPE_CHECKING:
-    from bevcli.model.bevformer import BEVFormerConfig
+    from bevcli.model.config import ModelConfig
 
 APPLICATION = "bevcli"
 FLUSH_TIMEOUT_S = 20.0
 INDEXED_FRAMES = 200  # a longer recording has no index, see `rrd_file`
 UNTRAINED = "untrained weights"
 FROM_RENDERED = "trained on renderings"
+WARNINGS = {
+    UNTRAINED: "The weights are UNTRAINED: boxes and maps are meaningless.",
+    FROM_RENDERED: "The weights were trained on rendered streets; these images are not rendered.",
+}
 PosedCameras = tuple[PosedCamera, ...]
 
 
 class RecordedModel(Protocol):
-    """What a recording needs to know about a model."""
+    """The facts about a model that go into a recording."""
 
     @property
-    def config(self) -> BEVFormerConfig:
+    def config(self) -> ModelConfig:
         """The model's configuration; its name and its classes are written."""
-        ...
 
     @property
     def untrained(self) -> bool:
-        """Whether the weights are random. Then titles, events and the page "About" say so."""
-        ...
+        """True for random weights. Then titles, events and the page "About" say so."""
 
     @property
     def bundled(self) -> bool:
-        """Whether the weights are those of the package, trained on rendered streets.
-
-        Titles and events say so where the drive is not a rendered one.
-        """
-        ...
+        """True for the weights of the package. Titles and events say so where the drive is not a rendered one."""
 
 
 class LiveSink(Protocol):
-    """A viewer that follows a recording while it is written, such as `bevcli.viewer.live.LiveView`."""
+    """A viewer that follows a recording while it is written, such as `bevcli.viewer.web.LiveView`."""
 
-    @property
-    def sink(self) -> LogSinkLike:
-        """Receives everything that goes into the file."""
-        ...
-
-    def open(self) -> None:
-        """Called once, when the recording starts."""
-        ...
+    def open(self, recording: Path) -> None:
+        """Called once, when the file is there."""
 
     def close(self) -> None:
-        """Called once, when the recording ends."""
-        ...
+        """Called once, when the file is whole."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +79,7 @@ class LastFrame:
 
 @dataclass(frozen=True)
 class RecordingState:
-    """What an interrupted recording needs to go on.
+    """The state of a recording after a frame, from which a later one goes on.
 
     Attributes:
         recording_id: rerun's id of the recording.
@@ -107,7 +95,7 @@ class RecordingState:
     origin: Array
     last: LastFrame | None
     colors: BevColors | None
-    tracks: TrackLogState
+    tracks: TrackHistory
 
 
 class Recording:
@@ -139,7 +127,7 @@ class Recording:
         self.title = f"{sequence.name} · {model.config.name}"
         self.note = weights_note(model, sequence)
         self.class_names = tuple(model.config.classes)
-        self._config, self._geo_origin = model.config, facts_of(sequence).geo_origin
+        self._config, self._geo_origin = model.config, sequence.facts.geo_origin
         self._rate_hz, self._has_ego_motion = frame_rate_hz(sequence.stamps), sequence.has_ego_motion
         self.options = RecordingOptions() if options is None else options
         recording_id = str(uuid.uuid4()) if resume is None else resume.recording_id
@@ -173,75 +161,76 @@ class Recording:
             legend_entries=len(legend),
             grid=grid,
         )
-        blueprint = recording_blueprint(self.rig, facts)
+        self._blueprint = recording_blueprint(self.rig, facts)
         self._file = RrdFile(self.path, None if self._resume is None else self._resume.size)
-        self._connect(self._file, blueprint)
+        follows = replace(facts, follows=self._live is not None)
+        self._connect(self._file, recording_blueprint(self.rig, follows))
         if self._live is not None:
-            self._live.open()
-        names, untrained = self.class_names, self.untrained
-        log_static.log_scene(self._stream, self.rig, names, vehicle, grid)
-        log_static.log_about(
-            self._stream,
-            self.title,
-            self.rig,
-            names,
-            self.options,
-            map_classes=map_classes,
-            untrained=untrained,
-            note=self.note,
-        )
+            self._live.open(self.path)
+        log_static.log_scene(self._stream, self.rig, self.class_names, vehicle, grid)
+        self._log_about(map_classes)
         log_legend(self._stream, legend)
         if self._resume is not None:
-            self._go_on_from(self._resume)
+            self._origin, self._last = self._resume.origin, self._resume.last
+            self._tracks.go_on_from(self._resume.tracks)
+            if self._bev_images is not None:
+                self._bev_images.colors = self._resume.colors
         return self
 
+    def _log_about(self, map_classes: tuple[str, ...]) -> None:
+        """Writes the page "About", and the facts of the run that readers of the file need."""
+        of_map: dict[str, Any] = {"map_classes": list(map_classes)} if map_classes else {}
+        facts = rr.AnyValues(
+            title=self.title,
+            untrained=self.untrained,
+            note=self.note,
+            score=self.options.score,
+            class_names=list(self.class_names),
+            camera_names=list(self.rig.names),
+            **of_map,
+        )
+        text = log_static.about_text(self.title, self.rig, self.options, untrained=self.untrained)
+        self._stream.log(entities.RUN, rr.TextDocument(text, media_type="text/markdown"), facts, static=True)
+
     def _connect(self, file: RrdFile, blueprint: rrb.Blueprint | None) -> None:
-        """Makes rerun write a new stream into the file, and to the viewer that follows. Raises OutputError."""
-        sinks = [] if self._live is None else [self._live.sink]
+        """Makes rerun write a new stream into the file. Raises OutputError."""
         try:
-            self._stream.set_sinks(file.sink(), *sinks, default_blueprint=blueprint)
+            self._stream.set_sinks(file.sink(), default_blueprint=blueprint)
         except RuntimeError as error:
             raise OutputError(f"{self.path}: the recording cannot be written ({error})") from error
         finally:
             file.opened()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         assert self._file is not None
         try:
             if self._bev_images is not None:
                 self._log_bev_images(self._bev_images.finish())
             if self._video is not None:
                 self._video.close()
+            if self._live is not None:  # who opens the file later sees it from the first frame on
+                self._stream.send_blueprint(self._blueprint, make_active=False)
             self._flush()
         finally:
             self._disconnect()
+            self._file.close()
             if self._live is not None:
                 self._live.close()
-            self._file.close()
 
     def state(self) -> RecordingState | None:
-        """What a later Recording needs to go on after the last frame. None as long as it cannot be resumed.
+        """The state from which a later Recording goes on; None as long as it cannot be resumed.
 
         BEV colours are fitted on the first two frames, and are part of the state.
         """
         colors = None if self._bev_images is None else self._bev_images.colors
         if self._origin is None or self._file is None or (self._bev_images is not None and colors is None):
             return None
-        return RecordingState(
-            self._recording_id, self._file.size, self._origin, self._last, colors, self._tracks.state()
-        )
+        tracks = self._tracks.state()
+        return RecordingState(self._recording_id, self._file.size, self._origin, self._last, colors, tracks)
 
     def is_deleted(self) -> bool:
-        """Whether somebody has deleted the file that is being written."""
+        """True if somebody has deleted the file that is being written."""
         return self._file is not None and self._file.is_deleted()
-
-    def _go_on_from(self, state: RecordingState) -> None:
-        self._origin, self._last = state.origin, state.last
-        self._tracks.go_on_from(state.tracks)
-        if self._bev_images is not None:
-            self._bev_images.colors = state.colors
 
     def log(self, frame: Frame, prediction: Prediction) -> None:
         """Writes one frame: images, shown boxes, ground truth, curves, events and the model's internals."""
@@ -255,8 +244,8 @@ class Recording:
         self._last = LastFrame(frame.stamp.scene, frame.world_from_ego)
         self._flush()
         self._frames += 1
-        # A new stream frees the index of the one before. With a viewer it would end the viewer's stream too.
-        if self._frames % INDEXED_FRAMES == 0 and self._live is None:
+        # A new stream frees the index of the one before.
+        if self._frames % INDEXED_FRAMES == 0:
             assert self._file is not None
             self._connect(self._file, None)
 
@@ -299,7 +288,7 @@ class Recording:
         pose = self._moved_to_origin(frame.world_from_ego.matrix)
         self._stream.log(
             entities.EGO,
-            rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]),
+            _transform(pose),
             rr.AnyValues(scene=frame.stamp.scene, timestamp_ns=frame.stamp.timestamp_ns, pose=pose.ravel()),
         )
         if self._has_ego_motion:
@@ -307,7 +296,7 @@ class Recording:
         before = self._before(frame)
         if self._geo_origin is not None:
             last = None if before is None else before.world_from_ego.translation
-            log_map.log_ego_on_map(self._stream, self._geo_origin, frame.world_from_ego.translation, last)
+            log_boxes.log_ego_on_map(self._stream, self._geo_origin, frame.world_from_ego.translation, last)
         if before is not None:
             poses = (before.world_from_ego, frame.world_from_ego)
             piece = [self._moved_to_origin(pose.matrix)[:3, 3] for pose in poses]
@@ -322,13 +311,16 @@ class Recording:
         assert self._origin is not None
         return rigid(-self._origin) @ world_from_a
 
+    def _world_from_bev(self, prediction: Prediction) -> Array:
+        return self._moved_to_origin(prediction.world_from_ego.matrix) @ prediction.ego_from_bev
+
     def _log_cameras(self, frame: Frame) -> PosedCameras:
         cameras = tuple(
             PosedCamera(c, self._moved_to_origin(frame.world_from_ego_at[c.name].matrix) @ c.ego_from_camera)
             for c in frame.rig.cameras
         )
         for posed in cameras:
-            log_cameras.log_pose(self._stream, posed)
+            self._stream.log(entities.camera(posed.name), _transform(posed.world_from_camera))
             image = frame.images.get(posed.name)
             if self._video is None:
                 log_cameras.log_image(self._stream, posed, image)
@@ -337,19 +329,17 @@ class Recording:
         return cameras
 
     def _log_boxes(self, frame: Frame, prediction: Prediction, cameras: PosedCameras) -> None:
-        shown = shown_boxes(prediction.boxes, self.options.score)
-        world_from_bev = self._moved_to_origin(prediction.world_from_ego.matrix) @ prediction.ego_from_bev
+        shown = prediction.boxes.scored(self.options.score)
+        world_from_bev = self._world_from_bev(prediction)
         in_world = shown.transformed(world_from_bev)
-        marks = Marks(*false_and_duplicate(shown, None))
+        marks = false_and_duplicate(shown, None)
         if frame.ground_truth is not None:
             in_recording = frame.ground_truth.transformed(self._moved_to_origin(np.eye(4)))
             truth = detectable(in_recording.transformed(inverse(world_from_bev)), prediction.grid)
-            if self.untrained:  # random boxes match nothing: a scene all in red would be useless
-                found = np.ones(len(truth), dtype=bool)
-            else:
-                matches = true_positives(shown, truth)
-                marks = Marks(*false_and_duplicate(shown, truth, matches))
-                found = matches[1] | log_boxes.other_classes(truth, self.class_names)
+            found = np.ones(len(truth), dtype=bool)
+            if not self.untrained:  # random boxes match nothing: a scene all in red would be useless
+                marks = false_and_duplicate(shown, truth)
+                found = marks.found | log_boxes.other_classes(truth, self.class_names)
             self._log_ground_truth(truth, found, world_from_bev, cameras)
         stream, names = self._stream, self.class_names
         ego_xy = self._moved_to_origin(prediction.world_from_ego.matrix)[:2, 3]
@@ -358,7 +348,7 @@ class Recording:
         self._tracks.log(in_world, frame.stamp, inverse(world_from_bev))
         if self._geo_origin is not None:
             in_sequence = shown.transformed(prediction.world_from_ego.matrix @ prediction.ego_from_bev)
-            log_map.log_boxes_on_map(stream, self._geo_origin, in_sequence, names)
+            log_boxes.log_boxes_on_map(stream, self._geo_origin, in_sequence, names)
         for posed in cameras:
             log_cameras.log_boxes_in_image(stream, posed, in_world, names)
         counts = [float((shown.classes == name).sum()) for name in names]
@@ -378,14 +368,11 @@ class Recording:
         stages = prediction.stage_seconds
         if self._last is None:
             log_static.log_curve_names(self._stream, stages, self.class_names)
-            log_static.log_speed_style(self._stream)
         self._stream.log(entities.STAGE_CURVES, rr.Scalars(list(stages.values())))
 
     def _log_frame_events(self, frame: Frame, prediction: Prediction) -> None:
-        if self._last is None and self.untrained:
-            self.event("The weights are UNTRAINED: boxes and maps are meaningless.", "WARN")
-        if self._last is None and self.note == FROM_RENDERED:
-            self.event("The weights were trained on rendered streets; these images are not rendered.", "WARN")
+        if self._last is None and self.note in WARNINGS:
+            self.event(WARNINGS[self.note], "WARN")
         where = f"frame {frame.stamp.index}"
         while self._early_events:
             self.event(*self._early_events.pop(0))
@@ -420,8 +407,7 @@ class Recording:
             self._pillars = log_static.drawn_pillars(prediction.grid, all_cells=self.options.level == "full")
             log_static.log_pillars(self._stream, prediction.grid, prediction.ego_from_bev, self._pillars)
         colors = log_static.pillar_colors(prediction.grid, len(self._pillars))
-        world_from_bev = self._moved_to_origin(prediction.world_from_ego.matrix) @ prediction.ego_from_bev
-        points = self._pillars.reshape(-1, 3) @ world_from_bev[:3, :3].T + world_from_bev[:3, 3]
+        points = apply(self._world_from_bev(prediction), self._pillars.reshape(-1, 3))
         for posed in cameras:
             if posed.name in frame.images:
                 log_cameras.log_pillar_hits(self._stream, posed, points, colors)
@@ -437,16 +423,15 @@ class Recording:
             log_cameras.log_samples(self._stream, posed, samples)
 
 
-def shown_boxes(boxes: Boxes3D, score: float) -> Boxes3D:
-    """The boxes with this score or more; all boxes where they have no scores."""
-    return boxes if boxes.scores is None else boxes[boxes.scores >= score]
+def _transform(parent_from_entity: Array) -> rr.Transform3D:
+    return rr.Transform3D(translation=parent_from_entity[:3, 3], mat3x3=parent_from_entity[:3, :3])
 
 
 def weights_note(model: RecordedModel, sequence: Sequence) -> str:
-    """What the titles of the views say about the weights; "" if there is nothing to say."""
+    """A note on the weights for the titles of the views, "" for none: a key of WARNINGS."""
     if model.untrained:
         return UNTRAINED
-    return FROM_RENDERED if model.bundled and not facts_of(sequence).rendered else ""
+    return FROM_RENDERED if model.bundled and not sequence.facts.rendered else ""
 
 
 def frame_rate_hz(stamps: tuple[FrameStamp, ...]) -> float:

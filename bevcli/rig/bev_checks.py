@@ -5,8 +5,6 @@ Published weights expect nuScenes' LIDAR_TOP: x right, y forward, 1.84 m above t
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from bevcli.findings import Finding
@@ -51,27 +49,26 @@ def _is_plausible(pose: Array) -> bool:
 
 def _mistake(pose: Array) -> Finding | None:
     """The common mistake whose undoing gives a plausible frame."""
-    undoings: tuple[tuple[str, str, str, Callable[[], Array]], ...] = (
-        ("transform-inverted", "is bev_from_ego, the inverse", "invert it", lambda: inverse(pose)),
-        ("quaternion-order", "has a quaternion that is not in the order w, x, y, z", "put w first",
-         lambda: reordered(pose, 1)),
-        ("quaternion-order", "has a quaternion that is not in the order w, x, y, z", "put w first",
-         lambda: reordered(pose, -1)),
-    )  # fmt: skip
     # KITTI, Waymo and Argoverse have x forward: rotated to x right, such a frame is plausible.
     turned = rigid(pose[:3, 3], pose[:3, :3] @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
     if _is_plausible(turned):
-        found, expected = "x forward, y left", "x right, y forward"
         advice = "rotate it by 90° about z, unless your weights were trained with x forward"
-        return _error("bev-x-forward", '"ego_from_bev" has x forward', found, expected, advice)
-    for code, message, advice, undo in undoings:
-        if _is_plausible(undo()):
-            return _error(code, f'"ego_from_bev" {message}', _found(pose), "x right, y forward, z up, z 1.84 m", advice)
-    return None
+        return _error(
+            "bev-x-forward", '"ego_from_bev" has x forward', "x forward, y left", "x right, y forward", advice
+        )
+    if _is_plausible(inverse(pose)):
+        code, message, advice = "transform-inverted", "is bev_from_ego, the inverse", "invert it"
+    elif _is_plausible(reordered(pose, 1)) or _is_plausible(reordered(pose, -1)):
+        code, advice = "quaternion-order", "put w first"
+        message = "has a quaternion that is not in the order w, x, y, z"
+    else:
+        return None
+    found = f"tilt {_tilt_deg(pose):.0f}°, y {_heading_deg(pose):.0f}° from forward, height {pose[2, 3]:.2f} m"
+    return _error(code, f'"ego_from_bev" {message}', found, "x right, y forward, z up, z 1.84 m", advice)
 
 
 def _defect(pose: Array) -> Finding:
-    """What is implausible about the frame, where no common mistake explains it."""
+    """The implausible property of the frame, where no common mistake explains it."""
     if _tilt_deg(pose) > TILT_ERROR_DEG:
         advice = "z of the bev frame points up"
         return _error("bev-tilted", '"ego_from_bev" is tilted', f"{_tilt_deg(pose):.0f}°", "level within 15°", advice)
@@ -101,10 +98,6 @@ def _warnings(pose: Array) -> tuple[Finding, ...]:
         advice = "nothing for the demo model, which levels the frame itself"
         findings.append(Finding("bev-tilted", "info", None, message, found, expected, advice))
     return tuple(findings)
-
-
-def _found(pose: Array) -> str:
-    return f"tilt {_tilt_deg(pose):.0f}°, y {_heading_deg(pose):.0f}° from forward, height {pose[2, 3]:.2f} m"
 
 
 def _error(code: str, message: str, found: str, expected: str, advice: str) -> Finding:

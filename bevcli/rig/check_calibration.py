@@ -1,23 +1,34 @@
-"""`check_calibration`: read a calibration, run all checks, and keep what they found."""
+"""`check_calibration`: read a calibration and the data of its sequence, run all checks, and keep what they found."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.errors import OutputError
+from bevcli.errors import InputError, OutputError
 from bevcli.findings import Finding, errors_of
+from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.cameras import CameraRig
+from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.rig.coverage import Coverage
-from bevcli.rig.inputs import read_inputs
-from bevcli.rig.report_text import report_text
-from bevcli.rig.rig_report import RigReport, check_rig, with_findings
+from bevcli.rig.rig_report import RigReport, check_rig, report_text, with_findings
+from bevcli.rig.sequence_checks import check_camera_times, check_ego_motion
+from bevcli.sequences.files.calibration_file import draft_calibration
+from bevcli.sequences.native.folder import FolderSequence
+from bevcli.sequences.native.tables import read_frames_table
+from bevcli.sequences.open import open_sequence
+from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.ros.format import is_ros_bag
+
+CALIBRATION = "calibration.json"
+_Found = tuple[tuple[Finding, ...], Mapping[str, NDArray[np.uint8]]]  # findings, and images by camera
 
 
 @dataclass(frozen=True)
@@ -65,8 +76,7 @@ class CalibrationCheck:
         OutputError where a file cannot be written.
         """
         # Only writing draws: matplotlib and rerun take a second to load.
-        from bevcli.rig.camera_sheet import write_camera_sheet
-        from bevcli.rig.coverage_map import write_coverage_map
+        from bevcli.rig.drawings import write_camera_sheet, write_coverage_map
         from bevcli.rig.rig_recording import write_rig_recording
 
         folder = Path(folder)
@@ -92,7 +102,7 @@ def check_calibration(
         path: a calibration.json, a sequence folder that contains one, a nuScenes root, or a ROS bag.
         sequence: a sequence folder or bag whose images, ego-motion and timestamps belong to the calibration.
         frame: index of the frame in the sequence whose images are kept, from 0.
-        options: of `open_sequence`, such as allow_outside, or topics for a bag.
+        options: of `open_sequence`, such as allow_outside, or topics for a bag. A native folder takes allow_outside.
 
     Returns:
         The findings with what is needed to draw them. Mistakes in the calibration are findings, not exceptions.
@@ -100,9 +110,20 @@ def check_calibration(
     Raises:
         InputError: the file is missing or not a JSON object, or the sequence has no such frame.
     """
-    inputs = read_inputs(Path(path), None if sequence is None else Path(sequence), frame, options)
-    report = with_findings(check_rig(inputs.rig, inputs.rig_findings), inputs.sequence_findings)
-    return CalibrationCheck(inputs.name, inputs.rig, report, inputs.images)
+    path, folder = Path(path), None if sequence is None else Path(sequence)
+    if is_ros_bag(path) or (path.is_dir() and not (path / CALIBRATION).exists()):
+        return _check_other_sequence(path, frame, options)
+    file = path / CALIBRATION if path.is_dir() else path
+    draft = draft_calibration(file)
+    if folder is not None and is_ros_bag(folder):
+        return _check_other_sequence(folder, frame, {**options, "calibration": file})
+    if folder is None and path.is_dir():
+        folder = path
+    found: _Found = ((), {})
+    if folder is not None and draft.rig.cameras:
+        found = _read_folder(folder, draft.rig, frame, bool(options.get("allow_outside")))
+    name = (folder or file.with_suffix("")).resolve().name
+    return CalibrationCheck(name, draft.rig, with_findings(check_rig(draft.rig, draft.findings), found[0]), found[1])
 
 
 def _coverage_to_json(coverage: Coverage) -> dict[str, Any]:
@@ -116,3 +137,81 @@ def _coverage_to_json(coverage: Coverage) -> dict[str, Any]:
         "cells_by_cameras": {str(cameras): int(cells) for cameras, cells in enumerate(counts)},
         "seen_by_camera": {name: round(share, 6) for name, share in coverage.shares.items()},
     }
+
+
+def _check_other_sequence(path: Path, frame: int, options: Mapping[str, Any]) -> CalibrationCheck:
+    """A sequence that is not a native folder, such as a nuScenes root or a bag, read as `bevcli run` reads it."""
+    sequence = open_sequence(path, ego_motion="optional", ground_truth=False, **options)
+    shown = sequence.load(_checked_index(sequence.stamps, frame, path))
+    report = with_findings(check_rig(shown.rig), _missing_images(shown))
+    return CalibrationCheck(sequence.name, shown.rig, report, _pixels(shown))
+
+
+def _read_folder(folder: Path, rig: CameraRig, frame: int, allow_outside: bool) -> _Found:
+    """The findings about a native folder, and the images of one of its frames."""
+    findings: list[Finding] = []
+    options = SequenceOptions(ego_motion="optional", ground_truth=False, allow_outside=allow_outside)
+    try:
+        sequence = FolderSequence(folder, options, rig=rig)
+    except InputError as error:
+        findings.append(_refused(error))
+        try:
+            # Images may be readable without ego-motion.
+            sequence = FolderSequence(folder, replace(options, ego_motion="static"), rig=rig)
+        except InputError:
+            return tuple(findings), {}
+    if sequence.ego_motion is not None:
+        for part in _split_by_scene(sequence.ego_motion, sequence.stamps):
+            findings += check_ego_motion(part)
+    if (folder / "frames.csv").is_file():
+        findings += _check_times(folder / "frames.csv", rig)
+    index = _checked_index(sequence.stamps, frame, folder)
+    try:
+        shown = sequence.load(index)
+    except InputError as error:
+        return (*findings, _refused(error)), {}
+    return (*findings, *_missing_images(shown)), _pixels(shown)
+
+
+def _checked_index(stamps: tuple[FrameStamp, ...], frame: int, path: Path) -> int:
+    if not 0 <= frame < len(stamps):
+        raise InputError(f"{path}: the sequence has no frame {frame} (it has {len(stamps)} frames, counted from 0)")
+    return frame
+
+
+def _split_by_scene(ego_motion: EgoMotion, stamps: tuple[FrameStamp, ...]) -> Iterator[EgoMotion]:
+    """The ego-motion of each scene: cut midway between frames of different scenes, where the pose may jump."""
+    changes = [(a.timestamp_ns + b.timestamp_ns) // 2 for a, b in pairwise(stamps) if a.scene != b.scene]
+    times = ego_motion.timestamps_ns
+    rows = np.split(np.arange(len(times)), np.searchsorted(times, np.sort(np.array(changes, dtype=np.int64))))
+    for part in rows:
+        if len(part) > 1:
+            columns = {
+                name: values[part] for name, values in vars(ego_motion).items() if name != "velocities_are_stated"
+            }
+            yield replace(ego_motion, **columns)
+
+
+def _check_times(table: Path, rig: CameraRig) -> tuple[Finding, ...]:
+    entries = read_frames_table(table, rig.names)
+    times = {
+        name: [entry.sources[name].timestamp_ns if name in entry.sources else None for entry in entries]
+        for name in rig.names
+    }
+    return check_camera_times([entry.stamp.timestamp_ns for entry in entries], times)
+
+
+def _refused(error: InputError) -> Finding:
+    advice = "fix this first: bevcli run refuses this sequence"
+    return Finding("sequence-refused", "error", None, str(error), advice=advice)
+
+
+def _missing_images(frame: Frame) -> tuple[Finding, ...]:
+    return tuple(
+        Finding("image-missing", "warning", name, f"has no image in frame {frame.stamp.index}", found=why)
+        for name, why in frame.dropped.items()
+    )
+
+
+def _pixels(frame: Frame) -> dict[str, NDArray[np.uint8]]:
+    return {name: image.pixels_bgr for name, image in frame.images.items()}

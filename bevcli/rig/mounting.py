@@ -1,4 +1,4 @@
-"""How a camera is mounted on the vehicle: position, yaw, pitch, roll, field of view, and its horizon."""
+"""The mounting of a camera on the vehicle: position, yaw, pitch, roll, field of view, and its horizon."""
 
 from __future__ import annotations
 

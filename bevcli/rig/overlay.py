@@ -28,33 +28,27 @@ Pixels = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class PillarPoints:
-    """The M pillar points that are inside a camera's image.
-
-    Attributes:
-        pixels: (M, 2).
-        distances: (M,), from the camera, metres.
-        colors: (M, 3), RGB by height.
-    """
+    """The M pillar points in a camera's image: pixels (M, 2), distances (M,) in metres, and RGB (M, 3) by height."""
 
     pixels: Array
     distances: Array
     colors: NDArray[np.uint8]
 
 
-def pillars_in(camera: Camera, ego_from_bev: Array, grid: BevGrid = PILLAR_GRID) -> PillarPoints:
+def pillars_in(camera: Camera, ego_from_bev: Array) -> PillarPoints:
     """The pillar points that are inside the camera's image, the farthest first. ego_from_bev: (4, 4)."""
-    points = apply(ego_from_bev, grid.pillars()).reshape(-1, 3)
+    points = apply(ego_from_bev, PILLAR_GRID.pillars()).reshape(-1, 3)
     pixels = pixels_in_image(camera, points)
     distances = np.linalg.norm(points - camera.ego_from_camera[:3, 3], axis=1)
-    colors = np.tile(height_colors(grid), (grid.rows * grid.columns, 1))
+    colors = np.tile(height_colors(), (PILLAR_GRID.rows * PILLAR_GRID.columns, 1))
     order = np.argsort(-distances)
     order = order[np.isfinite(pixels[order]).all(-1)]
     return PillarPoints(pixels[order], distances[order], colors[order])
 
 
-def height_colors(grid: BevGrid) -> NDArray[np.uint8]:
+def height_colors() -> NDArray[np.uint8]:
     """(Z, 3) RGB, the colours of a pillar's points, the lowest first."""
-    return colormap(np.linspace(0.12, 0.9, grid.pillar_points), "turbo")
+    return colormap(np.linspace(0.12, 0.9, PILLAR_GRID.pillar_points), "turbo")
 
 
 def ground_lines(camera: Camera) -> list[Array]:
@@ -68,9 +62,9 @@ def ground_lines(camera: Camera) -> list[Array]:
     return lines
 
 
-def pillar_lines(camera: Camera, ego_from_bev: Array, grid: BevGrid = PILLAR_GRID) -> list[Array]:
+def pillar_lines(camera: Camera, ego_from_bev: Array) -> list[Array]:
     """Lines (P, 2) in pixels from the lowest to the highest point of each pillar within 25 m."""
-    pillars = grid.pillars().reshape(-1, grid.pillar_points, 3)
+    pillars = PILLAR_GRID.pillars().reshape(-1, PILLAR_GRID.pillar_points, 3)
     low, high = pillars[:, :1], pillars[:, -1:]
     points = apply(ego_from_bev, low + np.linspace(0, 1, 24)[:, None] * (high - low))  # (Y X, 24, 3)
     near = np.linalg.norm(points[:, 0, :2] - camera.ego_from_camera[:2, 3], axis=-1) < PILLAR_LINES_M
@@ -132,15 +126,11 @@ def _draw_distances(canvas: Pixels, camera: Camera) -> None:
     """Label distances on the ground along the viewing direction, where the labels do not overlap."""
     ahead = np.array([np.cos(camera.yaw), np.sin(camera.yaw), 0.0])
     start = camera.ego_from_camera[:3, 3] * [1, 1, 0]
-    last = np.inf
+    font, size, last = cv2.FONT_HERSHEY_SIMPLEX, 0.5 * canvas.shape[1] / 800, np.inf
     for distance in LABELLED_M:
         pixel = pixels_in_image(camera, start + distance * ahead)
         if np.isfinite(pixel).all() and last - pixel[1] > 22:
             last = float(pixel[1])
-            _label(canvas, f"{distance:g} m", (round(pixel[0]), round(pixel[1])))
-
-
-def _label(canvas: Pixels, text: str, place: tuple[int, int]) -> None:
-    font, size = cv2.FONT_HERSHEY_SIMPLEX, 0.5 * canvas.shape[1] / 800
-    for color, thickness in (((10, 12, 16), 4), ((240, 244, 248), 1)):
-        cv2.putText(canvas, text, place, font, size, color, thickness, cv2.LINE_AA)
+            place = (round(pixel[0]), round(pixel[1]))
+            for color, thickness in (((10, 12, 16), 4), ((240, 244, 248), 1)):
+                cv2.putText(canvas, f"{distance:g} m", place, font, size, color, thickness, cv2.LINE_AA)

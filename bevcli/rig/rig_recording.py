@@ -15,9 +15,9 @@ from bevcli.errors import OutputError
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Array, apply
 from bevcli.recording import entities, log_static
-from bevcli.recording.camera_layout import camera_rows
+from bevcli.recording.blueprint import camera_rows
 from bevcli.rig.coverage import Coverage
-from bevcli.rig.coverage_map import COUNT_COLORS
+from bevcli.rig.drawings import COUNT_COLORS
 from bevcli.rig.mounting import horizon
 from bevcli.rig.overlay import (
     GROUND,
@@ -71,17 +71,12 @@ def _findings_markdown(report: RigReport) -> str:
     return "\n".join(lines)
 
 
-def _coverage_image(coverage: Coverage) -> Pixels:
-    """(rows, columns, 3) RGB, the number of cameras that see each cell; the first row has the largest y."""
-    colors = np.array([to_rgb(color) for color in COUNT_COLORS])
-    return np.round(255 * colors[np.minimum(coverage.counts, 4)][::-1]).astype(np.uint8)
-
-
 def _log_scene(stream: rr.RecordingStream, rig: CameraRig, coverage: Coverage) -> None:
     points = apply(rig.ego_from_bev, PILLAR_GRID.pillars()).reshape(-1, 3)
-    colors = np.tile(height_colors(PILLAR_GRID), (PILLAR_GRID.rows * PILLAR_GRID.columns, 1))
+    colors = np.tile(height_colors(), (PILLAR_GRID.rows * PILLAR_GRID.columns, 1))
     stream.log(entities.PILLARS, rr.Points3D(points, colors=colors, radii=rr.Radius.ui_points(1.5)), static=True)
-    image = _coverage_image(coverage)
+    by_count = np.array([to_rgb(color) for color in COUNT_COLORS])
+    image = np.round(255 * by_count[np.minimum(coverage.counts, 4)][::-1]).astype(np.uint8)  # first row: largest y
     large = np.kron(image, np.ones((PIXELS_PER_CELL, PIXELS_PER_CELL, 1), dtype=np.uint8))
     stream.log(COVERAGE, rr.Image(large, color_model="RGB"), static=True)
     (x0, x1), (y0, y1) = coverage.grid.x_range_m, coverage.grid.y_range_m

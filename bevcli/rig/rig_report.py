@@ -1,26 +1,38 @@
-"""All checks of a rig, in their order, and which findings suppress others."""
+"""All checks of a rig in their order, the findings that suppress others, and the report for the terminal."""
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from bevcli.findings import SEVERITIES, Finding, errors_of
-from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.rig.bev_checks import check_bev_frame
-from bevcli.rig.coverage import COVERAGE_GRID, Coverage, check_coverage, coverage_of
+from bevcli.rig.coverage import (
+    Coverage,
+    Measure,
+    check_coverage,
+    check_measures,
+    coverage_of,
+    measures_of,
+)
 from bevcli.rig.lens_checks import check_lenses
-from bevcli.rig.name_checks import check_names
-from bevcli.rig.nuscenes_comparison import Measure, check_measures, measures_of
-from bevcli.rig.pose_checks import check_poses, corrected
+from bevcli.rig.mounting import degrees_text, mounting_of, seen_fov_deg
+from bevcli.rig.pose_checks import check_names, check_poses, corrected
 
+BEV_ASSUMED = Finding(
+    "bev-assumed", "info", None, 'the calibration has no "ego_from_bev"',
+    advice="the default is used: a level frame at (0.94, 0, 1.84) m, x right, y forward",
+)  # fmt: skip
 MERGED_FROM = 3  # cameras with the same mistake: from this many on it is one finding on the whole rig
+WIDTH = 100
+INDENT = " " * 10
 
 
 @dataclass(frozen=True)
 class RigReport:
-    """What the checks of a rig found.
+    """The results of the checks of a rig.
 
     Attributes:
         findings: errors first, then warnings, then infos.
@@ -33,10 +45,8 @@ class RigReport:
     measures: tuple[Measure, ...]
 
 
-def check_rig(rig: CameraRig, found_before: Sequence[Finding] = (), grid: BevGrid = COVERAGE_GRID) -> RigReport:
-    """Run all checks of a rig.
-
-    found_before: findings from reading the file. grid: the BEV grid whose coverage is computed.
+def check_rig(rig: CameraRig, found_before: Sequence[Finding] = ()) -> RigReport:
+    """Run all checks of a rig. found_before: findings from reading the file.
 
     Consequences of a reported error are suppressed: a camera with an error from reading is not checked again, names are
     compared only for cameras with plausible poses, and coverage and the comparison with nuScenes are reported only
@@ -49,8 +59,8 @@ def check_rig(rig: CameraRig, found_before: Sequence[Finding] = (), grid: BevGri
     bev = () if rig_has_error else check_bev_frame(rig.ego_from_bev)
     findings = [*found_before, *_merged(poses, cameras), *_merged(lenses, cameras), *names, *bev]
     if rig.ego_from_bev_assumed:
-        findings.append(_assumed())
-    coverage = coverage_of(rig, grid)
+        findings.append(BEV_ASSUMED)
+    coverage = coverage_of(rig)
     measures: tuple[Measure, ...] = ()
     if rig.cameras and not errors_of(findings):
         measures = measures_of(rig.cameras, coverage)
@@ -96,11 +106,69 @@ def _merged(findings: Sequence[Finding], cameras: Sequence[Camera]) -> list[Find
     return merged
 
 
-def _assumed() -> Finding:
-    return Finding(
-        "bev-assumed",
-        "info",
-        None,
-        'the calibration has no "ego_from_bev"',
-        advice="the default is used: a level frame at (0.94, 0, 1.84) m, x right, y forward",
-    )
+def report_text(name: str, rig: CameraRig, report: RigReport) -> str:
+    """The report as plain text, wrapped at 100 columns."""
+    coverage = report.coverage
+    once = 1 - coverage.unseen - coverage.overlap
+    seen = f"{coverage.unseen:.1%} of the cells seen by no camera, {once:.1%} by one, {coverage.overlap:.1%} by more"
+    parts = [f"{name}: {len(rig.cameras)} cameras", "", *_rig_lines(rig, coverage), "", f"BEV grid: {seen}"]
+    parts += ["", *_finding_lines(report.findings)]
+    if report.measures:
+        rows = [("compared with nuScenes", "this rig", "nuScenes", "")]
+        rows += [(m.name, m.value, m.reference, "" if m.is_near else "far") for m in report.measures]
+        parts += ["", *_table(rows, left={0, 3})]
+    return "\n".join(parts)
+
+
+def _rig_lines(rig: CameraRig, coverage: Coverage) -> list[str]:
+    header = ("camera", "image", "FOV", "yaw", "pitch", "roll", "x", "y", "height", "lens", "sees")
+    rows = []
+    for camera in rig.cameras:
+        mounting = mounting_of(camera.ego_from_camera)
+        x, y, z = mounting.position
+        rows.append(
+            (
+                camera.name,
+                f"{camera.width}x{camera.height}",
+                f"{seen_fov_deg(camera)[0]:.0f}°",
+                degrees_text(mounting.yaw_deg, 0),
+                degrees_text(mounting.pitch_deg),
+                degrees_text(mounting.roll_deg),
+                f"{x:.2f}",
+                f"{y:.2f}",
+                f"{z:.2f} m",
+                camera.distortion.model if camera.distortion else "pinhole",
+                f"{coverage.shares[camera.name]:.0%}",
+            )
+        )
+    return _table([header, *rows], left={0, 9})
+
+
+def _finding_lines(findings: Sequence[Finding]) -> list[str]:
+    if not findings:
+        return ["No findings: the rig is plausible."]
+    counts = {severity: sum(f.severity == severity for f in findings) for severity in SEVERITIES}
+    total = ", ".join(f"{count} {severity}{'s' if count != 1 else ''}" for severity, count in counts.items() if count)
+    lines = [f"Findings: {total}"]
+    for finding in findings:
+        where = f"{finding.camera}: " if finding.camera else ""
+        head = f"{finding.severity:<9} {where}{finding.message}  [{finding.code}]"
+        lines.append("")
+        lines += textwrap.wrap(head, WIDTH, subsequent_indent=INDENT, break_long_words=False, break_on_hyphens=False)
+        for word, value in (("found", finding.found), ("expected", finding.expected), ("do", finding.advice)):
+            if value:
+                text = f"{word + ':':<9} {value}"
+                lines += textwrap.wrap(text, WIDTH, initial_indent=INDENT, subsequent_indent=INDENT * 2)
+    return lines
+
+
+def _table(rows: Sequence[Sequence[str]], left: set[int]) -> list[str]:
+    """Rows as aligned columns. left: indices of the columns that are aligned to the left, all others to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(
+            cell.ljust(width) if place in left else cell.rjust(width)
+            for place, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]

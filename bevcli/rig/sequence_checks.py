@@ -59,7 +59,7 @@ class _Drive:
         return np.degrees(np.arctan2(steps[:, 1], steps[:, 0]))
 
     def is_plausible(self) -> bool:
-        """Whether the vehicle is level, not too fast, and drives forward in most steps."""
+        """True if the vehicle is level, not too fast, and drives forward in most steps."""
         headings = self.headings_deg()
         ahead = len(headings) == 0 or (np.abs(headings) <= FORWARD_DEG).mean() >= MOST_STEPS
         return bool(self.tilt_deg() <= MAX_TILT_DEG and np.median(self.speeds) <= MAX_SPEED and ahead)
@@ -193,9 +193,7 @@ def _check_times_of(name: str, frame_ns: NDArray[np.int64], times: Sequence[int 
     offsets = np.array([time - int(frame) for time, frame in pairs if time is not None]) / 1e9
     if len(offsets) == 0:
         message = "has no image in any frame"
-        return Finding(
-            "camera-without-pictures", "warning", name, message, "0", f"{len(times)}", "check its image paths"
-        )
+        return Finding("camera-without-images", "warning", name, message, "0", f"{len(times)}", "check its image paths")
     offset, jitter = float(np.median(offsets)), float(np.std(offsets))
     found = f"{offset * 1e3:+.0f} ms, standard deviation {jitter * 1e3:.0f} ms"
     advice = "give the timestamp of each image, or assign this camera's images to other frames"

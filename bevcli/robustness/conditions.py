@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from collections.abc import Sequence as Items
+from collections.abc import Callable, Mapping, Sequence as Items
 from dataclasses import dataclass
-from typing import Literal
+from enum import Enum, auto
+from functools import partial
 
 from bevcli.errors import InputError
 from bevcli.frame import Sequence
-from bevcli.robustness.calibration_noise import CalibrationNoise
-from bevcli.robustness.draws import Draws
-from bevcli.robustness.ego_motion_faults import EgoMotionLost, TimeOffsets
-from bevcli.robustness.lighting import brightness, low_light
-from bevcli.robustness.lost_images import CameraCrash, FrameLost, LostImage
-from bevcli.robustness.processing import ImageCorruption, color_quantisation, motion_blur
-from bevcli.robustness.sequences import CorruptedImages, at_lower_rate
-from bevcli.robustness.weather import fog, snow
+from bevcli.robustness import corruptions, sequences
+from bevcli.robustness.options import LostImage, SeverityChoice
+from bevcli.robustness.sequences import Draws
 
-SeverityChoice = Literal["easy", "mid", "hard", "all"]
 CLEAN = "clean"
 # Makes of a scene what is run in its place, for a level: several sequences if they must not share a history.
-Apply = Callable[[Sequence, int, Draws, LostImage], tuple[Sequence, ...]]
+Apply = Callable[[Sequence, int, Draws, LostImage], Sequence | tuple[Sequence, ...]]
+
+
+class Shown(Enum):
+    """The part of a frame that shows a corruption on the contact sheet."""
+
+    IMAGE = auto()  # of the camera that looks ahead
+    BOXES = auto()  # the same with ground truth boxes: the image stays, they show where the model looks
+    CAMERAS = auto()  # all cameras
+    NOTHING = auto()  # it changes no image
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,7 @@ class Corruption:
         title: in plots, with the unit of the levels.
         levels: severity, such as "easy", or a number -> level.
         apply: makes of a scene what is run.
+        shown: on the contact sheet.
         published: whether it is one of RoboBEV's; only these count in mRR and mCE.
     """
 
@@ -40,6 +44,7 @@ class Corruption:
     title: str
     levels: Mapping[str, int]
     apply: Apply
+    shown: Shown = Shown.IMAGE
     published: bool = True
 
 
@@ -61,15 +66,15 @@ class Condition:
         return CLEAN if self.corruption is None else self.corruption.name
 
     def sequences(self, scene: Sequence, seed: int, kind: LostImage) -> tuple[Sequence, ...]:
-        """What is run in place of a scene."""
+        """The sequences that are run in place of a scene."""
         if self.corruption is None:
             return (scene,)
-        level = self.corruption.levels[self.severity]
-        return self.corruption.apply(scene, level, Draws(seed, self.name), kind)
+        made = self.corruption.apply(scene, self.corruption.levels[self.severity], Draws(seed, self.name), kind)
+        return made if isinstance(made, tuple) else (made,)
 
 
-def _images(corrupt: ImageCorruption) -> Apply:
-    return lambda scene, level, draws, kind: (CorruptedImages(scene, corrupt, level, draws),)
+def _images(corrupt: corruptions.ImageCorruption) -> Apply:
+    return partial(sequences.CorruptedImages, corrupt=corrupt)
 
 
 def _severities(easy: int, mid: int, hard: int) -> dict[str, int]:
@@ -78,35 +83,31 @@ def _severities(easy: int, mid: int, hard: int) -> dict[str, int]:
 
 # Levels of the first eight as published: RoboBEV, docs/CREATE.md.
 CORRUPTIONS = (
+    Corruption("camera_crash", "camera crash", _severities(2, 4, 5), sequences.CameraCrash, Shown.CAMERAS),
+    Corruption("frame_lost", "frame lost", _severities(2, 4, 5), sequences.FrameLost, Shown.CAMERAS),
     Corruption(
-        "camera_crash", "camera crash", _severities(2, 4, 5),
-        lambda scene, level, draws, kind: (CameraCrash(scene, level, draws, kind),),
+        "color_quantisation", "colour quantisation", _severities(1, 2, 3), _images(corruptions.color_quantisation)
     ),
-    Corruption(
-        "frame_lost", "frame lost", _severities(2, 4, 5),
-        lambda scene, level, draws, kind: (FrameLost(scene, level, draws, kind),),
-    ),
-    Corruption("color_quantisation", "colour quantisation", _severities(1, 2, 3), _images(color_quantisation)),
-    Corruption("motion_blur", "motion blur", _severities(2, 4, 5), _images(motion_blur)),
-    Corruption("brightness", "brightness", _severities(2, 4, 5), _images(brightness)),
-    Corruption("low_light", "low light", _severities(2, 3, 4), _images(low_light)),
-    Corruption("fog", "fog", _severities(2, 4, 5), _images(fog)),
-    Corruption("snow", "snow", _severities(1, 2, 3), _images(snow)),
+    Corruption("motion_blur", "motion blur", _severities(2, 4, 5), _images(corruptions.motion_blur)),
+    Corruption("brightness", "brightness", _severities(2, 4, 5), _images(corruptions.brightness)),
+    Corruption("low_light", "low light", _severities(2, 3, 4), _images(corruptions.low_light)),
+    Corruption("fog", "fog", _severities(2, 4, 5), _images(corruptions.fog)),
+    Corruption("snow", "snow", _severities(1, 2, 3), _images(corruptions.snow)),
     Corruption(
         "calibration_noise", "calibration noise", {"1": 1, "2": 2, "3": 3, "4": 4},
-        lambda scene, level, draws, kind: (CalibrationNoise(scene, level, draws),), published=False,
+        sequences.CalibrationNoise, Shown.BOXES, published=False,
     ),
     Corruption(
         "time_offset", "capture times off by up to 50, 100, 200 ms", _severities(50, 100, 200),
-        lambda scene, level, draws, kind: (TimeOffsets(scene, level, draws),), published=False,
+        sequences.TimeOffsets, Shown.BOXES, published=False,
     ),
     Corruption(
         "ego_motion_lost", "ego-motion lost in 2/6, 4/6, 5/6 of the frames", _severities(2, 4, 5),
-        lambda scene, level, draws, kind: (EgoMotionLost(scene, level, draws),), published=False,
+        sequences.EgoMotionLost, Shown.NOTHING, published=False,
     ),
     Corruption(
         "frame_rate", "1/2, 1/3, 1/4 of the frame rate", _severities(2, 3, 4),
-        lambda scene, level, draws, kind: at_lower_rate(scene, level), published=False,
+        lambda scene, step, *_: sequences.at_lower_rate(scene, step), Shown.NOTHING, published=False,
     ),
 )  # fmt: skip
 NAMES = tuple(corruption.name for corruption in CORRUPTIONS)
@@ -116,23 +117,17 @@ _GROUP_OF_LEVEL = {"1": "easy", "2": "mid", "3": "mid", "4": "hard"}  # of corru
 def choose_conditions(severity: SeverityChoice = "all", only: Items[str] = ()) -> tuple[Condition, ...]:
     """The conditions of a test: clean first, then the corruptions in the order of CORRUPTIONS.
 
-    Args:
-        severity: only conditions of this severity. Of the numbered levels, 1 is easy, 2 and 3 are mid, 4 is hard.
-        only: names of corruptions; empty for all.
-
-    Raises:
-        InputError: a name is unknown.
+    severity: only conditions of this severity; of the numbered levels, 1 is easy, 2 and 3 are mid, 4 is hard.
+    only: names of corruptions; empty for all. Raises InputError for an unknown name.
     """
     unknown = [name for name in only if name not in NAMES]
     if unknown:
-        raise InputError(f"--only {unknown[0]}: unknown corruption (expected one of {', '.join(NAMES)})")
-    return (
-        Condition(),
-        *(
-            Condition(corruption, label)
-            for corruption in CORRUPTIONS
-            if not only or corruption.name in only
-            for label in corruption.levels
-            if severity in ("all", _GROUP_OF_LEVEL.get(label, label))
-        ),
-    )
+        raise InputError(f"`only={unknown[0]}`: unknown corruption (expected one of {', '.join(NAMES)})")
+    chosen = [
+        Condition(corruption, label)
+        for corruption in CORRUPTIONS
+        if not only or corruption.name in only
+        for label in corruption.levels
+        if severity in ("all", _GROUP_OF_LEVEL.get(label, label))
+    ]
+    return (Condition(), *chosen)

@@ -1,17 +1,25 @@
-"""The table and the plot of a stress test."""
+"""The table, the plot and the contact sheet of a stress test."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence as Items
+from pathlib import Path
 
+import cv2
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from bevcli.errors import OutputError
 from bevcli.evaluation.plots import titled_figure
 from bevcli.evaluation.scores_report import aligned
-from bevcli.robustness.conditions import Corruption
+from bevcli.frame import Frame, Sequence
+from bevcli.geometry.transforms import inverse
+from bevcli.recording.box_lines import lines_in_image
+from bevcli.robustness.conditions import Condition, Corruption, Shown
+from bevcli.robustness.corruptions import Pixels
+from bevcli.robustness.options import StressOptions
 from bevcli.robustness.results import ConditionScores, StressResults
 
 SEVERITY_COLORS = ("#b8c9e8", "#7d9fd3", "#3f6fb5", "#173e7a")  # from the easiest severity to the hardest
@@ -44,16 +52,14 @@ def _block(
     rows = [("corruption", *head, "mean NDS", "RR %", *(("CE %",) if against else ()))]
     for corruption in group:
         scores = results.of(corruption.name)
-        cells = [cell for severity in severities for cell in _cells(scores.get(severity))]
-        mean = sum(found.nd_score for found in scores.values()) / len(scores)
+        cells = []
+        for part in map(scores.get, severities):
+            cells += [f"{part.nd_score:.3f}", f"{part.mean_ap:.3f}"] if part else ["-", "-"]
+        mean = sum(part.nd_score for part in scores.values()) / len(scores)
         rates = [f"{mean:.3f}", _percent(results.resilience(corruption.name))]
         rates += [_percent(results.corruption_error(corruption.name, against))] if against else []
         rows.append((corruption.name, *cells, *rates))
     return aligned(rows)
-
-
-def _cells(scores: ConditionScores | None) -> tuple[str, str]:
-    return ("-", "-") if scores is None else (f"{scores.nd_score:.3f}", f"{scores.mean_ap:.3f}")
 
 
 def _means(results: StressResults, published: int, against: StressResults | None) -> str:
@@ -83,13 +89,9 @@ def draw_stress(results: StressResults, against: StressResults | None = None) ->
         _draw_bars(axes, results, label, color=None)
         if against is not None:
             _draw_bars(axes, against, label, color=_OTHER_COLOR, order=tested)
-        axes.set_ylabel(label)
-        axes.set_ylim(0, 1)
+        axes.set(ylabel=label, ylim=(0, 1), axisbelow=True)
         axes.grid(axis="y", color="#e6e6e6")
-        axes.set_axisbelow(True)
-    titles = [
-        corruption.title.replace(" of the ", "\nof the ").replace(" by up to ", "\nby up to ") for corruption in tested
-    ]
+    titles = [part.title.replace(" of the ", "\nof the ").replace(" by up to ", "\nby up to ") for part in tested]
     panels[1].set_xticks(range(len(tested)), titles, rotation=35, ha="right")
     return figure
 
@@ -115,3 +117,98 @@ def _draw_bars(
 
 def _value(scores: ConditionScores, label: str) -> float:
     return scores.nd_score if label == "NDS" else scores.mean_ap
+
+
+TILE_WIDTH = 400  # pixels
+CAPTION = 24  # height of the text above a tile, pixels
+GAP = 6
+PAPER, INK, BOX = (28, 23, 20), (241, 236, 232), (60, 220, 255)  # BGR
+
+
+def write_contact_sheet(path: Path, scene: Sequence, conditions: Items[Condition], options: StressOptions) -> None:
+    """Writes corruptions.png: the middle frame of a scene, one row a corruption, one column a severity.
+
+    Raises OutputError.
+    """
+    place, rows = len(scene.stamps) // 2, dict[str, list[Pixels]]()
+    for condition in conditions:
+        corruption = condition.corruption
+        if corruption is None or corruption.shown is Shown.NOTHING:
+            continue
+        if corruption.name not in rows:
+            clean = _tile(scene.load(place), corruption)
+            rows[corruption.name] = [_captioned(clean, f"{corruption.name}: clean")]
+        (changed,) = condition.sequences(scene, options.seed, options.lost_images)
+        tile = _tile(changed.load(place), corruption)
+        rows[corruption.name].append(_captioned(tile, f"{corruption.name}: {condition.severity}"))
+    if not rows:
+        return
+    _, encoded = cv2.imencode(".png", _sheet(list(rows.values())))
+    try:
+        path.write_bytes(encoded.tobytes())
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
+
+
+def _tile(frame: Frame, corruption: Corruption) -> Pixels:
+    if corruption.shown is Shown.CAMERAS:
+        return _mosaic(frame)
+    ahead = min(frame.rig.cameras, key=lambda camera: abs(camera.yaw)).name
+    return _camera_tile(frame, ahead, TILE_WIDTH, boxes=corruption.shown is Shown.BOXES)
+
+
+def _mosaic(frame: Frame) -> Pixels:
+    """All cameras in rows of three, from left to right as they look."""
+    names = [camera.name for camera in sorted(frame.rig.cameras, key=lambda camera: -camera.yaw)]
+    tiles = [_camera_tile(frame, name, TILE_WIDTH // 3) for name in names]
+    height = max(tile.shape[0] for tile in tiles)
+    tiles = [_padded(tile, TILE_WIDTH // 3, height) for tile in tiles]
+    tiles += [_padded(tiles[0][:0], TILE_WIDTH // 3, height)] * (-len(tiles) % 3)
+    rows = [np.concatenate(tiles[start : start + 3], axis=1) for start in range(0, len(tiles), 3)]
+    return _padded(np.concatenate(rows), TILE_WIDTH, height * len(rows))
+
+
+def _camera_tile(frame: Frame, name: str, width: int, *, boxes: bool = False) -> Pixels:
+    """A camera's image at a width, grey where it is missing."""
+    camera = frame.rig[name]
+    height = round(width * camera.height / camera.width)
+    if name not in frame.images:
+        return np.full((height, width, 3), 90, dtype=np.uint8)
+    pixels = frame.images[name].pixels_bgr.copy()
+    if boxes:
+        _draw_boxes(pixels, frame, name)
+    return cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8)
+
+
+def _draw_boxes(pixels: Pixels, frame: Frame, name: str) -> None:
+    """Draws the ground truth boxes where the stated calibration and poses see them."""
+    if frame.ground_truth is None:
+        return
+    camera = frame.rig[name]
+    camera_from_world = camera.camera_from_ego @ inverse(frame.world_from_ego_at[name].matrix)
+    thickness = max(1, round(pixels.shape[1] / 500))
+    for start, end in lines_in_image(frame.ground_truth, camera, camera_from_world).segments.astype(int):
+        cv2.line(pixels, start.tolist(), end.tolist(), BOX, thickness, cv2.LINE_AA)
+
+
+def _captioned(tile: Pixels, text: str) -> Pixels:
+    top = np.full((CAPTION, tile.shape[1], 3), PAPER, dtype=np.uint8)
+    cv2.putText(top, text, (2, CAPTION - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.45, INK, 1, cv2.LINE_AA)
+    return np.concatenate([top, tile])
+
+
+def _sheet(rows: list[list[Pixels]]) -> Pixels:
+    columns = max(map(len, rows))
+    width = columns * (TILE_WIDTH + GAP) + GAP
+    lines = []
+    for row in rows:
+        height = max(tile.shape[0] for tile in row)
+        tiles = [_padded(tile, TILE_WIDTH + GAP, height + GAP) for tile in row]
+        lines.append(_padded(np.concatenate(tiles, axis=1), width, height + GAP))
+    return np.concatenate(lines)
+
+
+def _padded(tile: Pixels, width: int, height: int) -> Pixels:
+    canvas = np.full((height, width, 3), PAPER, dtype=np.uint8)
+    canvas[: tile.shape[0], : tile.shape[1]] = tile
+    return canvas

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from bevcli.errors import InputError
+from bevcli.evaluation.scores_report import finite
 from bevcli.parsing.documents import read_json
 from bevcli.robustness.conditions import CLEAN, CORRUPTIONS, Corruption
 
@@ -36,14 +37,13 @@ class ConditionScores:
     class_aps: Mapping[str, float]
 
     def to_dict(self) -> dict[str, Any]:
-        """The scores for JSON; undefined numbers are None."""
-        errors = {name: None if math.isnan(value) else value for name, value in self.errors.items()}
+        """The scores for JSON; undefined numbers are NaN."""
         return {
             "corruption": self.corruption,
             "severity": self.severity,
             "nd_score": self.nd_score,
             "mean_ap": self.mean_ap,
-            "tp_errors": errors,
+            "tp_errors": dict(self.errors),
             "mean_dist_aps": dict(self.class_aps),
         }
 
@@ -91,13 +91,11 @@ class StressResults:
 
     def mean_resilience(self) -> float:
         """mRR: the mean resilience rate of RoboBEV's corruptions that were tested; NaN without any."""
-        return _mean([self.resilience(corruption.name) for corruption in self.tested() if corruption.published])
+        return _mean(self.resilience(part.name) for part in self.tested() if part.published)
 
     def mean_corruption_error(self, against: StressResults) -> float:
         """mCE: the mean corruption error of RoboBEV's corruptions that both runs have; NaN without any."""
-        return _mean(
-            [self.corruption_error(corruption.name, against) for corruption in self.tested() if corruption.published]
-        )
+        return _mean(self.corruption_error(part.name, against) for part in self.tested() if part.published)
 
     def to_dict(self, against: StressResults | None = None) -> dict[str, Any]:
         """All of it for JSON; undefined numbers are None. docs/robustness.md explains the keys."""
@@ -107,17 +105,17 @@ class StressResults:
             **self.header,
             "complete": self.is_complete,
             "conditions": [scores.to_dict() for scores in self.scores],
-            "resilience": {name: _number(self.resilience(name)) for name in names},
-            "mRR": _number(self.mean_resilience()),
+            "resilience": {name: self.resilience(name) for name in names},
+            "mRR": self.mean_resilience(),
         }
         if against is not None:
             content["against"] = {name: against.header.get(name) for name in ("model", "weights")}
-            content["corruption_error"] = {name: _number(self.corruption_error(name, against)) for name in names}
-            content["mCE"] = _number(self.mean_corruption_error(against))
-        return content
+            content["corruption_error"] = {name: self.corruption_error(name, against) for name in names}
+            content["mCE"] = self.mean_corruption_error(against)
+        return finite(content)
 
     def differences(self, other: StressResults) -> tuple[str, ...]:
-        """What else than model and weights differs between the tests, so that their scores cannot be compared."""
+        """Settings other than model and weights that differ between the tests: their scores cannot be compared."""
         names = ("drives", "max_range_m", "seed", "lost_images")
         return tuple(name for name in names if self.header.get(name) != other.header.get(name))
 
@@ -141,10 +139,6 @@ def _scores(entry: Any) -> ConditionScores:
     return ConditionScores(str(entry["corruption"]), str(entry["severity"]), *numbers, errors, aps)
 
 
-def _number(value: float) -> float | None:
-    return None if math.isnan(value) else value
-
-
-def _mean(values: list[float]) -> float:
+def _mean(values: Iterable[float]) -> float:
     known = [value for value in values if not math.isnan(value)]
     return sum(known) / len(known) if known else math.nan

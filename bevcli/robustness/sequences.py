@@ -1,45 +1,64 @@
-"""Sequences that wrap another one: its frames with a change, kept in memory, of one scene, or at a lower rate."""
+"""Sequences that wrap another one: with faults of images, calibration, times and poses; in memory; at a lower rate."""
 
 from __future__ import annotations
 
+import hashlib
 import os
+from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
-from pathlib import Path
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.frame import CameraImage, Frame, FrameStamp, Sequence, facts_of
-from bevcli.robustness.draws import Draws
-from bevcli.robustness.processing import ImageCorruption, Level
+from bevcli.frame import CameraImage, DerivedSequence, Frame, FrameStamp, Sequence
+from bevcli.geometry.cameras import Camera, CameraRig, camera_pose_noise
+from bevcli.geometry.ego_motion import Kinematics
+from bevcli.geometry.transforms import Array, Pose, inverse, rigid
+from bevcli.robustness.corruptions import ImageCorruption, Level, Pixels
+from bevcli.robustness.options import LostImage
 from bevcli.sequences.selection import scenes_of, select
+
+
+@dataclass(frozen=True)
+class Draws:
+    """The random numbers of one corruption, from the seed of the whole test and the name of the corruption.
+
+    The severity is no part of the key: a harder severity draws the same numbers as an easier one, so that, for example,
+    it loses the same images and more.
+    """
+
+    seed: int
+    corruption: str
+
+    def generator(self, *keys: str | int) -> np.random.Generator:
+        """A generator for what the keys name, such as scene, frame index and camera."""
+        digest = hashlib.sha256("\0".join(map(str, (self.corruption, *keys))).encode()).digest()
+        return np.random.default_rng([self.seed, *np.frombuffer(digest, dtype="<u4").tolist()])
+
 
 KEPT_BYTES = 1 << 30  # decoded images that are kept in memory, of all drives together
 
 
-class ChangedSequence:
-    """A sequence whose frames are changed when they are loaded. A subclass overrides `change`."""
+class ChangedSequence(DerivedSequence):
+    """A sequence whose frames are changed when they are loaded. A subclass overrides `change`.
 
-    def __init__(self, sequence: Sequence) -> None:
-        self._sequence = sequence
-        self.name = sequence.name
-        self.rig = sequence.rig
-        self.has_ego_motion = sequence.has_ego_motion
-        self.notes = sequence.notes
-        self.facts = facts_of(sequence)
-        self.input_files: tuple[Path, ...] = getattr(sequence, "input_files", ())
+    level: of the change; its meaning depends on the subclass. lost_images: what the model gets for a lost image.
+    """
 
-    @property
-    def stamps(self) -> tuple[FrameStamp, ...]:
-        """Identity and time of each frame: those of the sequence."""
-        return self._sequence.stamps
+    def __init__(self, sequence: Sequence, level: Level, draws: Draws, lost_images: LostImage = "black") -> None:
+        super().__init__(sequence)
+        self._level, self._draws, self._lost_images = level, draws, lost_images
 
     def load(self, place: int) -> Frame:
         """The changed frame at a place."""
-        return self.change(place, self._sequence.load(place))
+        return self.change(place, self.sequence.load(place))
 
     def change(self, place: int, frame: Frame) -> Frame:
-        """The frame at a place with its change; here none."""
-        return frame
+        """The frame at a place with its change."""
+        raise NotImplementedError
 
     def scene_key(self, stamp: FrameStamp) -> str:
         """A name of the frame's scene for `Draws`, which does not depend on where the drive is stored."""
@@ -47,11 +66,11 @@ class ChangedSequence:
 
 
 class CorruptedImages(ChangedSequence):
-    """A sequence with every image corrupted. Each frame and camera has its own random numbers."""
+    """A sequence with every image corrupted by `corrupt`. Each frame and camera has its own random numbers."""
 
-    def __init__(self, sequence: Sequence, corrupt: ImageCorruption, level: Level, draws: Draws) -> None:
-        super().__init__(sequence)
-        self._corrupt, self._level, self._draws = corrupt, level, draws
+    def __init__(self, *arguments: Any, corrupt: ImageCorruption) -> None:
+        super().__init__(*arguments)
+        self._corrupt = corrupt
 
     def change(self, place: int, frame: Frame) -> Frame:
         """The frame with corrupted images; the cameras are computed in parallel."""
@@ -59,25 +78,29 @@ class CorruptedImages(ChangedSequence):
 
         def corrupted(name: str) -> CameraImage:
             random = self._draws.generator(scene, frame.stamp.index, name)
-            pixels = self._corrupt(frame.images[name].pixels_bgr, self._level, random)
-            return replace(frame.images[name], pixels_bgr=pixels, encoded=None, media_type=None)
+            return _with_pixels(frame.images[name], self._corrupt(frame.images[name].pixels_bgr, self._level, random))
 
         with ThreadPoolExecutor(min(max(len(frame.images), 1), os.cpu_count() or 1)) as threads:
             images = dict(zip(frame.images, threads.map(corrupted, frame.images), strict=True))
         return replace(frame, images=images)
 
 
-class FrameStore:
-    """The memory that `KeptFrames` of several drives share.
+def _with_pixels(image: CameraImage, pixels_bgr: Pixels) -> CameraImage:
+    return replace(image, pixels_bgr=pixels_bgr, encoded=None, media_type=None)
 
-    limit: bytes of decoded images; frames beyond it are read again each time.
+
+@dataclass
+class FrameStore:
+    """The memory that `KeptFrames` of several drives share; frames beyond it are read again each time.
+
+    Attributes:
+        left: bytes of decoded images that still fit.
     """
 
-    def __init__(self, limit: int = KEPT_BYTES) -> None:
-        self.left = limit
+    left: int = KEPT_BYTES
 
 
-class KeptFrames(ChangedSequence):
+class KeptFrames(DerivedSequence):
     """A sequence that keeps its decoded frames while the memory lasts, because every condition needs them.
 
     The bytes of the image files are not kept.
@@ -92,8 +115,8 @@ class KeptFrames(ChangedSequence):
         """The frame at a place, from memory if it is there."""
         if place in self._frames:
             return self._frames[place]
-        frame = self._sequence.load(place)
-        images = {name: replace(image, encoded=None, media_type=None) for name, image in frame.images.items()}
+        frame = self.sequence.load(place)
+        images = {name: _with_pixels(image, image.pixels_bgr) for name, image in frame.images.items()}
         frame = replace(frame, images=images)
         size = sum(image.pixels_bgr.nbytes for image in images.values())
         if size <= self._store.left:
@@ -116,3 +139,143 @@ def at_lower_rate(sequence: Sequence, step: int) -> tuple[Sequence, ...]:
     """
     count = len(sequence.stamps)
     return tuple(select(sequence, range(start, count, step)) for start in range(min(step, count)))
+
+
+MOST_CRASHES = 5  # draws of cameras at the hardest level
+FRAME_LOST_PARTS = 6  # level L loses an image with probability L/6
+
+
+class LostImages(ChangedSequence):
+    """A sequence that loses images. A subclass overrides `lost`."""
+
+    def lost(self, frame: Frame) -> Collection[str]:
+        """The cameras whose images are lost."""
+        raise NotImplementedError
+
+    def change(self, place: int, frame: Frame) -> Frame:
+        """The frame without the lost images, or with black ones."""
+        lost = [name for name in frame.images if name in self.lost(frame)]
+        if self._lost_images == "missing":
+            kept = {name: image for name, image in frame.images.items() if name not in lost}
+            dropped = {**frame.dropped, **dict.fromkeys(lost, "lost by bevcli stress")}
+            return replace(frame, images=kept, dropped=dropped)
+        black = {name: _with_pixels(frame.images[name], np.zeros_like(frame.images[name].pixels_bgr)) for name in lost}
+        return replace(frame, images={**frame.images, **black})
+
+
+class CameraCrash(LostImages):
+    """Level L draws L cameras of the rig, with replacement; they deliver nothing for the whole scene."""
+
+    def lost(self, frame: Frame) -> Collection[str]:
+        """The crashed cameras of the scene."""
+        names = frame.rig.names
+        drawn = self._draws.generator(self.scene_key(frame.stamp)).integers(0, len(names), MOST_CRASHES)
+        return {names[index] for index in drawn[: self._level]}
+
+
+class FrameLost(LostImages):
+    """Level L loses each image with a probability of L/6, independently of the others."""
+
+    def lost(self, frame: Frame) -> Collection[str]:
+        """The cameras whose images of this frame are lost."""
+        scene, index = self.scene_key(frame.stamp), frame.stamp.index
+        limit = self._level / FRAME_LOST_PARTS
+        return {name for name in frame.rig.names if self._draws.generator(scene, index, name).random() < limit}
+
+
+class CalibrationNoise(ChangedSequence):
+    """A sequence whose cameras state wrong poses, the same ones for a whole scene.
+
+    `camera_pose_noise` describes the levels.
+    """
+
+    _noisy: tuple[CameraRig, str, CameraRig] | None = None
+
+    def change(self, place: int, frame: Frame) -> Frame:
+        """The frame with a noisy rig. Frames of a scene with one rig share one noisy rig."""
+        scene = self.scene_key(frame.stamp)
+        if self._noisy is None or self._noisy[0] is not frame.rig or self._noisy[1] != scene:
+            cameras = tuple(self._with_noise(camera, scene) for camera in frame.rig.cameras)
+            self._noisy = (frame.rig, scene, replace(frame.rig, cameras=cameras))
+        return replace(frame, rig=self._noisy[2])
+
+    def _with_noise(self, camera: Camera, scene: str) -> Camera:
+        noise = camera_pose_noise(self._level, self._draws.generator(scene, camera.name))
+        return replace(camera, ego_from_camera=camera.ego_from_camera @ noise)
+
+
+POSE_LOST_PARTS = 6  # level L loses a pose with probability L/6
+
+
+class TimeOffsets(ChangedSequence):
+    """A sequence whose cameras state wrong capture times: each camera is off by its own constant, for a whole scene.
+
+    Level L draws each offset uniformly from -L to L milliseconds. The pose of the vehicle at the camera's time is then
+    that of the wrong time: the vehicle is moved on with the frame's velocity and angular rate. Images stay.
+    """
+
+    def change(self, place: int, frame: Frame) -> Frame:
+        """The frame with wrong times and the poses at these times."""
+        scene = self.scene_key(frame.stamp)
+        draws = {name: self._draws.generator(scene, name).uniform(-1, 1) for name in frame.rig.names}
+        offsets_s = {name: self._level / 1000 * draw for name, draw in draws.items()}
+        poses = {
+            name: Pose.from_matrix(pose.matrix @ motion_during(offsets_s[name], frame.kinematics))
+            for name, pose in frame.world_from_ego_at.items()
+        }
+        images = {
+            name: replace(image, timestamp_ns=image.timestamp_ns + round(offsets_s[name] * 1e9))
+            for name, image in frame.images.items()
+        }
+        return replace(frame, world_from_ego_at=poses, images=images)
+
+
+class EgoMotionLost(ChangedSequence):
+    """A sequence in which poses do not arrive: the last pose and kinematics that arrived are used instead.
+
+    Level L loses the pose of a frame with a probability of L/6; the first frame of a scene keeps its pose. The ground
+    truth is moved with the pose, so that it stays where it is relative to the vehicle.
+    """
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._arrived: dict[int, tuple[Pose, Kinematics]] = {}
+
+    def change(self, place: int, frame: Frame) -> Frame:
+        """The frame with the last pose that arrived."""
+        last = self._last_arrived(place)
+        if last == place:
+            self._arrived[place] = frame.world_from_ego, frame.kinematics
+            return frame
+        if last not in self._arrived:
+            earlier = self.sequence.load(last)
+            self._arrived[last] = earlier.world_from_ego, earlier.kinematics
+        pose, kinematics = self._arrived[last]
+        stated_from_world = pose.matrix @ inverse(frame.world_from_ego.matrix)
+        truth = frame.ground_truth
+        return replace(
+            frame,
+            world_from_ego=pose,
+            world_from_ego_at=dict.fromkeys(frame.world_from_ego_at, pose),
+            kinematics=kinematics,
+            ground_truth=None if truth is None else truth.transformed(stated_from_world),
+        )
+
+    def _last_arrived(self, place: int) -> int:
+        stamps = self.stamps
+        while place > 0 and stamps[place - 1].scene == stamps[place].scene:
+            random = self._draws.generator(self.scene_key(stamps[place]), stamps[place].index)
+            if random.random() >= self._level / POSE_LOST_PARTS:
+                break
+            place -= 1
+        return place
+
+
+def motion_during(seconds: float, kinematics: Kinematics) -> Array:
+    """(4, 4) ego_from_later_ego: the motion of the vehicle during a time with constant velocity and angular rate.
+
+    seconds: negative for an earlier time.
+    """
+    turn, _ = cv2.Rodrigues(seconds * kinematics.angular_rate)
+    half_turn, _ = cv2.Rodrigues(seconds / 2 * kinematics.angular_rate)
+    return rigid(half_turn @ (seconds * np.asarray(kinematics.velocity)), turn)

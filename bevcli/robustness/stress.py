@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from collections.abc import Sequence as Items
-from dataclasses import dataclass
+import json
+from collections.abc import Callable, Iterator, Sequence as Items
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,36 +13,36 @@ from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import evaluate_detections
 from bevcli.frame import Sequence
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.pipeline.model_loading import Model
-from bevcli.pipeline.preprocess import Preprocessor
-from bevcli.pipeline.run_folder import RunFolder
-from bevcli.pipeline.run_state import saved_state
-from bevcli.pipeline.runner import Runner, StepOptions
-from bevcli.pipeline.state_file import load_state, save_state
-from bevcli.robustness.conditions import CORRUPTIONS, Condition, choose_conditions
-from bevcli.robustness.contact_sheet import SheetOptions
-from bevcli.robustness.lost_images import LostImage
-from bevcli.robustness.results import ConditionScores, StressResults
+from bevcli.inference.load import Model
+from bevcli.inference.preprocess import Preprocessor
+from bevcli.inference.runner import Runner, StepOptions
+from bevcli.robustness.conditions import Condition, choose_conditions
+from bevcli.robustness.options import StressOptions
+from bevcli.robustness.results import ConditionScores, StressResults, read_results
 from bevcli.robustness.sequences import FrameStore, KeptFrames, split_scenes
-from bevcli.robustness.stress_files import StressState, stress_facts, write_figures, write_results
+from bevcli.runs.folder import RunFolder, replace_file
+from bevcli.runs.state import digest, load_state, run_facts, save_state, saved_state, short_hash
 from bevcli.training.validation import boxes_ego
+
+RESULTS, SHEET, PLOT = "stress.json", "corruptions.png", "stress.png"
+_INPUT_FACTS = ("frames of the input", "calibration", "files of the input")
 
 
 @dataclass(frozen=True)
-class StressOptions:
-    """How a stress test is made.
+class StressState:
+    """A test after a number of finished conditions, for `resume`.
 
     Attributes:
-        seed: of all random numbers, 0 or greater.
-        lost_images: what the model gets for a lost image.
-        temporal: whether the previous BEV map is used.
-        max_range_m: boxes beyond this distance are ignored, metres; by default beyond the nearest side of the BEV grid.
+        facts: what the results depend on, see `run_facts`.
+        scores: of the finished conditions.
     """
 
-    seed: int = 0
-    lost_images: LostImage = "black"
-    temporal: bool = True
-    max_range_m: float | None = None
+    facts: dict[str, str]
+    scores: tuple[ConditionScores, ...] = ()
+
+    def has(self, condition: Condition) -> bool:
+        """True if a condition is finished."""
+        return any((each.corruption, each.severity) == (condition.name, condition.severity) for each in self.scores)
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,6 @@ def stress(
     out: Path,
     options: StressOptions = StressOptions(),
     *,
-    against: StressResults | None = None,
     force: bool = False,
     resume: bool = False,
     after_frame: Callable[[], None] = lambda: None,
@@ -88,7 +87,6 @@ def stress(
         out: the folder for stress.json and, when the test is complete, stress.png and corruptions.png; made where it is
             missing.
         options: see `StressOptions`.
-        against: another run's results, for corruption errors.
         force: remove the files that an earlier test wrote into `out`.
         resume: go on with an interrupted test; it may get further conditions.
         after_frame: called after each frame.
@@ -101,18 +99,19 @@ def stress(
             another one.
     """
     if force and resume:
-        raise OutputError("--force and --resume exclude each other: pass one of them")
+        raise OutputError("`force` and `resume` exclude each other: pass one of them")
     store = FrameStore()
     scenes = [KeptFrames(scene, store) for drive in drives for scene in split_scenes(drive)]
-    facts = stress_facts(model, drives, options)
+    against = None if options.against is None else read_results(options.against)
+    facts = _facts(model, drives, replace(options, against=None))
     with RunFolder(out, force=force, resume=resume) as folder:
-        state = saved_state(folder, facts, StressState, "a stress test") if resume else None
+        state = saved_state(folder, facts, StressState) if resume else None
         if state is None:
             folder.remove_written()
             state = StressState(facts)
             save_state(folder.state_path, state)
         test = _Test(model, scenes, options, folder, after_frame, should_stop)
-        header = test.header(facts)
+        header = test.header()
         done = test.done_frames(conditions, state)
         if done:
             resumed(done)
@@ -120,63 +119,53 @@ def stress(
         try:
             for condition in conditions:
                 if not state.has(condition):
-                    state = StressState(facts, _in_order((*state.scores, test.run(condition))))
+                    scores = (*state.scores, test.run(condition))
+                    state = StressState(facts, tuple(sorted(scores, key=_place_of)))
                     save_state(folder.state_path, state)
-                    write_results(folder, StressResults(header, state.scores, is_complete=False), against)
+                    _write_results(folder, StressResults(header, state.scores, is_complete=False), against)
                     test.remove_boxes(condition)
         except _Stopped:
             is_complete = False
         results = StressResults(header, state.scores, is_complete)
-        write_results(folder, results, against)
+        _write_results(folder, results, against)
         if is_complete:
-            shown = [each for each in choose_conditions() if state.has(each)]
-            sheet = SheetOptions(options.seed, options.lost_images, place=len(scenes[0].stamps) // 2)
-            write_figures(folder, results, against, scenes[0], shown, sheet)
+            _write_figures(folder, results, against, scenes[0], options)
     return results
 
 
+@dataclass
 class _Test:
     """One model, its scenes, and the folder in which finished scenes of the current condition are kept."""
 
-    def __init__(
-        self,
-        model: Model,
-        scenes: Items[Sequence],
-        options: StressOptions,
-        folder: RunFolder,
-        after_frame: Callable[[], None],
-        should_stop: Callable[[], bool],
-    ) -> None:
-        self._model, self._scenes, self._options, self._folder = model, scenes, options, folder
-        self._after_frame, self._should_stop = after_frame, should_stop
-        range_m = options.max_range_m or model.config.bev_grid.nearest_side_m
-        self._range_m = range_m
-        self._metrics = DetectionConfig().cut_at(range_m)
-        self._runner: Runner | None = None
+    model: Model
+    scenes: Items[Sequence]
+    options: StressOptions
+    folder: RunFolder
+    after_frame: Callable[[], None]
+    should_stop: Callable[[], bool]
+    runner: Runner | None = None
 
-    def header(self, facts: dict[str, str]) -> dict[str, Any]:
-        """What was tested, for stress.json. It names no folders, so that the file is the same everywhere."""
-        weights = self._model.weights
+    def __post_init__(self) -> None:
+        self.range_m = self.options.max_range_m or self.model.config.bev_grid.nearest_side_m
+        self.metrics = DetectionConfig().cut_at(self.range_m)
+
+    def header(self) -> dict[str, Any]:
+        """A description of the test for stress.json. It names no folders, so that the file is the same everywhere."""
+        weights = self.model.weights
         return {
-            "model": self._model.name,
-            "weights": {
-                "file": "random" if weights is None else weights.name,
-                "hash": facts["weights"].split(", ")[-1],
-            },
-            "precision": self._model.precision,
-            "temporal": self._options.temporal,
-            "seed": self._options.seed,
-            "lost_images": self._options.lost_images,
-            "max_range_m": self._range_m,
-            "drives": [
-                {"name": scene.name, "scene": scene.stamps[0].scene, "frames": len(scene.stamps)}
-                for scene in self._scenes
-            ],
+            "model": self.model.name,
+            "weights": {"file": weights.name if weights else "random", "hash": short_hash(self.model.weights_hash)},
+            "precision": self.model.precision,
+            "temporal": self.options.temporal,
+            "seed": self.options.seed,
+            "lost_images": self.options.lost_images,
+            "max_range_m": self.range_m,
+            "drives": [{"name": s.name, "scene": s.stamps[0].scene, "frames": len(s.stamps)} for s in self.scenes],
         }
 
     def done_frames(self, conditions: Items[Condition], state: StressState) -> int:
         """The number of frames of these conditions that need not be run again."""
-        each = [len(scene.stamps) for scene in self._scenes]
+        each = [len(scene.stamps) for scene in self.scenes]
         finished = sum(state.has(condition) for condition in conditions) * sum(each)
         kept = next((condition for condition in conditions if not state.has(condition)), None)
         if kept is None:
@@ -185,64 +174,82 @@ class _Test:
 
     def run(self, condition: Condition) -> ConditionScores:
         """The scores under a condition. Raises _Stopped."""
-        boxes = [self._scene_boxes(condition, place) for place in range(len(self._scenes))]
+        boxes = [self._scene_boxes(condition, place) for place in range(len(self.scenes))]
         predictions = [frame for scene in boxes for frame in scene.predictions]
         truths = [frame for scene in boxes for frame in scene.ground_truth]
-        table = evaluate_detections(predictions, truths, self._metrics).overall.of_classes_with_ground_truth()
+        table = evaluate_detections(predictions, truths, self.metrics).overall.of_classes_with_ground_truth()
         aps = {name: scores.mean_ap for name, scores in table.classes.items()}
         return ConditionScores(condition.name, condition.severity, table.mean_ap, table.nd_score, table.errors, aps)
 
     def remove_boxes(self, condition: Condition) -> None:
         """Removes the stored boxes of a finished condition."""
-        for place in range(len(self._scenes)):
+        for place in range(len(self.scenes)):
             self._boxes_path(condition, place).unlink(missing_ok=True)
 
     def _boxes_path(self, condition: Condition, place: int) -> Path:
         name = "-".join(("boxes", condition.name, condition.severity or "0", str(place)))
-        return self._folder.state_path.with_name(f"{name}.safetensors")
+        return self.folder.state_path.with_name(f"{name}.safetensors")
 
     def _scene_boxes(self, condition: Condition, place: int) -> SceneBoxes:
         """The boxes of a scene: read if they are there already, else computed and stored."""
         path = self._boxes_path(condition, place)
         if path.exists():
-            kept: SceneBoxes = load_state(path)
-            return kept
-        scene = self._scenes[place]
-        parts = [
-            self._run_sequence(part)
-            for part in condition.sequences(scene, self._options.seed, self._options.lost_images)
-        ]
-        boxes = SceneBoxes(
-            tuple(frame for part in parts for frame in part.predictions),
-            tuple(frame for part in parts for frame in part.ground_truth),
-        )
-        if not boxes.ground_truth:
+            return load_state(path, SceneBoxes)
+        scene, frames = self.scenes[place], list[tuple[Boxes3D, Boxes3D]]()
+        for part in condition.sequences(scene, self.options.seed, self.options.lost_images):
+            frames += self._run_sequence(part)
+        if not frames:
             raise InputError(f"{scene.name}: has no ground truth (expected boxes to score against)")
-        self._folder.add(path)
+        boxes = SceneBoxes(*zip(*frames, strict=True))
+        self.folder.add(path)
         save_state(path, boxes)
         return boxes
 
-    def _run_sequence(self, sequence: Sequence) -> SceneBoxes:
-        model = self._model
-        if self._runner is None:
-            self._runner = Runner(model.prepared, model.device, StepOptions(model.precision, self._options.temporal))
-        predictions, truths = [], []
-        steps = self._runner.run(sequence, range(len(sequence.stamps)), Preprocessor(model.config))
+    def _run_sequence(self, sequence: Sequence) -> Iterator[tuple[Boxes3D, Boxes3D]]:
+        """The predicted boxes and the ground truth of each frame that has any."""
+        model = self.model
+        if self.runner is None:
+            self.runner = Runner(model.prepared, model.device, StepOptions(model.precision, self.options.temporal))
+        steps = self.runner.run(sequence, range(len(sequence.stamps)), Preprocessor(model.config))
         for frame, prediction, _ in steps:
             if frame.ground_truth is not None:
-                predicted, truth = boxes_ego(frame, frame.ground_truth, prediction)
-                predictions.append(predicted)
-                truths.append(truth)
-            self._after_frame()
-            if self._should_stop():
+                yield boxes_ego(frame, frame.ground_truth, prediction)
+            self.after_frame()
+            if self.should_stop():
                 raise _Stopped
-        return SceneBoxes(tuple(predictions), tuple(truths))
 
 
-def _in_order(scores: Items[ConditionScores]) -> tuple[ConditionScores, ...]:
+def _place_of(scores: ConditionScores) -> int:
     """Clean first, then as in CORRUPTIONS."""
-    order = {("clean", ""): -1}
-    for corruption in CORRUPTIONS:
-        for severity in corruption.levels:
-            order[corruption.name, severity] = len(order)
-    return tuple(sorted(scores, key=lambda each: order[each.corruption, each.severity]))
+    order = [(each.name, each.severity) for each in choose_conditions()]
+    return order.index((scores.corruption, scores.severity))
+
+
+def _facts(model: Model, drives: Items[Sequence], options: StressOptions) -> dict[str, str]:
+    """The facts that the results depend on, apart from the conditions."""
+    each = [run_facts(model, drive, options) for drive in drives]
+    facts = dict(each[0])
+    if len(each) > 1:
+        facts |= {name: digest(tuple(one[name] for one in each))[:12] for name in _INPUT_FACTS}
+    return facts | {"drives": ", ".join(drive.name for drive in drives)}
+
+
+def _write_results(folder: RunFolder, results: StressResults, against: StressResults | None) -> None:
+    path = folder.path / RESULTS
+    folder.add(path)
+    replace_file(path, (json.dumps(results.to_dict(against), indent=1) + "\n").encode())
+
+
+def _write_figures(
+    folder: RunFolder, results: StressResults, against: StressResults | None, scene: Sequence, options: StressOptions
+) -> None:
+    """Writes the plot, and a contact sheet of a scene."""
+    from bevcli.evaluation.plots import save_figures  # only plots need matplotlib
+    from bevcli.robustness.report import draw_stress, write_contact_sheet
+
+    folder.add(folder.path / SHEET)
+    conditions = [each for each in choose_conditions() if each.severity in results.of(each.name)]
+    write_contact_sheet(folder.path / SHEET, scene, conditions, options)
+    if results.tested():
+        folder.add(folder.path / PLOT)
+        save_figures({PLOT: draw_stress(results, against)}, folder.path)

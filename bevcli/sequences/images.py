@@ -1,21 +1,24 @@
-"""Reads the images of a frame from files or videos and decodes them in parallel."""
+"""A listed frame -> a Frame: its images, read from files or videos and decoded in parallel, and its poses."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeAlias
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import CameraImage
+from bevcli.frame import BevMap, CameraImage, Frame, FrameStamp
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.geometry.ego_motion import GRAVITY, Kinematics
+from bevcli.geometry.transforms import Pose
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.parsing.images import decode_image, media_type_of, size_of_image
 from bevcli.sequences.video import VideoReader
@@ -29,11 +32,12 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".webm", ".mov", ".m4v")
 # The calibration refers to the pixels as they are stored, so an EXIF orientation must not rotate them.
 DECODE_FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+AT_REST = Kinematics(np.array([0.0, 0.0, GRAVITY]), np.zeros(3), np.zeros(3))
 
 
 @dataclass(frozen=True)
 class ImageSource:
-    """Where one image is, and when it was taken.
+    """The place and the time of one image.
 
     Attributes:
         path: an image file or a video.
@@ -53,24 +57,25 @@ class UnreadableImage(Exception):
     """An image is missing or broken. The message is the reason."""
 
 
-class Source(Protocol):
-    """Where one image is: an `ImageSource`, or one of another format, which reads itself.
+@dataclass(frozen=True)
+class MessageSource:
+    """One image of another format, which reads itself.
 
     Attributes:
+        name: of the file and the image in it, for messages.
         timestamp_ns: time of the image, at least roughly.
+        read: reads the image; may be called from several threads. Raises UnreadableImage.
     """
 
-    @property
-    def timestamp_ns(self) -> int: ...
+    name: str
+    timestamp_ns: int
+    read: Callable[[], CameraImage]
+
+    def __str__(self) -> str:
+        return self.name
 
 
-@runtime_checkable
-class ReadableSource(Protocol):
-    """A source that reads its own image. It may be used from several threads."""
-
-    def read(self) -> CameraImage:
-        """The image. Raises UnreadableImage."""
-        ...
+Source: TypeAlias = ImageSource | MessageSource
 
 
 class ImageReader:
@@ -98,7 +103,7 @@ class ImageReader:
         """
         if self._strict and dropped:
             camera, reason = next(iter(dropped.items()))
-            raise InputError(f"camera {camera}: {reason}: add the image, or remove --strict")
+            raise InputError(f"camera {camera}: {reason}: add the image, or remove `strict=True`")
         tasks = {name: self._threads.submit(self._read_one, source, rig[name]) for name, source in sources.items()}
         images: dict[str, CameraImage] = {}
         reasons = dict(dropped)
@@ -107,28 +112,22 @@ class ImageReader:
                 images[name] = result_within(task, READING_TIMEOUT_S, f"{sources[name]}: reading the image")
             except UnreadableImage as unreadable:
                 if self._strict:
-                    hint = "replace the image, or remove --strict"
+                    hint = "replace the image, or remove `strict=True`"
                     raise InputError(f"camera {name}: {unreadable}: {hint}") from None
                 reasons[name] = str(unreadable)
         return images, reasons
 
     def _read_one(self, source: Source, camera: Camera) -> CameraImage:
-        if isinstance(source, ReadableSource):
-            image = source.read()
-            self._check_size(source, camera, (image.pixels_bgr.shape[1], image.pixels_bgr.shape[0]))
-            self._fitting.add(camera.name)
-            return image
-        if not isinstance(source, ImageSource):
-            raise TypeError(f"{source} is not an image source")
-        self._check_place(source)
-        if source.video_index is None:
+        if isinstance(source, ImageSource):
+            self._check_place(source)
+        if isinstance(source, ImageSource) and source.video_index is None:
             encoded, size = _read_file(source, camera)
             self._check_size(source, camera, size)
             image = _decode(source, encoded, size)
         else:
-            pixels = self._read_video(source, camera.name)
-            self._check_size(source, camera, (pixels.shape[1], pixels.shape[0]))
-            image = CameraImage(source.timestamp_ns, pixels)
+            image = source.read() if isinstance(source, MessageSource) else self._read_video(source, camera.name)
+            height, width = image.pixels_bgr.shape[:2]
+            self._check_size(source, camera, (width, height))
         self._fitting.add(camera.name)
         return image
 
@@ -142,7 +141,8 @@ class ImageReader:
             raise UnreadableImage(f"{str(source.path)!r} is not a file name") from None
         if os.path.commonpath((path, self._inside)) != self._inside:
             raise InputError(
-                f"{source.path}: leads out of the folder {self._inside} (to {path}): pass --allow-outside to read it"
+                f"{source.path}: leads out of the folder {self._inside} (to {path}): pass "
+                "`allow_outside=True` to read it"
             )
 
     def _check_size(self, source: Source, camera: Camera, size: tuple[int, int]) -> None:
@@ -154,13 +154,13 @@ class ImageReader:
             raise UnreadableImage(f"{source}: {found}")
         raise InputError(f"{source}: camera {camera.name}: {found}: use the calibration of this image size")
 
-    def _read_video(self, source: ImageSource, camera: str) -> NDArray[np.uint8]:
+    def _read_video(self, source: ImageSource, camera: str) -> CameraImage:
         reader = self._videos.get(camera)
         if reader is None or reader.path != source.path:
             reader = self._videos[camera] = VideoReader(source.path)
         assert source.video_index is not None
         try:
-            return reader.read(source.video_index)
+            return CameraImage(source.timestamp_ns, reader.read(source.video_index))
         except InputError as error:
             raise UnreadableImage(str(error)) from None
 
@@ -190,3 +190,66 @@ def _decode(source: ImageSource, encoded: bytes, size: tuple[int, int]) -> Camer
     if pixels is None:
         raise UnreadableImage(f"{source.path} is not a complete image")
     return CameraImage(source.timestamp_ns, pixels.astype(np.uint8, copy=False), encoded, media_type_of(encoded))
+
+
+@dataclass(frozen=True)
+class FrameEntry:
+    """One frame before its images are read. Each camera is in `sources` or in `dropped`.
+
+    Attributes:
+        stamp: index, scene and time of the frame.
+        sources: location of the image, by camera.
+        dropped: reason why there is no image, by camera.
+        origin: where the frame is listed, such as "frames.csv: line 3", for error messages.
+    """
+
+    stamp: FrameStamp
+    sources: Mapping[str, Source]
+    dropped: Mapping[str, str]
+    origin: str
+
+
+class Motion(Protocol):
+    """The vehicle's poses over time, such as `EgoMotion`."""
+
+    def pose_at(self, timestamp_ns: int) -> Pose:
+        """world_from_ego at a time."""
+        ...
+
+    def kinematics_at(self, timestamp_ns: int) -> Kinematics:
+        """Acceleration, angular rate and velocity at a time."""
+        ...
+
+
+def read_frame(
+    entry: FrameEntry,
+    rig: CameraRig,
+    reader: ImageReader,
+    motion: Motion | None,
+    ground_truth: Boxes3D | None = None,
+    ground_truth_map: BevMap | None = None,
+) -> Frame:
+    """The frame of an entry, with decoded images. Without motion, poses are the identity, and the vehicle is at rest.
+
+    Raises InputError as `ImageReader.read`, and for a time that the motion does not cover.
+    """
+    images, dropped = reader.read(entry.sources, rig, entry.dropped)
+    frame_ns = entry.stamp.timestamp_ns
+    times = dict.fromkeys(rig.names, frame_ns)
+    times |= {name: source.timestamp_ns for name, source in entry.sources.items()}
+    times |= {name: image.timestamp_ns for name, image in images.items()}
+
+    def pose_at(time: int) -> Pose:
+        return Pose.identity() if motion is None else motion.pose_at(time)
+
+    return Frame(
+        stamp=entry.stamp,
+        rig=rig,
+        images=images,
+        world_from_ego=pose_at(frame_ns),
+        world_from_ego_at={name: pose_at(time) for name, time in times.items()},
+        kinematics=AT_REST if motion is None else motion.kinematics_at(frame_ns),
+        dropped=dropped,
+        ground_truth=ground_truth,
+        ground_truth_map=ground_truth_map,
+    )

@@ -2,53 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from collections.abc import Sequence as Indices
+from collections.abc import Iterator, Sequence as Indices
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.frame import Frame, FrameStamp, Sequence, facts_of
+from bevcli.frame import DerivedSequence, Frame, FrameStamp, Sequence
 
 # A scene counts as having the wanted rate if the ratio of its rate to it is in this range: keyframe times jitter.
 SLOWEST_RATIO, FASTEST_RATIO = 0.75, 1.5
 LONGEST_GAP_PERIODS = 1.5  # a longer gap between two frames, in periods of the wanted rate, is a hole in the recording
 
 
-class Selection:
-    """The frames of another sequence at some of its indices, as a `Sequence`."""
+class Selection(DerivedSequence):
+    """The frames of another sequence at some of its indices."""
 
     def __init__(self, sequence: Sequence, indices: Indices[int], notes: tuple[str, ...] = ()) -> None:
-        self._sequence = sequence
+        super().__init__(sequence)
         self._indices = tuple(indices)
-        self.name = sequence.name
-        self.rig = sequence.rig
-        self.has_ego_motion = sequence.has_ego_motion
-        self.facts = facts_of(sequence)
+        self.stamps = tuple(sequence.stamps[index] for index in self._indices)
         self.notes = (*sequence.notes, *notes)
-        self.input_files: tuple[Path, ...] = getattr(sequence, "input_files", ())
 
-    @property
-    def stamps(self) -> tuple[FrameStamp, ...]:
-        """Index, scene and time of each frame, in order."""
-        stamps = self._sequence.stamps
-        return tuple(stamps[index] for index in self._indices)
+    def image_files(self, place: int) -> tuple[Path, ...]:
+        """Those of the frame at position `place` of the selection."""
+        return self.sequence.image_files(self._indices[place])
 
     def load(self, place: int) -> Frame:
         """The frame at position `place` of the selection, with decoded images."""
-        return self._sequence.load(self._indices[place])
+        return self.sequence.load(self._indices[place])
 
 
-class WithoutGroundTruth(Selection):
+class WithoutGroundTruth(DerivedSequence):
     """A sequence without its ground truth."""
 
-    def __init__(self, sequence: Sequence) -> None:
-        super().__init__(sequence, range(len(sequence.stamps)))
-
     def load(self, place: int) -> Frame:
-        """The frame at position `place`, without boxes and map."""
+        """The frame at a place, without boxes and map."""
         return replace(super().load(place), ground_truth=None, ground_truth_map=None)
 
 
@@ -78,7 +68,7 @@ def select_range(sequence: Sequence, frames: slice) -> Sequence:
     if not indices:
         start, stop = ("" if end is None else end for end in (frames.start, frames.stop))
         count = len(sequence.stamps)
-        raise InputError(f"--frames {start}:{stop}: the range has no frame (the sequence has {count}: 0:{count})")
+        raise InputError(f"`frames={start}:{stop}`: the range has no frame (the sequence has {count}: 0:{count})")
     return select(sequence, indices)
 
 
@@ -143,7 +133,10 @@ def _nearest_in_piece(seconds: np.ndarray, rate_hz: float) -> np.ndarray:
 
 def _rate_notes(total: int, kept: int, slowest_ratio: float, rate_hz: float) -> Iterator[str]:
     if kept < total:
-        yield f"{kept} of {total} frames are used, at about {rate_hz:g} frames per second (--rate all uses every frame)"
+        yield (
+            f"{kept} of {total} frames are used, at about {rate_hz:g} frames per second "
+            '(`rate_hz="all"` uses every frame)'
+        )
     if slowest_ratio < SLOWEST_RATIO:
         yield (
             f"the input has {slowest_ratio * rate_hz:.2g} frames per second, fewer than the model's {rate_hz:g}: "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,12 +26,7 @@ SMALLEST_IMAGE = 8  # bytes of a container for each of its images, at least
 
 @dataclass(frozen=True)
 class VideoFacts:
-    """Facts from the container of a video.
-
-    Attributes:
-        count: number of images.
-        rate_hz: images per second.
-    """
+    """Number of images and images per second of a video, as its container states them."""
 
     count: int
     rate_hz: float
@@ -58,15 +54,19 @@ class VideoReader:
         if index == self._at and self._pixels is not None:
             return self._pixels
         while self._at < index:
-            if not _grab(self._capture):
+            grabbed = False
+            with contextlib.suppress(cv2.error):  # a damaged stream
+                grabbed = self._capture.grab()
+            if not grabbed:
                 self._end, self._capture = self._at + 1, None
                 raise InputError(f"{self.path} has no image {index} (the last is {self._end - 1})")
             self._at += 1
-        pixels = _retrieve(self._capture)
-        if pixels is None:
-            raise InputError(f"{self.path}: image {index} cannot be decoded")
-        self._pixels = pixels.astype(np.uint8, copy=False)
-        return self._pixels
+        with contextlib.suppress(cv2.error):
+            readable, pixels = self._capture.retrieve()
+            if readable:
+                self._pixels = pixels.astype(np.uint8, copy=False)
+                return self._pixels
+        raise InputError(f"{self.path}: image {index} cannot be decoded")
 
 
 def open_capture(path: Path) -> cv2.VideoCapture:
@@ -87,21 +87,6 @@ def open_capture(path: Path) -> cv2.VideoCapture:
         capture.release()
         raise InputError(f"{path} has images of {width:.0f}x{height:.0f} (expected at most {MOST_PIXELS} pixels)")
     return capture
-
-
-def _grab(capture: cv2.VideoCapture) -> bool:
-    try:
-        return capture.grab()
-    except cv2.error:  # a damaged stream
-        return False
-
-
-def _retrieve(capture: cv2.VideoCapture) -> NDArray | None:
-    try:
-        readable, pixels = capture.retrieve()
-    except cv2.error:
-        return None
-    return pixels if readable else None
 
 
 def video_facts(path: Path) -> VideoFacts:

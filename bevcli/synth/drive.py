@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,62 +17,30 @@ from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid, rotation_about_z
 from bevcli.synth.assets.catalog import Assets, Body
 from bevcli.synth.assets.triangles import MeshTemplate, PlacedMesh, TriangleSoup
-from bevcli.synth.render.bev_map import MapWindow, draw_map
-from bevcli.synth.render.ground_texture import GroundTexture, paint_ground
+from bevcli.synth.render.ground import GroundTexture, MapWindow, draw_map, paint_ground
+from bevcli.synth.render.rasteriser import ShadowMap
 from bevcli.synth.render.renderer import RenderedView, WorldSnapshot, render_view
-from bevcli.synth.render.shadow_map import ShadowMap
 from bevcli.synth.rig import nuscenes_like_rig
-from bevcli.synth.world.actors import Actor, ActorState
 from bevcli.synth.world.city import CityPlan
 from bevcli.synth.world.ground_plan import GroundPlan
 from bevcli.synth.world.scenery import Scenery, signal_meshes
 from bevcli.synth.world.simulation import Simulation
+from bevcli.synth.world.traffic import Actor, ActorState
 from bevcli.synth.world.weather import WEATHER_NAMES, make_weather
 
 ANNOTATED_M = 60.0  # boxes are kept within this distance of the origin of the bev frame
 ACTORS_M = 66.0  # actors are drawn within this distance
 SCENERY_M = 135.0  # scenery is drawn within this distance
+NEAR_GROUND_M = 112.0  # side of the square that the ground texture and the shadow map cover at least
 SNAP_M = 24.0  # scenery, ground and shadows are made again when the vehicle has moved about this far
 FIRST_TIMESTAMP_NS = 1_700_000_000_000_000_000
 
 
-@dataclass(frozen=True)
-class TextureDetail:
-    """How fine the ground texture and the shadow map are.
-
-    Attributes:
-        ground_m: size of a texel of the ground, metres.
-        shadow_m: size of a texel of the shadow map, metres.
-        extent_m: side of the square that both cover at least, metres.
-    """
-
-    ground_m: float
-    shadow_m: float
-    extent_m: float
-
-    @staticmethod
-    def for_width(width: int) -> TextureDetail:
-        """The detail that suits images of a width in pixels."""
-        if width <= 500:
-            return TextureDetail(0.125, 0.16, 112.0)
-        return TextureDetail(0.06, 0.08, 112.0) if width <= 1000 else TextureDetail(0.04, 0.06, 112.0)
-
-
-@dataclass(frozen=True)
-class Surroundings:
-    """Everything around a point that does not move.
-
-    Attributes:
-        center: the point, world, metres.
-        scenery: triangles of the scenery.
-        ground: texture of the ground.
-        shadows: shadow map of the scenery.
-    """
-
-    center: tuple[float, float]
-    scenery: TriangleSoup
-    ground: GroundTexture
-    shadows: ShadowMap
+def texel_sizes(width: int) -> tuple[float, float]:
+    """The texel sizes of the ground texture and the shadow map, metres, that suit images of a width in pixels."""
+    if width <= 500:
+        return 0.125, 0.16
+    return (0.06, 0.08) if width <= 1000 else (0.04, 0.06)
 
 
 @dataclass(frozen=True)
@@ -145,9 +114,9 @@ class RenderedDrive:
         self.weather = make_weather(name, self._city.stream("weather"))
         self.simulation = Simulation(self._city, self._assets.catalog, frames / rate_hz)
         self._ground = GroundPlan(self._city)
-        self._detail = TextureDetail.for_width(max(camera.width for camera in self.rig.cameras) * supersampling)
+        self._texels_m = texel_sizes(max(camera.width for camera in self.rig.cameras) * supersampling)
         self._scenery = Scenery(self._city, self._assets.furniture)
-        self._around: Surroundings | None = None
+        self._around = lru_cache(maxsize=1)(self._make_surroundings)
         self._templates: dict[tuple[str, int], MeshTemplate] = {}
         self._placed: dict[tuple[str, int], tuple[PlacedMesh, tuple[float, ...]]] = {}
 
@@ -204,9 +173,8 @@ class RenderedDrive:
             # An object that has gone in the meantime is drawn where it was.
             seen = [state if moved is None else moved for state, moved in zip(states, later, strict=True)]
             names = [name for name in self.rig.names if delays[name] == delay]
-            views |= self._render_views(
-                names, seen, self.world_from_ego(time_s + delay), time_s + delay, pose.translation[:2]
-            )
+            there = self.world_from_ego(time_s + delay)
+            views |= self._render_views(names, seen, there, time_s + delay, pose.translation[:2])
         views = {name: views[name] for name in self.rig.names}
         boxes = self._boxes(states, views, pose)
         bev_from_world = inverse(pose.matrix @ self.rig.ego_from_bev)
@@ -223,14 +191,14 @@ class RenderedDrive:
 
         here: (2,) world, metres, the point around which the scenery is made.
         """
-        around = self._surroundings(here)
+        # Those of the nearest point of a grid with SNAP_M spacing, so that they are rarely made again.
+        scenery, ground, shadows = self._around(*(float(np.round(at / SNAP_M) * SNAP_M) for at in here))
         near_first = np.argsort([np.hypot(*(state.position[:2] - here)) for state in states], kind="stable")
         actors = [self._place(states[k]) for k in near_first]
         signals = signal_meshes(self._city, self.simulation.signals, self._assets.furniture, here, time_s)
         moving = TriangleSoup.gather([*actors, *signals], [*near_first.tolist(), *[-1] * len(signals)])
-        soup = around.scenery.joined(moving)
-        shadows = around.shadows.with_shadows_of([moving.triangles.corners, self._ego_corners(world_from_ego)])
-        snapshot = WorldSnapshot(soup, len(actors), around.ground, shadows, self.weather)
+        shadows = shadows.with_shadows_of([moving.triangles.corners, self._ego_corners(world_from_ego)])
+        snapshot = WorldSnapshot(scenery.joined(moving), len(actors), ground, shadows, self.weather)
 
         def render_one(name: str) -> RenderedView:
             return render_view(snapshot, self.rig[name], world_from_ego.matrix, self._supersampling)
@@ -240,19 +208,13 @@ class RenderedDrive:
         with ThreadPoolExecutor(self._threads) as pool:
             return dict(zip(names, pool.map(render_one, names), strict=True))
 
-    def _surroundings(self, here: Array) -> Surroundings:
-        """The surroundings of the nearest point of a grid with SNAP_M spacing, so that they are rarely made again."""
-        center = (float(np.round(here[0] / SNAP_M) * SNAP_M), float(np.round(here[1] / SNAP_M) * SNAP_M))
-        if self._around is None or self._around.center != center:
-            extent = self._detail.extent_m + SNAP_M
-            pieces = self._ground.pieces_around(center, extent * 0.71)
-            texture = paint_ground(pieces, center, extent, self._detail.ground_m)
-            scenery = self._scenery.around(center, SCENERY_M)
-            shadows = ShadowMap.of(
-                scenery.triangles.corners, self.weather.to_sun, center, extent, self._detail.shadow_m
-            )
-            self._around = Surroundings(center, scenery, texture, shadows)
-        return self._around
+    def _make_surroundings(self, x: float, y: float) -> tuple[TriangleSoup, GroundTexture, ShadowMap]:
+        """The scenery around a world point, the texture of the ground, and the shadow map of the scenery."""
+        center, extent, (ground_m, shadow_m) = (x, y), NEAR_GROUND_M + SNAP_M, self._texels_m
+        texture = paint_ground(self._ground.pieces_around(center, extent * 0.71), center, extent, ground_m)
+        scenery = self._scenery.around(center, SCENERY_M)
+        shadows = ShadowMap.of(scenery.triangles.corners, self.weather.to_sun, center, extent, shadow_m)
+        return scenery, texture, shadows
 
     def _place(self, state: ActorState) -> PlacedMesh:
         """The mesh of an actor in the world; kept while the actor stands still."""
@@ -284,9 +246,8 @@ class RenderedDrive:
         visible = sum(view.visible for view in views.values())
         unoccluded = sum(view.unoccluded for view in views.values())
         sizes = np.stack([s.body.size_lwh for s in states])
-        centers = np.stack([s.position for s in states]) + np.column_stack(
-            [np.zeros((len(states), 2)), sizes[:, 2] / 2]
-        )
+        centers = np.stack([s.position for s in states])
+        centers[:, 2] += sizes[:, 2] / 2
         boxes = Boxes3D(
             centers, sizes, np.array([s.yaw for s in states]), np.stack([s.velocity for s in states]),
             np.array([s.body.variant.class_name for s in states]),

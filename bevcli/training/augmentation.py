@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bevcli.frame import CameraImage, Frame
-from bevcli.geometry.cameras import Camera, CameraRig
-from bevcli.geometry.pose_noise import camera_pose_noise
+from bevcli.geometry.cameras import Camera, CameraRig, camera_pose_noise
 from bevcli.geometry.transforms import Array
 
 MAX_BRIGHTNESS = 32.0  # added to pixel values of 0 to 255
@@ -60,7 +59,7 @@ class AugmentationConfig:
 
 
 class ImageVariation:
-    """How the cameras of one clip see: exposure, white balance and noise, drawn once; missing images."""
+    """Exposure, white balance and noise of the cameras of one clip, drawn once; missing images."""
 
     def __init__(self, config: AugmentationConfig, random: np.random.Generator) -> None:
         self._config, self._random = config, random

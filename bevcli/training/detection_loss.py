@@ -1,20 +1,109 @@
-"""The detection loss: Hungarian matching, then focal and L1 loss, after each decoder layer, as published."""
+"""The detection loss: targets, Hungarian matching, then focal and L1 loss after each decoder layer, as published."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
-from bevcli.training.detection_targets import DetectionTargets
-from bevcli.training.focal_loss import focal_cost, focal_loss
-from bevcli.training.hungarian_matching import hungarian_matching
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.model.box_coding import encode
+from bevcli.model.config import ModelConfig
 
+ALPHA, GAMMA = 0.25, 2.0  # of the focal loss (Lin et al. 2017)
+UNUSABLE_COST = 1e5  # replaces a cost that is not finite, so that such a pair is chosen last
 VELOCITY_START = 8  # entries 8 and 9 of a box code are vx and vy
 MIN_MOVING_MPS = 0.5  # slower objects count as stationary
+
+
+@dataclass(frozen=True)
+class DetectionTargets:
+    """The G ground truth boxes of one frame.
+
+    Attributes:
+        labels: (G,) int64, indices into the model's classes.
+        codes: (G, 10) float32 box codes (see `bevcli.model.box_coding`); unknown velocities are NaN.
+    """
+
+    labels: Tensor
+    codes: Tensor
+
+    def to(self, device: torch.device) -> DetectionTargets:
+        """A copy on a device."""
+        return DetectionTargets(self.labels.to(device), self.codes.to(device))
+
+
+def detection_targets(boxes: Boxes3D, config: ModelConfig) -> DetectionTargets:
+    """Targets from the boxes that have one of the model's classes, a centre inside the BEV grid, and visible points.
+
+    Args:
+        boxes: ground truth in the bev frame.
+    """
+    return box_targets(boxes[in_range(boxes, config)], config.classes)
+
+
+def box_targets(boxes: Boxes3D, classes: tuple[str, ...]) -> DetectionTargets:
+    """Targets from all boxes that have one of the classes and visible points.
+
+    Args:
+        boxes: ground truth in the bev frame.
+    """
+    kept = boxes[np.isin(boxes.classes, classes) & has_points(boxes)]
+    labels = [classes.index(name) for name in kept.classes]
+    return DetectionTargets(torch.tensor(labels, dtype=torch.int64), torch.from_numpy(encode(kept)).float())
+
+
+def has_points(boxes: Boxes3D) -> NDArray[np.bool_]:
+    """(N,) bool, false where the ground truth counts 0 points; boxes without a count are kept."""
+    return np.ones(len(boxes), dtype=bool) if boxes.num_points is None else boxes.num_points != 0
+
+
+def in_range(boxes: Boxes3D, config: ModelConfig) -> NDArray[np.bool_]:
+    """(N,) bool: whether the centre (bev frame) lies in the model's x, y and z range."""
+    grid = config.bev_grid
+    low, high = np.array([grid.x_range_m, grid.y_range_m, grid.z_range_m]).T
+    return ((boxes.centers >= low) & (boxes.centers <= high)).all(-1)
+
+
+def focal_loss(logits: Tensor, targets: Tensor) -> Tensor:
+    """Elementwise focal loss, not reduced. Positives have weight ALPHA, negatives 1 - ALPHA.
+
+    Args:
+        logits: any shape.
+        targets: the same shape, 0 or 1.
+    """
+    probability = logits.sigmoid()
+    probability_of_target = probability * targets + (1 - probability) * (1 - targets)
+    weight = ALPHA * targets + (1 - ALPHA) * (1 - targets)
+    cross_entropy = F.binary_cross_entropy_with_logits(logits, targets, reduction="none")
+    return weight * (1 - probability_of_target) ** GAMMA * cross_entropy
+
+
+def focal_cost(logits: Tensor) -> Tensor:
+    """Focal loss as a positive minus focal loss as a negative; elementwise, negative for confident positives."""
+    probability = logits.sigmoid()
+    positive = -F.logsigmoid(logits) * ALPHA * (1 - probability) ** GAMMA
+    negative = -F.logsigmoid(-logits) * (1 - ALPHA) * probability**GAMMA
+    return positive - negative
+
+
+def hungarian_matching(costs: Tensor) -> tuple[Tensor, Tensor]:
+    """The one-to-one assignment with the smallest sum of costs: (K,) int64 query and (K,) ground truth indices.
+
+    The K = min(Q, G) pairs are sorted by query.
+
+    Args:
+        costs: (Q, G) cost of assigning each query to each ground truth object. The result is on its device.
+    """
+    finite = costs.detach().double().cpu().nan_to_num(UNUSABLE_COST, UNUSABLE_COST, -UNUSABLE_COST)
+    queries, truths = (torch.as_tensor(indices, device=costs.device) for indices in linear_sum_assignment(finite))
+    return queries, truths
 
 
 @dataclass(frozen=True)
@@ -41,7 +130,7 @@ class DetectionLossConfig:
 
 @dataclass(frozen=True)
 class DetectionLoss:
-    """Weighted scalar losses, summed over the decoder layers.
+    """Weighted scalar losses, summed over the decoder layers where there are several.
 
     Attributes:
         classes: () focal loss of the classes.
@@ -121,10 +210,10 @@ def _layer_loss(
     class_targets = torch.zeros_like(class_logits)  # (B, Q, classes)
     predicted, truths = [], []
     for element, truth in enumerate(targets):
-        pairs = hungarian_matching(matching_costs(class_logits[element], box_codes[element], truth, config))
-        class_targets[element, pairs.queries, truth.labels[pairs.truths]] = 1
-        predicted.append(box_codes[element, pairs.queries])
-        truths.append(truth.codes[pairs.truths])
+        queries, objects = hungarian_matching(matching_costs(class_logits[element], box_codes[element], truth, config))
+        class_targets[element, queries, truth.labels[objects]] = 1
+        predicted.append(box_codes[element, queries])
+        truths.append(truth.codes[objects])
     classes = config.class_weight * focal_loss(class_logits, class_targets).sum()
     boxes = config.box_weight * box_loss(torch.cat(predicted), torch.cat(truths), config)
     return torch.stack([classes, boxes]) / max(sum(map(len, predicted)), 1)

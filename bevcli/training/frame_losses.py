@@ -3,19 +3,110 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+import torch
 from torch import Tensor, nn
 
-from bevcli.model.bevformer import BEVFormerBase, BEVFormerInputs, BEVFormerOutputs
-from bevcli.training.dense_loss import DenseHead, DenseLossConfig, dense_loss
-from bevcli.training.detection_loss import DetectionLossConfig, detection_loss
-from bevcli.training.perspective_head import PerspectiveHead
-from bevcli.training.perspective_loss import PerspectiveLossConfig, perspective_loss
+from bevcli.geometry.bev_grid import BevGrid
+from bevcli.model.decoder import BOX_CODE_SIZE
+from bevcli.model.network import Network
+from bevcli.model.step import ModelInputs, ModelOutputs
+from bevcli.training.detection_loss import (
+    DetectionLoss,
+    DetectionLossConfig,
+    DetectionTargets,
+    box_loss,
+    detection_loss,
+    focal_loss,
+)
+from bevcli.training.perspective_loss import PerspectiveHead, PerspectiveLossConfig, perspective_loss
 from bevcli.training.samples import Targets
 from bevcli.training.segmentation_loss import SegmentationLossConfig, segmentation_loss
+
+
+@dataclass(frozen=True)
+class DenseLossConfig:
+    """The [training.dense_loss] table.
+
+    Attributes:
+        weight: of the whole loss; 0 disables it, as published.
+        reach_m: cells up to this distance from an object's centre are positives, metres.
+    """
+
+    weight: float = 0.0
+    reach_m: float = 1.5
+
+    def __post_init__(self) -> None:
+        if self.weight < 0 or self.reach_m <= 0:
+            raise ValueError("weight must not be negative, reach_m must be positive")
+
+
+class DenseHead(nn.Module):
+    """One linear layer that predicts classes and a box from each BEV cell."""
+
+    centers: Tensor
+
+    def __init__(self, channels: int, classes: int, grid: BevGrid) -> None:
+        super().__init__()
+        self.classes = nn.Linear(channels, classes)
+        self.boxes = nn.Linear(channels, BOX_CODE_SIZE)
+        nn.init.constant_(self.classes.bias, -math.log(99))  # focal prior, as in the detection head
+        centers = torch.as_tensor(grid.cell_centers(), dtype=torch.float32).reshape(-1, 2)
+        self.register_buffer("centers", centers, persistent=False)
+
+    def forward(self, bev: Tensor) -> tuple[Tensor, Tensor]:
+        """bev: (B, Y·X, C) -> class logits (B, Y·X, classes) and box codes (B, Y·X, 10).
+
+        The layer predicts a box centre as an offset from the cell's centre, metres.
+        """
+        codes = self.boxes(bev)
+        return self.classes(bev), torch.cat([codes[..., :2] + self.centers, codes[..., 2:]], dim=-1)
+
+
+def dense_loss(
+    head: DenseHead,
+    bev: Tensor,
+    targets: Sequence[DetectionTargets],
+    config: DenseLossConfig,
+    detection: DetectionLossConfig,
+) -> DetectionLoss:
+    """Focal loss of all cells and L1 loss of the positive ones, divided by the number of positive cells.
+
+    Args:
+        bev: (B, Y·X, C).
+        targets: B.
+        detection: the weights of classes and boxes, as in the detection loss.
+    """
+    logits, codes = head(bev)
+    class_targets = torch.zeros_like(logits)
+    predicted, truths = [], []
+    for element, truth in enumerate(targets):
+        cells, objects = _positive_cells(head.centers, truth.codes[:, :2], config.reach_m)
+        class_targets[element, cells, truth.labels[objects]] = 1
+        predicted.append(codes[element, cells])
+        truths.append(truth.codes[objects])
+    count = max(sum(map(len, predicted)), 1)
+    classes = detection.class_weight * focal_loss(logits, class_targets).sum() / count
+    boxes = detection.box_weight * box_loss(torch.cat(predicted), torch.cat(truths), detection) / count
+    return DetectionLoss(config.weight * classes, config.weight * boxes)
+
+
+def _positive_cells(cells: Tensor, objects: Tensor, reach_m: float) -> tuple[Tensor, Tensor]:
+    """Indices (K,) of the cells within reach of an object, and (K,) of the nearest object of each.
+
+    Args:
+        cells: (Y·X, 2) cell centres, metres.
+        objects: (G, 2) object centres, metres.
+    """
+    if not len(objects):
+        return (torch.zeros(0, dtype=torch.int64, device=cells.device),) * 2
+    distance, nearest = torch.cdist(cells, objects).min(dim=1)
+    positive = (distance <= reach_m).nonzero()[:, 0]
+    return positive, nearest[positive]
 
 
 @dataclass(frozen=True)
@@ -48,7 +139,7 @@ class FrameLosses:
             are part of the checkpoint format.
     """
 
-    def __init__(self, model: BEVFormerBase, configs: LossConfigs) -> None:
+    def __init__(self, model: Network, configs: LossConfigs) -> None:
         classes = len(model.config.classes)
         self.configs = configs
         self._query_groups = model.config.decoder.training_groups
@@ -63,7 +154,7 @@ class FrameLosses:
             self.auxiliary_heads["perspective_head"] = self._perspective_head
 
     @contextlib.contextmanager
-    def watching(self, model: BEVFormerBase) -> Iterator[None]:
+    def watching(self, model: Network) -> Iterator[None]:
         """Inside, each forward pass of the model keeps its image features for the perspective loss. No hook remains."""
         if self._perspective_head is None:
             yield
@@ -78,7 +169,7 @@ class FrameLosses:
         finally:
             hook.remove()
 
-    def __call__(self, inputs: BEVFormerInputs, outputs: BEVFormerOutputs, targets: Targets) -> dict[str, Tensor]:
+    def __call__(self, inputs: ModelInputs, outputs: ModelOutputs, targets: Targets) -> dict[str, Tensor]:
         """The weighted scalar losses by name; their sum is minimised.
 
         Call it inside `watching`, right after the forward pass that made the outputs.

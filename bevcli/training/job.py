@@ -1,30 +1,127 @@
-"""What a training is made from: the [training] table of a model file, a model, drives and an output folder."""
+"""Inputs of a training: the [training] table of a model file, a model, drives, an output folder and its processes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 import torch
+import torch.distributed
+from torch import Tensor, nn
 
 from bevcli.checkpoints import load_weights
 from bevcli.config import TRAINING, load_config, load_table
-from bevcli.errors import ConfigError, OutputError
+from bevcli.errors import OutputError
 from bevcli.geometry.cameras import CameraRig
-from bevcli.model.bevformer import BEVFormerBase, BEVFormerConfig
-from bevcli.model.bevformer_v2 import BEVFormerV2Config
-from bevcli.model.build import build_model
-from bevcli.model.uniad import UniADConfig
-from bevcli.synth.random_rig import RigDistribution
-from bevcli.synth.rig import rig_for_rendering
+from bevcli.model.network import Network, build_network
+from bevcli.synth.drives import Drives, check_training_seeds, open_drives, split_drives
+from bevcli.synth.options import DriveOptions
+from bevcli.synth.rig import RigDistribution, rig_for_rendering
 from bevcli.training.augmentation import AugmentationConfig
-from bevcli.training.clips import ClipConfig
-from bevcli.training.drives import Drives, check_training_seeds, open_drives, split_drives
 from bevcli.training.frame_losses import LossConfigs
-from bevcli.training.optimizer import OptimizerConfig
-from bevcli.training.process_group import ProcessGroup, join_process_group
+from bevcli.training.options import TrainOptions
+from bevcli.training.samples import ClipConfig
+
+
+@dataclass(frozen=True)
+class ProcessGroup:
+    """This process among those that train together.
+
+    Attributes:
+        rank: of this process, 0 to size - 1; the leader has rank 0.
+        size: the number of processes, 1 without torchrun.
+    """
+
+    rank: int = 0
+    size: int = 1
+
+    @property
+    def leads(self) -> bool:
+        """True in the leader, which writes files and prints."""
+        return self.rank == 0
+
+    def average_gradients(self, trained: nn.Module) -> None:
+        """Replaces each gradient by its mean over the processes; a missing gradient counts as zero."""
+        if self.size > 1:
+            for parameter in trained.parameters():
+                if parameter.grad is None:
+                    parameter.grad = torch.zeros_like(parameter)
+            self._average([parameter.grad for parameter in trained.parameters() if parameter.grad is not None])
+
+    def average_statistics(self, trained: nn.Module) -> None:
+        """Replaces the running statistics of batch norms (all float buffers) by their mean over the processes."""
+        if self.size > 1:
+            self._average([buffer for buffer in trained.buffers() if buffer.is_floating_point()])
+
+    def _average(self, tensors: list[Tensor]) -> None:
+        flat = torch.cat([tensor.flatten() for tensor in tensors])
+        torch.distributed.all_reduce(flat)
+        flat /= self.size
+        for tensor, mean in zip(tensors, flat.split([tensor.numel() for tensor in tensors]), strict=True):
+            tensor.copy_(mean.view_as(tensor))
+
+
+def join_process_group(device: torch.device) -> ProcessGroup:
+    """Joins the group in which torchrun started this process; a group of one without torchrun.
+
+    On GPUs each process takes the one of its local rank.
+    """
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        return ProcessGroup()
+    if device.type == "cuda":
+        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
+    torch.distributed.init_process_group("nccl" if device.type == "cuda" else "gloo")
+    return ProcessGroup(torch.distributed.get_rank(), torch.distributed.get_world_size())
+
+
+def leave_process_group(group: ProcessGroup) -> None:
+    """Ends the communication with the other processes."""
+    if group.size > 1:
+        torch.distributed.destroy_process_group()
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """The [training.optimizer] table.
+
+    Attributes:
+        learning_rate: the peak learning rate.
+        backbone_share: learning rate of the image backbone relative to the rest; 1 for an untrained backbone.
+        weight_decay: of AdamW.
+        warm_up_steps: steps in which the rate rises linearly.
+        warm_up_start: relative rate at step 0.
+        final_share: relative rate at the end of the cosine decay.
+        max_gradient_norm: gradients are clipped to this L2 norm.
+        average: decay per update of a running average of the weights, such as 0.998; 0 for none. The average is what is
+            evaluated and released, so that a training may end before its learning rate has decayed.
+    """
+
+    learning_rate: float = 2e-4
+    backbone_share: float = 0.1
+    weight_decay: float = 0.01
+    warm_up_steps: int = 500
+    warm_up_start: float = 1 / 3
+    final_share: float = 1e-3
+    max_gradient_norm: float = 35.0
+    average: float = 0.0
+
+    def __post_init__(self) -> None:
+        if min(self.learning_rate, self.max_gradient_norm) <= 0 or self.warm_up_steps < 0:
+            raise ValueError("learning_rate and max_gradient_norm must be positive, warm_up_steps not negative")
+        if not 0 <= self.average < 1:
+            raise ValueError("average must be from 0 to below 1")
+
+    def learning_rate_at(self, step: int, steps: int) -> float:
+        """The learning rate of a step (0 to steps - 1)."""
+        cosine = (1 + math.cos(math.pi * step / steps)) / 2
+        share = self.final_share + (1 - self.final_share) * cosine
+        if step < self.warm_up_steps:
+            share *= self.warm_up_start + (1 - self.warm_up_start) * step / self.warm_up_steps
+        return self.learning_rate * share
+
 
 CHECKPOINT = "checkpoint.pt"  # in the output folder
 
@@ -80,12 +177,12 @@ class TrainingJob:
         drives: to train on.
         held_out: to evaluate on; empty to evaluate on `drives`.
         out: the output folder, which exists.
-        device: where to train.
+        device: device to train on.
         seed: determines all random draws, together with the step and the rank of the process.
         group: the processes that train together.
     """
 
-    model: BEVFormerBase
+    model: Network
     config: TrainingConfig
     drives: Drives
     held_out: Drives
@@ -96,50 +193,30 @@ class TrainingJob:
 
 
 def prepare_training(
-    model_name_or_file: str,
-    device: torch.device,
-    *,
-    folders: Sequence[Path] = (),
-    rendered_seeds: Sequence[int] | None = None,
-    out: Path | None = None,
-    weights: Path | None = None,
-    steps: int | None = None,
-    held_out: int | None = None,
-    seed: int = 0,
-    resume: bool = False,
+    model_name_or_file: str, device: torch.device, data: DriveOptions, options: TrainOptions = TrainOptions()
 ) -> TrainingJob:
     """A training job, ready for `Trainer`. Joins the other processes if torchrun started several.
 
     Initial weights are drawn from PyTorch's global generator: call torch.manual_seed before to reproduce them.
+    data: the drives; rendered ones are kept in the output folder.
 
-    Args:
-        folders: sequence folders with ground truth.
-        rendered_seeds: of rendered drives, in place of folders. They are kept in the output folder.
-        out: the output folder, by default runs/train-MODEL.
-        weights: a file to start from, in place of random weights.
-        steps: replaces `steps` of the [training] table.
-        held_out: replaces `held_out` of the [training] table.
-        seed: of all draws after the initial weights.
-        resume: the output folder may hold a checkpoint.
-
-    Raises:
-        BevcliError: a file, the choice of drives, or the output folder is wrong.
+    Raises BevcliError where a file, the choice of drives, or the output folder is wrong.
     """
     model_config = load_config(model_name_or_file)
     config = load_table(model_name_or_file, TRAINING, TrainingConfig)
-    config = config if steps is None else replace(config, steps=steps)
-    config = config if held_out is None else replace(config, held_out=held_out)
-    check_window(model_config, config)
-    out = Path("runs") / f"train-{model_config.name}" if out is None else out
-    check_training_seeds(rendered_seeds or ())
+    held_out = config.held_out if options.held_out is None else options.held_out
+    config = replace(config, steps=options.steps or config.steps, held_out=held_out)
+    model_config.check_training(config.clips.frames)
+    out = options.out or Path("runs") / f"train-{model_config.name}"
+    check_training_seeds(data.rendered or ())
     rigs = config.rigs if config.rigs.random_share > 0 else None
-    drives = open_drives(folders, rendered_seeds, out / "drives", model_config, rigs)
+    drives = open_drives(data.data, data.rendered, out / "drives", model_config, rigs)
     drives, evaluated = split_drives(drives, config.held_out)
-    prepare_folder(out, resume=resume)
-    model = build_model(model_config)
-    if weights is not None:
-        load_weights(weights, model, resample=True)
-    return TrainingJob(model, config, drives, evaluated, out, device, seed, join_process_group(device))
+    prepare_folder(out, resume=options.resume)
+    model = build_network(model_config)
+    if options.weights is not None:
+        load_weights(options.weights, model, resample=True)
+    return TrainingJob(model, config, drives, evaluated, out, device, options.seed, join_process_group(device))
 
 
 def rig_for_drives(choice: str, model: str) -> CameraRig | RigDistribution:
@@ -152,28 +229,12 @@ def rig_for_drives(choice: str, model: str) -> CameraRig | RigDistribution:
     return rig_for_rendering(choice, None)
 
 
-def check_window(model: BEVFormerConfig, config: TrainingConfig) -> None:
-    """Raises ConfigError if clips cannot fill the window of a BEVFormerV2, and for a UniAD."""
-    if isinstance(model, UniADConfig):
-        raise ConfigError(f"{model.name}: a UniAD cannot be trained; expected a BEVFormer, such as tiny, small or base")
-    if not isinstance(model, BEVFormerV2Config):
-        return
-    if model.later_frames:
-        raise ConfigError(
-            f"{model.name}: frames after the current one cannot be trained; expected frames that end with 0, "
-            f"found {list(model.frames)}"
-        )
-    if config.clips.frames <= model.past_frames:
-        raise ConfigError(
-            f"{model.name}: training.clips.frames must be at least {model.past_frames + 1}, so that a clip fills the "
-            f"window of the model, but is {config.clips.frames}"
-        )
-
-
 def prepare_folder(out: Path, *, resume: bool) -> None:
     """Makes the output folder. Raises OutputError if it holds a training that is not to be resumed."""
     if (out / CHECKPOINT).exists() and not resume:
-        raise OutputError(f"{out}: already holds a training; pass --resume to continue it, or --out DIR for a new one")
+        raise OutputError(
+            f"{out}: already holds a training; pass `resume=True` to continue it, or `out=DIR` for a new one"
+        )
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

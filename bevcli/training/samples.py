@@ -1,21 +1,27 @@
-"""Training samples: the frames of a batch of clips as network inputs, with the targets of the frames to train on."""
+"""Training samples: clips drawn from drives, and their frames as network inputs and targets.
+
+As in the paper, the last frame of a clip is trained on; the others are its history.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from bevcli.errors import InputError
-from bevcli.frame import Frame
+from bevcli.frame import Frame, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import inverse
-from bevcli.model.bevformer import BEVFormerConfig, BEVFormerInputs
-from bevcli.pipeline.model_inputs import model_inputs
-from bevcli.pipeline.preprocess import PreparedFrame, Preprocessor
+from bevcli.inference.preprocess import Preprocessor
+from bevcli.model.config import ModelConfig
+from bevcli.model.step import ModelInputs, PreparedFrame, model_inputs
+from bevcli.sequences.selection import scenes_of
+from bevcli.synth.drives import Drives, InputShape
 from bevcli.training.augmentation import (
     AugmentationConfig,
     CalibrationVariation,
@@ -23,10 +29,100 @@ from bevcli.training.augmentation import (
     distort_images,
     mask_images,
 )
-from bevcli.training.clips import Clip
-from bevcli.training.detection_targets import DetectionTargets, box_targets, detection_targets
-from bevcli.training.drives import Drives
-from bevcli.training.segmentation_targets import SegmentationTargets, segmentation_targets
+from bevcli.training.detection_loss import DetectionTargets, box_targets, detection_targets
+from bevcli.training.segmentation_loss import SegmentationTargets, segmentation_targets
+
+_CHOICE = 8  # drives among which the other clips of a batch are drawn, at least
+
+
+@dataclass(frozen=True)
+class ClipConfig:
+    """The [training.clips] table.
+
+    Attributes:
+        frames: frames of a clip. The paper's base model uses 4, tiny and small use 3; 1 trains without history.
+        batch: clips of a batch.
+        short_share: share of the batches with shorter clips (0 to 1), because each scene starts without history.
+        learn: "last" trains on the last frame of a clip, as published. "all" trains on every frame of successive
+            frames, with one update each; a clip's first frame has no history.
+        in_turn: with "all", the number of batches a step. The updates alternate between them, so that successive
+            updates do not see the same few streets.
+    """
+
+    frames: int = 3
+    batch: int = 4
+    short_share: float = 0.1
+    learn: Literal["last", "all"] = "last"
+    in_turn: int = 1
+
+    def __post_init__(self) -> None:
+        if min(self.frames, self.batch) < 1 or not 0 <= self.short_share <= 1:
+            raise ValueError("frames and batch must be positive, short_share from 0 to 1")
+        if self.in_turn < 1 or (self.in_turn > 1 and self.learn != "all"):
+            raise ValueError('in_turn must be positive, and 1 unless learn is "all"')
+
+
+@dataclass(frozen=True)
+class Clip:
+    """Some frames of one drive.
+
+    Attributes:
+        drive: index of the drive.
+        frames: indices of the frames in the drive, ascending.
+    """
+
+    drive: int
+    frames: tuple[int, ...]
+
+
+def draw_clips(drives: Drives, config: ClipConfig, random: np.random.Generator, *, with_gap: bool = True) -> list[Clip]:
+    """The clips of one batch, all of the same length. Raises InputError if a drive is too short.
+
+    Args:
+        with_gap: with `learn` "last", leave out one of the earlier frames, as published for BEVFormer.
+    """
+    frames = config.frames
+    if frames > 1 and random.random() < config.short_share:
+        frames = int(random.integers(1, frames))
+    clips: list[Clip] = []
+    shapes = drives.input_shapes
+    leave_out = with_gap and config.learn == "last"
+    for _ in range(config.batch):
+        alike = range(len(drives)) if not clips or shapes is None else _similar_drives(shapes, clips[0].drive)
+        drive = int(alike[random.integers(len(alike))])
+        clips.append(Clip(drive, draw_frames(drives.open(drive), frames, random, with_gap=leave_out)))
+    return clips
+
+
+def _similar_drives(shapes: tuple[InputShape, ...], drive: int) -> NDArray[np.intp]:
+    """Drives that go into one batch with a drive: with as many cameras, and of these those with the nearest sizes.
+
+    The images of a batch are padded to the largest. At least `_CHOICE` drives, where so many have as many cameras.
+    """
+    counts, heights, widths = np.array(shapes).T
+    differences = np.abs(heights - heights[drive]) + np.abs(widths - widths[drive])
+    alike = counts == counts[drive]
+    nearest = np.sort(differences[alike])[:_CHOICE]
+    return np.flatnonzero(alike & (differences <= nearest[-1]))
+
+
+def draw_frames(
+    sequence: Sequence, count: int, random: np.random.Generator, *, with_gap: bool = True
+) -> tuple[int, ...]:
+    """Indices of a random frame and of `count` - 1 frames before it in its scene. Raises InputError if there are none.
+
+    Args:
+        with_gap: as published, take the `count` frames before it and leave out a random one.
+    """
+    scenes = list(scenes_of(sequence.stamps))
+    candidates = [(scene, end) for scene in scenes for end in range(count - 1, len(scene))]
+    if not candidates:
+        raise InputError(f"{sequence.name}: no scene has {count} frames or more, as many as a clip needs")
+    scene, end = candidates[int(random.integers(len(candidates)))]
+    before = scene[max(0, end - count if with_gap else end - count + 1) : end]
+    if len(before) == count:
+        del before[int(random.integers(len(before)))]
+    return (*before, scene[end])
 
 
 @dataclass(frozen=True)
@@ -45,11 +141,7 @@ class Targets:
 
     def to(self, device: torch.device) -> Targets:
         """A copy on a device."""
-        return Targets(
-            tuple(targets.to(device) for targets in self.detection),
-            tuple(targets.to(device) for targets in self.perspective),
-            tuple(targets.to(device) for targets in self.segmentation),
-        )
+        return Targets(*(tuple(one.to(device) for one in targets) for targets in vars(self).values()))
 
 
 @dataclass(frozen=True)
@@ -62,21 +154,20 @@ class Batch:
         targets: of the last frames of the clips. There are fewer than inputs if the first frames are history only.
     """
 
-    inputs: tuple[BEVFormerInputs, ...]
+    inputs: tuple[ModelInputs, ...]
     world_from_bev: Tensor
     targets: tuple[Targets, ...]
 
     def to(self, device: torch.device) -> Batch:
         """A copy on a device. Projections and poses stay on the CPU, which reads them without waiting for a GPU."""
         inputs = tuple(one.to(device, keep_geometry=True) for one in self.inputs)
-        targets = tuple(targets.to(device) for targets in self.targets)
-        return Batch(inputs, self.world_from_bev, targets)
+        return Batch(inputs, self.world_from_bev, tuple(targets.to(device) for targets in self.targets))
 
 
 def load_batch(
     drives: Drives,
     clips: list[Clip],
-    config: BEVFormerConfig,
+    config: ModelConfig,
     augmentation: AugmentationConfig,
     random: np.random.Generator,
     *,
@@ -114,28 +205,19 @@ def ground_truth_boxes(frame: Frame) -> Boxes3D:
     return frame.ground_truth.transformed(inverse(frame.world_from_ego.matrix @ frame.rig.ego_from_bev))
 
 
-def _targets(frames: Sequence[Frame], config: BEVFormerConfig) -> Targets:
+def _targets(frames: list[Frame], config: ModelConfig) -> Targets:
     boxes = [ground_truth_boxes(frame) for frame in frames]
     detection = tuple(detection_targets(of_frame, config) for of_frame in boxes)
     perspective = tuple(box_targets(of_frame, config.classes) for of_frame in boxes)
     if "segmentation" not in config.heads:
         return Targets(detection, perspective, ())
-    return Targets(
-        detection,
-        perspective,
-        tuple(
-            segmentation_targets(of_frame, frame.ground_truth_map, config.bev_grid)
-            for frame, of_frame in zip(frames, boxes, strict=True)
-        ),
-    )
+    maps = [frame.ground_truth_map for frame in frames]
+    segmentation = (segmentation_targets(*pair, config.bev_grid) for pair in zip(boxes, maps, strict=True))
+    return Targets(detection, perspective, tuple(segmentation))
 
 
 def _load_clip(
-    drives: Drives,
-    clip: Clip,
-    config: BEVFormerConfig,
-    augmentation: AugmentationConfig,
-    random: np.random.Generator,
+    drives: Drives, clip: Clip, config: ModelConfig, augmentation: AugmentationConfig, random: np.random.Generator
 ) -> list[PreparedFrame]:
     sequence, preprocess = drives.open(clip.drive), Preprocessor(config)
     vary_images, vary_rig = ImageVariation(augmentation, random), CalibrationVariation(augmentation, random)

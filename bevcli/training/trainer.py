@@ -2,35 +2,130 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
-from typing import TypeVar
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from bevcli.errors import BevcliError
-from bevcli.model.bevformer_v2 import BEVFormerV2
-from bevcli.model.prepared import choose_kernels
-from bevcli.pipeline.cpu_memory import trim_memory
-from bevcli.pipeline.model_loading import choose_precision
-from bevcli.pipeline.read_ahead import read_ahead
-from bevcli.pipeline.runner import Runner, StepOptions
-from bevcli.training.checkpoint import load_checkpoint, save_checkpoint, save_weights
-from bevcli.training.clip_forward import forward_clip
-from bevcli.training.clips import draw_clips
+from bevcli.inference.background import read_ahead
+from bevcli.inference.cpu_settings import trim_memory
+from bevcli.inference.load import choose_precision
+from bevcli.inference.runner import Runner, StepOptions
+from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms
+from bevcli.model.kernels.onednn import use_onednn
+from bevcli.model.network import Network
+from bevcli.model.resnet import ResNet
+from bevcli.model.step import ModelOutputs
+from bevcli.training.files import LearningCurve, draw_learning_curves, load_checkpoint, save_checkpoint, save_weights
 from bevcli.training.frame_losses import FrameLosses
-from bevcli.training.frozen_stages import FrozenStages
-from bevcli.training.job import CHECKPOINT, TrainingJob
-from bevcli.training.learning_curves import LearningCurve, draw_learning_curves
-from bevcli.training.optimizer import clip_gradients, make_optimizer, set_learning_rate, update_average
-from bevcli.training.samples import Batch, load_batch
+from bevcli.training.job import CHECKPOINT, OptimizerConfig, TrainingJob
+from bevcli.training.samples import Batch, draw_clips, load_batch
 from bevcli.training.validation import Validation, validate
 
 T = TypeVar("T")
+
+
+class FrozenStages:
+    """A copy of the stem and the first stages of a backbone, computed as in inference: faster, the same results.
+
+    Batch norms are folded into their convolutions and, on a CPU, oneDNN runs the residual blocks, one image at a time,
+    whose feature maps fit into the caches.
+    """
+
+    def __init__(self, backbone: ResNet, stages: int, dtype: torch.dtype) -> None:
+        """stages: how many, from the first. dtype: of the computation and its results."""
+        self._device = backbone.conv1.weight.device
+        self._dtype = dtype
+        part = copy.deepcopy(backbone)
+        part.stages = nn.ModuleList(part.stages[:stages])
+        part.output_stages = tuple(range(1, len(part.stages) + 1))
+        part.eval().requires_grad_(False)
+        fold_batch_norms(part, self._device)
+        part.to(dtype, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        if self._device.type == "cpu":
+            use_onednn(part)
+        self._part = part
+
+    @contextlib.contextmanager
+    def used_by(self, backbone: ResNet) -> Iterator[None]:
+        """Inside, the backbone takes the maps of its first stages from here."""
+        backbone.frozen_maps = self._maps
+        try:
+            yield
+        finally:
+            backbone.frozen_maps = None
+
+    @torch.no_grad()
+    def _maps(self, images: Tensor) -> list[Tensor]:
+        """images: (B, 3, H, W) -> the map of each stage, without gradient."""
+        with torch.autocast(self._device.type, enabled=False):
+            images = images.to(self._dtype).contiguous(memory_format=torch.channels_last)
+            if self._device.type != "cpu":
+                return list(self._part(images))
+            each = [self._part(image) for image in images.split(1)]
+            return [torch.cat(maps) for maps in zip(*each, strict=True)]
+
+
+def forward_clip(
+    model: Network, batch: Batch, *, learn_all: bool = False, freeze_batch_norm: bool = False
+) -> Iterator[ModelOutputs]:
+    """The outputs, in training mode, for the last frame of a batch of clips.
+
+    The frames before it only build its history, in evaluation mode and without gradient, as in the papers. Of a model
+    with a window of frames, this applies to the image features of the earlier frames.
+
+    Args:
+        batch: the clips.
+        learn_all: yield the outputs for every frame. The model may be updated in between: history has no gradient.
+        freeze_batch_norm: keep batch norms in evaluation mode, for fine-tuning.
+    """
+    frames = len(batch.inputs)
+    first_learned = 0 if learn_all else frames - 1
+    memory: Any = None
+    model.eval()
+    with torch.no_grad():
+        for place in range(first_learned):
+            memory = model.remember(batch, place, memory)
+    model.train()
+    for module in model.modules():
+        if freeze_batch_norm and isinstance(module, nn.BatchNorm2d):
+            module.eval()
+    for place in range(first_learned, frames):
+        outputs, memory = model.learn(batch, place, memory)
+        yield outputs
+
+
+def make_optimizer(trained: nn.Module, backbone: nn.Module, config: OptimizerConfig) -> torch.optim.AdamW:
+    """AdamW with two parameter groups: everything in `trained` except the backbone, and the backbone.
+
+    Frozen parameters get no gradient, so that it leaves them alone.
+    """
+    in_backbone = {id(parameter) for parameter in backbone.parameters()}
+    others = [parameter for parameter in trained.parameters() if id(parameter) not in in_backbone]
+    groups = [{"params": others, "share": 1.0}, {"params": list(backbone.parameters()), "share": config.backbone_share}]
+    return torch.optim.AdamW(groups, lr=config.learning_rate, weight_decay=config.weight_decay)
+
+
+def set_learning_rate(optimizer: torch.optim.AdamW, rate: float) -> None:
+    """Sets the learning rate of the next step; each parameter group takes its share of it."""
+    for group in optimizer.param_groups:
+        group["lr"] = rate * group["share"]
+
+
+@torch.no_grad()
+def update_average(average: dict[str, Tensor], state: Mapping[str, Tensor], decay: float) -> None:
+    """Moves a running average of a state dict towards it, in place; integers are copied."""
+    for key, value in state.items():
+        if value.is_floating_point():
+            average[key].lerp_(value, 1 - decay)
+        else:
+            average[key].copy_(value)
 
 
 class Trainer:
@@ -39,7 +134,7 @@ class Trainer:
     Writes checkpoint.pt, weights.safetensors, loss.csv, validation.csv and curves.png into the output folder.
 
     Attributes:
-        job: what is trained, on what.
+        job: model, drives and settings.
         trained: all modules that are trained: the model and the auxiliary heads.
         optimizer: of their parameters.
         done: the number of steps done.
@@ -86,18 +181,14 @@ class Trainer:
             row = self._step(batches)
             trim_memory()
             self.done += 1
-            stopped = stop()
-            if not self.job.group.leads:
-                if stopped:
-                    break
-                continue
-            self._loss_curve.add(self.done, row)
-            last = self.done == config.steps
-            if self.done % config.evaluate_every == 0 or last:
-                after_validation(self.done, self._validate())
-            if self.done % config.checkpoint_every == 0 or last or stopped:
-                save_checkpoint(self.job.out / CHECKPOINT, self.done, self.trained, self.optimizer, self._average)
-            after_step()
+            last, stopped = self.done == config.steps, stop()
+            if self.job.group.leads:
+                self._loss_curve.add(self.done, row)
+                if self.done % config.evaluate_every == 0 or last:
+                    after_validation(self.done, self._validate())
+                if self.done % config.checkpoint_every == 0 or last or stopped:
+                    save_checkpoint(self.job.out / CHECKPOINT, self.done, self.trained, self.optimizer, self._average)
+                after_step()
             if stopped:
                 break
         self.job.model.eval()
@@ -115,12 +206,11 @@ class Trainer:
         """The batches of a step: `clips.in_turn` of them."""
         job, config = self.job, self.job.config
         random = np.random.default_rng(self._seeds(step))
+        model, augmentation, learn_all = job.model.config, config.augmentation, self._learn_all
         batches = []
         for _ in range(config.clips.in_turn):
-            clips = draw_clips(job.drives, config.clips, random, with_gap=not isinstance(job.model, BEVFormerV2))
-            batches.append(
-                load_batch(job.drives, clips, job.model.config, config.augmentation, random, learn_all=self._learn_all)
-            )
+            clips = draw_clips(job.drives, config.clips, random, with_gap=model.trains_with_gaps)
+            batches.append(load_batch(job.drives, clips, model, augmentation, random, learn_all=learn_all))
         return batches
 
     def _step(self, batches: list[Batch]) -> dict[str, float]:
@@ -129,7 +219,7 @@ class Trainer:
         rate = config.optimizer.learning_rate_at(self.done, config.steps)
         set_learning_rate(self.optimizer, rate)
         gpus = [job.device] if job.device.type == "cuda" else []
-        frozen = nullcontext() if self._frozen is None else self._frozen.used_by(job.model.backbone)
+        frozen = contextlib.nullcontext() if self._frozen is None else self._frozen.used_by(job.model.backbone)
         with torch.random.fork_rng(gpus), self._losses.watching(job.model), frozen:
             torch.manual_seed(int(np.random.SeedSequence(self._seeds(self.done)).generate_state(1)[0]))  # for dropout
             clips = [self._clip_losses(batch.to(job.device)) for batch in batches]
@@ -153,13 +243,13 @@ class Trainer:
         total = torch.stack(list(losses.values())).sum()
         if not math.isfinite(total.item()):
             raise BevcliError(
-                f"step {self.done + 1}: the loss is {total.item()}; lower the learning rate, and --resume "
+                f"step {self.done + 1}: the loss is {total.item()}; lower the learning rate, and `resume` "
                 f"from the last checkpoint in {self.job.out}"
             )
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
         self.job.group.average_gradients(self.trained)
-        norm = clip_gradients(self.trained, self.job.config.optimizer.max_gradient_norm)
+        norm = nn.utils.clip_grad_norm_(self.trained.parameters(), self.job.config.optimizer.max_gradient_norm).item()
         self.optimizer.step()
         if self._average is not None:
             update_average(self._average, self.job.model.state_dict(), self.job.config.optimizer.average)
@@ -194,5 +284,5 @@ def alternated(iterators: Sequence[Iterator[T]]) -> Iterator[T]:
 
 
 def computes_in_bfloat16(device: torch.device) -> bool:
-    """Whether the device has bfloat16 instructions, so that mixed precision is faster."""
+    """True where the device has bfloat16 instructions, so that mixed precision is faster."""
     return device.type == "cuda" or torch.cpu._is_avx512_bf16_supported()

@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
+from typing import Any
 
 import numpy as np
 
-from bevcli.evaluation.config import DetectionConfig
+from bevcli.evaluation.config import DetectionConfig, TrackingConfig
 from bevcli.evaluation.detection import evaluate_detections
 from bevcli.evaluation.detection_scores import DetectionScores
+from bevcli.evaluation.scores_report import scores_table, scores_to_dict, tracking_table, tracking_to_dict
 from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmentation
-from bevcli.evaluation.tracking.config import TrackingConfig
 from bevcli.evaluation.tracking.scoring import TrackingScores, evaluate_tracking
-from bevcli.frame import MAP_CLASSES, Frame, FrameStamp, Prediction
+from bevcli.frame import MAP_CLASSES, Frame, Prediction
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
-from bevcli.geometry.transforms import Array, inverse
-from bevcli.pipeline.preprocess import Preprocessor
-from bevcli.pipeline.runner import Runner
-from bevcli.pipeline.tracking import TrackerConfig, track
-from bevcli.training.drives import Drives
+from bevcli.geometry.transforms import inverse
+from bevcli.inference.preprocess import Preprocessor
+from bevcli.inference.runner import Runner
+from bevcli.inference.tracking import TrackerConfig, track
+from bevcli.synth.drives import Drives
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,18 @@ class Validation:
         """The summary on one line."""
         return ", ".join(f"{name} {value:.3f}" for name, value in self.summary().items())
 
+    def to_dict(self) -> dict[str, Any]:
+        """All scores for JSON; undefined numbers are None."""
+        content = scores_to_dict(self.detection, self.config, self.segmentation)
+        content |= {} if self.tracking is None else {"tracking": tracking_to_dict(self.tracking)}
+        return content | ({"drives": [drive.to_dict() for drive in self.drives]} if self.drives else {})
+
+    def table(self) -> str:
+        """The scores as text for a terminal."""
+        parts = [scores_table(self.detection, self.segmentation)]
+        parts += [] if self.tracking is None else [tracking_table(self.tracking)]
+        return "\n\n".join([*parts, *([drives_table(self.drives)] if self.drives else [])])
+
 
 def validate(
     runner: Runner,
@@ -103,18 +116,18 @@ def validate(
     predictions: list[Boxes3D] = []
     truths: list[Boxes3D] = []
     maps = []
-    tracks: list[_TrackedFrame] = []
+    tracks: list[tuple[int, Frame, Boxes3D, Boxes3D]] = []
     of_drives: list[DriveScores] = []
     for index in range(len(drives)):
         sequence, first = drives.open(index), len(truths)
+        steps: Iterable[tuple[Frame, Prediction, object]]
         steps = runner.run(sequence, range(len(sequence.stamps)), Preprocessor(runner.config))
-        results = ((frame, prediction) for frame, prediction, _ in steps)
         if tracker is not None:
-            results = ((frame, prediction) for frame, prediction, _ in track(tracker, results))
-        for frame, prediction in results:
+            steps = track(tracker, ((frame, prediction) for frame, prediction, _ in steps))
+        for frame, prediction, _ in steps:
             if frame.ground_truth is not None:
                 if tracker is not None:
-                    tracks.append(_tracked_frame(index, frame, frame.ground_truth, prediction))
+                    tracks.append((index, frame, prediction.boxes_world, frame.ground_truth))
                 predicted, truth = boxes_ego(frame, frame.ground_truth, prediction)
                 predictions.append(predicted)
                 truths.append(truth)
@@ -152,26 +165,13 @@ def boxes_ego(frame: Frame, ground_truth: Boxes3D, prediction: Prediction) -> tu
     return predicted, ground_truth.transformed(inverse(frame.world_from_ego.matrix))
 
 
-@dataclass(frozen=True)
-class _TrackedFrame:
-    """What the tracking metrics need of a frame: boxes in the world frame, and the ego vehicle's position (2,)."""
-
-    stamp: FrameStamp
-    predictions: Boxes3D
-    ground_truth: Boxes3D
-    ego_xy: Array
-
-
-def _tracked_frame(drive: int, frame: Frame, ground_truth: Boxes3D, prediction: Prediction) -> _TrackedFrame:
-    stamp = replace(frame.stamp, scene=f"{drive} {frame.stamp.scene}")  # scenes of different drives may share a name
-    return _TrackedFrame(stamp, prediction.boxes_world, ground_truth, frame.world_from_ego.translation[:2])
-
-
-def _score_tracks(frames: list[_TrackedFrame], config: TrackingConfig) -> TrackingScores:
+def _score_tracks(frames: list[tuple[int, Frame, Boxes3D, Boxes3D]], config: TrackingConfig) -> TrackingScores:
+    """Tracking scores. frames: index of the drive, frame, and predicted and ground truth boxes in the world frame."""
     return evaluate_tracking(
-        [frame.predictions for frame in frames],
-        [frame.ground_truth for frame in frames],
-        [frame.stamp for frame in frames],
+        [predicted for *_, predicted, _ in frames],
+        [truth for *_, truth in frames],
+        # Scenes of different drives may share a name.
+        [replace(frame.stamp, scene=f"{drive} {frame.stamp.scene}") for drive, frame, *_ in frames],
         config,
-        np.array([frame.ego_xy for frame in frames]).reshape(-1, 2),
+        np.array([frame.world_from_ego.translation[:2] for _, frame, *_ in frames]).reshape(-1, 2),
     )

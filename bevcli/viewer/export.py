@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ import numpy as np
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.transforms import Array, Pose
+from bevcli.geometry.transforms import Pose
 from bevcli.recording import entities
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
@@ -23,21 +22,6 @@ COLUMNS = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class RecordedBoxes:
-    """The shown boxes of one frame.
-
-    Attributes:
-        stamp: index, scene and timestamp of the frame.
-        world_from_ego: the ego pose at the frame's time.
-        boxes: in the world frame, highest score first.
-    """
-
-    stamp: FrameStamp
-    world_from_ego: Pose
-    boxes: Boxes3D
-
-
 def export_boxes(recording: Path, path: Path) -> tuple[int, int]:
     """Writes the shown boxes, in the world frame, metres and radians; returns the number of frames and of boxes.
 
@@ -45,7 +29,7 @@ def export_boxes(recording: Path, path: Path) -> tuple[int, int]:
     """
     writers = {".csv": _write_csv, ".json": _write_json}
     if path.suffix.lower() not in writers:
-        raise InputError(f"--export {path}: the file must end in .csv or .json")
+        raise InputError(f"{path}: the file must end in .csv or .json")
     frames = [recorded_boxes(frame) for frame in RecordingReader(recording).frames()]
     try:
         writers[path.suffix.lower()](path, frames)
@@ -54,8 +38,8 @@ def export_boxes(recording: Path, path: Path) -> tuple[int, int]:
     return len(frames), sum(len(frame.boxes) for frame in frames)
 
 
-def recorded_boxes(frame: RecordedFrame) -> RecordedBoxes:
-    """The shown boxes of a frame, in the sequence's world frame (the recording stores them as float32)."""
+def recorded_boxes(frame: RecordedFrame) -> FrameBoxes:
+    """The shown boxes of a frame in the sequence's world frame, highest score first; recordings store float32."""
     entity = entities.BOXES
     origin = frame.array(entities.WORLD, "origin", 3).reshape(-1)[:3]
     origin = origin if len(origin) == 3 else np.zeros(3)
@@ -69,23 +53,15 @@ def recorded_boxes(frame: RecordedFrame) -> RecordedBoxes:
         scores=frame.array(entity, "score", 1)[:, 0],
         instances=np.array(frame.values(entity, "track"), dtype=np.str_) if frame.has(entity, "track") else None,
     )
-    return RecordedBoxes(_stamp(frame), _world_from_ego(frame, origin), boxes)
+    scene, time = (frame.values(entities.EGO, name) for name in ("scene", "timestamp_ns"))
+    stamp = FrameStamp(frame.index, scene[0] if scene else "", int(time[0]) if time else 0)
+    pose = frame.array(entities.EGO, "pose", 16)
+    world_from_ego = pose[0].reshape(4, 4).copy() if len(pose) else np.eye(4)
+    world_from_ego[:3, 3] += origin
+    return FrameBoxes(stamp, Pose.from_matrix(world_from_ego), boxes)
 
 
-def _stamp(frame: RecordedFrame) -> FrameStamp:
-    scene = frame.values(entities.EGO, "scene")
-    time = frame.values(entities.EGO, "timestamp_ns")
-    return FrameStamp(frame.index, scene[0] if scene else "", int(time[0]) if time else 0)
-
-
-def _world_from_ego(frame: RecordedFrame, origin: Array) -> Pose:
-    numbers = frame.array(entities.EGO, "pose", 16)
-    matrix = numbers[0].reshape(4, 4).copy() if len(numbers) else np.eye(4)
-    matrix[:3, 3] += origin
-    return Pose.from_matrix(matrix)
-
-
-def _write_csv(path: Path, frames: list[RecordedBoxes]) -> None:
+def _write_csv(path: Path, frames: list[FrameBoxes]) -> None:
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
@@ -93,7 +69,7 @@ def _write_csv(path: Path, frames: list[RecordedBoxes]) -> None:
             writer.writerows(_rows(frame))
 
 
-def _rows(frame: RecordedBoxes) -> Iterator[list[object]]:
+def _rows(frame: FrameBoxes) -> Iterator[list[object]]:
     stamp, boxes = frame.stamp, frame.boxes
     assert boxes.scores is not None
     for i, score in enumerate(boxes.scores):
@@ -103,7 +79,7 @@ def _rows(frame: RecordedBoxes) -> Iterator[list[object]]:
         yield [stamp.index, stamp.scene, stamp.timestamp_ns, boxes.classes[i], f"{score:.4f}", *rounded, instance]
 
 
-def _write_json(path: Path, frames: list[RecordedBoxes]) -> None:
+def _write_json(path: Path, frames: list[FrameBoxes]) -> None:
     with BoxesWriter(path, "world") as writer:
         for frame in frames:
-            writer.write(FrameBoxes(frame.stamp, frame.world_from_ego, frame.boxes))
+            writer.write(frame)

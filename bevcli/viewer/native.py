@@ -28,7 +28,7 @@ def viewer_environment() -> dict[str, str]:
 
 
 def display_is_there() -> bool:
-    """Whether a window can be opened here."""
+    """True if a window can be opened here."""
     if sys.platform in ("darwin", "win32"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
@@ -51,6 +51,15 @@ def stop(process: subprocess.Popen[bytes]) -> None:
             process.kill()
             with contextlib.suppress(subprocess.TimeoutExpired):  # it hangs in the kernel: leave it
                 process.wait(timeout=5)
+
+
+def show_window(recording: Path) -> bool:
+    """Open the viewer and wait until the user closes it. False if the viewer failed."""
+    process = start_viewer("--bind", LOOPBACK, "--port", "auto", str(recording))
+    try:
+        return process.wait() == 0
+    finally:
+        stop(process)
 
 
 def free_port(preferred: int | None = None, host: str = LOOPBACK) -> int:

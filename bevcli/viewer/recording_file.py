@@ -11,10 +11,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO, Literal
 
-from bevcli.errors import InputError
+import rerun as rr
+
+from bevcli.errors import BevcliError, InputError
 from bevcli.viewer.native import viewer_binary, viewer_environment
+
+if TYPE_CHECKING:
+    from rerun.notebook import Viewer
 
 # Reads all of a recording in a process of its own: damaged data ends rerun's process at once, without an exception.
 CHECK = """
@@ -157,7 +162,7 @@ def _is_whole(path: Path) -> bool:
 
 
 def _ends_with_a_message(file: BinaryIO, size: int) -> bool:
-    """Whether a file without an index ends after a whole message and has one at least."""
+    """True if a file without an index ends after a whole message and has one at least."""
     place = FILE_HEADER
     while place + MESSAGE_HEADER.size <= size:
         file.seek(place)
@@ -166,3 +171,34 @@ def _ends_with_a_message(file: BinaryIO, size: int) -> bool:
             return False
         place += MESSAGE_HEADER.size + length
     return place == size > FILE_HEADER
+
+
+def show(
+    recording: str | Path, *, width: int | Literal["auto"] = "auto", height: int | Literal["auto"] = 720
+) -> Viewer:
+    """rerun's viewer with a recording, as a widget for a Jupyter notebook: make it the last line of a cell.
+
+        bevcli.show("street.rrd")
+
+    Needs the extra `bevcli[notebook]`.
+
+    Args:
+        recording: a recording of `bevcli.Recording` or `bevcli run`.
+        width: pixels, or "auto" for the width of the cell.
+        height: pixels, or "auto" for 16:9.
+
+    Raises:
+        InputError: the file is missing or is not a recording.
+        BevcliError: the notebook package of rerun is not installed.
+    """
+    from rerun.notebook import HAS_NOTEBOOK, Viewer  # needs IPython and costs a second
+
+    if not HAS_NOTEBOOK:
+        raise BevcliError("the notebook viewer is not installed: pip install 'bevcli[notebook]'")
+    viewer = Viewer(width=width, height=height, use_global_recording=False, theme="dark")
+    with open_recording(Path(recording)) as opened:
+        stream = rr.RecordingStream("bevcli")
+        viewer.add_recording(stream)
+        stream.log_file_from_path(opened.path)
+        stream.flush(timeout_sec=60.0)
+    return viewer

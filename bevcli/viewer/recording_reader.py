@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ class RecordedFrame:
     rows: Mapping[str, Row]
 
     def has(self, entity: str, component: str) -> bool:
-        """Whether the entity has a value for this component."""
+        """True if the entity has a value for this component."""
         return component in self.rows.get(entity, {}) and self.rows[entity][component].is_valid
 
     def values(self, entity: str, component: str) -> list[Any]:
@@ -41,59 +42,53 @@ class RecordedFrame:
 
     def array(self, entity: str, component: str, width: int) -> Array:
         """The values of a component as (N, width) float64, `width` numbers each; (0, width) if there are none."""
-        if not self.has(entity, component):
-            return np.zeros((0, width))
-        values = self.rows[entity][component].values
-        while pa.types.is_nested(values.type):
-            values = values.flatten()
-        return np.asarray(values, dtype=np.float64).reshape(-1, width)
+        return np.asarray(self._numbers(entity, component), dtype=np.float64).reshape(-1, width)
 
     def blob(self, entity: str, component: str) -> bytes:
         """The bytes of a component that is one blob, such as a JPEG; empty if there is none."""
+        return np.asarray(self._numbers(entity, component), dtype=np.uint8).tobytes()
+
+    def _numbers(self, entity: str, component: str) -> pa.Array:
         if not self.has(entity, component):
-            return b""
+            return pa.array([], pa.uint8())
         values = self.rows[entity][component].values
         while pa.types.is_nested(values.type):
             values = values.flatten()
-        return np.asarray(values, dtype=np.uint8).tobytes()
+        return values
 
 
-@dataclass(frozen=True)
 class RecordingReader:
     """A recording that `Recording` wrote. Raises InputError if the file cannot be read."""
 
-    path: Path
-    _reader: RrdReader = field(init=False, repr=False)
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with self._reading():
+            self._reader = RrdReader(path)
 
-    def __post_init__(self) -> None:
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # rerun warns that a file without its end is read in parts; all are
             try:
-                object.__setattr__(self, "_reader", RrdReader(self.path))
-            except RuntimeError as error:
+                yield
+            except (RuntimeError, ValueError) as error:
                 raise InputError(f"{self.path}: the recording cannot be read ({error})") from error
 
     def chunks(self) -> Iterator[Chunk]:
         """All chunks of the recording, in the order of the file."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            try:
-                yield from self._reader.stream()
-            except (RuntimeError, ValueError) as error:
-                raise InputError(f"{self.path}: the recording cannot be read ({error})") from error
+        with self._reading():
+            yield from self._reader.stream()
 
     def frames(self) -> Iterator[RecordedFrame]:
         """The frames in order, each with the state of all entities."""
         state: dict[str, Row] = {}
         current: int | None = None
         for entity, frame, row in self._rows():
-            if frame is not None and current is not None and frame > current:
-                yield RecordedFrame(current, dict(state))
             if frame is not None and (current is None or frame > current):
+                if current is not None:
+                    yield RecordedFrame(current, dict(state))
                 current = frame
-            if (
-                frame is None or frame == current
-            ):  # a BEV image that was written late for an earlier frame is not current
+            if frame is None or frame == current:  # not a BEV image that was written late for an earlier frame
                 _apply(state, entity, row)
         if current is not None:
             yield RecordedFrame(current, dict(state))

@@ -36,7 +36,7 @@ def take_screenshot(recording: Path, image: Path, frame: int | None = None) -> t
     viewer hangs, and InputError if the file has another ending or the recording does not have the frame.
     """
     if image.suffix.lower() not in ENDINGS:
-        raise InputError(f"--screenshot {image}: the file must end in .png, .jpg or .jpeg")
+        raise InputError(f"{image}: the file must end in .png, .jpg or .jpeg")
     port = free_port()
     process = start_viewer("--headless", "--bind", LOOPBACK, "--port", str(port))
     # The client waits for the viewer without a limit; its calls fail when the viewer ends.
@@ -84,7 +84,7 @@ def _go_to(client: ViewerClient, state: ViewerState, frame: int | None) -> None:
         raise InputError("the recording has no frames (expected one that `bevcli run` wrote)")
     wanted = timeline.start if frame is None else frame
     if not timeline.start <= wanted <= timeline.end:
-        raise InputError(f"--frame {wanted}: the recording has frames {timeline.start} to {timeline.end}")
+        raise InputError(f"`frame={wanted}`: the recording has frames {timeline.start} to {timeline.end}")
     client.set_time(entities.FRAME_TIMELINE, sequence=wanted, play_state="paused")
 
 

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from bevcli.recording import entities
-from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
+from bevcli.viewer.recording_reader import RecordingReader
 
 SHOWN_ENTITIES = 15
 
@@ -23,7 +23,6 @@ class RecordingSummary:
         file_bytes: its size.
         title: name of the sequence and of the model.
         untrained: whether the model's weights were random.
-        frames: the number of frames.
         timestamps_ns: of the frames, in order.
         boxes: the number of shown boxes by class, largest first.
         bytes_by_entity: size in memory by entity, largest first.
@@ -33,7 +32,6 @@ class RecordingSummary:
     file_bytes: int
     title: str
     untrained: bool
-    frames: int
     timestamps_ns: tuple[int, ...]
     boxes: Mapping[str, int]
     bytes_by_entity: Mapping[str, int]
@@ -41,7 +39,7 @@ class RecordingSummary:
     def text(self) -> str:
         """The summary as text for a terminal."""
         lines = [f"{self.path}: {self.title}" + (" (UNTRAINED weights)" if self.untrained else "")]
-        lines += [f"  frames    {self.frames}{self._span()}", f"  size      {_size(self.file_bytes)}"]
+        lines += [f"  frames    {len(self.timestamps_ns)}{self._span()}", f"  size      {_size(self.file_bytes)}"]
         lines += [f"  boxes     {sum(self.boxes.values())}"]
         lines += [f"    {count:7d} {name}" for name, count in self.boxes.items()]
         lines += [f"  entities  {len(self.bytes_by_entity)}, by size"]
@@ -73,21 +71,16 @@ def summarise(path: Path, read_from: Path | None = None) -> RecordingSummary:
         boxes.update(frame.values(entities.BOXES, "name"))
         times += frame.values(entities.EGO, "timestamp_ns")
         title = frame.values(entities.RUN, "title")
-        untrained = _flag(frame, "untrained")
+        untrained = any(frame.values(entities.RUN, "untrained"))
     return RecordingSummary(
         path=path,
         file_bytes=path.stat().st_size,
         title=title[0] if title else "a recording",
         untrained=untrained,
-        frames=len(times),
         timestamps_ns=tuple(times),
         boxes=dict(boxes.most_common()),
         bytes_by_entity=dict(sizes.most_common()),
     )
-
-
-def _flag(frame: RecordedFrame, name: str) -> bool:
-    return any(frame.values(entities.RUN, name))
 
 
 def _size(count: int) -> str:

@@ -13,9 +13,8 @@ import numpy as np
 from bevcli.errors import InputError, OutputError
 from bevcli.recording import entities
 from bevcli.recording.video_images import has_av
-from bevcli.viewer.camera_images import CameraImages
-from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
-from bevcli.viewer.video_frame import HEIGHT, WIDTH, Tile, camera_rows_of, draw_frame, tiles
+from bevcli.viewer.recording_reader import RecordingReader
+from bevcli.viewer.video_frame import HEIGHT, WIDTH, CameraImages, Tile, draw_frame, tiles
 
 FOURCC = {".mp4": "vp09", ".webm": "VP90"}  # VP9: OpenCV's wheels cannot write H.264
 H264_QUALITY = 21  # x264's crf
@@ -29,7 +28,7 @@ def write_video(recording: Path, video: Path, on_frame: Callable[[], None] = lam
     cannot be written.
     """
     if video.suffix.lower() not in FOURCC:
-        raise InputError(f"--video {video}: the file must end in .mp4 or .webm")
+        raise InputError(f"{video}: the file must end in .mp4 or .webm")
     count, rate = frame_rate(recording)
     if not count:
         raise InputError(f"{recording}: the recording has no frames")
@@ -61,9 +60,8 @@ def _h264(video: Path, rate: float) -> Iterator[Callable[[np.ndarray], object]]:
     except OSError as error:
         raise _unwritable(video) from error
     with container:
-        stream = container.add_stream(
-            "libx264", rate=Fraction(rate).limit_denominator(1000), options={"crf": str(H264_QUALITY)}
-        )
+        exact = Fraction(rate).limit_denominator(1000)
+        stream = container.add_stream("libx264", rate=exact, options={"crf": str(H264_QUALITY)})
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
         yield lambda image: container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
         container.mux(stream.encode(None))
@@ -99,7 +97,7 @@ def _images(recording: Path) -> Iterator[np.ndarray]:
     images = CameraImages()
     for frame in RecordingReader(recording).frames():
         if layout is None:
-            layout = tiles(camera_rows_of(frame), image_sizes(frame))
+            layout = tiles(frame)
         yield draw_frame(frame, layout, images)
 
 
@@ -111,17 +109,8 @@ def draw_frame_at(recording: Path, index: int) -> np.ndarray | None:
     images = CameraImages()
     for frame in RecordingReader(recording).frames():
         if frame.index == index:
-            return draw_frame(frame, tiles(camera_rows_of(frame), image_sizes(frame)), images)
+            return draw_frame(frame, tiles(frame), images)
         for name in frame.values(entities.RUN, "camera_names"):
             if frame.has(entities.image(name), "VideoStream:sample"):  # a video is decoded in order
                 images.image(frame, name)
     return None
-
-
-def image_sizes(frame: RecordedFrame) -> dict[str, tuple[int, int]]:
-    """(width, height) of the images by camera, pixels."""
-    sizes = {}
-    for name in frame.values(entities.RUN, "camera_names"):
-        width, height = frame.array(entities.camera(name), "Pinhole:resolution", 2)[0]
-        sizes[name] = int(width), int(height)
-    return sizes

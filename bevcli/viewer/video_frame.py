@@ -3,27 +3,108 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from bevcli.frame import MAP_CLASSES
 from bevcli.geometry.transforms import Array
+from bevcli.parsing.images import decode_image
 from bevcli.recording import entities
-from bevcli.recording.camera_layout import rows_by_yaw
-from bevcli.recording.colors import class_color, map_colors
-from bevcli.viewer.camera_images import CameraImages
-from bevcli.viewer.flat_drawing import (
-    Canvas,
-    ToCanvas,
-    draw_arrows,
-    draw_labels,
-    draw_strips,
-    draw_text,
-    recorded_image,
-)
+from bevcli.recording.blueprint import rows_by_yaw
+from bevcli.recording.colors import Color, class_color, map_colors
+from bevcli.recording.video_images import Av1Decoder, require_av
 from bevcli.viewer.recording_reader import RecordedFrame
+
+MOST_PIXELS = 64 << 20
+
+
+class CameraImages:
+    """The images of a recording: call `image` once for each camera of each frame, in order."""
+
+    def __init__(self) -> None:
+        self._decoders: dict[str, Av1Decoder] = {}
+
+    def image(self, frame: RecordedFrame, camera: str) -> NDArray[np.uint8] | None:
+        """The image of a camera, (H, W, 3) uint8 BGR; None if the frame has none. Raises BevcliError without PyAV."""
+        entity = entities.image(camera)
+        data = frame.blob(entity, "VideoStream:sample")
+        if data:
+            if camera not in self._decoders:
+                require_av("the images of this recording are AV1")
+                self._decoders[camera] = Av1Decoder()
+            return self._decoders[camera].decode(data)
+        encoded = frame.blob(entity, "EncodedImage:blob")
+        image = decode_image(encoded, cv2.IMREAD_COLOR, MOST_PIXELS) if encoded else None
+        return None if image is None else image.astype(np.uint8, copy=False)
+
+
+Canvas = NDArray[np.uint8]
+ToCanvas = Callable[[Array], Array]  # points (K, 2) in the space of an entity -> (K, 2) pixels of a canvas
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+SUBPIXEL_BITS = 3
+
+
+def draw_strips(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: ToCanvas, thickness: int = 1) -> None:
+    """Draws the line strips of an entity."""
+    strips = frame.values(entity, "LineStrips2D:strips")
+    colors = entity_colors(frame, entity, "LineStrips2D:colors", len(strips))
+    for strip, color in zip(strips, colors, strict=True):
+        points = np.clip(to_canvas(np.array(strip)), -1e5, 1e5) * (1 << SUBPIXEL_BITS)
+        points = np.round(points).astype(np.int32)
+        cv2.polylines(canvas, [points], False, color, thickness, cv2.LINE_AA, SUBPIXEL_BITS)
+
+
+def draw_arrows(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: ToCanvas) -> None:
+    """Draws the 2D arrows of an entity."""
+    starts = frame.array(entity, "Arrows2D:origins", 2)
+    ends = starts + frame.array(entity, "Arrows2D:vectors", 2)
+    colors = entity_colors(frame, entity, "Arrows2D:colors", len(starts))
+    for start, end, color in zip(to_canvas(starts), to_canvas(ends), colors, strict=True):
+        cv2.arrowedLine(canvas, start.astype(int).tolist(), end.astype(int).tolist(), color, 1, cv2.LINE_AA, 0, 0.25)
+
+
+def draw_labels(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: ToCanvas, size: float = 0.4) -> None:
+    """Draws the labels of an entity as text on a dark background, centred on the labelled points."""
+    positions = to_canvas(frame.array(entity, "Points2D:positions", 2))
+    colors = entity_colors(frame, entity, "Points2D:colors", len(positions))
+    for text, (x, y), color in zip(frame.values(entity, "Points2D:labels"), positions, colors, strict=False):
+        draw_text(canvas, text, (int(x), int(y)), color, size, centered=True)
+
+
+def draw_text(
+    canvas: Canvas, text: str, position: tuple[int, int], color: Color, size: float = 0.45, *, centered: bool = False
+) -> None:
+    """Draws a line of text.
+
+    position: x, y, pixels, of the middle of its left edge, or of its centre if `centered`. color: BGR.
+    """
+    (width, height), _ = cv2.getTextSize(text, FONT, size, 1)
+    left = position[0] - width // 2 if centered else position[0]
+    bottom = position[1] + height // 2
+    if centered:
+        cv2.rectangle(canvas, (left - 2, bottom - height - 3), (left + width + 2, bottom + 3), (24, 20, 18), -1)
+    cv2.putText(canvas, text, (left, bottom), FONT, size, color, 1, cv2.LINE_AA)
+
+
+def entity_colors(frame: RecordedFrame, entity: str, component: str, count: int) -> list[tuple[int, int, int]]:
+    """`count` colours, BGR. One recorded colour is repeated; without a recorded colour all are white."""
+    packed = frame.values(entity, component) or [0xFFFFFFFF]
+    colors = [((c >> 8) & 255, (c >> 16) & 255, (c >> 24) & 255) for c in packed]
+    return colors if len(colors) == count else colors[:1] * count
+
+
+def recorded_image(frame: RecordedFrame, entity: str) -> Canvas | None:
+    """The uncompressed image of an entity, (H, W, 3) uint8 BGR; None if it has none."""
+    formats = frame.values(entity, "Image:format")
+    if not formats:
+        return None
+    pixels = np.frombuffer(frame.blob(entity, "Image:buffer"), dtype=np.uint8)
+    return pixels.reshape(formats[0]["height"], formats[0]["width"], 3)[..., ::-1]
+
 
 WIDTH, HEIGHT = 1920, 640
 BEV_SIDE = 640
@@ -49,14 +130,15 @@ class Tile:
     height: int
 
 
-def tiles(rows: tuple[tuple[str, ...], ...], sizes: dict[str, tuple[int, int]]) -> tuple[Tile, ...]:
-    """The rectangles of the cameras, by rows. sizes: (width, height) of the images by camera, pixels."""
+def tiles(frame: RecordedFrame) -> tuple[Tile, ...]:
+    """The rectangles of the cameras of a recording, in rows in the same order as in the viewer."""
+    rows = _camera_rows(frame)
     cell = CAMERAS_WIDTH // max(len(row) for row in rows), CAMERAS_HEIGHT // len(rows)
     layout = []
     for r, row in enumerate(rows):
         indent = (CAMERAS_WIDTH - len(row) * cell[0]) // 2
         for c, name in enumerate(row):
-            width, height = sizes[name]
+            width, height = map(int, frame.array(entities.camera(name), "Pinhole:resolution", 2)[0])
             scale = min(cell[0] / width, cell[1] / height)
             w, h = round(width * scale), round(height * scale)
             left, top = indent + c * cell[0] + (cell[0] - w) // 2, r * cell[1] + (cell[1] - h) // 2
@@ -64,8 +146,7 @@ def tiles(rows: tuple[tuple[str, ...], ...], sizes: dict[str, tuple[int, int]]) 
     return tuple(layout)
 
 
-def camera_rows_of(frame: RecordedFrame) -> tuple[tuple[str, ...], ...]:
-    """The cameras of a recording in rows, in the same order as in the viewer."""
+def _camera_rows(frame: RecordedFrame) -> tuple[tuple[str, ...], ...]:
     from_world = _rotation(frame, entities.EGO).T
     yaws = {}
     for name in frame.values(entities.RUN, "camera_names"):
@@ -102,13 +183,8 @@ def _draw_camera(canvas: Canvas, frame: RecordedFrame, tile: Tile, image: Canvas
     draw_strips(canvas, frame, boxes, to_canvas)
     draw_labels(canvas, frame, f"{boxes}/labels", to_canvas, 0.36)
     cv2.rectangle(canvas, (0, 0), (10 * len(tile.camera) + 12, 22), BACKGROUND, -1)
-    draw_text(
-        canvas,
-        tile.camera if image is not None else f"{tile.camera}: no image",
-        (8, 11),
-        TEXT if image is not None else WARNING,
-        0.42,
-    )
+    text, color = (tile.camera, TEXT) if image is not None else (f"{tile.camera}: no image", WARNING)
+    draw_text(canvas, text, (8, 11), color, 0.42)
 
 
 def _draw_bev(canvas: Canvas, frame: RecordedFrame) -> None:
@@ -152,21 +228,20 @@ def _draw_legend(canvas: Canvas, frame: RecordedFrame) -> None:
     names = frame.values(entities.RUN, "class_names")
     counts = Counter(frame.values(entities.BOXES, "name"))
     for index, name in enumerate(names):
-        red, green, blue = class_color(name, index)
-        x, y = 16 + 250 * (index % 5), 60 + 32 * (index // 5)
-        cv2.rectangle(canvas, (x, y - 7), (x + 14, y + 7), (blue, green, red), -1)
-        draw_text(canvas, f"{name.replace('_', ' ')} {counts[name]}", (x + 24, y), TEXT)
+        place = 16 + 250 * (index % 5), 60 + 32 * (index // 5)
+        _draw_entry(canvas, place, class_color(name, index), f"{name.replace('_', ' ')} {counts[name]}")
     if frame.has(entities.BEV_SEGMENTATION, "Image:buffer"):
         # Recordings of version 0.1.0 do not name their classes, which are those of the segmentation head.
-        _draw_map_legend(canvas, frame.values(entities.RUN, "map_classes") or list(MAP_CLASSES))
+        classes = frame.values(entities.RUN, "map_classes") or list(MAP_CLASSES)
+        width = min(250, (CAMERAS_WIDTH - 16) // len(classes))
+        for index, (name, color) in enumerate(map_colors(classes).items()):
+            _draw_entry(canvas, (16 + width * index, 60 + 32 * 2), color, f"map: {name.replace('_', ' ')}")
 
 
-def _draw_map_legend(canvas: Canvas, classes: list[str]) -> None:
-    width = min(250, (CAMERAS_WIDTH - 16) // len(classes))
-    for index, (name, (red, green, blue)) in enumerate(map_colors(classes).items()):
-        x, y = 16 + width * index, 60 + 32 * 2
-        cv2.rectangle(canvas, (x, y - 7), (x + 14, y + 7), (blue, green, red), -1)
-        draw_text(canvas, f"map: {name.replace('_', ' ')}", (x + 24, y), TEXT)
+def _draw_entry(canvas: Canvas, place: tuple[int, int], color: Color, text: str) -> None:
+    x, y = place
+    cv2.rectangle(canvas, (x, y - 7), (x + 14, y + 7), color[::-1], -1)
+    draw_text(canvas, text, (x + 24, y), TEXT)
 
 
 def _rotation(frame: RecordedFrame, entity: str) -> Array:

@@ -8,9 +8,10 @@ lets the pages connect to that origin only; so the viewer in the browser cannot 
 from __future__ import annotations
 
 import ipaddress
+import os
 import re
-import shutil
 import socket
+import stat
 import sys
 import threading
 import time
@@ -20,11 +21,11 @@ from collections.abc import Callable
 from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 from urllib.parse import parse_qs, quote, urlsplit
 
 from bevcli.errors import OutputError
-from bevcli.viewer.native import LOOPBACK, free_port, start_viewer, stop
+from bevcli.viewer.native import LOOPBACK, display_is_there, free_port, start_viewer, stop
 
 ASSETS = {
     "/": "text/html; charset=utf-8",
@@ -36,6 +37,8 @@ RECORDING = "/recording.rrd"
 START_TIMEOUT_S = 15.0
 STOP_TIMEOUT_S = 5.0
 CONNECTION_TIMEOUT_S = 60.0
+GROWTH_PERIOD_S = 0.05  # between two looks at a file that is still written
+BLOCK = 1 << 18  # bytes
 MOST_CONNECTIONS = 64
 FONT_LINKS = re.compile(rb"<link[^>]*https://fonts[^>]*>", re.DOTALL)  # links to Google's fonts; removed
 
@@ -56,18 +59,29 @@ def web_viewer_assets() -> dict[str, bytes]:
 class WebViewer:
     """A web server for the viewer and a recording.
 
+    The file is opened once, here: whatever takes its place later is not served.
+
     Args:
         assets: the web viewer's files by path (`web_viewer_assets`).
-        source: the file of a recording, or the address of a live stream (rerun+http://…).
+        recording: the .rrd file.
         host: the address to listen on.
         port: the preferred port; if it is in use, the next free one is taken.
+        ended: set when the file has its last byte; until then, viewers get what is appended. None for a whole file.
+
+    Raises OutputError where the recording cannot be read, or is no file.
     """
 
     def __init__(
-        self, assets: dict[str, bytes], source: Path | str, host: str = LOOPBACK, port: int | None = 9090
+        self,
+        assets: dict[str, bytes],
+        recording: Path,
+        host: str = LOOPBACK,
+        port: int | None = 9090,
+        *,
+        ended: threading.Event | None = None,
     ) -> None:
+        handler = partial(_Handler, assets, _open_regular(recording), ended)
         self.host, self.port = host, free_port(port, host)
-        handler = partial(_Handler, assets, source)
         self._server = _Server((host, self.port), handler)
 
     @property
@@ -75,27 +89,42 @@ class WebViewer:
         """The address to open in a browser."""
         return f"http://{self.host}:{self.port}"
 
+    @property
+    def followers(self) -> int:
+        """The number of viewers that have begun to read a growing recording."""
+        return len(self._server.live_transfers)
+
     def serve(self) -> None:
         """Serves until `close` is called from another thread."""
         self._server.serve_forever(poll_interval=1.0)
 
     def close(self) -> None:
-        """Stops `serve`, and frees the port."""
+        """Stops `serve`, and frees the port. Viewers that follow a recording and still read get its rest first."""
         # shutdown waits until `serve` has ended, without a limit.
         stopping = threading.Thread(target=self._server.shutdown, daemon=True)
         stopping.start()
         stopping.join(STOP_TIMEOUT_S)
         self._server.server_close()
+        for transfer in self._server.live_transfers:
+            while transfer.is_alive() and time.monotonic() - self._server.last_block_s < STOP_TIMEOUT_S:
+                transfer.join(GROWTH_PERIOD_S)
 
 
 class _Server(ThreadingHTTPServer):
-    """A thread for each connection, MOST_CONNECTIONS at a time. A connection that breaks is no error."""
+    """A thread for each connection, MOST_CONNECTIONS at a time. A connection that breaks is no error.
+
+    Attributes:
+        live_transfers: threads that send a recording while it grows.
+        last_block_s: time at which a viewer took the last block (time.monotonic()).
+    """
 
     daemon_threads = True
 
     def __init__(self, address: tuple[str, int], handler: Callable[..., BaseHTTPRequestHandler]) -> None:
         if ":" in address[0]:
             self.address_family = socket.AF_INET6
+        self.live_transfers: list[threading.Thread] = []
+        self.last_block_s = 0.0
         self._free = threading.BoundedSemaphore(MOST_CONNECTIONS)
         super().__init__(address, handler)
 
@@ -120,11 +149,14 @@ class _Server(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
+    server: _Server
     protocol_version = "HTTP/1.1"
     timeout = CONNECTION_TIMEOUT_S  # of each read and write
 
-    def __init__(self, assets: dict[str, bytes], source: Path | str, *request: object) -> None:
-        self.assets, self.source = assets, source
+    def __init__(
+        self, assets: dict[str, bytes], file: BinaryIO, ended: threading.Event | None, *request: object
+    ) -> None:
+        self.assets, self.file, self.ended = assets, file, ended
         super().__init__(*request)  # type: ignore[arg-type]
 
     def do_GET(self) -> None:
@@ -132,8 +164,8 @@ class _Handler(BaseHTTPRequestHandler):
         parts = urlsplit(self.path)
         if not _is_own_name(self.headers.get("Host", "")):
             self._send_head(403, "text/plain", 0)
-        elif parts.path == RECORDING and isinstance(self.source, Path):
-            self._send_recording(self.source)
+        elif parts.path == RECORDING:
+            self._send_recording()
         elif parts.path == "/" and "url" not in parse_qs(parts.query):
             self._redirect(parts.query)
         elif parts.path in self.assets:
@@ -146,8 +178,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Logs nothing, so that the terminal stays readable."""
 
     def _redirect(self, query: str) -> None:
-        host = self.headers.get("Host", "")
-        url = self.source if isinstance(self.source, str) else f"http://{host}{RECORDING}"
+        url = f"http://{self.headers.get('Host', '')}{RECORDING}"
         self.send_response(302)
         # The labels of images and of the scene are unreadable in the light theme of a light browser.
         theme = "" if "theme" in parse_qs(query) else "&theme=dark"
@@ -155,22 +186,62 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Length", "0")
         self.end_headers()
 
-    def _send_recording(self, path: Path) -> None:
-        with path.open("rb") as file:
-            self._send_head(200, "application/octet-stream", path.stat().st_size)
-            shutil.copyfileobj(file, self.wfile, 1 << 20)
+    def _send_recording(self) -> None:
+        size = os.fstat(self.file.fileno()).st_size
+        if self.ended is None:
+            self._send_head(200, "application/octet-stream", size)
+            self._copy(0, size)
+            return
+        self.server.live_transfers.append(threading.current_thread())
+        self.close_connection = True
+        self._send_head(200, "application/octet-stream", None)
+        sent, is_last = 0, False
+        while not is_last:
+            is_last = self.ended.wait(GROWTH_PERIOD_S)
+            size = os.fstat(self.file.fileno()).st_size
+            if size > sent:
+                self.wfile.write(b"%x\r\n" % (size - sent))
+                self._copy(sent, size)
+                self.wfile.write(b"\r\n")
+                sent = size
+        self.wfile.write(b"0\r\n\r\n")
+        """Sends the bytes from start to end. Raises ConnectionError where the file is cut meanwhile."""
 
-    def _send_head(self, status: int, media_type: str, length: int) -> None:
-        live = "" if isinstance(self.source, Path) else self.source.removeprefix("rerun+").removesuffix("/proxy")
+    def _copy(self, start: int, end: int) -> None:
+        """Sends the bytes from start to end. Raises ConnectionError where the file is cut meanwhile."""
+        while start < end:
+            block = os.pread(self.file.fileno(), min(BLOCK, end - start), start)
+            if not block:
+                raise ConnectionError("the recording is shorter than it was")
+            self.wfile.write(block)
+            self.server.last_block_s = time.monotonic()
+            start += len(block)
+
+    def _send_head(self, status: int, media_type: str, length: int | None) -> None:
+        """length: of the body in bytes; None for a body in chunks."""
         self.send_response(status)
         self.send_header("Content-Type", media_type)
-        self.send_header("Content-Length", str(length))
-        self.send_header("Content-Security-Policy", f"connect-src 'self' blob: data: {live}".strip())
+        if length is None:
+            self.send_header("Transfer-Encoding", "chunked")
+        else:
+            self.send_header("Content-Length", str(length))
+        self.send_header("Content-Security-Policy", "connect-src 'self' blob: data:")
         self.end_headers()
 
 
+def _open_regular(path: Path) -> BinaryIO:
+    """The opened file, closed when nobody reads it any more. Raises OutputError where it is no regular file."""
+    try:
+        file = open(path, "rb", buffering=0, opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
+    except OSError as error:
+        raise OutputError(f"{path}: the recording cannot be read ({error.strerror})") from None
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        raise OutputError(f"{path}: is no file (expected a recording)")
+    return file
+
+
 def _is_own_name(host: str) -> bool:
-    """Whether a Host header names this machine: an IP address, localhost or the machine's own name.
+    """True if a Host header names this machine: an IP address, localhost or the machine's own name.
 
     Another name could be that of a foreign page which its owner has pointed to this machine (DNS rebinding), so that
     the browser lets the page read the recording.
@@ -197,3 +268,40 @@ def _fetch(address: str) -> bytes:
             if time.monotonic() > deadline:
                 raise OutputError(f"the web viewer does not start ({address}: {error})") from error
             time.sleep(0.05)
+
+
+class LiveView:
+    """A viewer in a window; without a display in the browser, at an address that is printed to stderr.
+
+    It reads the recording's own file while it grows, through the server above. Writing never waits for it.
+    """
+
+    def __init__(self) -> None:
+        self._ended = threading.Event()
+        self._web: WebViewer | None = None
+
+    @property
+    def address(self) -> str:
+        """The address to open in a browser; empty before `open`."""
+        return "" if self._web is None else self._web.address
+
+    @property
+    def followers(self) -> int:
+        """The number of viewers that have begun to read the recording."""
+        return 0 if self._web is None else self._web.followers
+
+    def open(self, recording: Path) -> None:
+        """Starts the viewer. A window stays open after the run until the user closes it."""
+        in_window = display_is_there()
+        self._web = WebViewer({} if in_window else web_viewer_assets(), recording, ended=self._ended)
+        threading.Thread(target=self._web.serve, daemon=True).start()
+        if in_window:
+            start_viewer("--bind", LOOPBACK, "--port", "auto", f"{self._web.address}{RECORDING}")
+        else:
+            print(f"live view: {self.address}", file=sys.stderr)
+
+    def close(self) -> None:
+        """Sends the rest of the recording, and stops the server. A window stays open."""
+        self._ended.set()
+        if self._web is not None:
+            self._web.close()

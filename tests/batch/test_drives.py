@@ -9,7 +9,7 @@ from small_fleet import write_drive
 from bevcli.batch.drives import find_drives, read_list
 from bevcli.batch.storage import open_storage
 from bevcli.errors import BevcliError, InputError
-from bevcli.sequences.nuscenes.choice import NuScenesChoice
+from bevcli.sequences.nuscenes.format import NuScenesOptions
 
 
 def test_patterns_lists_and_paths_give_each_drive_once(tmp_path):
@@ -36,7 +36,7 @@ def test_a_nuscenes_root_gives_a_drive_per_scene(tmp_path):
     drives, _ = find_drives([str(tmp_path)])
     assert [(drive.name, drive.scene) for drive in drives] == [(f"scene-000{i}",) * 2 for i in (1, 2, 3)]
     assert len({drive.input_hash for drive in drives}) == 3
-    (other,), _ = find_drives([str(tmp_path)], NuScenesChoice(version="v1.0-test"))
+    (other,), _ = find_drives([str(tmp_path)], NuScenesOptions(version="v1.0-test"))
     assert 'has no version "v1.0-test"' in other.problem
 
 

@@ -5,17 +5,24 @@ import shutil
 import numpy as np
 import pytest
 import torch
+from command_line import MINI_TOML
 from memory_drive import MemorySequence
 from recorded_drive import predict
-from small_fleet import MINI_TOML, make_job, results_of, write_drive
+from small_fleet import make_job, results_of, write_drive
 
 from bevcli.batch.drives import find_drives
-from bevcli.batch.embeddings import EMBEDDINGS, FramePooling, read_embeddings
-from bevcli.batch.find_like import find_like, open_query, similar_frames_page
+from bevcli.batch.find_like import (
+    EMBEDDINGS,
+    FramePooling,
+    find_like,
+    open_query,
+    read_embeddings,
+    similar_frames_page,
+)
 from bevcli.batch.run_batch import run_batch
 from bevcli.batch.storage import open_storage
 from bevcli.errors import InputError
-from bevcli.pipeline.state_file import save_state
+from bevcli.runs.state import save_state
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +37,7 @@ def batch(tmp_path_factory):
     return folder / "out"
 
 
-def test_the_vector_of_a_frame_is_mean_and_deviation_of_its_features(tmp_path):
+def test_a_frames_vector_is_mean_and_deviation_of_its_features(tmp_path):
     frame = MemorySequence().load(2)
     prediction = predict(frame)
     pooling = FramePooling("model")
@@ -72,7 +79,7 @@ def test_the_page_shows_a_thumbnail_of_every_frame(batch):
 
 def test_what_cannot_be_searched_is_named(batch, tmp_path):
     storage = open_storage(str(batch))
-    with pytest.raises(InputError, match=r"--frame 9: one-.* has no vector of this frame \(found frames 0 to 2\)"):
+    with pytest.raises(InputError, match=r"`frame=9`: one-.* has no vector of this frame \(found frames 0 to 2\)"):
         find_like(open_query("one", 9, storage), storage)
     with pytest.raises(InputError, match="nobody: is not a drive of the batch"):
         open_query("nobody", 0, storage)
@@ -82,7 +89,7 @@ def test_what_cannot_be_searched_is_named(batch, tmp_path):
     result = tmp_path / "drives/x-0"
     result.mkdir(parents=True)
     save_state(result / EMBEDDINGS, {"vectors": torch.zeros(1)})
-    with pytest.raises(InputError, match="does not contain the vectors of a drive"):
+    with pytest.raises(InputError, match=r"embeddings\.safetensors: the state cannot be read"):
         find_like(query, open_storage(str(tmp_path)))
     pooling = FramePooling("another model")
     pooling.write(result)

@@ -11,17 +11,20 @@ import fsspec
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from command_line import MINI_TOML
 from sequences.nuscenes_tables import Size, write_tables
-from small_fleet import MINI_TOML, make_job, results_of, write_drive, write_fleet
+from small_fleet import make_job, results_of, write_drive, write_fleet
 
 from bevcli.batch import worker as worker_module
 from bevcli.batch.drives import find_drives
 from bevcli.batch.run_batch import run_batch
 from bevcli.batch.worker import Worker
-from bevcli.errors import OutputError
+from bevcli.errors import InputError, OutputError
 from bevcli.evaluation.evaluate import evaluate
-from bevcli.pipeline.run import run_into_folder
+from bevcli.runs.run_into_folder import run_into_folder
+from bevcli.sequences.nuscenes.format import NuScenesOptions
 from bevcli.sequences.open import open_sequence
+from bevcli.sequences.ros.format import BagOptions
 
 COMPARED = ("predictions.json", "tracks.csv")
 
@@ -50,7 +53,7 @@ def batch(fleet, tmp_path):
 
 def run_alone(fleet, name, out):
     job = make_job(out, fleet / "mini.toml")
-    drive = open_sequence(fleet / "drives" / name, **job.reading)
+    drive = open_sequence(fleet / "drives" / name, job.source)
     run_into_folder(job.load_model(), drive, out, job.run)
 
 
@@ -59,7 +62,7 @@ def times(out):
     return {path: path.stat().st_mtime_ns for part in ("drives", "failed") for path in (out / part).rglob("*")}
 
 
-def test_drives_have_the_bytes_of_single_runs_and_a_bad_one_is_a_row(batch, fleet, tmp_path):
+def test_drives_have_bytes_of_single_runs_and_a_bad_one_is_a_row(batch, fleet, tmp_path):
     summary = batch(options={"retries": 1})
     assert (summary.drives, summary.failed, summary.skipped, summary.stopped) == (4, 1, 0, False)
     results = results_of(tmp_path / "out")
@@ -89,7 +92,7 @@ def test_a_second_batch_with_resume_does_nothing(batch, tmp_path):
     assert times(tmp_path / "out") == before
 
 
-def test_failed_drives_run_again_on_request_or_after_they_are_mended(batch, tmp_path):
+def test_failed_drives_run_again_on_request_or_once_mended(batch, tmp_path):
     drives = tmp_path / "drives"
     write_drive(drives / "good", 1)
     (drives / "bad").mkdir()
@@ -102,7 +105,7 @@ def test_failed_drives_run_again_on_request_or_after_they_are_mended(batch, tmp_
     assert (summary.skipped, summary.failed) == (1, 0)
 
 
-def test_drives_run_again_if_the_input_or_an_option_differs_but_not_in_another_order(batch, tmp_path):
+def test_drives_run_again_if_input_or_option_differs_not_order(batch, tmp_path):
     paths = [str(path) for path in write_fleet(tmp_path / "drives", 3)]
     batch(paths)
     assert batch(paths[::-1], resume=True).skipped == 3
@@ -115,14 +118,24 @@ def test_drives_run_again_if_the_input_or_an_option_differs_but_not_in_another_o
     assert batch(paths[:2], resume=True, options={"embed": True}).skipped == 0
 
 
-def test_a_folder_with_a_batch_or_something_else_is_not_overwritten(batch, fleet, tmp_path):
+def test_a_folder_with_a_batch_or_other_files_is_not_overwritten(batch, fleet, tmp_path):
     batch([str(fleet / "drives/d000")])
-    with pytest.raises(OutputError, match="has a batch already: pass --resume"):
+    with pytest.raises(OutputError, match="has a batch already: pass `resume=True`"):
         batch([str(fleet / "drives/d000")])
     (tmp_path / "other").mkdir()
     (tmp_path / "other/file").touch()
     with pytest.raises(OutputError, match="is not a batch and not empty"):
         batch([str(fleet / "drives/d000")], out=tmp_path / "other")
+
+
+def test_an_option_that_no_drive_has_is_refused_by_name(fleet, tmp_path):
+    job = make_job(tmp_path / "out", fleet / "mini.toml")
+    drives, _ = find_drives([str(fleet / "drives/*")])
+    with pytest.raises(InputError, match="the drives of the batch: `topics` is for a ROS bag: remove it"):
+        run_batch(replace(job, own=(BagOptions(topics={"CAM": "/image"}),)), job.load_model(), drives)
+    (tmp_path / "one.mcap").touch()
+    mixed, _ = find_drives([str(fleet / "drives/d000"), str(tmp_path / "one.mcap")])
+    replace(job, own=(BagOptions(topics={"CAM": "/image"}), NuScenesOptions())).check_options(mixed)
 
 
 def test_a_stopped_batch_goes_on_with_the_drives_that_are_left(batch, fleet, tmp_path):
@@ -166,7 +179,7 @@ def test_any_exception_of_one_drive_leaves_the_others_alone(batch, monkeypatch):
     assert errors["d001"] == "ZeroDivisionError: two lines"
 
 
-def test_metrics_of_drives_are_those_of_eval_and_the_joint_ones_are_written(batch, fleet, tmp_path):
+def test_metrics_of_drives_equal_eval_and_joint_ones_are_written(batch, fleet, tmp_path):
     (fleet / "drives/d000/ground_truth.json").rename(fleet / "hidden.json")
     try:
         summary = batch(options={"evaluate": True})
@@ -231,7 +244,7 @@ def test_a_nuscenes_root_at_a_url_gives_the_bytes_of_a_local_one(batch, tmp_path
     assert [path.name for path in tables.iterdir()] == ["v1.0-mini"]
 
 
-def test_the_report_needs_no_other_file_and_contains_no_markup_of_a_drive(batch, fleet, tmp_path):
+def test_the_report_needs_no_other_file_nor_a_drives_markup(batch, fleet, tmp_path):
     name = "<b>bold<b>"
     shutil.copytree(fleet / "drives/d000", tmp_path / "drives" / name)
     batch([str(tmp_path / "drives" / name), str(fleet / "drives/empty")])
@@ -251,12 +264,14 @@ def test_the_hash_of_a_job_follows_model_weights_and_options(fleet, tmp_path):
     other.write_text(MINI_TOML.replace("queries = 20", "queries = 21"))
     jobs = [
         job,
-        replace(job, reading={**job.reading, "every": 2}),
+        replace(job, source=replace(job.source, every=2)),
         replace(job, run=replace(job.run, track=False)),
-        replace(job, precision="bf16"),
+        replace(job, model=replace(job.model, precision="bf16")),
     ]
     hashes = [each.hash(model) for each in jobs] + [
-        replace(job, model=str(other)).hash(replace(job, model=str(other)).load_model())
+        replace(job, model=replace(job.model, model=str(other))).hash(
+            replace(job, model=replace(job.model, model=str(other))).load_model()
+        )
     ]
     assert len(set(hashes)) == 5
     assert replace(job, out="elsewhere", retries=0).hash(model) == job.hash(model)

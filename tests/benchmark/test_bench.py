@@ -9,13 +9,13 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from bevcli.benchmark import measure
+from bevcli.benchmark import limits, measure
 from bevcli.benchmark.limits import MachineLimits
 from bevcli.benchmark.made_up import MadeUpDrive
 from bevcli.benchmark.result import BenchmarkResult, Comparison
-from bevcli.benchmark.version import Version
+from bevcli.benchmark.versions import Version
 from bevcli.cli.main import app
-from bevcli.pipeline.preprocess import Preprocessor
+from bevcli.inference.preprocess import Preprocessor
 
 RESULT = BenchmarkResult(
     model="tiny",
@@ -56,6 +56,9 @@ def test_the_text_contains_the_derived_numbers():
 
 def test_json_of_a_whole_benchmark(small_model_file, monkeypatch):
     monkeypatch.setattr(measure, "RUNS", 2)
+    monkeypatch.setattr(measure, "RUN_FRAMES", 4)
+    monkeypatch.setattr(limits, "CPU_EDGE", 256)
+    monkeypatch.setattr(limits, "COPIED_FLOATS", 1 << 20)
     arguments = ["bench", "--model", str(small_model_file), "--frames", "1", "--against", "plain", "--json"]
     answer = CliRunner().invoke(app, arguments, catch_exceptions=False)
     data = json.loads(answer.stdout)
@@ -108,7 +111,7 @@ def test_on_a_gpu_the_stages_add_up_to_the_frame(small_model_file):
 def test_a_window_is_filled_after_one_frame(window_model, frames, filled):
     version, drive = Version(window_model(*frames), torch.device("cpu")), MadeUpDrive(3)
     version.step(Preprocessor(version.runner.config)(drive.load(2)))
-    version.fill_window(drive)
+    version.fill_past(drive)
     assert [frame.stamp.index for frame in version.state.memory.frames] == filled
 
 
@@ -126,6 +129,6 @@ def test_runs_and_the_model_alone_take_turns_without_a_gap(window_model, monkeyp
 
     monkeypatch.setattr(version.runner, "step", watched)
     run_s, ratio = measure._time_runs(version, drive, 1, 4)
-    assert seen == [(place, "") for place in range(1, 17)]
+    assert seen == [(place, None) for place in range(1, 17)]
     assert run_s > 0
     assert ratio > 0

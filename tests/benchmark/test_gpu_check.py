@@ -33,10 +33,12 @@ def test_a_device_that_agrees_with_the_cpu_passes(small_model_file, monkeypatch)
 
 def test_numbers_that_are_too_far_apart_are_an_error():
     near, far = torch.full((99,), 0.01), torch.tensor([5.0])
-    assert "error" not in gpu_check._differences(torch.cat([near, far]), 0.001)
-    assert gpu_check._differences(torch.cat([near, far, far]), 0.001)["error"] == "differs too much"
-    assert gpu_check._differences(near, 0.5)["error"] == "differs too much"
-    assert gpu_check._differences(torch.full((99,), math.nan), math.nan)["error"] == "differs too much"
+    assert "error" not in gpu_check._differences([(torch.cat([near, far]), torch.tensor(0.001))])
+    assert gpu_check._differences([(torch.cat([near, far, far]), torch.tensor(0.001))])["error"] == "differs too much"
+    assert gpu_check._differences([(near, torch.tensor(0.5))])["error"] == "differs too much"
+    assert (
+        gpu_check._differences([(torch.full((99,), math.nan), torch.tensor(math.nan))])["error"] == "differs too much"
+    )
 
 
 def test_a_part_that_fails_does_not_end_the_others(monkeypatch, tmp_path, capsys):

@@ -7,11 +7,11 @@ import torch
 
 from bevcli.benchmark.made_up import MadeUpDrive, made_up_model
 from bevcli.config import load_config
+from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.pillar_projection import find_hits, project_pillars
-from bevcli.pipeline.preprocess import Preprocessor
 
 
-def test_the_cameras_see_about_as_many_cells_as_those_of_nuscenes():
+def test_the_cameras_see_about_as_many_cells_as_nuscenes():
     config = load_config("tiny")
     prepared = Preprocessor(config)(MadeUpDrive(1).load(0))
     pillars = torch.as_tensor(config.bev_grid.pillars()).float().flatten(0, 1)

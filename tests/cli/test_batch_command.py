@@ -1,7 +1,8 @@
 """`bevcli batch` and `bevcli find-like` as commands: exit codes, messages and the files that they name."""
 
 import pytest
-from small_fleet import MINI_TOML, command, make_job, write_fleet
+from command_line import MINI_TOML, command
+from small_fleet import make_job, write_fleet
 
 from bevcli.batch import ray_workers
 from bevcli.batch.ray_workers import Workers, run_on_ray
@@ -44,6 +45,6 @@ def test_mistakes_are_one_line(place):
 
 
 def test_several_workers_without_ray_name_what_to_install(place, monkeypatch):
-    monkeypatch.setattr(ray_workers, "is_installed", lambda: False)
-    with pytest.raises(BevcliError, match=r"run pip install 'bevcli\[ray\]', or pass --workers 1"):
+    monkeypatch.setattr(ray_workers, "ray_is_installed", lambda: False)
+    with pytest.raises(BevcliError, match=r"run pip install 'bevcli\[ray\]', or pass `count=1`"):
         next(run_on_ray(make_job(place / "none", place / "mini.toml"), "hash", [], Workers(2)))

@@ -1,49 +1,49 @@
-"""The options that select inputs, models and devices, and what `run` tells before it starts."""
+"""The options that select inputs, models and devices."""
 
 import pytest
 import torch
-import typer
 from typer.testing import CliRunner
 
-from bevcli.cli.input_options import complete_model, ego_motion_use, parse_frames, parse_rate
 from bevcli.cli.main import app
 from bevcli.config import known_models
 from bevcli.errors import BevcliError
-from bevcli.pipeline.model_loading import choose_device
+from bevcli.inference.load import Model, choose_device
+from bevcli.inference.options import complete_model
 from bevcli.sequences.open import open_sequence
+from bevcli.sequences.options import SequenceOptions, parse_frames, parse_rate
 
 
 @pytest.mark.parametrize(
     ("text", "frames"),
-    [(None, [0, 1, 2, 3, 4]), ("1:3", [1, 2]), (":2", [0, 1]), ("3:99", [3, 4]), ("4:", [4]), (":", [0, 1, 2, 3, 4])],
+    [("1:3", [1, 2]), (":2", [0, 1]), ("3:99", [3, 4]), ("4:", [4]), (":", [0, 1, 2, 3, 4])],
 )
 def test_frames_range_excludes_its_end(text, frames):
-    chosen = parse_frames(text)
-    assert [0, 1, 2, 3, 4][slice(None) if chosen is None else chosen] == frames
+    assert [0, 1, 2, 3, 4][parse_frames(text)] == frames
 
 
 @pytest.mark.parametrize("text", ["3", "a:b", "-1:2", "1:2:3", ""])
 def test_invalid_frames_range_is_a_usage_error(text):
-    with pytest.raises(typer.BadParameter, match="expected A:B"):
+    with pytest.raises(ValueError, match="expected A:B"):
         parse_frames(text)
 
 
 def test_rate_is_a_number_or_all():
-    assert parse_rate("2.5", default_hz=2.0) == 2.5
-    assert parse_rate("all", default_hz=2.0) is None
-    assert parse_rate(None, default_hz=2.0) == 2.0
+    assert parse_rate("2.5") == 2.5
+    assert parse_rate("all") == "all"
 
 
 @pytest.mark.parametrize("text", ["fast", "-2", "0", "inf", "nan"])
 def test_invalid_rate_is_a_usage_error(text):
-    with pytest.raises(typer.BadParameter, match="frames per second"):
-        parse_rate(text, default_hz=2.0)
+    with pytest.raises(ValueError, match="frames per second"):
+        parse_rate(text)
 
 
-def test_static_takes_precedence_over_no_temporal():
-    assert ego_motion_use(static=True, temporal=False) == "static"
-    assert ego_motion_use(static=False, temporal=False) == "optional"
-    assert ego_motion_use(static=False, temporal=True) == "required"
+def test_static_takes_precedence_over_no_temporal(mini_model):
+    model = Model(mini_model)
+    static = SequenceOptions(ego_motion="static")
+    assert static.for_model(model.config, temporal=False).ego_motion == "static"
+    assert SequenceOptions().for_model(model.config, temporal=False).ego_motion == "optional"
+    assert SequenceOptions().for_model(model.config).ego_motion == "required"
 
 
 def test_model_names_are_completed():
@@ -53,13 +53,13 @@ def test_model_names_are_completed():
 
 @pytest.mark.parametrize("name", ["cuda:", "gpu", "cuda:x"])
 def test_an_unknown_device_is_an_error(name):
-    with pytest.raises(BevcliError, match=f"--device {name}: unknown device"):
+    with pytest.raises(BevcliError, match=f"`device={name}`: unknown device"):
         choose_device(name)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_a_numbered_gpu_that_is_not_there_is_an_error():
-    with pytest.raises(BevcliError, match="--device cuda:1: PyTorch sees no CUDA GPU here"):
+    with pytest.raises(BevcliError, match="`device=cuda:1`: PyTorch sees no CUDA GPU here"):
         choose_device("cuda:1")
 
 

@@ -1,7 +1,6 @@
 """`bevcli run` that is killed, stopped, or runs out of disk: it loses no finished frame, and `--resume` goes on."""
 
 import json
-import multiprocessing
 import os
 import random
 import resource
@@ -9,13 +8,16 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
 import pytest
 import torch
+from command_line import MINI_TOML
+from forks import FORKS
 from memory_drive import MemorySequence
-from test_run import MINI_TOML
+from small_fleet import RIG
 
 from bevcli.cli.main import run_app
 from bevcli.sequences.files.boxes_file import read_boxes
@@ -23,8 +25,47 @@ from bevcli.sequences.native.writer import NativeWriter
 from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.recording_reader import RecordingReader
 
-FRAMES = 24
-COMMAND = [sys.executable, "-m", "bevcli", "run", "drive", "--model", "mini.toml", "--untrained", "--rate", "all"]
+FRAMES = 16
+pytestmark = pytest.mark.usefixtures("unchecked_recordings")
+
+
+class Run:
+    """A process of `bevcli run drive`, whose texts go into a file."""
+
+    def __init__(self, folder: Path, out: Path, *more: str, file_size: int | None = None) -> None:
+        handle, name = tempfile.mkstemp(dir=folder, suffix=".txt")
+        os.close(handle)
+        self.texts = Path(name)
+        self.process = FORKS.Process(target=run_in_fork, args=(folder, [*ARGUMENTS, str(out), *more], name, file_size))
+        self.process.start()
+
+    def end(self, seconds: float = 60) -> int:
+        """The exit code."""
+        self.process.join(seconds)
+        assert self.process.exitcode is not None, self.printed
+        return self.process.exitcode
+
+    def signal(self, number: int) -> None:
+        os.kill(self.process.pid, number)
+
+    @property
+    def printed(self) -> str:
+        return self.texts.read_text()
+
+
+ARGUMENTS = ["run", "drive", "--model", "mini.toml", "--untrained", "--rate", "all", "--out"]
+
+
+def run_in_fork(folder: Path, arguments: list[str], texts: str, file_size: int | None) -> None:
+    os.chdir(folder)
+    with open(texts, "w") as output:
+        os.dup2(output.fileno(), 1)
+        os.dup2(output.fileno(), 2)
+    sys.argv = ["bevcli", *arguments]
+    torch.set_num_threads(1)  # the last bits of a result depend on the number of threads
+    if file_size is not None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (file_size, file_size))
+    run_app()
 
 
 @pytest.fixture(scope="module")
@@ -32,26 +73,19 @@ def place(tmp_path_factory):
     """A folder with a drive, a model and the folder `whole` of an uninterrupted run."""
     folder = tmp_path_factory.mktemp("interrupted")
     (folder / "mini.toml").write_text(MINI_TOML)
-    sequence = MemorySequence(FRAMES, scenes="a" * FRAMES)
+    sequence = MemorySequence(FRAMES, RIG, scenes="a" * FRAMES)
     with NativeWriter(folder / "drive", with_ego_motion=True) as writer:
         for index in range(FRAMES):
             writer.write(sequence.load(index))
-    done = start(folder, "whole")
-    assert done.wait(120) == 0, done.stderr.read()
+    complete(folder, folder / "whole")
     return folder
 
 
-def start(folder, out, *more, **options) -> subprocess.Popen:
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    return subprocess.Popen(
-        [*COMMAND, "--out", str(out), *more],
-        cwd=folder,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=environment,
-        **options,
-    )
+def complete(folder: Path, out: Path, *more: str) -> float:
+    """Runs to the end; returns the seconds that this took."""
+    began, run = time.monotonic(), Run(folder, out, *more)
+    assert run.end() == 0, run.printed
+    return time.monotonic() - began
 
 
 def finished(out: Path) -> int:
@@ -62,13 +96,13 @@ def finished(out: Path) -> int:
     return len(read_boxes(out / "predictions.json").frames)
 
 
-def wait_for_frames(process: subprocess.Popen, out: Path, count: int) -> None:
+def wait_for_frames(run: Run, out: Path, count: int) -> None:
     deadline = time.monotonic() + 60
-    while process.poll() is None and time.monotonic() < deadline:
+    while run.process.is_alive() and time.monotonic() < deadline:
         if (out / "predictions.json.partial").exists() and finished(out) >= count:
             return
-        time.sleep(0.005)
-    raise AssertionError(f"the run ended before frame {count}: {process.stderr.read()}")
+        time.sleep(0.01)
+    raise AssertionError(f"the run ended before frame {count}: {run.printed}")
 
 
 def frames_of_recording(path: Path) -> list[int]:
@@ -92,70 +126,66 @@ def assert_equals_whole(out: Path, folder: Path) -> None:
     assert frames_of_recording(out / "recording.rrd") == list(range(FRAMES))
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-def test_a_signal_ends_the_run_after_its_frame_and_resume_completes_it(place, number, code):
-    out = place / f"signal-{code}"
-    process = start(place, out)
-    wait_for_frames(process, out, 2)
-    process.send_signal(number)
-    _, printed = process.communicate(timeout=20)
-    assert process.returncode == code
-    assert "Traceback" not in printed
-    count = assert_finished_frames_are_whole(out, place)
-    assert 2 <= count < FRAMES
-    assert json.loads((out / "summary.json").read_text())["frames"] == count
-    again = start(place, out, "--resume")
-    assert again.wait(60) == 0, again.stderr.read()
+def test_a_signal_ends_a_run_after_its_frame_resume_completes_it(place):
+    out, count = place / "signals", 0
+    for number, code in ((signal.SIGTERM, 143), (signal.SIGINT, 130)):
+        run, before = Run(place, out, "--resume"), count
+        wait_for_frames(run, out, before + 2)
+        run.signal(number)
+        assert run.end(20) == code
+        assert "Traceback" not in run.printed
+        count = assert_finished_frames_are_whole(out, place)
+        assert before + 2 <= count < FRAMES
+        assert json.loads((out / "summary.json").read_text())["frames"] == count
+    complete(place, out, "--resume")
     assert_equals_whole(out, place)
 
 
 def test_a_second_signal_ends_the_run_at_once(place):
     out = place / "twice"
-    process = start(place, out)
-    wait_for_frames(process, out, 1)
-    os.kill(process.pid, signal.SIGSTOP)  # both signals come within one frame
+    run = Run(place, out)
+    wait_for_frames(run, out, 1)
+    run.signal(signal.SIGSTOP)  # both signals come within one frame
     for number in (signal.SIGTERM, signal.SIGINT):
-        process.send_signal(number)
-    os.kill(process.pid, signal.SIGCONT)
-    process.communicate(timeout=10)
-    assert process.returncode != 0
+        run.signal(number)
+    run.signal(signal.SIGCONT)
+    assert run.end(10) != 0
 
 
-def assert_fails_in_one_line(process: subprocess.Popen, *words: str) -> None:
-    _, printed = process.communicate(timeout=60)
+def slow(value):
+    return pytest.param(value, marks=pytest.mark.slow)
+
+
+def assert_fails_in_one_line(run: Run, *words: str) -> None:
+    code = run.end()
     lines = [
-        line for line in printed.splitlines() if not line.startswith(("note:", "warning:")) and "frames" not in line
+        line for line in run.printed.splitlines() if not line.startswith(("note:", "warning:")) and "frames" not in line
     ]
-    assert process.returncode == 1, printed
-    assert len(lines) == 1, printed
+    assert code == 1, run.printed
+    assert len(lines) == 1, run.printed
     assert lines[0].startswith("error: ")
-    assert all(word in lines[0] for word in words), printed
+    assert all(word in lines[0] for word in words), run.printed
 
 
-@pytest.mark.parametrize("limit", [100, 3_000, 100_000, 600_000, 1_500_000])
+@pytest.mark.parametrize("limit", [slow(3_000), 100_000, slow(300_000), slow(600_000)])
 def test_a_file_size_limit_is_an_error_of_one_line(place, limit):
     out = place / f"limit-{limit}"
-
-    def limit_files():
-        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
-
-    assert_fails_in_one_line(start(place, out, preexec_fn=limit_files), "written")
+    assert_fails_in_one_line(Run(place, out, file_size=limit), "written")
     assert_finished_frames_are_whole(out, place)
 
 
-@pytest.mark.parametrize("size", ["300k", "2m", "4m"])
-def test_a_full_disk_is_an_error_of_one_line_and_resume_goes_on_with_more_space(place, size):
+@pytest.mark.parametrize("size", [slow("100k"), slow("300k"), "600k"])
+def test_a_full_disk_is_a_one_line_error_and_resume_goes_on(place, size):
     disk = place / f"disk-{size}"
     disk.mkdir()
     mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "none", disk], check=False, timeout=10)
     if mounted.returncode != 0:
         pytest.skip("cannot mount a small file system here (needs root)")
     try:
-        assert_fails_in_one_line(start(place, disk / "out"), "No space left on device")
+        assert_fails_in_one_line(Run(place, disk / "out"), "No space left on device")
         assert_finished_frames_are_whole(disk / "out", place)
         subprocess.run(["mount", "-o", "remount,size=100m", disk], check=True, timeout=10)
-        again = start(place, disk / "out", "--resume")
-        assert again.wait(60) == 0, again.stderr.read()
+        complete(place, disk / "out", "--resume")
         assert_equals_whole(disk / "out", place)
     finally:
         subprocess.run(["umount", disk], check=True, timeout=10)
@@ -163,58 +193,30 @@ def test_a_full_disk_is_an_error_of_one_line_and_resume_goes_on_with_more_space(
 
 def test_a_deleted_output_folder_is_an_error_of_one_line(place):
     out = place / "deleted"
-    process = start(place, out)
-    wait_for_frames(process, out, 1)
+    run = Run(place, out)
+    wait_for_frames(run, out, 1)
     out.rename(place / "moved")
     subprocess.run(["rm", "-r", place / "moved"], check=False, timeout=10)
-    assert_fails_in_one_line(process, "deleted")
+    assert_fails_in_one_line(run, "deleted")
     assert not out.exists()
 
 
-# Runs that are killed start from a process that has imported everything, which takes most of the time of a short run.
-FORKS = multiprocessing.get_context("forkserver")
-FORKS.set_forkserver_preload(
-    ["bevcli.cli.main", "bevcli.pipeline.run", "bevcli.recording.writer", "bevcli.sequences.open"]
-)
+def check_kills(folder: Path, kills: int, name: str, duration_s: float) -> None:
+    """Kills at random moments, the first and the second after a frame.
 
-
-def run_in_fork(folder: Path, arguments: list[str]) -> None:
-    os.chdir(folder)
-    with open(folder / "output.txt", "w") as output:
-        os.dup2(output.fileno(), 1)
-        os.dup2(output.fileno(), 2)
-    sys.argv = arguments
-    torch.set_num_threads(1)  # as `start`: the last bits of a result depend on the number of threads
-    run_app()
-
-
-def fork(folder: Path, out: Path, *more: str) -> multiprocessing.process.BaseProcess:
-    process = FORKS.Process(target=run_in_fork, args=(folder, [*COMMAND[2:], "--out", str(out), *more]))
-    process.start()
-    return process
-
-
-def complete(folder: Path, out: Path, *more: str) -> float:
-    """Runs to the end; returns the seconds that this took."""
-    began = time.monotonic()
-    process = fork(folder, out, *more)
-    process.join(60)
-    assert process.exitcode == 0, (folder / "output.txt").read_text()
-    return time.monotonic() - began
-
-
-def check_kills(folder: Path, kills: int, name: str) -> None:
-    """Kills at random moments: every second run is resumed and killed again, the others start anew."""
+    Every second run is resumed and killed again, the others start anew.
+    """
     randomness = random.Random(19)
-    complete(folder, folder / f"{name}-timed")  # starts the server of the forks
-    duration_s = complete(folder, folder / f"{name}-timed", "--force")
     found = []
     for number in range(kills):
         out, how = (folder / f"{name}-killed", "--force") if number % 2 else (folder / f"{name}-resumed", "--resume")
-        process = fork(folder, out, how)
-        process.join(randomness.uniform(0.2, 1.0) * duration_s)
-        process.kill()
-        process.join(10)
+        run = Run(folder, out, how)
+        if number < 2:
+            wait_for_frames(run, out, randomness.randrange(1, FRAMES // 2))
+        else:
+            run.process.join(randomness.uniform(0.2, 1.0) * duration_s)
+        run.process.kill()
+        run.process.join(10)
         found.append(assert_finished_frames_are_whole(out, folder) if out.exists() else 0)
         if finished(out) == FRAMES:
             shutil.rmtree(out)
@@ -224,10 +226,10 @@ def check_kills(folder: Path, kills: int, name: str) -> None:
 
 
 def test_a_few_kills_lose_no_finished_frame(place):
-    check_kills(place, 4, "few")
+    check_kills(place, 3, "few", 1.5)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_a_hundred_kills_lose_no_finished_frame(place):
-    check_kills(place, 100, "many")
+    check_kills(place, 100, "many", complete(place, place / "timed"))

@@ -1,19 +1,18 @@
+import contextlib
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from command_line import command
 
 import bevcli
+from bevcli.cli.main import run_app
 
-SAMPLE = Path(__file__).parents[2] / "samples" / "street"
+ROOT = Path(__file__).parents[2]
+SAMPLE = ROOT / "samples" / "street"
 HEAVY = ("torch", "cv2", "rerun", "matplotlib", "trimesh", "scipy", "numba")
-
-
-def bevcli_command(*arguments, **options):
-    return subprocess.run(
-        [sys.executable, "-m", "bevcli", *arguments], capture_output=True, text=True, check=False, **options
-    )
 
 
 def test_help_imports_nothing_heavy():
@@ -22,18 +21,18 @@ def test_help_imports_nothing_heavy():
 
 
 def test_version():
-    assert bevcli_command("--version").stdout.strip() == f"bevcli {bevcli.__version__}"
+    assert command(ROOT, "--version").stdout.strip() == f"bevcli {bevcli.__version__}"
 
 
 @pytest.mark.parametrize(
-    ("command", "extra"), [("run", "video"), ("batch", "video"), ("export-onnx", "onnx"), ("quantize", "onnx")]
+    ("name", "extra"), [("run", "video"), ("batch", "video"), ("export-onnx", "onnx"), ("quantize", "onnx")]
 )
-def test_help_names_the_extras_that_a_command_needs(command, extra):
-    assert f"bevcli[{extra}]" in bevcli_command(command, "--help").stdout
+def test_help_names_the_extras_that_a_command_needs(name, extra):
+    assert f"bevcli[{extra}]" in command(ROOT, name, "--help").stdout
 
 
 def test_a_mistake_in_usage_exits_2():
-    assert bevcli_command("run").returncode == 2
+    assert command(ROOT, "run").returncode == 2
 
 
 @pytest.mark.parametrize(
@@ -46,7 +45,7 @@ def test_a_mistake_in_usage_exits_2():
     ],
 )
 def test_a_mistake_in_the_input_is_one_line_and_exits_1(arguments, message, tmp_path):
-    done = bevcli_command(*arguments, cwd=tmp_path)
+    done = command(tmp_path, *arguments)
     assert done.returncode == 1
     assert done.stderr.startswith("error: ")
     assert done.stderr.count("\n") == 1
@@ -80,7 +79,7 @@ NAME_OF_300 = "x" * 300
     ids=lambda arguments: arguments[0],
 )
 def test_an_output_name_that_the_system_refuses_is_one_line(arguments, tmp_path):
-    done = bevcli_command(*map(str, arguments), cwd=tmp_path)
+    done = command(tmp_path, *arguments)
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1].startswith("error: ")
     assert "Traceback" not in done.stderr
@@ -88,10 +87,18 @@ def test_an_output_name_that_the_system_refuses_is_one_line(arguments, tmp_path)
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no full device")
 @pytest.mark.parametrize("arguments", [("--version",), ("--help",), ("weights", "inspect", "--model", "demo")])
-def test_a_full_output_device_is_one_line(arguments, tmp_path):
+def test_a_full_output_device_is_one_line(arguments, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["bevcli", *arguments])
+    with open("/dev/full", "w") as full, contextlib.redirect_stdout(full), pytest.raises(SystemExit, match="1"):
+        run_app()
+    assert capsys.readouterr().err == "error: No space left on device\n"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no full device")
+def test_a_program_with_a_full_output_device_ends_in_one_line():
     with open("/dev/full", "w") as full:
         done = subprocess.run(
-            [sys.executable, "-m", "bevcli", *arguments], stdout=full, stderr=subprocess.PIPE, text=True, check=False
+            [sys.executable, "-m", "bevcli", "--help"], stdout=full, stderr=subprocess.PIPE, text=True, check=False
         )
     assert done.returncode == 1
     assert done.stderr == "error: No space left on device\n"
@@ -102,7 +109,42 @@ def test_a_full_output_device_is_one_line(arguments, tmp_path):
     [("--port", "99999"), ("--port", "0"), ("--host", ""), ("--host", "no.such.host.invalid"), ("--host", "192.0.2.1")],
 )
 def test_an_address_that_cannot_be_listened_on_is_a_usage_error(options, tmp_path):
-    done = bevcli_command("viz", "recording.rrd", "--web", *options, cwd=tmp_path)
+    done = command(tmp_path, "viz", "recording.rrd", "--web", *options)
     assert done.returncode == 2
     assert options[0] in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_a_command_of_another_package_appears(tmp_path):
+    (tmp_path / "greeting.py").write_text(
+        "from bevcli.errors import InputError\n"
+        "from bevcli.options import option, options\n\n"
+        "@options('Greeting')\n"
+        "class GreetingOptions:\n"
+        "    name: str = option(default='you', help='Whom to greet.', flag='--to')\n\n"
+        "def greet(greeting: GreetingOptions) -> None:\n"
+        '    """Print a greeting."""\n'
+        "    if greeting.name == 'nobody':\n"
+        "        raise InputError('pass another `name`')\n"
+        "    print('hello', greeting.name)\n"
+    )
+    package = tmp_path / "greeting-1.0.dist-info"
+    package.mkdir()
+    (package / "METADATA").write_text("Metadata-Version: 2.1\nName: greeting\nVersion: 1.0\n")
+    (package / "entry_points.txt").write_text("[bevcli.commands]\ngreet = greeting:greet\n")
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+
+    def program(*arguments: str) -> subprocess.CompletedProcess:
+        command = [sys.executable, "-m", "bevcli", *arguments]
+        return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+
+    assert "Print a greeting." in program("--help").stdout
+    assert program("greet", "--to", "me").stdout == "hello me\n"
+    assert program("greet", "--to", "nobody").stderr == "error: pass another --to\n"
+
+
+def test_a_command_imports_no_other_command():
+    code = "import sys, bevcli.cli.main as m; m.app(['samples', '--help'], standalone_mode=False); print(*sys.modules)"
+    loaded = subprocess.check_output([sys.executable, "-c", code], text=True).split()
+    assert "bevcli.cli.samples" in loaded
+    assert "bevcli.cli.run" not in loaded

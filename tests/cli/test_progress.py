@@ -18,7 +18,7 @@ class Terminal(io.StringIO):
 
 def work(stream: io.StringIO, total: int) -> list[str]:
     """Runs a progress to its end with one message in the middle; returns what was written, line by line."""
-    with Progress(total, "frames", stream) as progress:
+    with Progress(total, "frames", stream=stream) as progress:
         for done in range(total):
             if done == total // 2:
                 progress.message("note: [half] of it :car:")

@@ -3,49 +3,22 @@
 import csv
 import json
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from command_line import MINI_TOML, command
 from memory_drive import MemorySequence, WithoutImages
 
 from bevcli.errors import OutputError
-from bevcli.pipeline.model_loading import Model
-from bevcli.pipeline.run import RunOptions, run_into_folder
+from bevcli.inference.load import Model
 from bevcli.recording.options import RecordingOptions
+from bevcli.runs.run_into_folder import RunOptions, run_into_folder
 from bevcli.sequences.files.boxes_file import read_boxes
 
 SAMPLE = Path(__file__).parents[2] / "samples/street"
-MINI_TOML = """
-name = "mini"
-classes = ["car", "truck", "construction_vehicle", "bus", "trailer",
-  "barrier", "motorcycle", "bicycle", "pedestrian", "traffic_cone"]
-cameras = ["CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT"]
-channels = 32
-[image]
-size = [160, 90]
-color_order = "rgb"
-mean = [123.0, 116.0, 103.0]
-std = [58.0, 57.0, 57.0]
-[bev_grid]
-rows = 10
-columns = 10
-[backbone]
-blocks = [1, 1, 1, 1]
-width = 8
-[encoder]
-layers = 2
-attention_heads = 4
-[decoder]
-layers = 2
-attention_heads = 4
-queries = 30
-max_boxes = 20
-"""
 
 
 @pytest.fixture
@@ -60,13 +33,7 @@ def job(mini_model, tmp_path):
     return make
 
 
-def command(cwd, *arguments):
-    return subprocess.run(
-        [sys.executable, "-m", "bevcli", *arguments], cwd=cwd, capture_output=True, text=True, check=False
-    )
-
-
-def test_the_command_runs_the_sample_and_says_that_it_is_untrained(tmp_path):
+def test_the_command_runs_the_sample_and_says_untrained(tmp_path):
     (tmp_path / "mini.toml").write_text(MINI_TOML)
     done = command(tmp_path, "run", str(SAMPLE), "--model", "mini.toml", "--untrained", "--frames", "0:2")
     assert done.returncode == 0, done.stderr
@@ -79,7 +46,7 @@ def test_the_command_runs_the_sample_and_says_that_it_is_untrained(tmp_path):
         ".bevcli",
     }
     boxes = read_boxes(out / "predictions.json")
-    assert [len(frame.boxes) for frame in boxes.frames] == [20, 20]
+    assert [len(frame.boxes) for frame in boxes.frames] == [10, 10]
     assert boxes.extras["untrained"] is True
     assert json.loads((out / "summary.json").read_text())["untrained"] is True
     assert "UNTRAINED" in done.stdout
@@ -129,7 +96,7 @@ def test_gaps_are_in_the_summary(job):
     out = job(WithoutImages({0: ["CAM_BACK"], 1: "all"}, count=3))
     summary = json.loads((out / "summary.json").read_text())
     assert summary["skipped_frames"] == [1]
-    assert {"frame": 0, "camera": "CAM_BACK", "reason": "missing"} in summary["dropped_pictures"]
+    assert {"frame": 0, "camera": "CAM_BACK", "reason": "missing"} in summary["dropped_images"]
     frames = read_boxes(out / "predictions.json").frames
     assert frames[1].extras["skipped"] is True
     assert len(frames[1].boxes) == 0

@@ -6,10 +6,10 @@ import torch
 from memory_drive import MemorySequence
 
 from bevcli.frame import MAP_CLASSES
-from bevcli.model.bevformer import BEVFormer
-from bevcli.pipeline.model_loading import Model
-from bevcli.pipeline.run import RunOptions, run_into_folder
+from bevcli.inference.load import Model
+from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.recording.options import RecordingOptions
+from bevcli.runs.run_into_folder import RunOptions, run_into_folder
 from bevcli.sequences.files.map_folder import open_maps
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,20 +15,21 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.config import as_table
-from bevcli.engines.engine import ENGINES
 from bevcli.engines.export_onnx import export_onnx
-from bevcli.engines.exported import load_exported, raw_images
+from bevcli.engines.exported import load_exported
 from bevcli.engines.quantize import quantize
 from bevcli.errors import BevcliError, ConfigError, WeightsError
+from bevcli.inference.load import load_model
+from bevcli.inference.run import run
+from bevcli.inference.tracking import TrackerConfig
+from bevcli.model.export_form import raw_images
 from bevcli.model.image_tokens import ImageTokensConfig
 from bevcli.model.resnet import ResNetConfig
-from bevcli.pipeline.model_loading import load_model
-from bevcli.pipeline.run import run
-from bevcli.pipeline.tracking import TrackerConfig
+from bevcli.registry import entries
 from bevcli.sequences.open import open_sequence
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
-from small_model import small_inputs, small_model
+from small_model import small_config, small_inputs, small_model, step_of_file
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
@@ -53,18 +55,20 @@ def int8_file(small_file) -> Path:
 
 def _model():
     return small_model(
+        encoder=replace(small_config().encoder, layers=1),
+        decoder=replace(small_config().decoder, layers=1),
         backbone=ResNetConfig((1, 1, 1, 1), "pytorch", output_stages=(3, 4), deformable_stages=(), width=8),
         image_tokens=ImageTokensConfig(level_embeddings=3, calibration_embedding=True),
     )
 
 
-@pytest.mark.parametrize("engine", list(ENGINES))
+@pytest.mark.parametrize("engine", list(entries("bevcli.engines")))
 def test_an_engine_equals_the_model_with_and_without_history(small_file, engine):
     exported, model = load_exported(small_file, engine), _model()
     history = torch.randn(1, 48, 32, generator=torch.Generator().manual_seed(1))
     for previous in (None, history):
         with torch.inference_mode():
-            expected, found = model(small_inputs(), previous), exported(small_inputs(), previous)
+            expected, found = model(small_inputs(), previous), step_of_file(exported, small_inputs(), previous)
         torch.testing.assert_close(found.bev, expected.bev, rtol=1e-4, atol=1e-4)
         torch.testing.assert_close(found.class_logits[-1], expected.class_logits[-1], rtol=1e-4, atol=1e-3)
         torch.testing.assert_close(found.box_codes[-1], expected.box_codes[-1], rtol=1e-4, atol=1e-3)
@@ -78,12 +82,12 @@ def test_a_file_tells_its_model_and_that_its_weights_are_random(small_file):
     assert model.prepared is model.network
 
 
-@pytest.mark.parametrize("engine", list(ENGINES))
-def test_int8_is_close_to_float32_and_only_the_image_features_are_rounded(small_file, int8_file, engine):
+@pytest.mark.parametrize("engine", list(entries("bevcli.engines")))
+def test_int8_is_close_and_only_image_features_are_rounded(small_file, int8_file, engine):
     assert load_model(int8_file).precision == "int8"
     exact, rounded = (load_exported(file, engine) for file in (small_file, int8_file))
     with torch.inference_mode():
-        expected, found = exact(small_inputs()).bev, rounded(small_inputs()).bev
+        expected, found = (step_of_file(file, small_inputs()).bev for file in (exact, rounded))
     difference = (found - expected).norm() / expected.norm()
     assert 1e-5 < difference < 0.1
     proto = onnx.load(int8_file)
@@ -95,20 +99,22 @@ def test_int8_is_close_to_float32_and_only_the_image_features_are_rounded(small_
     assert len(weights) == len(readers)  # of the convolutions, and no others
 
 
-def test_more_cameras_on_a_cell_than_the_file_has_slots_for_are_an_error(small_file, int8_file, tmp_path):
+def test_more_cameras_on_a_cell_than_slots_are_an_error(small_file, int8_file, tmp_path):
     model = _model()
     inputs = small_inputs()
     inputs.image_from_bev[:, 1] = inputs.image_from_bev[:, 0]  # both cameras look the same way
     with torch.inference_mode():
         expected = model(inputs).bev
-        torch.testing.assert_close(load_exported(small_file, "onnxruntime")(inputs).bev, expected, rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(
+            step_of_file(load_exported(small_file, "onnxruntime"), inputs).bev, expected, rtol=1e-4, atol=1e-4
+        )
     one = tmp_path / "one.onnx"
     proto = onnx.load(small_file)
     for entry in proto.metadata_props:
         entry.value = "1" if entry.key == "cameras_per_cell" else entry.value
     onnx.save(proto, one)
-    with pytest.raises(WeightsError, match=r"takes 1 cameras .* has 2: export it with --cameras-per-cell 2"):
-        load_exported(one, "onnxruntime")(inputs)
+    with pytest.raises(WeightsError, match=r"takes 1 cameras .* has 2: use `bevcli export-onnx --cameras-per-cell 2`"):
+        step_of_file(load_exported(one, "onnxruntime"), inputs)
 
 
 def test_a_model_in_the_metadata_is_checked_like_a_model_file(small_file, tmp_path):
@@ -127,14 +133,14 @@ def test_a_model_in_the_metadata_is_checked_like_a_model_file(small_file, tmp_pa
 
 def test_options_that_do_not_apply_are_named(small_file, int8_file):
     for options, message in (
-        ({"weights": "w.pth"}, "an exported file holds its weights: leave out --weights w.pth"),
-        ({"untrained": True}, "leave out --untrained"),
-        ({"precision": "bf16"}, "--precision bf16: .* has a fixed precision"),
-        ({"device": "cuda"}, "--device cuda: .* runs on the CPU"),
+        ({"weights": "w.pth"}, "an exported file holds its weights: leave out `weights=w.pth`"),
+        ({"untrained": True}, "leave out `untrained"),
+        ({"precision": "bf16"}, "`precision=bf16`: .* has a fixed precision"),
+        ({"device": "cuda"}, "`device=cuda`: .* runs on the CPU"),
     ):
         with pytest.raises(BevcliError, match=message):
             load_model(small_file, **options)
-    with pytest.raises(BevcliError, match=r"bevcli export-onnx tiny, then --model tiny\.onnx"):
+    with pytest.raises(BevcliError, match=r"bevcli export-onnx tiny, then `model=tiny\.onnx`"):
         load_model("tiny", untrained=True, engine="openvino")
     with pytest.raises(WeightsError, match="is quantised already"):
         quantize(int8_file, [], int8_file.with_name("again.onnx"))
@@ -148,7 +154,7 @@ def test_every_command_runs_demo_from_a_file(tmp_path, monkeypatch):
     command("export-onnx", "demo")
     command("quantize", "demo.onnx", "--calibrate", str(STREET), "--frames", "4", "--check", str(STREET))
     expected = [prediction.boxes for _, prediction in run(load_model("demo"), open_sequence(STREET))]
-    for engine in ENGINES:
+    for engine in entries("bevcli.engines"):
         command("run", str(STREET), "--model", "demo.onnx", "--engine", engine, "--out", engine)
         found = json.loads((tmp_path / engine / "predictions.json").read_text())
         first = found["frames"][0]["boxes"][0]

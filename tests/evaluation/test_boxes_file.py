@@ -73,7 +73,7 @@ def test_the_file_is_whole_after_every_frame(tmp_path: Path) -> None:
     assert len(read_boxes(path).frames) == 3
 
 
-def test_a_number_that_is_not_finite_is_refused_and_leaves_the_file_whole(tmp_path: Path) -> None:
+def test_a_number_that_is_not_finite_is_refused_file_stays_whole(tmp_path: Path) -> None:
     path = tmp_path / "predictions.json"
     broken = some_boxes().transformed(np.full((4, 4), np.nan))
     with BoxesWriter(path, "world") as writer:

@@ -23,7 +23,6 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
 from bevcli.sequences.files.boxes_file import BoxesFile, BoxesWriter, FrameBoxes, read_boxes
 from bevcli.sequences.files.map_folder import write_map
-from bevcli.sequences.nuscenes.choice import NuScenesChoice
 
 
 def write_frames(path: Path, frames: list[Boxes3D], reference: str = "ego", pose: Pose | None = None) -> Path:
@@ -188,7 +187,7 @@ def test_mistakes_are_named(tmp_path: Path, files: tuple[Path, Path]) -> None:
     with pytest.raises(InputError, match=r"other.predictions\.json: the file is missing"):
         open_predictions(tmp_path / "other")
     with pytest.raises(InputError, match='has no scene "x"'):
-        open_ground_truth(files[1], NuScenesChoice(scene="x"))
+        open_ground_truth(files[1], scene="x")
 
 
 def test_bicycles_in_a_bicycle_rack_are_left_out() -> None:

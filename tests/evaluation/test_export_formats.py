@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from bevcli.errors import InputError
-from bevcli.evaluation.export_csv import write_csv
-from bevcli.evaluation.export_kitti import kitti_labels, write_kitti
+from bevcli.evaluation.export import kitti_labels, write_csv, write_kitti
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, default_ego_from_bev

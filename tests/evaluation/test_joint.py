@@ -13,7 +13,7 @@ from bevcli.evaluation.scores_report import scores_to_dict
 from bevcli.evaluation.segmentation import evaluate_segmentation
 from bevcli.frame import BevMap
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.pipeline.state_file import load_state, save_state
+from bevcli.runs.state import load_state, save_state
 
 CONFIG = DetectionConfig().cut_at(25)
 
@@ -71,7 +71,7 @@ def test_drives_without_boxes_on_one_side_count_too():
 def test_matches_of_a_drive_are_the_same_after_a_file(tmp_path):
     before = matches_of(*drive_of(4, 3, 0.5))
     save_state(tmp_path / "matches.safetensors", before)
-    after = load_state(tmp_path / "matches.safetensors")
+    after = load_state(tmp_path / "matches.safetensors", DriveMatches)
     assert_same(score_jointly([after], CONFIG)[0], score_jointly([before], CONFIG)[0])
 
 

@@ -57,7 +57,7 @@ def test_the_frame_of_reference_does_not_matter(one: str, other: str) -> None:
     assert pairs.ego_pose_known == ("world" in (one, other))
 
 
-def test_boxes_without_a_pose_for_the_transformation_are_an_error() -> None:
+def test_boxes_without_a_pose_to_transform_by_are_an_error() -> None:
     world = boxes_file(TRUTH, "world")
     bev = replace(boxes_file(PREDICTIONS, "bev"), ego_from_bev=None)
     with pytest.raises(InputError, match=r'frame 0: boxes in the bev frame .* add "ego_from_bev"'):
@@ -96,7 +96,9 @@ def test_frames_of_one_side_are_left_out_or_counted_with_a_note() -> None:
     half = boxes_file(PREDICTIONS[:2])
     left_out = pair_frames(half, boxes_file(TRUTH))
     assert len(left_out.predictions) == 2
-    assert left_out.notes == ("2 of 4 ground-truth frames have no prediction: left out (--count-missing counts them)",)
+    assert left_out.notes == (
+        "2 of 4 ground-truth frames have no prediction: left out (`count_missing=True` counts them)",
+    )
     counted = pair_frames(half, boxes_file(TRUTH), count_missing=True)
     assert [len(boxes) for boxes in counted.predictions[2:]] == [0, 0]
     assert "count as missed" in counted.notes[0]

@@ -39,7 +39,7 @@ def test_cells_are_summed_over_frames() -> None:
     assert scores.iou == pytest.approx({"vehicle": 5 / 8})  # not the mean of 1/4 and 1
 
 
-def test_a_finer_and_wider_prediction_is_sampled_at_the_cells_of_the_ground_truth() -> None:
+def test_a_finer_wider_prediction_is_sampled_at_cells_of_truth() -> None:
     true = bev_map([[1, 0], [0, 2]])
     wide = np.zeros((8, 8), dtype=np.uint8)  # cells of 1 m over 8 m
     wide[2:4, 2:4], wide[4:6, 4:6], wide[0], wide[7] = 1, 2, 8, 8

@@ -213,5 +213,5 @@ def test_a_tracking_submission_is_read_back(tmp_path: Path) -> None:
 
 def test_a_tracking_submission_needs_tracks(tmp_path: Path) -> None:
     file = BoxesFile("world", (frame(0, many_boxes(3), sample_token="t"),))
-    with pytest.raises(InputError, match="run with --track"):
+    with pytest.raises(InputError, match="bevcli run --track"):
         write_submission(file, tmp_path / "out.json", tracking=True)

@@ -140,7 +140,7 @@ def test_an_object_keeps_its_track_while_it_is_near():
     assert (found["ids"], found["motp"], found["amota"]) == (0, 0.5, 1)
 
 
-def test_a_track_that_changes_its_name_in_a_gap_is_a_fragmentation_and_a_switch():
+def test_a_track_renamed_in_a_gap_is_fragmented_and_a_switch():
     truth = [[("A", k, 0)] for k in range(10)]
     predicted = [[("s", k, 0)] if k < 4 else [("t", k, 0)] if k >= 6 else [] for k in range(10)]
     found = metrics(car_scores(predicted, truth))
@@ -155,7 +155,7 @@ def test_a_gap_inside_a_track_is_interpolated():
     assert (found["frag"], found["fn"], found["amota"], found["motp"]) == (0, 0, 1, 0)
 
 
-def test_longer_gaps_are_interpolated_with_the_devkits_inverted_weights():
+def test_longer_gaps_are_interpolated_with_the_devkits_weights():
     truth = [[("A", k, 0)] for k in range(4)]
     predicted = [[("s", 0, 0)], [], [], [("s", 3, 0)]]
     found = metrics(car_scores(predicted, truth))
@@ -170,7 +170,7 @@ def test_a_late_start_counts_the_seconds_before_the_first_match():
     assert (found["mt"], found["ml"]) == (0, 0)  # found in seven of ten frames
 
 
-def test_the_same_names_in_another_scene_are_other_objects_and_tracks():
+def test_the_same_names_in_another_scene_are_other_objects():
     truth = two_cars(frames=5) + two_cars(frames=5)
     swapped = two_cars("s", "t", frames=5) + two_cars("t", "s", frames=5)
     scores = car_scores(swapped, truth, scenes="aaaaabbbbb")
@@ -195,7 +195,7 @@ def test_boxes_beyond_the_range_of_their_class_do_not_count():
     assert (found["gt"], found["fp"], found["amota"]) == (5, 0, 1)
 
 
-def test_as_many_pairs_as_possible_are_matched_even_if_they_are_farther():
+def test_as_many_pairs_as_possible_are_matched_even_if_farther():
     truth = [[("A", 0, 0), ("B", 1.9, 0)]]
     predicted = [[("s", 1.8, 0), ("t", 3.7, 0)]]  # s is nearest to B, but then t would be left over for nobody
     found = metrics(car_scores(predicted, truth))

@@ -8,8 +8,8 @@ import torch
 
 from bevcli.config import load_config
 from bevcli.explain.figures import FIGURES
-from bevcli.model.bevformer import BEVFormer
-from bevcli.model.bevformer_v2 import BEVFormerV2, BEVFormerV2Config
+from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer_v2.bevformer_v2 import BEVFormerV2, BEVFormerV2Config
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs/bevformer.md"
@@ -123,13 +123,13 @@ def facts_of(name: str) -> dict[str, str]:
     return facts
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", [pytest.param(name, marks=[pytest.mark.slow] * (name == "base")) for name in MODELS])
 def test_the_tables_state_the_shapes_and_sizes_of_the_models(model):
     assert {label: stated[model] for label, stated in table_rows(MODELS).items()} == facts_of(model)
 
 
 @pytest.mark.parametrize("model", V2_MODELS)
-def test_the_table_of_v2_states_the_shapes_and_sizes_of_its_models(model):
+def test_the_table_of_v2_states_shapes_and_sizes_of_its_models(model):
     assert {label: stated[model] for label, stated in table_rows(V2_MODELS).items()} == facts_of_v2(model)
 
 

@@ -63,7 +63,7 @@ def _maps(folder: Path) -> None:
 def _model(folder: Path) -> None:
     from bevcli.checkpoints import expected_state
     from bevcli.config import TRACKING, TRAINING, load_config, load_table
-    from bevcli.pipeline.tracking import TrackerConfig
+    from bevcli.inference.tracking import TrackerConfig
     from bevcli.training.job import TrainingConfig
 
     load_table(folder / "model.toml", TRACKING, TrackerConfig)
@@ -98,15 +98,16 @@ def _recording(folder: Path) -> None:
 
 
 def _state(folder: Path) -> None:
-    from bevcli.pipeline.run_folder import RunFolder
-    from bevcli.pipeline.run_state import open_state
+    from bevcli.model.bevformer.bevformer import BevHistory
+    from bevcli.runs.folder import RunFolder
+    from bevcli.runs.state import RunState, saved_state
 
     with RunFolder(folder / "out", resume=True) as out:
-        open_state(out, {"model": "mini"})
+        saved_state(out, {"model": "mini"}, RunState[BevHistory])
 
 
 def _older_run(folder: Path) -> None:
-    from bevcli.pipeline.run_folder import RunFolder
+    from bevcli.runs.folder import RunFolder
 
     with RunFolder(folder / "older", force=True):
         pass
@@ -115,8 +116,7 @@ def _older_run(folder: Path) -> None:
 def _checkpoint(folder: Path) -> None:
     import torch
 
-    from bevcli.training.checkpoint import load_checkpoint
-    from bevcli.training.learning_curves import LearningCurve
+    from bevcli.training.files import LearningCurve, load_checkpoint
 
     model = torch.nn.Linear(2, 1)
     load_checkpoint(folder / "checkpoint.pt", model, torch.optim.AdamW(model.parameters()))

@@ -21,13 +21,12 @@ from recorded_drive import record
 
 from bevcli.frame import FrameStamp
 from bevcli.geometry.transforms import Pose
-from bevcli.pipeline.run_state import RunnerState, RunState
-from bevcli.pipeline.runner import BevState
-from bevcli.pipeline.state_file import save_state
-from bevcli.pipeline.temporal import BevHistory
-from bevcli.sequences.native.ego_motion_file import read_ego_motion
+from bevcli.model.bevformer.bevformer import BevHistory
+from bevcli.runs.state import RunState, save_state
+from bevcli.runs.summary import Counts
+from bevcli.sequences.native.tables import read_ego_motion
 from bevcli.sequences.open import open_sequence
-from bevcli.training.checkpoint import save_checkpoint
+from bevcli.training.files import save_checkpoint
 
 CAMERAS = ("CAM_FRONT", "CAM_BACK")
 SIZE = (64, 36)
@@ -159,10 +158,8 @@ def _runs(folder: Path) -> None:
     """The state of a run, the summary of an older one, a checkpoint of a training, and a mesh of the vehicle."""
     (folder / "out/.bevcli").mkdir(parents=True)
     (folder / "out/.bevcli/written").write_text("recording.rrd\npredictions.json\n")
-    runner = RunnerState(
-        BevState(BevHistory(torch.zeros(1, 4, 2), Pose(np.zeros(3), np.eye(4)[0])), FrameStamp(0, "", 5))
-    )
-    save_state(folder / "out/.bevcli/state.safetensors", RunState({"model": "mini"}, 1, runner, None, {"boxes": 3}))
+    memory, stamp = BevHistory(torch.zeros(1, 4, 2), Pose.identity()), FrameStamp(0, "", 5)
+    save_state(folder / "out/.bevcli/state.safetensors", RunState({"model": "mini"}, None, Counts(), memory, stamp))
     (folder / "older").mkdir()
     (folder / "older/summary.json").write_text(json.dumps({"bevcli_version": "0.1", "files": ["older/recording.rrd"]}))
     model = torch.nn.Linear(2, 1)

@@ -11,7 +11,7 @@ def test_cells_of_a_small_grid_by_hand():
     assert grid.cell_centers()[1, 3] == pytest.approx([3, 0.5])
 
 
-def test_cell_of_a_centre_is_its_cell_and_outside_points_have_none():
+def test_cell_of_a_centre_is_its_cell_outside_points_have_none():
     grid = BevGrid(rows=5, columns=7)
     rows, columns = np.indices((5, 7))
     assert (grid.cell_of(grid.cell_centers()) == np.stack([rows, columns], axis=-1)).all()

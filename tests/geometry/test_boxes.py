@@ -35,7 +35,7 @@ def test_edges_have_the_lengths_of_the_sizes():
     )
 
 
-def test_transforming_moves_corners_like_points_and_can_be_inverted():
+def test_transforming_moves_corners_like_points_and_inverts():
     a_from_b = rigid((3, -1, 0.5), rotation_about_z(0.7))
     boxes = some_boxes()
     moved = boxes.transformed(a_from_b)

@@ -56,7 +56,7 @@ def test_points_behind_the_camera_have_no_pixel():
     assert camera().contains(pixels, depth).tolist() == [False, False, True]
 
 
-def test_distortion_that_is_not_monotonic_gives_no_pixel_beyond_its_limit():
+def test_distortion_not_monotonic_gives_no_pixel_past_its_limit():
     pixels, _ = camera(Distortion("brown_conrady", (-0.3, 0, 0, 0))).project([[8.0, 0, 4]])
     assert np.isnan(pixels).all()
 

@@ -22,12 +22,15 @@ from stated_rule import rule_image, rule_tensor
 
 from bevcli.config import load_config
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.ego_motion import Kinematics
 from bevcli.geometry.transforms import Pose, rigid, rotation_from_quaternion
-from bevcli.model.bevformer import BEVFormer, BEVFormerConfig, BEVFormerInputs
-from bevcli.model.bevformer_v2 import BEVFormerV2, BEVFormerV2Config, WindowFrame
+from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer_v2.bevformer_v2 import BEVFormerV2, BEVFormerV2Config
+from bevcli.model.bevformer_v2.window import WindowFrame, other_bev_from_bev
+from bevcli.model.config import ModelConfig
 from bevcli.model.ego_motion import EgoMotionInputs, ego_motion_inputs
 from bevcli.model.official_keys import from_official
-from bevcli.pipeline.temporal import other_bev_from_bev
+from bevcli.model.step import ModelInputs
 
 DATA = Path(__file__).parents[1] / "data"
 STEM_GAIN = {"tiny": 1.0}
@@ -61,7 +64,7 @@ def rule_model(name: str, history_shift: str) -> BEVFormer:
     config = load_config(name)
     motion = replace(config.ego_motion, history_shift=history_shift)
     model = BEVFormer(replace(config, ego_motion=motion)).eval()
-    model.load_state_dict(from_official(official_state(name)))
+    model.load_state_dict(from_official(official_state(name))[0])
     return model
 
 
@@ -70,7 +73,7 @@ def rule_model_v2(name: str) -> BEVFormerV2:
     config = load_config(name)
     assert isinstance(config, BEVFormerV2Config)
     model = BEVFormerV2(config).eval()
-    state = from_official(official_state(name))
+    state = from_official(official_state(name))[0]
     state["decoder.query_embedding"] = state["decoder.query_embedding"][:900].clone()  # the first group
     model.load_state_dict(state)
     return model
@@ -84,7 +87,7 @@ def with_history_shift(model: BEVFormer, history_shift: str) -> BEVFormer:
     return other
 
 
-def image_from_bev(frame: int, config: BEVFormerConfig) -> np.ndarray:
+def image_from_bev(frame: int, config: ModelConfig) -> np.ndarray:
     """(N, 4, 4) bev metres to pixels of the network's input, by textbook formulas."""
     matrices = []
     for name in config.cameras:
@@ -100,7 +103,7 @@ def image_from_bev(frame: int, config: BEVFormerConfig) -> np.ndarray:
     return np.stack(matrices)
 
 
-def network_image(frame: int, camera: str, config: BEVFormerConfig) -> np.ndarray:
+def network_image(frame: int, camera: str, config: ModelConfig) -> np.ndarray:
     """(3, H, W) normalised, resized, padded."""
     image = rule_image(frame, camera).astype(np.float32)
     if config.image.color_order == "rgb":
@@ -119,19 +122,19 @@ def pose(frame: int) -> Pose:
     return Pose(np.array(info["ego2global_translation"]), np.array(info["ego2global_rotation"]))
 
 
-def motion(frame: int, config: BEVFormerConfig, *, all_frames: bool = False) -> EgoMotionInputs:
+def motion(frame: int, config: ModelConfig, *, all_frames: bool = False) -> EgoMotionInputs:
     """The ego-motion inputs of a frame. all_frames: whether frame 3 moves from frame 2, which is of another scene."""
     previous = pose(frame - 1) if frame in (1, 2) or (frame == 3 and all_frames) else None
     can_bus = np.array(frames()[frame]["can_bus"])
     sensors = can_bus[7:10], can_bus[10:13], can_bus[13:16]
-    return ego_motion_inputs(pose(frame), previous, *sensors, config.bev_grid, config.ego_motion)
+    return ego_motion_inputs(pose(frame), previous, Kinematics(*sensors), config.bev_grid, config.ego_motion)
 
 
-def inputs(frame: int, config: BEVFormerConfig, *, all_frames: bool = False) -> BEVFormerInputs:
+def inputs(frame: int, config: ModelConfig, *, all_frames: bool = False) -> ModelInputs:
     """The network's inputs for one of the four frames. all_frames: see `motion`."""
     moved = motion(frame, config, all_frames=all_frames)
     images = np.stack([network_image(frame, name, config) for name in config.cameras])
-    return BEVFormerInputs(
+    return ModelInputs(
         images=torch.from_numpy(images)[None],
         image_from_bev=torch.from_numpy(image_from_bev(frame, config)).float()[None],
         camera_index=torch.arange(len(config.cameras)),
@@ -142,7 +145,7 @@ def inputs(frame: int, config: BEVFormerConfig, *, all_frames: bool = False) -> 
     )
 
 
-def history_image_from_bev(frame: int, current: int, config: BEVFormerConfig) -> np.ndarray:
+def history_image_from_bev(frame: int, current: int, config: ModelConfig) -> np.ndarray:
     """(N, 4, 4) bev metres of the current frame to pixels of an earlier frame's images."""
     info = frames()[current]
     ego_from_bev = rigid(info["lidar2ego_translation"], rotation_from_quaternion(info["lidar2ego_rotation"]))

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from bevcli.engines.exported import ExportedModel
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.bevformer import BEVFormer, BEVFormerConfig, BEVFormerInputs, ImageConfig
+from bevcli.model.bevformer.bevformer import BEVFormer, recurrent_feed
+from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.decoder import DecoderConfig
 from bevcli.model.encoder import EncoderConfig
 from bevcli.model.fpn import FPNConfig
 from bevcli.model.image_tokens import ImageTokensConfig
 from bevcli.model.resnet import ResNetConfig
+from bevcli.model.step import ModelInputs, ModelOutputs
 
 CAMERAS = ("FRONT", "BACK")
 HEIGHT, WIDTH = 64, 96
 
 
-def small_config(**changes: object) -> BEVFormerConfig:
+def small_config(**changes: object) -> ModelConfig:
     """Two cameras, two feature levels, 6 x 8 cells over 24 x 32 m."""
     settings: dict[str, object] = {
         "name": "small-for-tests",
@@ -32,7 +36,7 @@ def small_config(**changes: object) -> BEVFormerConfig:
         "encoder": EncoderConfig(2, attention_heads=4, temporal_points=2, spatial_points=4, feed_forward_width=48),
         "decoder": DecoderConfig(2, attention_heads=4, points=2, queries=12, feed_forward_width=48, max_boxes=10),
     }
-    return BEVFormerConfig(**{**settings, **changes})  # type: ignore[arg-type]
+    return ModelConfig(**{**settings, **changes})  # type: ignore[arg-type]
 
 
 def small_model(seed: int = 0, **changes: object) -> BEVFormer:
@@ -46,11 +50,11 @@ def small_model(seed: int = 0, **changes: object) -> BEVFormer:
     return model
 
 
-def small_inputs(seed: int = 0, batch: int = 1) -> BEVFormerInputs:
+def small_inputs(seed: int = 0, batch: int = 1) -> ModelInputs:
     """Random images, one camera that looks along +y and one along -y, and a vehicle that moved slightly."""
     random = torch.Generator().manual_seed(seed)
     projections = torch.from_numpy(np.stack([_image_from_bev(1.0), _image_from_bev(-1.0)])).float()
-    return BEVFormerInputs(
+    return ModelInputs(
         images=torch.randn(batch, 2, 3, HEIGHT, WIDTH, generator=random),
         image_from_bev=projections.expand(batch, -1, -1, -1) + 0.1 * torch.randn(batch, 1, 1, 1, generator=random),
         camera_index=torch.arange(2),
@@ -59,6 +63,12 @@ def small_inputs(seed: int = 0, batch: int = 1) -> BEVFormerInputs:
         shift=0.1 * torch.randn(batch, 2, generator=random),
         rotation_deg=20 * torch.randn(batch, generator=random),
     )
+
+
+def step_of_file(exported: ExportedModel, inputs: ModelInputs, history: Tensor | None = None) -> ModelOutputs:
+    """One step of an exported BEVFormer."""
+    outputs: ModelOutputs = exported(recurrent_feed(inputs, history, exported.config))
+    return outputs
 
 
 def _image_from_bev(direction: float) -> np.ndarray:

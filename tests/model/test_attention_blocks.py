@@ -37,7 +37,7 @@ def test_temporal_self_attention_averages_a_cell_and_its_history() -> None:
     torch.testing.assert_close(attended, (history + current) / 2, atol=1e-5, rtol=1e-5)
 
 
-def test_shifted_reference_points_sample_the_neighbouring_history() -> None:
+def test_shifted_reference_points_sample_neighbouring_history() -> None:
     block = TemporalSelfAttention(CHANNELS, 2, 4, (ROWS, COLUMNS), dropout=0.1).eval()
     pass_through(block.attention)
     history, current = torch.randn(1, CELLS, CHANNELS), torch.zeros(1, CELLS, CHANNELS)
@@ -49,7 +49,7 @@ def test_shifted_reference_points_sample_the_neighbouring_history() -> None:
     torch.testing.assert_close(grid[:, -1], torch.zeros(ROWS, CHANNELS), atol=1e-5, rtol=0)
 
 
-def test_spatial_cross_attention_averages_the_cameras_that_see_a_cell() -> None:
+def test_spatial_cross_attention_averages_cameras_seeing_a_cell() -> None:
     block = SpatialCrossAttention(CHANNELS, heads=2, points=4, levels=1, dropout=0.1).eval()
     pass_through(block.attention)
     bias = torch.randn(CHANNELS)

@@ -8,13 +8,14 @@ import pytest
 import torch
 from small_model import small_inputs, small_model
 
-from bevcli.model.bevformer import BEVFormer, BEVFormerInputs, BEVFormerOutputs
-from bevcli.model.prepared import prepare_for_inference
+from bevcli.inference.attention import AttentionProbe
+from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.segmentation import SegmentationConfig
-from bevcli.pipeline.attention import AttentionProbe
+from bevcli.model.step import ModelInputs, ModelOutputs
 
 
-def drive(model: BEVFormer, seeds: list[int], history: torch.Tensor | None = None) -> list[BEVFormerOutputs]:
+def drive(model: BEVFormer, seeds: list[int], history: torch.Tensor | None = None) -> list[ModelOutputs]:
     """The outputs of frames with these seeds; each frame's history is the BEV map of the one before."""
     outputs = []
     with torch.inference_mode():
@@ -24,7 +25,7 @@ def drive(model: BEVFormer, seeds: list[int], history: torch.Tensor | None = Non
     return outputs
 
 
-def assert_same(a: BEVFormerOutputs, b: BEVFormerOutputs) -> None:
+def assert_same(a: ModelOutputs, b: ModelOutputs) -> None:
     for name in ("bev", "class_logits", "box_codes"):
         torch.testing.assert_close(getattr(a, name), getattr(b, name), atol=1e-5, rtol=1e-5)
 
@@ -127,7 +128,7 @@ def test_with_bfloat16_autocast_boxes_stay_float32_and_near() -> None:
 
 
 @pytest.mark.parametrize("prepared", [False, True])
-def test_a_probe_holds_the_samples_of_a_layer_and_changes_nothing(prepared: bool) -> None:
+def test_a_probe_holds_a_layers_samples_and_changes_nothing(prepared: bool) -> None:
     model, inputs, history = small_model(), small_inputs(), torch.randn(1, 48, 32)
     visible = hit(model, inputs)[0]
     if prepared:
@@ -146,7 +147,7 @@ def test_a_probe_holds_the_samples_of_a_layer_and_changes_nothing(prepared: bool
     assert ((probe.history_share > 0) & (probe.history_share < 1)).all()
 
 
-def test_a_probe_finds_the_sampling_points_of_untrained_heads_around_the_pillar() -> None:
+def test_a_probe_finds_untrained_heads_samples_around_the_pillar() -> None:
     """Untrained, point p of head h lies p + 1 cells of each level away, in the direction of its ring."""
     model, inputs = BEVFormer(small_model().config).eval(), small_inputs()
     with torch.no_grad(), AttentionProbe(model, layer=0, cells=torch.arange(48)) as probe:
@@ -177,7 +178,7 @@ def test_a_probe_leaves_no_hooks_behind_even_after_an_error() -> None:
     assert hooks(model) == 0
 
 
-def hit(model: BEVFormer, inputs: BEVFormerInputs) -> torch.Tensor:
+def hit(model: BEVFormer, inputs: ModelInputs) -> torch.Tensor:
     """(B, N, Y·X) bool: whether a camera sees a cell."""
     return model.pillars.project(inputs.image_from_bev, inputs.image_size, inputs.has_image).hit
 
@@ -187,7 +188,7 @@ def hooks(model: BEVFormer) -> int:
     return sum(len(module._forward_hooks) + len(module._forward_pre_hooks) for module in model.modules())
 
 
-def _row(inputs: BEVFormerInputs, i: int) -> BEVFormerInputs:
+def _row(inputs: ModelInputs, i: int) -> ModelInputs:
     """The inputs of one batch element."""
     rows = {field.name: getattr(inputs, field.name)[i : i + 1] for field in fields(inputs)}
-    return BEVFormerInputs(**{**rows, "camera_index": inputs.camera_index})
+    return ModelInputs(**{**rows, "camera_index": inputs.camera_index})

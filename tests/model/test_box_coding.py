@@ -9,16 +9,16 @@ from small_model import small_config
 
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import wrap_angle
-from bevcli.model.bevformer import BEVFormerOutputs
 from bevcli.model.box_coding import decode, encode
+from bevcli.model.step import ModelOutputs
 
 CONFIG = small_config()
 
 
-def outputs(logits: np.ndarray, codes: np.ndarray) -> BEVFormerOutputs:
+def outputs(logits: np.ndarray, codes: np.ndarray) -> ModelOutputs:
     """Two decoder layers, the first with arbitrary numbers; logits (Q, classes), codes (Q, 10)."""
     layers = [torch.from_numpy(np.stack([np.full_like(x, 7), x])).float()[:, None] for x in (logits, codes)]
-    return BEVFormerOutputs(torch.zeros(1, 1, 1), *layers)
+    return ModelOutputs(torch.zeros(1, 1, 1), *layers)
 
 
 def some_boxes(count: int) -> Boxes3D:
@@ -62,7 +62,7 @@ def test_unknown_velocities_are_nan_in_the_code() -> None:
     assert np.isnan(encode(boxes)[0, 8:]).all()
 
 
-def test_the_best_scores_are_decoded_and_a_query_may_have_two_classes() -> None:
+def test_best_scores_are_decoded_a_query_may_have_two_classes() -> None:
     logits = np.array([[3.0, 2.0, -5.0], [-4.0, 1.0, -6.0]])
     codes = encode(some_boxes(2))
     boxes = decode(outputs(logits, codes), CONFIG)[0]

@@ -14,7 +14,7 @@ from small_model import HEIGHT, WIDTH, small_config, small_inputs, small_model
 from bevcli.checkpoints import compare, load_weights
 from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.transforms import apply, inverse
-from bevcli.model.bevformer import BEVFormer
+from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.calibration_embedding import ray_features
 from bevcli.model.image_tokens import ImageTokensConfig
 
@@ -63,7 +63,7 @@ def test_weights_without_the_embedding_start_a_training_only(tmp_path: Path):
     assert not model.calibration_embedding.layers[-1].weight.any()
 
 
-def test_every_sequence_of_a_batch_may_have_its_own_camera_embeddings():
+def test_each_sequence_of_a_batch_may_have_its_own_embeddings():
     model, inputs = small_model(), small_inputs(batch=2)
     one, other = torch.tensor([0, 1]), torch.tensor([1, 0])
     with torch.no_grad():

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
-from bevcli.benchmark.textbook import PaddedSampling
+from bevcli.benchmark.versions import PaddedSampling
 from bevcli.model.deformable_attention import GridSampling
+from bevcli.model.kernels.choose import fastest_sampling
 from bevcli.model.kernels.compiled import CompiledSampling
-from bevcli.model.kernels.tables import Tables
-from bevcli.model.prepared import fastest_sampling
+from bevcli.model.upload import Tables
 
 SHAPES = ((5, 7), (3, 4), (1, 1))
 PLAIN, PADDED, COMPILED = GridSampling(), PaddedSampling(), CompiledSampling()
@@ -38,7 +38,7 @@ def test_sampling_modules_equal_the_plain_one(sampling, depth):
 
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("depth", [1, 16, 33])
-def test_the_compiled_loops_have_the_gradients_of_the_plain_module(depth, threads, monkeypatch):
+def test_compiled_loops_have_the_gradients_of_the_plain_module(depth, threads, monkeypatch):
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
     gradients = []
     for sampling in (PLAIN, COMPILED):

@@ -11,7 +11,7 @@ from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, 
 
 
 @pytest.mark.parametrize("stride", [1, 2])
-def test_without_offsets_and_with_a_full_mask_it_is_a_plain_convolution(stride: int) -> None:
+def test_without_offsets_and_with_full_mask_it_is_plain(stride: int) -> None:
     torch.manual_seed(0)
     x, weight = torch.randn(2, 4, 7, 9), torch.randn(5, 4, 3, 3)
     plain = F.conv2d(x, weight, stride=stride, padding=1)

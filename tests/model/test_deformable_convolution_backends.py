@@ -7,8 +7,8 @@ import torch
 
 import bevcli.model.kernels.compiled as compiled
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
+from bevcli.model.kernels.choose import BiasedDeformableConvolution
 from bevcli.model.kernels.compiled import CompiledDeformableConvolution
-from bevcli.model.prepared import BiasedDeformableConvolution
 
 
 def plain_layer(stride: int) -> BiasedDeformableConvolution:

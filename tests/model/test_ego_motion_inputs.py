@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from bevcli.geometry.bev_grid import BevGrid
+from bevcli.geometry.ego_motion import Kinematics
 from bevcli.geometry.transforms import Pose
 from bevcli.model.ego_motion import EgoMotionConfig, EgoMotionInputs, ego_motion_inputs
 
@@ -19,7 +20,7 @@ def pose(x: float, y: float, yaw_deg: float, sign: float = 1.0) -> Pose:
 
 def inputs_for(now: Pose, before: Pose | None, **settings: object) -> EgoMotionInputs:
     config = EgoMotionConfig(**settings)  # type: ignore[arg-type]
-    return ego_motion_inputs(now, before, (1, 2, 9.8), (0.1, 0.2, 0.3), (7, 0, 0), GRID, config)
+    return ego_motion_inputs(now, before, Kinematics((1, 2, 9.8), (0.1, 0.2, 0.3), (7, 0, 0)), GRID, config)
 
 
 @pytest.mark.parametrize("yaw_deg", [0, 37, 180, 301])

@@ -16,8 +16,9 @@ import original_reference as original
 import pytest
 import torch
 
-from bevcli.model.bevformer import BEVFormer, BEVFormerInputs, BEVFormerOutputs
+from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.box_coding import decode
+from bevcli.model.step import ModelInputs, ModelOutputs
 
 SHARED = os.environ.get("BEVCLI_SHARED", "")
 pytestmark = [
@@ -84,7 +85,7 @@ def record_stages(model: BEVFormer) -> dict[str, Any]:
     return stages
 
 
-def check_inputs(inputs: BEVFormerInputs, golden: Golden, frame: int) -> None:
+def check_inputs(inputs: ModelInputs, golden: Golden, frame: int) -> None:
     stride = 16 if inputs.images.shape[-1] == 800 else 32
     images = inputs.images[0, ..., ::stride, ::stride]
     np.testing.assert_allclose(images, golden(frame, "img_sub").reshape(images.shape), atol=1e-4)
@@ -103,7 +104,7 @@ def check_stages(stages: dict[str, Any], golden: Golden, frame: int, name: str) 
         assert_cells_close(stages[layer][0, :: golden.inner_row_stride], golden(frame, layer), SHARE_OFF[name])
 
 
-def check_outputs(outputs: BEVFormerOutputs, model: BEVFormer, golden: Golden, frame: int, name: str) -> None:
+def check_outputs(outputs: ModelOutputs, model: BEVFormer, golden: Golden, frame: int, name: str) -> None:
     whole = f"f{frame}_bev_embed" in golden.arrays
     bev = outputs.bev[0] if whole else outputs.bev[0, :: golden.row_stride]
     expected = golden(frame, "bev_embed" if whole else "bev_embed_sub")

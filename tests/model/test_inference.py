@@ -10,14 +10,16 @@ import torch
 from small_model import small_inputs, small_model
 from torch import nn
 
-from bevcli.benchmark.textbook import textbook_version
-from bevcli.model.bevformer import BEVFormer, BEVFormerOutputs
-from bevcli.model.prepared import fold_batch_norms, prepare_for_inference
+from bevcli.benchmark.versions import textbook_version
+from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.kernels.choose import fold_batch_norms
+from bevcli.model.prepare import prepare_for_inference
+from bevcli.model.step import ModelOutputs
 
 CPU = torch.device("cpu")
 
 
-def two_steps(model: BEVFormer) -> BEVFormerOutputs:
+def two_steps(model: BEVFormer) -> ModelOutputs:
     """The outputs of the second of two steps, which has history."""
     with torch.inference_mode():
         return model(small_inputs(1), model(small_inputs(0)).bev)

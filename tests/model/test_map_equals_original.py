@@ -21,9 +21,9 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.deformable_attention import DeformableAttention
 from bevcli.model.kernels.compiled import CompiledSampling
 from bevcli.model.kernels.onednn import use_onednn
-from bevcli.model.map_head import MapHead, MapHeadConfig, MapOutputs
-from bevcli.model.map_merging import merge_map, thing_scores
 from bevcli.model.official_keys import from_official
+from bevcli.model.uniad.map_head import MapHead, MapHeadConfig, MapOutputs
+from bevcli.model.uniad.map_merging import merge_map, thing_scores
 
 KEPT = np.load(original.DATA / "golden_uniad_map.npz")
 FRAME = 5
@@ -53,7 +53,7 @@ class Step(NamedTuple):
 def step(prepared: bool) -> Step:
     """One step with weights by the rule. prepared: with the kernels of inference on a CPU."""
     head = MapHead(CONFIG, 256, GRID).eval().requires_grad_(False)
-    state = from_official(uniad_state("seg_head."))
+    state = from_official(uniad_state("seg_head."))[0]
     head.load_state_dict({key.removeprefix(PREFIX): tensor for key, tensor in state.items()})
     parts = (head.encoder, head.location_decoder.layers[-1], head.thing_masks.layers[-1], head.stuff_masks.layers[-1])
     found: dict[int, torch.Tensor] = {}
@@ -77,7 +77,7 @@ def test_official_keys_of_the_map_head_are_those_of_ours() -> None:
     with torch.device("meta"):
         expected = {f"{PREFIX}{key}": tuple(t.shape) for key, t in MapHead(CONFIG, 256, GRID).state_dict().items()}
     shapes = {key: shape for key, shape in uniad_shapes().items() if key.startswith("seg_head.")}
-    found = from_official({key: torch.empty(shape, device="meta") for key, shape in shapes.items()})
+    found = from_official({key: torch.empty(shape, device="meta") for key, shape in shapes.items()})[0]
     assert {key: tuple(tensor.shape) for key, tensor in found.items()} == expected
 
 

@@ -9,10 +9,9 @@ import pytest
 import torch
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.deformable_attention import DeformableAttention
-from bevcli.model.map_encoder import sine_position
-from bevcli.model.map_head import MapHead, MapHeadConfig, MapOutputs
-from bevcli.model.map_merging import merge_map, thing_scores
+from bevcli.model.uniad.map_encoder import FlatListAttention, sine_position
+from bevcli.model.uniad.map_head import MapHead, MapHeadConfig, MapOutputs
+from bevcli.model.uniad.map_merging import merge_map, thing_scores
 
 SMALL = MapHeadConfig(
     thing_queries=7,
@@ -77,13 +76,11 @@ def bilinear(values: np.ndarray, x: float, y: float) -> np.ndarray:
 
 @pytest.mark.parametrize("reference_size", [2, 4])
 @pytest.mark.parametrize("queries", [30, 8, 3])
-def test_attention_built_for_four_levels_reads_as_the_kernel_of_the_released_code(
-    queries: int, reference_size: int
-) -> None:
+def test_attention_for_four_levels_reads_as_the_released_kernel(queries: int, reference_size: int) -> None:
     """The kernel walks two flat arrays with the strides of one level; this loop does the same index arithmetic."""
     heads, levels, points, channels, (rows, columns) = 4, 4, 2, 8, (5, 6)
     torch.manual_seed(1)
-    attention = DeformableAttention(channels, channels, heads, points, levels)
+    attention = FlatListAttention(channels, channels, heads, points, levels)
     with torch.no_grad():
         for parameter in attention.parameters():
             parameter.add_(torch.randn_like(parameter))
@@ -111,7 +108,7 @@ def test_attention_built_for_four_levels_reads_as_the_kernel_of_the_released_cod
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-5)
 
 
-def test_the_position_embedding_is_that_of_the_row_and_then_that_of_the_column() -> None:
+def test_the_position_embedding_is_that_of_row_then_of_column() -> None:
     position = sine_position(4, 3, 8).view(4, 3, 8)
     y, x = (2.5 / 4) * 2 * math.pi, (0.5 / 3) * 2 * math.pi
     expected = [math.sin(y), math.cos(y), math.sin(y / 100), math.cos(y / 100)]

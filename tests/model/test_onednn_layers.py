@@ -12,9 +12,10 @@ from torch import nn
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.feed_forward import FeedForward
 from bevcli.model.kernels import onednn as onednn_layers
+from bevcli.model.kernels.choose import fold_batch_norms
 from bevcli.model.kernels.compiled import CompiledDeformableConvolution
 from bevcli.model.kernels.onednn import FusedBottleneck, PackedConvolution, PackedLinear, has_onednn, use_onednn
-from bevcli.model.prepared import fold_batch_norms, prepare_for_inference
+from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.resnet import Bottleneck, ResNet, ResNetConfig
 
 pytestmark = pytest.mark.skipif(not has_onednn(torch.float32), reason="this build of PyTorch has no oneDNN")
@@ -88,7 +89,7 @@ def test_a_packed_convolution_takes_inputs_of_every_size(groups):
                 torch.testing.assert_close(packed(x), plain(x), atol=TOLERANCE[dtype], rtol=TOLERANCE[dtype])
 
 
-def test_residual_blocks_do_not_write_over_the_maps_that_a_backbone_returns():
+def test_residual_blocks_do_not_write_over_returned_maps():
     backbone = ResNet(ResNetConfig((2, 2, 2, 2), output_stages=(1, 2, 3, 4), width=8)).eval().requires_grad_(False)
     for module in backbone.modules():
         if isinstance(module, nn.BatchNorm2d):

@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.model.bevformer import BEVFormer, BEVFormerOutputs
+from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.box_coding import decode
-from bevcli.model.prepared import prepare_for_inference
+from bevcli.model.prepare import prepare_for_inference
+from bevcli.model.step import ModelOutputs
 
 CPU = torch.device("cpu")
 pytestmark = pytest.mark.slow
@@ -22,13 +23,13 @@ def model() -> BEVFormer:
 
 
 @pytest.fixture(scope="module")
-def prepared_fp32(model: BEVFormer) -> list[BEVFormerOutputs]:
+def prepared_fp32(model: BEVFormer) -> list[ModelOutputs]:
     return four_frames(prepare_for_inference(model, CPU))
 
 
-def four_frames(model: BEVFormer) -> list[BEVFormerOutputs]:
+def four_frames(model: BEVFormer) -> list[ModelOutputs]:
     """The outputs of all frames; 0 to 2 are one scene, 3 is another."""
-    outputs: list[BEVFormerOutputs] = []
+    outputs: list[ModelOutputs] = []
     with torch.inference_mode():
         for frame in range(4):
             history = outputs[-1].bev if frame in (1, 2) else None
@@ -49,7 +50,7 @@ def test_float32_equals_the_model(model, prepared_fp32):
         assert (found.class_logits.sigmoid() - expected.class_logits.sigmoid()).abs().max() < 1e-4
 
 
-def test_of_the_boxes_in_bfloat16_95_percent_are_within_a_tenth_of_a_metre(model, prepared_fp32):
+def test_95_percent_of_bfloat16_boxes_are_within_a_tenth_metre(model, prepared_fp32):
     half = four_frames(prepare_for_inference(model, CPU, "bf16"))
     pairs = zip(prepared_fp32, half, strict=True)
     distances = [nearest(decode(one, model.config)[0], decode(other, model.config)[0]) for one, other in pairs]

@@ -33,7 +33,7 @@ def test_one_forward_pass_computes_both_heads() -> None:
     assert outputs.segmentation.locations.shape == (2, 2, 5, 4)
 
 
-def test_without_the_head_there_are_no_segmentation_outputs_and_weights() -> None:
+def test_without_the_head_there_are_no_outputs_and_weights() -> None:
     model = small_model()
     assert model(small_inputs()).segmentation is None
     assert not [key for key in model.state_dict() if "segmentation" in key]
@@ -89,7 +89,7 @@ def test_a_probability_is_class_times_mask() -> None:
     assert (one.stuff.ravel().tolist(), one.things.tolist()) == ([True, False, False], [[-1]])
 
 
-def test_a_bev_map_has_one_bit_for_each_class_and_its_first_row_ahead() -> None:
+def test_a_bev_map_has_a_bit_a_class_and_its_first_row_ahead() -> None:
     grid = BevGrid(2, 3, x_range_m=(-3, 3), y_range_m=(-2, 2))
     logits = torch.full((1, 1, 5, 6), -9.0)
     logits[0, 0, 0, :3] = 9.0  # the road: the row behind the vehicle

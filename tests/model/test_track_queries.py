@@ -11,9 +11,9 @@ import torch
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.transforms import rigid, rotation_about_z
 from bevcli.model.decoder import ObjectQueries
-from bevcli.model.memory_bank import Memories, MemoryBank
-from bevcli.model.query_interaction import QueryInteraction
-from bevcli.model.track_queries import (
+from bevcli.model.uniad.memory_bank import Memories, MemoryBank
+from bevcli.model.uniad.query_interaction import QueryInteraction
+from bevcli.model.uniad.track_queries import (
     EGO,
     NO_TRACK,
     FrameMotion,
@@ -33,7 +33,7 @@ def step(ids: list[int], misses: list[int], scores: list[float], next_id: int = 
     return found.tolist(), count.tolist(), after
 
 
-def test_queries_without_a_track_start_one_from_the_birth_score_on() -> None:
+def test_queries_without_a_track_start_one_from_the_birth_score() -> None:
     ids, _, after = step([NO_TRACK] * 4, [0] * 4, [0.39, 0.4, 0.1, 0.9])
     assert ids == [NO_TRACK, 7, NO_TRACK, 8]
     assert after == 9
@@ -51,7 +51,7 @@ def test_a_high_score_forgets_the_misses() -> None:
     assert step([3], [4], [0.4]) == ([3], [0], 7)
 
 
-def test_a_track_ends_with_its_fifth_miss_even_if_they_are_not_consecutive() -> None:
+def test_a_track_ends_with_its_fifth_miss_also_not_consecutive() -> None:
     ids, misses = [3], [0]
     for score, alive in [(0.1, True), (0.1, True), (0.37, True), (0.1, True), (0.1, True), (0.36, True), (0.1, False)]:
         ids, misses, _ = step(ids, misses, [score])
@@ -71,7 +71,7 @@ def test_an_object_is_expected_where_its_velocity_takes_it() -> None:
     assert found[0].tolist() == pytest.approx([3, 1, 3])
 
 
-def test_a_standing_object_is_expected_at_its_place_as_the_vehicle_now_sees_it() -> None:
+def test_a_standing_object_is_expected_where_the_vehicle_sees_it() -> None:
     """The vehicle has driven 4 m ahead (y) and turned left by 90 degrees: what was 10 m ahead is 6 m to the right."""
     previous_from_now = rigid((0, 4, 0), rotation_about_z(math.pi / 2))
     matrix = torch.from_numpy(np.linalg.inv(previous_from_now)).float()
@@ -110,7 +110,7 @@ def bank() -> MemoryBank:
     return MemoryBank(channels=8, heads=2, interval=4).eval()
 
 
-def test_a_track_saves_at_its_first_frame_and_then_at_every_fourth(bank: MemoryBank) -> None:
+def test_a_track_saves_at_its_first_frame_and_then_each_fourth(bank: MemoryBank) -> None:
     memories = Memories.empty(torch.zeros(1, 8), length=4)
     filled = []
     for frame in range(20):
@@ -120,7 +120,7 @@ def test_a_track_saves_at_its_first_frame_and_then_at_every_fourth(bank: MemoryB
     assert filled[-1] == 4
 
 
-def test_the_newest_memory_is_the_last_one_and_the_oldest_is_dropped(bank: MemoryBank) -> None:
+def test_the_newest_memory_is_last_and_the_oldest_is_dropped(bank: MemoryBank) -> None:
     memories = Memories.empty(torch.zeros(1, 8), length=2)
     saved = []
     for frame in range(9):

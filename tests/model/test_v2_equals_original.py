@@ -18,10 +18,10 @@ import pytest
 import torch
 
 from bevcli.config import load_config
-from bevcli.model.bevformer_v2 import BEVFormerV2
+from bevcli.model.bevformer_v2.bevformer_v2 import BEVFormerV2
 from bevcli.model.box_coding import decode
 from bevcli.model.pillar_projection import Pillars
-from bevcli.model.prepared import prepare_for_inference
+from bevcli.model.prepare import prepare_for_inference
 
 KEPT = np.load(original.DATA / "golden_v2.npz")
 SHARED = os.environ.get("BEVCLI_SHARED", "")
@@ -36,7 +36,7 @@ def test_cropped_images_and_their_projection_equal_the_originals() -> None:
 
 
 @pytest.mark.parametrize("back", [1, 2])
-def test_a_history_frame_lies_in_the_current_bev_frame_as_in_the_original(back: int) -> None:
+def test_a_history_frame_lies_in_the_bev_as_in_the_original(back: int) -> None:
     found = original.history_image_from_bev(FRAME - back, FRAME, load_config("v2-t8"))
     np.testing.assert_allclose(found, KEPT[f"image_from_bev_{back}"], rtol=0, atol=0.02)  # in float64 it is 0.1 off
 

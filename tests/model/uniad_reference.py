@@ -14,7 +14,7 @@ from bevcli.geometry.transforms import Array, rigid, rotation_about_z, rotation_
 from bevcli.model.encoder import EncoderConfig
 from bevcli.model.official_keys import from_official
 from bevcli.model.resnet import ResNetConfig
-from bevcli.model.uniad import UniAD, UniADConfig
+from bevcli.model.uniad.uniad import UniAD, UniADConfig
 
 TRACKER_CLASS_BIAS = 3.8  # of golden_uniad_track_only
 
@@ -44,7 +44,7 @@ def rule_uniad(first_frame: str) -> UniAD:
     config = uniad_config()
     model = UniAD(replace(config, ego_motion=replace(config.ego_motion, first_frame=first_frame))).eval()
     state = {key: torch.from_numpy(uniad_tensor(key, shape)) for key, shape in model_shapes().items()}
-    model.load_state_dict(from_official(state))
+    model.load_state_dict(from_official(state)[0])
     return model
 
 
@@ -58,7 +58,7 @@ def rule_tracker() -> UniAD:
     parts += ("pts_bbox_head.reg_branches", "pts_bbox_head.transformer.decoder")
     shapes = {key: shape for key, shape in model_shapes().items() if key.startswith(parts)}
     state = {key: torch.from_numpy(uniad_tensor(key, shape, TRACKER_CLASS_BIAS)) for key, shape in shapes.items()}
-    _, unexpected = model.load_state_dict(from_official(state), strict=False)
+    _, unexpected = model.load_state_dict(from_official(state)[0], strict=False)
     assert not unexpected
     return model
 

@@ -10,10 +10,10 @@ import lz4.frame
 import zstandard
 
 from bevcli.errors import InputError
-from bevcli.parsing.compressed import decompressed
-from bevcli.sequences.ros.bag import is_ros_bag
-from bevcli.sequences.ros.decoding import Encoding, Topic, decoder
-from bevcli.sequences.ros.sqlite_file import SqliteFile
+from bevcli.parsing.files import decompressed
+from bevcli.sequences.ros.format import is_ros_bag
+from bevcli.sequences.ros.messages import Topic, decoder
+from bevcli.sequences.ros.storage import SqliteFile
 
 COMPRESS = {"zstd": zstandard.compress, "lz4": lz4.frame.compress, "": bytes}
 
@@ -37,8 +37,8 @@ def test_damaged_data_is_a_value_error(kind):
         decompressed("bzip3", b"", 5000)
 
 
-def test_the_messages_of_a_json_topic_are_objects_with_attributes():
-    decode = decoder(Topic("/t", "T", Encoding("json")))
+def test_messages_of_a_json_topic_are_objects_with_attributes():
+    decode = decoder(Topic("/t", "T", "json"))
     assert decode(b'{"a": [1, {"b": "\\u00e9"}]}') == SimpleNamespace(a=[1, SimpleNamespace(b="\u00e9")])
     for text in (b"[" * 100_000, b'{"a": ' + b"9" * 5000 + b"}", b"{"):
         with pytest.raises(InputError):

@@ -8,7 +8,7 @@ import pytest
 from bevcli.errors import ConfigError, InputError
 from bevcli.parsing.documents import parse_json, parse_toml, read_json, read_yaml
 from bevcli.parsing.files import read_bytes
-from bevcli.sequences.native.csv_table import read_csv
+from bevcli.sequences.native.tables import read_csv
 
 
 def refused(function, *arguments, error=InputError, **options):

@@ -3,9 +3,8 @@
 import numpy as np
 from memory_drive import make_rig
 
-from bevcli.recording.box_lines import ImageLines
-from bevcli.recording.camera_layout import camera_rows, rows_by_yaw
-from bevcli.recording.labels import LETTER_HEIGHT, LETTER_WIDTH, labels_in_image
+from bevcli.recording.blueprint import camera_rows, rows_by_yaw
+from bevcli.recording.box_lines import LETTER_HEIGHT, LETTER_WIDTH, ImageLines, labels_in_image
 
 
 def test_nuscenes_cameras_are_in_two_rows():

@@ -10,8 +10,7 @@ from bevcli.evaluation.detection import evaluate_detections
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.recording.colors import GROUND_TRUTH_COLOR, MISSED_COLOR, OTHER_COLOR
-from bevcli.recording.log_boxes import ground_truth_colors, other_classes
-from bevcli.recording.matching import detectable, true_positives
+from bevcli.recording.log_boxes import detectable, ground_truth_colors, other_classes, true_positives
 
 
 def boxes(places, classes, scores=None) -> Boxes3D:
@@ -29,14 +28,14 @@ def test_a_box_is_found_within_two_metres_and_its_class():
     assert found.tolist() == [True, False, False]
 
 
-def test_a_box_is_found_once_by_the_prediction_with_the_highest_score():
+def test_a_box_is_found_once_by_the_highest_score():
     truth = boxes([(0, 0)], ["car"])
     true, found = true_positives(boxes([(0.1, 0), (0.5, 0)], ["car", "car"], [0.3, 0.9]), truth)
     assert true.tolist() == [False, True]
     assert found.tolist() == [True]
 
 
-def test_ground_truth_outside_the_grid_or_without_points_is_not_detectable():
+def test_truth_outside_grid_or_without_points_is_undetectable():
     truth = replace(boxes([(0, 0), (1, 1), (80, 0)], ["car"] * 3), num_points=np.array([5, 0, 5]))
     assert detectable(truth, BevGrid(50, 50)).centers[:, 0].tolist() == [0]
 
@@ -55,7 +54,7 @@ def evaluated(predicted, truth):
     )
 
 
-def test_at_exactly_two_metres_the_display_agrees_with_the_evaluation():
+def test_at_exactly_two_metres_display_agrees_with_evaluation():
     truth = boxes([(0, 0), (10, 0)], ["car", "car"])
     predicted = boxes([(0, 2.0), (10, np.nextafter(2.0, 0))], ["car", "car"], [0.9, 0.8])
     true, found = true_positives(predicted, truth)
@@ -63,7 +62,7 @@ def test_at_exactly_two_metres_the_display_agrees_with_the_evaluation():
     assert evaluated(predicted, truth) == (true.tolist(), found.tolist())
 
 
-def test_of_equal_scores_the_display_chooses_the_one_that_the_evaluation_chooses():
+def test_of_equal_scores_the_display_chooses_as_the_evaluation():
     truth = boxes([(0, 0)], ["car"])
     predicted = boxes([(0.1, 0), (0.5, 0)], ["car", "car"], [0.7, 0.7])
     true, found = true_positives(predicted, truth)

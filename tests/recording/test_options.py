@@ -20,5 +20,5 @@ def test_unknown_values_are_errors(wrong):
 
 
 def test_a_missing_mesh_file_is_an_error():
-    with pytest.raises(InputError, match=r"--vehicle-mesh none\.glb"):
+    with pytest.raises(InputError, match=r"`vehicle_mesh=none\.glb`"):
         RecordingOptions(vehicle_mesh=Path("none.glb"))

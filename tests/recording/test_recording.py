@@ -12,7 +12,7 @@ from memory_drive import MemorySequence, WithoutImages
 from recorded_drive import NamedModel, bev_from_world, boxes_ahead, predict, record, with_truth
 
 from bevcli.errors import OutputError
-from bevcli.frame import CameraImage
+from bevcli.frame import CameraImage, NewStart, StartReason
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
 from bevcli.recording import entities
@@ -161,7 +161,8 @@ def events(path: Path) -> list[str]:
 
 def test_the_reason_of_a_restart_without_history_is_an_event(tmp_path):
     drive = MemorySequence(4, scenes="aabb")
-    reasons = ("first frame", "", "new scene", "gap of 9.0 s")
+    first, new = NewStart(StartReason.FIRST_FRAME), NewStart(StartReason.NEW_SCENE)
+    reasons = (first, None, new, NewStart(StartReason.GAP, 9.0))
     with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
         for place in range(4):
             frame = drive.load(place)

@@ -8,9 +8,9 @@ from memory_drive import MemorySequence
 from recorded_drive import NamedModel, boxes_ahead, predict, with_truth
 
 from bevcli.recording import entities
-from bevcli.recording.labels import box_labels
+from bevcli.recording.box_lines import box_labels
+from bevcli.recording.log_boxes import false_and_duplicate
 from bevcli.recording.log_tracks import AHEAD_S, PAST_S
-from bevcli.recording.matching import false_and_duplicate
 from bevcli.recording.writer import Recording
 from bevcli.viewer.export import recorded_boxes
 from bevcli.viewer.recording_reader import RecordingReader
@@ -87,12 +87,12 @@ def test_the_label_names_the_track():
     assert box_labels(boxes_ahead()) == ["car 0.90", "pedestrian 0.60", "bus 0.10"]
 
 
-def test_a_second_box_on_an_object_is_a_duplicate_and_no_false_positive():
+def test_a_second_box_on_an_object_is_a_duplicate_not_false():
     boxes = boxes_ahead()[[0, 0, 0, 1]]
     moved = boxes.centers + [[0, 0, 0], [0.8, 0, 0], [9, 0, 0], [0, 0, 0]]
     boxes = replace(boxes, centers=moved, scores=np.array([0.9, 0.8, 0.7, 0.6]))
     truth = replace(boxes_ahead()[:1], scores=None)
-    false, duplicate = false_and_duplicate(boxes, truth)
+    false, duplicate, _ = false_and_duplicate(boxes, truth)
     assert duplicate.tolist() == [False, True, False, False]
     assert false.tolist() == [False, False, True, True]  # a car far away, and a pedestrian
 
@@ -100,10 +100,10 @@ def test_a_second_box_on_an_object_is_a_duplicate_and_no_false_positive():
 def test_the_marks_of_the_tracker_count_unless_the_box_is_true():
     boxes = replace(boxes_ahead(), duplicates=np.array([True, True, False]))
     truth = replace(boxes_ahead()[:1], scores=None)
-    false, duplicate = false_and_duplicate(boxes, truth)
+    false, duplicate, _ = false_and_duplicate(boxes, truth)
     assert duplicate.tolist() == [False, True, False]
     assert false.tolist() == [False, False, True]
-    assert [part.tolist() for part in false_and_duplicate(boxes, None)] == [[False] * 3, [True, True, False]]
+    assert [part.tolist() for part in false_and_duplicate(boxes, None)[:2]] == [[False] * 3, [True, True, False]]
 
 
 @pytest.mark.parametrize("entity", [entities.DUPLICATES, entities.BEV_DUPLICATES])

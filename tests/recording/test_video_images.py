@@ -10,8 +10,8 @@ from bevcli.errors import BevcliError
 from bevcli.recording import entities, options, video_images
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.video_images import Av1Decoder, Av1Encoder
-from bevcli.viewer.camera_images import CameraImages
 from bevcli.viewer.recording_reader import RecordingReader
+from bevcli.viewer.video_frame import CameraImages
 
 with_av = pytest.mark.skipif(not video_images.has_av(), reason="PyAV is not installed: pip install 'bevcli[video]'")
 
@@ -68,5 +68,5 @@ def test_a_dropped_image_starts_a_new_stream(tmp_path):
 
 def test_without_pyav_the_message_says_what_to_install(monkeypatch):
     monkeypatch.setattr(video_images, "has_av", lambda: False)
-    with pytest.raises(BevcliError, match=r"--images av1: PyAV is not installed: pip install 'bevcli\[video\]'"):
+    with pytest.raises(BevcliError, match=r"`images=\"av1\"`: PyAV is not installed: pip install 'bevcli\[video\]'"):
         options.RecordingOptions(images="av1")

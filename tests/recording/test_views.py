@@ -12,7 +12,7 @@ from bevcli.frame import MAP_CLASSES, MOST_MAP_CLASSES, BevMap, DriveFacts, clas
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.geometry.geographic import GeoOrigin
-from bevcli.model.bevformer import BEVFormerConfig
+from bevcli.model.config import ModelConfig
 from bevcli.recording import entities
 from bevcli.recording.blueprint import TEXTS_SHARE, TITLE_HEIGHT, WINDOW, camera_row_shares
 from bevcli.recording.colors import (
@@ -24,8 +24,7 @@ from bevcli.recording.colors import (
     OTHER_MAP_COLORS,
     map_colors,
 )
-from bevcli.recording.legend import legend_entries
-from bevcli.recording.log_static import ring_distances_m
+from bevcli.recording.log_static import legend_entries, ring_distances_m
 from bevcli.recording.writer import FROM_RENDERED, UNTRAINED, Recording, frame_rate_hz, weights_note
 from bevcli.viewer.recording_reader import RecordingReader
 
@@ -164,7 +163,7 @@ class LaneModel(NamedModel):
         return LaneConfig(**{part.name: getattr(TINY, part.name) for part in fields(TINY)})
 
 
-class LaneConfig(BEVFormerConfig):
+class LaneConfig(ModelConfig):
     """The configuration of that model."""
 
     @property
@@ -172,7 +171,7 @@ class LaneConfig(BEVFormerConfig):
         return ("drivable_area", "divider", "kerb")
 
 
-def test_a_model_with_map_classes_of_its_own_is_drawn_with_a_legend(tmp_path):
+def test_a_model_with_its_own_map_classes_is_drawn_with_a_legend(tmp_path):
     drive = MemorySequence(1)
     cells = np.zeros((20, 20), dtype=np.uint8)
     cells[0, :3] = [1, 1 + 2, 4]

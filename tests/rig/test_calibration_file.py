@@ -70,7 +70,7 @@ def test_a_rotation_may_be_a_matrix(tmp_path):
         np.testing.assert_allclose(a.ego_from_camera, b.ego_from_camera, atol=1e-14)
 
 
-def test_without_ego_from_bev_a_level_frame_with_y_forward_is_assumed(tmp_path):
+def test_without_ego_from_bev_a_level_frame_y_forward_is_assumed(tmp_path):
     document = copy_of("six")
     del document["ego_from_bev"]
     rig = read_calibration(written(document, tmp_path))
@@ -194,7 +194,7 @@ def test_a_mistake_is_one_line_that_names_file_and_place(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", MISTAKES)
-def test_the_lenient_reader_finds_the_same_and_keeps_the_other_cameras(name, tmp_path):
+def test_the_lenient_reader_finds_the_same_keeps_other_cameras(name, tmp_path):
     spoil, pattern = MISTAKES[name]
     document = copy_of("six")
     spoil(document)

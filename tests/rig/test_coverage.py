@@ -40,7 +40,7 @@ def test_two_equal_cameras_see_each_cell_twice(tmp_path):
 @pytest.mark.parametrize(
     ("yaw", "pitch", "roll"), [(0, 0, 0), (55, 3, -4), (-110, -20, 8), (180, 10, 0), (90, -45, 20), (0, 30, 180)]
 )
-def test_the_mounting_has_the_angles_that_the_camera_was_turned_by(yaw, pitch, roll, tmp_path):
+def test_the_mounting_has_the_angles_the_camera_was_turned_by(yaw, pitch, roll, tmp_path):
     document = rig({"any": camera((1.0, 0.5, 1.6), yaw, 900.0, pitch=pitch, roll=roll)})
     mounting = mounting_of(rig_of(document, tmp_path)["any"].ego_from_camera)
     found = np.exp(1j * np.radians([mounting.yaw_deg, mounting.pitch_deg, mounting.roll_deg]))
@@ -55,7 +55,7 @@ def test_the_field_of_view_of_a_pinhole(tmp_path):
         assert seen_fov_deg(rig_of(document, tmp_path)["any"])[0] == pytest.approx(degrees, abs=0.2)
 
 
-def test_the_horizon_of_a_level_camera_is_the_row_of_its_principal_point(tmp_path):
+def test_a_level_cameras_horizon_is_its_principal_points_row(tmp_path):
     level = rig_of(rig({"any": camera((0, 0, 1.6), 30, 900.0)}), tmp_path)["any"]
     rows = horizon(level)[:, 1]
     np.testing.assert_allclose(rows[np.isfinite(rows)], level.intrinsics[1, 2], atol=1e-6)

@@ -14,6 +14,7 @@ from bevcli.errors import InputError
 from bevcli.rig.check_calibration import check_calibration
 from bevcli.viewer.screenshot import take_screenshot
 
+FAST_RIGS = ("six", "four fisheyes")
 FILES = {"cameras.png", "coverage.png", "recording.rrd", "findings.json"}
 
 
@@ -59,7 +60,9 @@ def write_motion(folder, heading, rows=31):
     (folder / "ego_motion.csv").write_text("\n".join(["timestamp_ns,x,y,z,qw,qx,qy,qz", *lines]))
 
 
-@pytest.mark.parametrize("name", HEALTHY)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in FAST_RIGS)) for name in HEALTHY]
+)
 def test_every_healthy_rig_gets_all_files_and_exit_code_0(name, tmp_path):
     result = run(calibration(copy_of(name), tmp_path), "--out", tmp_path / "out")
     assert result.exit_code == 0, result.output
@@ -95,7 +98,7 @@ def test_what_run_refuses_is_explained(tmp_path):
     assert (tmp_path / "out" / "cameras.png").exists()
 
 
-def test_a_calibration_without_any_usable_camera_gets_its_findings(tmp_path):
+def test_a_calibration_without_usable_cameras_gets_its_findings(tmp_path):
     path = calibration({"format": "bevcli-calibration/1", "cameras": {"front": {}}}, tmp_path)
     result = run(path, "--out", tmp_path / "out")
     assert result.exit_code == 3
@@ -145,7 +148,7 @@ def test_images_of_another_size_are_explained(small_drive, tmp_path):
     assert "160" in error["message"]
 
 
-def test_ego_motion_that_does_not_cover_the_frames_is_explained_and_the_images_shown(small_drive, tmp_path):
+def test_ego_motion_that_misses_frames_is_explained_with_images(small_drive, tmp_path):
     write_motion(small_drive, heading=(1, 0, 0, 0), rows=5)
     result = run(small_drive, "--out", tmp_path / "out", "--json")
     errors = [f for f in json.loads(result.stdout)["findings"] if f["severity"] == "error"]
@@ -159,6 +162,7 @@ def test_a_frame_that_is_not_there_is_a_mistake_in_the_input(small_drive, tmp_pa
     assert "5 frames" in str(result.exception)
 
 
+@pytest.mark.slow
 def test_the_real_sequences_give_no_error(shared, tmp_path):
     for name in ("nuscenes-scene-0103", "nuscenes-mini-4"):
         result = run(shared / "data" / name, "--out", tmp_path / name, "--json")

@@ -5,7 +5,7 @@ import pytest
 from mistakes import MOTION_MISTAKES, drive, motion_of
 
 from bevcli.rig.sequence_checks import check_camera_times, check_ego_motion
-from bevcli.sequences.native.ego_motion_file import read_ego_motion
+from bevcli.sequences.native.tables import read_ego_motion
 
 
 @pytest.mark.parametrize("start_yaw", [0.0, 0.7, 2.0, -3.0])
@@ -47,7 +47,7 @@ def late_by(milliseconds):
     return [time + milliseconds * 1_000_000 for time in FRAMES]
 
 
-def test_cameras_within_a_few_hundredths_of_a_second_give_no_finding():
+def test_cameras_within_hundredths_of_a_second_give_no_finding():
     assert check_camera_times(FRAMES, {"front": FRAMES, "back": late_by(-43), "left": late_by(40)}) == ()
 
 
@@ -68,10 +68,10 @@ def test_a_camera_with_jitter_is_named():
 
 def test_a_camera_without_any_image_is_named():
     (finding,) = check_camera_times(FRAMES, {"front": FRAMES, "back": [None] * len(FRAMES)})
-    assert (finding.code, finding.camera) == ("camera-without-pictures", "back")
+    assert (finding.code, finding.camera) == ("camera-without-images", "back")
 
 
-def test_velocities_that_are_derived_from_uneven_poses_are_not_blamed(tmp_path):
+def test_velocities_from_uneven_poses_are_not_blamed(tmp_path):
     times = np.cumsum([0, *[10, 990] * 20]) * 1_000_000 + 10**18
     speeds = np.repeat([0.5, 30.0], 20)
     lines = ["timestamp_ns,x,y,z,qw,qx,qy,qz"]

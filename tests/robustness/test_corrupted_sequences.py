@@ -9,14 +9,22 @@ from memory_drive import MemorySequence
 
 from bevcli.frame import Frame
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.cameras import camera_pose_noise
 from bevcli.geometry.ego_motion import Kinematics
-from bevcli.geometry.pose_noise import camera_pose_noise
 from bevcli.geometry.transforms import Pose, inverse
-from bevcli.robustness.calibration_noise import CalibrationNoise
-from bevcli.robustness.draws import Draws
-from bevcli.robustness.ego_motion_faults import EgoMotionLost, TimeOffsets, motion_during
-from bevcli.robustness.lost_images import CameraCrash, FrameLost
-from bevcli.robustness.sequences import FrameStore, KeptFrames, at_lower_rate, split_scenes
+from bevcli.robustness.sequences import (
+    CalibrationNoise,
+    CameraCrash,
+    Draws,
+    EgoMotionLost,
+    FrameLost,
+    FrameStore,
+    KeptFrames,
+    TimeOffsets,
+    at_lower_rate,
+    motion_during,
+    split_scenes,
+)
 
 DRAWS = Draws(0, "test")
 
@@ -42,7 +50,7 @@ def lost_cameras(frame: Frame) -> set[str]:
     return {name for name, image in frame.images.items() if not image.pixels_bgr.any()}
 
 
-def test_a_crashed_camera_is_black_in_every_frame_and_crashes_at_harder_levels_too():
+def test_a_crashed_camera_is_black_in_each_frame_also_at_harder():
     drive = MemorySequence(3)
     lost = {}
     for level in (2, 4, 5):
@@ -55,7 +63,7 @@ def test_a_crashed_camera_is_black_in_every_frame_and_crashes_at_harder_levels_t
     assert lost[2] <= lost[4] <= lost[5]
 
 
-def test_cameras_crash_with_replacement_so_that_some_scenes_lose_fewer():
+def test_cameras_crash_with_replacement_so_scenes_may_lose_fewer():
     drive = MemorySequence(1)
     counts = {len(CameraCrash(drive, 2, Draws(seed, "test"), "black").lost(drive.load(0))) for seed in range(30)}
     assert counts == {1, 2}
@@ -87,7 +95,7 @@ def test_calibration_noise_has_the_stated_spread_per_axis():
     assert angles_deg.var(axis=0) == pytest.approx(4.0, rel=0.1)
 
 
-def test_calibration_noise_is_one_wrong_rig_per_scene_and_leaves_all_else():
+def test_calibration_noise_is_one_wrong_rig_a_scene_and_no_more():
     drive = MemorySequence(4, scenes="aabb")
     noisy = CalibrationNoise(drive, 2, DRAWS)
     frames = [noisy.load(place) for place in range(4)]
@@ -101,7 +109,7 @@ def test_calibration_noise_is_one_wrong_rig_per_scene_and_leaves_all_else():
     assert np.array_equal(frames[0].rig["CAM_BACK"].intrinsics, clean.rig["CAM_BACK"].intrinsics)
 
 
-def test_a_wrong_capture_time_moves_the_camera_along_the_vehicles_path():
+def test_a_wrong_capture_time_moves_the_camera_along_the_path():
     drive = MemorySequence(2)
     clean, wrong = drive.load(1), TimeOffsets(drive, 200, DRAWS).load(1)
     offsets = {name: wrong.images[name].timestamp_ns - clean.images[name].timestamp_ns for name in drive.rig.names}
@@ -126,7 +134,7 @@ def test_the_motion_during_a_time_is_that_of_many_short_steps():
     assert np.allclose(whole @ motion_during(-0.2, kinematics), np.eye(4), atol=0.003)
 
 
-def test_a_lost_pose_is_the_last_one_that_arrived_and_the_truth_stays_around_the_vehicle():
+def test_a_lost_pose_is_the_last_that_arrived_and_truth_stays():
     drive = WithTruth(10)
     stale = EgoMotionLost(drive, 4, DRAWS)
     clean, frames = [drive.load(place) for place in range(10)], [stale.load(place) for place in range(10)]
@@ -169,7 +177,7 @@ def test_kept_frames_are_read_once_while_the_memory_lasts():
     drive = WithTruth(3)
     frame_bytes = sum(image.pixels_bgr.nbytes for image in drive.load(0).images.values())
     drive.loads = 0
-    kept = KeptFrames(drive, FrameStore(limit=2 * frame_bytes))
+    kept = KeptFrames(drive, FrameStore(2 * frame_bytes))
     for _ in range(3):
         for place in range(3):
             kept.load(place)

@@ -6,10 +6,19 @@ import numpy as np
 import pytest
 from PIL import Image, ImageOps
 
-from bevcli.robustness.draws import Draws
-from bevcli.robustness.lighting import LOW_LIGHT, brightness, low_light
-from bevcli.robustness.processing import blur_kernel, color_quantisation, motion_blur
-from bevcli.robustness.weather import FOG, fog, fractal, snow
+from bevcli.robustness.corruptions import (
+    FOG,
+    LOW_LIGHT,
+    blur_kernel,
+    brightness,
+    color_quantisation,
+    fog,
+    fractal,
+    low_light,
+    motion_blur,
+    snow,
+)
+from bevcli.robustness.sequences import Draws
 
 LEVELS = {brightness: 5, low_light: 4, motion_blur: 5, color_quantisation: 3, fog: 5, snow: 3}
 
@@ -23,7 +32,7 @@ def random(*keys: str | int, seed: int = 0) -> np.random.Generator:
 
 
 @pytest.mark.parametrize("corrupt", LEVELS, ids=lambda corrupt: corrupt.__name__)
-def test_a_corruption_keeps_shape_and_type_and_repeats_to_the_byte(corrupt):
+def test_a_corruption_keeps_shape_and_type_and_repeats_exactly(corrupt):
     image = noise_image()
     before = image.copy()
     first, second = (corrupt(image, LEVELS[corrupt], random("a", 3, "CAM_FRONT")) for _ in range(2))
@@ -49,7 +58,7 @@ def test_color_quantisation_is_the_posterisation_of_pillow(level, bits):
     assert np.array_equal(color_quantisation(image, level, random()), posterised)
 
 
-def test_brightness_raises_the_value_of_hsv_and_keeps_hue_and_saturation():
+def test_brightness_raises_value_and_keeps_hue_and_saturation():
     image = noise_image(4, 5)
     brighter = brightness(image, 2, random())
     for before, after in zip(image.reshape(-1, 3), brighter.reshape(-1, 3), strict=True):
@@ -58,7 +67,7 @@ def test_brightness_raises_the_value_of_hsv_and_keeps_hue_and_saturation():
         assert np.abs(after - expected).max() <= 1
 
 
-def test_low_light_squares_and_dims_the_stretched_image_and_adds_noise_of_the_stated_variance():
+def test_low_light_dims_and_adds_noise_of_the_stated_variance():
     image = np.zeros((200, 300, 3), dtype=np.uint8)
     image[:100] = 51  # the darkest and the brightest value are 51 and 204, so 127.5 would be half of the range
     image[:100, :150] = 204
@@ -71,7 +80,7 @@ def test_low_light_squares_and_dims_the_stretched_image_and_adds_noise_of_the_st
     assert dark[:100, :150].var() == pytest.approx(brightest / photons + read_noise**2, rel=0.05)
 
 
-def test_motion_blur_spreads_a_point_along_a_line_and_leaves_even_areas():
+def test_motion_blur_spreads_a_point_and_leaves_even_areas():
     image = np.zeros((181, 1600, 3), dtype=np.uint8)
     image[90, 800] = 255
     rows, columns = np.nonzero(motion_blur(image, 2, random())[..., 0])
@@ -81,7 +90,7 @@ def test_motion_blur_spreads_a_point_along_a_line_and_leaves_even_areas():
     assert (motion_blur(np.full_like(image, 77), 5, random()) == 77).all()
 
 
-def test_a_blur_has_the_same_length_relative_to_the_image_at_every_width():
+def test_a_blur_has_the_same_relative_length_at_every_width():
     def length(scale: float) -> float:
         kernel = blur_kernel(15, 12.0, 30.0, scale)
         y, x = np.indices(kernel.shape) - (len(kernel) - 1) / 2
@@ -102,7 +111,7 @@ def test_fog_reduces_contrast_by_the_stated_factor():
     assert difference == pytest.approx(50 / (1 + FOG[4][0]), abs=1.01)
 
 
-def test_the_map_of_the_fog_covers_0_to_1_and_its_structure_gets_finer_with_a_smaller_decay():
+def test_the_fog_covers_0_to_1_and_is_finer_with_a_smaller_decay():
     coarse, fine = (fractal(128, decay, random()) for decay in (2.0, 1.4))
     for grid in (coarse, fine):
         assert grid.shape == (128, 128)

@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 from bevcli.cli.main import app
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import Frame
-from bevcli.pipeline.model_loading import Model
-from bevcli.pipeline.run import run
-from bevcli.pipeline.runner import Runner
+from bevcli.inference.load import Model
+from bevcli.inference.run import run
+from bevcli.inference.runner import Runner
 from bevcli.robustness.conditions import choose_conditions
 from bevcli.robustness.stress import StressOptions, stress
 from bevcli.training.validation import drives_table, validate
@@ -37,6 +37,8 @@ class SelfLabelledDrive(MemorySequence):
 
 class DrivesInMemory(list):
     """A list of drives as `Drives`."""
+
+    input_shapes = None
 
     def open(self, index):
         return self[index]
@@ -85,7 +87,7 @@ def test_the_clean_scores_are_those_of_validate(whole, model, drives):
     assert drives_table(together.drives).splitlines()[-1].startswith("mAP: mean 0.")
 
 
-def test_an_interrupted_test_that_is_resumed_gives_the_same_bytes(whole, model, drives, tmp_path):
+def test_an_interrupted_test_resumed_gives_the_same_bytes(whole, model, drives, tmp_path):
     out, frames, runs = tmp_path / "out", 0, 0
 
     def count() -> None:
@@ -124,13 +126,13 @@ def test_finished_scenes_are_not_run_again(model, drives, tmp_path):
     assert len(again) == 2 * 2 * FRAMES - FRAMES
 
 
-def test_a_resumed_test_may_get_more_conditions_but_no_other_options(whole, model, drives, tmp_path):
+def test_a_resumed_test_may_get_more_conditions_no_other_options(whole, model, drives, tmp_path):
     for part in (CONDITIONS[3:4], CONDITIONS):
         stress(model, drives, part, tmp_path, resume=True)
     assert (tmp_path / "stress.json").read_bytes() == (whole / "stress.json").read_bytes()
     with pytest.raises(OutputError, match="option seed: was 0, is 1"):
         stress(model, drives, CONDITIONS, tmp_path, StressOptions(seed=1), resume=True)
-    with pytest.raises(OutputError, match="--force"):
+    with pytest.raises(OutputError, match="`force=True`"):
         stress(model, drives, CONDITIONS, tmp_path)
 
 

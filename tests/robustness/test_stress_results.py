@@ -24,12 +24,12 @@ def results(nds: tuple[float, ...], model: str = "base") -> StressResults:
     return StressResults({"model": model, "drives": []}, tuple(scores))
 
 
-def test_the_mean_resilience_of_bevformer_base_is_the_published_one():
+def test_mean_resilience_of_bevformer_base_is_the_published_one():
     assert 100 * results(BEVFORMER_BASE).mean_resilience() == pytest.approx(60.40, abs=0.01)
     assert 100 * results(DETR3D).mean_resilience() == pytest.approx(70.77, abs=0.01)
 
 
-def test_the_mean_corruption_error_against_detr3d_is_the_published_one():
+def test_mean_corruption_error_to_detr3d_is_the_published_one():
     assert 100 * results(BEVFORMER_BASE).mean_corruption_error(results(DETR3D)) == pytest.approx(97.97, abs=0.01)
 
 
@@ -70,7 +70,7 @@ def test_differences_of_the_tests_are_named():
     assert own.differences(StressResults({**other.header, "seed": 3}, other.scores)) == ("seed",)
 
 
-def test_conditions_are_clean_and_each_corruption_at_its_severities():
+def test_conditions_are_clean_and_each_corruption_by_severity():
     everything = choose_conditions()
     assert len(everything) == 1 + 8 * 3 + 4 + 3 * 3
     assert everything[0].name == "clean"

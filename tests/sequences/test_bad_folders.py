@@ -42,8 +42,8 @@ def test_missing_file(drive, file):
 
 def test_missing_ego_motion_says_what_to_do(drive):
     (drive / "ego_motion.csv").unlink()
-    assert "--static" in message(drive)
-    assert "--no-temporal" in message(drive)
+    assert '`ego_motion="static"`' in message(drive)
+    assert "`temporal=False`" in message(drive)
 
 
 def test_neither_table_nor_images(drive):

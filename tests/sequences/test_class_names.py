@@ -40,7 +40,7 @@ def classes(sequence) -> list[str]:
     return sequence.load(0).ground_truth.classes.tolist()
 
 
-def test_names_are_compared_without_case_and_others_are_kept_and_named_once(labelled: Path) -> None:
+def test_names_ignore_case_and_unknown_ones_are_named_once(labelled: Path) -> None:
     sequence = open_sequence(labelled)
     assert classes(sequence) == ["car", "truck", "Tricycle", "lorry", "pedestrian"]
     notes = [note for note in sequence.notes if "other classes" in note]
@@ -52,7 +52,7 @@ def test_a_class_map_renames_without_case(labelled: Path) -> None:
     sequence = open_sequence(labelled, class_map={"Lorry": "Truck", "tricycle": "bicycle"})
     assert classes(sequence) == ["car", "truck", "bicycle", "truck", "pedestrian"]
     assert not any("other classes" in note for note in sequence.notes)
-    with pytest.raises(InputError, match='--class-map Lorry=tank: "tank" is not a class'):
+    with pytest.raises(InputError, match='`class_map` Lorry=tank: "tank" is not a class'):
         open_sequence(labelled, class_map={"Lorry": "tank"})
 
 

@@ -52,7 +52,7 @@ def test_converted_drive_without_ego_motion_has_none(drive, tmp_path):
     (drive / "ego_motion.csv").unlink()
     assert convert(drive, tmp_path / "out").exit_code == 0
     assert not (tmp_path / "out" / "ego_motion.csv").exists()
-    with pytest.raises(InputError, match="--static"):
+    with pytest.raises(InputError, match='`ego_motion="static"`'):
         open_sequence(tmp_path / "out")
 
 

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError
-from bevcli.frame import DriveFacts, facts_of
+from bevcli.frame import DriveFacts
 from bevcli.geometry.geographic import GeoOrigin
 from bevcli.sequences.files.calibration_file import draft_calibration
 from bevcli.sequences.native.writer import NativeWriter
@@ -35,18 +35,18 @@ def test_what_is_written_is_read(tmp_path, facts):
 
 def test_a_part_of_a_drive_and_a_converted_drive_state_the_same(tmp_path):
     folder = written(tmp_path / "drive", MUNICH)
-    assert facts_of(open_sequence(folder, frames=slice(0, 2))) == MUNICH
+    assert open_sequence(folder, frames=slice(0, 2)).facts == MUNICH
     result = CliRunner().invoke(app, ["convert", str(folder), str(tmp_path / "copy")], catch_exceptions=False)
     assert result.exit_code == 0
-    assert facts_of(open_sequence(tmp_path / "copy")) == MUNICH
+    assert open_sequence(tmp_path / "copy").facts == MUNICH
 
 
 def test_a_sequence_of_another_kind_states_nothing():
-    assert facts_of(MemorySequence(1)) == DriveFacts()
+    assert MemorySequence(1).facts == DriveFacts()
 
 
 def test_the_samples_are_rendered():
-    assert all(facts_of(open_sequence(SAMPLES / name)).rendered for name in ("street", "crossing"))
+    assert all(open_sequence(SAMPLES / name).facts.rendered for name in ("street", "crossing"))
 
 
 def test_the_heading_is_east_where_it_is_missing(tmp_path):

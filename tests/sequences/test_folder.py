@@ -6,6 +6,7 @@ import pytest
 
 from bevcli.sequences.native.folder import FolderSequence
 from bevcli.sequences.open import open_sequence
+from bevcli.sequences.options import SequenceOptions
 
 
 def test_stamps_are_the_rows_of_frames_csv(drive):
@@ -132,7 +133,7 @@ def test_missing_image_number_leaves_a_gap_in_time(drive):
     (drive / "frames.csv").unlink()
     for camera in ("CAM_FRONT", "CAM_BACK"):
         (drive / "images" / camera / "1.png").unlink()
-    sequence = FolderSequence(drive, ego_motion="static")
+    sequence = FolderSequence(drive, SequenceOptions(ego_motion="static"))
     assert [stamp.timestamp_ns for stamp in sequence.stamps] == [0, 10**9, 15 * 10**8]
     assert any("assumed" in note for note in sequence.notes)
 

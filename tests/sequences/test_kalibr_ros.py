@@ -118,7 +118,7 @@ def test_mistakes_name_file_and_camera(tmp_path, text, poses, expected):
     assert str(tmp_path) in str(caught.value)
 
 
-def test_intrinsics_without_extrinsics_and_vice_versa_are_an_error(tmp_path):
+def test_intrinsics_without_extrinsics_and_the_reverse_fail(tmp_path):
     intrinsics, extrinsics = write(tmp_path, KALIBR, {})
     for pair in ((intrinsics, None), (None, extrinsics)):
         with pytest.raises(InputError, match="must be given together"):

@@ -10,12 +10,13 @@ import pytest
 from nuscenes_tables import CAMERAS, SAMPLE_US, Size, ego_x, sample_time, scene_name, write_tables
 
 from bevcli.errors import InputError
-from bevcli.sequences.nuscenes import cache as nuscenes_cache
-from bevcli.sequences.nuscenes import json_tables as nuscenes_json
+from bevcli.sequences.nuscenes import cache as nuscenes_cache, json_tables as nuscenes_json
 from bevcli.sequences.nuscenes.build import build_index
-from bevcli.sequences.nuscenes.choice import MINI_VAL, TEST, VAL, NuScenesChoice, numbers, split_of
+from bevcli.sequences.nuscenes.choice import MINI_VAL, TEST, VAL, numbers, split_of
+from bevcli.sequences.nuscenes.format import NuScenesOptions
 from bevcli.sequences.nuscenes.scene import read_can_bus
 from bevcli.sequences.nuscenes.sequence import NuScenesSequence
+from bevcli.sequences.open import open_sequence
 
 SMALL = Size(scenes=3, samples=4, objects=8)
 
@@ -125,7 +126,7 @@ def test_can_bus_is_the_first_message_after_the_time(tmp_path):
 
 def test_sweeps_follow_the_front_images_between_keyframes(root):
     """There are six front images per keyframe, so 12 frames per second. Keyframes keep their samples and times."""
-    keyframes, sweeps = NuScenesSequence(root), NuScenesSequence(root, NuScenesChoice(sweeps=True))
+    keyframes, sweeps = NuScenesSequence(root), NuScenesSequence(root, own=NuScenesOptions(sweeps=True))
     times = np.array([stamp.timestamp_ns for stamp in sweeps.stamps if stamp.scene == scene_name(1)])
     assert len(times) == 4 * 6
     np.testing.assert_allclose(np.diff(times) / 1e3, SAMPLE_US / 6, atol=5)
@@ -151,33 +152,33 @@ def test_splits_have_their_official_scenes():
 
 def test_split_selects_its_scenes(root):
     """Of scenes 1 to 3, the third is in val."""
-    assert {stamp.scene for stamp in NuScenesSequence(root, NuScenesChoice(split="val")).stamps} == {"scene-0003"}
-    assert {stamp.scene for stamp in NuScenesSequence(root, NuScenesChoice(split="train")).stamps} == {
+    assert {stamp.scene for stamp in NuScenesSequence(root, own=NuScenesOptions(split="val")).stamps} == {"scene-0003"}
+    assert {stamp.scene for stamp in NuScenesSequence(root, own=NuScenesOptions(split="train")).stamps} == {
         "scene-0001",
         "scene-0002",
     }
 
 
 @pytest.mark.parametrize(
-    ("choice", "expected"),
+    ("options", "expected"),
     [
-        (NuScenesChoice(version="v1.0-mini"), "v1.0-trainval"),
-        (NuScenesChoice(scene="scene-0009"), "scene-0001"),
-        (NuScenesChoice(split="validation"), "mini_val"),
-        (NuScenesChoice(split="test"), "test"),
-        (NuScenesChoice(scene="scene-0001", split="val"), "scene-0001"),
+        ({"version": "v1.0-mini"}, "v1.0-trainval"),
+        ({"scene": "scene-0009"}, "scene-0001"),
+        ({"split": "validation"}, "mini_val"),
+        ({"split": "test"}, "test"),
+        ({"scene": "scene-0001", "split": "val"}, "scene-0001"),
     ],
 )
-def test_choice_without_scenes_is_an_error(root, choice, expected):
+def test_choice_without_scenes_is_an_error(root, options, expected):
     with pytest.raises(InputError, match=expected):
-        NuScenesSequence(root, choice)
+        open_sequence(root, **options)
 
 
 def test_several_versions_require_a_choice(root):
     write_tables(root / "v1.0-mini", SMALL)
-    with pytest.raises(InputError, match="--version"):
+    with pytest.raises(InputError, match="`version`"):
         NuScenesSequence(root)
-    assert NuScenesSequence(root, NuScenesChoice(version="v1.0-mini")).stamps
+    assert NuScenesSequence(root, own=NuScenesOptions(version="v1.0-mini")).stamps
 
 
 @pytest.mark.parametrize(

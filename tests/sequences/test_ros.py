@@ -28,7 +28,7 @@ from bevcli.frame import Sequence
 from bevcli.geometry.cameras import Distortion
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Pose, rotation_about_z
-from bevcli.sequences.native.ego_motion_file import read_ego_motion
+from bevcli.sequences.native.tables import read_ego_motion
 from bevcli.sequences.open import open_sequence
 
 
@@ -77,7 +77,7 @@ def test_a_bag_gives_the_frames_it_was_written_from(
         np.testing.assert_allclose(found.kinematics.velocity, [10, 0, 0], atol=1e-6)
 
 
-def test_the_time_of_an_image_is_its_stated_time_not_that_of_its_recording(
+def test_the_time_of_an_image_is_stated_not_that_of_recording(
     tmp_path: Path, native: Sequence, motion: EgoMotion
 ) -> None:
     path = write_mcap(tmp_path / "bag.mcap", messages_of(native, motion, delay_ns=180_000_000))
@@ -87,7 +87,7 @@ def test_the_time_of_an_image_is_its_stated_time_not_that_of_its_recording(
     assert sequence.load(0).images["CAM_FRONT"].timestamp_ns == native.stamps[0].timestamp_ns
 
 
-def test_a_replayed_bag_with_changing_delays_keeps_the_stated_times(
+def test_a_replayed_bag_with_changing_delays_keeps_stated_times(
     tmp_path: Path, native: Sequence, motion: EgoMotion
 ) -> None:
     messages = [
@@ -103,7 +103,7 @@ def test_a_replayed_bag_with_changing_delays_keeps_the_stated_times(
 def test_opening_a_bag_reads_no_image(
     tmp_path: Path, native: Sequence, motion: EgoMotion, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from bevcli.sequences.ros.mcap_file import McapFile
+    from bevcli.sequences.ros.storage import McapFile
 
     messages = messages_of(native, motion)
     images = [message for message in messages if "image" in message[0]]
@@ -152,7 +152,7 @@ def test_a_file_without_a_message_says_which_topics_it_has(tmp_path: Path, nativ
 
 def test_missing_poses_and_extrinsics_are_named(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
     path = write_mcap(tmp_path / "bag.mcap", messages_of(native, None))
-    with pytest.raises(InputError, match=r"has no poses of the vehicle.*/tf_static.*--ego-motion FILE"):
+    with pytest.raises(InputError, match=r"has no poses of the vehicle.*/tf_static.*`ego_motion_file=FILE`"):
         open_sequence(path)
     assert open_sequence(path, ego_motion="static").load(0).images
     messages = [message for message in messages_of(native, motion) if message[0] != "/tf_static"]
@@ -239,11 +239,11 @@ def test_a_topics_file_states_cameras_frames_and_poses(tmp_path: Path, native: S
         open_sequence(path, topics={"CAM_FRONT": "/nothing"})
 
 
-def test_a_calibration_whose_cameras_are_not_found_names_the_option(
+def test_a_calibration_with_cameras_not_found_names_the_option(
     tmp_path: Path, drive: Path, native: Sequence, motion: EgoMotion
 ) -> None:
     path = write_mcap(tmp_path / "bag.mcap", renamed(messages_of(native, motion), AUTOWARE))
-    with pytest.raises(InputError, match=r"camera CAM_FRONT of the calibration.*--topic CAM_FRONT=/TOPIC"):
+    with pytest.raises(InputError, match=r"camera CAM_FRONT of the calibration.*`topics=\{'CAM_FRONT': '/TOPIC'\}`"):
         open_sequence(path, calibration=drive / "calibration.json")
     topics = {
         "CAM_FRONT": AUTOWARE["/CAM_FRONT/image/compressed"],
@@ -261,7 +261,7 @@ def test_frames_before_the_first_pose_are_left_out(tmp_path: Path, native: Seque
     assert any("1 of 4 frames are left out" in note for note in sequence.notes)
 
 
-def test_poses_of_another_part_of_the_vehicle_are_moved_to_the_ego_frame(
+def test_poses_of_another_part_of_the_vehicle_move_to_the_ego(
     tmp_path: Path, native: Sequence, motion: EgoMotion
 ) -> None:
     base_from_imu = Pose.from_matrix(np.eye(4))
@@ -320,7 +320,7 @@ def test_the_distortion_models_of_camera_info(tmp_path: Path, native: Sequence, 
     assert sequence.rig["CAM_BACK"].distortion is None
 
 
-def test_a_rectified_image_has_the_intrinsics_and_rotation_of_the_rectification(
+def test_a_rectified_image_has_the_rectifications_intrinsics(
     tmp_path: Path, native: Sequence, motion: EgoMotion
 ) -> None:
     camera = replace(native.rig["CAM_FRONT"], distortion=LENSES["plumb_bob"])
@@ -397,7 +397,7 @@ def test_a_bayer_image_of_one_colour_has_that_colour(
     np.testing.assert_array_equal(image.pixels_bgr[10, 10], [40, 120, 200])
 
 
-def test_an_unknown_encoding_is_an_error_and_a_broken_image_is_a_gap(
+def test_an_unknown_encoding_is_an_error_a_broken_image_is_a_gap(
     tmp_path: Path, native: Sequence, motion: EgoMotion
 ) -> None:
     messages = raw_messages(native, motion, lambda pixels: encode(pixels, "bgr8"), "32FC1")
@@ -409,7 +409,7 @@ def test_an_unknown_encoding_is_an_error_and_a_broken_image_is_a_gap(
     messages[place] = (topic, kind, time, {**fields, "data": fields["data"][:40]})
     path = write_mcap(tmp_path / "bag.mcap", messages)
     assert "is not a complete image" in open_sequence(path).load(0).dropped["CAM_FRONT"]
-    with pytest.raises(InputError, match="--strict"):
+    with pytest.raises(InputError, match="`strict=True`"):
         open_sequence(path, strict=True).load(0)
 
 
@@ -494,13 +494,16 @@ def test_a_folder_without_metadata_and_a_ros1_bag(tmp_path: Path, native: Sequen
     (tmp_path / "old.bag").write_bytes(b"#ROSBAG V2.0\n")
     with pytest.raises(InputError, match="is a bag of ROS 1: convert it"):
         open_sequence(tmp_path / "old.bag")
+    (tmp_path / "folder.bag").mkdir()
+    with pytest.raises(InputError, match=r"folder\.bag: is a bag of ROS 1: convert it"):
+        open_sequence(tmp_path / "folder.bag")
 
 
 def test_options_for_other_inputs_are_refused(tmp_path: Path, drive: Path, native: Sequence, motion: EgoMotion) -> None:
     path = write_mcap(tmp_path / "bag.mcap", messages_of(native, motion))
-    with pytest.raises(InputError, match="are not for ROS bags"):
+    with pytest.raises(InputError, match='has no scene "one"'):
         open_sequence(path, scene="one")
-    with pytest.raises(InputError, match="are for MCAP files and ROS bags"):
+    with pytest.raises(InputError, match="`topics` is for a ROS bag: remove it"):
         open_sequence(drive, topics={"CAM_FRONT": "/a"})
 
 
@@ -578,7 +581,7 @@ def nav_sat_fix(time: int, latitude: float, longitude: float, status: int = 0) -
     return "/gnss/fix", "sensor_msgs/NavSatFix", time, fields
 
 
-def test_the_first_valid_satellite_position_places_the_drive_on_earth(native, motion, tmp_path):
+def test_the_first_valid_satellite_fix_places_the_drive_on_earth(native, motion, tmp_path):
     times = [stamp.timestamp_ns for stamp in native.stamps]
     fixes = [nav_sat_fix(times[0], 0.0, 0.0, status=-1), nav_sat_fix(times[1], 48.137, 11.575)]
     path = write_mcap(tmp_path / "drive.mcap", [*messages_of(native, motion), *fixes])

@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 
 from bevcli.errors import InputError
-from bevcli.frame import FrameStamp
+from bevcli.frame import FrameStamp, Sequence
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.selection import select_every, select_range, select_rate
 
 START_NS = 1_533_151_603_000_000_000
 
 
-class Drive:
+class Drive(Sequence):
     """A sequence of frames at given seconds. `load` returns the frame's position."""
 
-    name, rig, has_ego_motion, notes = "drive", None, True, ()
+    name, rig, has_ego_motion = "drive", None, True
 
     def __init__(self, *scenes):
         self.stamps = tuple(
@@ -92,7 +92,7 @@ def test_range_of_frames(frames, expected):
 
 @pytest.mark.parametrize("frames", [slice(5, 9), slice(2, 2)])
 def test_range_without_frames_is_an_error(frames):
-    with pytest.raises(InputError, match=r"--frames \d:\d: .*has 5: 0:5"):
+    with pytest.raises(InputError, match=r"`frames=\d:\d`: .*has 5: 0:5"):
         select_range(Drive(np.arange(5)), frames)
 
 
@@ -110,10 +110,10 @@ def test_range_counts_the_frames_that_are_left_after_thinning(drive):
 
 @pytest.mark.parametrize("options", [{"rate_hz": 2.0, "every": 2}, {"rate_hz": 0.0}, {"rate_hz": -1.0}])
 def test_invalid_rate_is_an_error(drive, options):
-    with pytest.raises(InputError, match="--rate"):
+    with pytest.raises(InputError, match="`rate_hz"):
         open_sequence(drive, **options)
 
 
 def test_invalid_step_is_an_error(drive):
-    with pytest.raises(InputError, match="--every 0"):
+    with pytest.raises(InputError, match="`every=0`"):
         open_sequence(drive, every=0)

@@ -11,7 +11,7 @@ from bevcli.geometry.transforms import inverse, wrap_angle
 from bevcli.synth.assets.catalog import Assets
 from bevcli.synth.drive import ANNOTATED_M, RenderedDrive, RenderedFrame
 from bevcli.synth.rig import nuscenes_like_rig
-from bevcli.synth.world.actors import ActorState
+from bevcli.synth.world.traffic import ActorState
 
 
 def test_same_seed_gives_the_same_bytes(drive: RenderedDrive, frame: RenderedFrame, assets: Assets):
@@ -111,7 +111,7 @@ def test_velocities_are_differences_of_positions(drive: RenderedDrive):
     assert checked > 20
 
 
-def test_a_turn_moves_standing_boxes_in_the_ego_frame_and_not_in_the_world(drive: RenderedDrive, assets: Assets):
+def test_a_turn_moves_standing_boxes_in_ego_but_not_world_frame(drive: RenderedDrive, assets: Assets):
     turning = max(range(19), key=lambda k: _turned(drive, k))
     assert _turned(drive, turning) > np.radians(5)
     first, second = drive.frame(turning), drive.frame(turning + 1)

@@ -11,8 +11,7 @@ from bevcli.sequences.open import open_sequence
 from bevcli.synth.assets.catalog import Assets
 from bevcli.synth.drive import RenderedDrive
 from bevcli.synth.export import export_drive
-from bevcli.synth.random_rig import RigDistribution, draw_rig
-from bevcli.synth.rig import nuscenes_like_rig, rig_for_rendering
+from bevcli.synth.rig import RigDistribution, draw_rig, nuscenes_like_rig, rig_for_rendering
 
 SIZE = (512, 288)
 RANDOM = RigDistribution(random_share=1.0)
@@ -45,7 +44,7 @@ def test_every_rig_can_be_rendered():
         rig_for_rendering(draw_rig(lenses, seed, (64, 36)).rig, None)
 
 
-def test_a_rig_that_looks_all_around_leaves_no_gap_between_its_cameras():
+def test_a_rig_that_looks_all_around_has_no_gap_between_cameras():
     level = RigDistribution(random_share=1.0, front_share=0.0, yaw_jitter_deg=0.0, fov_spread=0.0)
     for seed in range(50):
         rig = draw_rig(level, seed, SIZE).rig
@@ -120,7 +119,7 @@ def test_a_late_camera_sees_objects_where_they_are_then(delayed: tuple[RenderedD
     assert compared
 
 
-def test_the_other_cameras_of_a_drive_with_a_late_one_are_unchanged(delayed, assets: Assets):
+def test_other_cameras_of_a_drive_with_a_late_one_are_unchanged(delayed, assets: Assets):
     drive, _ = delayed
     usual = RenderedDrive(5, frames=2, rig=nuscenes_like_rig(160, 90), assets=assets)
     np.testing.assert_array_equal(drive.frame(1).images["CAM_BACK"], usual.frame(1).images["CAM_BACK"])

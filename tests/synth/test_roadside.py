@@ -3,9 +3,9 @@
 import pytest
 
 from bevcli.synth.assets.catalog import Assets
-from bevcli.synth.world.actors import StandingActor
 from bevcli.synth.world.city import STOP_LINE_M, CityPlan
 from bevcli.synth.world.roadside import Roadside
+from bevcli.synth.world.traffic import StandingActor
 
 WORKS = ("barrier-", "cone-", "machine-", "worker-")
 
@@ -37,7 +37,7 @@ def test_only_stretches_with_room_have_road_works(assets: Assets, spacing_m: flo
 
 
 @pytest.mark.parametrize("spacing_m", [45.0, 66.0, 100.0])
-def test_everything_at_a_kerb_is_between_the_stop_lines_and_on_the_parking_lane(assets: Assets, spacing_m: float):
+def test_all_at_a_kerb_is_between_stop_lines_on_the_parking_lane(assets: Assets, spacing_m: float):
     city = EvenCity(3, spacing_m)
     checked = 0
     for actor, axis, index, cross in standing(city, assets):

@@ -6,7 +6,7 @@ from pathlib import Path
 import bevcli.synth
 
 ROOT = Path(bevcli.synth.__file__).parent
-LAYERS = ("assets", "world", "render", "rig", "random_rig", "drive", "export")
+LAYERS = ("assets", "world", "render", "options", "rig", "drive", "export", "drives")
 
 
 def test_parts_import_only_from_lower_parts():

@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 from memory_drive import make_rig
 
-from bevcli.frame import BevMap, CameraImage, Frame, FrameStamp
+from bevcli.frame import BevMap, CameraImage, Frame, FrameStamp, Sequence
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.ego_motion import GRAVITY, Kinematics
 from bevcli.geometry.transforms import Pose, apply, inverse
-from bevcli.model.bevformer import BEVFormerConfig, ImageConfig
+from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.decoder import DecoderConfig
 from bevcli.model.encoder import EncoderConfig
 from bevcli.model.resnet import ResNetConfig
@@ -24,7 +24,7 @@ COLORS = {"car": (40, 60, 220), "pedestrian": (60, 200, 60)}
 SIZES = {"car": (4.5, 2.0, 1.6), "pedestrian": (0.8, 0.8, 1.8)}
 RIG = make_rig({"CAM_FRONT": 0.0, "CAM_BACK": 180.0})
 REACH_M = 16.0
-CONFIG = BEVFormerConfig(
+CONFIG = ModelConfig(
     name="painted",
     classes=tuple(COLORS),
     cameras=RIG.names,
@@ -39,14 +39,13 @@ CONFIG = BEVFormerConfig(
 )
 
 
-class PaintedDrive:
+class PaintedDrive(Sequence):
     """Two frames half a second apart, with three cars and two pedestrians.
 
     all_labelled: whether both frames have ground truth, or only the second.
     """
 
     has_ego_motion = True
-    notes = ()
     rig = RIG
 
     def __init__(self, seed: int, *, all_labelled: bool) -> None:
@@ -83,6 +82,8 @@ class PaintedDrive:
 
 class PaintedDrives:
     """Painted drives of the seeds 0 to count - 1."""
+
+    input_shapes = None
 
     def __init__(self, count: int, *, all_labelled: bool = False) -> None:
         self._drives = [PaintedDrive(seed, all_labelled=all_labelled) for seed in range(count)]

@@ -43,13 +43,13 @@ def test_the_grid_mask_covers_about_a_quarter() -> None:
     assert covered.mean().item() == pytest.approx(0.25, abs=0.1)
 
 
-def test_images_and_calibration_stay_as_they_are_unless_the_config_says_otherwise() -> None:
+def test_images_and_calibration_stay_unless_the_config_says_so() -> None:
     frame, random = MemorySequence(1).load(0), np.random.default_rng(0)
     assert ImageVariation(NONE, random)(frame) is frame
     assert CalibrationVariation(NONE, random)(frame) is frame
 
 
-def test_exposure_and_white_balance_are_constant_over_a_clip_and_differ_between_cameras() -> None:
+def test_exposure_and_white_balance_last_a_clip_by_camera() -> None:
     sequence, config = MemorySequence(2), AugmentationConfig(0, 0, exposure=1.0, white_balance=0.2)
     vary = ImageVariation(config, np.random.default_rng(0))
     gains = []
@@ -73,7 +73,7 @@ def test_some_images_are_dropped_but_never_all_of_a_frame() -> None:
     assert len(ImageVariation(AugmentationConfig(drop_image=1.0), random)(frame).images) == 1
 
 
-def test_the_poses_of_cameras_have_the_same_noise_in_all_frames_of_a_clip() -> None:
+def test_camera_poses_have_one_noise_in_all_frames_of_a_clip() -> None:
     sequence, config = MemorySequence(2), AugmentationConfig(calibration_share=1.0, calibration_noise=2.0)
     vary = CalibrationVariation(config, np.random.default_rng(0))
     first, second = vary(sequence.load(0)), vary(sequence.load(1))

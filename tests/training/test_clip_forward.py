@@ -12,20 +12,18 @@ from painted_drives import CONFIG, PaintedDrives
 
 from bevcli.config import TRAINING, known_models, load_config, load_table
 from bevcli.errors import ConfigError
-from bevcli.model.bev_fusion import BevFusionConfig
-from bevcli.model.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config
-from bevcli.model.build import build_model
+from bevcli.inference.preprocess import Preprocessor
+from bevcli.model.bevformer_v2.bev_fusion import BevFusionConfig
+from bevcli.model.bevformer_v2.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config
 from bevcli.model.fpn import FPNConfig
-from bevcli.pipeline.preprocess import Preprocessor
-from bevcli.pipeline.temporal import temporal_model
+from bevcli.model.temporal_model import build_model
+from bevcli.synth.options import DriveOptions
 from bevcli.training.augmentation import AugmentationConfig
-from bevcli.training.clip_forward import forward_clip
-from bevcli.training.clips import Clip, ClipConfig
-from bevcli.training.job import TrainingConfig, TrainingJob, check_window, prepare_training
-from bevcli.training.optimizer import OptimizerConfig
+from bevcli.training.job import OptimizerConfig, TrainingConfig, TrainingJob, prepare_training
+from bevcli.training.options import TrainOptions
 from bevcli.training.perspective_loss import PerspectiveLossConfig
-from bevcli.training.samples import Batch, load_batch
-from bevcli.training.trainer import Trainer
+from bevcli.training.samples import Batch, Clip, ClipConfig, load_batch
+from bevcli.training.trainer import Trainer, forward_clip
 
 V1 = replace(CONFIG, heads=("detection",))
 WINDOW = BEVFormerV2Config(
@@ -55,11 +53,11 @@ def test_a_clip_gives_the_outputs_of_inference(config: BEVFormerV2Config, *, lea
     model.eval()
     drives = PaintedDrives(3, all_labelled=True)
     for drive in range(3):
-        running, memory = temporal_model(model, CPU), None
+        memory = None
         for index in range(2):
             prepared = Preprocessor(config)(drives.open(drive).load(index))
             with torch.no_grad():
-                expected, memory = running.step(prepared, memory, ())
+                expected, memory = model.step(prepared, memory, ())
             place = index if learn_all else index - 1
             if place >= 0:
                 torch.testing.assert_close(outputs[place].bev[drive], expected.bev[0], atol=2e-4, rtol=0)
@@ -68,7 +66,7 @@ def test_a_clip_gives_the_outputs_of_inference(config: BEVFormerV2Config, *, lea
                 )
 
 
-def test_the_earlier_frame_of_a_window_changes_the_output_and_has_no_gradient() -> None:
+def test_the_earlier_frame_of_a_window_counts_without_gradient() -> None:
     torch.manual_seed(0)
     model, batch = build_model(WINDOW), batch_of(WINDOW)
     black = replace(batch.inputs[0], images=torch.zeros_like(batch.inputs[0].images))
@@ -108,7 +106,7 @@ SHORT = TrainingConfig(
 
 
 @pytest.mark.parametrize("learn", ["last", "all"])
-def test_a_resumed_training_with_a_window_equals_an_uninterrupted_one(tmp_path: Path, learn: str) -> None:
+def test_resumed_training_with_a_window_equals_an_uninterrupted(tmp_path: Path, learn: str) -> None:
     settings = replace(SHORT, clips=replace(SHORT.clips, learn=learn))
     whole = trained(tmp_path / "whole", settings)
     whole.run()
@@ -134,21 +132,21 @@ def test_a_resumed_training_with_a_window_equals_an_uninterrupted_one(tmp_path: 
 
 def test_a_window_that_clips_cannot_fill_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"training.clips.frames must be at least 2, .* but is 1"):
-        check_window(WINDOW, replace(SHORT, clips=ClipConfig(1)))
+        WINDOW.check_training(1)
     with pytest.raises(ConfigError, match=r"frames after the current one cannot be trained; .* found \[0, 1\]"):
-        check_window(replace(WINDOW, frames=(0, 1)), SHORT)
-    check_window(V1, replace(SHORT, clips=ClipConfig(1)))
+        replace(WINDOW, frames=(0, 1)).check_training(SHORT.clips.frames)
+    V1.check_training(1)
 
 
 @pytest.mark.parametrize("name", [name for name in known_models() if name.startswith("v2-")])
-def test_the_published_windows_can_be_trained_with_perspective_supervision(name: str) -> None:
+def test_published_windows_train_with_perspective_supervision(name: str) -> None:
     settings = load_table(name, TRAINING, TrainingConfig)
-    check_window(load_config(name), settings)
+    load_config(name).check_training(settings.clips.frames)
     assert settings.perspective_loss.weight > 0
 
 
 def test_a_job_of_a_window_is_prepared_from_a_model_file(tmp_path: Path) -> None:
-    job = prepare_training("v2-t1", CPU, rendered_seeds=range(4), out=tmp_path / "out")
+    job = prepare_training("v2-t1", CPU, DriveOptions(rendered=(0, 1, 2, 3)), TrainOptions(tmp_path / "out"))
     assert isinstance(job.model, BEVFormerV2)
 
 

@@ -9,11 +9,13 @@ import pytest
 from memory_drive import MemorySequence
 
 from bevcli.errors import InputError
-from bevcli.training.clips import ClipConfig, draw_clips, draw_frames
+from bevcli.training.samples import ClipConfig, draw_clips, draw_frames
 
 
 class Drives:
     """Copies of one drive."""
+
+    input_shapes: tuple[tuple[int, int, int], ...] | None = None
 
     def __init__(self, sequence: MemorySequence, count: int = 2) -> None:
         self._sequence, self._count = sequence, count
@@ -56,7 +58,7 @@ def test_a_drive_too_short_for_a_clip_is_rejected() -> None:
         drawn(MemorySequence(6, scenes="aaabbb"), frames=4)
 
 
-def test_the_clips_of_a_batch_have_the_same_length_and_some_batches_are_short() -> None:
+def test_clips_of_a_batch_have_one_length_and_some_are_short() -> None:
     random, lengths = np.random.default_rng(0), Counter()
     for _ in range(300):
         clips = draw_clips(Drives(MemorySequence(8)), ClipConfig(frames=3, batch=4, short_share=0.3), random)
@@ -66,7 +68,7 @@ def test_the_clips_of_a_batch_have_the_same_length_and_some_batches_are_short() 
     assert lengths[3] / 300 == pytest.approx(0.7, abs=0.1)
 
 
-def test_the_clips_of_a_batch_have_as_many_cameras_and_similar_image_sizes() -> None:
+def test_clips_of_a_batch_share_camera_count_and_image_sizes() -> None:
     drives, random = Drives(MemorySequence(5), 40), np.random.default_rng(0)
     sizes = [(4 + index % 2, 96 + 32 * (index // 2), 160) for index in range(40)]
     drives.input_shapes = tuple(sizes)

@@ -10,10 +10,10 @@ import torch
 from bevcli.checkpoints import bundled_weights
 from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import WeightsError
-from bevcli.model.bevformer import BEVFormer
-from bevcli.pipeline.model_loading import load_model
-from bevcli.pipeline.runner import Runner
-from bevcli.training.drives import FolderDrives
+from bevcli.inference.load import load_model
+from bevcli.inference.runner import Runner
+from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.synth.drives import FolderDrives
 from bevcli.training.job import TrainingConfig
 from bevcli.training.validation import validate
 
@@ -49,11 +49,11 @@ def test_its_weights_are_in_the_package_and_the_default() -> None:
 
 @pytest.mark.parametrize("name", ["tiny", "small", "base"])
 def test_other_models_do_not_run_without_weights(name: str) -> None:
-    with pytest.raises(WeightsError, match=f"model {name} has no weights: give --weights FILE"):
+    with pytest.raises(WeightsError, match=f"model {name} has no weights: pass `weights=FILE`"):
         load_model(name)
 
 
-def test_a_model_file_of_the_user_does_not_get_the_weights_of_the_package(tmp_path: Path) -> None:
+def test_a_users_model_file_does_not_get_the_packages_weights(tmp_path: Path) -> None:
     own = tmp_path / "demo.toml"
     own.write_text((STREET.parents[1] / "configs" / "demo.toml").read_text())
     with pytest.raises(WeightsError, match="has no weights"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from bevcli.model.resnet import ResNet, ResNetConfig
-from bevcli.training.frozen_stages import FrozenStages
+from bevcli.training.trainer import FrozenStages
 
 
 def made_backbone() -> ResNet:

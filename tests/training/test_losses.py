@@ -9,32 +9,35 @@ import numpy as np
 import pytest
 import torch
 
-from bevcli.training.detection_loss import DetectionLossConfig, detection_loss
-from bevcli.training.detection_targets import DetectionTargets
-from bevcli.training.focal_loss import focal_cost, focal_loss
-from bevcli.training.hungarian_matching import hungarian_matching
+from bevcli.training.detection_loss import (
+    DetectionLossConfig,
+    DetectionTargets,
+    detection_loss,
+    focal_cost,
+    focal_loss,
+    hungarian_matching,
+)
 from bevcli.training.segmentation_loss import dice_costs, dice_loss
 
 
 @pytest.mark.parametrize("shape", [(5, 3), (3, 5), (4, 4), (6, 1)])
 def test_no_permutation_is_cheaper_than_the_matching(shape: tuple[int, int]) -> None:
     costs = np.random.default_rng(sum(shape)).normal(size=shape)
-    pairs = hungarian_matching(torch.from_numpy(costs))
+    queries, truths = (indices.tolist() for indices in hungarian_matching(torch.from_numpy(costs)))
     small, large = sorted(shape)
     wide = costs if shape[0] == small else costs.T
     cheapest = min(sum(wide[i, p] for i, p in enumerate(order)) for order in permutations(range(large), small))
-    queries, truths = pairs.queries.tolist(), pairs.truths.tolist()
     assert costs[queries, truths].sum() == pytest.approx(cheapest)
     assert len(set(queries)) == len(set(truths)) == small
 
 
 def test_no_ground_truth_gives_no_pairs() -> None:
-    assert len(hungarian_matching(torch.zeros(4, 0)).queries) == 0
+    assert len(hungarian_matching(torch.zeros(4, 0))[0]) == 0
 
 
 def test_a_pair_with_a_nan_cost_is_chosen_last() -> None:
-    pairs = hungarian_matching(torch.tensor([[float("nan"), 0.0], [1.0, 5.0]]))
-    assert (pairs.queries.tolist(), pairs.truths.tolist()) == ([0, 1], [1, 0])
+    queries, truths = hungarian_matching(torch.tensor([[float("nan"), 0.0], [1.0, 5.0]]))
+    assert (queries.tolist(), truths.tolist()) == ([0, 1], [1, 0])
 
 
 def test_focal_loss_by_hand() -> None:
@@ -83,7 +86,7 @@ def test_query_groups_are_matched_independently() -> None:
     assert together.item() == pytest.approx(sum(apart).item() / 2)
 
 
-def test_of_two_queries_at_the_same_position_the_more_confident_is_matched() -> None:
+def test_of_two_queries_at_a_position_the_confident_is_matched() -> None:
     codes = torch.tensor([[code(0.0), code(0.0)]])[None]
     logits = torch.tensor([[[[-2.0], [2.0]]]])
     loss = detection_loss(logits, codes, [targets(code(0.0))], CONFIG).classes.item()
@@ -108,7 +111,7 @@ def test_every_layer_adds_its_loss() -> None:
     assert thrice.total.item() == pytest.approx(3 * once.item())
 
 
-def test_a_box_of_unknown_velocity_contributes_to_the_class_loss_only() -> None:
+def test_a_box_of_unknown_velocity_adds_to_the_class_loss_only() -> None:
     codes, logits = torch.tensor([[code(2.0)]])[None], torch.zeros(1, 1, 1, 1)
     loss = detection_loss(logits, codes, [targets(code(0.0, vx=float("nan")))], CONFIG)
     assert loss.boxes.item() == 0

@@ -12,19 +12,22 @@ from painted_drives import CONFIG, PaintedDrives
 
 from bevcli.config import TRAINING, load_table
 from bevcli.errors import ConfigError
-from bevcli.model.bevformer import BEVFormer
+from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.fpn import FPNConfig
 from bevcli.model.image_tokens import ImageTokensConfig
 from bevcli.model.resnet import ResNetConfig
 from bevcli.training.augmentation import AugmentationConfig
-from bevcli.training.clips import Clip
-from bevcli.training.detection_targets import DetectionTargets
+from bevcli.training.detection_loss import DetectionLoss, DetectionTargets
 from bevcli.training.frame_losses import FrameLosses
 from bevcli.training.job import TrainingConfig
-from bevcli.training.perspective_head import PerspectiveHead
-from bevcli.training.perspective_loss import PerspectiveLoss, PerspectiveLossConfig, perspective_loss
-from bevcli.training.perspective_targets import feature_locations, perspective_targets
-from bevcli.training.samples import Batch, load_batch
+from bevcli.training.perspective_loss import (
+    PerspectiveHead,
+    PerspectiveLossConfig,
+    feature_locations,
+    perspective_loss,
+    perspective_targets,
+)
+from bevcli.training.samples import Batch, Clip, load_batch
 
 WEIGHTS = PerspectiveLossConfig(weight=1.0)
 NOTHING = DetectionTargets(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 10))
@@ -57,7 +60,7 @@ def loss_of(
     *,
     has_image: torch.Tensor | None = None,
     targets: tuple[DetectionTargets, ...] | None = None,
-) -> PerspectiveLoss:
+) -> DetectionLoss:
     inputs = data.inputs[0]
     truth = data.targets[0].perspective if targets is None else targets
     seen = inputs.has_image if has_image is None else has_image
@@ -69,6 +72,7 @@ def random_maps(images: int) -> list[torch.Tensor]:
     return [torch.randn(images, 32, rows, columns, generator=generator) for rows, columns in ((12, 16), (6, 8))]
 
 
+@pytest.mark.slow
 def test_backbone_and_head_learn_the_depths_of_boxes() -> None:
     data, head = batch(), make_head()
     torch.manual_seed(0)
@@ -169,7 +173,7 @@ def test_ignored_pixels_have_no_class_loss() -> None:
     assert head_with_high_logits(~ignored) > head_with_high_logits(nowhere)
 
 
-def test_a_batch_has_the_mean_loss_of_its_frames_by_positive_pixel() -> None:
+def test_a_batch_has_its_frames_mean_loss_by_positive_pixel() -> None:
     both, head, maps = batch(2), make_head(), random_maps(4)
     whole = loss_of(head, maps, both)
     inputs = both.inputs[0]
@@ -210,7 +214,7 @@ def test_boxes_outside_the_grid_are_detected_too() -> None:
     assert len(targets.detection[0].labels) < len(targets.perspective[0].labels) == 5
 
 
-def test_the_table_of_earlier_versions_is_rejected_with_the_new_name(tmp_path: Path) -> None:
+def test_the_table_of_earlier_versions_is_rejected_by_new_name(tmp_path: Path) -> None:
     (tmp_path / "old.toml").write_text("[training.picture_loss]\nweight = 1.0\n")
     expected = r'unknown key "training.picture_loss"; \[training.perspective_loss\] replaces it'
     with pytest.raises(ConfigError, match=expected):

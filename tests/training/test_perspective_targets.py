@@ -11,8 +11,8 @@ import torch
 
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.box_coding import encode
-from bevcli.training.detection_targets import DetectionTargets
-from bevcli.training.perspective_targets import (
+from bevcli.training.detection_loss import DetectionTargets
+from bevcli.training.perspective_loss import (
     OUTLINE_DEPTH_M,
     PerspectiveTargets,
     feature_locations,
@@ -132,12 +132,12 @@ def test_every_visible_box_is_detected_with_any_number_of_levels(shapes: list[tu
     assert set(found.labels.tolist()) == {0, 1, 2}
 
 
-def test_a_box_smaller_than_a_pixel_of_the_features_has_one_positive_pixel() -> None:
+def test_a_box_smaller_than_a_pixel_has_one_positive_pixel() -> None:
     found = targets((0.5, 60, 1.6, 0.4, 0.4, 1, 0))  # 1.3 x 3.3 pixels around (193.7, 111.7)
     assert cells(found.locations) == [(13, 24)]
 
 
-def test_of_two_boxes_a_pixel_detects_the_one_with_the_nearer_center() -> None:
+def test_of_two_boxes_a_pixel_detects_that_of_the_nearer_center() -> None:
     one, other = (0, 10, 1.5, 1, 1, 1, 0), (1, 10, 1.5, 1, 1, 1, 0)  # centres 20 pixels apart, at x 192 and 212
     found = targets(one, other)
     pixels = feature_locations(SHAPES, SIZE, torch.device("cpu")).pixels[found.locations]
@@ -147,7 +147,7 @@ def test_of_two_boxes_a_pixel_detects_the_one_with_the_nearer_center() -> None:
 
 
 @pytest.mark.parametrize("row", [(0, -10, 1, 4, 2, 1.6, 0), (100, 10, 1, 4, 2, 1.6, 0), (0, 10, 50, 4, 2, 1.6, 0)])
-def test_boxes_behind_the_camera_or_outside_the_image_teach_nothing(row: tuple[float, ...]) -> None:
+def test_boxes_behind_the_camera_or_outside_teach_nothing(row: tuple[float, ...]) -> None:
     found = targets(row)
     assert not len(found.locations)
     assert not found.ignored.any()
@@ -160,7 +160,7 @@ def test_no_boxes_give_no_targets() -> None:
     assert not found.ignored.any()
 
 
-def test_a_box_whose_center_is_just_outside_the_image_is_detected_at_the_border() -> None:
+def test_a_box_centered_just_outside_is_detected_at_the_border() -> None:
     found = targets((10.2, 10, 1.5, 4, 2, 2, 0))  # centre at x 396, the image ends at 384, the box begins at 341
     pixels = feature_locations(SHAPES, SIZE, torch.device("cpu"))
     assert len(found.locations) > 0
@@ -170,7 +170,7 @@ def test_a_box_whose_center_is_just_outside_the_image_is_detected_at_the_border(
     assert not found.ignored.any()
 
 
-def test_a_truck_beside_the_camera_is_neither_detected_nor_background() -> None:
+def test_a_truck_beside_a_camera_is_not_detected_nor_background() -> None:
     """Its centre is behind the camera, its front end is visible."""
     row = (3, -1, 1.5, 12, 2, 3, math.pi / 2)
     found = targets(row)
@@ -181,7 +181,7 @@ def test_a_truck_beside_the_camera_is_neither_detected_nor_background() -> None:
     assert pixels[:, 0].max() > 376
 
 
-def test_the_outline_of_a_box_partly_behind_the_camera_equals_that_of_its_part_in_front() -> None:
+def test_a_box_partly_behind_has_the_outline_of_its_front_part() -> None:
     """A box from 4 m behind to 8 m ahead looks like the box from the cutting plane to 8 m ahead."""
     start, end = OUTLINE_DEPTH_M, 8.0
     whole, part = (1, 2, 1.0, 12, 1, 1, math.pi / 2), (1, (start + end) / 2, 1.0, end - start, 1, 1, math.pi / 2)
@@ -199,7 +199,7 @@ def test_the_rotation_is_relative_to_the_viewing_ray() -> None:
     torch.testing.assert_close(rotations, expected, atol=1e-4, rtol=0)
 
 
-def test_the_depth_target_does_not_change_when_image_and_focal_length_are_scaled() -> None:
+def test_the_depth_target_ignores_scaling_of_image_and_focal() -> None:
     """The features of an image do not tell its focal length: the same pixels must have the same target."""
     half = np.diag([0.5, 0.5, 1]) @ INTRINSICS
     box = truth((2, 10, 1.5, 4, 1, 2, 0.2))

@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 import torch
 import torch.distributed
+from forks import FORKS
 from painted_drives import CONFIG, PaintedDrives
 from torch import nn
 
-from bevcli.model.bevformer import BEVFormer
-from bevcli.training.clips import ClipConfig
-from bevcli.training.job import TrainingConfig, TrainingJob
-from bevcli.training.process_group import ProcessGroup, join_process_group, leave_process_group
+from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.training.job import ProcessGroup, TrainingConfig, TrainingJob, join_process_group, leave_process_group
+from bevcli.training.samples import ClipConfig
 from bevcli.training.trainer import Trainer
 
 SHORT = TrainingConfig(
@@ -49,8 +49,13 @@ def train(group: ProcessGroup, folder: Path) -> None:
     torch.save(trainer.job.model.state_dict(), folder / f"{group.rank}-of-{group.size}.pt")
 
 
-def test_two_processes_train_one_model_and_only_the_leader_writes(tmp_path: Path) -> None:
-    torch.multiprocessing.spawn(train_in_a_group_of_two, (tmp_path,), nprocs=2)
+def test_two_processes_train_one_model_and_the_leader_writes(tmp_path: Path) -> None:
+    group = [FORKS.Process(target=train_in_a_group_of_two, args=(rank, tmp_path)) for rank in range(2)]
+    for process in group:
+        process.start()
+    for process in group:
+        process.join(300)
+        assert process.exitcode == 0
     leader, other = (torch.load(tmp_path / f"{rank}-of-2.pt") for rank in (0, 1))
     assert all(torch.equal(leader[key], other[key]) for key in leader)
     assert len((tmp_path / "loss.csv").read_text().splitlines()) == 1 + SHORT.steps

@@ -12,8 +12,8 @@ from bevcli.errors import InputError
 from bevcli.frame import BevMap
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.training.detection_targets import detection_targets
-from bevcli.training.segmentation_targets import segmentation_targets
+from bevcli.training.detection_loss import detection_targets
+from bevcli.training.segmentation_loss import segmentation_targets
 
 GRID = BevGrid(4, 8, x_range_m=(-8, 8), y_range_m=(-4, 4))  # cells of 2 m
 
@@ -32,7 +32,7 @@ def boxes(*rows: tuple[str, float, float, float], num_points: list[int] | None =
     )
 
 
-def test_boxes_out_of_range_of_other_classes_or_without_points_are_no_targets(mini_config) -> None:
+def test_boxes_out_of_range_class_or_points_are_no_targets(mini_config) -> None:
     config = replace(mini_config, classes=("car", "pedestrian"))
     truth = boxes(
         ("pedestrian", 1, 2, 0),

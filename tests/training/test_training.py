@@ -13,19 +13,20 @@ from painted_drives import CONFIG, PaintedDrives
 from safetensors.torch import load_file
 
 from bevcli.checkpoints import load_weights
-from bevcli.cli.train import StopRequest
+from bevcli.cli.stop_signals import StopSignals
 from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import BevcliError, ConfigError, InputError, OutputError, WeightsError
-from bevcli.model.bevformer import BEVFormer
+from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.synth.drives import FIRST_HELD_OUT_SEED, RenderedDrives, open_drives, split_drives
+from bevcli.synth.options import DriveOptions, parse_seeds
 from bevcli.training.augmentation import AugmentationConfig
-from bevcli.training.checkpoint import save_checkpoint
-from bevcli.training.clips import ClipConfig
-from bevcli.training.dense_loss import DenseLossConfig
-from bevcli.training.drives import FIRST_HELD_OUT_SEED, RenderedDrives, open_drives, parse_seeds, split_drives
-from bevcli.training.job import TrainingConfig, TrainingJob, prepare_folder, prepare_training
-from bevcli.training.optimizer import OptimizerConfig, make_optimizer, set_learning_rate
+from bevcli.training.files import save_checkpoint
+from bevcli.training.frame_losses import DenseLossConfig
+from bevcli.training.job import OptimizerConfig, TrainingConfig, TrainingJob, prepare_folder, prepare_training
+from bevcli.training.options import TrainOptions
 from bevcli.training.perspective_loss import PerspectiveLossConfig
-from bevcli.training.trainer import Trainer, alternated
+from bevcli.training.samples import ClipConfig
+from bevcli.training.trainer import Trainer, alternated, make_optimizer, set_learning_rate
 
 SHORT = TrainingConfig(
     steps=5, held_out=0, evaluate_every=4, checkpoint_every=2, clips=ClipConfig(frames=2, batch=2, short_share=0.0)
@@ -60,22 +61,26 @@ def run_and_kill(killed: Trainer, *, after: int) -> None:
         killed.run(kill)
 
 
-def test_a_killed_and_resumed_training_equals_an_uninterrupted_one(tmp_path: Path) -> None:
-    whole = trainer(tmp_path / "whole")
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Trainer:
+    """An uninterrupted training."""
+    whole = trainer(tmp_path_factory.mktemp("training"))
     whole.run()
+    return whole
+
+
+def test_a_killed_and_resumed_training_equals_an_uninterrupted(whole: Trainer, tmp_path: Path) -> None:
     run_and_kill(trainer(tmp_path / "killed"), after=3)  # a step after the last checkpoint
     resumed = trainer(tmp_path / "killed", resume=True)
     assert resumed.done == 2
     resumed.run()
     assert_same_weights(whole, resumed)
     for file in ("loss.csv", "validation.csv"):
-        assert (tmp_path / "whole" / file).read_text() == (tmp_path / "killed" / file).read_text()
-    assert len((tmp_path / "whole" / "loss.csv").read_text().splitlines()) == 1 + 5
+        assert (whole.job.out / file).read_text() == (tmp_path / "killed" / file).read_text()
+    assert len((whole.job.out / "loss.csv").read_text().splitlines()) == 1 + 5
 
 
-def test_a_training_that_is_asked_to_stop_leaves_a_checkpoint_to_resume_from(tmp_path: Path) -> None:
-    whole = trainer(tmp_path / "whole")
-    whole.run()
+def test_a_stopped_training_leaves_a_checkpoint_to_resume_from(whole: Trainer, tmp_path: Path) -> None:
     stopped = trainer(tmp_path / "part")
     stopped.run(stop=lambda: stopped.done == 1)  # the next regular checkpoint is after step 2
     assert stopped.done == 1
@@ -86,15 +91,14 @@ def test_a_training_that_is_asked_to_stop_leaves_a_checkpoint_to_resume_from(tmp
 
 
 @pytest.mark.parametrize(("number", "exit_code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_requests_a_stop_and_a_second_one_interrupts(number: int, exit_code: int) -> None:
+def test_a_signal_requests_a_stop_and_a_second_one_kills(number: int, exit_code: int) -> None:
     before = signal.getsignal(number)
-    with StopRequest() as request:
-        assert not request()
+    with StopSignals("step") as signals:
+        assert not signals.received()
         os.kill(os.getpid(), number)
-        assert request()
-        assert request.exit_code == exit_code
-        with pytest.raises(KeyboardInterrupt):
-            os.kill(os.getpid(), number)
+        assert signals.received()
+        assert signals.exit_code == exit_code
+        assert signal.getsignal(number) is signal.SIG_DFL
     assert signal.getsignal(number) is before
 
 
@@ -234,7 +238,7 @@ def test_resuming_from_nothing_or_from_another_model_is_rejected(tmp_path: Path)
         trainer(tmp_path, resume=True)
 
 
-def test_a_checkpoint_with_the_image_loss_of_earlier_versions_is_rejected(tmp_path: Path) -> None:
+def test_a_checkpoint_of_an_earlier_image_loss_is_rejected(tmp_path: Path) -> None:
     old = trainer(tmp_path)
     old.trained["picture_reader"] = torch.nn.Linear(2, 2)
     save_checkpoint(tmp_path / "checkpoint.pt", 1, old.trained, old.optimizer)
@@ -265,7 +269,7 @@ def test_the_learning_rate_warms_up_and_decays_by_a_cosine() -> None:
     assert [group["lr"] for group in optimizer.param_groups] == pytest.approx([0.3, 0.03])
 
 
-def test_the_training_table_is_read_and_is_no_part_of_the_model_config(tmp_path: Path) -> None:
+def test_the_training_table_is_read_apart_from_the_model_config(tmp_path: Path) -> None:
     tiny = Path(__file__).parents[2].joinpath("bevcli", "configs", "tiny.toml").read_text()
     file = tmp_path / "mine.toml"
     file.write_text(f"{tiny}\n[training]\nsteps = 12\n[training.clips]\nframes = 4\n")
@@ -279,7 +283,7 @@ def test_the_training_table_is_read_and_is_no_part_of_the_model_config(tmp_path:
 
 def test_drives_come_from_folders_or_from_seeds(tmp_path: Path) -> None:
     for folders, seeds in (([], None), ([tmp_path], [0, 1])):
-        with pytest.raises(InputError, match="give either --data DIR"):
+        with pytest.raises(InputError, match="give either `data=DIR`"):
             open_drives(folders, seeds, tmp_path, CONFIG)
     assert len(open_drives([tmp_path], None, tmp_path, CONFIG)) == 1
     assert len(open_drives([], [3, 9], tmp_path, CONFIG)) == 2
@@ -287,6 +291,8 @@ def test_drives_come_from_folders_or_from_seeds(tmp_path: Path) -> None:
 
 class NumberedDrives:
     """Five drives, of which each is only a number."""
+
+    input_shapes = None
 
     def __len__(self) -> int:
         return 5
@@ -309,8 +315,8 @@ def test_holding_out_all_drives_is_rejected() -> None:
 
 
 def test_seeds_are_a_range_or_a_list() -> None:
-    assert parse_seeds("2:5") == [2, 3, 4]
-    assert parse_seeds("3,9") == [3, 9]
+    assert parse_seeds("2:5") == (2, 3, 4)
+    assert parse_seeds("3,9") == (3, 9)
     for wrong in ("", "a", "5:2", "-1", "1:2:3"):
         with pytest.raises(InputError, match=r"expected seeds as A:B \(B excluded\) or A,B,C"):
             parse_seeds(wrong)
@@ -318,7 +324,7 @@ def test_seeds_are_a_range_or_a_list() -> None:
 
 def test_a_job_is_prepared_from_a_model_file_and_seeds(tmp_path: Path) -> None:
     cpu, out = torch.device("cpu"), tmp_path / "out"
-    job = prepare_training("demo", cpu, rendered_seeds=range(10), out=out, steps=3, seed=4)
+    job = prepare_training("demo", cpu, DriveOptions(rendered=tuple(range(10))), TrainOptions(out, steps=3, seed=4))
     assert (job.model.config, job.config) == (
         load_config("demo"),
         replace(load_table("demo", TRAINING, TrainingConfig), steps=3),
@@ -328,15 +334,16 @@ def test_a_job_is_prepared_from_a_model_file_and_seeds(tmp_path: Path) -> None:
 
 
 def test_seeds_reserved_for_evaluation_are_rejected(tmp_path: Path) -> None:
+    drives = DriveOptions(rendered=(1, FIRST_HELD_OUT_SEED))
     with pytest.raises(InputError, match="seed 1000000 is reserved for evaluation"):
-        prepare_training("demo", torch.device("cpu"), rendered_seeds=[1, FIRST_HELD_OUT_SEED], out=tmp_path)
+        prepare_training("demo", torch.device("cpu"), drives, TrainOptions(tmp_path))
 
 
 def test_a_training_is_not_overwritten(tmp_path: Path) -> None:
     prepare_folder(tmp_path / "new", resume=False)
     (tmp_path / "new" / "checkpoint.pt").write_bytes(b"")
     prepare_folder(tmp_path / "new", resume=True)
-    with pytest.raises(OutputError, match="pass --resume to continue it"):
+    with pytest.raises(OutputError, match="pass `resume=True` to continue it"):
         prepare_folder(tmp_path / "new", resume=False)
 
 

@@ -16,10 +16,11 @@ from bevcli.errors import InputError, OutputError
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.video_images import has_av
 from bevcli.recording.writer import Recording
-from bevcli.viewer import live
+from bevcli.viewer import web
 from bevcli.viewer.native import LOOPBACK, free_port, start_viewer, stop
 from bevcli.viewer.recording_reader import RecordingReader
 from bevcli.viewer.screenshot import NO_DRIVER, take_screenshot
+from bevcli.viewer.web import LiveView
 
 VIEWS = {
     "3D scene", "BEV", "BEV features", "History weight", "Speed", "Seconds per stage", "Boxes per class", "Legend",
@@ -93,17 +94,19 @@ def test_a_port_in_use_is_not_free():
 def test_a_viewer_that_dies_or_hangs_does_not_disturb_the_run(tmp_path, monkeypatch, fate):
     viewers: list[subprocess.Popen] = []
 
-    def open_headless(view: live.LiveView) -> None:
-        port = str(free_port())
-        arguments = ("--headless", "--bind", LOOPBACK, "--port", port, "--connect", view.stream_address)
-        viewers.append(start_viewer(*arguments))
-        time.sleep(3)  # until it is connected
+    def start_headless(*arguments: str) -> subprocess.Popen:
+        viewers.append(start_viewer("--headless", *arguments))
+        return viewers[-1]
 
-    monkeypatch.setattr(live.LiveView, "open", open_headless)
+    monkeypatch.setattr(web, "display_is_there", lambda: True)
+    monkeypatch.setattr(web, "start_viewer", start_headless)
     drive = MemorySequence(8)
     path = tmp_path / "recording.rrd"
     try:
-        with Recording(path, drive, NamedModel(), live=live.LiveView()) as recording:
+        view = LiveView()
+        with Recording(path, drive, NamedModel(), live=view) as recording:
+            while not view.followers:
+                time.sleep(0.1)  # until the viewer is connected
             for place in range(8):
                 if place == 3:
                     os.kill(viewers[0].pid, fate)

@@ -22,17 +22,18 @@ import pytest
 from memory_drive import MemorySequence
 from recorded_drive import record
 
+from bevcli.errors import OutputError
 from bevcli.viewer import web
-from bevcli.viewer.web import WebViewer, web_viewer_assets
+from bevcli.viewer.web import LiveView, WebViewer, web_viewer_assets
 
 PAGE = {"/": b"<html>viewer</html>", "/re_viewer.js": b"js", "/re_viewer_bg.wasm": b"wasm", "/favicon.ico": b""}
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 WITHOUT_A_GPU = "--no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader --ignore-gpu-blocklist"
 
 
-@pytest.fixture
-def viewer(tmp_path):
-    recording = tmp_path / "recording.rrd"
+@pytest.fixture(scope="module")
+def viewer(tmp_path_factory):
+    recording = tmp_path_factory.mktemp("served") / "recording.rrd"
     recording.write_bytes(b"RRF2 and so on")
     viewer = WebViewer(PAGE, recording)
     thread = threading.Thread(target=viewer.serve)
@@ -88,7 +89,7 @@ def get(viewer, **headers) -> int:
 @pytest.mark.parametrize(
     "host", ["evil.example", "evil.example:{}", "127.0.0.1.evil.example", "", "[::1", "localhost.x"]
 )
-def test_a_page_that_was_pointed_here_by_its_name_service_reads_nothing(viewer, host):
+def test_a_page_led_here_by_its_name_service_reads_nothing(viewer, host):
     assert get(viewer, Host=host.format(viewer.port)) == 403
 
 
@@ -97,7 +98,7 @@ def test_addresses_and_the_name_of_this_machine_are_served(viewer, host):
     assert get(viewer, Host=host.format(viewer.port)) == 200
 
 
-def test_connections_beyond_the_limit_are_closed_and_silent_ones_end(tmp_path, monkeypatch):
+def test_connections_over_the_limit_close_and_silent_ones_end(tmp_path, monkeypatch):
     monkeypatch.setattr(web, "MOST_CONNECTIONS", 3)
     monkeypatch.setattr(web._Handler, "timeout", 1.0)
     (tmp_path / "recording.rrd").write_bytes(b"RRF2")
@@ -132,10 +133,71 @@ def test_a_reset_connection_prints_nothing(tmp_path, capfd):
 
 def test_a_server_that_never_served_can_be_closed(tmp_path, monkeypatch):
     monkeypatch.setattr(web, "STOP_TIMEOUT_S", 0.2)
+    (tmp_path / "recording.rrd").touch()
     WebViewer(PAGE, tmp_path / "recording.rrd").close()
 
 
+def test_whatever_replaces_the_recording_is_not_served(tmp_path):
+    recording = tmp_path / "recording.rrd"
+    recording.write_bytes(b"RRF2 shown")
+    (tmp_path / "secret").write_bytes(b"secret")
+    viewer = WebViewer(PAGE, recording)
+    threading.Thread(target=viewer.serve, daemon=True).start()
+    for replace in (lambda: None, lambda: recording.symlink_to(tmp_path / "secret"), lambda: os.mkfifo(recording)):
+        recording.unlink()
+        replace()
+        with urllib.request.urlopen(viewer.address + "/recording.rrd", timeout=5) as answer:
+            assert answer.read() == b"RRF2 shown"
+        recording.touch()
+    viewer.close()
+
+
+@pytest.mark.parametrize("make", [lambda path: None, os.mkfifo, Path.mkdir])
+def test_only_files_are_served(tmp_path, make):
+    make(tmp_path / "recording.rrd")
+    with pytest.raises(OutputError, match=r"recording\.rrd: "):
+        WebViewer(PAGE, tmp_path / "recording.rrd")
+
+
+@pytest.fixture
+def live_view(tmp_path, monkeypatch):
+    """A live view of a recording that holds four bytes, without a viewer; and the open file."""
+    monkeypatch.setattr(web, "display_is_there", lambda: False)
+    monkeypatch.setattr(web, "web_viewer_assets", lambda: PAGE)
+    view = LiveView()
+    with (tmp_path / "recording.rrd").open("wb", buffering=0) as file:
+        file.write(b"RRF2")
+        view.open(tmp_path / "recording.rrd")
+        yield view, file
+    view.close()
+
+
+def test_a_live_view_sends_what_is_appended(live_view):
+    view, file = live_view
+    with urllib.request.urlopen(view.address + "/recording.rrd", timeout=5) as answer:
+        assert answer.read(4) == b"RRF2"
+        file.write(b" frame 1")
+        assert answer.read(8) == b" frame 1"
+        file.write(b" the end")
+        view.close()
+        assert answer.read() == b" the end"
+
+
+def test_another_site_reads_nothing_of_a_live_view(live_view):
+    view, _ = live_view
+    address = urlsplit(view.address)
+    for method, path in (("GET", "/recording.rrd"), ("POST", "/recording.rrd"), ("POST", "/proxy")):
+        connection = http.client.HTTPConnection(address.hostname, address.port, timeout=5)
+        connection.request(method, path, headers={"Host": "evil.example", "Origin": "http://evil.example"})
+        answer = connection.getresponse()
+        assert answer.status in (403, 501)
+        assert answer.getheader("Access-Control-Allow-Origin") is None
+    with pytest.raises(OSError), socket.create_connection((address.hostname, 9876), timeout=2):
+        pass
+
+
 def test_a_port_in_use_is_replaced_by_another(viewer, tmp_path):
+    (tmp_path / "recording.rrd").touch()
     second = WebViewer(PAGE, tmp_path / "recording.rrd", port=viewer.port)
     assert second.port != viewer.port
     second._server.server_close()

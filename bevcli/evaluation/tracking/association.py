@@ -1,16 +1,158 @@
-"""Which track each object is matched to, frame by frame, at one score threshold."""
+"""The boxes of many frames with their identities, and the track that each object is matched to, frame by frame."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from bevcli.evaluation.tracking.tracked_boxes import Indices, TrackedBoxes
+from bevcli.errors import InputError
+from bevcli.frame import FrameStamp
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
+
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class TrackedBoxes:
+    """N boxes, ordered by frame.
+
+    Attributes:
+        frames: (N,) index of each box's frame, rising; frames of a scene are in the order of time.
+        tracks: (N,) identity, a number from 0 on; the same name in two scenes has two numbers.
+        xy: (N, 2) centre on the ground, metres.
+        classes: (N,) names.
+        scores: (N,) track scores; 0 for ground truth.
+    """
+
+    frames: Indices
+    tracks: Indices
+    xy: Array
+    classes: NDArray[np.str_]
+    scores: Array
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, selection: NDArray[Any]) -> TrackedBoxes:
+        """The boxes of a mask (N,) bool or of an index array."""
+        return TrackedBoxes(*(column[selection] for column in self.columns()))
+
+    def columns(self) -> tuple[NDArray[Any], ...]:
+        """Frames, tracks, positions, classes and scores."""
+        return self.frames, self.tracks, self.xy, self.classes, self.scores
+
+
+def scored_tracks(
+    frames: Sequence[Boxes3D],
+    stamps: Sequence[FrameStamp],
+    ego_xy: Array,
+    ranges_m: Mapping[str, float],
+    side: str,
+) -> TrackedBoxes:
+    """The boxes that are scored: in range, with points, with one score a track, and interpolated in gaps.
+
+    frames: F frames of boxes in any order. Boxes without an identity are left out. The score of a box is its track
+    score, or its score where it has none. stamps: of the frames. ego_xy: (F, 2) position of the ego vehicle in each
+    frame's frame of reference, metres. ranges_m: class -> range; boxes of other classes are left out. side:
+    "predictions" or "ground truth", for messages.
+
+    Returns boxes whose `frames` are places in the order of `time_order`. Raises InputError if a frame has one identity
+    twice.
+    """
+    places = time_order(stamps)
+    given = [_columns(frames[place], row, ego_xy[place], ranges_m) for row, place in enumerate(places)]
+    rows, names, classes, xy, scores = map(np.concatenate, zip(*given, strict=True))
+    ordered = [stamps[place] for place in places]
+    _, scenes = np.unique([stamp.scene for stamp in ordered], return_inverse=True)
+    _, name_numbers = np.unique(names, return_inverse=True)
+    keys = scenes[rows] * (len(names) + 1) + name_numbers
+    _, tracks = np.unique(keys, return_inverse=True)
+    _require_unique(rows, tracks, names, ordered, side)
+    scores = _means_of_tracks(tracks, scores)
+    times = np.array([stamp.timestamp_ns for stamp in ordered], dtype=np.int64)
+    return _interpolated(TrackedBoxes(rows, tracks, xy, classes, scores), times)
+
+
+def _means_of_tracks(tracks: Indices, scores: Array) -> Array:
+    """(N,) the mean score of each box's track, by `numpy.mean` as in the devkit.
+
+    Its pairwise sum decides the last bit, and with it whether a box at a threshold counts.
+    """
+    order = np.argsort(tracks, kind="stable")
+    _, starts, lengths = np.unique(tracks[order], return_index=True, return_counts=True)
+    means = [np.mean(scores[order[start : start + length]]) for start, length in zip(starts, lengths, strict=True)]
+    return np.array(means)[tracks]
+
+
+def time_order(stamps: Sequence[FrameStamp]) -> list[int]:
+    """The places of frames ordered by scene (in the order of first appearance), then by time."""
+    first: dict[str, int] = {}
+    for place, stamp in enumerate(stamps):
+        first.setdefault(stamp.scene, place)
+    return sorted(range(len(stamps)), key=lambda place: (first[stamps[place].scene], stamps[place].timestamp_ns))
+
+
+def _columns(
+    boxes: Boxes3D, row: int, ego_xy: Array, ranges_m: Mapping[str, float]
+) -> tuple[Indices, NDArray[np.str_], NDArray[np.str_], Array, Array]:
+    """Frame, identity, class, position and score of the boxes of a frame that are scored."""
+    limits = np.array([ranges_m.get(str(name), -1.0) for name in boxes.classes])
+    away = np.linalg.norm(boxes.centers[:, :2] - ego_xy, axis=1)
+    kept = away < limits
+    if boxes.num_points is not None:
+        kept &= boxes.num_points != 0
+    names = np.full(len(boxes), "") if boxes.instances is None else boxes.instances
+    kept &= names != ""
+    scores = boxes.scores if boxes.track_scores is None else boxes.track_scores
+    scores = np.zeros(len(boxes)) if scores is None else scores
+    rows = np.full(int(kept.sum()), row, dtype=np.int64)
+    return rows, names[kept], boxes.classes[kept], boxes.centers[kept, :2], scores[kept]
+
+
+def _require_unique(
+    rows: Indices, tracks: Indices, names: NDArray[np.str_], ordered: Sequence[FrameStamp], side: str
+) -> None:
+    order = np.lexsort((tracks, rows))
+    same = (np.diff(rows[order]) == 0) & (np.diff(tracks[order]) == 0)
+    if same.any():
+        box = order[int(np.argmax(same))]
+        stamp = ordered[rows[box]]
+        raise InputError(
+            f'{side}: scene "{stamp.scene}" frame {stamp.index}: two boxes have the instance "{names[box]}" '
+            "(expected one box for each object)"
+        )
+
+
+def _interpolated(boxes: TrackedBoxes, times_ns: Indices) -> TrackedBoxes:
+    """Adds a box to every frame inside a track in which the track has none.
+
+    As in the devkit, the weight of the right neighbour is (t_right - t) / (t_right - t_left): the nearer neighbour
+    counts less in gaps of several frames. New boxes come last in their frame, by their track's first appearance.
+    """
+    order = np.lexsort((boxes.frames, boxes.tracks))
+    left, right = order[:-1], order[1:]
+    missing = np.where(boxes.tracks[left] == boxes.tracks[right], boxes.frames[right] - boxes.frames[left] - 1, 0)
+    left, right = np.repeat(left, missing), np.repeat(right, missing)
+    step = np.arange(len(left)) - np.repeat(np.cumsum(missing) - missing, missing) + 1
+    frames = boxes.frames[left] + step
+    span = times_ns[boxes.frames[right]] - times_ns[boxes.frames[left]]
+    weight = (times_ns[boxes.frames[right]] - times_ns[frames]) / span
+    xy = (1 - weight)[:, None] * boxes.xy[left] + weight[:, None] * boxes.xy[right]
+    scores = (1 - weight) * boxes.scores[left] + weight * boxes.scores[right]
+    first_appearance = np.full(int(boxes.tracks.max(initial=-1)) + 1, len(boxes))
+    np.minimum.at(first_appearance, boxes.tracks, np.arange(len(boxes)))
+    added = TrackedBoxes(frames, boxes.tracks[right], xy, boxes.classes[right], scores)
+    added = added[np.argsort(first_appearance[added.tracks], kind="stable")]
+    both = TrackedBoxes(*map(np.concatenate, zip(boxes.columns(), added.columns(), strict=True)))
+    return both[np.argsort(both.frames, kind="stable")]
+
 
 MISS, MATCH, SWITCH = 0, 1, 2
 Pair = tuple[int, int, float]  # box of the ground truth, box of the predictions, distance in metres
@@ -71,11 +213,8 @@ def associate(
     In each frame an object keeps the track that it was matched to last, if that is present and near. The other objects
     and tracks are matched so that as many pairs as possible arise, and among those with the least sum of distances.
 
-    Args:
-        truth: G boxes of one class.
-        predictions: boxes of the same class.
-        pairs: of `near_pairs`.
-        threshold: predictions with a lower score are left out.
+    truth: G boxes of one class. predictions: boxes of the same class. pairs: of `near_pairs`. threshold: predictions
+    with a lower score are left out.
     """
     alive = predictions.scores[pairs.predictions] >= threshold
     truths, candidates, distances = pairs.truths[alive], pairs.predictions[alive], pairs.distances[alive]

@@ -134,10 +134,7 @@ def as_array(tensor: Tensor) -> np.ndarray:
 def in_threads(work: Callable[[int, int], None], rows: int, min_range: int = 64) -> None:
     """Calls work(begin, end) for ranges that together cover 0 to rows, in as many threads as PyTorch uses.
 
-    Args:
-        work: must release the GIL; an exception in it is raised here.
-        rows: number of rows.
-        min_range: smallest number of rows that is worth a call of its own.
+    work: must release the GIL; an exception in it is raised here. min_range: rows that are worth a call of their own.
     """
     threads = torch.get_num_threads()
     step = max(min_range, -(-rows // (threads * RANGES_PER_THREAD)))

@@ -1,10 +1,8 @@
 """Layers run by oneDNN on a CPU, for inference: weights are packed once, ReLU and sums are fused into convolutions.
 
 A residual block adds its last convolution to the shortcut in place: with few channels such a convolution mostly waits
-for memory, and new memory for the result would be one more array to pass through.
-
-The operators are those that PyTorch's compiler uses for convolutions and linear layers. Where a build of PyTorch lacks
-them, a model keeps its own layers.
+for memory. The operators are those that PyTorch's compiler uses; where a build of PyTorch lacks them, a model keeps its
+own layers.
 """
 
 from __future__ import annotations
@@ -14,9 +12,8 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from bevcli.model.bev_fusion import FusionBlock
 from bevcli.model.feed_forward import FeedForward
-from bevcli.model.resnet import Bottleneck
+from bevcli.model.resnet import BasicBlock, Bottleneck
 
 OPERATORS = (
     "_convolution_pointwise",
@@ -29,7 +26,7 @@ OPERATORS = (
 
 
 def has_onednn(dtype: torch.dtype) -> bool:
-    """Whether this build of PyTorch and this CPU can run these layers in a dtype."""
+    """This build of PyTorch and this CPU can run these layers in a dtype."""
     if not torch.backends.mkldnn.is_available() or not all(hasattr(torch.ops.mkldnn, name) for name in OPERATORS):
         return False
     return dtype == torch.float32 or (dtype == torch.bfloat16 and torch.ops.mkldnn._is_mkldnn_bf16_supported())
@@ -96,16 +93,16 @@ class FusedBottleneck(nn.Module):
         return self.conv3.add_to(self.downsample(x), y)
 
 
-class FusedFusionBlock(nn.Module):
-    """A `FusionBlock` whose batch norms are folded."""
+class FusedBasicBlock(nn.Module):
+    """A `BasicBlock` whose batch norms are folded."""
 
-    def __init__(self, block: FusionBlock) -> None:
+    def __init__(self, block: BasicBlock) -> None:
         super().__init__()
         self.conv1, self.conv2 = PackedConvolution(block.conv1, "relu"), PackedConvolution(block.conv2, "relu")
         self.downsample = block.downsample
 
     def forward(self, x: Tensor) -> Tensor:
-        """As `FusionBlock.forward`. Without a `downsample` the result is written over x."""
+        """As `BasicBlock.forward`. Without a `downsample` the result is written over x."""
         y = self.conv1(x)
         return self.conv2.add_to(self.downsample(x), y)
 
@@ -122,14 +119,14 @@ def use_onednn(part: nn.Module) -> None:
 
 
 def _fast(layer: nn.Module) -> nn.Module:
-    """What takes the place of a layer: the layer itself where oneDNN has nothing for it, or not in this dtype."""
+    """The replacement of a layer; the layer itself where oneDNN has nothing for it, or not in this dtype."""
     parameter = next(layer.parameters(), None)
     if parameter is None or not has_onednn(parameter.dtype):
         return layer
     if isinstance(layer, Bottleneck):
         return FusedBottleneck(layer)
-    if isinstance(layer, FusionBlock):
-        return FusedFusionBlock(layer)
+    if isinstance(layer, BasicBlock):
+        return FusedBasicBlock(layer)
     if isinstance(layer, FeedForward):  # dropout has no effect in inference
         return nn.Sequential(PackedLinear(layer.expand, layer.activation), PackedLinear(layer.reduce))
     # Not subclasses, such as the layer in multi-head attention whose weight is read by its owner.

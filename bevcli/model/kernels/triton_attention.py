@@ -10,7 +10,7 @@ import triton
 import triton.language as tl
 from torch import Tensor, nn
 
-from bevcli.model.kernels.tables import Tables
+from bevcli.model.upload import Tables
 
 QUERIES_PER_PROGRAM = 32
 
@@ -57,14 +57,9 @@ class TritonSampling(nn.Module):
 
 def constants(heads: int, depth: int, levels: int, points: int) -> dict[str, int]:
     """The arguments of the kernel that it is compiled for. depth: channels of a head."""
-    return {
-        "HEADS": heads,
-        "DEPTH": depth,
-        "PADDED_DEPTH": triton.next_power_of_2(depth),
-        "LEVELS": levels,
-        "POINTS": points,
-        "BLOCK": QUERIES_PER_PROGRAM,
-    }
+    padded = triton.next_power_of_2(depth)
+    counts = {"HEADS": heads, "DEPTH": depth, "PADDED_DEPTH": padded, "LEVELS": levels, "POINTS": points}
+    return {**counts, "BLOCK": QUERIES_PER_PROGRAM}
 
 
 @triton.jit

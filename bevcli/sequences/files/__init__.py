@@ -1,9 +1,9 @@
 """Readers and writers of single files that several formats and commands share.
 
 boxes_file: ground_truth.json and predictions.json; box_json: one frame's boxes in it.
-incremental_json: a JSON file that is written entry by entry.
+incremental_json: a file that only grows, and a JSON file that is written entry by entry.
 map_folder: BEV maps, one PNG per frame.
-calibration_file: calibration.json; camera_fields: one camera in it.
+calibration_file: calibration.json.
 kalibr_ros: Kalibr and ROS intrinsics that replace calibration.json.
-transform_json: rigid transforms in JSON; json_fields: checked numbers in JSON, with findings.
+json_fields: checked numbers and rigid transforms in JSON, with findings.
 """

@@ -20,6 +20,13 @@ KEYS = frozenset(
         "visibility", "num_points",
     )
 )  # fmt: skip
+# Keys of optional columns: type, value where a box has none, and a text for messages.
+PLAIN: dict[str, tuple[Any, Any, str]] = {
+    "attribute": (str, "", "a string"),
+    "instance": (str, "", "a string"),
+    "duplicate": (bool, False, "true or false"),
+    "num_points": (int, -1, "an integer, 0 or more"),
+}
 _UNKNOWN_VELOCITY = [None, None]
 _OWN_NAMES = ClassNames()
 
@@ -42,13 +49,13 @@ def boxes_from_json(objects: Any, where: str, class_names: ClassNames = _OWN_NAM
         yaws=_numbers([box["yaw"] for box in objects], 1, f"{where}: box", "yaw"),
         velocities=_velocities([box.get("velocity") for box in objects], where),
         classes=np.array([class_names[box["class"]] for box in objects]),
-        scores=_scores(objects, where),
-        attributes=_names(objects, "attribute", where),
-        instances=_names(objects, "instance", where),
+        scores=_shares(objects, "score", where, required=True),
+        attributes=_plain(objects, "attribute", where),
+        instances=_plain(objects, "instance", where),
         track_scores=_shares(objects, "track_score", where),
-        duplicates=_flags(objects, "duplicate", where),
+        duplicates=_plain(objects, "duplicate", where),
         visibilities=_shares(objects, "visibility", where),
-        num_points=_num_points(objects, where),
+        num_points=_plain(objects, "num_points", where),
     )
     for key, column in (("center", boxes.centers), ("size_lwh", boxes.sizes_lwh), ("yaw", boxes.yaws)):
         _require(np.isfinite(column), column, f"{where}: box", key, "finite numbers")
@@ -141,53 +148,30 @@ def _velocities(values: list[Any], where: str) -> Array:
     return _numbers(with_nan, 2, f"{where}: box", "velocity")
 
 
-def _scores(objects: Sequence[dict[str, Any]], where: str) -> Array | None:
-    if not any("score" in box for box in objects):
-        return None
-    for place, box in enumerate(objects):
-        if "score" not in box:
-            raise InputError(f'{where}: box {place}: "score" is missing (other boxes of the frame have one)')
-    scores = _numbers([box["score"] for box in objects], 1, f"{where}: box", "score")
-    _require((scores >= 0) & (scores <= 1), scores, f"{where}: box", "score", "0 to 1")
-    return scores
+def _shares(objects: Sequence[dict[str, Any]], key: str, where: str, *, required: bool = False) -> Array | None:
+    """An optional column of numbers from 0 to 1, NaN where a box has none.
 
-
-def _shares(objects: Sequence[dict[str, Any]], key: str, where: str) -> Array | None:
-    """An optional column of numbers from 0 to 1, NaN where a box has none."""
+    required: whether every box must have one if any has.
+    """
     if not any(key in box for box in objects):
         return None
+    for place, box in enumerate(objects if required else ()):
+        if key not in box:
+            raise InputError(f'{where}: box {place}: "{key}" is missing (other boxes of the frame have one)')
     values = [box.get(key) for box in objects]
-    numbers = _numbers([math.nan if v is None else v for v in values], 1, f"{where}: box", key)
-    good = np.isnan(numbers) | ((numbers >= 0) & (numbers <= 1))
+    numbers = _numbers([math.nan if v is None and not required else v for v in values], 1, f"{where}: box", key)
+    good = ((numbers >= 0) & (numbers <= 1)) | (np.isnan(numbers) & (not required))
     _require(good, numbers, f"{where}: box", key, "0 to 1")
     return numbers
 
 
-def _flags(objects: Sequence[dict[str, Any]], key: str, where: str) -> NDArray[np.bool_] | None:
+def _plain(objects: Sequence[dict[str, Any]], key: str, where: str) -> NDArray[Any] | None:
+    """An optional column of texts, flags or counts, with a default where a box has none."""
     if not any(key in box for box in objects):
         return None
-    values = [box.get(key, False) for box in objects]
+    kind, default, expected = PLAIN[key]
+    values: list[Any] = [default if kind is str and not box.get(key) else box.get(key, default) for box in objects]
     for place, value in enumerate(values):
-        if type(value) is not bool:
-            raise InputError(f"{where}: box {place}: {key}: expected true or false, found {value!r:.40}")
-    return np.array(values)
-
-
-def _num_points(objects: Sequence[dict[str, Any]], where: str) -> NDArray[np.int64] | None:
-    if not any("num_points" in box for box in objects):
-        return None
-    values = [box.get("num_points", -1) for box in objects]
-    for place, value in enumerate(values):
-        if type(value) is not int or ("num_points" in objects[place] and value < 0):
-            raise InputError(f"{where}: box {place}: num_points: expected an integer, 0 or more, found {value!r:.40}")
-    return np.array(values, dtype=np.int64)
-
-
-def _names(objects: Sequence[dict[str, Any]], key: str, where: str) -> NDArray[np.str_] | None:
-    if not any(key in box for box in objects):
-        return None
-    values = [box.get(key) or "" for box in objects]
-    for place, value in enumerate(values):
-        if not isinstance(value, str):
-            raise InputError(f"{where}: box {place}: {key}: expected a string, found {value!r:.40}")
+        if type(value) is not kind or (kind is int and key in objects[place] and value < 0):
+            raise InputError(f"{where}: box {place}: {key}: expected {expected}, found {value!r:.40}")
     return np.array(values)

@@ -16,11 +16,11 @@ from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
+from bevcli.parsing.documents import without_garbage_collection
 from bevcli.sequences.files.box_json import boxes_from_json, boxes_to_json
 from bevcli.sequences.files.class_names import ClassNames
 from bevcli.sequences.files.incremental_json import IncrementalJson, read_entries
-from bevcli.sequences.files.transform_json import pose_from_json, pose_to_json
-from bevcli.sequences.garbage_collection import without_garbage_collection
+from bevcli.sequences.files.json_fields import pose_from_json, pose_to_json
 
 FORMAT = "bevcli-boxes/1"
 LARGEST_BYTES = 4 << 30

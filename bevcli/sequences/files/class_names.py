@@ -31,7 +31,7 @@ class ClassNames:
             known = _KNOWN.get(target.lower())
             if known is None:
                 raise InputError(
-                    f'--class-map {name}={target}: "{target}" is not a class (expected one of {", ".join(CLASSES)})'
+                    f'`class_map` {name}={target}: "{target}" is not a class (expected one of {", ".join(CLASSES)})'
                 )
             self._by_lower_case[name.lower()] = known
             self._by_name[name] = known
@@ -61,10 +61,10 @@ def count_other_classes(frames: Iterable[Boxes3D]) -> Counter[str]:
 
 
 def other_classes_note(counts: Mapping[str, int], where: str) -> str:
-    """What to tell the user of boxes whose class is not scored. where: the file or the side that has them."""
+    """A note for the user about boxes whose class is not scored. where: the file or the side that has them."""
     named = ", ".join(f"{name} ({count})" for name, count in sorted(counts.items()))
     example = next(iter(sorted(counts)))
     return (
         f"{where}: {sum(counts.values())} boxes have other classes and are not scored: {named} "
-        f'(--class-map "{example}=car" renames a class)'
+        f'(`class_map` "{example}=car" renames a class)'
     )

@@ -15,9 +15,55 @@ from typing import Any
 from bevcli.errors import InputError, OutputError
 from bevcli.parsing.documents import parse_json
 from bevcli.parsing.files import read_bytes
-from bevcli.sequences.files.growing_file import GrowingFile
 
 PARTIAL = ".partial"
+
+
+class GrowingFile:
+    """A file that gets each piece whole or not at all, also on a full disk, and that can be resumed.
+
+    Attributes:
+        path: where it is.
+        name: the path in error messages.
+        size: bytes written so far. Pass it as `resume_at` to go on from here.
+    """
+
+    def __init__(self, path: Path, resume_at: int | None = None, name: Path | None = None) -> None:
+        """Creates the file, or cuts it to `resume_at` bytes and goes on there. Raises OutputError."""
+        self.path, self.name = path, path if name is None else name
+        self.size = 0
+        try:
+            # Unbuffered: a piece is in the file at once.
+            self._file = path.open("wb" if resume_at is None else "r+b", buffering=0)
+            if resume_at is not None:
+                self._file.truncate(resume_at)
+                self.size = self._file.seek(resume_at)
+        except OSError as error:
+            raise self._failure(error) from None
+
+    def append(self, content: bytes) -> None:
+        """Writes a piece. Raises OutputError; the file then is as before."""
+        try:
+            rest = memoryview(content)
+            while rest:
+                rest = rest[os.write(self._file.fileno(), rest) :]
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                self._file.truncate(self.size)
+                self._file.seek(self.size)
+            raise self._failure(error) from None
+        self.size += len(content)
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._file.close()
+
+    def is_deleted(self) -> bool:
+        """True if somebody has deleted the file while it is written."""
+        return os.fstat(self._file.fileno()).st_nlink == 0
+
+    def _failure(self, error: OSError) -> OutputError:
+        return OutputError(f"{self.name}: cannot be written ({error.strerror})")
 
 
 def partial_path(path: Path) -> Path:
@@ -63,11 +109,7 @@ def _is_entry(line: bytes) -> bool:
 
 
 class IncrementalJson:
-    """Writes entries between a head and a tail. Entries are not kept in memory.
-
-    Attributes:
-        path: the file, which has its name once it is closed.
-    """
+    """Writes entries between a head and a tail, and keeps none of them in memory. `path` exists once it is closed."""
 
     def __init__(self, path: Path, head: str, tail: str, resume_at: int | None = None) -> None:
         """Creates the file. Head and tail together must be valid JSON.
@@ -104,7 +146,7 @@ class IncrementalJson:
         except ValueError:
             raise OutputError(
                 f"{self.path}: {name}: a box or pose has a number that is not finite, so the model's output is "
-                "invalid: try --precision fp32"
+                'invalid: try `precision="fp32"`'
             ) from None
         member = text if key is None else f"{json.dumps(key)}: {text}"
         self._file.append((self._separator + member).encode())
@@ -122,7 +164,7 @@ class IncrementalJson:
         _rename(self._partial, self.path)
 
     def is_deleted(self) -> bool:
-        """Whether somebody has deleted the file that is being written."""
+        """True if somebody has deleted the file that is being written."""
         return self._file.is_deleted()
 
 

@@ -12,9 +12,8 @@ from bevcli.findings import errors_of
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.parsing.documents import read_json, read_yaml
-from bevcli.sequences.files.camera_fields import parse_camera
-from bevcli.sequences.files.json_fields import Report, parse_numbers
-from bevcli.sequences.files.transform_json import parse_transform, transform_to_json
+from bevcli.sequences.files.calibration_file import parse_camera
+from bevcli.sequences.files.json_fields import Report, parse_numbers, parse_transform, transform_to_json
 
 Fields = dict[str, Any]  # the fields of one camera, as in calibration.json
 YAML_SUFFIXES = (".yaml", ".yml")
@@ -35,7 +34,7 @@ def read_rig(intrinsics: Path | None, extrinsics: Path | None) -> CameraRig | No
     if intrinsics is None and extrinsics is None:
         return None
     if intrinsics is None or extrinsics is None:
-        raise InputError("--intrinsics and --extrinsics must be given together: pass both, or write a calibration.json")
+        raise InputError("`intrinsics` and `extrinsics` must be given together: pass both, or write a calibration.json")
     cameras = dict(_read_intrinsics(intrinsics))
     document = _read_extrinsics(extrinsics)
     poses = _poses(document.get("cameras", {}), cameras, extrinsics)
@@ -66,7 +65,9 @@ def _read_intrinsics(path: Path) -> Iterator[tuple[str, Fields]]:
 
 
 def _cameras_in(path: Path) -> Iterator[tuple[str, Fields]]:
-    document = _load_yaml(path)
+    document = read_yaml(path)
+    if not isinstance(document, dict):
+        raise InputError(f"{path}: expected a mapping (Kalibr camchain or ROS camera_info)")
     if "image_width" in document or "width" in document:
         yield str(document.get("camera_name") or path.stem), _ros_fields(document, path)
     elif any(isinstance(entry, dict) and "intrinsics" in entry for entry in document.values()):
@@ -74,13 +75,6 @@ def _cameras_in(path: Path) -> Iterator[tuple[str, Fields]]:
             yield str(name), _kalibr_fields(entry, f"{path}: camera {name}")
     else:
         raise InputError(f"{path}: expected a Kalibr camchain (cam0: intrinsics: ...) or a ROS camera_info")
-
-
-def _load_yaml(path: Path) -> Mapping[str, Any]:
-    document = read_yaml(path)
-    if not isinstance(document, dict):
-        raise InputError(f"{path}: expected a mapping (Kalibr camchain or ROS camera_info)")
-    return document
 
 
 def _kalibr_fields(entry: Any, where: str) -> Fields:
@@ -128,8 +122,7 @@ def _data(document: Mapping[str, Any], name: str) -> Any:
 def _numbers(owner: Mapping[str, Any], name: str, count: int, where: str) -> list[float]:
     report = Report()
     numbers = parse_numbers(owner, name, (count,), report)
-    for error in errors_of(report.findings):
-        raise InputError(f"{where}: {error.line}")
+    _raise_first(report, where)
     assert numbers is not None
     return [float(number) for number in numbers]
 

@@ -25,14 +25,7 @@ LONGEST_NAME = 100  # characters of a class
 
 @dataclass(frozen=True)
 class MapFolder:
-    """A folder of maps with one extent in the bev frame.
-
-    Attributes:
-        path: the folder.
-        x_range_m: smallest and largest x, metres.
-        y_range_m: smallest and largest y, metres.
-        classes: class -> its bit, of the classes that the maps may contain, by rising bit.
-    """
+    """A folder of maps with one extent in the bev frame, metres. classes: class -> its bit, by rising bit."""
 
     path: Path
     x_range_m: tuple[float, float]
@@ -40,7 +33,7 @@ class MapFolder:
     classes: Mapping[str, int]
 
     def has(self, frame: int) -> bool:
-        """Whether the folder has a map of this frame."""
+        """True if the folder has a map of this frame."""
         return map_path(self.path, frame).is_file()
 
     def load(self, frame: int) -> BevMap:
@@ -135,6 +128,6 @@ def _classes(legend: dict[str, Any], path: Path) -> dict[str, int]:
 
 
 def _are_names(values: Collection[Any]) -> bool:
-    """Whether these are different names of up to LONGEST_NAME printable characters."""
+    """True if these are different names of up to LONGEST_NAME printable characters."""
     texts = {text for text in values if isinstance(text, str) and 0 < len(text) <= LONGEST_NAME and text.isprintable()}
     return len(texts) == len(values)

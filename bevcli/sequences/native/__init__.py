@@ -1,8 +1,7 @@
 """The native sequence folder: one drive with calibration, images or videos, ego-motion and ground truth.
 
-folder: FolderSequence, the folder as a Sequence.
-frames_table: frames.csv. unlisted_frames and timing: folders without it, from file names, videos and timing.toml.
-ego_motion_file: ego_motion.csv. ground_truth: ground_truth.json and ground_truth_map/.
-csv_table: strict CSV reading.
+folder: FolderSequence, the folder as a Sequence, with ground_truth.json and ground_truth_map/.
+tables: frames.csv and ego_motion.csv. unlisted_frames: folders without frames.csv, from file names, videos and
+timing.toml.
 writer: NativeWriter, which writes frames as a native folder.
 """

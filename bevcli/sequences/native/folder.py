@@ -2,78 +2,74 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
 
 from bevcli.errors import InputError
-from bevcli.frame import DriveFacts, Frame, FrameStamp
+from bevcli.frame import BevMap, DriveFacts, Frame, Sequence
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
+from bevcli.geometry.transforms import Array, Pose, inverse
+from bevcli.sequences.files.boxes_file import BoxesFile, read_boxes
 from bevcli.sequences.files.calibration_file import read_rig_and_facts
-from bevcli.sequences.frame_reading import read_frame
-from bevcli.sequences.images import ImageReader, ImageSource
-from bevcli.sequences.native.ego_motion_file import read_ego_motion
-from bevcli.sequences.native.frames_table import FrameEntry, check_times, read_frames_table
-from bevcli.sequences.native.ground_truth import FolderGroundTruth, GroundTruthUse
+from bevcli.sequences.files.class_names import ClassNames, count_other_classes, other_classes_note
+from bevcli.sequences.files.incremental_json import existing
+from bevcli.sequences.files.map_folder import open_maps
+from bevcli.sequences.images import FrameEntry, ImageReader, ImageSource, read_frame
+from bevcli.sequences.native.format import NativeOptions
+from bevcli.sequences.native.tables import check_times, read_ego_motion, read_frames_table
 from bevcli.sequences.native.unlisted_frames import find_frames
+from bevcli.sequences.options import EgoMotionUse, SequenceOptions
 
-# required: ego_motion.csv must exist. optional: without the file there are no poses.
-# static: the vehicle stands, and the file is not read.
-EgoMotionUse = Literal["required", "optional", "static"]
-# Any of these makes a folder a native sequence, so that an incomplete one gets an error that names the missing file.
-MARKERS = ("calibration.json", "frames.csv", "ego_motion.csv", "images", "videos")
+BOXES_FILE = "ground_truth.json"
+MAPS_FOLDER = "ground_truth_map"
 
 
-def is_native_folder(path: Path) -> bool:
-    """Whether a folder contains any part of a native sequence."""
-    return any((path / part).exists() for part in MARKERS)
-
-
-class FolderSequence:
+class FolderSequence(Sequence):
     """A native sequence folder as a `Sequence`.
 
-    rig: used in place of calibration.json, if given. ego_motion_file: used in place of ego_motion.csv, if given.
-    ground_truth: see `GroundTruthUse`. allow_outside: whether images may lie outside of the folder.
+    rig: used in place of the rig of `own` and of calibration.json, if given.
     Raises InputError if a file of the folder is missing or invalid.
     """
 
     def __init__(
         self,
         path: Path,
-        *,
-        ego_motion: EgoMotionUse = "required",
-        strict: bool = False,
+        common: SequenceOptions = SequenceOptions(),
+        own: NativeOptions = NativeOptions(),
         rig: CameraRig | None = None,
-        ego_motion_file: Path | None = None,
-        ground_truth: GroundTruthUse = GroundTruthUse(),
-        allow_outside: bool = False,
     ) -> None:
         if not path.is_dir():
             raise InputError(f"{path}: the sequence folder is missing")
         self.path = path
         self.name = path.resolve().name
+        rig = own.rig() if rig is None else rig
         calibration = path / "calibration.json"
         self.rig, self.facts = read_rig_and_facts(calibration) if rig is None else (rig, DriveFacts())
         self._entries, notes = _read_entries(path, self.rig)
-        if not allow_outside:
+        self.stamps = tuple(entry.stamp for entry in self._entries)
+        if not common.allow_outside:
             _check_paths(path, self._entries)
-        self.ego_motion, motion_notes = _read_motion(
-            ego_motion_file or path / "ego_motion.csv", ego_motion, self._entries
-        )
+        file = own.ego_motion_file or path / "ego_motion.csv"
+        self.ego_motion, motion_notes = _read_motion(file, common.ego_motion)
+        if self.ego_motion is not None:
+            advice = "set start_ns in timing.toml" if notes else "add ego-motion, or remove the frame"
+            _check_coverage(file, self.ego_motion, self._entries, advice)
         self.has_ego_motion = self.ego_motion is not None
-        self._truth = FolderGroundTruth(path, ground_truth)
+        self._truth = FolderGroundTruth(path, own.class_map, is_read=common.ground_truth)
         self.notes = (*rig_notes(self.rig), *notes, *motion_notes, *self._truth.notes)
-        self._images = ImageReader(strict=strict, inside=None if allow_outside else path)
-
-    @property
-    def stamps(self) -> tuple[FrameStamp, ...]:
-        """Index, scene and time of each frame, in order."""
-        return tuple(entry.stamp for entry in self._entries)
+        self._images = ImageReader(strict=common.strict, inside=None if common.allow_outside else path)
 
     @property
     def input_files(self) -> tuple[Path, ...]:
         """Tables and videos: the files in the folder itself. A run can be resumed only if they are the same."""
         return tuple(sorted(path for path in self.path.iterdir() if path.is_file()))
+
+    def image_files(self, place: int) -> tuple[Path, ...]:
+        """See `Sequence`."""
+        sources = self._entries[place].sources.values()
+        return tuple(source.path for source in sources if isinstance(source, ImageSource))
 
     def load(self, place: int) -> Frame:
         """The frame at position `place`, with decoded images. Raises InputError as `ImageReader.read`."""
@@ -86,12 +82,13 @@ class FolderSequence:
 
 
 def _read_entries(path: Path, rig: CameraRig) -> tuple[tuple[FrameEntry, ...], tuple[str, ...]]:
+    """The frames of frames.csv, or else those that are found, with a note."""
     table = path / "frames.csv"
     if table.is_file():
         return read_frames_table(table, rig.names), ()
-    found = find_frames(path, rig.names)
-    check_times(found.entries)
-    return found.entries, (found.note,)
+    entries, note = find_frames(path, rig.names)
+    check_times(entries)
+    return entries, (note,)
 
 
 def _check_paths(folder: Path, entries: tuple[FrameEntry, ...]) -> None:
@@ -101,37 +98,33 @@ def _check_paths(folder: Path, entries: tuple[FrameEntry, ...]) -> None:
             path = source.path if isinstance(source, ImageSource) else folder
             if not path.is_relative_to(folder) or ".." in path.relative_to(folder).parts:
                 raise InputError(
-                    f"{entry.origin}: camera {camera}: {path}: leads out of the folder: pass --allow-outside to read it"
+                    f"{entry.origin}: camera {camera}: {path}: leads out of the folder: pass "
+                    "`allow_outside=True` to read it"
                 )
 
 
-def _read_motion(
-    file: Path, use: EgoMotionUse, entries: tuple[FrameEntry, ...]
-) -> tuple[EgoMotion | None, tuple[str, ...]]:
+def _read_motion(file: Path, use: EgoMotionUse) -> tuple[EgoMotion | None, tuple[str, ...]]:
     if use == "static":
         unread = f" ({file.name} is not read)" if file.is_file() else ""
         return None, (f"the vehicle is assumed to stand still{unread}",)
     if file.is_file():
-        motion = read_ego_motion(file)
-        _check_coverage(file, motion, entries)
-        return motion, ()
+        return read_ego_motion(file), ()
     if use == "required":
         raise InputError(
-            f"{file}: the file is missing (expected the vehicle's poses): add it, pass --static if the vehicle stands, "
-            "or pass --no-temporal to run without history"
+            f"{file}: the file is missing (expected the vehicle's poses): add it, "
+            'pass `ego_motion="static"` if the vehicle stands, or pass `temporal=False` to run without history'
         )
     return None, ("ego_motion.csv is missing: boxes are in the ego frame",)
 
 
-def _check_coverage(file: Path, motion: EgoMotion, entries: tuple[FrameEntry, ...]) -> None:
-    first, last = int(motion.timestamps_ns[0]), int(motion.timestamps_ns[-1])
+def _check_coverage(file: Path, motion: EgoMotion, entries: tuple[FrameEntry, ...], advice: str) -> None:
+    """Raise InputError for a frame or an image at whose time the pose is not known."""
+    first, last = motion.first_ns, motion.last_ns
     for entry in entries:
         times = {"the frame": entry.stamp.timestamp_ns}
         times |= {f"camera {name}": source.timestamp_ns for name, source in entry.sources.items()}
         for what, time in times.items():
             if not first - TOLERANCE_NS <= time <= last + TOLERANCE_NS:
-                listed = entry.origin.startswith(str(file.with_name("frames.csv")))
-                advice = "add ego-motion, or remove the frame" if listed else "set start_ns in timing.toml"
                 raise InputError(
                     f"{file}: covers {first} to {last} ns, but {what} is at {time} ns ({entry.origin}; at most 50 ms "
                     f"outside is allowed): {advice}"
@@ -143,3 +136,50 @@ def rig_notes(rig: CameraRig, source: str = "calibration.json") -> tuple[str, ..
     if not rig.ego_from_bev_assumed:
         return ()
     return (f'{source} has no "ego_from_bev": the default is used, a level frame at (0.94, 0, 1.84) m in ego',)
+
+
+class FolderGroundTruth:
+    """ground_truth.json, read at once, and ground_truth_map/, read frame by frame. Either may be missing.
+
+    class_map: class names in the file -> known classes, see `ClassNames`. is_read: whether they are read at all.
+
+    Attributes:
+        notes: names the classes that are not scored.
+    """
+
+    def __init__(self, folder: Path, class_map: Mapping[str, str], *, is_read: bool = True) -> None:
+        boxes_path, maps_path = folder / BOXES_FILE, folder / MAPS_FOLDER
+        has_boxes = is_read and existing(boxes_path).is_file()
+        self._boxes: BoxesFile | None = read_boxes(boxes_path, ClassNames(class_map)) if has_boxes else None
+        self.notes = _notes(boxes_path, self._boxes)
+        self._frames = {frame.stamp.index: frame for frame in self._boxes.frames} if self._boxes else {}
+        self._maps = open_maps(maps_path) if is_read and maps_path.is_dir() else None
+
+    def boxes(self, frame: int, world_from_ego: Pose | None, ego_from_bev: Array) -> Boxes3D | None:
+        """A frame's boxes in the world frame; None if the file does not have the frame.
+
+        world_from_ego: the sequence's pose at the frame's time. None without ego-motion: boxes are in the ego frame.
+        ego_from_bev: (4, 4) of the rig, for a file in the bev frame that does not state its own.
+        """
+        truth = self._frames.get(frame)
+        if truth is None or self._boxes is None:
+            return None
+        if self._boxes.frame_of_reference == "world":
+            if world_from_ego:
+                return truth.boxes
+            own = truth.world_from_ego
+            return None if own is None else truth.boxes.transformed(inverse(own.matrix))
+        boxes = truth.boxes
+        if self._boxes.frame_of_reference == "bev":
+            stated = self._boxes.ego_from_bev
+            boxes = boxes.transformed(stated.matrix if stated else ego_from_bev)
+        return boxes.transformed(world_from_ego.matrix) if world_from_ego else boxes
+
+    def bev_map(self, frame: int) -> BevMap | None:
+        """A frame's map, None if there is none."""
+        return self._maps.load(frame) if self._maps and self._maps.has(frame) else None
+
+
+def _notes(path: Path, boxes: BoxesFile | None) -> tuple[str, ...]:
+    others = count_other_classes(frame.boxes for frame in boxes.frames) if boxes else None
+    return (other_classes_note(others, str(path)),) if others else ()

@@ -1,40 +1,112 @@
-"""Finds the frames of a folder without frames.csv: from image names, or from one video per camera."""
+"""Finds the frames of a folder without frames.csv: from image names, or from one video per camera.
+
+timing.toml states their times:
+start_ns = 1533151603547590000   # time of the first image; default 0
+rate_hz = 12.0                   # images per second; default for a video: the rate in its file
+[cameras.CAM_BACK]               # where one camera differs
+offset_ns = 25000000             # its first image is this much later than start_ns
+rate_hz = 24.0
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
-from bevcli.sequences.images import IMAGE_SUFFIXES, VIDEO_SUFFIXES, ImageSource
-from bevcli.sequences.native.frames_table import FrameEntry
-from bevcli.sequences.native.timing import FILE_NAME, Timing, read_timing
+from bevcli.parsing.documents import TOML_BYTES, parse_toml
+from bevcli.parsing.files import read_text
+from bevcli.sequences.images import IMAGE_SUFFIXES, VIDEO_SUFFIXES, FrameEntry, ImageSource
 from bevcli.sequences.video import VideoFacts, video_facts
 
+FILE_NAME = "timing.toml"
 # A number in an image's name is a time in nanoseconds from this value on (hours after 1970), an index below it.
 SMALLEST_TIMESTAMP = 10**13
 ASSUMED_RATE_HZ = 2.0  # rate of numbered images without timing.toml: the rate of the published models
 
 
 @dataclass(frozen=True)
-class UnlistedFrames:
-    """Frames that were found without frames.csv.
+class CameraTiming:
+    """Timing of one camera. offset_ns: its first image is this much later than the common start. rate_hz: its own."""
 
-    Attributes:
-        entries: the frames, in order.
-        note: tells the user how they were found.
+    offset_ns: int = 0
+    rate_hz: float | None = None
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Timing of numbered images or videos, see the top of this file. cameras: those that differ, by name."""
+
+    start_ns: int = 0
+    rate_hz: float | None = None
+    cameras: Mapping[str, CameraTiming] = field(default_factory=dict)
+
+    def rate_of(self, camera: str) -> float | None:
+        """Images per second of one camera, None if not stated."""
+        own = self.cameras.get(camera, CameraTiming()).rate_hz
+        return self.rate_hz if own is None else own
+
+    def time_of(self, camera: str, number: int, rate_hz: float) -> int:
+        """Time in nanoseconds of a camera's image `number`, from 0."""
+        offset = self.cameras.get(camera, CameraTiming()).offset_ns
+        return self.start_ns + offset + round(number * 1e9 / rate_hz)
+
+
+def read_timing(folder: Path, cameras: tuple[str, ...]) -> Timing:
+    """The folder's timing.toml, or the defaults if the file is missing.
+
+    Raises InputError for broken TOML, an unknown key or camera, or an invalid value.
     """
+    path = folder / FILE_NAME
+    if not path.is_file():
+        return Timing()
+    stated = parse_toml(read_text(path, TOML_BYTES), path)
+    _check_keys(path, "", stated, ("start_ns", "rate_hz", "cameras"))
+    own = stated.get("cameras", {})
+    if not isinstance(own, dict):
+        raise InputError(f'{path}: "cameras": expected a table for each camera, such as [cameras.{cameras[0]}]')
+    _check_keys(path, "cameras.", own, cameras)
+    by_camera = {name: _camera(path, name, table) for name, table in own.items()}
+    return Timing(_integer(path, "", stated, "start_ns"), _rate(path, "", stated), by_camera)
 
-    entries: tuple[FrameEntry, ...]
-    note: str
+
+def _camera(path: Path, name: str, table: Any) -> CameraTiming:
+    where = f"cameras.{name}."
+    if not isinstance(table, dict):
+        raise InputError(f"{path}: cameras.{name}: expected a table, such as [cameras.{name}]")
+    _check_keys(path, where, table, ("offset_ns", "rate_hz"))
+    return CameraTiming(_integer(path, where, table, "offset_ns"), _rate(path, where, table))
 
 
-def find_frames(folder: Path, cameras: tuple[str, ...]) -> UnlistedFrames:
-    """The frames in `images/CAMERA/*` or `videos/CAMERA.*`.
+def _check_keys(path: Path, where: str, table: Mapping[str, Any], known: tuple[str, ...]) -> None:
+    for key in table:
+        if key not in known:
+            raise InputError(f'{path}: unknown key "{where}{key}" (known: {", ".join(known)})')
+
+
+def _integer(path: Path, where: str, table: Mapping[str, Any], key: str) -> int:
+    value = table.get(key, 0)
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise InputError(f"{path}: {where}{key}: expected an integer (nanoseconds), found {value!r}")
+    return value
+
+
+def _rate(path: Path, where: str, table: Mapping[str, Any]) -> float | None:
+    value = table.get("rate_hz")
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < 10_000:
+        raise InputError(f"{path}: {where}rate_hz: expected images per second, above 0, found {value!r}")
+    return float(value)
+
+
+def find_frames(folder: Path, cameras: tuple[str, ...]) -> tuple[tuple[FrameEntry, ...], str]:
+    """The frames in `images/CAMERA/*` or `videos/CAMERA.*`, and a note that tells the user how they were found.
 
     Raises InputError if there is neither, or if the cameras' images do not have the same names.
     """
@@ -49,7 +121,7 @@ def find_frames(folder: Path, cameras: tuple[str, ...]) -> UnlistedFrames:
     )
 
 
-def _from_names(folder: Path, cameras: tuple[str, ...], timing: Timing) -> UnlistedFrames:
+def _from_names(folder: Path, cameras: tuple[str, ...], timing: Timing) -> tuple[tuple[FrameEntry, ...], str]:
     images = {name: _numbered(folder / "images" / name) for name in cameras}
     numbers = _common_numbers(folder, images)
     are_times = numbers[0] >= SMALLEST_TIMESTAMP
@@ -65,7 +137,7 @@ def _from_names(folder: Path, cameras: tuple[str, ...], timing: Timing) -> Unlis
         entries.append(FrameEntry(stamp, sources, {}, f"{folder / 'images'}: image {number}"))
     how = "timestamps from the image names" if are_times else f"numbered images at {rate:g} per second"
     where = "" if are_times or timing.rate_hz else f" (assumed; set rate_hz in {FILE_NAME})"
-    return UnlistedFrames(tuple(entries), f"frames.csv is missing: found {len(numbers)} frames, {how}{where}")
+    return tuple(entries), f"frames.csv is missing: found {len(numbers)} frames, {how}{where}"
 
 
 def _numbered(folder: Path) -> dict[int, Path]:
@@ -99,7 +171,7 @@ def _common_numbers(folder: Path, images: Mapping[str, Mapping[int, Path]]) -> l
     return everywhere
 
 
-def _from_videos(folder: Path, cameras: tuple[str, ...], timing: Timing) -> UnlistedFrames:
+def _from_videos(folder: Path, cameras: tuple[str, ...], timing: Timing) -> tuple[tuple[FrameEntry, ...], str]:
     """One frame for each image of the camera with the lowest rate, with the other cameras' nearest images."""
     paths = {name: _video_of(folder / "videos", name) for name in cameras}
     facts = {name: video_facts(path) for name, path in paths.items()}
@@ -119,7 +191,7 @@ def _from_videos(folder: Path, cameras: tuple[str, ...], timing: Timing) -> Unli
     has_timing = (folder / FILE_NAME).is_file()
     stated = f"times from {FILE_NAME}" if has_timing else f"starting at time 0 (set start_ns in {FILE_NAME})"
     note = f"frames.csv is missing: found {len(entries)} frames from {leading}, {rates[leading]:g} per second"
-    return UnlistedFrames(tuple(entries), f"{note}, {stated}")
+    return tuple(entries), f"{note}, {stated}"
 
 
 def _video_of(folder: Path, camera: str) -> Path:

@@ -21,8 +21,8 @@ from bevcli.geometry.transforms import Pose
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.sequences.files.map_folder import write_map
-from bevcli.sequences.native.ego_motion_file import write_ego_motion
-from bevcli.sequences.native.ground_truth import BOXES_FILE, MAPS_FOLDER
+from bevcli.sequences.native.folder import BOXES_FILE, MAPS_FOLDER
+from bevcli.sequences.native.tables import write_ego_motion
 
 # The files that the writer creates and `force` removes. Other files in the folder are kept.
 PARTS = ("calibration.json", "frames.csv", "ego_motion.csv", "images", BOXES_FILE, MAPS_FOLDER)
@@ -100,7 +100,7 @@ class NativeWriter:
         elif frame.rig is not self._rig and not same_rig(frame.rig, self._rig):
             raise InputError(
                 f"frame {stamp.index} ({stamp.scene}): its calibration differs from the first frame's, but a native "
-                "sequence has a single calibration: convert scene by scene (--scene)"
+                "sequence has a single calibration: convert scene by scene (`scene`)"
             )
         if stamp.index in self._numbers:
             raise InputError(f"frame {stamp.index} ({stamp.scene}): its index occurred before: renumber the frames")
@@ -140,7 +140,7 @@ class NativeWriter:
         spans = sorted((first, last, name) for name, (first, last) in self._scenes.items())
         for (_, end, earlier), (start, _, later) in pairwise(spans):
             if start <= end:
-                raise InputError(f"scenes {earlier} and {later} overlap in time: convert scene by scene (--scene)")
+                raise InputError(f"scenes {earlier} and {later} overlap in time: convert scene by scene (`scene`)")
 
     def _write_boxes(self, frame: Frame) -> None:
         assert frame.ground_truth is not None
@@ -153,7 +153,7 @@ class NativeWriter:
 
 
 def same_rig(one: CameraRig, other: CameraRig) -> bool:
-    """Whether all names and numbers of two rigs are equal."""
+    """True if all names and numbers of two rigs are equal."""
     return (
         one.names == other.names
         and np.array_equal(one.ego_from_bev, other.ego_from_bev)
@@ -171,7 +171,7 @@ def _make_room(folder: Path, force: bool) -> None:
         raise OutputError(f"{folder}: is a file (expected a folder to write)")
     if folder.is_dir() and any(folder.iterdir()):
         if not force:
-            raise OutputError(f"{folder}: exists already: choose another folder, or pass --force to replace it")
+            raise OutputError(f"{folder}: exists already: choose another folder, or pass `force=True` to replace it")
         for part in PARTS:
             path = folder / part
             if path.is_dir() and not path.is_symlink():
@@ -191,7 +191,5 @@ def _ego_motion(rows: Mapping[int, tuple[Pose, Kinematics]]) -> EgoMotion:
         np.array(times, dtype=np.int64),
         np.stack([pose.translation for pose in poses]),
         np.stack([pose.quaternion for pose in poses]),
-        np.stack([k.acceleration for k in kinematics]),
-        np.stack([k.angular_rate for k in kinematics]),
-        np.stack([k.velocity for k in kinematics]),
+        *map(np.stack, zip(*(vars(k).values() for k in kinematics), strict=True)),
     )

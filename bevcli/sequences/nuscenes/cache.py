@@ -29,34 +29,23 @@ def open_index(tables: Path) -> tuple[NuScenesIndex, str]:
     """The index of a folder with tables, from the cache if it is up to date, and a note for the user or ""."""
     if sum(path.stat().st_size for path in tables.glob("*.json")) < SMALLEST_BYTES:
         return build_index(tables), ""
-    folder = _cache_folder(tables)
-    fingerprint = _fingerprint(tables)
+    name = hashlib.sha256(str(tables.resolve()).encode()).hexdigest()[:16]
+    folder = user_cache() / "nuscenes" / f"{tables.name}-{name}"
+    facts = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in sorted(tables.glob("*.json"))]
+    fingerprint = json.dumps({"format": FORMAT, "tables": facts})
     if _is_fresh(folder, fingerprint):
         return _load(folder), ""
     index = build_index(tables)
     try:
         _save(index, folder, fingerprint)
     except OSError as error:
-        return (
-            index,
-            f"{folder}: the index cannot be cached ({error.strerror}); opening it again will be slow",
-        )
+        return index, f"{folder}: the index cannot be cached ({error.strerror}); opening it again will be slow"
     return index, f"the index of the nuScenes tables is cached in {folder}"
 
 
 def user_cache() -> Path:
     """The folder of all caches of bevcli, $XDG_CACHE_HOME/bevcli (default ~/.cache/bevcli)."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "bevcli"
-
-
-def _cache_folder(tables: Path) -> Path:
-    name = hashlib.sha256(str(tables.resolve()).encode()).hexdigest()[:16]
-    return user_cache() / "nuscenes" / f"{tables.name}-{name}"
-
-
-def _fingerprint(tables: Path) -> str:
-    facts = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in sorted(tables.glob("*.json"))]
-    return json.dumps({"format": FORMAT, "tables": facts})
 
 
 def _is_fresh(folder: Path, fingerprint: str) -> bool:

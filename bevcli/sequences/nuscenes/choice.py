@@ -1,13 +1,15 @@
-"""Which part of a nuScenes dataset is read: version, official split and scenes."""
+"""The part of a nuScenes dataset that is read: version, official split, scenes, and keyframes or sweeps."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from bevcli.errors import InputError
-from bevcli.sequences.nuscenes.index import NuScenesIndex
+from bevcli.sequences.nuscenes.format import versions_in
+from bevcli.sequences.nuscenes.index import Ints, NuScenesIndex
 
 # Scene numbers of the official splits, as published on nuscenes.org. All other scenes are in train and mini_train.
 VAL = (
@@ -20,33 +22,14 @@ TEST = (
 )
 MINI_VAL = "103 916"
 SPLITS = ("train", "val", "test", "mini_train", "mini_val")
-
-
-@dataclass(frozen=True)
-class NuScenesChoice:
-    """The part of a dataset to read.
-
-    Attributes:
-        version: name of the version's folder, such as "v1.0-mini". None: the only version in the root.
-        scene: name of a scene, such as "scene-0103". None: all scenes.
-        split: one of SPLITS. None: all scenes.
-        sweeps: whether to read the images between the keyframes too.
-    """
-
-    version: str | None = None
-    scene: str | None = None
-    split: str | None = None
-    sweeps: bool = False
-
-
-def is_nuscenes_root(path: Path) -> bool:
-    """Whether a folder contains the tables of a nuScenes version, such as ROOT/v1.0-mini/scene.json."""
-    return bool(_versions(path))
+LEADING_CAMERA = "CAM_FRONT"
+# The cameras run at 12 Hz, triggered by the lidar's rotation. An image further away belongs to another rotation.
+NEAR_US = 60_000
 
 
 def tables_of(root: Path, version: str | None) -> Path:
     """The folder with a version's tables. Raises InputError if it is missing, or if the choice is not unique."""
-    return root / choose_version(root, _versions(root), version)
+    return root / choose_version(root, versions_in(root), version)
 
 
 def choose_version(root: object, versions: Sequence[str], version: str | None) -> str:
@@ -57,26 +40,26 @@ def choose_version(root: object, versions: Sequence[str], version: str | None) -
         return version
     found = ", ".join(versions) or "none"
     wanted = f'has no version "{version}"' if version else "has several versions"
-    raise InputError(f"{root}: {wanted} (found: {found}): choose one with --version")
+    raise InputError(f"{root}: {wanted} (found: {found}): choose one with `version`")
 
 
-def chosen_scenes(index: NuScenesIndex, tables: Path, choice: NuScenesChoice) -> list[int]:
-    """Indices of the chosen scenes. Raises InputError if there are none, or for an unknown scene or split."""
+def chosen_scenes(index: NuScenesIndex, tables: Path, split: str | None, scene: str | None = None) -> list[int]:
+    """Indices of the scenes of a split (None: all), or of one scene. Raises InputError if there are none."""
     names = [str(name) for name in index.scenes.names]
-    if choice.split is not None and choice.split not in SPLITS:
-        raise InputError(f'--split "{choice.split}": expected one of {", ".join(SPLITS)}')
-    if choice.scene is not None and choice.scene not in names:
+    if split is not None and split not in SPLITS:
+        raise InputError(f'`split` "{split}": expected one of {", ".join(SPLITS)}')
+    if scene is not None and scene not in names:
         few = ", ".join(names[:6]) + (f", ... ({len(names)} scenes)" if len(names) > 6 else "")
-        raise InputError(f'{tables}: has no scene "{choice.scene}" (found: {few})')
-    mini = (choice.split or "").startswith("mini")
+        raise InputError(f'{tables}: has no scene "{scene}" (found: {few})')
+    mini = (split or "").startswith("mini")
     scenes = [
         number
         for number, name in enumerate(names)
-        if choice.scene in (None, name) and choice.split in (None, split_of(name, mini=mini))
+        if scene in (None, name) and split in (None, split_of(name, mini=mini))
     ]
     if not scenes:
-        what = f"scene {choice.scene} is not in" if choice.scene else "has no scene of"
-        raise InputError(f"{tables}: {what} the split {choice.split}: choose another --split or --version")
+        what = f"scene {scene} is not in" if scene else "has no scene of"
+        raise InputError(f"{tables}: {what} the split {split}: choose another `split` or `version`")
     return scenes
 
 
@@ -104,5 +87,50 @@ def numbers(ranges: str) -> frozenset[int]:
     return frozenset(found)
 
 
-def _versions(root: Path) -> list[str]:
-    return sorted(path.parent.name for path in root.glob("v1.*/scene.json"))
+def keyframes(index: NuScenesIndex, scene: int) -> Iterator[tuple[int, int, Ints]]:
+    """Time in us, sample and image rows of each keyframe of a scene."""
+    first, last = index.scenes.first_image[scene : scene + 2]
+    keys = first + np.flatnonzero(index.images.keys[first:last])
+    samples = index.images.samples[keys]
+    keys = keys[np.argsort(samples, kind="stable")]
+    start, end = index.scenes.first_sample[scene : scene + 2]
+    bounds = np.searchsorted(np.sort(samples), np.arange(start, end + 1))
+    for place, sample in enumerate(range(start, end)):
+        yield int(index.samples.times_us[sample]), sample, keys[bounds[place] : bounds[place + 1]]
+
+
+def sweep_frames(index: NuScenesIndex, scene: int) -> Iterator[tuple[int, int | None, Ints]]:
+    """Time in us, sample (None between keyframes) and image rows of every frame of a scene.
+
+    There is one frame for each image of the front camera. A frame between keyframes follows its front image by the
+    same delay as a keyframe, and has the image of each camera that is nearest in time.
+    """
+    first, last = index.scenes.first_image[scene : scene + 2]
+    rows = np.arange(first, last)
+    images = index.images
+    cameras = index.sensors.channels[images.sensors[first:last]]
+    names = sorted(set(cameras.tolist()))
+    leading = rows[cameras == (LEADING_CAMERA if LEADING_CAMERA in names else names[0])]
+    sample_times = index.samples.times_us[images.samples[leading]]
+    keys = images.keys[leading]
+    lag = int(np.median((sample_times - images.times_us[leading])[keys])) if keys.any() else 0
+    by_camera = [rows[cameras == name] for name in names]
+    key_rows = rows[images.keys[first:last]]
+    time = -1
+    for row, is_key in zip(leading, keys, strict=True):
+        earlier, sample = time, int(images.samples[row])
+        if is_key:
+            time = int(index.samples.times_us[sample])
+            found = key_rows[images.samples[key_rows] == sample]
+        else:
+            time = int(images.times_us[row]) + lag
+            found = _nearest(index, by_camera, time)
+        if time > earlier:
+            yield time, sample if is_key else None, found
+
+
+def _nearest(index: NuScenesIndex, by_camera: list[Ints], time: int) -> Ints:
+    """Rows of each camera's image nearest to a time in us, without images that are too far away."""
+    times = index.images.times_us
+    nearest = np.array([rows[np.argmin(np.abs(times[rows] - time))] for rows in by_camera])
+    return nearest[np.abs(times[nearest] - time) <= NEAR_US]

@@ -41,7 +41,8 @@ def read_batches(path: Path) -> Iterator[list[Row]]:
         rest = file.read(BATCH_BYTES).lstrip()[1:]  # without the list's opening bracket
         while block := file.read(BATCH_BYTES):
             text = rest + block
-            cut = _last_row_end(text)
+            ends = [found.start() + 1 for found in BETWEEN_ROWS.finditer(text, max(0, len(text) - TAIL_BYTES))]
+            cut = ends[-1] if ends else 0
             yield _parse(path, b"[" + text[:cut] + b"]")
             rest = text[cut:].lstrip()[1:]  # without the comma
         yield _parse(path, b"[" + rest)
@@ -121,12 +122,6 @@ def places_of(wanted: NDArray[np.bytes_], table: NDArray[np.bytes_], path: Path)
         token = wanted[unknown][0].decode()
         raise InputError(f'{path}: token "{token}" is missing in this table, but another table refers to it')
     return places
-
-
-def _last_row_end(text: bytes) -> int:
-    start = max(0, len(text) - TAIL_BYTES)
-    ends = [match.start() + 1 for match in BETWEEN_ROWS.finditer(text, start)]
-    return ends[-1] if ends else 0
 
 
 def _parse(path: Path, text: bytes) -> list[Row]:

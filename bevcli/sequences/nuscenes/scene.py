@@ -13,7 +13,7 @@ from bevcli.errors import InputError
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics, derive_kinematics
 from bevcli.geometry.transforms import Array, Pose
-from bevcli.sequences.files.camera_fields import LARGEST_SIZE, is_camera_name
+from bevcli.sequences.files.calibration_file import LARGEST_SIZE, is_camera_name
 from bevcli.sequences.nuscenes.index import NuScenesIndex
 from bevcli.sequences.nuscenes.json_tables import integers, read_rows, vectors
 
@@ -47,11 +47,7 @@ class CanBus:
 class SceneFacts:
     """Calibration and motion of one scene.
 
-    Attributes:
-        rig: the scene's cameras.
-        sensor_names: camera name of each calibrated sensor, by its row in the index.
-        motion: all poses of the scene.
-        can_bus: None if the scene has no CAN bus data.
+    sensor_names: camera of each calibrated sensor, by its row in the index. can_bus: None without CAN bus data.
     """
 
     rig: CameraRig
@@ -104,12 +100,7 @@ def scene_motion(index: NuScenesIndex, scene: int) -> EgoMotion:
     inside = np.clip(times, key_times[0], key_times[-1])
     derived = [rough.kinematics_at(int(time)) for time in inside]
     return EgoMotion(
-        times,
-        translations,
-        quaternions,
-        np.stack([k.acceleration for k in derived]),
-        np.stack([k.angular_rate for k in derived]),
-        np.stack([k.velocity for k in derived]),
+        times, translations, quaternions, *map(np.stack, zip(*(vars(k).values() for k in derived), strict=True))
     )
 
 

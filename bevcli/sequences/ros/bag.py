@@ -5,8 +5,7 @@ from __future__ import annotations
 import importlib.util
 import re
 import threading
-from collections.abc import Iterator
-from collections.abc import Sequence as Indices
+from collections.abc import Iterator, Sequence as Indices
 from contextlib import contextmanager
 from itertools import groupby
 from pathlib import Path
@@ -16,14 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import BevcliError, InputError
-from bevcli.parsing.compressed import decompressed
 from bevcli.parsing.documents import read_yaml
-from bevcli.parsing.files import MIB, open_regular
-from bevcli.sequences.ros.decoding import Decode, Topic, decoder
+from bevcli.parsing.files import MIB, decompressed
+from bevcli.sequences.ros.format import METADATA, SUFFIXES
+from bevcli.sequences.ros.messages import Decode, Topic, decoder
 
-SUFFIXES = (".mcap", ".db3")
-METADATA = "metadata.yaml"
-SPLIT_NAME = re.compile(r"(?P<stem>.*?)_\d+")  # rosbag2 numbers the files of a recording: drive_0.mcap, drive_1.mcap
+SPLIT_NUMBER = re.compile(r"_\d+$")  # rosbag2 numbers the files of a recording: drive_0.mcap, drive_1.mcap
 LARGEST_MESSAGE = 256 * MIB  # bytes after decompression
 PACKAGES = ("mcap", "rosbags", "google.protobuf")
 
@@ -41,7 +38,7 @@ def _broken_files_refused(path: Path) -> Iterator[None]:
 
 
 class BagFile(Protocol):
-    """One file of a bag: `McapFile` or `SqliteFile`."""
+    """One file of a bag: `McapFile` or `SqliteFile`. topics: by name. notes: for the user about the file."""
 
     topics: dict[str, Topic]
     notes: tuple[str, ...]
@@ -59,10 +56,6 @@ class Bag:
     """A recording of one or more files. Messages are numbered by topic, in order of time. Safe to use from threads.
 
     Raises InputError if a file is missing or broken, or the packages of the extra `ros` are not installed.
-
-    Attributes:
-        path: the file or the folder, as it was given.
-        topics: the topics, by name.
     """
 
     def __init__(self, path: Path) -> None:
@@ -70,7 +63,8 @@ class Bag:
         self._lock = threading.RLock()
         self._compression = ""
         with _broken_files_refused(path):
-            self._files = [_open_file(file) for file in self._file_paths()]
+            self.file_paths = tuple(self._file_paths())
+            self._files = [_open_file(file) for file in self.file_paths]
         self.topics = {name: topic for file in self._files for name, topic in sorted(file.topics.items())}
         self._decoders: dict[str, Decode] = {}
         self._starts: dict[str, NDArray[np.int64]] = {}
@@ -78,7 +72,7 @@ class Bag:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the user should be told about the files."""
+        """Notes for the user about the files."""
         return tuple(note for file in self._files for note in file.notes)
 
     def times(self, topic: str) -> NDArray[np.int64]:
@@ -125,7 +119,7 @@ class Bag:
             raise InputError(f"{self.path}: its files are compressed: decompress them first (zstd -d *.zstd)")
         self._compression = mode
         paths = [file for file in listed if file.suffix in SUFFIXES and file.is_file()] or found
-        if not listed and len({_stem(file) for file in paths}) > 1:
+        if not listed and len({SPLIT_NUMBER.sub("", file.stem) for file in paths}) > 1:
             names = ", ".join(file.name for file in paths[:4])
             raise InputError(f"{self.path}: has several bags and no {METADATA}: pass one of them ({names})")
         if not paths:
@@ -133,22 +127,8 @@ class Bag:
         return sorted(paths, key=_number) if not listed else paths
 
 
-def is_ros_bag(path: Path) -> bool:
-    """Whether a path is an .mcap or .db3 file, or a folder with some."""
-    if path.is_dir():
-        return any(file.suffix in SUFFIXES for file in path.iterdir()) or _is_rosbag_metadata(path / METADATA)
-    return path.suffix in SUFFIXES
-
-
-def _is_rosbag_metadata(path: Path) -> bool:
-    if not path.is_file():
-        return False
-    with open_regular(path) as file:
-        return b"rosbag2_bagfile_information" in file.read(4096)
-
-
 def _metadata(path: Path) -> dict[str, Any]:
-    """What metadata.yaml states; empty without the file, which a recording that was cut off does not have."""
+    """The statements of metadata.yaml; empty without the file, which a recording that was cut off does not have."""
     if not path.is_file():
         return {}
     try:
@@ -163,8 +143,7 @@ def _open_file(path: Path) -> BagFile:
     missing = [name for name in PACKAGES if not _is_installed(name)]
     if missing:
         raise InputError(f"{path}: ROS bags need the packages of an extra: run pip install 'bevcli[ros]'")
-    from bevcli.sequences.ros.mcap_file import McapFile
-    from bevcli.sequences.ros.sqlite_file import SqliteFile
+    from bevcli.sequences.ros.storage import McapFile, SqliteFile
 
     if not path.stat().st_size:
         raise InputError(f"{path}: the file is empty")
@@ -176,11 +155,6 @@ def _is_installed(name: str) -> bool:
         return importlib.util.find_spec(name) is not None
     except ModuleNotFoundError:  # the package around it
         return False
-
-
-def _stem(file: Path) -> str:
-    numbered = SPLIT_NAME.fullmatch(file.stem)
-    return numbered["stem"] if numbered else file.stem
 
 
 def _number(file: Path) -> tuple[int, str]:

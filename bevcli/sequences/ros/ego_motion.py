@@ -3,35 +3,101 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics, derive_kinematics
-from bevcli.geometry.transforms import Array, Pose, interpolate
-from bevcli.sequences.ros.bag import Bag
-from bevcli.sequences.ros.capture_times import capture_times
-from bevcli.sequences.ros.messages import pose_of
-from bevcli.sequences.ros.transforms import read_transforms
+from bevcli.geometry.geographic import GeoOrigin
+from bevcli.geometry.transforms import Array, Pose, interpolate, inverse, rigid
+from bevcli.sequences.ros.bag import Bag, spread
+from bevcli.sequences.ros.messages import Transform, pose_of, short_type, timestamp_ns, transforms_of
 
+SAMPLED_MESSAGES = 200  # from the start of each topic with transforms: enough to see every frame once
 Sample = tuple[int, Pose]  # time ns, pose at that time
 ReadMessage = Callable[[int], dict[str, list[Sample]]]  # message -> samples by link
 MARGIN = 4  # samples on each side of a time: derivatives of second order, and one more
 MESSAGES_AT_ONCE = 8
 MOST_MESSAGES = 8192  # around one time; more without a pose is a gap
 KINEMATICS_STEP_NS = 50_000_000  # poses closer than this in time are thinned before they are differentiated
+SAMPLES = 5
+LARGEST_SPREAD_NS = 50_000_000  # of the delay between capture and recording, among the samples
+FIX_TYPES = ("sensor_msgs/NavSatFix", "foxglove/LocationFix")
+FIXES_TRIED = 50
+MAX_OFFSET_M = 10_000.0  # from the world's origin; GeoOrigin counts the Earth as flat around it
+
+
+class TransformTree:
+    """Frames and the transforms between them, each frame with one parent. The first transform of a frame counts."""
+
+    def __init__(self, transforms: Iterable[Transform] = ()) -> None:
+        self._parents: dict[str, tuple[str, Array]] = {}
+        for one in transforms:
+            if one.child != one.parent:
+                self._parents.setdefault(one.child, (one.parent, one.parent_from_child.matrix))
+
+    @property
+    def frames(self) -> list[str]:
+        """Names of all frames, sorted."""
+        return sorted({*self._parents, *(parent for parent, _ in self._parents.values())})
+
+    def path_up(self, frame: str) -> list[str]:
+        """A frame and its ancestors, the root last."""
+        path = [frame]
+        while path[-1] in self._parents and self._parents[path[-1]][0] not in path:
+            path.append(self._parents[path[-1]][0])
+        return path
+
+    def between(self, a: str, b: str) -> Array | None:
+        """(4, 4) a_from_b in metres, None if the tree does not connect the frames."""
+        up_a, up_b = self.path_up(a), self.path_up(b)
+        common = next((frame for frame in up_b if frame in up_a), None)
+        if common is None:
+            return None
+        return inverse(self._down(up_a[: up_a.index(common)])) @ self._down(up_b[: up_b.index(common)])
+
+    def _down(self, frames: list[str]) -> Array:
+        """(4, 4) ancestor_from_frame along frames, of which each is the child of the next."""
+        matrix = rigid()
+        for frame in frames:
+            matrix = self._parents[frame][1] @ matrix
+        return matrix
+
+
+def read_transforms(bag: Bag, topic: str, indices: Iterable[int]) -> list[Transform]:
+    """The transforms of some messages of a topic. Raises InputError if one is broken."""
+    found: list[Transform] = []
+    for index in indices:
+        try:
+            found += transforms_of(bag.message(topic, index))
+        except (AttributeError, ValueError) as error:
+            raise InputError(f"{bag.path}: {topic}: message {index} is not a transform ({error})") from None
+    return found
+
+
+def is_static(topic: str) -> bool:
+    """True for a topic with transforms that never change."""
+    return topic.rstrip("/").endswith("static")
+
+
+def sampled_transforms(bag: Bag, topics: Iterable[str]) -> tuple[list[Transform], list[Transform]]:
+    """Static transforms, and the first ones of the topics with transforms that change."""
+    static: list[Transform] = []
+    changing: list[Transform] = []
+    for topic in topics:
+        first = range(min(len(bag.times(topic)), SAMPLED_MESSAGES))
+        (static if is_static(topic) else changing).extend(read_transforms(bag, topic, first))
+    return static, changing
 
 
 class BagEgoMotion:
     """The vehicle's poses in a bag, with the methods of `EgoMotion`.
 
     Only messages around the asked times are read. Kinematics are derived from the poses.
-
-    Attributes:
-        first_ns, last_ns: time of the first and the last pose.
     """
 
     def __init__(
@@ -114,7 +180,7 @@ class BagEgoMotion:
 
 
 def _reaches(times: list[int], timestamp_ns: int, sign: int) -> bool:
-    """Whether enough samples lie on one side of a time for derivatives there. times: the outermost last."""
+    """True if enough samples lie on one side of a time for derivatives there. times: the outermost last."""
     beyond = [time for time in times if sign * (time - timestamp_ns) >= 0]
     return len(beyond) > MARGIN and sign * (beyond[-1] - timestamp_ns) >= MARGIN * KINEMATICS_STEP_NS
 
@@ -184,3 +250,59 @@ def _kinematics(times: np.ndarray, translations: Array, quaternions: Array) -> t
     return tuple(  # type: ignore[return-value]
         np.stack([np.interp(seconds, seconds[kept], column) for column in part.T], axis=-1) for part in derived
     )
+
+
+def capture_times(bag: Bag, topic: str) -> NDArray[np.int64]:
+    """(N,) times at which a topic's messages were captured, ns, within about the jitter of their recording.
+
+    The index of a bag has the times of recording only. The delay is taken from a few messages. If it differs much
+    among them, such as in a bag that was replayed at another speed, the times of all messages are read.
+    """
+    logged = bag.times(topic)
+    stated = {index: _stated_time(bag, topic, index) for index in spread(len(logged), SAMPLES)}
+    delays = [time - int(logged[index]) for index, time in stated.items() if time]
+    if not delays:
+        return logged
+    typical = int(np.median(delays))
+    if max(delays) - min(delays) <= LARGEST_SPREAD_NS:
+        return logged + typical
+    return np.array([_stated_time(bag, topic, index) or int(time) + typical for index, time in enumerate(logged)])
+
+
+def _stated_time(bag: Bag, topic: str, index: int) -> int:
+    """The time that a message states, ns; 0 if it states none, or cannot be read."""
+    try:
+        message = bag.message(topic, index)
+        return timestamp_ns(message) or next((one.timestamp_ns for one in transforms_of(message)), 0)
+    except (InputError, AttributeError, ValueError):
+        return 0
+
+
+def find_geo_origin(bag: Bag, motion: EgoMotion | BagEgoMotion | None) -> GeoOrigin | None:
+    """The place of the world frame on Earth: the first valid NavSatFix, at the vehicle's place at its time.
+
+    The world's x axis is taken as east and y as north, as ROS's REP 103 and 105 say of a map frame. The antenna counts
+    as the vehicle's origin. None without poses, without a valid position, or if the vehicle is too far from the
+    world's origin.
+    """
+    topics = [
+        name for name, topic in bag.topics.items() if short_type(topic.type_name) in FIX_TYPES and len(bag.times(name))
+    ]
+    if motion is None or not topics:
+        return None
+    times = bag.times(topics[0])
+    for index in spread(len(times), FIXES_TRIED):
+        time = int(times[index])
+        if not motion.first_ns <= time <= motion.last_ns:
+            continue
+        fix = bag.message(topics[0], index)
+        position = np.array([fix.latitude, fix.longitude], dtype=np.float64)
+        is_valid = getattr(getattr(fix, "status", None), "status", 0) >= 0
+        if not (is_valid and np.isfinite(position).all() and np.any(position)):
+            continue
+        place = motion.pose_at(time).translation
+        if np.linalg.norm(place[:2]) > MAX_OFFSET_M:
+            return None
+        latitude, longitude = GeoOrigin(*position.tolist()).latitude_longitude(-place)
+        return GeoOrigin(float(latitude), float(longitude))
+    return None

@@ -1,4 +1,4 @@
-"""The message types that are used, and their fields as this package's types.
+"""The bytes of a message (ROS 2's CDR, JSON, Protobuf) -> its fields -> this package's types.
 
 ROS messages and Foxglove's schemas (in CDR, JSON or Protobuf) name the same things differently; this is the one place
 that knows the names.
@@ -7,8 +7,10 @@ that knows the names.
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import numpy as np
@@ -16,6 +18,8 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.geometry.cameras import Distortion
 from bevcli.geometry.transforms import Array, Pose
+from bevcli.parsing.documents import parse_json
+from bevcli.sequences.files.calibration_file import COEFFICIENT_COUNTS
 
 Kind = Literal["image", "video", "calibration", "transforms", "pose"]
 # The types by what they are used for; names without "msg/", and "foxglove" for foxglove_msgs, too.
@@ -43,7 +47,77 @@ LENSES = {
     "kannala_brandt": "kannala_brandt",
     "fisheye": "kannala_brandt",
 }
-COEFFICIENT_COUNTS = {"brown_conrady": (4, 5, 8), "kannala_brandt": (4,)}
+Decode = Callable[[bytes], Any]
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of a bag.
+
+    Attributes:
+        name: such as "/camera/front/image_raw".
+        type_name: as the bag writes it, such as "sensor_msgs/msg/Image".
+        encoding: of its messages: "cdr", "json" or "protobuf".
+        schema: encoding of the definition: "ros2msg", "ros2idl", "jsonschema", "protobuf"; "" if there is none.
+        definition: the definition of the type, empty if there is none.
+    """
+
+    name: str
+    type_name: str
+    encoding: str
+    schema: str = ""
+    definition: bytes = b""
+
+
+def decoder(topic: Topic) -> Decode:
+    """The function that decodes a topic's messages. Nested messages are objects with attributes, too.
+
+    Raises InputError if the encoding is not supported, or the definition is broken.
+    """
+    makers = {"cdr": _cdr, "json": _json, "protobuf": _protobuf}
+    make = makers.get(topic.encoding)
+    if make is None:
+        raise InputError(f"{topic.name}: messages are encoded as {topic.encoding} (expected {', '.join(makers)})")
+    return make(topic)
+
+
+def _cdr(topic: Topic) -> Decode:
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+    from rosbags.typesys.store import TypesysError
+
+    name = topic.type_name if "/msg/" in topic.type_name else topic.type_name.replace("/", "/msg/")
+    text = topic.definition.decode(errors="replace")
+    try:
+        if not text:
+            store = get_typestore(Stores.LATEST)
+        else:
+            store = get_typestore(Stores.EMPTY)
+            is_idl = topic.schema == "ros2idl"
+            store.register(get_types_from_idl(text) if is_idl else get_types_from_msg(text, name))
+        store.get_msgdef(name)
+    except (TypesysError, KeyError, ValueError) as error:
+        found = "its definition cannot be read" if text else "the bag has no definition of it, and it is not a ROS type"
+        raise InputError(f"{topic.name}: type {name}: {found} ({error})") from None
+    return lambda data: store.deserialize_cdr(data, name)
+
+
+def _json(topic: Topic) -> Decode:
+    # Objects with attributes in place of dicts.
+    return lambda data: parse_json(data, Path(topic.name), pairs=lambda pairs: SimpleNamespace(**dict(pairs)))
+
+
+def _protobuf(topic: Topic) -> Decode:
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+    from google.protobuf.message import DecodeError
+
+    pool = descriptor_pool.DescriptorPool()
+    try:
+        files = descriptor_pb2.FileDescriptorSet.FromString(topic.definition)
+        message_factory.GetMessages(files.file, pool)  # adds each file after those that it imports
+        message = message_factory.GetMessageClass(pool.FindMessageTypeByName(topic.type_name))
+    except (DecodeError, KeyError, TypeError) as error:
+        raise InputError(f"{topic.name}: the definition of {topic.type_name} cannot be read ({error})") from None
+    return message.FromString
 
 
 def short_type(name: str) -> str:
@@ -53,14 +127,7 @@ def short_type(name: str) -> str:
 
 @dataclass(frozen=True)
 class Transform:
-    """A transform between two frames at a time.
-
-    Attributes:
-        parent: name of the parent frame.
-        child: name of the child frame.
-        timestamp_ns: 0 if it is not stated.
-        parent_from_child: the pose of the child.
-    """
+    """The pose of a child frame in its parent at a time. timestamp_ns: 0 if it is not stated."""
 
     parent: str
     child: str
@@ -148,7 +215,7 @@ def camera_info_of(message: Any, where: str) -> CameraInfo:
     scale = np.diag([1 / binning[0], 1 / binning[1], 1.0])
     intrinsics = scale @ _matrix(_first(message, "k", "K"), 3, 3)
     if not (intrinsics[0, 0] > 0 and intrinsics[1, 1] > 0):
-        raise InputError(f"{where}: the camera is not calibrated (K is zero): pass --calibration FILE")
+        raise InputError(f"{where}: the camera is not calibrated (K is zero): pass `calibration=FILE`")
     projection = _matrix(_first(message, "p", "P"), 3, 4)
     rotation = _matrix(_first(message, "r", "R"), 3, 3)
     return CameraInfo(

@@ -4,32 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import DriveFacts, Frame, FrameStamp
+from bevcli.frame import DriveFacts, Frame, FrameStamp, Sequence
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
 from bevcli.geometry.transforms import Array, rigid
 from bevcli.sequences.files.calibration_file import read_rig_and_facts
-from bevcli.sequences.frame_reading import read_frame
-from bevcli.sequences.images import ImageReader, Source
-from bevcli.sequences.native.ego_motion_file import read_ego_motion
-from bevcli.sequences.native.folder import EgoMotionUse, rig_notes
-from bevcli.sequences.native.frames_table import FrameEntry
+from bevcli.sequences.images import FrameEntry, ImageReader, Source, read_frame
+from bevcli.sequences.native.folder import rig_notes
+from bevcli.sequences.native.tables import read_ego_motion
+from bevcli.sequences.options import EgoMotionUse, SequenceOptions
 from bevcli.sequences.ros.bag import Bag
-from bevcli.sequences.ros.capture_times import capture_times
-from bevcli.sequences.ros.ego_motion import BagEgoMotion, motion_from_poses, motion_from_transforms
-from bevcli.sequences.ros.geo_origin import find_geo_origin
-from bevcli.sequences.ros.images import BagImage
+from bevcli.sequences.ros.ego_motion import (
+    BagEgoMotion,
+    TransformTree,
+    capture_times,
+    find_geo_origin,
+    is_static,
+    motion_from_poses,
+    motion_from_transforms,
+    sampled_transforms,
+)
+from bevcli.sequences.ros.format import BagOptions, is_ros_bag
+from bevcli.sequences.ros.images import BagVideo, bag_image
 from bevcli.sequences.ros.messages import CameraInfo, camera_info_of, frame_of, pose_of
-from bevcli.sequences.ros.packets import BagVideo
-from bevcli.sequences.ros.topics import CameraTopics, TopicFinder
-from bevcli.sequences.ros.topics_file import StatedTopics
-from bevcli.sequences.ros.transforms import TransformTree, is_static, sampled_transforms
+from bevcli.sequences.ros.topics import CameraTopics, StatedTopics, TopicFinder, read_topics_file
 
 # Usual names of the frame of the vehicle, and of the world.
 EGO_FRAMES = ("base_link", "base_footprint", "ego_vehicle", "ego", "vehicle", "vehicle_frame", "chassis")
@@ -37,51 +42,36 @@ SAME_RATE = 0.98  # cameras whose rates differ by less have the same rate; the f
 CALIBRATION_FILE, EGO_MOTION_FILE = "calibration.json", "ego_motion.csv"
 
 
-class RosSequence:
+class RosSequence(Sequence):
     """A bag as a `Sequence`. Opening it reads the index, the calibration and the static transforms.
 
     The camera with the lowest rate leads: each of its images is a frame, with the other cameras' nearest images.
 
-    stated: what the user states about its topics. rig, ego_motion_file: replace those of the bag.
     Raises InputError if the bag is broken, or cameras, extrinsics or poses are not found.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        ego_motion: EgoMotionUse = "required",
-        strict: bool = False,
-        stated: StatedTopics = StatedTopics(),
-        rig: CameraRig | None = None,
-        ego_motion_file: Path | None = None,
-    ) -> None:
+    def __init__(self, path: Path, common: SequenceOptions = SequenceOptions(), own: BagOptions = BagOptions()) -> None:
+        if path.suffix == ".bag" and not is_ros_bag(path):
+            raise InputError(
+                f"{path}: is a bag of ROS 1: convert it (`rosbags-convert --src {path.name} --dst {path.stem}`)"
+            )
+        stated = read_topics_file(own.topics_file, own.topics)
+        rig = own.rig()
         self.path = path
         self.name = path.resolve().stem if path.is_file() else path.resolve().name
         self._bag = Bag(path)
-        folder = path.parent if path.is_file() else path
-        beside: list[str] = []
-        calibration = folder / CALIBRATION_FILE
-        stated_rig, stated_facts = read_rig_and_facts(calibration) if calibration.is_file() else (None, DriveFacts())
-        if rig is None and stated_rig is not None:
-            rig = stated_rig
-            beside.append(f"{calibration} is used in place of the calibration in the bag")
-        if ego_motion_file is None and ego_motion != "static" and (folder / EGO_MOTION_FILE).is_file():
-            ego_motion_file = folder / EGO_MOTION_FILE
-            beside.append(f"{ego_motion_file} is used in place of the poses in the bag")
+        rig, facts, file, beside = _files_beside(path.parent if path.is_file() else path, rig, common, own)
         finder = TopicFinder(self._bag, stated, rig.names if rig else None)
         static, changing = sampled_transforms(self._bag, finder.of_kind("transforms"))
         tree = TransformTree([*static, *changing])
-        reader = _RigReader(self._bag, finder, stated, tree)
+        reader = _VehicleReader(self._bag, finder, stated, tree)
         self.rig = reader.rig() if rig is None else rig
-        motion = _find_motion(self._bag, finder, stated, tree, reader, ego_motion, ego_motion_file)
+        motion = reader.motion(common.ego_motion, file)
         self._motion = motion.poses
         self.has_ego_motion = motion.poses is not None
-        self.facts = replace(
-            stated_facts, geo_origin=stated_facts.geo_origin or find_geo_origin(self._bag, motion.poses)
-        )
-        entries = _entries(self._bag, finder.cameras)
-        self._entries = _covered(entries, self._motion, path)
+        self.facts = replace(facts, geo_origin=facts.geo_origin or find_geo_origin(self._bag, motion.poses))
+        self._entries, gaps = _covered(_entries(self._bag, finder.cameras), self._motion, path)
+        self.stamps = tuple(entry.stamp for entry in self._entries)
         self.notes = (
             finder.table(motion.source),
             *self._bag.notes,
@@ -90,22 +80,46 @@ class RosSequence:
             *(f"{name} is not used: no CameraInfo belongs to it" for name in finder.left_out),
             *rig_notes(self.rig, "the calibration" if rig else "a bag"),
             *motion.notes,
-            *_coverage_notes(len(entries), len(self._entries)),
+            *gaps,
         )
-        self._images = ImageReader(strict=strict)
+        self._images = ImageReader(strict=common.strict)
 
     @property
-    def stamps(self) -> tuple[FrameStamp, ...]:
-        """Index, scene and time of each frame, in order."""
-        return tuple(entry.stamp for entry in self._entries)
+    def input_files(self) -> tuple[Path, ...]:
+        """The files of the bag."""
+        return self._bag.file_paths
 
     def load(self, place: int) -> Frame:
         """The frame at position `place`, with decoded images. Raises InputError as `ImageReader.read`."""
         return read_frame(self._entries[place], self.rig, self._images, self._motion)
 
 
-class _RigReader:
-    """Reads the rig of a bag: CameraInfo and the transforms from the cameras to the vehicle."""
+def _files_beside(
+    folder: Path, rig: CameraRig | None, common: SequenceOptions, own: BagOptions
+) -> tuple[CameraRig | None, DriveFacts, Path | None, list[str]]:
+    """Rig, facts, ego-motion file and notes: those of files beside the bag, where no others are given."""
+    calibration, notes = folder / CALIBRATION_FILE, []
+    found, facts = read_rig_and_facts(calibration) if calibration.is_file() else (None, DriveFacts())
+    if rig is None and found is not None:
+        notes.append(f"{calibration} is used in place of the calibration in the bag")
+    file = own.ego_motion_file
+    if file is None and common.ego_motion != "static" and (folder / EGO_MOTION_FILE).is_file():
+        file = folder / EGO_MOTION_FILE
+        notes.append(f"{file} is used in place of the poses in the bag")
+    return found if rig is None else rig, facts, file, notes
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """The poses and their origin. poses: None without any. source: the topic, "" if it is none."""
+
+    poses: EgoMotion | BagEgoMotion | None
+    source: str
+    notes: tuple[str, ...] = ()
+
+
+class _VehicleReader:
+    """Reads the rig of a bag, from CameraInfo and the transforms to the vehicle, and the vehicle's poses."""
 
     def __init__(self, bag: Bag, finder: TopicFinder, stated: StatedTopics, tree: TransformTree) -> None:
         self._bag, self._finder, self._stated, self._tree = bag, finder, stated, tree
@@ -146,7 +160,7 @@ class _RigReader:
             return EGO_FRAMES[0]
         self.notes.append(
             f'no frame is named {" or ".join(EGO_FRAMES[:2])}: "{common[0]}" is taken as the frame of the vehicle '
-            "(ego_frame in --topics FILE.toml states another)"
+            "(ego_frame in `topics_file=FILE.toml` states another)"
         )
         return common[0]
 
@@ -156,13 +170,13 @@ class _RigReader:
             frames = ", ".join(self._tree.frames[:12]) or "none"
             raise InputError(
                 f'{self._bag.path}: camera {camera}: no transform leads from its frame "{frame}" to "{self.ego_frame}" '
-                f"(frames: {frames}; {self._finder.seen()}): pass --calibration FILE, or name the frames with --topics "
-                "FILE.toml"
+                f"(frames: {frames}; {self._finder.seen()}): pass `calibration=FILE`, or name the frames "
+                "with `topics_file=FILE.toml`"
             )
         if abs(found[2, 2]) > 0.7:
             self.notes.append(
                 f'camera {camera}: it looks up or down, if "{frame}" is an optical frame (z ahead, x right): if it is '
-                "not, name the optical frame with --topics FILE.toml"
+                "not, name the optical frame with `topics_file=FILE.toml`"
             )
         return found
 
@@ -173,68 +187,59 @@ class _RigReader:
         lens = None if topics.is_rectified else info.distortion
         return Camera(topics.camera, info.width, info.height, info.intrinsics, ego_from_camera, lens)
 
+    def motion(self, use: EgoMotionUse, file: Path | None) -> _Motion:
+        """The poses of a file, a topic or the transforms. Raises InputError if they are required and not found."""
+        if use == "static":
+            return _Motion(None, "", ("the vehicle is assumed to stand still (poses in the bag are not read)",))
+        if file is not None:
+            return _Motion(read_ego_motion(file), "")
+        ego_frame = self.ego_frame or next((name for name in EGO_FRAMES if name in self._tree.frames), EGO_FRAMES[0])
+        topic = self._finder.pose_topic()
+        if topic is not None:
+            child = pose_of(self._bag.message(topic, 0)).child
+            child_from_ego = self._tree.between(child, ego_frame) if child and child != ego_frame else None
+            notes: tuple[str, ...] = ()
+            if child and child != ego_frame and child_from_ego is None:
+                notes = (f'{topic} has poses of "{child}", which are taken as those of "{ego_frame}"',)
+            return _Motion(motion_from_poses(self._bag, topic, child_from_ego), topic, notes)
+        changing = [name for name in self._finder.of_kind("transforms") if not is_static(name)]
+        path = self._moving_path(ego_frame, changing)
+        if len(path) > 1:
+            child_from_ego = None if path[0] == ego_frame else self._tree.between(path[0], ego_frame)
+            poses = motion_from_transforms(self._bag, changing, path[::-1], child_from_ego)
+            return _Motion(poses, changing[0])
+        if use == "required":
+            raise InputError(
+                f"{self._bag.path}: has no poses of the vehicle: no Odometry or PoseStamped, and no transform that "
+                f'moves "{ego_frame}" ({self._finder.seen()}): pass `ego_motion_file=FILE`, `ego_motion="static"` if '
+                "the vehicle stands, or `temporal=False` to run without history"
+            )
+        return _Motion(None, "", ("the bag has no poses of the vehicle: boxes are in the ego frame",))
 
-@dataclass(frozen=True)
-class _Motion:
-    """Where the poses come from. poses: None without any. source: the topic, "" if it is none."""
-
-    poses: EgoMotion | BagEgoMotion | None
-    source: str
-    notes: tuple[str, ...] = ()
-
-
-def _find_motion(
-    bag: Bag,
-    finder: TopicFinder,
-    stated: StatedTopics,
-    tree: TransformTree,
-    reader: _RigReader,
-    use: EgoMotionUse,
-    file: Path | None,
-) -> _Motion:
-    if use == "static":
-        return _Motion(None, "", ("the vehicle is assumed to stand still (poses in the bag are not read)",))
-    if file is not None:
-        return _Motion(read_ego_motion(file), "")
-    ego_frame = reader.ego_frame or next((name for name in EGO_FRAMES if name in tree.frames), EGO_FRAMES[0])
-    topic = finder.pose_topic()
-    if topic is not None:
-        child = pose_of(bag.message(topic, 0)).child
-        child_from_ego = tree.between(child, ego_frame) if child and child != ego_frame else None
-        notes: tuple[str, ...] = ()
-        if child and child != ego_frame and child_from_ego is None:
-            notes = (f'{topic} has poses of "{child}", which are taken as those of "{ego_frame}"',)
-        return _Motion(motion_from_poses(bag, topic, child_from_ego), topic, notes)
-    changing = [name for name in finder.of_kind("transforms") if not is_static(name)]
-    _, sampled = sampled_transforms(bag, changing)
-    moving = {one.child for one in sampled}
-    path = tree.path_up(ego_frame)
-    if stated.world_frame in path:
-        path = path[: path.index(stated.world_frame) + 1]
-    while len(path) > 1 and path[-2] not in moving:  # static links above the topmost moving one only move the world
-        path.pop()
-    while len(path) > 1 and path[0] not in moving:  # static links below the lowest moving one
-        path.pop(0)
-    if len(path) > 1 and all(frame in moving for frame in path[:-1]):
-        child_from_ego = None if path[0] == ego_frame else tree.between(path[0], ego_frame)
-        poses = motion_from_transforms(bag, changing, path[::-1], child_from_ego)
-        return _Motion(poses, changing[0])
-    if use == "required":
-        raise InputError(
-            f"{bag.path}: has no poses of the vehicle: no Odometry or PoseStamped, and no transform that moves "
-            f'"{ego_frame}" ({finder.seen()}): pass --ego-motion FILE, --static if the vehicle stands, or '
-            "--no-temporal to run without history"
-        )
-    return _Motion(None, "", ("the bag has no poses of the vehicle: boxes are in the ego frame",))
+    def _moving_path(self, ego_frame: str, topics: list[str]) -> list[str]:
+        """Frames from the vehicle's to the world's, with links that move; a single one if there are none."""
+        moving = {one.child for one in sampled_transforms(self._bag, topics)[1]}
+        path = self._tree.path_up(ego_frame)
+        if self._stated.world_frame in path:
+            path = path[: path.index(self._stated.world_frame) + 1]
+        while len(path) > 1 and path[-2] not in moving:  # static links above the topmost moving one only move the world
+            path.pop()
+        while len(path) > 1 and path[0] not in moving:  # static links below the lowest moving one
+            path.pop(0)
+        return path if all(frame in moving for frame in path[:-1]) else path[:1]
 
 
 def _entries(bag: Bag, cameras: tuple[CameraTopics, ...]) -> tuple[FrameEntry, ...]:
     """One frame for each image of the camera with the lowest rate, with the other cameras' nearest images."""
     times = {one.camera: capture_times(bag, one.images) for one in cameras}
-    periods = {name: _period_ns(own) for name, own in times.items()}
+    # The median time between images; a second for a single one.
+    periods = {n: float(np.median(np.diff(own))) if len(own) > 1 else 1e9 for n, own in times.items()}
     slowest = max(periods.values())
     leading = next(name for name, period in periods.items() if period >= SAME_RATE * slowest)
-    makers = {one.camera: _source_maker(bag, one) for one in cameras}
+    makers: dict[str, Callable[[int, int], Source]] = {
+        one.camera: BagVideo(bag, one.images).image if one.is_video else partial(bag_image, bag, one.images)
+        for one in cameras
+    }
     topics = {one.camera: one.images for one in cameras}
     entries: list[FrameEntry] = []
     last = None
@@ -255,46 +260,27 @@ def _entries(bag: Bag, cameras: tuple[CameraTopics, ...]) -> tuple[FrameEntry, .
     return tuple(entries)
 
 
-def _source_maker(bag: Bag, topics: CameraTopics) -> Callable[[int, int], Source]:
-    if topics.is_video:
-        return BagVideo(bag, topics.images).image
-    return lambda index, time: BagImage(bag, topics.images, index, time)
-
-
 def _covered(
     entries: tuple[FrameEntry, ...], motion: EgoMotion | BagEgoMotion | None, path: Path
-) -> tuple[FrameEntry, ...]:
-    """The frames with poses around all of their images. Localisation often starts later than the cameras."""
+) -> tuple[tuple[FrameEntry, ...], tuple[str, ...]]:
+    """The frames with poses around all of their images, and notes. Localisation often starts later than the cameras."""
     if motion is None:
-        return entries
+        return entries, ()
     first, last = motion.first_ns - TOLERANCE_NS, motion.last_ns + TOLERANCE_NS
     kept = tuple(
         entry
         for entry in entries
-        if all(first <= time <= last for time in (entry.stamp.timestamp_ns, *_source_times(entry)))
+        if all(first <= one.timestamp_ns <= last for one in (entry.stamp, *entry.sources.values()))
     )
     if not kept:
         begin, end = entries[0].stamp.timestamp_ns, entries[-1].stamp.timestamp_ns
         raise InputError(
             f"{path}: the poses ({motion.first_ns} to {motion.last_ns} ns) and the images ({begin} to {end} ns) do not "
-            "overlap in time: pass --ego-motion FILE for these images"
+            "overlap in time: pass `ego_motion_file=FILE` for these images"
         )
-    return kept
-
-
-def _source_times(entry: FrameEntry) -> list[int]:
-    return [source.timestamp_ns for source in entry.sources.values()]
-
-
-def _coverage_notes(total: int, kept: int) -> tuple[str, ...]:
-    return (
-        (f"{total - kept} of {total} frames are left out: there are no poses at their times",) if kept < total else ()
-    )
-
-
-def _period_ns(times: NDArray[np.int64]) -> float:
-    """The median time between images; a second for a single one."""
-    return float(np.median(np.diff(times))) if len(times) > 1 else 1e9
+    left_out = len(entries) - len(kept)
+    note = f"{left_out} of {len(entries)} frames are left out: there are no poses at their times"
+    return kept, (note,) if left_out else ()
 
 
 def _nearest(times: NDArray[np.int64], time: int) -> int:

@@ -1,17 +1,31 @@
-"""Finds which topics of a bag belong to which camera, and where the vehicle's poses are."""
+"""Finds the topics of each camera of a bag and of the vehicle's poses. A TOML states what type and name do not show:
+
+ego_frame = "base_link"                                  # the frame of the vehicle
+world_frame = "map"                                      # the frame that poses from /tf refer to
+ego_motion = "/localization/kinematic_state"             # a topic with poses, or /tf
+[cameras]                                                # only these cameras are used
+CAM_FRONT = "/sensing/camera/camera0/image_raw/compressed"
+[calibration]                                            # a camera's CameraInfo
+CAM_FRONT = "/sensing/camera/camera0/camera_info"
+[frames]                                                 # a camera's optical frame
+CAM_FRONT = "camera0/camera_optical_link"
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from bevcli.errors import InputError
+from bevcli.parsing.documents import TOML_BYTES, parse_toml
+from bevcli.parsing.files import read_text
 from bevcli.sequences.ros.bag import Bag
 from bevcli.sequences.ros.messages import KINDS, Kind, frame_of, short_type
-from bevcli.sequences.ros.topics_file import StatedTopics
 
 # Parts of a topic's name that do not name a camera.
 GENERIC = re.compile(
@@ -34,15 +48,55 @@ GOALS = re.compile(r"goal|target|initial|waypoint|planning|planner|prediction|pe
 
 
 @dataclass(frozen=True)
-class CameraTopics:
-    """The topics of one camera.
+class StatedTopics:
+    """Statements of the user about the topics of a bag. "" and missing cameras: to be found.
 
     Attributes:
-        camera: its name.
-        images: topic of its images.
-        calibration: topic of its intrinsics, None if there is none.
-        is_video: whether the messages are packets of a video.
+        ego_frame: name of the vehicle's frame.
+        world_frame: name of the frame that poses refer to, for poses from transforms.
+        ego_motion: topic of the vehicle's poses.
+        cameras: camera -> image topic; if there are any, only these cameras are used.
+        calibration: camera -> topic of its calibration.
+        frames: camera -> name of its optical frame.
+        renamed: camera -> image topic, as `topics` states it; other cameras are still found.
     """
+
+    ego_frame: str = ""
+    world_frame: str = ""
+    ego_motion: str = ""
+    cameras: Mapping[str, str] = field(default_factory=dict)
+    calibration: Mapping[str, str] = field(default_factory=dict)
+    frames: Mapping[str, str] = field(default_factory=dict)
+    renamed: Mapping[str, str] = field(default_factory=dict)
+
+
+def read_topics_file(path: Path | None, topics: Mapping[str, str]) -> StatedTopics:
+    """The statements of a TOML file (None: no file) and of `topics`.
+
+    topics: camera -> image topic. Raises InputError for broken TOML, an unknown key or a wrong type.
+    """
+    if path is None:
+        return StatedTopics(renamed=topics)
+    stated = parse_toml(read_text(path, TOML_BYTES), path)
+    known = [one.name for one in fields(StatedTopics) if one.name != "renamed"]
+    for key, value in stated.items():
+        if key not in known:
+            raise InputError(f'{path}: unknown key "{key}" (known: {", ".join(known)})')
+        _check(path, key, value)
+    return StatedTopics(**stated, renamed=topics)
+
+
+def _check(path: Path, key: str, value: Any) -> None:
+    if key in ("cameras", "calibration", "frames"):
+        if not isinstance(value, dict) or not all(isinstance(entry, str) for entry in value.values()):
+            raise InputError(f'{path}: "{key}": expected a table of names, such as CAM_FRONT = "..."')
+    elif not isinstance(value, str):
+        raise InputError(f'{path}: "{key}": expected a name, found {value!r:.40}')
+
+
+@dataclass(frozen=True)
+class CameraTopics:
+    """The topics of one camera: of its images, and of its intrinsics. is_video: the images are packets of a video."""
 
     camera: str
     images: str
@@ -51,7 +105,7 @@ class CameraTopics:
 
     @property
     def is_rectified(self) -> bool:
-        """Whether the name of the topic says that lens distortion was removed from the images."""
+        """True if the name of the topic says that lens distortion was removed from the images."""
         return any(RECTIFIED.search(part) for part in self.images.split("/"))
 
 
@@ -87,12 +141,14 @@ class TopicFinder:
                 if one.camera in explicit or len(without) == len(cameras):
                     raise InputError(
                         f"{bag.path}: camera {one.camera}: no CameraInfo belongs to {one.images}: pass "
-                        f"--calibration FILE, or name the topic with --topics FILE.toml ({self.seen()})"
+                        f"`calibration=FILE`, or name the topic with `topics_file=FILE.toml` ({self.seen()})"
                     )
             cameras = [one for one in cameras if one.calibration is not None]
             self.left_out = tuple(one.images for one in without)
         if not cameras:
-            raise InputError(f"{bag.path}: has no image topic ({self.seen()}): name them with --topic CAMERA=/TOPIC")
+            raise InputError(
+                f"{bag.path}: has no image topic ({self.seen()}): name them with `topics={{'CAMERA': '/TOPIC'}}`"
+            )
         self.cameras = tuple(cameras)
 
     def of_kind(self, kind: Kind) -> list[str]:
@@ -207,6 +263,6 @@ def _for_calibration(found: Mapping[str, str], names: tuple[str, ...], bag: Bag)
             offered = ", ".join(found.values()) or "none"
             raise InputError(
                 f"{bag.path}: camera {name} of the calibration: its image topic was not found (image topics: "
-                f"{offered}): pass --topic {name}=/TOPIC"
+                f"{offered}): pass `topics={{{name!r}: '/TOPIC'}}`"
             )
         yield name, chosen[0]

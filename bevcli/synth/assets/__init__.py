@@ -1,9 +1,4 @@
-"""Meshes of everything in the city, each built from a few primitives.
+"""Meshes of everything in the city.
 
-mesh, triangles        meshes with colours and materials; meshes placed in the world
-paint                  colours
-cars, trucks, trailers, buses, machines, cycles, people, roadworks
-                       the ten annotated classes
-street_furniture       objects without annotations: trees, lamps, signs, signals
-catalog                all of them by class, with sizes and colours to draw from
+Cycles are with the people, construction vehicles with the roadworks; `catalog` has all annotated objects by class.
 """

@@ -8,25 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.synth.assets.buses import BUS_NAMES, bus
-from bevcli.synth.assets.cars import CAR_SHAPES, car
-from bevcli.synth.assets.cycles import BICYCLE_NAMES, MOTORCYCLE_NAMES, bicycle, motorcycle
-from bevcli.synth.assets.machines import MACHINE_NAMES, machine
-from bevcli.synth.assets.mesh import Mesh
-from bevcli.synth.assets.paint import (
-    BUS_PAINTS,
-    CAR_PAINTS,
-    CLOTHES,
-    MACHINE_PAINTS,
-    TRUCK_PAINTS,
-    Color,
-    linear,
-)
-from bevcli.synth.assets.people import PERSON_NAMES, person
-from bevcli.synth.assets.roadworks import BARRIER_NAMES, CONE_NAMES, barrier, traffic_cone
+from bevcli.synth.assets import people, roadworks, vehicles
+from bevcli.synth.assets.mesh import Mesh, joined
+from bevcli.synth.assets.paint import BUS_PAINTS, CAR_PAINTS, CLOTHES, MACHINE_PAINTS, TRUCK_PAINTS, Color, linear
 from bevcli.synth.assets.street_furniture import StreetFurniture
-from bevcli.synth.assets.trailers import TRAILER_NAMES, trailer
-from bevcli.synth.assets.trucks import TRUCK_NAMES, truck
 
 YELLOW_ONLY: tuple[Color, ...] = ((238, 190, 30),)  # paint of taxis and school buses
 
@@ -84,24 +69,31 @@ def draw_body(
     return Body(variant, size, linear(paint), linear(dye), instance)
 
 
+# The classes but pedestrians: the names of the looks, the function that makes their parts, paints, dyes.
+_CLASSES: dict[str, tuple[Iterable[str], Callable[[str], list[Mesh]], tuple[Color, ...], tuple[Color, ...]]] = {
+    "car": (vehicles.CAR_SHAPES, vehicles.car, CAR_PAINTS, CAR_PAINTS),
+    "truck": (vehicles.TRUCK_NAMES, vehicles.truck, TRUCK_PAINTS, TRUCK_PAINTS),
+    "construction_vehicle": (roadworks.MACHINES, roadworks.machine, MACHINE_PAINTS, TRUCK_PAINTS),
+    "bus": (vehicles.BUSES, vehicles.bus, BUS_PAINTS, BUS_PAINTS),
+    "trailer": (vehicles.TRAILER_NAMES, vehicles.trailer, TRUCK_PAINTS, TRUCK_PAINTS),
+    "barrier": (roadworks.BARRIER_NAMES, roadworks.barrier, CAR_PAINTS, CLOTHES),
+    "motorcycle": (people.MOTORCYCLE_NAMES, people.motorcycle, CAR_PAINTS, CLOTHES),
+    "bicycle": (people.BICYCLE_NAMES, people.bicycle, CAR_PAINTS, CLOTHES),
+    "traffic_cone": (roadworks.CONE_NAMES, roadworks.traffic_cone, CAR_PAINTS, CLOTHES),
+}
+
+
 class Catalog:
     """All variants by class. It does not depend on the drive."""
 
     def __init__(self) -> None:
         self.by_class: dict[str, tuple[Variant, ...]] = {
-            "car": _variants("car", CAR_SHAPES, car, CAR_PAINTS, CAR_PAINTS),
-            "truck": _variants("truck", TRUCK_NAMES, truck, TRUCK_PAINTS, TRUCK_PAINTS),
-            "construction_vehicle": _variants(
-                "construction_vehicle", MACHINE_NAMES, machine, MACHINE_PAINTS, TRUCK_PAINTS
-            ),
-            "bus": _variants("bus", BUS_NAMES, bus, BUS_PAINTS, BUS_PAINTS),
-            "trailer": _variants("trailer", TRAILER_NAMES, trailer, TRUCK_PAINTS, TRUCK_PAINTS),
-            "barrier": _variants("barrier", BARRIER_NAMES, barrier, CAR_PAINTS, CLOTHES),
-            "motorcycle": _variants("motorcycle", MOTORCYCLE_NAMES, motorcycle, CAR_PAINTS, CLOTHES),
-            "bicycle": _variants("bicycle", BICYCLE_NAMES, bicycle, CAR_PAINTS, CLOTHES),
-            "pedestrian": (*map(_walking_person, PERSON_NAMES), *map(_standing_person, PERSON_NAMES)),
-            "traffic_cone": _variants("traffic_cone", CONE_NAMES, traffic_cone, CAR_PAINTS, CLOTHES),
+            name: tuple(_variant(name, look, make, paints, dyes) for look in looks)
+            for name, (looks, make, paints, dyes) in _CLASSES.items()
         }
+        # A walking person has two mirrored strides of the same size.
+        walking, standing = ([_person(name, *strides) for name in people.PERSON_NAMES] for strides in ((1, -1), (0,)))
+        self.by_class["pedestrian"] = (*walking, *standing)
 
     def draw(self, class_name: str, rng: np.random.Generator, names: Iterable[str] | None = None) -> Variant:
         """Draw a variant of a class. names: draw from these variants only."""
@@ -128,32 +120,16 @@ class Assets:
         return Assets(Catalog(), StreetFurniture())
 
 
-def _variants(
-    class_name: str,
-    names: Iterable[str],
-    make: Callable[[str], Mesh],
-    paints: tuple[Color, ...],
-    dyes: tuple[Color, ...],
-) -> tuple[Variant, ...]:
-    variants = []
-    for name in names:
-        mesh = make(name)
-        chosen = YELLOW_ONLY if name in ("taxi", "school") else paints
-        variants.append(Variant(class_name, name, (mesh,), mesh.extents, chosen, dyes))
-    return tuple(variants)
+def _variant(
+    class_name: str, look: str, make: Callable[[str], list[Mesh]], paints: tuple[Color, ...], dyes: tuple[Color, ...]
+) -> Variant:
+    mesh = joined(make(look))
+    chosen = YELLOW_ONLY if look in ("taxi", "school") else paints
+    return Variant(class_name, look, (mesh,), mesh.extents, chosen, dyes)
 
 
-def _walking_person(name: str) -> Variant:
-    """A variant with two mirrored strides of the same size."""
-    poses = (person(name, 1), person(name, -1))
-    return Variant("pedestrian", name, poses, poses[0].extents * _height_factor(name), CLOTHES, CLOTHES)
-
-
-def _standing_person(name: str) -> Variant:
-    pose = person(name, 0)
-    size = pose.extents * _height_factor(name)
-    return Variant("pedestrian", f"{name}_standing", (pose,), size, CLOTHES, CLOTHES)
-
-
-def _height_factor(name: str) -> float:
-    return 0.68 if name == "child" else 1.0
+def _person(name: str, *strides: int) -> Variant:
+    """A person with a pose for each stride."""
+    poses = tuple(joined(people.person(name, stride)) for stride in strides)
+    size = poses[0].extents * (0.68 if name == "child" else 1.0)
+    return Variant("pedestrian", name if any(strides) else f"{name}_standing", poses, size, CLOTHES, CLOTHES)

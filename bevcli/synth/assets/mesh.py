@@ -7,27 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from enum import IntEnum
 
 import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from bevcli.geometry.transforms import rigid
-from bevcli.synth.assets.paint import Color, linear
+from bevcli.synth.assets.paint import Color, Finish, Surface, linear
 
-
-class Material(IntEnum):
-    """How a face is shaded. PAINT and DYE faces take the two colours of the individual."""
-
-    MATTE = 0
-    PAINT = 1
-    GLASS = 2
-    GLOW = 3
-    GROUND = 4
-    FACADE = 5
-    DYE = 6
-    LEAVES = 7
+Point = tuple[float, float, float]  # x, y, z, metres
 
 
 @dataclass(frozen=True)
@@ -59,113 +47,87 @@ class Mesh:
         return replace(self, faces=((self.faces - middle) * scale).astype(np.float32))
 
 
-def from_trimesh(shape: trimesh.Trimesh, color: Color, material: Material = Material.MATTE) -> Mesh:
-    """A mesh of one colour and material."""
-    faces = np.asarray(shape.triangles, dtype=np.float32)
-    return Mesh(faces, np.tile(linear(color), (len(faces), 1)), np.full(len(faces), material, np.uint8))
+def from_faces(faces: ArrayLike, surface: Surface) -> Mesh:
+    """A mesh of faces (F, 3, 3) with one surface."""
+    corners = np.asarray(faces, dtype=np.float32)
+    color, material = surface if isinstance(surface, Finish) else Finish(surface)
+    return Mesh(corners, np.tile(linear(color), (len(corners), 1)), np.full(len(corners), material, np.uint8))
 
 
 def joined(parts: Iterable[Mesh]) -> Mesh:
     """One mesh of all parts."""
-    meshes = list(parts)
-    return Mesh(
-        np.concatenate([m.faces for m in meshes]),
-        np.concatenate([m.albedo for m in meshes]),
-        np.concatenate([m.material for m in meshes]),
-    )
+    faces, albedo, material = zip(*((part.faces, part.albedo, part.material) for part in parts), strict=True)
+    return Mesh(np.concatenate(faces), np.concatenate(albedo), np.concatenate(material))
 
 
-def block(
-    center: tuple[float, float, float],
-    size_lwh: tuple[float, float, float],
-    color: Color,
-    material: Material = Material.MATTE,
-) -> Mesh:
+def block(center: Point, size_lwh: Point, surface: Surface) -> Mesh:
     """A cuboid. center: its middle."""
-    return from_trimesh(trimesh.creation.box(size_lwh, rigid(center)), color, material)
+    return from_faces(trimesh.creation.box(size_lwh, rigid(center)).triangles, surface)
 
 
-def rod(
-    start: ArrayLike,
-    end: ArrayLike,
-    radius: float,
-    color: Color,
-    material: Material = Material.MATTE,
-    sections: int = 6,
-) -> Mesh:
+def rod(start: ArrayLike, end: ArrayLike, radius: float, surface: Surface, sections: int = 6) -> Mesh:
     """A cylinder between two points."""
     shape = trimesh.creation.cylinder(radius, segment=np.array([start, end], dtype=np.float64), sections=sections)
-    return from_trimesh(shape, color, material)
+    return from_faces(shape.triangles, surface)
 
 
-def cone(
-    x: float, y: float, bottom: float, top: float, radius: float, top_radius: float, color: Color,
-    material: Material = Material.MATTE, sections: int = 8,
-) -> Mesh:  # fmt: skip
-    """An upright truncated cone at (x, y). bottom, top: heights; radius, top_radius: at these heights."""
+def crossbar(x: float, z: float, half: float, radius: float, surface: Surface, sections: int = 6) -> Mesh:
+    """A cylinder along y about (x, 0, z). half: half its length."""
+    return rod((x, -half, z), (x, half, z), radius, surface, sections)
+
+
+def cone(bottom: float, top: float, radius: float, top_radius: float, surface: Surface, sections: int = 8) -> Mesh:
+    """An upright truncated cone at x = y = 0. bottom, top: heights; radius, top_radius: at these heights."""
     angle = np.linspace(0, 2 * np.pi, sections, endpoint=False)
     ring = np.stack([np.cos(angle), np.sin(angle)], -1)
-    rings = [
-        np.column_stack([ring * r + (x, y), np.full(sections, z)]) for r, z in ((radius, bottom), (top_radius, top))
-    ]
-    return loft(rings, color, material)
+    rings = [np.column_stack([ring * r, np.full(sections, z)]) for r, z in ((radius, bottom), (top_radius, top))]
+    return loft(rings, surface)
 
 
-def ball(
-    center: tuple[float, float, float],
-    radii: tuple[float, float, float],
-    color: Color,
-    material: Material = Material.MATTE,
-    subdivisions: int = 1,
-) -> Mesh:
+def ball(center: Point, radii: Point, surface: Surface, subdivisions: int = 1) -> Mesh:
     """An ellipsoid with 20 faces; each subdivision multiplies them by 4."""
     shape = trimesh.creation.icosphere(subdivisions=subdivisions)
     shape.apply_scale(radii)
     shape.apply_translation(center)
-    return from_trimesh(shape, color, material)
+    return from_faces(shape.triangles, surface)
 
 
-def loft(rings: Sequence[ArrayLike], color: Color, material: Material = Material.MATTE) -> Mesh:
+def loft(rings: Sequence[ArrayLike], surface: Surface) -> Mesh:
     """A closed body through rings (P, 3) of equally many points, with a cap at each end.
 
     The end rings must be convex. The faces point outwards for both orientations of the rings.
     """
     points = np.asarray(rings, dtype=np.float64)
-    count, per_ring = points.shape[:2]
+    count = points.shape[1]
+    last = (len(points) - 1) * count
     faces: list[tuple[int, int, int]] = []
-    for k in range(count - 1):
-        for i in range(per_ring):
-            a, b = k * per_ring + i, k * per_ring + (i + 1) % per_ring
-            faces += [(a, b, b + per_ring), (a, b + per_ring, a + per_ring)]
-    last = (count - 1) * per_ring
-    for i in range(1, per_ring - 1):
+    for a in range(last):
+        b = a + 1 if (a + 1) % count else a + 1 - count  # the next point of the ring
+        faces += [(a, b, b + count), (a, b + count, a + count)]
+    for i in range(1, count - 1):
         faces += [(0, i + 1, i), (last, last + i, last + i + 1)]
     shape = trimesh.Trimesh(points.reshape(-1, 3), faces, process=False)
     if shape.volume < 0:
         shape.invert()
-    sound = shape.area_faces > 1e-9
-    return from_trimesh(trimesh.Trimesh(shape.vertices, shape.faces[sound], process=False), color, material)
+    return from_faces(shape.triangles[shape.area_faces > 1e-9], surface)
 
 
-def prism(rings: ArrayLike, color: Color) -> Mesh:
-    """A faster `loft` between two horizontal rings, with the material MATTE.
+def prism(rings: ArrayLike, surface: Surface) -> Mesh:
+    """A faster `loft` between two horizontal rings.
 
     rings: (2, P, 3), the lower ring first; both convex and counter-clockwise seen from above.
     """
-    lower, upper = np.asarray(rings, dtype=np.float32)
-    after_lower, after_upper = np.roll(lower, -1, axis=0), np.roll(upper, -1, axis=0)
-    faces = [np.stack([lower, after_lower, after_upper], 1), np.stack([lower, after_upper, upper], 1)]
-    for i in range(1, len(lower) - 1):
-        faces += [
-            np.stack([lower[0], lower[i + 1], lower[i]])[None],
-            np.stack([upper[0], upper[i], upper[i + 1]])[None],
-        ]
-    joint = np.concatenate(faces)
-    return Mesh(joint, np.tile(linear(color), (len(joint), 1)), np.full(len(joint), Material.MATTE, np.uint8))
+    points = np.asarray(rings, dtype=np.float32)
+    count = points.shape[1]
+    following = [(i, (i + 1) % count) for i in range(count)]
+    faces = [(i, j, j + count) for i, j in following] + [(i, j + count, i + count) for i, j in following]
+    for i in range(1, count - 1):
+        faces += [(0, i + 1, i), (count, count + i, count + i + 1)]
+    return from_faces(points.reshape(-1, 3)[faces], surface)
 
 
 def side_profile(
-    outline_xz: ArrayLike, half_width: float, color: Color, material: Material = Material.MATTE, y: float = 0.0,
+    outline_xz: ArrayLike, half_width: float, surface: Surface, y: float = 0.0,
     top_half_width: float | None = None,
 ) -> Mesh:  # fmt: skip
     """A convex outline (P, 2) of x and z, extruded along y around `y`.
@@ -177,7 +139,7 @@ def side_profile(
     low, high = outline[:, 1].min(), outline[:, 1].max()
     half = half_width + (top - half_width) * (outline[:, 1] - low) / max(high - low, 1e-9)
     rings = [np.column_stack([outline[:, 0], y + side * half, outline[:, 1]]) for side in (-1, 1)]
-    return loft(rings, color, material)
+    return loft(rings, surface)
 
 
 def wheel(x: float, y: float, radius: float, width: float, hub: Color = (122, 124, 128)) -> Mesh:

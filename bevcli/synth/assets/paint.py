@@ -2,18 +2,50 @@
 
 from __future__ import annotations
 
+from enum import IntEnum
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Color = tuple[int, int, int]  # sRGB, 0 to 255
 
-# Parts of vehicles. PAINT is a placeholder: each vehicle gets a colour of its own.
-PAINT: Color = (200, 200, 200)
-GLASS: Color = (38, 48, 56)
+
+class Material(IntEnum):
+    """Kind of shading of a face. PAINT and DYE faces take the two colours of the individual."""
+
+    MATTE = 0
+    PAINT = 1
+    GLASS = 2
+    GLOW = 3
+    GROUND = 4
+    FACADE = 5
+    DYE = 6
+    LEAVES = 7
+
+
+class Finish(NamedTuple):
+    """The colour and the material of a surface.
+
+    Attributes:
+        color: sRGB. That of PAINT and DYE is a placeholder.
+        material: kind of shading.
+    """
+
+    color: Color
+    material: Material = Material.MATTE
+
+
+Surface = Color | Finish  # a colour alone is matte
+
+# Parts of vehicles.
+PAINT = Finish((200, 200, 200), Material.PAINT)
+DYED_PAINT = Finish((200, 200, 200), Material.DYE)
+CARGO = Finish((224, 224, 220), Material.DYE)
+GLASS = Finish((38, 48, 56), Material.GLASS)
 TRIM: Color = (34, 35, 38)
-CARGO: Color = (224, 224, 220)
-HEADLAMP: Color = (255, 248, 226)
-TAIL_LAMP: Color = (190, 16, 18)
+HEADLAMP = Finish((255, 248, 226), Material.GLOW)
+TAIL_LAMP = Finish((190, 16, 18), Material.GLOW)
 
 # Colours to draw from.
 CAR_PAINTS: tuple[Color, ...] = (

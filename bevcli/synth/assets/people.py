@@ -1,21 +1,26 @@
-"""Meshes of people: walking in two mirrored strides, standing, and riding a cycle."""
+"""Meshes of people, and of bicycles and motorcycles with and without riders."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from bevcli.synth.assets.mesh import Material, Mesh, ball, block, cone, joined, loft, rod
-from bevcli.synth.assets.paint import Color
+from bevcli.synth.assets.mesh import Mesh, ball, block, cone, crossbar, loft, rod, side_profile
+from bevcli.synth.assets.paint import HEADLAMP, PAINT, TAIL_LAMP, TRIM, Color, Finish, Material, Surface
 
 SKIN: tuple[Color, ...] = ((224, 176, 146), (196, 144, 112), (142, 96, 70), (98, 66, 50))
 HAIR: tuple[Color, ...] = ((40, 32, 28), (92, 66, 42), (180, 146, 90), (120, 118, 116))
-SHIRT: Color = (120, 120, 120)
+SHIRT = Finish((120, 120, 120), Material.DYE)
 TROUSERS: tuple[Color, ...] = ((44, 52, 76), (52, 50, 50), (112, 98, 78), (78, 84, 92))
 PERSON_NAMES = ("man", "woman", "worker", "child", "backpack", "coat")
+RUBBER: Color = (24, 24, 26)
+CHROME: Color = (176, 178, 182)
+BICYCLE_NAMES = ("city", "racer", "cargo", "mountain", "city_rider", "racer_rider", "cargo_rider", "mountain_rider")
+MOTORCYCLE_NAMES = ("sport", "cruiser", "scooter", "sport_rider", "cruiser_rider", "scooter_rider")
+Place = tuple[float, float]  # x and z, metres
 
 
-def person(name: str, stride: int) -> Mesh:
-    """The mesh of a person, about 1.75 m tall.
+def person(name: str, stride: int) -> list[Mesh]:
+    """The parts of a person, about 1.75 m tall.
 
     name: one of PERSON_NAMES. stride: +1 left leg in front, -1 right leg in front, 0 standing.
     """
@@ -25,21 +30,13 @@ def person(name: str, stride: int) -> Mesh:
     parts = [
         *_leg(0.1, swing, legs),
         *_leg(-0.1, -swing, legs),
-        _torso(
-            0.86,
-            1.46,
-            Material.DYE if name != "worker" else Material.MATTE,
-            (240, 120, 30) if name == "worker" else SHIRT,
-        ),
+        _torso((240, 120, 30) if name == "worker" else SHIRT),
         *_arm(0.25, -swing * 0.9, skin),
         *_arm(-0.25, swing * 0.9, skin),
-        *_head(0.02, 1.62, skin, hair),
+        *_head(skin, hair),
     ]
     if name == "woman":
-        parts += [
-            cone(0, 0, 0.55, 1.0, 0.27, 0.17, SHIRT, Material.DYE),
-            ball((-0.07, 0, 1.58), (0.1, 0.13, 0.18), hair),
-        ]
+        parts += [cone(0.55, 1.0, 0.27, 0.17, SHIRT), ball((-0.07, 0, 1.58), (0.1, 0.13, 0.18), hair)]
     elif name == "worker":
         parts += [
             ball((0.02, 0, 1.73), (0.15, 0.14, 0.09), (250, 210, 40)),
@@ -48,8 +45,8 @@ def person(name: str, stride: int) -> Mesh:
     elif name == "backpack":
         parts.append(block((-0.2, 0, 1.22), (0.18, 0.32, 0.46), (150, 52, 44)))
     elif name == "coat":
-        parts.append(cone(0, 0, 0.5, 1.3, 0.26, 0.2, SHIRT, Material.DYE))
-    return joined(parts)
+        parts.append(cone(0.5, 1.3, 0.26, 0.2, SHIRT))
+    return parts
 
 
 def _leg(y: float, swing: float, color: Color) -> list[Mesh]:
@@ -65,20 +62,22 @@ def _leg(y: float, swing: float, color: Color) -> list[Mesh]:
 def _arm(y: float, swing: float, skin: Color) -> list[Mesh]:
     elbow, hand = (swing * 0.5 - 0.02, y * 1.04, 1.14), (swing + 0.04, y, 0.9)
     return [
-        rod((0, y * 0.92, 1.4), elbow, 0.06, SHIRT, Material.DYE),
-        rod(elbow, hand, 0.048, SHIRT, Material.DYE),
+        rod((0, y * 0.92, 1.4), elbow, 0.06, SHIRT),
+        rod(elbow, hand, 0.048, SHIRT),
         ball(hand, (0.05, 0.05, 0.06), skin, subdivisions=0),
     ]
 
 
-def _torso(low: float, high: float, material: Material, color: Color) -> Mesh:
+def _torso(surface: Surface) -> Mesh:
+    low, high = 0.86, 1.46  # metres
     angle = np.linspace(0, 2 * np.pi, 8, endpoint=False) + np.pi / 8
     ring = np.stack([0.13 * np.cos(angle), 0.2 * np.sin(angle)], -1)
     levels = ((low, 0.86), ((low + high) / 2, 0.9), (high - 0.08, 1.12), (high, 0.75))
-    return loft([np.column_stack([ring * scale, np.full(8, z)]) for z, scale in levels], color, material)
+    return loft([np.column_stack([ring * scale, np.full(8, z)]) for z, scale in levels], surface)
 
 
-def _head(x: float, z: float, skin: Color, hair: Color) -> list[Mesh]:
+def _head(skin: Color, hair: Color) -> list[Mesh]:
+    x, z = 0.02, 1.62  # of its middle, metres
     return [
         rod((x - 0.02, 0, z - 0.2), (x, 0, z - 0.05), 0.055, skin),
         ball((x, 0, z), (0.105, 0.085, 0.125), skin),
@@ -86,11 +85,11 @@ def _head(x: float, z: float, skin: Color, hair: Color) -> list[Mesh]:
     ]
 
 
-def rider(seat: tuple[float, float], bars: tuple[float, float], pedal: tuple[float, float], helmet: Color) -> Mesh:
-    """A person who sits on a cycle. seat, bars, pedal: (x, z) of the seat, of the hands and of the feet, metres."""
+def rider(seat: Place, bars: Place, pedal: Place, helmet: Color) -> list[Mesh]:
+    """A person who sits on a cycle. seat, bars, pedal: places of the seat, of the hands and of the feet."""
     hip, shoulder = np.array([seat[0], 0.0, seat[1] + 0.06]), np.array([seat[0] + 0.26, 0.0, seat[1] + 0.56])
     parts = [
-        rod(hip, shoulder, 0.16, SHIRT, Material.DYE, 8),
+        rod(hip, shoulder, 0.16, SHIRT, 8),
         ball(tuple(shoulder + (0.06, 0, 0.24)), (0.12, 0.1, 0.13), SKIN[1]),
         ball(tuple(shoulder + (0.05, 0, 0.29)), (0.145, 0.115, 0.11), helmet),
     ]
@@ -104,6 +103,92 @@ def rider(seat: tuple[float, float], bars: tuple[float, float], pedal: tuple[flo
             rod(hip + (0, side * 0.09, 0), knee, 0.08, TROUSERS[0]),
             rod(knee, foot, 0.06, TROUSERS[0]),
             block((foot[0] + 0.05, foot[1], foot[2]), (0.24, 0.09, 0.09), (30, 30, 30)),
-            rod(shoulder + (0, side * 0.17, -0.05), hand, 0.055, SHIRT, Material.DYE),
+            rod(shoulder + (0, side * 0.17, -0.05), hand, 0.055, SHIRT),
         ]
-    return joined(parts)
+    return parts
+
+
+def _thin_wheel(x: float, radius: float, width: float) -> list[Mesh]:
+    """A wheel: a dark tyre around a lighter disc."""
+    return [
+        crossbar(x, radius, width / 2, radius, RUBBER, 14),
+        crossbar(x, radius, width / 2 + 0.005, radius * 0.86, (150, 152, 156), 14),
+        crossbar(x, radius, width / 2 + 0.02, radius * 0.15, TRIM),
+    ]
+
+
+def bicycle(name: str) -> list[Mesh]:
+    """The parts of a bicycle. name: one of BICYCLE_NAMES; with the suffix "_rider" a person sits on it."""
+    kind = name.removesuffix("_rider")
+    reach = {"city": 1.05, "racer": 1.0, "cargo": 1.35, "mountain": 1.08}[kind]
+    radius, seat_z, bar_z = 0.34, 0.92, {"city": 1.08, "racer": 0.95, "cargo": 1.05, "mountain": 1.02}[kind]
+    back, front = -reach / 2, reach / 2
+    crank, seat, head = (-0.05, 0, 0.3), (-0.22, 0, seat_z), (front - 0.2, 0, bar_z - 0.12)
+    tube = 0.03
+    parts = [
+        *_thin_wheel(back, radius, 0.045),
+        *_thin_wheel(front, radius, 0.045),
+        rod(crank, seat, tube, PAINT, 5),
+        rod(seat, head, tube, PAINT, 5),
+        rod(crank, head, tube, PAINT, 5),
+        rod(crank, (back, 0, radius), 0.025, PAINT, 4),
+        rod(seat, (back, 0, radius), 0.02, PAINT, 4),
+        rod((front - 0.22, 0, bar_z), (front, 0, radius), 0.028, TRIM, sections=5),
+        crossbar(front - 0.24, bar_z, 0.27, 0.022, TRIM, 5),
+        block((-0.24, 0, seat_z + 0.03), (0.26, 0.15, 0.06), RUBBER),
+        crossbar(-0.05, 0.3, 0.16, 0.03, CHROME, 5),
+    ]
+    if kind == "city":
+        parts += [
+            block((back - 0.02, 0, 0.74), (0.42, 0.16, 0.03), TRIM),
+            block((front - 0.05, 0, 0.98), (0.3, 0.34, 0.22), (120, 92, 62)),
+        ]
+    if kind == "cargo":
+        parts.append(block((0.32, 0, 0.62), (0.55, 0.5, 0.45), (168, 122, 70)))
+    if name.endswith("_rider"):
+        helmet = (230, 230, 226) if kind == "racer" else (52, 58, 70)
+        parts += rider((-0.24, seat_z + 0.04), (front - 0.24, bar_z), (-0.05, 0.3), helmet)
+    return parts
+
+
+def motorcycle(name: str) -> list[Mesh]:
+    """The parts of a motorcycle. name: one of MOTORCYCLE_NAMES; with the suffix "_rider" a person sits on it."""
+    kind = name.removesuffix("_rider")
+    radius, reach = (0.24, 1.25) if kind == "scooter" else (0.32, 1.45)
+    back, front = -reach / 2, reach / 2
+    parts = [crossbar(x, radius, 0.07, radius, RUBBER, 14) for x in (back, front)]
+    parts += [crossbar(x, radius, 0.085, radius * 0.55, CHROME, 8) for x in (back, front)]
+    bar_z = 1.08 if kind == "cruiser" else 0.98
+    parts += [rod((front - 0.28, y, bar_z), (front, y, radius), 0.035, CHROME, sections=5) for y in (-0.1, 0.1)]
+    parts += [
+        crossbar(front - 0.3, bar_z, 0.36, 0.025, TRIM, 5),
+        ball((front - 0.14, 0, bar_z - 0.16), (0.1, 0.11, 0.11), HEADLAMP),
+        block((back - 0.12, 0, 0.72), (0.08, 0.2, 0.1), TAIL_LAMP),
+    ]
+    if kind == "scooter":
+        body = [(back - 0.1, 0.35), (back + 0.6, 0.3), (back + 0.55, 0.75), (back - 0.1, 0.78)]
+        shield = [(front - 0.42, 0.3), (front - 0.3, 0.28), (front - 0.22, 0.95), (front - 0.34, 0.98)]
+        parts += [
+            side_profile(body, 0.2, PAINT),
+            side_profile(shield, 0.22, PAINT),
+            block((0.0, 0, 0.3), (0.6, 0.36, 0.08), TRIM),
+            block((back + 0.2, 0, 0.8), (0.7, 0.28, 0.08), RUBBER),
+        ]
+    else:
+        tank_z = 0.82 if kind == "sport" else 0.74
+        tank = [(-0.15, 0.62), (0.35, 0.66), (0.38, tank_z), (0.0, tank_z + 0.14), (-0.2, tank_z)]
+        tail = [(back - 0.15, 0.66), (back + 0.4, 0.6), (back + 0.4, 0.72), (back - 0.12, 0.82)]
+        parts += [
+            block((-0.02, 0, 0.45), (0.55, 0.3, 0.36), (70, 70, 74)),
+            side_profile(tank, 0.17, PAINT),
+            block((-0.42, 0, 0.76), (0.62, 0.26, 0.1), RUBBER),
+            side_profile(tail, 0.13, PAINT),
+            *[rod((-0.1, y, 0.3), (back - 0.1, y, 0.36), 0.05, CHROME) for y in (-0.17, 0.17)],
+        ]
+        if kind == "sport":
+            fairing = np.array([(-0.42, 0.6), (-0.1, 0.62), (-0.12, 0.9), (-0.3, 1.08), (-0.42, 0.9)]) + (front, 0)
+            parts.append(side_profile(fairing, 0.18, PAINT))
+    if name.endswith("_rider"):
+        seat = (back + 0.35, 0.82) if kind == "scooter" else (-0.4, 0.8)
+        parts += rider(seat, (front - 0.3, bar_z), (0.0, 0.36), (200, 30, 34) if kind == "sport" else (34, 36, 40))
+    return parts

@@ -1,9 +1,124 @@
-"""Meshes of traffic cones and barriers. A barrier's long side is its width, as in nuScenes annotations."""
+"""Meshes of construction vehicles, traffic cones and barriers.
+
+A barrier's long side is its width, as in nuScenes annotations.
+"""
 
 from __future__ import annotations
 
-from bevcli.synth.assets.mesh import Mesh, block, cone, joined, side_profile
-from bevcli.synth.assets.paint import Color
+from typing import Any
+
+from bevcli.synth.assets.mesh import Mesh, block, cone, crossbar, rod, side_profile, wheel
+from bevcli.synth.assets.paint import CARGO, GLASS, PAINT, TRIM, Color
+
+WORN_STEEL = (96, 96, 98)
+BLACK_RUBBER = (30, 30, 32)
+
+
+def _cabin(x: float, y: float, bottom: float, size: tuple[float, float, float]) -> list[Mesh]:
+    """A cabin with windows, a roof and four posts."""
+    length, width, height = size
+    parts = [
+        block((x, y, bottom + height * 0.15), (length, width, height * 0.3), PAINT),
+        block((x, y, bottom + height * 0.62), (length * 0.94, width * 0.94, height * 0.66), GLASS),
+        block((x, y, bottom + height), (length * 1.06, width * 1.06, 0.1), PAINT),
+    ]
+    for at in ((x + sx * length, y + sy * width) for sx in (-0.5, 0.5) for sy in (-0.5, 0.5)):
+        parts.append(rod((*at, bottom), (*at, bottom + height), 0.05, TRIM, sections=4))
+    return parts
+
+
+def _track(y: float, length: float, height: float, width: float) -> list[Mesh]:
+    """A crawler track with its rollers."""
+    half, foot, shoulder = length / 2, length / 2 - height / 2, length / 2 - height * 0.35
+    outline = [
+        (-foot, 0), (foot, 0), (half, height * 0.5), (shoulder, height), (-shoulder, height), (-half, height * 0.5),
+    ]  # fmt: skip
+    parts = [side_profile(outline, width / 2, BLACK_RUBBER, y=y)]
+    start, end, z = y - width / 2 - 0.02, y + width / 2 + 0.02, height * 0.45
+    for x in (-half * 0.7, -half * 0.25, half * 0.25, half * 0.7):
+        parts.append(rod((x, start, z), (x, end, z), height * 0.3, WORN_STEEL, sections=8))
+    return parts
+
+
+MIXER_DRUM = [(-3.6, 1.6), (-2.0, 1.25), (0.6, 1.35), (1.2, 1.9), (0.9, 2.9), (-1.0, 3.2), (-3.4, 2.6)]
+MACHINES: dict[str, tuple[tuple[Any, ...], ...]] = {
+    "excavator": (
+        (_track, 1.05, 3.6, 0.85, 0.5),
+        (_track, -1.05, 3.6, 0.85, 0.5),
+        (block, (0, 0, 0.75), (2.0, 1.6, 0.4), TRIM),
+        (block, (-0.9, 0, 1.5), (2.2, 2.5, 1.1), PAINT),
+        (block, (-1.9, 0, 1.5), (0.5, 2.4, 1.0), TRIM),
+        (_cabin, 0.6, 0.7, 1.0, (1.4, 1.0, 1.9)),
+        (rod, (0.6, -0.3, 1.5), (2.6, -0.3, 3.3), 0.2, PAINT, 6),
+        (rod, (2.6, -0.3, 3.3), (3.9, -0.3, 1.6), 0.16, PAINT, 6),
+        (rod, (0.9, -0.3, 2.3), (2.1, -0.3, 3.1), 0.08, (200, 200, 202)),
+        (side_profile, [(3.6, 1.6), (4.2, 1.5), (3.9, 0.6), (3.2, 0.5), (3.2, 0.9)], 0.5, WORN_STEEL, -0.3),
+    ),
+    "loader": (
+        (block, (-1.7, 0, 1.5), (2.0, 1.9, 1.1), PAINT),
+        (block, (0.6, 0, 1.1), (2.4, 1.2, 0.6), PAINT),
+        (block, (-2.7, 0, 1.3), (0.2, 2.0, 0.8), TRIM),
+        (_cabin, -0.3, 0, 1.5, (1.3, 1.4, 1.7)),
+        *[(wheel, x, y, 0.75, 0.55, (220, 190, 60)) for x in (-1.7, 1.4) for y in (-1.0, 1.0)],
+        *[(rod, (0.6, y, 1.6), (2.7, y, 0.7), 0.11, PAINT) for y in (-0.6, 0.6)],
+        (side_profile, [(2.6, 0.15), (3.6, 0.1), (3.5, 0.3), (2.9, 1.1), (2.6, 1.1)], 1.35, WORN_STEEL),
+    ),
+    "backhoe": (
+        (block, (0.9, 0, 1.2), (2.0, 1.0, 0.7), PAINT),
+        (_cabin, -0.6, 0, 0.9, (1.5, 1.6, 1.9)),
+        *[(wheel, -1.1, y, 0.72, 0.5, (220, 190, 60)) for y in (-0.9, 0.9)],
+        *[(wheel, 1.4, y, 0.48, 0.35, (220, 190, 60)) for y in (-0.85, 0.85)],
+        *[(rod, (0.9, y, 1.3), (2.5, y, 0.6), 0.09, PAINT) for y in (-0.6, 0.6)],
+        (side_profile, [(2.4, 0.1), (3.2, 0.1), (3.1, 0.3), (2.6, 0.9), (2.4, 0.9)], 1.15, WORN_STEEL),
+        (rod, (-1.6, 0, 1.0), (-2.7, 0, 3.1), 0.14, PAINT),
+        (rod, (-2.7, 0, 3.1), (-3.3, 0, 1.5), 0.11, PAINT),
+        (side_profile, [(-3.6, 1.0), (-3.0, 1.1), (-2.9, 1.6), (-3.4, 1.6)], 0.35, WORN_STEEL),
+        (block, (-1.7, 0, 0.7), (0.3, 2.1, 0.6), TRIM),
+    ),
+    "bulldozer": (
+        (_track, 0.95, 3.4, 1.0, 0.55),
+        (_track, -0.95, 3.4, 1.0, 0.55),
+        (block, (0.9, 0, 1.35), (1.9, 1.2, 0.9), PAINT),
+        (block, (-0.7, 0, 1.2), (1.6, 1.4, 0.7), PAINT),
+        (_cabin, -0.6, 0, 1.4, (1.3, 1.4, 1.6)),
+        (rod, (1.2, 0.35, 1.7), (1.2, 0.35, 2.5), 0.07, BLACK_RUBBER),
+        (side_profile, [(2.2, 0.05), (2.45, 0.05), (2.35, 0.7), (2.5, 1.3), (2.2, 1.25)], 1.55, WORN_STEEL),
+        *[(rod, (0.2, y, 0.6), (2.25, y, 0.5), 0.1, PAINT) for y in (-1.35, 1.35)],
+    ),
+    "roller": (
+        (crossbar, 1.7, 0.72, 1.0, 0.72, WORN_STEEL, 14),
+        *[(block, (1.5, y, 0.85), (1.9, 0.1, 0.25), PAINT) for y in (-1.06, 1.06)],
+        (block, (-1.3, 0, 1.3), (2.0, 1.5, 0.8), PAINT),
+        (_cabin, 0.1, 0, 1.0, (1.2, 1.4, 1.9)),
+        *[(wheel, -1.4, y, 0.7, 0.5) for y in (-0.85, 0.85)],
+    ),
+    "crane": (
+        (block, (0, 0, 0.95), (8.2, 2.4, 0.6), PAINT),
+        (_cabin, 3.2, 0.4, 1.2, (1.5, 1.4, 1.3)),
+        *[(wheel, x, y, 0.6, 0.4) for x in (-3.0, -1.6, 1.4, 2.8) for y in (-1.05, 1.05)],
+        (block, (-1.2, 0, 1.8), (3.0, 2.0, 1.0), PAINT),
+        (_cabin, -0.4, -0.6, 1.6, (1.3, 0.9, 1.5)),
+        (rod, (-2.2, 0.2, 2.4), (4.6, 0.2, 3.5), 0.34, PAINT, 4),
+        (rod, (3.8, 0.2, 3.36), (5.0, 0.2, 3.56), 0.22, WORN_STEEL, 4),
+        (block, (-2.9, 0, 1.8), (0.7, 2.3, 1.0), TRIM),
+    ),
+    "mixer": (
+        (side_profile, MIXER_DRUM, 0.95, CARGO),
+        (block, (-0.6, 0, 0.95), (7.6, 1.0, 0.3), TRIM),
+        (_cabin, 3.1, 0, 0.9, (1.7, 2.3, 1.9)),
+        (block, (3.1, 0, 0.8), (2.0, 2.4, 0.7), PAINT),
+        *[(wheel, x, y, 0.5, 0.35) for x in (-2.6, -1.3, 2.8) for y in (-1.05, 1.05)],
+        (rod, (-3.6, 0, 2.9), (-4.3, 0, 1.6), 0.2, PAINT),
+        *[(rod, (-3.2, y, 1.0), (-3.4, y * 0.3, 2.8), 0.07, PAINT) for y in (-0.8, 0.8)],
+    ),
+}  # of each construction vehicle, the functions that make its parts, and their arguments
+
+
+def machine(name: str) -> list[Mesh]:
+    """The parts of a construction vehicle. name: a key of MACHINES."""
+    made = [make(*arguments) for make, *arguments in MACHINES[name]]
+    return [part for parts in made for part in (parts if isinstance(parts, list) else [parts])]
+
 
 ORANGE: Color = (240, 92, 26)
 WHITE: Color = (240, 240, 236)
@@ -12,75 +127,42 @@ CONE_NAMES = ("tall", "short", "slim", "drum", "lime")
 BARRIER_NAMES = ("concrete", "plastic", "plank", "fence", "white_plastic")
 
 
-def traffic_cone(name: str) -> Mesh:
-    """The mesh of a traffic cone. name: one of CONE_NAMES."""
+def traffic_cone(name: str) -> list[Mesh]:
+    """The parts of a traffic cone. name: one of CONE_NAMES."""
     if name == "drum":
-        bands = [
-            cone(
-                0,
-                0,
-                0.2 * k,
-                0.2 * k + 0.2,
-                0.29 - 0.012 * k,
-                0.28 - 0.012 * k,
-                ORANGE if k % 2 == 0 else WHITE,
-                sections=10,
-            )
-            for k in range(5)
-        ]
-        return joined([cone(0, 0, 0, 0.06, 0.36, 0.36, (30, 30, 32), sections=10), *bands])
-    height = {"tall": 0.95, "short": 0.6, "slim": 1.1, "lime": 0.75}[name]
-    foot = {"tall": 0.17, "short": 0.14, "slim": 0.09, "lime": 0.15}[name]
+        bands = [(0.2 * k, 0.2 * k + 0.2, 0.29 - 0.012 * k, 0.28 - 0.012 * k, (ORANGE, WHITE)[k % 2]) for k in range(5)]
+        return [cone(*band, sections=10) for band in [(0, 0.06, 0.36, 0.36, BLACK_RUBBER), *bands]]
+    height, foot, tip = {
+        "tall": (0.95, 0.17, 0.03), "short": (0.6, 0.14, 0.03), "slim": (1.1, 0.09, 0.06), "lime": (0.75, 0.15, 0.03),
+    }[name]  # fmt: skip
     color = ORANGE if name != "lime" else (196, 216, 40)
-    tip = 0.03 if name != "slim" else 0.06
-
-    def radius(fraction: float) -> float:
-        return foot + (tip - foot) * fraction
-
-    stripes = [(0.0, 0.4, color), (0.4, 0.58, WHITE), (0.58, 0.7, color), (0.7, 0.82, WHITE), (0.82, 1.0, color)]
-    rings = [
-        cone(0, 0, 0.04 + a * (height - 0.04), 0.04 + b * (height - 0.04), radius(a), radius(b), c)
-        for a, b, c in stripes
-    ]
-    return joined([block((0, 0, 0.025), (0.4, 0.4, 0.05), (30, 30, 32) if name != "short" else color), *rings])
+    parts = [block((0, 0, 0.025), (0.4, 0.4, 0.05), (30, 30, 32) if name != "short" else color)]
+    for a, b, c in ((0.0, 0.4, color), (0.4, 0.58, WHITE), (0.58, 0.7, color), (0.7, 0.82, WHITE), (0.82, 1.0, color)):
+        low, high = 0.04 + a * (height - 0.04), 0.04 + b * (height - 0.04)
+        parts.append(cone(low, high, foot + (tip - foot) * a, foot + (tip - foot) * b, c))
+    return parts
 
 
-def barrier(name: str) -> Mesh:
-    """The mesh of a barrier, about 0.5 m long (its thickness), 2.5 m wide and 1 m high. name: one of BARRIER_NAMES."""
-    if name == "concrete":
-        return _jersey((172, 168, 160), None)
-    if name in ("plastic", "white_plastic"):
-        return _jersey(RED if name == "plastic" else WHITE, WHITE if name == "plastic" else RED)
-    feet = [block((0, y, 0.05), (0.5, 0.14, 0.1), (46, 46, 48)) for y in (-0.95, 0.95)]
-    posts = [block((0, y, 0.5), (0.06, 0.06, 1.0), (150, 152, 150)) for y in (-0.95, 0.95)]
+def barrier(name: str) -> list[Mesh]:
+    """The parts of a barrier, about 0.5 m long (its thickness), 2.5 m wide and 1 m high. name: one of BARRIER_NAMES."""
+    walls = {"concrete": ((172, 168, 160),), "plastic": (RED, WHITE) * 2, "white_plastic": (WHITE, RED) * 2}
+    if name in walls:
+        return _jersey(walls[name])
+    parts = [block((0, y, 0.05), (0.5, 0.14, 0.1), (46, 46, 48)) for y in (-0.95, 0.95)]
     if name == "plank":
-        boards = [
-            block((0.04, -1.25 + 0.25 * (k + 0.5), z), (0.04, 0.25, 0.2), RED if k % 2 else WHITE)
-            for z in (0.85, 0.45)
-            for k in range(10)
-        ]
-        return joined([*feet, *posts, *boards])
-    rails = [block((0, 0, z), (0.05, 2.5, 0.06), (206, 208, 204)) for z in (0.2, 1.02)]
-    bars = [block((0, -1.2 + 0.2 * k, 0.6), (0.03, 0.03, 0.84), (206, 208, 204)) for k in range(13)]
-    return joined([*feet, *rails, *bars, block((0.03, 0, 0.72), (0.03, 0.9, 0.3), ORANGE)])
+        parts += [block((0, y, 0.5), (0.06, 0.06, 1.0), (150, 152, 150)) for y in (-0.95, 0.95)]
+        for z in (0.85, 0.45):
+            for k in range(10):
+                parts.append(block((0.04, -1.25 + 0.25 * (k + 0.5), z), (0.04, 0.25, 0.2), RED if k % 2 else WHITE))
+        return parts
+    parts += [block((0, 0, z), (0.05, 2.5, 0.06), (206, 208, 204)) for z in (0.2, 1.02)]
+    parts += [block((0, -1.2 + 0.2 * k, 0.6), (0.03, 0.03, 0.84), (206, 208, 204)) for k in range(13)]
+    return [*parts, block((0.03, 0, 0.72), (0.03, 0.9, 0.3), ORANGE)]
 
 
-def _jersey(color: Color, other: Color | None) -> Mesh:
-    """A wall along y with a sloped foot. other: the colour of every second piece; None for one colour."""
-    outline = [
-        (-0.28, 0.0),
-        (0.28, 0.0),
-        (0.26, 0.2),
-        (0.1, 0.45),
-        (0.08, 0.95),
-        (-0.08, 0.95),
-        (-0.1, 0.45),
-        (-0.26, 0.2),
-    ]
-    count = 1 if other is None else 4
-    parts = []
-    for k in range(count):
-        paint = color if k % 2 == 0 or other is None else other
-        y = -1.25 + (2 * k + 1) * 1.25 / count
-        parts.append(side_profile(outline, 1.25 / count, paint, y=y))
-    return joined(parts)
+def _jersey(colors: tuple[Color, ...]) -> list[Mesh]:
+    """A wall along y with a sloped foot, in pieces of these colours."""
+    side = [(0.28, 0.0), (0.26, 0.2), (0.1, 0.45), (0.08, 0.95)]
+    outline = [(-0.28, 0.0), *side, *((-x, z) for x, z in side[:0:-1])]
+    half = 1.25 / len(colors)
+    return [side_profile(outline, half, paint, y=-1.25 + (2 * k + 1) * half) for k, paint in enumerate(colors)]

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.jit import njit
-from bevcli.synth.assets.mesh import Material, Mesh
+from bevcli.synth.assets.mesh import Mesh
+from bevcli.synth.assets.paint import Material
 
 NO_FACADES = np.zeros((0, 16), np.float32)
 
@@ -44,21 +44,13 @@ class Triangles:
     @staticmethod
     def joined(parts: Sequence[Triangles]) -> Triangles:
         """All triangles of all parts, in their order."""
-        facade, facade_count = [], 0
-        for part in parts:
-            if len(part.facades):
-                facade.append(np.where(part.facade >= 0, part.facade + facade_count, -1).astype(np.int32))
-            else:
-                facade.append(part.facade)
-            facade_count += len(part.facades)
-        return Triangles(
-            np.concatenate([part.corners for part in parts]),
-            np.concatenate([part.normals for part in parts]),
-            np.concatenate([part.albedo for part in parts]),
-            np.concatenate([part.material for part in parts]),
-            np.concatenate(facade),
-            np.concatenate([part.facades for part in parts]),
+        starts = np.cumsum([0, *(len(part.facades) for part in parts)])
+        facade = [np.where(part.facade >= 0, part.facade + k, -1) for part, k in zip(parts, starts, strict=False)]
+        corners, normals, albedo, material, facades = (
+            np.concatenate([getattr(part, name) for part in parts])
+            for name in ("corners", "normals", "albedo", "material", "facades")
         )
+        return Triangles(corners, normals, albedo, material, np.concatenate(facade).astype(np.int32), facades)
 
 
 @dataclass(frozen=True)
@@ -118,33 +110,21 @@ class MeshTemplate:
 
     def placed(self, position: tuple[float, float, float], yaw: float) -> PlacedMesh:
         """The mesh turned by `yaw` (radians) and moved to a world position (metres)."""
-        x, y, z = position
-        mesh = self.mesh
-        corners, normals = np.empty_like(mesh.faces), np.empty_like(self.normals)
         cosine, sine = float(np.cos(yaw)), float(np.sin(yaw))
-        _turn_and_shift(mesh.faces, self.normals, cosine, sine, float(x), float(y), float(z), corners, normals)
+        corners = (_turned(self.mesh.faces, cosine, sine) + position).astype(np.float32)
+        normals = _turned(self.normals, cosine, sine).astype(np.float32)
+        x, y, z = position
         cx, cy, cz, radius = self.sphere
         sphere = np.array([cosine * cx - sine * cy + x, sine * cx + cosine * cy + y, cz + z, radius], np.float32)
         no_facade = np.full(len(corners), -1, np.int32)
+        mesh = self.mesh
         return PlacedMesh(Triangles(corners, normals, mesh.albedo, mesh.material, no_facade, NO_FACADES), sphere)
 
 
-@njit(nogil=True)
-def _turn_and_shift(
-    faces: NDArray, normals: NDArray, cosine: float, sine: float, x: float, y: float, z: float,
-    out_corners: NDArray, out_normals: NDArray,
-) -> None:  # fmt: skip
-    """Turn faces (F, 3, 3) and normals (F, 3) about z, shift the faces by x, y, z; write into the last two arrays."""
-    for t in range(faces.shape[0]):
-        for i in range(3):
-            a, b = faces[t, i, 0], faces[t, i, 1]
-            out_corners[t, i, 0] = cosine * a - sine * b + x
-            out_corners[t, i, 1] = sine * a + cosine * b + y
-            out_corners[t, i, 2] = faces[t, i, 2] + z
-        a, b = normals[t, 0], normals[t, 1]
-        out_normals[t, 0] = cosine * a - sine * b
-        out_normals[t, 1] = sine * a + cosine * b
-        out_normals[t, 2] = normals[t, 2]
+def _turned(vectors: NDArray[np.float32], cosine: float, sine: float) -> NDArray[np.float64]:
+    """Vectors (..., 3) turned about z."""
+    x, y, z = np.moveaxis(vectors.astype(np.float64), -1, 0)
+    return np.stack([cosine * x - sine * y, sine * x + cosine * y, z], -1)
 
 
 @dataclass(frozen=True)

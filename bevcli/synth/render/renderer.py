@@ -1,21 +1,26 @@
-"""The image of one camera: rasterise and shade the world, and count the pixels of each object."""
+"""The image of one camera: rasterise and shade the world, and count the pixels of each object.
+
+Each pixel is shaded once, in linear RGB. All surfaces are diffuse; glass and paint also reflect the sky. The ground has
+no triangles: a pixel that sees none and looks down sees the plane z = 0. The image of a camera with distortion is
+resampled from a wider pinhole image.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.geometry.cameras import Camera
+from bevcli.errors import InputError
+from bevcli.geometry.cameras import Camera, distort
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.synth.assets.triangles import TriangleSoup
-from bevcli.synth.render.ground_texture import GroundTexture
-from bevcli.synth.render.lens import LensMaps, distortion_maps
-from bevcli.synth.render.rasteriser import VisibilityBuffer, rasterise
-from bevcli.synth.render.shading import shade
-from bevcli.synth.render.shadow_map import ShadowMap
+from bevcli.synth.render.ground import GroundTexture
+from bevcli.synth.render.rasteriser import ShadowMap, VisibilityBuffer, rasterise
+from bevcli.synth.render.shading_kernels import LIGHT_LIMIT, shade_pixels
 from bevcli.synth.world.weather import Weather
 
 
@@ -64,13 +69,13 @@ def render_view(snapshot: WorldSnapshot, camera: Camera, world_from_ego: Array, 
     Raises InputError where the field of view is too wide.
     """
     if camera.distortion is not None:
-        lens = distortion_maps(camera)
-        return _distorted(lens, render_view(snapshot, lens.pinhole, world_from_ego, supersampling))
+        pinhole, columns, rows = distortion_maps(camera)
+        return _distorted(render_view(snapshot, pinhole, world_from_ego, supersampling), columns, rows)
     soup = snapshot.soup
     fine = _supersampled(camera, supersampling)
     world_from_camera = world_from_ego @ camera.ego_from_camera
     buffer = rasterise(soup, fine, inverse(world_from_camera), snapshot.object_count)
-    image = shade(buffer, soup.triangles, snapshot.ground, snapshot.shadows, snapshot.weather, fine, world_from_camera)
+    image = shade(snapshot, buffer, fine, world_from_camera)
     objects = _seen_objects(buffer, soup)
     area = supersampling**2
     visible = np.bincount(objects[objects >= 0], minlength=snapshot.object_count)
@@ -80,11 +85,10 @@ def render_view(snapshot: WorldSnapshot, camera: Camera, world_from_ego: Array, 
     return RenderedView(image, objects, visible // area, -(-buffer.unoccluded // area))
 
 
-def _distorted(lens: LensMaps, pinhole: RenderedView) -> RenderedView:
+def _distorted(pinhole: RenderedView, columns: NDArray[np.float32], rows: NDArray[np.float32]) -> RenderedView:
     """Resample a pinhole image. The ratio of visible to unoccluded pixels of each object stays as it is."""
-    image = cv2.remap(pinhole.pixels_bgr, lens.x, lens.y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-    rows, columns = np.round(lens.y).astype(int), np.round(lens.x).astype(int)
-    objects = pinhole.objects[rows, columns]
+    image = cv2.remap(pinhole.pixels_bgr, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    objects = pinhole.objects[np.round(rows).astype(int), np.round(columns).astype(int)]
     visible = np.bincount(objects[objects >= 0], minlength=len(pinhole.visible))
     share = np.minimum(pinhole.visible / np.maximum(pinhole.unoccluded, 1), 1.0)
     unoccluded = np.where(visible > 0, np.ceil(visible / np.maximum(share, 1e-6)), pinhole.unoccluded)
@@ -104,3 +108,79 @@ def _seen_objects(buffer: VisibilityBuffer, soup: TriangleSoup) -> NDArray[np.in
     """(H, W) index of the object that each pixel sees; -1 for none."""
     owners = np.repeat(soup.mesh_objects, soup.mesh_ranges[:, 1] - soup.mesh_ranges[:, 0])
     return np.where(buffer.triangles >= 0, owners[buffer.triangles], -1).astype(np.int32)
+
+
+TABLE_SIZE = 4096
+
+
+def shade(
+    snapshot: WorldSnapshot, buffer: VisibilityBuffer, camera: Camera, world_from_camera: Array
+) -> NDArray[np.uint8]:
+    """Colour a visibility buffer. Returns (H, W, 3) uint8 BGR.
+
+    camera: the buffer's camera; its distortion is ignored. world_from_camera: (4, 4).
+    """
+    triangles, ground, shadows, w = snapshot.soup.triangles, snapshot.ground, snapshot.shadows, snapshot.weather
+    light = np.stack([w.sun, w.sky, w.bounce, w.zenith, w.horizon, w.haze, w.cloud_color]).astype(np.float64)
+    ray_from_image = world_from_camera[:3, :3] @ np.linalg.inv(camera.intrinsics)
+    image = np.empty((*buffer.triangles.shape, 3), np.uint8)
+    shade_pixels(
+        (buffer.triangles, buffer.inverse_depth),
+        (triangles.normals, triangles.albedo, triangles.material, triangles.facade, triangles.facades),
+        (ground.texels, ground.offsets, ground.rough, *ground.origin, ground.texel_m, ground.size),
+        (shadows.heights, *shadows.origin, shadows.texel_m, *shadows.shear, w.shadow_softness_m),
+        (light, w.to_sun, w.clouds, w.haze_m, w.lamps),
+        (ray_from_image, np.ascontiguousarray(world_from_camera[:3, 3]), 1.0 / camera.intrinsics[0, 0]),
+        _display_table(),
+        image,
+    )
+    return image
+
+
+@lru_cache(maxsize=1)
+def _display_table() -> NDArray[np.uint8]:
+    """(TABLE_SIZE,) sRGB bytes of linear light from 0 to LIGHT_LIMIT. Light above 0.7 is compressed smoothly."""
+    light = np.linspace(0, LIGHT_LIMIT, TABLE_SIZE)
+    shoulder = 0.7
+    rolled = shoulder + (1 - shoulder) * (1 - np.exp(-(light - shoulder) / (1 - shoulder)))
+    mapped = np.where(light < shoulder, light, rolled)
+    encoded = np.where(mapped <= 0.0031308, 12.92 * mapped, 1.055 * mapped ** (1 / 2.4) - 0.055)
+    return np.clip(np.round(encoded * 255), 0, 255).astype(np.uint8)
+
+
+WIDEST = 4.0  # tangent of the widest angle off the optical axis; wider pinhole images would be too large
+REFINEMENTS = 15  # fixed-point steps; OpenCV's result alone is off by some pixels at strong distortion
+
+
+def distortion_maps(camera: Camera) -> tuple[Camera, NDArray[np.float32], NDArray[np.float32]]:
+    """A wider pinhole camera, and column and row (H, W) in its image for each pixel of a camera with distortion.
+
+    Raises InputError where the camera sees more than about 75 degrees off its optical axis.
+    """
+    u, v = np.meshgrid(np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64))
+    rays = _undistorted_rays(camera, np.stack([u, v], -1).reshape(-1, 2)).reshape(camera.height, camera.width, 2)
+    if not np.isfinite(rays).all() or np.abs(rays).max() > WIDEST:
+        raise InputError(
+            "its field of view is too wide to be rendered (expected at most 75 degrees off the optical axis): "
+            'remove "distortion" from the rig or use a narrower lens'
+        )
+    low, high = rays.reshape(-1, 2).min(0), rays.reshape(-1, 2).max(0)
+    focal = np.array([camera.intrinsics[0, 0], camera.intrinsics[1, 1]])
+    width, height = (int(np.ceil(n)) + 2 for n in (high - low) * focal)
+    offset = -low * focal + 1
+    intrinsics = np.array([[focal[0], 0, offset[0]], [0, focal[1], offset[1]], [0, 0, 1.0]])
+    pinhole = replace(camera, width=width, height=height, intrinsics=intrinsics, distortion=None)
+    pixels = (rays * focal + offset).astype(np.float32)
+    return pinhole, np.ascontiguousarray(pixels[..., 0]), np.ascontiguousarray(pixels[..., 1])
+
+
+def _undistorted_rays(camera: Camera, pixels: Array) -> Array:
+    """(P, 2) normalised pinhole coordinates of pixels (P, 2), refined until distortion maps them to these pixels."""
+    assert camera.distortion is not None
+    coefficients = np.array(camera.distortion.coefficients)
+    undistort = cv2.fisheye.undistortPoints if camera.distortion.model == "kannala_brandt" else cv2.undistortPoints
+    rays = np.asarray(undistort(pixels[:, None], camera.intrinsics, coefficients), dtype=np.float64)[:, 0]
+    wanted = (pixels - camera.intrinsics[:2, 2]) @ np.linalg.inv(camera.intrinsics[:2, :2]).T
+    for _ in range(REFINEMENTS):
+        rays = rays + (wanted - distort(rays, camera.distortion))
+    return rays

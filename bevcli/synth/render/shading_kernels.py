@@ -5,14 +5,14 @@ Positions are in the world frame in metres, colours are linear RGB.
 """
 
 # mypy: disable-error-code="no-untyped-def"
-# The functions have no type hints: numba takes the types from the first call.
+# The kernels have no type hints: numba takes the types from the first call.
 
 from __future__ import annotations
 
 import numpy as np
 
 from bevcli.jit import njit
-from bevcli.synth.assets.mesh import Material
+from bevcli.synth.assets.paint import Material
 
 LIGHT_LIMIT = 1.6  # the brightest light in the display table
 ROUGH_TEXEL_M = 0.25  # texel size of the ground's roughness
@@ -118,15 +118,8 @@ def _sky(x, y, z, light, to_sun, clouds, out):
     zenith, horizon, cloud = light[3], light[4], light[6]
     up = max(z, 0.0)
     mix = 1.0 - (1.0 - up) * (1.0 - up) * (1.0 - up)
-    size = clouds.shape[0]
     spread = 90.0 / (up + 0.18)
-    fu, fv = x * spread, y * spread
-    iu, iv = int(np.floor(fu)), int(np.floor(fv))
-    wu, wv = fu - iu, fv - iv
-    i0, i1, j0, j1 = iu & (size - 1), (iu + 1) & (size - 1), iv & (size - 1), (iv + 1) & (size - 1)
-    cover = (clouds[j0, i0] * (1 - wu) + clouds[j0, i1] * wu) * (1 - wv) + (
-        clouds[j1, i0] * (1 - wu) + clouds[j1, i1] * wu
-    ) * wv
+    cover = _repeated(clouds, x * spread, y * spread)
     cover *= min(1.0, up * 5.0) * 0.85
     toward = max(x * to_sun[0] + y * to_sun[1] + z * to_sun[2], 0.0)
     toward2 = toward * toward
@@ -135,6 +128,17 @@ def _sky(x, y, z, light, to_sun, clouds, out):
     for c in range(3):
         base = horizon[c] + (zenith[c] - horizon[c]) * mix
         out[c] = base + (cloud[c] - base) * cover + glow * light[0, c]
+
+
+@njit(nogil=True, inline="always")
+def _repeated(texture, u, v):
+    """Linear interpolation of a texture (S, S), S a power of 2, that repeats in both directions, at column u, row v."""
+    size = texture.shape[0]
+    iu, iv = int(np.floor(u)), int(np.floor(v))
+    wu, wv = u - iu, v - iv
+    i0, i1, j0, j1 = iu & (size - 1), (iu + 1) & (size - 1), iv & (size - 1), (iv + 1) & (size - 1)
+    low, high = texture[j0, i0] * (1 - wu) + texture[j0, i1] * wu, texture[j1, i0] * (1 - wu) + texture[j1, i1] * wu
+    return low * (1 - wv) + high * wv
 
 
 @njit(nogil=True, error_model="numpy")
@@ -216,7 +220,7 @@ def _ground(ground, x, y, across, along, rx, ry, out):
         span *= 2
     n = size >> level
     scale = 1.0 / (texel_m * (1 << level))
-    red = green = blue = 0.0
+    out[0] = out[1] = out[2] = 0.0
     step_x, step_y = along / samples * rx / flat * scale, along / samples * ry / flat * scale
     start_x = (x - origin_x) * scale - 0.5 - 0.5 * (samples - 1) * step_x
     start_y = (y - origin_y) * scale - 0.5 - 0.5 * (samples - 1) * step_y
@@ -228,20 +232,12 @@ def _ground(ground, x, y, across, along, rx, ry, out):
         w00, w01, w10, w11 = (1 - wu) * (1 - wv), wu * (1 - wv), (1 - wu) * wv, wu * wv
         at = offsets[level] + iv * n + iu
         under = at + n
-        r = texels[at, 0] * w00 + texels[at + 1, 0] * w01 + texels[under, 0] * w10 + texels[under + 1, 0] * w11
-        g = texels[at, 1] * w00 + texels[at + 1, 1] * w01 + texels[under, 1] * w10 + texels[under + 1, 1] * w11
-        b = texels[at, 2] * w00 + texels[at + 1, 2] * w01 + texels[under, 2] * w10 + texels[under + 1, 2] * w11
-        red, green, blue = red + r * r, green + g * g, blue + b * b
-    share = 1.0 / (65025.0 * samples)
-    out[0], out[1], out[2] = red * share, green * share, blue * share
-    size_n = rough.shape[0]
-    u, v = x / ROUGH_TEXEL_M, y / ROUGH_TEXEL_M
-    iu, iv = int(np.floor(u)), int(np.floor(v))
-    wu, wv = u - iu, v - iv
-    i0, i1, j0, j1 = iu & (size_n - 1), (iu + 1) & (size_n - 1), iv & (size_n - 1), (iv + 1) & (size_n - 1)
-    grain = (rough[j0, i0] * (1 - wu) + rough[j0, i1] * wu) * (1 - wv) + (
-        rough[j1, i0] * (1 - wu) + rough[j1, i1] * wu
-    ) * wv
+        for c in range(3):
+            root = texels[at, c] * w00 + texels[at + 1, c] * w01 + texels[under, c] * w10 + texels[under + 1, c] * w11
+            out[c] += root * root
+    for c in range(3):
+        out[c] *= 1.0 / (65025.0 * samples)
+    grain = _repeated(rough, x / ROUGH_TEXEL_M, y / ROUGH_TEXEL_M)
     if width < 0.05:
         fine = _hash(int(np.floor(x * 45)), int(np.floor(y * 45))) % 256 / 255.0 - 0.5
         grain += 0.22 * fine * min(1.0, (0.05 - width) / 0.035)

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from itertools import product
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -59,6 +60,10 @@ class Street:
         """From the centre line to the kerb, metres."""
         return self.lanes * self.lane_m + self.bike_m + self.parking_m
 
+    def point(self, position: float, offset: float = 0.0) -> tuple[float, float]:
+        """Plan point at a position along the street, `offset` metres from its centre line (towards +y or +x)."""
+        return (position, self.position + offset) if self.axis == 0 else (self.position + offset, position)
+
     def lane_offset(self, lane: int) -> float:
         """From the centre line to the middle of a lane, metres. Lane 0 is the innermost."""
         return self.lane_m * (lane + 0.5)
@@ -82,15 +87,55 @@ class Block:
     high: tuple[float, float]
     sidewalks: tuple[float, float, float, float]
 
-    def side(self, side: int) -> tuple[Array, Array, Array]:
-        """Start, end and inward direction of a side, each (2,) in plan coordinates.
+    def side(self, side: int) -> tuple[Array, Array, Array, float]:
+        """Start (2,), unit vector along it (2,), inward unit vector (2,) and length of a side, plan coordinates.
 
         side: 0 south, 1 east, 2 north, 3 west.
         """
         (x0, y0), (x1, y1) = self.low, self.high
-        corners = [np.array(p, dtype=np.float64) for p in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))]
+        start, end = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)], dtype=np.float64)[[side, (side + 1) % 4]]
+        length = float(np.hypot(*(end - start)))
         inward = np.array([(0, 1), (-1, 0), (0, -1), (1, 0)][side], dtype=np.float64)
-        return corners[side], corners[(side + 1) % 4], inward
+        return start, (end - start) / length, inward, length
+
+    def inside(self, margin: float = 0.0) -> tuple[Array, Array]:
+        """South-west and north-east corner (2,) of the land behind the pavements, `margin` metres from them."""
+        south, east, north, west = self.sidewalks
+        return np.array(self.low) + (west, south) + margin, np.array(self.high) - (east, north) - margin
+
+
+class Neighbourhood(NamedTuple):
+    """A part of the city.
+
+    Attributes:
+        columns: its streets of axis 1, in order.
+        rows: its streets of axis 0, in order.
+        block_columns: columns of its blocks.
+        block_rows: rows of its blocks.
+    """
+
+    columns: list[Street]
+    rows: list[Street]
+    block_columns: range
+    block_rows: range
+
+    @property
+    def blocks(self) -> list[tuple[int, int]]:
+        """Column and row of each block."""
+        return list(product(self.block_columns, self.block_rows))
+
+    @property
+    def nodes(self) -> list[tuple[int, int]]:
+        """Column and row of each junction."""
+        return [(column.index, row.index) for column, row in product(self.columns, self.rows)]
+
+    @property
+    def stretches(self) -> list[tuple[int, int, int]]:
+        """Axis and index of the street of each stretch, and index of the street that crosses it at the beginning."""
+        return [
+            *((1, column.index, k) for column in self.columns for k in self.block_rows),
+            *((0, row.index, k) for row in self.rows for k in self.block_columns),
+        ]
 
 
 class CityPlan:
@@ -113,26 +158,23 @@ class CityPlan:
         entropy = [self.seed, name, *(index + 2**20 for index in indices)]
         return np.random.Generator(np.random.PCG64(np.random.SeedSequence(entropy)))
 
+    def _sway(self, points: Array) -> Array:
+        """Shift (..., 2) of plan points (..., 2) that makes the streets curved, metres."""
+        return self._amplitude * np.sin(2 * np.pi * points[..., ::-1] / self._period + self._phase)
+
     def bend(self, points: ArrayLike) -> Array:
         """Map plan points (..., 2) to world points (..., 2)."""
         p = np.asarray(points, dtype=np.float64)
-        x = p[..., 0] + self._amplitude[0] * np.sin(2 * np.pi * p[..., 1] / self._period[0] + self._phase[0])
-        y = p[..., 1] + self._amplitude[1] * np.sin(2 * np.pi * p[..., 0] / self._period[1] + self._phase[1])
-        world = np.empty_like(p)
-        world[..., 0] = self._cosine * x - self._sine * y
-        world[..., 1] = self._sine * x + self._cosine * y
-        return world
+        x, y = np.moveaxis(p + self._sway(p), -1, 0)
+        return np.stack([self._cosine * x - self._sine * y, self._sine * x + self._cosine * y], axis=-1)
 
     def unbend(self, points: ArrayLike) -> Array:
         """Map world points (..., 2) to plan points (..., 2). The inverse of `bend`, by fixed-point iteration."""
-        w = np.asarray(points, dtype=np.float64)
-        c, s = self._cosine, self._sine
-        target = np.stack([c * w[..., 0] + s * w[..., 1], -s * w[..., 0] + c * w[..., 1]], axis=-1)
-        p = target.copy()
+        x, y = np.moveaxis(np.asarray(points, dtype=np.float64), -1, 0)
+        target = np.stack([self._cosine * x + self._sine * y, -self._sine * x + self._cosine * y], axis=-1)
+        p = target
         for _ in range(12):
-            x = target[..., 0] - self._amplitude[0] * np.sin(2 * np.pi * p[..., 1] / self._period[0] + self._phase[0])
-            y = target[..., 1] - self._amplitude[1] * np.sin(2 * np.pi * p[..., 0] / self._period[1] + self._phase[1])
-            p = np.stack([x, y], axis=-1)
+            p = target - self._sway(p)
         return p
 
     def heading(self, point: ArrayLike, direction: ArrayLike) -> float:
@@ -169,7 +211,7 @@ class CityPlan:
         )  # fmt: skip
 
     def landuse(self, column: int, row: int) -> Landuse:
-        """What a block is used for: 70 % houses, 14 % parks, 16 % building sites."""
+        """Use of a block: 70 % houses, 14 % parks, 16 % building sites."""
         share = self.stream("landuse", column, row).random()
         if share < 0.14:
             return "park"
@@ -179,26 +221,41 @@ class CityPlan:
         """The streets of an axis that overlap the interval from low to high (plan coordinates, metres), in order."""
         index = self.nearest(axis, low) - 1
         found: list[Street] = []
-        while True:
-            street = self.street(axis, index)
-            if street.position - street.half_width > high:
-                return found
+        while (street := self.street(axis, index)).position - street.half_width <= high:
             if street.position + street.half_width >= low:
                 found.append(street)
             index += 1
+        return found
+
+    def around(self, center: ArrayLike, reach_m: float) -> Neighbourhood:
+        """The streets and blocks within `reach_m` metres, along x and y, of a world point (2,)."""
+        x, y = self.unbend(center)
+        columns = self.streets_between(1, x - reach_m, x + reach_m)
+        rows = self.streets_between(0, y - reach_m, y + reach_m)
+        return Neighbourhood(columns, rows, self._gaps(columns, 1, x), self._gaps(rows, 0, y))
+
+    def _gaps(self, streets: list[Street], axis: int, position: float) -> range:
+        """Index of the street before each block; without streets, of the one before the position."""
+        if streets:
+            return range(streets[0].index - 1, streets[-1].index + 1)
+        return range(below := self._below(axis, position), below + 1)
 
     def nearest(self, axis: int, position: float) -> int:
         """Index of the street of an axis whose centre line is nearest to a plan coordinate in metres."""
+        index = self._below(axis, position)
+        before, after = self._position(axis, index), self._position(axis, index + 1)
+        return index if position - before <= after - position else index + 1
+
+    def _below(self, axis: int, position: float) -> int:
         index = round(position / 85)
         while self._position(axis, index) > position:
             index -= 1
         while self._position(axis, index + 1) < position:
             index += 1
-        before, after = self._position(axis, index), self._position(axis, index + 1)
-        return index if position - before <= after - position else index + 1
+        return index
 
 
-def rounded_rectangle(low: tuple[float, float], high: tuple[float, float], radius: float) -> Array:
+def rounded_rectangle(low: Array | tuple[float, float], high: Array | tuple[float, float], radius: float) -> Array:
     """(P, 2) counter-clockwise outline with round corners and with points about every SIDE_STEP_M on its sides."""
     (x0, y0), (x1, y1) = low, high
     radius = min(radius, (x1 - x0) / 2, (y1 - y0) / 2)

@@ -1,4 +1,4 @@
-"""What is painted on the ground: roads, lane lines, crossings and pavements, as polygons in the world frame.
+"""Paint on the ground: roads, lane lines, crossings and pavements, as polygons in the world frame.
 
 The ground texture and the ground truth map are both drawn from these polygons.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -56,7 +57,7 @@ class GroundPiece:
     """The ground of one block, junction or stretch of street, in the world frame, metres.
 
     Attributes:
-        paints: what is painted, in this order.
+        paints: polygons in the order of painting.
         roads: polygons (P, 2) of the drivable road.
         lane_boundaries: polylines (P, 2).
         crossings: polygons (P, 2) of pedestrian crossings.
@@ -73,57 +74,37 @@ class GroundPlan:
 
     def __init__(self, city: CityPlan) -> None:
         self.city = city
-        self._pieces: dict[tuple[str, int, int], GroundPiece] = {}
+        self._block = lru_cache(maxsize=None)(self._make_block)
+        self._stretch = lru_cache(maxsize=None)(self._make_stretch)
+        self._junction = lru_cache(maxsize=None)(self._make_junction)
 
     def pieces_around(self, center: ArrayLike, reach_m: float) -> list[GroundPiece]:
         """Pieces within `reach_m` metres of a world point (2,), in the order in which they must be painted."""
-        x, y = self.city.unbend(center)
-        reach = reach_m * 1.1 + 10
-        columns = self.city.streets_between(1, x - reach, x + reach)
-        rows = self.city.streets_between(0, y - reach, y + reach)
-        found = []
-        for i in range(columns[0].index - 1, columns[-1].index + 1):
-            for j in range(rows[0].index - 1, rows[-1].index + 1):
-                found.append(self._piece("block", i, j))
-        for street in columns + rows:
-            others = rows if street.axis == 1 else columns
-            for k in range(others[0].index - 1, others[-1].index + 1):
-                found.append(self._piece(f"stretch{street.axis}", street.index, k))
-        for i in range(columns[0].index, columns[-1].index + 1):
-            for j in range(rows[0].index, rows[-1].index + 1):
-                found.append(self._piece("junction", i, j))
-        return found
+        near = self.city.around(center, reach_m * 1.1 + 10)
+        return [
+            *(self._block(*block) for block in near.blocks),
+            *(self._stretch(*stretch) for stretch in near.stretches),
+            *(self._junction(*node) for node in near.nodes),
+        ]
 
-    def _piece(self, kind: str, i: int, j: int) -> GroundPiece:
-        key = (kind, i, j)
-        if key not in self._pieces:
-            makers = {"block": self._block, "junction": self._junction}
-            make = makers.get(kind)
-            self._pieces[key] = make(i, j) if make else self._stretch(int(kind[-1]), i, j)
-        return self._pieces[key]
-
-    def _block(self, column: int, row: int) -> GroundPiece:
+    def _make_block(self, column: int, row: int) -> GroundPiece:
         """The kerb, the pavement with its joints, and the land behind it."""
         city, block = self.city, self.city.block(column, row)
+        (x0, y0), (x1, y1) = block.low, block.high
         outline = city.bend(rounded_rectangle(block.low, block.high, CORNER_M))
-        inner = rounded_rectangle(
-            (block.low[0] + 0.25, block.low[1] + 0.25), (block.high[0] - 0.25, block.high[1] - 0.25), CORNER_M - 0.25
-        )
+        inner = rounded_rectangle((x0 + 0.25, y0 + 0.25), (x1 - 0.25, y1 - 0.25), CORNER_M - 0.25)
         paints = [GroundPaint(outline, KERB), GroundPaint(city.bend(inner), PAVEMENT)]
         south, east, north, west = block.sidewalks
-        (x0, y0), (x1, y1) = block.low, block.high
         x, y = np.arange(x0 + 1, x1 - 1, 1.5), np.arange(y0 + 1, y1 - 1, 1.5)
         for low, high in ((y0 + 0.3, y0 + south), (y1 - north, y1 - 0.3)):
             paints += self._bars(_pairs(x, low), _pairs(x, high), 0.04, JOINT)
         for low, high in ((x0 + 0.3, x0 + west), (x1 - east, x1 - 0.3)):
             paints += self._bars(_pairs(y, low)[:, ::-1], _pairs(y, high)[:, ::-1], 0.04, JOINT)
-        yard_low = (x0 + west, y0 + south)
-        yard_high = (x1 - east, y1 - north)
-        yard = city.bend(rounded_rectangle(yard_low, yard_high, 0.5))
+        yard = city.bend(rounded_rectangle(*block.inside(), 0.5))
         paints.append(GroundPaint(yard, YARD[city.landuse(column, row)]))
         return GroundPiece(tuple(paints))
 
-    def _junction(self, column: int, row: int) -> GroundPiece:
+    def _make_junction(self, column: int, row: int) -> GroundPiece:
         """The area where two streets meet, with its crossings and stop lines."""
         a, b = self.city.street(1, column), self.city.street(0, row)
         x, y = a.position, b.position
@@ -134,19 +115,15 @@ class GroundPlan:
             edge = (y if street is a else x) + sign * across.half_width
             crossings.append(self._band(street, edge + sign * CROSSING_FROM_M, edge + sign * CROSSING_TO_M))
             offsets = np.arange(-street.half_width + 0.75, street.half_width - 0.05, 1.1)
-            start = [self._at(street, edge + sign * CROSSING_FROM_M, offset) for offset in offsets]
-            end = [self._at(street, edge + sign * CROSSING_TO_M, offset) for offset in offsets]
+            start = [street.point(edge + sign * CROSSING_FROM_M, offset) for offset in offsets]
+            end = [street.point(edge + sign * CROSSING_TO_M, offset) for offset in offsets]
             paints += self._bars(start, end, 0.55, WHITE)
-            side = self._approach_side(street, sign)
-            stop = edge + sign * STOP_LINE_M
-            paints.append(
-                self._bar(self._at(street, stop, side * 0.15),
-                          self._at(street, stop, side * (street.lanes * street.lane_m + street.bike_m)), 0.4, WHITE)
-            )  # fmt: skip
-        road = self.city.bend(outline)
-        return GroundPiece(tuple(paints), roads=(road,), crossings=tuple(crossings))
+            side, stop = _approach_side(street, sign), edge + sign * STOP_LINE_M
+            kerb = side * (street.lanes * street.lane_m + street.bike_m)
+            paints += self._bars([street.point(stop, side * 0.15)], [street.point(stop, kerb)], 0.4, WHITE)
+        return GroundPiece(tuple(paints), roads=(self.city.bend(outline),), crossings=tuple(crossings))
 
-    def _stretch(self, axis: int, index: int, cross: int) -> GroundPiece:
+    def _make_stretch(self, axis: int, index: int, cross: int) -> GroundPiece:
         """A street between two junctions: asphalt from centre to centre, lines between the stop lines."""
         street = self.city.street(axis, index)
         before, after = self.city.street(1 - axis, cross), self.city.street(1 - axis, cross + 1)
@@ -158,19 +135,18 @@ class GroundPlan:
         lanes_edge = street.lanes * street.lane_m
         for side in (-1, 1):
             if street.painted_bike:
-                paints.append(
-                    GroundPaint(self._band(street, low, high, side * lanes_edge, side * (lanes_edge + street.bike_m)),
-                                BIKE_LANE)
-                )  # fmt: skip
+                lane = self._band(street, low, high, side * lanes_edge, side * (lanes_edge + street.bike_m))
+                paints.append(GroundPaint(lane, BIKE_LANE))
             if street.parking_m:
                 inner = lanes_edge + street.bike_m
-                paints.append(
-                    GroundPaint(self._band(street, low, high, side * inner, side * street.half_width), PARKING)
-                )
+                lane = self._band(street, low, high, side * inner, side * street.half_width)
+                paints.append(GroundPaint(lane, PARKING))
             for offset, color, dash in self._lines(street):
                 boundaries.append(self.city.bend(self._line(street, low, high, side * offset)))
-                dashes = list(self._dashes(street, low, high, side * offset, dash))
-                paints += self._bars([a for a, _ in dashes], [b for _, b in dashes], LINE_M, color)
+                length, step = (dash, dash * 2.5) if dash else (4.0, 4.0)
+                starts = np.arange(low, high, step)
+                ends = [street.point(min(at + length, high), side * offset) for at in starts]
+                paints += self._bars([street.point(at, side * offset) for at in starts], ends, LINE_M, color)
         paints += self._marks(street, low, high)
         return GroundPiece(tuple(paints), (self._band(street, start, end),), tuple(boundaries))
 
@@ -187,7 +163,7 @@ class GroundPlan:
         """Arrows before the stop lines, patches and manhole covers."""
         rng = self.city.stream("marks", street.axis, street.index, int(low))
         for sign, stop in ((1, low), (-1, high)):
-            side = self._approach_side(street, sign)
+            side = _approach_side(street, sign)
             for lane in range(street.lanes):
                 for back in (5.0, 17.0):
                     yield from self._arrow(street, stop + sign * back, side * street.lane_offset(lane), sign)
@@ -199,35 +175,16 @@ class GroundPlan:
         for _ in range(3):
             at, offset = rng.uniform(low, high), rng.uniform(-1, 1) * (street.half_width - 2)
             angle = np.linspace(0, 2 * np.pi, 14)[:-1]
-            yield GroundPaint(
-                self.city.bend(
-                    np.array(self._at(street, at, offset)) + 0.36 * np.stack([np.cos(angle), np.sin(angle)], -1)
-                ),
-                (58, 56, 55),
-            )
+            cover = np.array(street.point(at, offset)) + 0.36 * np.stack([np.cos(angle), np.sin(angle)], -1)
+            yield GroundPaint(self.city.bend(cover), (58, 56, 55))
 
     def _arrow(self, street: Street, at: float, offset: float, sign: int) -> Iterator[GroundPaint]:
-        yield self._bar(self._at(street, at, offset), self._at(street, at + sign * 2.2, offset), 0.16, WHITE)
-        head = [self._at(street, at - sign * 1.1, offset), self._at(street, at, offset + 0.42),
-                self._at(street, at, offset - 0.42)]  # fmt: skip
+        yield from self._bars([street.point(at, offset)], [street.point(at + sign * 2.2, offset)], 0.16, WHITE)
+        head = [street.point(at - sign * 1.1, offset), street.point(at, offset + 0.42), street.point(at, offset - 0.42)]
         yield GroundPaint(self.city.bend(head), WHITE)
 
-    def _approach_side(self, street: Street, sign: int) -> int:
-        """The sign of the offset of the lanes that lead to a junction.
-
-        sign: +1 where the stretch begins at the junction, -1 where it ends there, along the street's axis.
-        """
-        towards = -sign  # their direction along the street
-        return -towards if street.axis == 0 else towards
-
-    def _at(self, street: Street, position: float, offset: float) -> tuple[float, float]:
-        """Plan point at a position along a street, `offset` metres from its centre line (towards +y or +x)."""
-        if street.axis == 0:
-            return position, street.position + offset
-        return street.position + offset, position
-
     def _line(self, street: Street, start: float, end: float, offset: float) -> Array:
-        return along(self._at(street, start, offset), self._at(street, end, offset))
+        return along(street.point(start, offset), street.point(end, offset))
 
     def _band(
         self, street: Street, start: float, end: float, low: float | None = None, high: float | None = None
@@ -235,21 +192,8 @@ class GroundPlan:
         """World outline (P, 2) of a strip of a street. low, high: offsets of its edges; default: the kerbs."""
         low = -street.half_width if low is None else low
         high = street.half_width if high is None else high
-        return self.city.bend(
-            np.concatenate([self._line(street, start, end, low), self._line(street, start, end, high)[::-1]])
-        )
-
-    def _dashes(
-        self, street: Street, low: float, high: float, offset: float, dash: float
-    ) -> Iterator[tuple[tuple[float, float], tuple[float, float]]]:
-        step = dash * 2.5 if dash else 4.0
-        for start in np.arange(low, high, step):
-            end = min(start + (dash or step), high)
-            yield self._at(street, start, offset), self._at(street, end, offset)
-
-    def _bar(self, start: tuple[float, float], end: tuple[float, float], width: float, color: Color) -> GroundPaint:
-        """A painted line between two plan points. width: metres."""
-        return self._bars([start], [end], width, color)[0]
+        edges = self._line(street, start, end, low), self._line(street, start, end, high)[::-1]
+        return self.city.bend(np.concatenate(edges))
 
     def _bars(self, starts: ArrayLike, ends: ArrayLike, width: float, color: Color) -> list[GroundPaint]:
         """Painted lines from plan points (L, 2) to plan points (L, 2). width: metres."""
@@ -258,6 +202,14 @@ class GroundPlan:
         normal = np.stack([-way[:, 1], way[:, 0]], -1) / np.linalg.norm(way, axis=1, keepdims=True) * width / 2
         corners = self.city.bend(np.stack([a + normal, b + normal, b - normal, a - normal], axis=1))
         return [GroundPaint(outline, color, width) for outline in corners]
+
+
+def _approach_side(street: Street, sign: int) -> int:
+    """The sign of the offset of the lanes that lead to a junction.
+
+    sign: +1 where the stretch begins at the junction, -1 where it ends there, along the street's axis.
+    """
+    return sign if street.axis == 0 else -sign
 
 
 def _pairs(varying: Array, fixed: float) -> Array:

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from bevcli.geometry.transforms import Array
 from bevcli.synth.assets.catalog import Body, Catalog, draw_body
 from bevcli.synth.assets.people import PERSON_NAMES
-from bevcli.synth.world.actors import MOVING_M_S, ActorState
 from bevcli.synth.world.city import KERB_M, CityPlan, along, rounded_rectangle
 from bevcli.synth.world.route import DIRECTIONS, node_center, street_of
-from bevcli.synth.world.signals import Signals
+from bevcli.synth.world.traffic import MOVING_M_S, ActorState, Signals
 
 STRIDE_M = 0.72  # distance after which the pose changes
 CROSSING_LINE_M = 3.2  # from the edge of the junction to the line on which people cross
@@ -50,7 +49,7 @@ class Walker:
         return np.array([np.interp(place, self.positions, self.path[:, k]) for k in (0, 1)])
 
     def on_road(self, time_s: float) -> bool:
-        """Whether the person is on the road at a time, so that vehicles must stop."""
+        """True while the person is on the road, so that vehicles must stop."""
         return self.road[0] - 0.3 < float(np.interp(time_s, self.times, self.places)) < self.road[1] + 0.3
 
     def state(self, time_s: float) -> ActorState | None:
@@ -85,7 +84,7 @@ def _make(
     return Walker(city, body, path, np.concatenate([[0], np.cumsum(steps)]), np.array(times), np.array(places), road)
 
 
-def strollers(city: CityPlan, catalog: Catalog, column: int, row: int, span_s: tuple[float, float]) -> list[Walker]:
+def strollers(city: CityPlan, catalog: Catalog, span_s: tuple[float, float], column: int, row: int) -> list[Walker]:
     """People who walk around a block on its pavement. span_s: start and end of the simulation, seconds."""
     rng = city.stream("strollers", column, row)
     land = city.block(column, row)
@@ -107,7 +106,7 @@ def strollers(city: CityPlan, catalog: Catalog, column: int, row: int, span_s: t
 
 
 def crossers(
-    city: CityPlan, catalog: Catalog, signals: Signals, node: tuple[int, int], span_s: tuple[float, float]
+    city: CityPlan, catalog: Catalog, signals: Signals, span_s: tuple[float, float], node: tuple[int, int]
 ) -> list[Walker]:
     """People who cross a street at a junction, over the whole simulation.
 

@@ -29,7 +29,6 @@ class JunctionPass:
         direction: index into DIRECTIONS on the approach.
         turn: -1 right, 0 straight on, 1 left.
         stop: route position of the stop line, metres.
-        enter: route position of the near edge of the junction, metres.
         leave: route position behind the crossing on the far side, metres.
     """
 
@@ -37,7 +36,6 @@ class JunctionPass:
     direction: int
     turn: int
     stop: float
-    enter: float
     leave: float
 
 
@@ -78,7 +76,7 @@ class Route:
 
 @dataclass(frozen=True)
 class LaneStart:
-    """Where a route begins.
+    """Start of a route.
 
     Attributes:
         node: column and row of the first junction ahead.
@@ -162,10 +160,9 @@ def build_route(
         radius = _radius(cross, new_offset, turn)
         begin, end = corner - DIRECTIONS[direction] * radius, corner + DIRECTIONS[after] * radius
         stop = _lane_point(center, direction, offset, -(cross.half_width + STOP_LINE_M))
-        enter = _lane_point(center, direction, offset, -cross.half_width)
         across = street_of(city, node, after + 1)
         leave = _lane_point(center, after, new_offset, across.half_width + CROSSING_TO_M)
-        marks.append((node, direction, turn, stop, enter, leave))
+        marks.append((node, direction, turn, stop, leave))
         piece = _arc(begin, corner, end) if turn != 0 else np.stack([begin, end])
         corners.append(piece)
         travelled += float(np.linalg.norm(piece[0] - at)) + radius * 1.6
@@ -200,7 +197,7 @@ def _arc(begin: Array, corner: Array, end: Array) -> Array:
 def _finish(city: CityPlan, corners: Array, marks: list, speed: float) -> Route:
     """Sample a plan line (C, 2), map it to the world, smooth it, and find the route positions of the marks.
 
-    marks: of each junction: node, direction, turn, and the plan points of stop, enter and leave.
+    marks: of each junction: node, direction, turn, and the plan points of stop and leave.
     """
     along_corners = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
     samples = np.arange(0, along_corners[-1], STEP_M)

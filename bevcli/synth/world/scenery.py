@@ -1,18 +1,203 @@
-"""Objects without annotations: kerbs, houses, trees, street furniture and traffic signals."""
+"""Objects without annotations: houses, kerbs, trees, street furniture and traffic signals."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
+
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from bevcli.geometry.transforms import Array
-from bevcli.synth.assets.mesh import joined
+from bevcli.synth.assets.mesh import Mesh, from_faces, joined, prism
+from bevcli.synth.assets.paint import Color, Finish, Material, darker, linear
 from bevcli.synth.assets.street_furniture import TREE_KINDS, StreetFurniture
 from bevcli.synth.assets.triangles import MeshTemplate, PlacedMesh, TriangleSoup
-from bevcli.synth.world.buildings import House, houses, kerb_slab
 from bevcli.synth.world.city import CORNER_M, KERB_M, Block, CityPlan, rounded_rectangle
 from bevcli.synth.world.route import DIRECTIONS, node_center, right_of, street_of
-from bevcli.synth.world.signals import Signals
+from bevcli.synth.world.traffic import Signals
+
+BRICK: tuple[Color, ...] = ((150, 82, 62), (128, 66, 54), (168, 108, 80), (110, 74, 64), (178, 130, 98))
+PLASTER: tuple[Color, ...] = (
+    (214, 202, 178), (198, 178, 142), (186, 192, 190), (222, 214, 204), (176, 150, 128), (164, 178, 162),
+    (206, 172, 144),
+)  # fmt: skip
+OFFICE: tuple[Color, ...] = ((120, 126, 132), (150, 152, 150), (90, 98, 106), (176, 172, 164))
+ROOF: Color = (104, 98, 94)
+
+
+@dataclass(frozen=True)
+class FacadeStyle:
+    """The look of a wall.
+
+    Attributes:
+        wall: sRGB colour of the wall.
+        floor_m: height of a storey, metres.
+        pitch_m: distance between the middles of two windows, metres.
+        window_m: width and height of a window, metres.
+        shop_m: height of the ground floor, metres; below 1 it is a plinth instead of a shop front.
+        brick: contrast of the brick pattern, 0 to 1; 0 is plaster.
+        band: whether the windows of a storey form one horizontal band.
+        seed: seed of the random details, 0 to 4095.
+    """
+
+    wall: Color
+    floor_m: float
+    pitch_m: float
+    window_m: tuple[float, float]
+    shop_m: float
+    brick: float
+    band: bool
+    seed: int
+
+
+def facade_row(
+    style: FacadeStyle, origin: NDArray[np.float64], tangent: NDArray[np.float64], height: float, length: float
+) -> NDArray[np.float32]:
+    """(16,) numbers that describe a wall to the shading kernel.
+
+    origin: (2,) world point of the wall's start, metres. tangent: (2,) unit vector along the wall, counter-clockwise
+    around the house. height, length: of the wall, metres.
+    """
+    wall = linear(style.wall)
+    return np.array(
+        [*origin, *tangent, height, length, style.floor_m, style.pitch_m, *style.window_m, style.shop_m, style.brick,
+         float(style.band) + 2.0 * (style.seed % 4096), *wall], np.float32,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class House:
+    """One building, in the world frame.
+
+    Attributes:
+        walls: two triangles for each of its four walls, with the material FACADE.
+        facades: (4, 16) made by `facade_row`.
+        rest: roof, awnings and roof structures.
+    """
+
+    walls: Mesh
+    facades: NDArray[np.float32]
+    rest: Mesh
+
+    def placed(self) -> list[PlacedMesh]:
+        """The walls and the rest as meshes in the world."""
+        rows = np.repeat(np.arange(4), 2).astype(np.int32)
+        return [PlacedMesh.from_mesh(self.walls, rows, self.facades), PlacedMesh.from_mesh(self.rest)]
+
+
+def houses(city: CityPlan, land: Block) -> list[House]:
+    """Row houses along the four sides of a block, with some gaps."""
+    rng = city.stream("houses", land.column, land.row)
+    (x0, y0), (x1, y1) = land.inside()
+    depth = min(14.0, (x1 - x0) / 2 - 2, (y1 - y0) / 2 - 2)
+    built = []
+    for low, high in ((y0, y0 + depth), (y1 - depth, y1)):
+        built += [_house(city, rng, (a, low), (b, high)) for a, b in _lots(rng, x0, x1)]
+    for low, high in ((x0, x0 + depth), (x1 - depth, x1)):
+        built += [_house(city, rng, (low, a), (high, b)) for a, b in _lots(rng, y0 + depth + 0.5, y1 - depth - 0.5)]
+    return built
+
+
+def _lots(rng: np.random.Generator, start: float, end: float) -> list[tuple[float, float]]:
+    """Cut a side of a block into lots of 9 to 24 m, given by start and end. One lot in ten stays empty."""
+    lots, at = [], start
+    while at < end - 8:
+        to = min(at + rng.uniform(9, 24), end)
+        if end - to < 8:
+            to = end
+        if rng.random() > 0.1:
+            lots.append((at, to))
+        at = to
+    return lots
+
+
+def _style(rng: np.random.Generator, height: float) -> FacadeStyle:
+    seed = int(rng.integers(4096))
+    shop = 3.9 if rng.random() < 0.6 else 0.6
+    kind = rng.random()
+    if kind < 0.42:
+        wall, brick, band = BRICK[rng.integers(len(BRICK))], 0.9, False
+    elif kind < 0.78 or height < 12:
+        wall, brick, band = PLASTER[rng.integers(len(PLASTER))], 0.0, False
+    else:
+        wall, brick, band = OFFICE[rng.integers(len(OFFICE))], 0.0, True
+    pitch = rng.uniform(2.2, 3.4)
+    window = (min(rng.uniform(1.0, 1.7), pitch - 0.5), rng.uniform(1.4, 1.9))
+    return FacadeStyle(wall, rng.uniform(3.0, 3.5), pitch, window, shop, brick, band, seed)
+
+
+def _house(city: CityPlan, rng: np.random.Generator, low: tuple[float, float], high: tuple[float, float]) -> House:
+    """A house on a plan rectangle, with its four corners mapped to the world."""
+    storeys = int(rng.choice([2, 3, 4, 5, 6, 8, 11], p=[0.12, 0.22, 0.22, 0.18, 0.12, 0.09, 0.05]))
+    style = _style(rng, storeys * 3.2)
+    height = style.shop_m + storeys * style.floor_m + 0.9 + KERB_M
+    setback = rng.choice([0.0, 0.0, 0.6])
+    corners = np.array([low, (high[0], low[1]), high, (low[0], high[1])], dtype=np.float64)
+    corners += setback * np.sign(corners.mean(0) - corners)
+    ground = city.bend(corners)
+    walls, rows = zip(*(_wall(ground[k], ground[(k + 1) % 4], height, style) for k in range(4)), strict=True)
+    rest = [_roof(ground, height, style)]
+    if style.shop_m > 1:
+        rest += _awnings(rng, ground)
+    middle = ground.mean(0)
+    for _ in range(int(rng.integers(0, 3))):
+        at = middle + rng.uniform(-3, 3, 2)
+        square = at + np.array([(1.1, 0.8), (-1.1, 0.8), (-1.1, -0.8), (1.1, -0.8)])
+        rest.append(prism([np.column_stack([square, np.full(4, height + z)]) for z in (0.0, 1.3)], (150, 150, 148)))
+    return House(joined(walls), np.stack(rows), joined(rest))
+
+
+def _wall(start: Array, end: Array, height: float, style: FacadeStyle) -> tuple[Mesh, NDArray[np.float32]]:
+    """One wall between two world points (2,), and its row of `House.facades`."""
+    length = float(np.hypot(*(end - start)))
+    a, b, top_a, top_b = (*start, 0.0), (*end, 0.0), (*start, height), (*end, height)
+    mesh = from_faces([[a, b, top_b], [a, top_b, top_a]], Finish(style.wall, Material.FACADE))
+    return mesh, facade_row(style, start, (end - start) / length, height, length)
+
+
+def _roof(ground: Array, height: float, style: FacadeStyle) -> Mesh:
+    """A flat slab that overhangs the walls by 0.25 m."""
+    middle = ground.mean(0)
+    wide = middle + (ground - middle) * (1 + 0.25 / np.linalg.norm(ground - middle, axis=1, keepdims=True))
+    rings = [np.column_stack([wide, np.full(4, z)]) for z in (height - 0.22, height + 0.12)]
+    return prism(rings, darker(style.wall, 0.8) if style.band else ROOF)
+
+
+def _awnings(rng: np.random.Generator, ground: Array) -> list[Mesh]:
+    """Slanted awnings over some of the shop fronts."""
+    colors: tuple[Color, ...] = ((164, 44, 40), (42, 92, 66), (44, 66, 120), (206, 196, 176), (198, 138, 44))
+    parts = []
+    for k in range(4):
+        start, end = ground[k], ground[(k + 1) % 4]
+        length = np.hypot(*(end - start))
+        if rng.random() > 0.4 or length < 9:
+            continue
+        way = (end - start) / length
+        out = np.array([way[1], -way[0]])
+        a = start + way * rng.uniform(1.0, length - 5.5)
+        b = a + way * 4.0
+        footprint = np.array([a, a + out * 1.3, b + out * 1.3, b])
+        rings = [np.column_stack([footprint, (h, e, e, h)]) for h, e in ((3.15, 2.65), (3.3, 2.72))]
+        parts.append(prism(rings, colors[int(rng.integers(len(colors)))]))
+    return parts
+
+
+def kerb_slab(city: CityPlan, outline: Array) -> Mesh:
+    """The raised ground of a block over a plan outline (P, 2): kerb stones around a top with the material GROUND."""
+    ring = city.bend(outline)
+    middle = ring.mean(0)
+    following = np.roll(ring, -1, axis=0)
+    a, b, top_a, top_b = (
+        np.column_stack([points, np.full(len(ring), z)]) for z in (0.0, KERB_M) for points in (ring, following)
+    )
+    center = np.tile([*middle, KERB_M], (len(ring), 1))
+    sides = np.concatenate([np.stack([a, b, top_b], 1), np.stack([a, top_b, top_a], 1)])
+    faces = np.concatenate([sides, np.stack([top_a, top_b, center], 1)]).astype(np.float32)
+    material = np.r_[np.full(len(sides), Material.MATTE), np.full(len(ring), Material.GROUND)].astype(np.uint8)
+    return Mesh(faces, np.tile(linear((176, 174, 168)), (len(faces), 1)), material)
+
 
 SIGNALS_REACH_M = 110.0  # traffic signals are drawn within this distance
 
@@ -22,37 +207,23 @@ class Scenery:
 
     def __init__(self, city: CityPlan, furniture: StreetFurniture) -> None:
         self.city, self.furniture = city, furniture
-        self._blocks: dict[tuple[int, int], list[PlacedMesh]] = {}
+        self._block = lru_cache(maxsize=None)(self._make_block)
 
     def around(self, center: ArrayLike, reach_m: float) -> TriangleSoup:
         """Meshes within `reach_m` metres of a world point (2,)."""
-        x, y = self.city.unbend(center)
-        columns = self.city.streets_between(1, x - reach_m, x + reach_m)
-        rows = self.city.streets_between(0, y - reach_m, y + reach_m)
-        found: list[PlacedMesh] = []
-        for i in range(columns[0].index - 1, columns[-1].index + 1):
-            for j in range(rows[0].index - 1, rows[-1].index + 1):
-                found += self._block(i, j)
-        at = np.asarray(center, dtype=np.float64)
-        near = [mesh for mesh in found if np.hypot(*(mesh.sphere[:2] - at)) < reach_m + mesh.sphere[3]]
+        found = [mesh for block in self.city.around(center, reach_m).blocks for mesh in self._block(*block)]
+        distances = [np.hypot(*(mesh.sphere[:2] - np.asarray(center, dtype=np.float64))) for mesh in found]
+        near = [(mesh, at) for mesh, at in zip(found, distances, strict=True) if at < reach_m + mesh.sphere[3]]
         # Draw walls first, near ones before far ones: they hide most of the rest, which is then skipped.
-        near.sort(key=lambda mesh: (len(mesh.triangles.facades) == 0, float(np.hypot(*(mesh.sphere[:2] - at)))))
-        return TriangleSoup.gather(near, [-1] * len(near))
+        near.sort(key=lambda item: (len(item[0].triangles.facades) == 0, item[1]))
+        return TriangleSoup.gather([mesh for mesh, _ in near], [-1] * len(near))
 
-    def _block(self, column: int, row: int) -> list[PlacedMesh]:
-        key = (column, row)
-        if key not in self._blocks:
-            self._blocks[key] = self._make(self.city.block(column, row))
-        return self._blocks[key]
-
-    def _make(self, land: Block) -> list[PlacedMesh]:
-        slab = kerb_slab(self.city, rounded_rectangle(land.low, land.high, CORNER_M))
-        meshes = [PlacedMesh.from_mesh(slab)]
-        use = self.city.landuse(land.column, land.row)
+    def _make_block(self, column: int, row: int) -> list[PlacedMesh]:
+        land, use = self.city.block(column, row), self.city.landuse(column, row)
+        meshes = [PlacedMesh.from_mesh(kerb_slab(self.city, rounded_rectangle(land.low, land.high, CORNER_M)))]
         if use == "houses":
-            for house in houses(self.city, land):
-                meshes += _house_meshes(house)
-        rng = self.city.stream("furniture", land.column, land.row)
+            meshes += [mesh for house in houses(self.city, land) for mesh in house.placed()]
+        rng = self.city.stream("furniture", column, row)
         if use == "park":
             meshes += self._park(land, rng)
         for side in range(4):
@@ -61,9 +232,7 @@ class Scenery:
 
     def _park(self, land: Block, rng: np.random.Generator) -> list[PlacedMesh]:
         """Trees and bushes all over a block."""
-        south, east, north, west = land.sidewalks
-        low = np.array([land.low[0] + west + 1.5, land.low[1] + south + 1.5])
-        high = np.array([land.high[0] - east - 1.5, land.high[1] - north - 1.5])
+        low, high = land.inside(1.5)
         count = int(np.prod(high - low) / 75)
         meshes = []
         for point in low + rng.random((count, 2)) * (high - low):
@@ -73,10 +242,8 @@ class Scenery:
 
     def _side(self, land: Block, side: int, rng: np.random.Generator) -> list[PlacedMesh]:
         """The pavement on one side of a block: trees, lamps and signs near the kerb, benches and bins between them."""
-        start, end, inward = land.side(side)
+        start, way, inward, length = land.side(side)
         street = self.city.street(side % 2, (land.row, land.column + 1, land.row + 1, land.column)[side])
-        length = float(np.hypot(*(end - start)))
-        way = (end - start) / length
         outward = self.city.heading(start, -inward)
         meshes, at = [], CORNER_M + 3.0
         lamp_next = bool(rng.random() < 0.5)
@@ -105,13 +272,6 @@ class Scenery:
         return template.placed((float(x), float(y), KERB_M), yaw)
 
 
-def _house_meshes(house: House) -> list[PlacedMesh]:
-    wall = joined([w.mesh for w in house.walls])
-    rows = np.stack([w.row for w in house.walls])
-    index = np.repeat(np.arange(len(rows)), [len(w.mesh.faces) for w in house.walls]).astype(np.int32)
-    return [PlacedMesh.from_mesh(wall, index, rows), PlacedMesh.from_mesh(joined(house.rest))]
-
-
 def signal_meshes(
     city: CityPlan, signals: Signals, furniture: StreetFurniture, here: ArrayLike, time_s: float
 ) -> list[PlacedMesh]:
@@ -119,18 +279,12 @@ def signal_meshes(
 
     Each junction has one signal for each approach, behind the junction on the right.
     """
-    x, y = city.unbend(here)
-    reach = SIGNALS_REACH_M
     meshes = []
-    for column in city.streets_between(1, x - reach, x + reach):
-        for row in city.streets_between(0, y - reach, y + reach):
-            node = (column.index, row.index)
-            for direction in range(4):
-                street, cross = street_of(city, node, direction), street_of(city, node, direction + 1)
-                ahead = DIRECTIONS[direction] * (cross.half_width + 0.9)
-                spot = node_center(city, node) + ahead + right_of(direction) * (street.half_width + 0.9)
-                template = furniture.signals[signals.light(node, direction % 2, time_s)]
-                yaw = city.heading(spot, -DIRECTIONS[direction])
-                px, py = city.bend(spot)
-                meshes.append(template.placed((float(px), float(py), KERB_M), yaw))
+    for node, direction in product(city.around(here, SIGNALS_REACH_M).nodes, range(4)):
+        street, cross = street_of(city, node, direction), street_of(city, node, direction + 1)
+        ahead = DIRECTIONS[direction] * (cross.half_width + 0.9)
+        spot = node_center(city, node) + ahead + right_of(direction) * (street.half_width + 0.9)
+        template = furniture.signals[signals.light(node, direction % 2, time_s)]
+        x, y = city.bend(spot)
+        meshes.append(template.placed((float(x), float(y), KERB_M), city.heading(spot, -DIRECTIONS[direction])))
     return meshes

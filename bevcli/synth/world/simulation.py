@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,14 +12,117 @@ from scipy.ndimage import gaussian_filter1d
 from bevcli.geometry.ego_motion import GRAVITY
 from bevcli.geometry.transforms import Array
 from bevcli.synth.assets.catalog import Catalog, draw_body
-from bevcli.synth.world.actors import Actor, DrivingActor, interpolated_track
-from bevcli.synth.world.city import CityPlan
-from bevcli.synth.world.pedestrians import Walker, crossers, strollers
+from bevcli.synth.world.city import STOP_LINE_M, CityPlan
+from bevcli.synth.world.pedestrians import crossers, strollers
 from bevcli.synth.world.roadside import Roadside
-from bevcli.synth.world.route import Route
-from bevcli.synth.world.signals import Signals
-from bevcli.synth.world.spawning import VehicleSpawner
-from bevcli.synth.world.traffic import STEP_S, Unit, Vehicle, step
+from bevcli.synth.world.route import (
+    DIRECTIONS,
+    LaneStart,
+    Route,
+    bicycle_turns,
+    build_route,
+    draw_turns,
+    lane_offset,
+    node_center,
+    right_of,
+    street_of,
+)
+from bevcli.synth.world.traffic import STEP_S, Actor, DrivingActor, Signals, Unit, Vehicle, interpolated_track, step
+
+TRAFFIC_MIX = {
+    "car": 0.54, "truck": 0.12, "bus": 0.09, "train": 0.09, "motorcycle": 0.10, "construction_vehicle": 0.06,
+}  # fmt: skip
+RIDERS = {
+    "motorcycle": ("sport_rider", "cruiser_rider", "scooter_rider"),
+    "bicycle": ("city_rider", "racer_rider", "cargo_rider", "mountain_rider"),
+}
+DRIVING_MACHINES = ("loader", "backhoe", "crane", "mixer")
+SEMITRAILERS = ("box", "curtain", "container", "tanker", "flatbed")
+
+
+class VehicleSpawner:
+    """Draws vehicles and their routes. route_m: length of the ego vehicle's route, metres; others in proportion."""
+
+    def __init__(self, city: CityPlan, catalog: Catalog, route_m: float) -> None:
+        self.city, self.catalog, self.route_m = city, catalog, route_m
+        self._rng = city.stream("population")
+        self._count = 0
+
+    def spawn_ego(self, units: tuple[Unit, ...]) -> Vehicle:
+        """The ego vehicle, on the approach to junction (0, 0)."""
+        rng = self.city.stream("ego")
+        direction = int(rng.integers(4))
+        lane = int(rng.integers(street_of(self.city, (0, 0), direction).lanes))
+        edge = street_of(self.city, (0, 0), direction + 1).half_width + STOP_LINE_M
+        start = LaneStart((0, 0), direction, lane, edge + rng.uniform(18, 78))
+        speed = float(rng.uniform(8.0, 12.0))
+        route = build_route(self.city, start, draw_turns(self.city, start, rng, 0.4), self.route_m, speed)
+        return Vehicle(route, units, 8.0, speed * 0.6, 1.0)
+
+    def spawn(self, around: Array, near_m: float, far_m: float, taken: Array, bicycle: bool) -> Vehicle | None:
+        """Try to place a vehicle on a lane at a random point; None where it does not fit.
+
+        around: world point (2,). near_m, far_m: least and greatest distance from it, metres.
+        taken: (M, 2) world points of other vehicles. bicycle: whether to place a bicycle.
+        """
+        rng = self._rng
+        x, y = self.city.unbend(around)
+        axis = int(rng.integers(2))
+        across, lengthwise = (y, x) if axis == 0 else (x, y)
+        streets = self.city.streets_between(axis, across - far_m, across + far_m)
+        if not streets:
+            return None
+        street = streets[int(rng.integers(len(streets)))]
+        at = lengthwise + rng.uniform(-far_m, far_m)
+        direction = axis + 2 * int(rng.integers(2))
+        node = self._next_node(axis, street.index, at, direction)
+        before = float((node_center(self.city, node) - street.point(at)) @ DIRECTIONS[direction])
+        lane = int(rng.integers(street.lanes))
+        units = self._units(bicycle)
+        length = units[-1].lag + float(units[-1].body.size_lwh[0])
+        cross = street_of(self.city, node, direction + 1)
+        if before < cross.half_width + STOP_LINE_M + 1:
+            return None
+        point = street.point(at) + right_of(direction) * lane_offset(street, lane, bicycle)
+        front = self.city.bend(point)
+        if not near_m <= np.hypot(*(front - around)) <= far_m:
+            return None
+        reach = np.linspace(-length - 6, 8, 10)[:, None] * DIRECTIONS[direction]  # the space needed before and behind
+        gaps = self.city.bend(point + reach)[:, None] - taken
+        if np.sqrt((gaps**2).sum(-1).min()) < (1.6 if bicycle else 2.2):
+            return None
+        start = LaneStart(node, direction, lane, before + length + 2)
+        turns = bicycle_turns(rng) if bicycle else draw_turns(self.city, start, rng)
+        speed = float(rng.uniform(3.5, 6.0) if bicycle else rng.uniform(7.5, 12.5))
+        route = build_route(self.city, start, turns, self.route_m * speed / 12 + length, speed, bicycle)
+        return Vehicle(route, units, length + 2, speed * 0.7, float(rng.uniform(0.7, 1.25)), bicycle)
+
+    def _next_node(self, axis: int, index: int, at: float, direction: int) -> tuple[int, int]:
+        nearest = self.city.nearest(1 - axis, at)
+        position = self.city.street(1 - axis, nearest).position
+        if direction < 2 and position < at:
+            nearest += 1
+        if direction >= 2 and position > at:
+            nearest -= 1
+        return (nearest, index) if axis == 0 else (index, nearest)
+
+    def _units(self, bicycle: bool) -> tuple[Unit, ...]:
+        rng, draw = self._rng, self.catalog.draw
+        class_name = "bicycle" if bicycle else str(rng.choice(list(TRAFFIC_MIX), p=list(TRAFFIC_MIX.values())))
+        self._count += 1
+        name = f"moving-{self._count}"
+        if class_name == "train":
+            heavy = rng.random() < 0.7
+            first = draw("truck", rng, ("tractor",) if heavy else ("pickup", "delivery", "box"))
+            second = draw("trailer", rng, SEMITRAILERS if heavy else ("utility",))
+            tractor, towed = draw_body(first, rng, name), draw_body(second, rng, f"{name}-trailer")
+            lag = float(tractor.size_lwh[0]) + (0.35 if not heavy else 0.25)
+            return Unit(tractor, 0.0), Unit(towed, lag)
+        names = RIDERS.get(class_name)
+        if class_name == "construction_vehicle":
+            names = DRIVING_MACHINES
+        return (Unit(draw_body(draw(class_name, rng, names), rng, name), 0.0),)
+
 
 WARM_UP_S = 6.0  # simulated time before the first frame, in which queues form
 AFTER_S = 0.6  # simulated time after the last frame
@@ -55,14 +159,9 @@ class EgoTrack:
         s = [interpolated_track(self.times, self.positions, self.speeds, time_s + d) for d in (-h, 0.0, h)]
         speed = (s[2] - s[0]) / (2 * h)
         rate = float(self.route.yaw_at(s[2]) - self.route.yaw_at(s[0])) / (2 * h)
-        forward = float(
-            np.interp(time_s + h, self.times, self.speeds) - np.interp(time_s - h, self.times, self.speeds)
-        ) / (2 * h)
-        return (
-            np.array([forward, speed * rate, GRAVITY]),
-            np.array([0.0, 0.0, rate]),
-            np.array([speed, 0.0, 0.0]),
-        )
+        before, after = np.interp([time_s - h, time_s + h], self.times, self.speeds)
+        forward = float(after - before) / (2 * h)
+        return np.array([forward, speed * rate, GRAVITY]), np.array([0.0, 0.0, rate]), np.array([speed, 0.0, 0.0])
 
 
 class Simulation:
@@ -73,41 +172,26 @@ class Simulation:
         self.roadside = Roadside(city, catalog)
         self.span_s = (-WARM_UP_S, duration_s + AFTER_S)
         self.spawner = VehicleSpawner(city, catalog, 14.0 * (self.span_s[1] - self.span_s[0]) + 60)
-        body = draw_body(catalog.by_class["car"][2], city.stream("ego-body"), "ego", 0.0)
-        self.ego_body = body
-        self._ego = self.spawner.spawn_ego((Unit(body, 0.0),))
+        self.ego_body = draw_body(catalog.by_class["car"][2], city.stream("ego-body"), "ego", 0.0)
+        self._ego = self.spawner.spawn_ego((Unit(self.ego_body, 0.0),))
         first = self._ego.route.passes[0]
         self.signals = Signals(city, (first.node, first.direction % 2))
-        self._crossers: dict[tuple[int, int], list[Walker]] = {}
-        self._strollers: dict[tuple[int, int], list[Walker]] = {}
+        self._crossers = lru_cache(maxsize=None)(partial(crossers, city, catalog, self.signals, self.span_s))
+        self._strollers = lru_cache(maxsize=None)(partial(strollers, city, catalog, self.span_s))
         self._driving: list[DrivingActor] = []
         self._run()
         self.ego = _smoothed(self._ego)
 
     def actors_near(self, point: ArrayLike, reach_m: float) -> list[Actor]:
         """Actors that may be within `reach_m` metres of a world point (2,), and some that are not, in a fixed order."""
-        x, y = self.city.unbend(point)
-        columns = self.city.streets_between(1, x - reach_m, x + reach_m)
-        rows = self.city.streets_between(0, y - reach_m, y + reach_m)
-        spans = (
-            range(columns[0].index - 1, columns[-1].index + 1)
-            if columns
-            else range(_below(self.city, 1, x), _below(self.city, 1, x) + 1),
-            range(rows[0].index - 1, rows[-1].index + 1)
-            if rows
-            else range(_below(self.city, 0, y), _below(self.city, 0, y) + 1),
-        )
+        near = self.city.around(point, reach_m)
         found: list[Actor] = [*self._driving]
-        for i in spans[0]:
-            for j in spans[1]:
-                found += self.roadside.block(i, j)
-                found += self._strollers_of(i, j)
-        for street, span in [*((c, spans[1]) for c in columns), *((r, spans[0]) for r in rows)]:
-            for k in span:
-                found += self.roadside.stretch(street.axis, street.index, k)
-        for i in spans[0]:
-            for j in spans[1]:
-                found += self._crossers_of((i, j))
+        for block in near.blocks:
+            found += [*self.roadside.block(*block), *self._strollers(*block)]
+        for stretch in near.stretches:
+            found += self.roadside.stretch(*stretch)
+        for node in near.blocks:
+            found += self._crossers(node)
         return found
 
     def _run(self) -> None:
@@ -145,11 +229,12 @@ class Simulation:
     def _renew(self, vehicles: list[Vehicle], time_s: float) -> list[Vehicle]:
         """Remove vehicles that are far away or at the end of their route, and spawn others. Returns those removed."""
         here = self._ego.route.at(self._ego.front)
-        gone = []
-        for vehicle in vehicles[1:]:
-            far = np.hypot(*(vehicle.route.at(vehicle.front) - here)) > REACH_M + 30
-            if far or vehicle.front > vehicle.route.length - 15:
-                gone.append(vehicle)
+        gone = [
+            vehicle
+            for vehicle in vehicles[1:]
+            if vehicle.front > vehicle.route.length - 15
+            or np.hypot(*(vehicle.route.at(vehicle.front) - here)) > REACH_M + 30
+        ]
         for vehicle in gone:
             vehicles.remove(vehicle)
         count = len(vehicles)
@@ -164,26 +249,10 @@ class Simulation:
         points = [
             w.plan_at(time_s)
             for node in nodes
-            for w in self._crossers_of(node)
+            for w in self._crossers(node)
             if w.times[0] < time_s < w.times[-1] and w.on_road(time_s)
         ]
         return self.city.bend(np.array(points).reshape(-1, 2))
-
-    def _crossers_of(self, node: tuple[int, int]) -> list[Walker]:
-        if node not in self._crossers:
-            self._crossers[node] = crossers(self.city, self.catalog, self.signals, node, self.span_s)
-        return self._crossers[node]
-
-    def _strollers_of(self, column: int, row: int) -> list[Walker]:
-        key = (column, row)
-        if key not in self._strollers:
-            self._strollers[key] = strollers(self.city, self.catalog, column, row, self.span_s)
-        return self._strollers[key]
-
-
-def _below(city: CityPlan, axis: int, position: float) -> int:
-    index = city.nearest(axis, position)
-    return index if city.street(axis, index).position <= position else index - 1
 
 
 def _smoothed(ego: Vehicle) -> EgoTrack:

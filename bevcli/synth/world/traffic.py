@@ -1,18 +1,83 @@
-"""The traffic simulation: vehicles follow routes, keep their distance, obey signals and give way."""
+"""Traffic: signals, vehicles that keep their distance, obey signals and give way, and the states of actors."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.geometry.transforms import Array
 from bevcli.jit import njit
-from bevcli.synth.assets.catalog import Body
+from bevcli.synth.assets.catalog import Body, Variant
+from bevcli.synth.world.city import CityPlan
 from bevcli.synth.world.route import JunctionPass, Route
-from bevcli.synth.world.signals import Light, Signals
+
+Light = Literal["red", "yellow", "green"]
+YELLOW_S, CLEARING_S = 1.5, 2.0  # durations of yellow, and of red in all directions
+WALK_START_S = 4.5  # people may start to cross until this time after parallel traffic got green
+
+
+@dataclass(frozen=True)
+class SignalCycle:
+    """The cycle of one junction: axis 0 has green first, then axis 1.
+
+    Attributes:
+        greens: duration of green for axis 0 and for axis 1, seconds.
+        offset: position in the cycle at time 0, seconds.
+    """
+
+    greens: tuple[float, float]
+    offset: float
+
+    @property
+    def length(self) -> float:
+        """Length of the cycle, seconds."""
+        return sum(self.greens) + 2 * (YELLOW_S + CLEARING_S)
+
+    def since_green(self, axis: int, time_s: float) -> float:
+        """Seconds since an axis last got green, at a time in seconds."""
+        return (time_s + self.offset - self.green_start(axis)) % self.length
+
+    def green_start(self, axis: int) -> float:
+        """Position in the cycle at which an axis gets green, seconds."""
+        return 0.0 if axis == 0 else self.greens[0] + YELLOW_S + CLEARING_S
+
+
+class Signals:
+    """The signals of a city.
+
+    first: node and axis of the ego vehicle's approach to its first junction. Its light turns green early in the
+    drive, so that the ego vehicle does not wait for the whole drive.
+    """
+
+    def __init__(self, city: CityPlan, first: tuple[tuple[int, int], int]) -> None:
+        self._city, self._first = city, first
+        self.cycle = lru_cache(maxsize=None)(self._cycle)
+
+    def _cycle(self, node: tuple[int, int]) -> SignalCycle:
+        rng = self._city.stream("signals", *node)
+        greens = (15.0, 10.0) if rng.random() < 0.5 else (10.0, 15.0)
+        cycle = SignalCycle(greens, float(rng.uniform(0, 40)))
+        if node == self._first[0]:
+            return SignalCycle(greens, cycle.green_start(self._first[1]) + float(rng.uniform(-3, 11)))
+        return cycle
+
+    def light(self, node: tuple[int, int], axis: int, time_s: float) -> Light:
+        """The light for vehicles on a street of this axis."""
+        cycle = self.cycle(node)
+        since = cycle.since_green(axis, time_s)
+        if since < cycle.greens[axis]:
+            return "green"
+        return "yellow" if since < cycle.greens[axis] + YELLOW_S else "red"
+
+    def walk(self, node: tuple[int, int], axis: int, time_s: float) -> bool:
+        """True while people may start to cross a street of this axis: shortly after the other axis got green."""
+        return self.cycle(node).since_green(1 - axis, time_s) < WALK_START_S
+
 
 STEP_S = 0.1  # time step of the simulation
 LOOK_AHEAD_M, LOOK_STEPS = 42.0, 54  # range of the search for obstacles, and its number of samples
@@ -121,7 +186,7 @@ def _follow(speed: float, limit: float, strongest: float, gap: float, lead_speed
 
 
 def _same_way(vehicle: Vehicle, vehicles: list[Vehicle], other: int) -> bool:
-    """Whether the other vehicle drives in about the same direction (within 60 degrees)."""
+    """True where the other vehicle drives in about the same direction (within 60 degrees)."""
     if other < 0:
         return False
     mine = vehicle.route.yaw_at(vehicle.front)
@@ -132,7 +197,7 @@ def _same_way(vehicle: Vehicle, vehicles: list[Vehicle], other: int) -> bool:
 def _may_enter(
     vehicle: Vehicle, crossing: JunctionPass, vehicles: list[Vehicle], signals: Signals, time_s: float
 ) -> bool:
-    """Whether the light is green and nobody has priority. Left turns may also start on yellow."""
+    """True where the light is green and nobody has priority. Left turns may also start on yellow."""
     light = signals.light(crossing.node, crossing.direction % 2, time_s)
     if light != "green" and (light == "red" or crossing.turn <= 0):
         return False
@@ -144,7 +209,7 @@ def _may_enter(
 
 
 def _has_priority(other: Vehicle, theirs: JunctionPass, vehicle: Vehicle, crossing: JunctionPass, light: Light) -> bool:
-    """Whether the other vehicle has priority: oncoming over left turns, bicycles over right turns not yet begun."""
+    """True where the other vehicle has priority: oncoming over left turns, bicycles over right turns not yet begun."""
     if theirs.direction == (crossing.direction + 2) % 4 and crossing.turn == 1 and theirs.turn != 1:
         near = theirs.stop - 15 < other.front < theirs.leave - 5
         waits = other.speed < 0.5 and (light == "yellow" or other.front < theirs.stop - 6)
@@ -194,3 +259,123 @@ def _nearest_in_way(
             if dx * dx + dy * dy < squared:
                 return max(i * (LOOK_AHEAD_M - 0.3) / (LOOK_STEPS - 1) - 0.4, 0.05), owners[k]
     return np.inf, -1
+
+
+MOVING_M_S = 0.3  # slower actors have the attribute of a standing one
+_DIFFERENCE_S = 0.02  # half the interval of the central differences that give velocities
+
+
+@dataclass(frozen=True)
+class ActorState:
+    """An actor at one time.
+
+    Attributes:
+        body: size and looks.
+        position: (3,) middle of the bottom, world, metres.
+        yaw: world, radians.
+        velocity: (2,) world, m/s.
+        attribute: nuScenes attribute, such as "vehicle.moving"; empty for classes without attributes.
+        pose: index of the mesh among the variant's poses; taken modulo their number.
+    """
+
+    body: Body
+    position: Array
+    yaw: float
+    velocity: Array
+    attribute: str
+    pose: int = 0
+
+
+class Actor(Protocol):
+    """An annotated object over the time of a drive."""
+
+    def state(self, time_s: float) -> ActorState | None:
+        """The state at a time in seconds since the start of the drive, or None while it is not there."""
+        ...
+
+
+@dataclass(frozen=True)
+class StandingActor:
+    """An actor that never moves.
+
+    Attributes:
+        body: size and looks.
+        position: (3,) middle of the bottom, world, metres.
+        yaw: world, radians.
+        attribute: nuScenes attribute.
+    """
+
+    body: Body
+    position: Array
+    yaw: float
+    attribute: str
+
+    def state(self, time_s: float) -> ActorState:
+        """The same state at all times."""
+        return ActorState(self.body, self.position, self.yaw, np.zeros(2), self.attribute)
+
+
+@dataclass(frozen=True)
+class DrivingActor:
+    """One unit of a driving vehicle. Its axles are on the route.
+
+    Attributes:
+        vehicle: the vehicle, after the simulation.
+        unit: the unit.
+        times: (T,) times of the simulation steps, seconds.
+        fronts: (T,) route positions of the vehicle's front, metres.
+        speeds: (T,) m/s.
+    """
+
+    vehicle: Vehicle
+    unit: Unit
+    times: NDArray[np.float64]
+    fronts: NDArray[np.float64]
+    speeds: NDArray[np.float64]
+
+    @staticmethod
+    def of(vehicle: Vehicle) -> list[DrivingActor]:
+        """One actor for each unit of a vehicle. Call it after the simulation."""
+        times, fronts, speeds = np.array(vehicle.track).T
+        return [DrivingActor(vehicle, unit, times, fronts, speeds) for unit in vehicle.units]
+
+    def state(self, time_s: float) -> ActorState | None:
+        """The state, or None before the vehicle appears and after it leaves."""
+        if time_s < self.times[0] or time_s > self.times[-1]:
+            return None
+        center, yaw = self._pose(time_s)
+        early, late = max(time_s - _DIFFERENCE_S, self.times[0]), min(time_s + _DIFFERENCE_S, self.times[-1])
+        velocity = (self._pose(late)[0] - self._pose(early)[0]) / max(late - early, 1e-9)
+        body = self.unit.body
+        position = np.array([center[0], center[1], 0.0])
+        moving = float(np.hypot(*velocity)) > MOVING_M_S
+        return ActorState(body, position, yaw, velocity, driving_attribute(body.variant, moving))
+
+    def _pose(self, time_s: float) -> tuple[Array, float]:
+        front = interpolated_track(self.times, self.fronts, self.speeds, time_s)
+        length = float(self.unit.body.size_lwh[0])
+        middle = front - self.unit.lag - length / 2
+        route = self.vehicle.route
+        rear, fore = points_between(route.points, route.positions, middle - 0.3 * length, middle + 0.3 * length, 2)
+        return (rear + fore) / 2, math.atan2(fore[1] - rear[1], fore[0] - rear[0])
+
+
+def interpolated_track(times: Array, fronts: Array, speeds: Array, time_s: float) -> float:
+    """Route position in metres at a time: cubic Hermite interpolation between the steps of a track.
+
+    times, fronts, speeds: (T,) seconds, metres and m/s of the steps.
+    """
+    k = min(max(int(times.searchsorted(time_s, side="right")) - 1, 0), len(times) - 2)
+    span = times[k + 1] - times[k]
+    u = (time_s - times[k]) / span
+    a, b, m, n = fronts[k], fronts[k + 1], speeds[k] * span, speeds[k + 1] * span
+    return float(
+        (2 * u**3 - 3 * u**2 + 1) * a + (u**3 - 2 * u**2 + u) * m + (3 * u**2 - 2 * u**3) * b + (u**3 - u**2) * n
+    )
+
+
+def driving_attribute(variant: Variant, moving: bool) -> str:
+    """The nuScenes attribute of a vehicle or cycle in traffic."""
+    if variant.class_name in ("bicycle", "motorcycle"):
+        return "cycle.with_rider" if variant.name.endswith("_rider") else "cycle.without_rider"
+    return "vehicle.moving" if moving else "vehicle.stopped"

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.synth.assets.paint import linear
+from bevcli.synth.assets.paint import Color, linear
 
-WEATHER_NAMES = ("noon", "evening", "overcast")
+Range = tuple[float, float]  # lowest and highest value
 
 
 @dataclass(frozen=True)
@@ -49,97 +49,77 @@ class Weather:
     shadow_softness_m: float
 
 
+@dataclass(frozen=True)
+class _Kind:
+    """The numbers of one kind of weather. A range is drawn uniformly; a number is taken as it is.
+
+    Attributes:
+        elevation: of the sun, radians.
+        sun: colour of the sunlight, linear RGB.
+        strength: of the sunlight.
+        sky: light from above, linear RGB.
+        zenith, horizon, cloud: sRGB colours.
+        cloud_threshold: noise above it is cloud, 0 to 1.
+        haze_m, lamps, shadow_softness_m: as in `Weather`.
+    """
+
+    elevation: Range | float
+    sun: tuple[float, float, float]
+    strength: float
+    sky: tuple[float, float, float]
+    zenith: Color
+    horizon: Color
+    cloud: Color
+    cloud_threshold: Range | float
+    haze_m: float
+    lamps: float
+    shadow_softness_m: float
+
+
+_KINDS = {
+    "noon": _Kind(
+        (0.65, 1.05), (1.0, 0.95, 0.86), 1.25, (0.32, 0.39, 0.50),
+        (84, 136, 206), (190, 212, 232), (255, 255, 255), (0.45, 0.62), 420.0, 0.5, 0.05,
+    ),
+    "evening": _Kind(
+        (0.22, 0.38), (1.0, 0.70, 0.42), 0.95, (0.26, 0.28, 0.38),
+        (92, 118, 178), (250, 206, 160), (255, 214, 178), (0.42, 0.6), 300.0, 1.2, 0.12,
+    ),
+    "overcast": _Kind(
+        1.35, (0.95, 0.98, 1.0), 0.22, (0.50, 0.53, 0.57),
+        (150, 158, 168), (205, 210, 214), (222, 226, 230), 0.2, 230.0, 0.8, 0.8,
+    ),
+}  # fmt: skip
+WEATHER_NAMES = tuple(_KINDS)
+
+
 def make_weather(name: str, rng: np.random.Generator) -> Weather:
     """The weather of a name, with sun and clouds drawn from `rng`. Raises InputError where the name is not known."""
-    if name not in WEATHER_NAMES:
+    if name not in _KINDS:
         raise InputError(f"weather: expected {', '.join(WEATHER_NAMES[:-1])} or {WEATHER_NAMES[-1]}, found {name!r}")
-    azimuth = rng.uniform(0, 2 * np.pi)
-    if name == "noon":
-        elevation = rng.uniform(0.65, 1.05)
-        return _weather(
-            name,
-            azimuth,
-            elevation,
-            (1.0, 0.95, 0.86),
-            1.25,
-            (0.32, 0.39, 0.50),
-            (84, 136, 206),
-            (190, 212, 232),
-            (255, 255, 255),
-            _clouds(rng, rng.uniform(0.45, 0.62)),
-            420.0,
-            0.5,
-            0.05,
-        )
-    if name == "evening":
-        elevation = rng.uniform(0.22, 0.38)
-        return _weather(
-            name,
-            azimuth,
-            elevation,
-            (1.0, 0.70, 0.42),
-            0.95,
-            (0.26, 0.28, 0.38),
-            (92, 118, 178),
-            (250, 206, 160),
-            (255, 214, 178),
-            _clouds(rng, rng.uniform(0.42, 0.6)),
-            300.0,
-            1.2,
-            0.12,
-        )
-    return _weather(
-        "overcast",
-        azimuth,
-        1.35,
-        (0.95, 0.98, 1.0),
-        0.22,
-        (0.50, 0.53, 0.57),
-        (150, 158, 168),
-        (205, 210, 214),
-        (222, 226, 230),
-        _clouds(rng, 0.2),
-        230.0,
-        0.8,
-        0.8,
-    )
-
-
-def _weather(
-    name: str,
-    azimuth: float,
-    elevation: float,
-    sun: tuple[float, float, float],
-    strength: float,
-    sky: tuple[float, float, float],
-    zenith: tuple[int, int, int],
-    horizon: tuple[int, int, int],
-    cloud: tuple[int, int, int],
-    clouds: NDArray[np.float32],
-    haze_m: float,
-    lamps: float,
-    softness: float,
-) -> Weather:
-    to_sun = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
-    sun_light = (np.array(sun) * strength).astype(np.float32)
-    sky_light = np.array(sky, np.float32)
-    bounce = (0.22 * (sun_light * np.sin(elevation) + sky_light) + 0.25 * sky_light).astype(np.float32)
-    haze = linear(horizon) * np.float32(0.95)
+    kind = _KINDS[name]
+    azimuth, elevation = rng.uniform(0, 2 * np.pi), _drawn(kind.elevation, rng)
+    sun = (np.array(kind.sun) * kind.strength).astype(np.float32)
+    sky, horizon = np.array(kind.sky, np.float32), linear(kind.horizon)
     return Weather(
-        name,
-        to_sun,
-        sun_light,
-        sky_light,
-        bounce,
-        linear(zenith),
-        linear(horizon),
-        haze,
-        linear(cloud),
-        clouds,
-        haze_m,
-        lamps,
-        softness,
+        name=name,
+        to_sun=np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]),
+        sun=sun,
+        sky=sky,
+        bounce=(0.22 * (sun * np.sin(elevation) + sky) + 0.25 * sky).astype(np.float32),
+        zenith=linear(kind.zenith),
+        horizon=horizon,
+        haze=horizon * np.float32(0.95),
+        cloud_color=linear(kind.cloud),
+        clouds=_clouds(rng, _drawn(kind.cloud_threshold, rng)),
+        haze_m=kind.haze_m,
+        lamps=kind.lamps,
+        shadow_softness_m=kind.shadow_softness_m,
     )
+
+
+def _drawn(value: Range | float, rng: np.random.Generator) -> float:
+    return rng.uniform(*value) if isinstance(value, tuple) else value
 
 
 def _clouds(rng: np.random.Generator, threshold: float) -> NDArray[np.float32]:
@@ -147,11 +127,15 @@ def _clouds(rng: np.random.Generator, threshold: float) -> NDArray[np.float32]:
     size = 512
     total = np.zeros((size, size))
     for octave in range(5):
-        cells = 4 * 2**octave
-        coarse = np.pad(rng.random((cells, cells)), 2, mode="wrap")
-        scale = size // cells
-        fine = cv2.resize(coarse, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-        total += fine[2 * scale : 2 * scale + size, 2 * scale : 2 * scale + size] * 0.5**octave
+        total += tiling_noise(rng, size, 4 * 2**octave) * 0.5**octave
     total = (total - total.min()) / (total.max() - total.min())
     cover = np.clip((total - threshold) / 0.25, 0, 1)
     return (cover * cover * (3 - 2 * cover)).astype(np.float32)
+
+
+def tiling_noise(rng: np.random.Generator, size: int, cells: int, low: float = 0.0) -> NDArray[np.float64]:
+    """(size, size) smooth noise from about low to low + 1 with `cells` waves a side; it repeats in both directions."""
+    coarse = np.pad(rng.random((cells, cells)), 2, mode="wrap") + low
+    scale = size // cells
+    fine = cv2.resize(coarse, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+    return np.asarray(fine[2 * scale : 2 * scale + size, 2 * scale : 2 * scale + size])

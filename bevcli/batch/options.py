@@ -1,0 +1,92 @@
+"""The options of a batch, of its workers on Ray, and of a search for similar frames."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+from bevcli.options import option, options
+
+
+def ray_is_installed() -> bool:
+    """Ray is installed."""
+    return importlib.util.find_spec("ray") is not None
+
+
+@options("Workers")
+class Workers:
+    """The number of workers on Ray, and the resources of each."""
+
+    count: int | None = option(
+        default=None,
+        help="Number of workers. Default: one per GPU, else one per core. 1 without `address` needs no Ray.",
+        flag="--workers",
+        metavar="N",
+        minimum=1,
+    )
+    address: str | None = option(
+        default=None,
+        help="Address of a running Ray cluster, such as auto or 10.0.0.1:6379. Default: Ray on this machine.",
+        flag="--ray",
+        metavar="ADDRESS",
+    )
+    gpus: float | None = option(
+        default=None,
+        help="Share of a GPU of each worker, such as 0.5. Default: 1 if there are GPUs.",
+        flag="--gpus-per-worker",
+        metavar="F",
+        minimum=0,
+    )
+    threads: int | None = option(
+        default=None,
+        help="CPU threads of each worker. Default: cores / workers, 1 on a cluster; without Ray all cores.",
+        metavar="N",
+        minimum=1,
+    )
+    retries: int = option(default=2, help="Further attempts after a drive has failed.", metavar="N", minimum=0)
+
+    @property
+    def in_this_process(self) -> bool:
+        """True for one worker, and without Ray: drives then run one after another in this process."""
+        return self.address is None and (self.count == 1 or (self.count is None and not ray_is_installed()))
+
+
+@options("Output")
+class BatchOptions:
+    """The output of a batch, and its drives from a file."""
+
+    out: str = option(help="Folder or URL of the batch.")
+    listed: Path | None = option(
+        default=None,
+        help="A text file with one drive per line; # starts a comment.",
+        flag="--list",
+        metavar="FILE",
+        panel="Options",
+    )
+    resume: bool = option(
+        default=False,
+        help="Go on with the batch in the output folder: skip drives that are done or have failed. Drives whose files, "
+        "model, weights or options differ run again.",
+    )
+    retry_failed: bool = option(default=False, help="With `resume`: run failed drives again.")
+    evaluate: bool = option(
+        default=False,
+        help="Score drives that have ground truth, each and all together (metrics.json).",
+        flag="--eval",
+    )
+    embed: bool = option(
+        default=False, help="Write a vector per frame, the pooled BEV features, for `bevcli find-like`."
+    )
+
+
+@options()
+class FindLikeOptions:
+    """A frame of a batch, and how many similar ones are listed."""
+
+    frame: int = option(help="The index of the frame.", metavar="K")
+    batch: str = option(help="Folder or URL of a batch of `bevcli batch --embed`.", flag="--in", metavar="BATCH_DIR")
+    count: int = option(default=12, help="Number of frames.", minimum=1)
+    per_drive: int = option(default=3, help="At most this many frames of each drive.", minimum=1)
+    html: Path | None = option(
+        default=None, help="The page with thumbnails. Default: find-like.html in the batch.", metavar="FILE"
+    )

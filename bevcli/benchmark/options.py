@@ -1,0 +1,32 @@
+"""BenchOptions: the options of the benchmark."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from bevcli.inference.options import complete_model
+from bevcli.options import option, options
+
+
+@options()
+class BenchOptions:
+    """The model that is measured, and what is written."""
+
+    model: str = option(
+        default="tiny",
+        help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, uniad-track-map, a FILE.toml or a FILE.onnx.",
+        complete=complete_model,
+    )
+    frames: int = option(default=5, help="Number of timed frames, after the warm-up.", minimum=1)
+    against: Literal["plain"] | None = option(
+        default=None, help="Also run the plain version; compare times and results."
+    )
+    profile: Path | None = option(
+        default=None, help="Write PyTorch's profile of one frame (open it at chrome://tracing).", metavar="OUT"
+    )
+    table: Path | None = option(
+        default=None,
+        help="Measure all models in all precisions, and write the table of docs/speed.md.",
+        metavar="OUT",
+    )

@@ -1,0 +1,207 @@
+"""Commands for typer from functions that take dataclasses of options, and the flags in place of arguments' names."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import re
+import types
+from collections.abc import Callable, Iterable, Mapping
+from contextvars import ContextVar
+from dataclasses import MISSING, Field, dataclass
+from inspect import Parameter, Signature, signature
+from pathlib import Path
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+
+import typer
+
+from bevcli.errors import BevcliError
+from bevcli.options import Option, defaults, flag_of, option_of
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
+
+_ARGUMENT = re.compile(r"`([a-z]\w*)(?:=([^`]*))?`")
+
+
+@dataclass(frozen=True)
+class Part:
+    """The options that a command takes of a dataclass, in an annotation: `Annotated[ModelOptions, Part(only=…)]`.
+
+    Attributes:
+        only: names of its fields; empty for all of them.
+        without: names of fields that the command does not have.
+        classes: dataclasses whose fields the parameter, a mapping, gets by name. None: the annotated dataclass itself.
+    """
+
+    only: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()
+    classes: Callable[[], Iterable[type[Any]]] | None = None
+
+    def __contains__(self, name: str) -> bool:
+        return name not in self.without and (not self.only or name in self.only)
+
+
+@dataclass(frozen=True)
+class _Flag:
+    """An option of a command. kind: type of the field. default: `Parameter.empty` for a required one."""
+
+    field: Field[Any]
+    option: Option
+    kind: Any
+    default: Any
+    panel: str
+
+    @property
+    def yes(self) -> str:
+        return flag_of(self.field).split()[0].partition("/")[0]
+
+    @property
+    def no(self) -> str:
+        """Spelling of the opposite, or ""."""
+        return flag_of(self.field).split()[0].partition("/")[2]
+
+    @property
+    def takes_value(self) -> bool:
+        return self.kind is not bool and self.option.flag_value is None
+
+    def parameter(self, flags: Mapping[str, _Flag]) -> Parameter:
+        """The parameter of a function, as typer reads it. flags: for the help text."""
+        stated, default = self.option, self.default
+        kind: Any = _plain(self.kind)
+        if stated.flag_value is not None:
+            kind, default = bool, False
+        elif stated.repeatable or stated.parse is not None:
+            kind = str if stated.parse is not None else get_args(self.kind)[0]
+            kind = types.GenericAlias(list, (kind,)) if stated.repeatable else kind
+            if default is not Parameter.empty:
+                kind, default = kind | None, None
+        info = typer.Option(
+            *flag_of(self.field).split(),
+            help=_with_flags(stated.help, flags),
+            rich_help_panel=self.panel,
+            metavar=stated.metavar or None,
+            min=stated.minimum,
+            max=stated.maximum,
+            autocompletion=stated.complete,
+        )
+        annotation = Annotated[kind, info]
+        return Parameter(self.field.name, Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+    def value(self, given: Any) -> Any:
+        """The field's value for what typer has read; MISSING for its default. Raises click's usage error."""
+        if self.option.flag_value is not None:
+            return self.option.flag_value if given else MISSING
+        if self.option.parse is None and not self.option.repeatable:
+            return given
+        if given in (None, [], ()):
+            return MISSING
+        try:
+            return tuple(given) if self.option.parse is None else self.option.parse(given)
+        except ValueError as error:
+            raise typer.BadParameter(str(error), param_hint=self.yes) from None
+
+
+_flags: ContextVar[Mapping[str, _Flag]] = ContextVar("flags", default=types.MappingProxyType({}))
+
+
+def command(function: Callable[..., None]) -> Callable[..., None]:
+    """The function for typer: each parameter that is a dataclass of options becomes one parameter for each field.
+
+    Arguments in backticks in a help text, and in a `BevcliError` of the function, become flags.
+    """
+    parts: list[Parameter | _Flag] = []
+    flags: dict[str, _Flag] = {}
+    makers: dict[str, tuple[Callable[..., Any], list[str]]] = {}
+    hints = get_type_hints(function, include_extras=True)
+    for parameter in signature(function).parameters.values():
+        hint = hints[parameter.name]
+        make, found = _flags_of(hint)
+        if make is None:
+            parts.append(parameter.replace(kind=Parameter.KEYWORD_ONLY, annotation=hint))
+            continue
+        for name in found.keys() & flags.keys():  # one of them is of another package
+            raise BevcliError(f"command {function.__name__}: two options are named {name}: rename one")
+        makers[parameter.name] = make, list(found)
+        flags |= found
+        parts += found.values()
+
+    def called(**given: Any) -> None:
+        before = _flags.set(flags)
+        try:
+            for parameter, (make, names) in makers.items():
+                values = {name: flags[name].value(given.pop(name)) for name in names}
+                given[parameter] = make(**{name: value for name, value in values.items() if value is not MISSING})
+            function(**given)
+        except BevcliError as error:
+            error.args = (as_flags(str(error)), *error.args[1:])
+            raise
+        finally:
+            _flags.reset(before)
+
+    called.__name__, called.__doc__, called.__module__ = function.__name__, function.__doc__, function.__module__
+    parameters = [part.parameter(flags) if isinstance(part, _Flag) else part for part in parts]
+    called.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
+    return called
+
+
+def as_flags(text: str) -> str:
+    """A text of the library for the command line: the running command's arguments in backticks become its flags."""
+    return _with_flags(text, _flags.get())
+
+
+def print_note(text: str) -> None:
+    """Print a note of the library to stderr."""
+    typer.echo(f"note: {as_flags(text)}", err=True)
+
+
+def _with_flags(text: str, flags: Mapping[str, _Flag]) -> str:
+    def flag(found: re.Match[str]) -> str:
+        return _as_flag(flags[found[1]], found[2]) if found[1] in flags else found[0]
+
+    return _ARGUMENT.sub(flag, text)
+
+
+def _as_flag(flag: _Flag, value: str | None) -> str:
+    """The flag with a value that a text of the library states as Python."""
+    if value is None:
+        return flag.yes
+    try:
+        literal = ast.literal_eval(value)
+    except (ValueError, SyntaxError):
+        literal = value
+    if literal is False:
+        return flag.no or f"no {flag.yes}"
+    if not flag.takes_value:
+        return flag.yes
+    if isinstance(literal, dict):
+        return " ".join(f"{flag.yes} {key}={each}" for key, each in literal.items())
+    if isinstance(literal, tuple | list):
+        literal = ",".join(map(str, literal))
+    return f"{flag.yes} {literal}"
+
+
+def _flags_of(hint: Any) -> tuple[Callable[..., Any] | None, dict[str, _Flag]]:
+    """The maker of a parameter's value, and its options by name; None for a parameter without options."""
+    part = Part()
+    if get_origin(hint) is Annotated:
+        hint, *extras = get_args(hint)
+        part = next((each for each in extras if isinstance(each, Part)), part)
+    if part.classes is None and not dataclasses.is_dataclass(hint):
+        return None, {}
+    found: dict[str, _Flag] = {}
+    for kind in [hint] if part.classes is None else part.classes():
+        kinds, known = get_type_hints(kind), defaults(kind)
+        for field in dataclasses.fields(kind):
+            stated = option_of(field)
+            if stated is not None and not stated.hidden and field.name in part:
+                default = known.get(field.name, Parameter.empty)
+                flag = _Flag(field, stated, kinds[field.name], default, stated.panel or kind.panel)
+                found.setdefault(field.name, flag)
+    assert set(part.only) <= found.keys(), f"{hint}: {part.only}"
+    return (dict if part.classes else hint), found
+
+
+def _plain(hint: Any) -> Any:
+    """The type that typer parses: of several that Python takes, such as `str | Path | None`, the path."""
+    kinds = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+    return (Path | None if type(None) in kinds else Path) if Path in kinds else hint

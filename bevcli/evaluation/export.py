@@ -1,0 +1,196 @@
+"""Boxes in the formats of other tools: a CSV table, and KITTI object labels of one camera."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bevcli.errors import InputError, OutputError
+from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
+from bevcli.geometry.cameras import Camera
+from bevcli.geometry.transforms import Array, apply, inverse, wrap_angle
+from bevcli.sequences.files.box_json import boxes_to_json
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
+from bevcli.sequences.files.calibration_file import read_calibration
+from bevcli.sequences.files.incremental_json import GrowingFile
+
+COLUMNS = (
+    "frame", "scene", "timestamp_ns", "frame_of_reference", "class", "score", "x", "y", "z", "length", "width",
+    "height", "yaw", "vx", "vy", "attribute", "instance", "track_score", "duplicate", "visibility", "num_points",
+)  # fmt: skip
+
+
+class CsvWriter:
+    """`with CsvWriter(path) as writer: writer.write(frame, "world")`; the file is complete after every frame.
+
+    Metres and radians; a cell is empty where a value is unknown. Raises OutputError where the file cannot be written.
+    """
+
+    def __init__(self, path: Path, resume_at: int | None = None) -> None:
+        """resume_at: `file.size` of an earlier writer of this file, to go on from there."""
+        self.file = GrowingFile(path, resume_at)
+        if resume_at is None:
+            self._append([dict(zip(COLUMNS, COLUMNS, strict=True))])
+
+    def write(self, frame: FrameBoxes, frame_of_reference: str) -> int:
+        """Adds a row for each box of a frame, and returns their number."""
+        rows = list(_rows(frame, frame_of_reference))
+        self._append(rows)
+        return len(rows)
+
+    def _append(self, rows: list[dict[str, Any]]) -> None:
+        text = io.StringIO()
+        csv.DictWriter(text, COLUMNS, lineterminator="\n").writerows(rows)
+        self.file.append(text.getvalue().encode())
+
+    def __enter__(self) -> CsvWriter:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.file.close()
+
+
+def write_csv(boxes: BoxesFile, path: Path) -> int:
+    """Write all boxes in their frame of reference; return their number. Raises OutputError."""
+    with CsvWriter(path) as writer:
+        return sum(writer.write(frame, boxes.frame_of_reference) for frame in boxes.frames)
+
+
+def _rows(frame: FrameBoxes, frame_of_reference: str) -> Iterator[dict[str, Any]]:
+    stamp = frame.stamp
+    for box in boxes_to_json(frame.boxes):
+        center, size, velocity = box.pop("center"), box.pop("size_lwh"), box.pop("velocity")
+        yield {
+            "frame": stamp.index,
+            "scene": stamp.scene,
+            "timestamp_ns": stamp.timestamp_ns,
+            "frame_of_reference": frame_of_reference,
+            **box,
+            **dict(zip(COLUMNS[6:12], (*center, *size), strict=True)),
+            **dict(zip(("vx", "vy"), velocity, strict=True)),
+        }
+
+
+# KITTI's types where it has the class; names in its style for the others.
+KITTI_TYPES = {
+    "car": "Car", "truck": "Truck", "construction_vehicle": "ConstructionVehicle", "bus": "Bus",
+    "trailer": "Trailer", "barrier": "Barrier", "motorcycle": "Motorcycle", "bicycle": "Cyclist",
+    "pedestrian": "Pedestrian", "traffic_cone": "TrafficCone",
+}  # fmt: skip
+OCCLUSION_UNKNOWN = 3
+NEAR_M = 0.1  # box edges are clipped at this depth
+
+
+def write_kitti(boxes: BoxesFile, camera: Camera, ego_from_bev: Array, folder: Path) -> int:
+    """Write label_2/NNNNNN.txt and calib/NNNNNN.txt for every frame; NNNNNN is the frame's index.
+
+    A label is written for each box that is at least partly inside the image without lens distortion. ego_from_bev:
+    (4, 4), for boxes in the bev frame, and as the lidar frame of the calibration. Returns the number of labels. Raises
+    InputError where frame indices repeat, and OutputError.
+    """
+    numbers = [frame.stamp.index for frame in boxes.frames]
+    if len(set(numbers)) < len(numbers):
+        raise InputError("frame indices repeat (KITTI's files are named by them): export each scene separately")
+    count = 0
+    try:
+        for name in ("label_2", "calib"):
+            (folder / name).mkdir(parents=True, exist_ok=True)
+        for frame in boxes.frames:
+            lines = kitti_labels(_in_ego(frame, boxes.frame_of_reference, ego_from_bev), camera)
+            name = f"{frame.stamp.index:06d}.txt"
+            (folder / "label_2" / name).write_text("".join(f"{line}\n" for line in lines))
+            (folder / "calib" / name).write_text(_calibration(camera, ego_from_bev))
+            count += len(lines)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written ({error.strerror})") from None
+    return count
+
+
+def kitti_labels(boxes_ego: Boxes3D, camera: Camera) -> list[str]:
+    """One line for each box that the camera sees, in the order of the boxes.
+
+    The fields: type, truncated 0 to 1, occluded (3: unknown), alpha, 2D box (left, top, right, bottom) in pixels,
+    height, width and length in metres, centre of the bottom face in the camera frame, rotation_y, and the score if
+    there is one.
+    """
+    camera_from_ego = camera.camera_from_ego
+    locations = apply(camera_from_ego, boxes_ego.centers - boxes_ego.sizes_lwh * (0, 0, 0.5))
+    headings = np.stack([np.cos(boxes_ego.yaws), np.sin(boxes_ego.yaws), np.zeros(len(boxes_ego))], axis=-1)
+    headings = headings @ camera_from_ego[:3, :3].T
+    rotations_y = np.arctan2(-headings[:, 2], headings[:, 0])
+    alphas = wrap_angle(rotations_y - np.arctan2(locations[:, 0], locations[:, 2]))
+    lines = []
+    for place, corners in enumerate(boxes_ego.corners()):
+        seen = _image_box(apply(camera_from_ego, corners), camera)
+        if seen is None:
+            continue
+        rectangle, truncated = seen
+        length, width, height = boxes_ego.sizes_lwh[place]
+        numbers = [alphas[place], *rectangle, height, width, length, *locations[place], rotations_y[place]]
+        kind = KITTI_TYPES.get(str(boxes_ego.classes[place]), "Misc")
+        label = f"{kind} {truncated:.2f} {OCCLUSION_UNKNOWN} "
+        score = "" if boxes_ego.scores is None else f" {boxes_ego.scores[place]:.4f}"
+        lines.append(label + " ".join(f"{number:.3f}" for number in numbers) + score)
+    return lines
+
+
+def _image_box(corners: Array, camera: Camera) -> tuple[Array, float] | None:
+    """The rectangle around a box's projection, clipped to the image, and the share of its area that is clipped."""
+    points = _in_front_of_camera(corners)
+    if not len(points):
+        return None
+    pixels = (points @ camera.intrinsics.T)[:, :2] / points[:, 2:]
+    whole = np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
+    limits = np.array([camera.width - 1, camera.height - 1] * 2)
+    cut = np.clip(whole, 0, limits)
+    area, whole_area = np.prod(cut[2:] - cut[:2]), np.prod(whole[2:] - whole[:2])
+    return (cut, float(1 - area / whole_area)) if area > 0 else None
+
+
+def _in_front_of_camera(corners: Array) -> Array:
+    """The corners (8, 3) in front of the camera, and the points where box edges intersect the plane at NEAR_M."""
+    points = [corner for corner in corners if corner[2] >= NEAR_M]
+    for start, end in BOX_EDGES:
+        a, b = corners[start], corners[end]
+        if (a[2] < NEAR_M) != (b[2] < NEAR_M):
+            points.append(a + (NEAR_M - a[2]) / (b[2] - a[2]) * (b - a))
+    return np.array(points)
+
+
+def read_kitti_camera(calibration: Path, name: str | None) -> tuple[Camera, Array]:
+    """The camera for the labels, and ego_from_bev (4, 4).
+
+    calibration: calibration.json, or a folder that contains it. name: default CAM_FRONT, or else the camera that looks
+    most directly ahead. Raises InputError where there is no such file or camera.
+    """
+    path = calibration / "calibration.json" if calibration.is_dir() else calibration
+    rig = read_calibration(path)
+    if name is None:
+        name = "CAM_FRONT" if "CAM_FRONT" in rig.names else min(rig.cameras, key=lambda camera: abs(camera.yaw)).name
+    if name not in rig.names:
+        raise InputError(f'{path}: has no camera "{name}" (expected one of {", ".join(rig.names)})')
+    return rig[name], rig.ego_from_bev
+
+
+def _in_ego(frame: FrameBoxes, frame_of_reference: str, ego_from_bev: Array) -> Boxes3D:
+    if frame_of_reference == "bev":
+        return frame.boxes.transformed(ego_from_bev)
+    if frame_of_reference == "ego":
+        return frame.boxes
+    assert frame.world_from_ego is not None  # read_boxes requires it
+    return frame.boxes.transformed(inverse(frame.world_from_ego.matrix))
+
+
+def _calibration(camera: Camera, ego_from_bev: Array) -> str:
+    """KITTI's calibration: P0 to P3 are this camera's, R0_rect is the identity, the lidar frame is the bev frame."""
+    projection = np.concatenate([camera.intrinsics, np.zeros((3, 1))], axis=1)
+    rows = {f"P{number}": projection for number in range(4)}
+    rows["R0_rect"] = np.eye(3)
+    rows["Tr_velo_to_cam"] = (camera.camera_from_ego @ ego_from_bev)[:3]
+    rows["Tr_imu_to_velo"] = inverse(ego_from_bev)[:3]
+    return "".join(f"{name}: {' '.join(f'{number:.12e}' for number in row.ravel())}\n" for name, row in rows.items())

@@ -1,0 +1,50 @@
+"""The options of scoring and of the export of boxes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from bevcli.options import option, options
+
+
+@options()
+class EvaluationOptions:
+    """The options of `evaluate`, and the folder of its plots."""
+
+    plot: Path | None = option(
+        default=None,
+        help="Write plots: precision and recall, errors by range, missed objects and false positives from above.",
+        metavar="DIR",
+    )
+    max_range: float | None = option(
+        default=None,
+        help="Cut nuScenes' class ranges at this distance from the ego vehicle. Default: the model's range.",
+        metavar="METRES",
+    )
+    count_missing: bool = option(default=False, help="Count ground-truth frames without a prediction as missed.")
+    tracking: bool = option(
+        default=False, help="Also score tracks: AMOTA, identity switches and the other tracking metrics."
+    )
+
+
+@options()
+class ExportOptions:
+    """The format of exported boxes and what it needs."""
+
+    form: Literal["csv", "kitti", "nuscenes", "nuscenes-tracking"] = option(
+        help="csv: one table. kitti: label_2 and calib. nuscenes: results_nusc.json. nuscenes-tracking: "
+        "tracking_nusc.json.",
+        flag="--format",
+    )
+    out: Path | None = option(
+        default=None,
+        help="Default: boxes.csv, kitti, results_nusc.json or tracking_nusc.json next to PREDICTIONS.",
+    )
+    score: float = option(default=0.0, help="Leave out boxes scored below this.", minimum=0, maximum=1)
+    calibration: Path | None = option(
+        default=None, help="kitti: calibration.json, or the sequence folder that contains it."
+    )
+    camera: str | None = option(
+        default=None, help="kitti: the camera. Default: CAM_FRONT, else the one that looks most directly ahead."
+    )

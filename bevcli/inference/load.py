@@ -1,0 +1,263 @@
+"""`load_model`: a configured model with its weights, on a device."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from bevcli.checkpoints import bundled_weights, load_weights, read_checkpoint
+from bevcli.config import TRACKING, as_table, known_models, load_config, load_table, settings_of_table
+from bevcli.engines.exported import SUFFIX, load_exported
+from bevcli.errors import BevcliError, WeightsError
+from bevcli.geometry.cameras import CameraRig
+from bevcli.inference.options import ModelOptions
+from bevcli.inference.preprocess import image_for_rig
+from bevcli.inference.tracking import TrackerConfig
+from bevcli.inference.training_rigs import facts_notes, rig_notes
+from bevcli.model.config import ModelConfig
+from bevcli.model.prepare import Precision, prepare_for_inference
+from bevcli.model.temporal_model import TemporalModel, build_model
+from bevcli.options import gather
+
+DEFAULT_MODEL = "demo"
+UNTRAINED_SEED = 0  # two untrained runs of one drive agree
+
+
+@dataclass(frozen=True)
+class Model:
+    """A model with its weights, and the device that it runs on.
+
+    Attributes:
+        network: the plain model, as in its paper, on the CPU; or an exported file.
+        device: where it runs.
+        precision: of the image features; the rest of the network computes in float32. Only exported files have "int8".
+        weights: the file that the weights came from, None for random weights.
+        bundled: whether that file is part of the package.
+        left_out: what of that file is for training only and was left out; "" for nothing.
+        tracker: the parameters of the tracker, the table [tracking] of the model's TOML file.
+        not_read: classes and functions in the weights file whose objects were not read.
+        engine: the program that computes it: "torch", or for an exported file "onnxruntime" or "openvino".
+        facts: metadata in the weights file.
+        file: the exported file; None for PyTorch.
+    """
+
+    network: TemporalModel
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+    precision: Precision | Literal["int8"] = "fp32"
+    weights: Path | None = None
+    bundled: bool = False
+    left_out: str = ""
+    tracker: TrackerConfig = field(default_factory=TrackerConfig)
+    not_read: tuple[str, ...] = ()
+    engine: str = "torch"
+    facts: Mapping[str, str] = field(default_factory=dict)
+    file: Path | None = None
+
+    @property
+    def config(self) -> ModelConfig:
+        """The model's configuration, as its TOML file states it."""
+        return self.network.config
+
+    @property
+    def name(self) -> str:
+        """The model's name, such as "tiny"."""
+        return self.config.name
+
+    @property
+    def untrained(self) -> bool:
+        """The weights are random: boxes and maps are meaningless."""
+        return self.weights is None
+
+    @property
+    def is_exported(self) -> bool:
+        """The network is an exported file, whose parts cannot be observed, trained or exported again."""
+        return self.engine != "torch"
+
+    def require_parts(self, what: str) -> None:
+        """Raises BevcliError for an exported file. what: needs the network's parts, such as "`probes`"."""
+        if self.is_exported:
+            raise BevcliError(f"{what}: not available for {self.file}, an exported file: use {self.name} by its name")
+
+    def contents(self) -> dict[str, Any]:
+        """The contents of the model's TOML file, [training] excluded."""
+        return as_table(self.config, self.tracker)
+
+    def for_rig(self, rig: CameraRig) -> Model:
+        """The model with images of one size, that of a rig, for an exported file: see `ImageConfig.focal_px`."""
+        network = copy.copy(self.network)  # the copy has the same weights
+        network.config = replace(self.config, image=image_for_rig(rig, self.config.image))
+        return replace(self, network=network)
+
+    def rig_notes(self, rig: CameraRig) -> tuple[str, ...]:
+        """Warnings where the rig lies outside the training distribution; none for random weights."""
+        if self.untrained:
+            return ()
+        return (*facts_notes(self.facts, self.config), *rig_notes(rig, self.config))
+
+    @cached_property
+    def config_hash(self) -> str:
+        """SHA-256 of the configurations of network and tracker."""
+        return hashlib.sha256(repr((self.config, self.tracker)).encode()).hexdigest()
+
+    @cached_property
+    def weights_hash(self) -> str:
+        """SHA-256 of names, types, shapes and values of all weights."""
+        found = hashlib.sha256()
+        for name, tensor in self.network.state_dict().items():
+            found.update(f"{name}{tensor.dtype}{list(tensor.shape)}".encode())
+            found.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
+        return found.hexdigest()
+
+    @cached_property
+    def prepared(self) -> TemporalModel:
+        """The network on its device, made ready for inference on the first use: same results, faster."""
+        if self.is_exported:
+            return self.network
+        assert self.precision != "int8"
+        return prepare_for_inference(self.network, self.device, self.precision)
+
+
+def load_model(
+    model: str | Path | None = None,
+    weights: str | Path | None = None,
+    options: ModelOptions | None = None,
+    **changes: Any,
+) -> Model:
+    """Load a model and its weights.
+
+        model = bevcli.load_model("tiny", weights="bevformer_tiny_epoch_24.pth", device="cuda")
+
+    Args:
+        model: a known model ("tiny", "small", "base", "v2-t1-base", "v2-t1", "v2-t2", "v2-t8", "uniad-track-map",
+            "demo"), a FILE.toml, or an exported FILE.onnx, which holds its weights and runs on the CPU in the precision
+            of the file. None takes the model that the weights fit, or "demo" where there are no weights.
+        weights: an official .pth as published, or a .safetensors. None takes the weights of the package, which only
+            "demo" has.
+        options: a model with its options; `model` and `weights` replace its own where they are given.
+        changes: the other options of `ModelOptions` as keywords: `device` ("auto", "cpu", "cuda", "cuda:1", "mps" or a
+            torch.device), `precision`, `untrained` and `engine`.
+
+    Raises:
+        ConfigError: the model's TOML file is missing or wrong.
+        WeightsError: there are no weights, they do not fit, or both weights and `untrained` are given.
+        BevcliError: the device is not there, the engine is not installed, or an option does not apply to the model.
+    """
+    given = {name: value for name, value in (("model", model), ("weights", weights)) if value is not None}
+    chosen = gather(ModelOptions, options, given | changes)
+    return _load_exported(chosen) if str(chosen.model).endswith(SUFFIX) else _load_network(chosen)
+
+
+def _load_network(options: ModelOptions) -> Model:
+    """The model of a TOML file with its weights."""
+    name, weights, untrained = options.model, options.weights, options.untrained
+    if options.engine is not None:
+        raise needs_exported_file(options.engine, "tiny" if name is None else str(name))
+    if weights is not None and untrained:
+        raise WeightsError(f"`weights={weights}` and `untrained` exclude each other: pass one of them")
+    if name is None:
+        name = DEFAULT_MODEL if weights is None else _model_of(weights)
+    config, tracker = load_config(name), load_table(name, TRACKING, TrackerConfig)
+    bundled = bundled_weights(str(name)) if weights is None and not untrained else None
+    file = weights or bundled
+    if file is None and not untrained:
+        raise WeightsError(
+            f"model {config.name} has no weights: pass `weights=FILE` (the official .pth or a .safetensors), "
+            "or `untrained=True` to try the program with random weights"
+        )
+    target = choose_device(options.device)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(UNTRAINED_SEED)
+        network = build_model(config)
+    loaded = None if file is None else load_weights(file, network)
+    return Model(
+        network.eval(),
+        target,
+        choose_precision(options.precision, target),
+        file,
+        bundled=bundled is not None,
+        left_out="" if loaded is None else loaded.left_out,
+        tracker=tracker,
+        not_read=() if loaded is None else loaded.not_read,
+        facts={} if loaded is None else loaded.facts,
+    )
+
+
+def needs_exported_file(engine: str, model: str) -> BevcliError:
+    """The error for an engine that is to run a model by its name."""
+    return BevcliError(
+        f"`engine={engine}`: runs exported files only: bevcli export-onnx {model}, then `model={model}.onnx`"
+    )
+
+
+def _load_exported(options: ModelOptions) -> Model:
+    """The model of a file of `bevcli export-onnx` or `bevcli quantize`."""
+    file, engine = Path(str(options.model)), options.engine or "onnxruntime"
+    if options.weights is not None or options.untrained:
+        option = "`untrained`" if options.untrained else f"`weights={options.weights}`"
+        raise WeightsError(f"{file}: an exported file holds its weights: leave out {option}")
+    if options.precision is not None:
+        raise BevcliError(
+            f"`precision={options.precision}`: {file} has a fixed precision: leave out the option "
+            "(bevcli quantize writes files with INT8)"
+        )
+    if str(options.device) not in ("auto", "cpu"):
+        raise BevcliError(f"`device={options.device}`: {file} runs on the CPU: leave out the option")
+    network = load_exported(file, engine)
+    found = network.metadata
+    return Model(
+        network,
+        torch.device("cpu"),
+        found.precision,
+        None if found.untrained else file,
+        bundled=found.bundled,
+        tracker=settings_of_table(found.contents, TRACKING, TrackerConfig, str(file)),
+        engine=engine,
+        file=file,
+    )
+
+
+def _model_of(weights: Path) -> str:
+    """The first known model that a file of weights fits."""
+    models = read_checkpoint(weights).models
+    if not models:
+        raise WeightsError(
+            f"{weights}: fits none of the known models ({', '.join(known_models())}): name its own by `model=FILE.toml`"
+        )
+    return models[0]
+
+
+def choose_device(name: str | torch.device) -> torch.device:
+    """The device of a name: "auto" (a CUDA GPU where there is one), "cpu", "cuda", "cuda:N" or "mps".
+
+    Raises BevcliError if the name is unknown or there is no such device.
+    """
+    if isinstance(name, torch.device):
+        return name
+    numbered = re.fullmatch(r"cuda:(\d+)", name)
+    if name not in ("auto", "cpu", "cuda", "mps") and not numbered:
+        raise BevcliError(f'`device={name}`: unknown device (expected "auto", "cpu", "cuda", "cuda:N" or "mps")')
+    if name == "mps" and not torch.backends.mps.is_available():
+        raise BevcliError("`device=mps`: PyTorch sees no Apple GPU here (use `device=cpu`)")
+    available = torch.cuda.is_available()
+    if name.startswith("cuda") and not available:
+        raise BevcliError(
+            f"`device={name}`: PyTorch sees no CUDA GPU here (use `device=cpu`, or install a CUDA build of torch)"
+        )
+    if numbered and int(numbered[1]) >= (count := torch.cuda.device_count()):
+        raise BevcliError(f"`device={name}`: there is no such GPU (found {count}: cuda:0 to cuda:{count - 1})")
+    if name == "auto":
+        name = "cuda" if available else "cpu"
+    return torch.device(name)
+
+
+def choose_precision(chosen: Precision | None, device: torch.device) -> Precision:
+    """The chosen precision, or by default fp32 on the CPU and bf16 on a GPU."""
+    return chosen or ("bf16" if device.type == "cuda" else "fp32")

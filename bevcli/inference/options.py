@@ -1,0 +1,56 @@
+"""ModelOptions: a model, its weights, and the device that it runs on."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+from typing import Literal
+
+from bevcli.options import option, options
+from bevcli.registry import entries
+
+
+def complete_model(incomplete: str) -> list[str]:
+    """The known models that start with a text, for completion in a shell."""
+    # Not of bevcli.config, which loads PyTorch: completion must be quick.
+    files = [file.name for file in resources.files("bevcli").joinpath("configs").iterdir()]
+    return sorted(
+        file.removesuffix(".toml") for file in files if file.endswith(".toml") and file.startswith(incomplete)
+    )
+
+
+def complete_engine(incomplete: str) -> list[str]:
+    """The known engines that start with a text, for completion in a shell."""
+    return [name for name in entries("bevcli.engines") if name.startswith(incomplete)]
+
+
+@options("Model")
+class ModelOptions:
+    """The options of `load_model`."""
+
+    model: str | Path | None = option(
+        default=None,
+        help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, uniad-track-map, demo, a FILE.toml or a FILE.onnx of "
+        "`bevcli export-onnx`. Default: the model that WEIGHTS fit, else demo.",
+        complete=complete_model,
+    )
+    weights: Path | None = option(
+        default=None,
+        help="An official .pth file or a .safetensors file. Default: the weights in the package (demo).",
+    )
+    untrained: bool = option(default=False, help="Use random weights; all outputs are labelled UNTRAINED.")
+    device: str = option(
+        default="auto",
+        help="auto uses a CUDA GPU if there is one; cuda:1 is the second one; mps is the GPU of a Mac (untried).",
+        metavar="auto|cpu|cuda|cuda:N|mps",
+    )
+    engine: str | None = option(
+        default=None,
+        help="Program that runs a FILE.onnx: onnxruntime, openvino, or that of an installed package. Default: "
+        "onnxruntime.",
+        metavar="NAME",
+        complete=complete_engine,
+    )
+    precision: Literal["fp32", "bf16", "fp16"] | None = option(
+        default=None, help="Precision of the image features. Default: fp32 on a CPU, bf16 on a GPU."
+    )

@@ -1,0 +1,274 @@
+"""From a frame to the network's input. Images are resized only here, together with their calibration."""
+
+from __future__ import annotations
+
+import os
+import weakref
+from collections.abc import Iterator, Mapping, Sequence as Items
+from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from bevcli.errors import InputError
+from bevcli.frame import Frame, Sequence
+from bevcli.geometry.cameras import Camera, CameraRig, level_rig
+from bevcli.geometry.transforms import Array, inverse
+from bevcli.jit import njit
+from bevcli.model.camera_assignment import CameraAssignment, assign_cameras
+from bevcli.model.config import ImageConfig, ModelConfig
+from bevcli.model.export_form import raw_images
+from bevcli.model.step import PreparedFrame
+
+
+class Preprocessor:
+    """Prepares the frames of a sequence for one model, with threads of its own that end with it.
+
+    chosen_cameras: camera -> model camera whose embedding it uses. Other cameras are assigned by viewing direction.
+    """
+
+    def __init__(self, config: ModelConfig, chosen_cameras: Mapping[str, str] | None = None) -> None:
+        self.config = config
+        self._chosen_cameras = chosen_cameras
+        self._rig: CameraRig | None = None
+        self._model_rig: CameraRig
+        self._assignment = CameraAssignment((), ())
+        self._image = config.image
+        # In sequence, preparing the images takes longer than the model on a GPU.
+        self._threads = ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="preprocess")
+        weakref.finalize(self, self._threads.shutdown, wait=False)
+
+    def __call__(self, frame: Frame) -> PreparedFrame:
+        """The frame with its images undistorted, resized, normalised and padded, and the matching projections."""
+        self._use_rig(frame.rig)
+        frame = frame if frame.rig is self._model_rig else replace(frame, rig=self._model_rig)
+        image, names = self._image, self._assignment.cameras
+        width, height = image.padded_size
+        images = torch.zeros(1, len(names), 3, height, width)
+
+        def write(place: int, name: str) -> None:
+            pixels = frame.rig[name].undistort(frame.images[name].pixels_bgr)
+            write_network_image(pixels, image, out=images[0, place].numpy())
+
+        tasks = [self._threads.submit(write, i, name) for i, name in enumerate(names) if name in frame.images]
+        for task in wait(tasks).done:
+            task.result()
+        scales = tuple(network_scale(frame.rig[name], image) for name in names)
+        matrices = [image_from_bev(frame, name) for name in names]
+        networks = [network_from_image(frame.rig[name], image) for name in names]
+        projections = [network @ matrix for network, matrix in zip(networks, matrices, strict=True)]
+        return PreparedFrame(
+            frame=frame,
+            assignment=self._assignment,
+            scales=scales,
+            images=images,
+            image_from_bev=torch.from_numpy(np.stack(projections))[None],
+            camera_index=torch.tensor([self.config.cameras.index(name) for name in self._assignment.embeddings]),
+            has_image=torch.tensor([[name in frame.images for name in names]]),
+        )
+
+    def _use_rig(self, rig: CameraRig) -> None:
+        if rig is self._rig:
+            return
+        self._rig, bev_frame = rig, self.config.bev_frame
+        self._model_rig = level_rig(rig, bev_frame.height_m) if bev_frame.level else rig
+        self._assignment = assign_cameras(rig, self.config.cameras, self._chosen_cameras)
+        self._image = image_for_rig(rig, self.config.image)
+
+
+def image_for_rig(rig: CameraRig, image: ImageConfig) -> ImageConfig:
+    """The `ImageConfig` of a rig, with a size of its own where the model has a `focal_px`.
+
+    The size is then the smallest that holds all resized images. They fit inside `image.size`, or are larger by one
+    factor for all cameras, at most up to `focal_px` and `max_pixels`.
+    """
+    if image.focal_px is None or image.max_pixels is None or not rig.cameras:
+        return image
+    enlargement = rig_enlargement(rig, image)
+    return replace(image, size=_common_size(rig, image, enlargement), focal_px=None, max_pixels=None)
+
+
+def rig_enlargement(rig: CameraRig, image: ImageConfig) -> float:
+    """Factor, at least 1, by which the images of a rig are larger than inside `image.size`: see `image_for_rig`."""
+    if image.focal_px is None or image.max_pixels is None or not rig.cameras:
+        return 1.0
+    focal = np.median([network_scale(camera, image) * camera.intrinsics[0, 0] for camera in rig.cameras])
+    width, height = _common_size(rig, image, 1.0)
+    affordable = np.sqrt(image.max_pixels / (len(rig.cameras) * width * height))
+    return float(max(1.0, min(image.focal_px / focal, affordable)))
+
+
+def _common_size(rig: CameraRig, image: ImageConfig, enlargement: float) -> tuple[int, int]:
+    """(width, height) of the smallest image that holds every camera's, each scaled to fit and then enlarged."""
+    scales = [enlargement * network_scale(camera, image) for camera in rig.cameras]
+    width = max(round(scale * camera.width) for scale, camera in zip(scales, rig.cameras, strict=True))
+    height = max(round(scale * camera.height) for scale, camera in zip(scales, rig.cameras, strict=True))
+    return width, height
+
+
+def network_scale(camera: Camera, image: ImageConfig) -> float:
+    """Pixels of the resized image per pixel of the camera's: the largest scale at which it fits the model's size."""
+    return min(image.size[0] / camera.width, image.size[1] / camera.height)
+
+
+def network_from_image(camera: Camera, image: ImageConfig) -> Array:
+    """(4, 4) float64: homogeneous pixels (u·d, v·d, d, 1) of the camera's image to those of the network's input."""
+    scale = network_scale(camera, image)
+    left, top = image.crop_box[:2]
+    matrix = np.diag([scale, scale, 1.0, 1.0])
+    shift = resize_shift(scale, image)
+    matrix[:2, 2] = shift - left, shift - top
+    return matrix
+
+
+def resize_shift(scale: float, image: ImageConfig) -> float:
+    """Pixels of the resized image that are added to scaled pixel coordinates: see `ImageConfig.half_pixel_shift`."""
+    return (scale - 1) / 2 if image.half_pixel_shift else 0.0
+
+
+def write_network_image(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: NDArray[np.float32]) -> None:
+    """Resize, crop and normalise an image and write it to the top left corner of `out`; the rest is left unchanged.
+
+    The image is resized as float32, which equals the original's order (normalise, then resize) up to rounding.
+
+    pixels_bgr: (H, W, 3) uint8. out: (3, H', W') float32.
+    """
+    height, width = pixels_bgr.shape[:2]
+    scale = min(image.size[0] / width, image.size[1] / height)
+    # "area" averages, which is only defined for shrinking; enlarged images are always interpolated.
+    method: Literal["linear", "area"] = "area" if image.resize == "area" and scale < 1 else "linear"
+    left, top, right, bottom = image.crop_box
+    resize_and_normalize(
+        pixels_bgr,
+        resize_taps(height, round(height * scale), method)[top:bottom],
+        resize_taps(width, round(width * scale), method)[left:right],
+        np.asarray(image.mean, dtype=np.float32),
+        np.asarray(image.std, dtype=np.float32),
+        out,
+        reverse_channels=image.color_order == "rgb",
+    )
+
+
+def image_from_bev(frame: Frame, camera_name: str) -> Array:
+    """(4, 4) float64 from the bev frame at the frame's time to the undistorted image at the camera's time.
+
+    A point (x, y, z, 1) in metres becomes (u d, v d, d, 1) with pixel (u, v) and depth d in metres.
+    """
+    camera = frame.rig[camera_name]
+    camera_ego_from_world = inverse(frame.world_from_ego_at[camera_name].matrix)
+    ego_from_ego = camera_ego_from_world @ frame.world_from_ego.matrix
+    return camera.image_from_camera @ camera.camera_from_ego @ ego_from_ego @ frame.rig.ego_from_bev
+
+
+def calibration_images(config: ModelConfig, cameras: int, drives: Items[Sequence], frames: int) -> Iterator[np.ndarray]:
+    """Yields (1, N, H, W, 3) float32, the input `images` of an exported file, for frames of these drives.
+
+    Args:
+        config: of the model.
+        cameras: N, the number of cameras of the exported file.
+        drives: whose frames are read; frames without any image are left out.
+        frames: at most so many, evenly spaced over all frames of all drives.
+
+    Raises InputError where a frame cannot be read, or a rig has another number of cameras.
+    """
+    places = [(drive, place) for drive in drives for place in range(len(drive.stamps))]
+    chosen = np.linspace(0, len(places) - 1, min(frames, len(places))).round().astype(int)
+    preprocessors = {id(drive): Preprocessor(config) for drive in drives}
+    for drive, place in (places[index] for index in chosen):
+        prepared = preprocessors[id(drive)](drive.load(place))
+        if len(prepared.assignment.cameras) != cameras:
+            raise InputError(f"{drive.name}: has {len(prepared.assignment.cameras)} cameras (the file takes {cameras})")
+        if prepared.frame.images:
+            yield raw_images(prepared.images, config).numpy()
+
+
+SMALLEST_OVERLAP = 1e-3  # pixels; OpenCV leaves out what overlaps less with the area of a pixel
+
+
+@dataclass(frozen=True)
+class Taps:
+    """The pixels of a row (or column) that each of the n pixels of the resized one is a weighted mean of.
+
+    Attributes:
+        first: (n,) int64, index of the first of its K pixels.
+        weights: (K, n) float32, those of its K pixels.
+    """
+
+    first: NDArray[np.int64]
+    weights: NDArray[np.float32]
+
+    def __getitem__(self, chosen: slice) -> Taps:
+        """The taps of some of the n pixels."""
+        return Taps(self.first[chosen], np.ascontiguousarray(self.weights[:, chosen]))
+
+
+@lru_cache(maxsize=64)
+def resize_taps(length: int, new_length: int, method: Literal["linear", "area"]) -> Taps:
+    """The taps of a row of `length` pixels that is resized to `new_length`, as OpenCV's INTER_LINEAR or INTER_AREA."""
+    scale, places = length / new_length, np.arange(new_length)[:, None]
+    center = np.clip((places + 0.5) * scale - 0.5, 0, length - 1)
+
+    def weigh(pixels: NDArray[np.int64]) -> Array:
+        if method == "linear":
+            return np.clip(1 - np.abs(pixels - center), 0, None)
+        overlap = np.minimum(pixels + 1, (places + 1) * scale) - np.maximum(pixels, places * scale)
+        return np.where(overlap > SMALLEST_OVERLAP, overlap / scale, 0)
+
+    reach = int(np.ceil(scale / 2)) + 1
+    near = np.floor(center).astype(np.int64) + np.arange(-reach, reach + 1)
+    used = (weigh(near) > 0) & (near >= 0) & (near < length)
+    first, count = np.take_along_axis(near, used.argmax(1)[:, None], 1), used.sum(1).max()
+    first = np.minimum(first, length - count)
+    weights = weigh(first + np.arange(count)).astype(np.float32)
+    return Taps(first[:, 0], np.ascontiguousarray(weights.T))
+
+
+def resize_and_normalize(
+    pixels: NDArray[np.uint8],
+    rows: Taps,
+    columns: Taps,
+    mean: NDArray[np.float32],
+    std: NDArray[np.float32],
+    out: NDArray[np.float32],
+    *,
+    reverse_channels: bool,
+) -> None:
+    """Writes the resized image, less `mean` and divided by `std`, to the top left corner of `out`.
+
+    pixels: (H, W, 3) uint8. rows, columns: of the h rows and w columns of the result. mean, std: (3,) of the result's
+    channels. out: (3, h or more, w or more). reverse_channels: whether the first channel becomes the last.
+    """
+    lines = np.ascontiguousarray(pixels).reshape(len(pixels), -1)
+    if reverse_channels:
+        mean, std, out = mean[::-1].copy(), std[::-1].copy(), out[::-1]
+    _resample(lines, rows.first, rows.weights, columns.first, columns.weights, mean, std, out)
+
+
+@njit(nogil=True, error_model="numpy", fastmath={"contract"})
+def _resample(lines, first_row, row_weights, first_column, column_weights, mean, std, planes) -> None:  # type: ignore[no-untyped-def]
+    """lines: (H, W * 3) uint8. planes: (3, h, w) float32, by the channels of `lines`."""
+    mixed = np.empty(lines.shape[1], np.float32)  # a row of the result before its columns are resized
+    for y in range(len(first_row)):
+        mixed[:] = np.float32(0)
+        for k in range(len(row_weights)):
+            weight = row_weights[k, y]
+            if weight > 0:
+                line = lines[first_row[y] + k]
+                for i in range(len(line)):
+                    mixed[i] += weight * np.float32(line[i])
+        for x in range(len(first_column)):
+            first = second = third = np.float32(0)
+            place = 3 * first_column[x]
+            for k in range(len(column_weights)):
+                weight = column_weights[k, x]
+                first += weight * mixed[place]
+                second += weight * mixed[place + 1]
+                third += weight * mixed[place + 2]
+                place += 3
+            planes[0, y, x] = (first - mean[0]) / std[0]
+            planes[1, y, x] = (second - mean[1]) / std[1]
+            planes[2, y, x] = (third - mean[2]) / std[2]

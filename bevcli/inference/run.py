@@ -1,0 +1,88 @@
+"""The loop over a sequence: `run` yields predictions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+from bevcli.frame import Frame, Prediction, Sequence
+from bevcli.inference.load import Model
+from bevcli.inference.preprocess import Preprocessor
+from bevcli.inference.runner import BevState, Runner, StepOptions
+from bevcli.inference.tracking import TrackerState, track as track_boxes, without_identities
+
+
+@dataclass(frozen=True)
+class RunnerState:
+    """The state between two frames.
+
+    Attributes:
+        bev: of the model, None before the first frame.
+        tracks: of the tracker, None before the first frame or without tracks.
+    """
+
+    bev: BevState | None = None
+    tracks: TrackerState | None = None
+
+
+def run(
+    model: Model,
+    sequence: Sequence,
+    *,
+    temporal: bool = True,
+    track: bool = True,
+    attention: bool = False,
+    probes: tuple[tuple[float, float], ...] = (),
+    cameras: Mapping[str, str] | None = None,
+) -> Iterator[tuple[Frame, Prediction]]:
+    """Runs a model over a sequence, frame by frame; the BEV map of a frame is the history of the next.
+
+        for frame, prediction in bevcli.run(model, drive):
+            print(frame.stamp.index, len(prediction.boxes))
+
+    Frames are read and prepared in the background. Nothing is kept of a frame after it was yielded.
+
+    Args:
+        model: of `load_model`.
+        sequence: of `open_sequence`.
+        temporal: whether the previous BEV map is used.
+        track: whether the boxes get identities over time: the columns `instances`, `track_scores` and `duplicates`.
+            With history, those of a UniAD are the model's own.
+        attention: whether `Prediction.attention` is filled in.
+        probes: x, y in metres, bev frame: BEV cells whose sampling points `Prediction.attention` shows. They imply
+            `attention`.
+        cameras: camera of the rig -> camera of the model whose embedding it takes. Default: the camera of the same
+            name, else the one with the nearest viewing direction.
+
+    Raises:
+        InputError: a frame cannot be read, a probe lies outside the BEV grid, a camera is unknown, or the attention
+            of an exported file is asked for.
+    """
+    if attention or probes:
+        model.require_parts("attention and probes")
+    asked = StepOptions(model.precision, temporal, ask_attention=attention or bool(probes), probes=tuple(probes))
+    steps = run_steps(model, sequence, asked, cameras, track=track)
+    return ((frame, prediction) for frame, prediction, _ in steps)
+
+
+def run_steps(
+    model: Model,
+    sequence: Sequence,
+    options: StepOptions,
+    cameras: Mapping[str, str] | None,
+    *,
+    track: bool,
+    start: int = 0,
+    state: RunnerState = RunnerState(),
+) -> Iterator[tuple[Frame, Prediction, RunnerState]]:
+    """The frames from the place `start` on, with what the next frame needs."""
+    runner = Runner(model.prepared, model.device, options)
+    places = range(start, len(sequence.stamps))
+    tracks = state.tracks
+    for frame, prediction, bev in runner.run(sequence, places, Preprocessor(model.config, cameras), state.bev):
+        tracked = prediction
+        if not track:
+            tracked = replace(prediction, boxes=without_identities(prediction.boxes))
+        elif not runner.tracks:
+            ((_, tracked, tracks),) = track_boxes(model.tracker, [(frame, prediction)], tracks)
+        yield frame, tracked, RunnerState(bev, tracks)

@@ -1,0 +1,214 @@
+"""The temporal run: frame by frame, with the memory that the model keeps."""
+
+from __future__ import annotations
+
+import contextlib
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence as Items
+from dataclasses import dataclass
+from itertools import islice
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from bevcli.frame import AttentionView, BevMap, Frame, FrameStamp, NewStart, Prediction, Sequence, StartReason
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.inference.attention import AttentionProbe, attention_view, probe_cells
+from bevcli.inference.background import read_ahead
+from bevcli.inference.preprocess import Preprocessor
+from bevcli.inference.stage_clock import StageClock
+from bevcli.inference.tracking import without_identities
+from bevcli.inference.transfer import ImageUploader, origin, read_back
+from bevcli.model.prepare import DTYPES, Precision
+from bevcli.model.step import PreparedFrame
+from bevcli.model.temporal_model import Memory, TemporalModel
+
+
+@dataclass(frozen=True)
+class BevState:
+    """The state of a run between two frames.
+
+    Attributes:
+        memory: of the model; the runner only passes it on.
+        stamp: of the frame; None where the next frame starts anew.
+    """
+
+    memory: Memory
+    stamp: FrameStamp | None
+
+
+@dataclass(frozen=True)
+class StepOptions:
+    """Options of a step.
+
+    Attributes:
+        precision: of a plain model, by autocast; a prepared model and an exported file have their own.
+        temporal: whether history is used.
+        ask_attention: whether predictions carry an AttentionView; those of an exported file never do.
+        probes: x, y in metres, bev frame: the cells whose sampling points the AttentionView shows.
+    """
+
+    precision: Precision | Literal["int8"] = "fp32"
+    temporal: bool = True
+    ask_attention: bool = False
+    probes: tuple[tuple[float, float], ...] = ()
+
+
+class Runner:
+    """Runs a model on a device, step by step. The state is an argument and a result; the runner keeps none."""
+
+    def __init__(self, model: TemporalModel, device: torch.device, options: StepOptions | None = None) -> None:
+        self.model = model.to(device).eval()
+        self.config = model.config
+        self.device = device
+        self.options = StepOptions() if options is None else options
+        self.clock = StageClock(model.observed, device, model.stages)
+
+    @torch.inference_mode()
+    def step(
+        self, state: BevState | None, prepared: PreparedFrame, upcoming: Items[PreparedFrame] = ()
+    ) -> tuple[BevState | None, Prediction]:
+        """The state and the prediction after one frame.
+
+        A frame without any image returns the state unchanged, so that the next alignment by ego-motion spans both
+        frames. Where the model's numbers stop being finite, the prediction has no boxes and names the place, and the
+        next frame starts anew.
+
+        Args:
+            state: the result of the step before; None at the start.
+            prepared: the frame, preprocessed.
+            upcoming: the frames after it, for a model that looks ahead. Those after the end of the scene, after a gap
+                or without images are not used.
+        """
+        frame = prepared.frame
+        started_anew = self._new_start(None if state is None else state.stamp, frame.stamp)
+        if started_anew:
+            state = self._restarted(state)
+        if not frame.images:
+            return state, self._prediction(prepared, started_anew, Boxes3D.empty(), None)
+        probe = self._probe()
+        with self.clock:
+            with self._autocast(), probe or contextlib.nullcontext():
+                before, later = None if state is None else state.memory, self._usable(prepared, upcoming)
+                outputs, memory = self.model.step(prepared, before, later)
+                found, is_finite = read_back(outputs, prepared.images)
+                if not is_finite:
+                    where = origin(self.model.observed, lambda: self.model.step(prepared, before, later))
+                    lost = self._prediction(prepared, started_anew, Boxes3D.empty(), None, not_finite=where)
+                    return self._restarted(state), lost
+            boxes = self.model.decode_boxes(found)
+            if self.config.has_tracks and not self.tracks:
+                boxes = without_identities(boxes)
+            self.clock.mark("box_decoding")
+            segmentation = self.model.decode_map(found)
+            if segmentation is not None:
+                self.clock.mark("map_merging")
+        view = None if probe is None else attention_view(probe, prepared, self.config)
+        prediction = self._prediction(prepared, started_anew, boxes, outputs.bev[0], view, segmentation)
+        return BevState(memory, frame.stamp), prediction
+
+    def run(
+        self, sequence: Sequence, places: Items[int], preprocessor: Preprocessor, state: BevState | None = None
+    ) -> Iterator[tuple[Frame, Prediction, BevState | None]]:
+        """Yields frame, prediction and state at these places of a sequence. Frames are read and prepared in advance.
+
+        A model that looks ahead sees the later ones of these places.
+        """
+        upload_images = ImageUploader(self.device)
+
+        def prepare(place: int) -> PreparedFrame:
+            return upload_images(preprocessor(sequence.load(place)))
+
+        ahead = self.config.later_frames if self.options.temporal else 0
+        for prepared, upcoming in with_upcoming(read_ahead(prepare, places), ahead):
+            state, prediction = self.step(state, prepared, upcoming)
+            yield prepared.frame, prediction, state
+
+    @property
+    def tracks(self) -> bool:
+        """The boxes have identities, those of the model's own tracks."""
+        return self.options.temporal and self.config.has_tracks
+
+    def _restarted(self, state: BevState | None) -> BevState | None:
+        """The state before a frame without history: what the model keeps over scenes, None for nothing."""
+        if state is None or not self.options.temporal:
+            return None
+        memory = self.model.restarted(state.memory)
+        return None if memory is None else BevState(memory, None)
+
+    def _new_start(self, before: FrameStamp | None, stamp: FrameStamp) -> NewStart | None:
+        if not self.options.temporal:
+            return NewStart(StartReason.HISTORY_OFF)
+        if not self.config.uses_history:
+            return NewStart(StartReason.NO_HISTORY)
+        if before is None:
+            return NewStart(StartReason.FIRST_FRAME)
+        if stamp.scene != before.scene:
+            return NewStart(StartReason.NEW_SCENE)
+        seconds = (stamp.timestamp_ns - before.timestamp_ns) / 1e9
+        return None if 0 < seconds <= self.config.max_gap_s else NewStart(StartReason.GAP, seconds)
+
+    def _usable(self, prepared: PreparedFrame, upcoming: Items[PreparedFrame]) -> list[PreparedFrame]:
+        """The upcoming frames with images that continue the frame's scene without a gap."""
+        usable: list[PreparedFrame] = []
+        stamp = prepared.frame.stamp
+        for later in upcoming[: self.config.later_frames]:
+            if not later.frame.images:
+                continue
+            if self._new_start(stamp, later.frame.stamp):
+                break
+            usable.append(later)
+            stamp = later.frame.stamp
+        return usable
+
+    def _probe(self) -> AttentionProbe | None:
+        if not self.options.ask_attention or not self.model.has_parts:
+            return None
+        cells = probe_cells(self.options.probes, self.config.bev_grid)
+        return AttentionProbe(self.model, self.config.encoder.layers - 1, cells.to(self.device))
+
+    def _autocast(self) -> contextlib.AbstractContextManager[object]:
+        # For a plain model; a prepared one has a precision of its own and ignores it.
+        if self.options.precision in ("fp32", "int8"):
+            return contextlib.nullcontext()
+        return torch.autocast(self.device.type, DTYPES[self.options.precision])
+
+    def _prediction(
+        self,
+        prepared: PreparedFrame,
+        started_anew: NewStart | None,
+        boxes: Boxes3D,
+        bev: Tensor | None,
+        attention: AttentionView | None = None,
+        segmentation: BevMap | None = None,
+        not_finite: str = "",
+    ) -> Prediction:
+        frame, assignment = prepared.frame, prepared.assignment
+        return Prediction(
+            stamp=frame.stamp,
+            boxes=boxes,
+            ego_from_bev=frame.rig.ego_from_bev,
+            world_from_ego=frame.world_from_ego,
+            grid=self.config.bev_grid,
+            bev=bev,
+            started_anew=started_anew,
+            camera_embeddings=dict(zip(assignment.cameras, assignment.embeddings, strict=True)),
+            skipped=bev is None and not not_finite,
+            not_finite=not_finite,
+            segmentation=segmentation,
+            attention=attention,
+            stage_seconds={} if bev is None else self.clock.read(),
+        )
+
+
+def with_upcoming(
+    frames: Iterable[PreparedFrame], count: int
+) -> Iterator[tuple[PreparedFrame, tuple[PreparedFrame, ...]]]:
+    """Each frame with the next ones, up to `count`; fewer at the end."""
+    source = iter(frames)
+    waiting = deque(islice(source, count + 1))
+    while waiting:
+        frame = waiting.popleft()
+        yield frame, tuple(waiting)
+        waiting.extend(islice(source, 1))

@@ -1,0 +1,275 @@
+"""Tracking: boxes get identities over time, by greedy matching of centres that move with the predicted velocity.
+
+The matching is that of CenterPoint (Yin et al., Center-based 3D Object Detection and Tracking, CVPR 2021, section 4.3):
+the tracks move to the frame's time, and the boxes, highest score first, each take the nearest free track of their class
+within the class's gate. Added here: two score thresholds, scores of tracks, and the suppression of duplicates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.frame import Frame, FrameStamp, Prediction
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.transforms import Array
+
+
+@dataclass(frozen=True)
+class Gates:
+    """The largest distance, by class, between a box and the place where its track is expected, metres.
+
+    Attributes:
+        other: for classes that are not listed.
+    """
+
+    car: float = 3.0
+    truck: float = 3.0
+    construction_vehicle: float = 4.0
+    bus: float = 5.0
+    trailer: float = 4.0
+    barrier: float = 1.0
+    motorcycle: float = 4.0
+    bicycle: float = 2.5
+    pedestrian: float = 2.0
+    traffic_cone: float = 1.0
+    other: float = 4.0
+
+    def __post_init__(self) -> None:
+        for gate in fields(self):
+            if not getattr(self, gate.name) > 0:
+                raise ValueError(f"gates_m.{gate.name} must be above 0 m, found {getattr(self, gate.name):g}")
+
+    def of(self, classes: NDArray[np.str_]) -> Array:
+        """(N,) the gates of boxes of these classes (N,), metres."""
+        return np.array([getattr(self, str(name), self.other) for name in classes], dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class TrackerConfig:
+    """The parameters of the tracker: the table [tracking] of a model's TOML file.
+
+    Attributes:
+        birth_score: an unmatched box with this score or more starts a track.
+        keep_score: a box with this score or more can continue a track.
+        confirm_frames: number of frames with a box after which a track is confirmed.
+        coast_s: time that a confirmed track lives without a box, in seconds. Other tracks end with the first frame
+            without a box.
+        duplicate_widths: a box is a duplicate when the centre of a better box of its class is closer than this many
+            widths of the better box. 0: no box is a duplicate.
+        use_velocity: whether tracks move with the predicted velocity; if not, they stay where their last box is.
+        gates_m: the largest distance of a match, by class.
+    """
+
+    birth_score: float = 0.2
+    keep_score: float = 0.1
+    confirm_frames: int = 2
+    coast_s: float = 1.5
+    duplicate_widths: float = 1.0
+    use_velocity: bool = True
+    gates_m: Gates = field(default_factory=Gates)
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.keep_score <= self.birth_score <= 1:
+            raise ValueError(
+                f"keep_score and birth_score must be 0 to 1, keep_score not above birth_score; found "
+                f"{self.keep_score:g} and {self.birth_score:g}"
+            )
+        if self.confirm_frames < 1 or self.coast_s < 0 or self.duplicate_widths < 0:
+            raise ValueError(
+                "confirm_frames must be at least 1, coast_s and duplicate_widths must not be negative; found "
+                f"{self.confirm_frames}, {self.coast_s:g} and {self.duplicate_widths:g}"
+            )
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """T tracks in the world frame.
+
+    Attributes:
+        numbers: (T,) identity.
+        classes: (T,) names.
+        centers_xy: (T, 2) centre of the last box, metres.
+        velocities: (T, 2) velocity of the last box, m/s.
+        seen_ns: (T,) time of the last box.
+        frames: (T,) number of frames with a box.
+        score_sums: (T,) sum of the scores of these boxes.
+    """
+
+    numbers: NDArray[np.int64]
+    classes: NDArray[np.str_]
+    centers_xy: Array
+    velocities: Array
+    seen_ns: NDArray[np.int64]
+    frames: NDArray[np.int64]
+    score_sums: Array
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __getitem__(self, selection: NDArray[Any]) -> Tracks:
+        """The tracks of a mask (T,) bool or of an index array."""
+        return Tracks(*(getattr(self, column.name)[selection] for column in fields(self)))
+
+    @staticmethod
+    def empty() -> Tracks:
+        """No track at all."""
+        nothing, no_numbers = np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
+        return Tracks(no_numbers, np.zeros(0, "<U1"), nothing, nothing, no_numbers, no_numbers, np.zeros(0))
+
+
+@dataclass(frozen=True)
+class TrackerState:
+    """All that the tracker keeps from one frame to the next.
+
+    Attributes:
+        tracks: the tracks that live.
+        stamp: of the last frame.
+        next_number: the identity of the next track. It never falls, so that identities differ between scenes, too.
+    """
+
+    tracks: Tracks
+    stamp: FrameStamp
+    next_number: int
+
+
+def track(
+    config: TrackerConfig, predictions: Iterable[tuple[Frame, Prediction]], state: TrackerState | None = None
+) -> Iterator[tuple[Frame, Prediction, TrackerState | None]]:
+    """Gives the boxes of a run's predictions their identities, and yields the state after each frame.
+
+    A frame without any image has no boxes and leaves the state as it is.
+    """
+    for frame, prediction in predictions:
+        if not prediction.skipped:
+            state, tracked = step(config, state, prediction.boxes_world, prediction.stamp)
+            columns = {name: getattr(tracked, name) for name in ("instances", "track_scores", "duplicates")}
+            prediction = replace(prediction, boxes=replace(prediction.boxes, **columns))
+        yield frame, prediction, state
+
+
+def step(
+    config: TrackerConfig, state: TrackerState | None, boxes: Boxes3D, stamp: FrameStamp
+) -> tuple[TrackerState, Boxes3D]:
+    """The state after a frame, and its boxes with their identities.
+
+    The boxes have the same order and the columns `instances` ("" for a box without a track), `track_scores` (NaN
+    without a track) and `duplicates`. Tracks start anew with a new scene, and where the time does not advance or
+    advances by more than `coast_s` after the last box.
+
+    Args:
+        config: the parameters.
+        state: of the frame before, None for the first frame.
+        boxes: N predictions in the world frame (or any other one that does not move), with scores.
+        stamp: scene and time of the frame.
+    """
+    scores = np.zeros(len(boxes)) if boxes.scores is None else boxes.scores
+    number = 0 if state is None else state.next_number
+    tracks = _living(config, state, stamp)
+    order = np.argsort(-scores, kind="stable")
+    duplicates = find_duplicates(boxes, order, config.duplicate_widths)
+    usable = order[~duplicates[order] & (scores[order] >= config.keep_score)]
+    matches = _match(config, tracks, boxes, usable, stamp)
+    born = usable[(matches[usable] < 0) & (scores[usable] >= config.birth_score)]
+    matches[born] = len(tracks) + np.arange(len(born))
+    tracks = _with_births(tracks, boxes, born, number)
+    owned = np.flatnonzero(matches >= 0)
+    tracks = _updated(tracks, boxes, scores, owned, matches[owned], stamp)
+    instances = np.full(len(boxes), "", dtype="<U20")
+    instances[owned] = tracks.numbers[matches[owned]].astype("<U20")
+    track_scores = np.full(len(boxes), np.nan)
+    track_scores[owned] = track_score(tracks[matches[owned]])
+    tracked = replace(boxes, instances=instances, track_scores=track_scores, duplicates=duplicates)
+    unseen = tracks.seen_ns != stamp.timestamp_ns
+    tracks = tracks[~(unseen & (tracks.frames < config.confirm_frames))]
+    return TrackerState(tracks, stamp, number + len(born)), tracked
+
+
+def without_identities(boxes: Boxes3D) -> Boxes3D:
+    """The boxes without the columns that tracking adds."""
+    return replace(boxes, instances=None, track_scores=None, duplicates=None)
+
+
+def track_score(tracks: Tracks) -> Array:
+    """(T,) 0 to 1: the mean score of a track's boxes."""
+    return tracks.score_sums / tracks.frames
+
+
+def find_duplicates(boxes: Boxes3D, order: NDArray[np.int64], widths: float) -> NDArray[np.bool_]:
+    """Mask (N,) of the boxes on an object that a better box of their class describes already.
+
+    order: (N,) their indices, highest score first. widths: distance of the centres, in widths of the better box.
+    """
+    ranked = boxes[order]
+    x, y = ranked.centers[:, :2].T
+    near = np.hypot(x[:, None] - x, y[:, None] - y) < widths * ranked.sizes_lwh[:, 1, None]
+    _, classes = np.unique(ranked.classes, return_inverse=True)
+    near &= classes[:, None] == classes
+    near = np.triu(near, k=1)  # (N, N): row i says which worse boxes lie on the object of box i
+    worse = np.zeros(len(boxes), dtype=bool)
+    for rank, row in enumerate(near):
+        if not worse[rank]:
+            worse |= row
+    duplicates = np.zeros(len(boxes), dtype=bool)
+    duplicates[order] = worse
+    return duplicates
+
+
+def _living(config: TrackerConfig, state: TrackerState | None, stamp: FrameStamp) -> Tracks:
+    """The tracks that may go on in a frame."""
+    if state is None or state.stamp.scene != stamp.scene or stamp.timestamp_ns <= state.stamp.timestamp_ns:
+        return Tracks.empty()
+    return state.tracks[stamp.timestamp_ns - state.tracks.seen_ns <= config.coast_s * 1e9]
+
+
+def _match(
+    config: TrackerConfig, tracks: Tracks, boxes: Boxes3D, usable: NDArray[np.int64], stamp: FrameStamp
+) -> NDArray[np.int64]:
+    """(N,) the index of each box's track, -1 for none. `usable` (M,): the boxes that may match, best first."""
+    matches = np.full(len(boxes), -1)
+    if not len(tracks):
+        return matches
+    places = tracks.centers_xy
+    if config.use_velocity:
+        seconds = (stamp.timestamp_ns - tracks.seen_ns) / 1e9
+        places = places + np.nan_to_num(tracks.velocities) * seconds[:, None]
+    away = np.linalg.norm(boxes.centers[usable, None, :2] - places, axis=-1)  # (M, T)
+    away[boxes.classes[usable, None] != tracks.classes] = np.inf
+    away[away > config.gates_m.of(boxes.classes[usable])[:, None]] = np.inf
+    for box, distances in zip(usable, away, strict=True):
+        nearest = int(np.argmin(distances))
+        if np.isfinite(distances[nearest]):
+            matches[box] = nearest
+            away[:, nearest] = np.inf
+    return matches
+
+
+def _with_births(tracks: Tracks, boxes: Boxes3D, born: NDArray[np.int64], number: int) -> Tracks:
+    """The tracks, followed by a new one, without any box so far, for each of these boxes."""
+    count = len(born)
+    nothing, nowhere = np.zeros(count, dtype=np.int64), np.zeros((count, 2))
+    new = Tracks(number + np.arange(count), boxes.classes[born], nowhere, nowhere, nothing, nothing, np.zeros(count))
+    columns = (np.concatenate([getattr(tracks, c.name), getattr(new, c.name)]) for c in fields(Tracks))
+    return Tracks(*columns)
+
+
+def _updated(
+    tracks: Tracks,
+    boxes: Boxes3D,
+    scores: Array,
+    owned: NDArray[np.int64],
+    owners: NDArray[np.int64],
+    stamp: FrameStamp,
+) -> Tracks:
+    """The tracks after the boxes `owned` (K,) were added to the tracks `owners` (K,)."""
+    tracks = tracks[np.arange(len(tracks))]  # a copy
+    tracks.centers_xy[owners] = boxes.centers[owned, :2]
+    tracks.velocities[owners] = boxes.velocities[owned]
+    tracks.seen_ns[owners] = stamp.timestamp_ns
+    tracks.frames[owners] += 1
+    tracks.score_sums[owners] += scores[owned]
+    return tracks

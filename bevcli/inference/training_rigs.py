@@ -1,0 +1,106 @@
+"""A drive's rig next to the rigs that a model's weights were trained on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.model.config import ModelConfig
+
+# How far outside the range of the training a camera may be without a note.
+_FOV_DEG, _HEIGHT_M, _TILT_DEG = 8.0, 0.3, 1.5
+_BEV_TILT_DEG = 4.0  # published weights were trained with nuScenes' LIDAR_TOP, which is tilted by up to 3 degrees
+
+
+def rig_notes(rig: CameraRig, config: ModelConfig) -> tuple[str, ...]:
+    """Warnings where a rig lies outside the training distribution, at most two: the cameras, and the bev frame."""
+    return (*_cameras_note(rig, config), *_bev_frame_note(rig, config))
+
+
+def weights_facts(config: ModelConfig) -> dict[str, str]:
+    """The metadata of a weights file: the model, and the frame and the rigs that the weights expect."""
+    x0, x1 = config.bev_grid.x_range_m
+    frame = config.bev_frame
+    facts = {
+        "model": config.name,
+        "bev_frame": f"level, {frame.height_m:g} m above the ground" if frame.level else "as in the drive",
+        "range_m": f"{x0:g} to {x1:g}",
+    }
+    rigs = config.training_rigs
+    if not rigs.known:
+        return facts
+    cameras = "{} to {} cameras".format(*rigs.cameras) if rigs.cameras[0] < rigs.cameras[1] else f"{rigs.cameras[0]}"
+    lenses = "field of view {:g} to {:g}°".format(*rigs.fov_deg)
+    places = "height {:g} to {:g} m, pitch and roll up to {:g}°".format(*rigs.height_m, rigs.tilt_deg)
+    return facts | {"training_rigs": f"{cameras}{'' if 'cameras' in cameras else ' cameras'}, {lenses}, {places}"}
+
+
+def facts_notes(facts: Mapping[str, str], config: ModelConfig) -> Iterator[str]:
+    """A warning where the model's file contradicts the bev frame that the weights file states."""
+    expected = weights_facts(config)["bev_frame"]
+    stated = facts.get("bev_frame", expected)
+    if stated != expected:
+        yield (
+            f'the weights were trained with a bev frame "{stated}", but the model\'s file gives them one "{expected}": '
+            "set [bev_frame] in the model's file"
+        )
+
+
+def _cameras_note(rig: CameraRig, config: ModelConfig) -> Iterator[str]:
+    trained = config.training_rigs
+    if not trained.known or not rig.cameras:
+        return
+    count, heights = len(rig.cameras), [float(camera.ego_from_camera[2, 3]) for camera in rig.cameras]
+    fovs = [_fov_deg(camera) for camera in rig.cameras]
+    tilt = max(_tilt_deg(camera) for camera in rig.cameras)
+    far = []
+    if not trained.cameras[0] <= count <= trained.cameras[1]:
+        far.append(f"{count} cameras ({_range(trained.cameras, '')})")
+    if _is_outside(heights, trained.height_m, _HEIGHT_M):
+        far.append(f"camera heights {_range((min(heights), max(heights)), ' m')} ({_range(trained.height_m, ' m')})")
+    if _is_outside(fovs, trained.fov_deg, _FOV_DEG):
+        far.append(f"fields of view {_range((min(fovs), max(fovs)), '°', 0)} ({_range(trained.fov_deg, '°', 0)})")
+    if tilt > trained.tilt_deg + _TILT_DEG:
+        far.append(f"pitch or roll up to {tilt:.1f}° ({trained.tilt_deg:g}°)")
+    if far:
+        cost = f"; measured: {trained.cost}" if trained.cost else ""
+        yield f"the rig is unlike those that the weights were trained on (theirs in brackets): {', '.join(far)}{cost}"
+
+
+def _bev_frame_note(rig: CameraRig, config: ModelConfig) -> Iterator[str]:
+    tilt_deg = float(np.degrees(np.arccos(np.clip(rig.ego_from_bev[2, 2], -1, 1))))
+    height, expected = float(rig.ego_from_bev[2, 3]), config.bev_frame
+    if expected.level and (tilt_deg >= 0.1 or abs(height - expected.height_m) >= 0.05):
+        yield (
+            f"the bev frame is tilted by {tilt_deg:.1f}° and {height:.2f} m high, but the weights expect a level one "
+            f"at {expected.height_m:g} m: the model computes in such a frame, and gives boxes back in ego and world"
+        )
+    if not expected.level and tilt_deg > _BEV_TILT_DEG:
+        off = 30 * np.tan(np.radians(tilt_deg))
+        yield (
+            f"the bev frame is tilted by {tilt_deg:.1f}°, but the weights were trained with one tilted by up to 3°: "
+            f'boxes 30 m away may be {off:.1f} m too high or too low (level "ego_from_bev" in the calibration)'
+        )
+
+
+def _fov_deg(camera: Camera) -> float:
+    """Horizontal field of view without distortion, degrees."""
+    focal, center = camera.intrinsics[0, 0], camera.intrinsics[0, 2]
+    return float(np.degrees(np.arctan(center / focal) + np.arctan((camera.width - center) / focal)))
+
+
+def _tilt_deg(camera: Camera) -> float:
+    """The larger of pitch and roll, degrees; a camera upside down or on its side has a roll near 0."""
+    heights = np.abs(camera.ego_from_camera[2, [0, 2]])  # of the axes to the right and ahead
+    return float(np.degrees(np.arcsin(np.clip(heights, 0, 1))).max())
+
+
+def _is_outside(values: list[float], trained: tuple[float, float], margin: float) -> bool:
+    return min(values) < trained[0] - margin or max(values) > trained[1] + margin
+
+
+def _range(ends: tuple[float, float], unit: str, digits: int = 1) -> str:
+    low, high = (f"{end:.{digits}f}".removesuffix(".0") for end in ends)
+    return f"{low}{unit}" if low == high else f"{low} to {high}{unit}"

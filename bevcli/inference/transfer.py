@@ -1,0 +1,124 @@
+"""Between CPU and GPU: images go up while the model computes, results come back with one wait and are checked."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import fields, is_dataclass, replace
+
+import torch
+from torch import Tensor, nn
+
+from bevcli.model.segmentation import SegmentationOutputs
+from bevcli.model.step import ModelOutputs, PreparedFrame
+from bevcli.model.upload import upload
+
+
+class ImageUploader:
+    """Uploads the images of frames to a CUDA GPU on a stream of its own. Does nothing for other devices.
+
+    The thread that reads frames ahead calls it; this thread waits for the copy, and the model does not.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        """To call in the thread that runs the model."""
+        self._device = device
+        on_gpu = device.type == "cuda"
+        self._stream = torch.cuda.Stream(device) if on_gpu else None
+        self._of_model = torch.cuda.current_stream(device) if on_gpu else None
+
+    def __call__(self, prepared: PreparedFrame) -> PreparedFrame:
+        """The frame with its images on the device."""
+        if self._stream is None or self._of_model is None:
+            return prepared
+        with torch.cuda.stream(self._stream):
+            images = upload(prepared.images, self._device)
+        # The allocator must not give the memory away while the model's stream may still read it.
+        images.record_stream(self._of_model)
+        self._stream.synchronize()
+        return replace(prepared, images=images)
+
+
+def read_back(outputs: ModelOutputs, images: Tensor) -> tuple[ModelOutputs, bool]:
+    """The last layers' outputs on the CPU, and whether the BEV map, the class logits and the box codes are finite.
+
+    All copies from a CUDA GPU share one wait. The BEV map stays on its device; where `ModelOutputs.stays_on_device`, so
+    does everything. On a CPU the input images must be finite too: the ReLU of oneDNN turns NaN into zero, so NaN in the
+    images may not reach the outputs. Weights are checked when they are read and when they are prepared. Not seen are
+    numbers inside of the backbone that grow beyond the range of their type and that ReLU then turns into zeros.
+    """
+    logits, codes = outputs.class_logits[-1:], outputs.box_codes[-1:]
+    checked = [outputs.bev, logits, codes, *([images] if outputs.bev.device.type == "cpu" else [])]
+    extremes = torch.stack([end.float() for x in checked for end in _extremes(x)])
+    if outputs.stays_on_device:
+        return outputs, bool(torch.isfinite(extremes).all())
+    found = [logits, codes, extremes]
+    segmentation = outputs.segmentation
+    if segmentation is not None:
+        found += [segmentation.mask_logits[-1:], segmentation.class_logits[-1:], segmentation.locations[-1:]]
+    logits, codes, extremes, *masks = _on_cpu(found)
+    on_cpu = ModelOutputs(outputs.bev, logits, codes, SegmentationOutputs(*masks) if masks else None)
+    return on_cpu, bool(torch.isfinite(extremes).all())
+
+
+def _extremes(tensor: Tensor) -> tuple[Tensor, Tensor]:
+    """The smallest and the largest number; NaN where any is NaN."""
+    if tensor.device.type == "mps":  # has no aminmax
+        return tensor.amin(), tensor.amax()
+    return torch.aminmax(tensor)
+
+
+def _on_cpu(tensors: list[Tensor]) -> list[Tensor]:
+    """The tensors on the CPU, after one wait for a CUDA GPU."""
+    device = tensors[0].device
+    if device.type != "cuda":
+        return [tensor.cpu() for tensor in tensors]
+    copies = [torch.empty(x.shape, dtype=x.dtype, pin_memory=True).copy_(x, non_blocking=True) for x in tensors]
+    torch.cuda.current_stream(device).synchronize()
+    return copies
+
+
+def origin(model: nn.Module, step: Callable[[], object]) -> str:
+    """The origin of NaN or infinity: an input, or the first module whose output has any.
+
+    model: the model that the step is made with. step: makes the step once more; every module is checked meanwhile.
+    """
+    found: list[str] = []
+
+    def check(value: object, place: str = "") -> None:
+        bad = [name for name, tensor in _tensors(value, "history") if not _is_finite(tensor)]
+        if bad and not found:
+            found.append(place or f"input {bad[0]}")
+
+    with ExitStack() as hooks:
+        hooks.enter_context(model.register_forward_pre_hook(lambda module, arguments: check(arguments)))
+        for name, module in model.named_modules():
+            if name:
+                hook = module.register_forward_hook(lambda *call, name=name: check(call[2], describe(name)))
+                hooks.enter_context(hook)
+        step()
+    return found[0] if found else "the whole model"
+
+
+def describe(name: str) -> str:
+    """A module's name with the part of the paper's figure: "encoder layer 3 (encoder.layers.3.norms.0)"."""
+    layer = re.match(r"(encoder|decoder)\.layers\.(\d+)", name)
+    part = f"{layer[1]} layer {layer[2]}" if layer else name.split(".")[0].replace("_", " ")
+    return part if part == name else f"{part} ({name})"
+
+
+def _tensors(value: object, name: str) -> Iterator[tuple[str, Tensor]]:
+    """The tensors in lists and dataclasses, with the name of the field that holds them, `name` outside of one."""
+    if isinstance(value, Tensor):
+        yield name, value
+    elif isinstance(value, tuple | list):
+        for part in value:
+            yield from _tensors(part, name)
+    elif is_dataclass(value) and not isinstance(value, type):
+        for field in fields(value):
+            yield from _tensors(getattr(value, field.name), field.name)
+
+
+def _is_finite(tensor: Tensor) -> bool:
+    return not tensor.is_floating_point() or bool(torch.isfinite(tensor).all())

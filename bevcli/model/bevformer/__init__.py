@@ -1,0 +1,1 @@
+"""BEVFormer (Li et al. 2022)."""

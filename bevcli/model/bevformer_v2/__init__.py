@@ -1,0 +1,1 @@
+"""BEVFormerV2 (Yang et al. 2022)."""

@@ -1,0 +1,233 @@
+"""The configuration that every model has: images, BEV grid, and the parts that models share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal
+
+from bevcli.frame import MAP_CLASSES
+from bevcli.geometry.bev_grid import BevGrid
+from bevcli.model.decoder import DecoderConfig
+from bevcli.model.deformable_attention import LevelShapes
+from bevcli.model.ego_motion import EgoMotionConfig
+from bevcli.model.encoder import EncoderConfig
+from bevcli.model.fpn import FPNConfig
+from bevcli.model.image_tokens import ImageTokensConfig
+from bevcli.model.resnet import ResNetConfig
+from bevcli.model.segmentation import SegmentationConfig
+
+
+@dataclass(frozen=True)
+class ImageConfig:
+    """The network's input made of an image: resized, cropped, normalised in float, padded at right and bottom.
+
+    Attributes:
+        size: (width, height) in pixels that an image is resized to. Images of another aspect ratio are scaled to fit
+            inside.
+        mean: of each channel, subtracted, on the scale 0 to 255 and in color_order.
+        std: of each channel, the divisor, on the same scale.
+        color_order: order of the channels, "rgb" or "bgr".
+        pad_divisor: width and height are padded with zeros to a multiple of it.
+        resize: "linear", as the published weights were trained, aliases where images shrink to less than half;
+            "area" averages the pixels that fall into one.
+        half_pixel_shift: whether projections follow the resized image exactly: it keeps the corners of the image, so
+            that pixel u goes to (u + 0.5) * scale - 0.5. If false, it goes to u * scale, as the published weights were
+            trained, which is 0.3 pixels off where 1600 pixels become 512.
+        crop: (left, top, right, bottom) in pixels of the resized image: the part that the network sees. None for all.
+        focal_px: images of wide cameras become larger than `size`: their median focal length becomes this, in pixels
+            of the network's input, so that objects at the same distance have the same size for every rig
+            (`bevcli.inference.preprocess.image_for_rig`). None: `size` holds for every rig.
+        max_pixels: with `focal_px`, images become larger only as long as all images of a frame have no more pixels.
+    """
+
+    size: tuple[int, int]
+    mean: tuple[float, float, float]
+    std: tuple[float, float, float]
+    color_order: Literal["rgb", "bgr"]
+    pad_divisor: int = 32
+    resize: Literal["linear", "area"] = "linear"
+    half_pixel_shift: bool = False
+    crop: tuple[int, int, int, int] | None = None
+    focal_px: float | None = None
+    max_pixels: int | None = None
+
+    def __post_init__(self) -> None:
+        if min(self.size) < 1 or min(self.std) <= 0 or self.pad_divisor < 1:
+            raise ValueError("size, std and pad_divisor must be positive")
+        left, top, right, bottom = self.crop_box
+        if not (0 <= left < right <= self.size[0] and 0 <= top < bottom <= self.size[1]):
+            raise ValueError("crop must be left, top, right, bottom inside size, left < right and top < bottom")
+        if (self.focal_px is None) != (self.max_pixels is None):
+            raise ValueError("focal_px and max_pixels must be given together")
+        if self.focal_px is not None and self.max_pixels is not None:
+            if self.crop is not None:
+                raise ValueError("crop and focal_px exclude each other: with focal_px the size depends on the rig")
+            if self.focal_px <= 0 or self.max_pixels < 1:
+                raise ValueError("focal_px and max_pixels must be positive")
+
+    @property
+    def crop_box(self) -> tuple[int, int, int, int]:
+        """Left, top, right and bottom of the part of the resized image that the network sees, pixels."""
+        return (0, 0, *self.size) if self.crop is None else self.crop
+
+    @property
+    def padded_size(self) -> tuple[int, int]:
+        """(width, height) of the network's input, pixels."""
+        left, top, right, bottom = self.crop_box
+        width, height = (-(-extent // self.pad_divisor) * self.pad_divisor for extent in (right - left, bottom - top))
+        return width, height
+
+
+@dataclass(frozen=True)
+class BevFrameConfig:
+    """The bev frame that a model was trained in, relative to the ego frame, whose origin is on the ground.
+
+    Attributes:
+        level: whether the z axis of the bev frame must be vertical. The bev frame of every drive is then replaced by a
+            level one with the same heading and origin, at the height `height_m`. If false, the drive's is used.
+        height_m: height of the origin above the ground, metres; nuScenes' LIDAR_TOP has 1.84.
+    """
+
+    level: bool = False
+    height_m: float = 1.84
+
+
+@dataclass(frozen=True)
+class TrainingRigsConfig:
+    """The rigs that a model's weights were trained on. It changes no result: a drive's rig is compared with it.
+
+    Attributes:
+        cameras: smallest and largest number of cameras; 0 and 0 where the rigs are not known.
+        fov_deg: smallest and largest horizontal field of view.
+        height_m: smallest and largest height of a camera above the ground.
+        tilt_deg: largest pitch or roll of a camera.
+        cost: what other rigs were measured to cost, in words.
+    """
+
+    cameras: tuple[int, int] = (0, 0)
+    fov_deg: tuple[float, float] = (0.0, 180.0)
+    height_m: tuple[float, float] = (0.0, 10.0)
+    tilt_deg: float = 90.0
+    cost: str = ""
+
+    @property
+    def known(self) -> bool:
+        """The model's file states the rigs."""
+        return self.cameras[1] > 0
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """A whole model. `bevcli.config.load_config` reads it from a TOML file.
+
+    A model with settings of its own has a subclass, which may also override the properties.
+
+    Attributes:
+        architecture: name of the registered model; the key `architecture` of a TOML file chooses it.
+        has_tracks: the model gives its boxes identities over time.
+        trains_with_gaps: a training clip leaves out one of its earlier frames, as published for BEVFormer.
+        name: of the model.
+        classes: of the objects, in the order of the class logits.
+        cameras: names of the camera embeddings, in their order.
+        image: how images become the network's input.
+        bev_grid: the cells of the BEV map and their pillars.
+        bev_frame: the frame in which the grid lies.
+        training_rigs: the rigs that the weights were trained on.
+        rate_hz: frame rate of the training data.
+        max_gap_s: after a longer time between two frames the history is dropped.
+        channels: C, of all tokens and queries.
+        heads: what is computed from the BEV map; "segmentation" adds the head that `segmentation` configures.
+        backbone: the ResNet.
+        neck: the feature pyramid network.
+        image_tokens: camera and level embeddings.
+        ego_motion: can-bus numbers and alignment of the history.
+        encoder: the BEV encoder.
+        decoder: the object decoder.
+        segmentation: the segmentation head.
+    """
+
+    architecture: ClassVar[str] = "BEVFormer"
+    has_tracks: ClassVar[bool] = False
+    trains_with_gaps: ClassVar[bool] = True
+
+    name: str
+    classes: tuple[str, ...]
+    cameras: tuple[str, ...]
+    image: ImageConfig
+    bev_grid: BevGrid
+    bev_frame: BevFrameConfig = field(default_factory=BevFrameConfig)
+    training_rigs: TrainingRigsConfig = field(default_factory=TrainingRigsConfig)
+    rate_hz: float = 2.0
+    max_gap_s: float = 2.0
+    channels: int = 256
+    heads: tuple[Literal["detection", "segmentation"], ...] = ("detection",)
+    backbone: ResNetConfig = field(default_factory=ResNetConfig)
+    neck: FPNConfig = field(default_factory=FPNConfig)
+    image_tokens: ImageTokensConfig = field(default_factory=ImageTokensConfig)
+    ego_motion: EgoMotionConfig = field(default_factory=EgoMotionConfig)
+    encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    decoder: DecoderConfig = field(default_factory=DecoderConfig)
+    segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
+
+    def __post_init__(self) -> None:
+        grid, levels = self.bev_grid, self.neck.levels
+        if min(grid.rows, grid.columns, grid.pillar_points) < 1:
+            raise ValueError("bev_grid needs at least one row, column and pillar point")
+        if any(start >= end for start, end in (grid.x_range_m, grid.y_range_m, grid.z_range_m)):
+            raise ValueError("bev_grid: each range goes from a smaller to a larger number")
+        if not (self.classes and self.cameras) or min(self.channels, self.rate_hz, self.max_gap_s) <= 0:
+            raise ValueError("classes and cameras must not be empty, channels, rate_hz and max_gap_s must be positive")
+        if "detection" not in self.heads or len(set(self.heads)) < len(self.heads):
+            raise ValueError('heads must name "detection", and no head twice')
+        divisors = [2, self.encoder.attention_heads, self.decoder.attention_heads]
+        if "segmentation" in self.heads:
+            divisors.append(self.segmentation.attention_heads)
+        if any(self.channels % divisor for divisor in divisors):
+            raise ValueError(f"channels is {self.channels}; it must be even and a multiple of the attention_heads")
+        if self.encoder.spatial_points % grid.pillar_points:
+            raise ValueError("encoder.spatial_points must be a multiple of bev_grid.pillar_points")
+        if not len(self.backbone.output_stages) <= levels <= self._most_neck_levels():
+            raise ValueError(
+                f"neck.levels is {levels}; expected at least the number of backbone.output_stages, "
+                f"at most image_tokens.level_embeddings"
+            )
+
+    @property
+    def encoder_levels(self) -> int:
+        """Number of the neck's levels that the BEV encoder attends to, the finest ones."""
+        return min(self.neck.levels, self.image_tokens.level_embeddings)
+
+    @property
+    def level_shapes(self) -> LevelShapes:
+        """(height, width) of each of these levels."""
+        width, height = self.image.padded_size
+        strides = [2 ** (stage + 1) for stage in sorted(self.backbone.output_stages)]
+        while len(strides) < self.neck.levels:
+            strides.append(2 * strides[-1])
+        return tuple((-(-height // stride), -(-width // stride)) for stride in strides[: self.encoder_levels])
+
+    @property
+    def map_classes(self) -> tuple[str, ...]:
+        """The classes of the map that the model predicts, in the order of their bits; empty without a map."""
+        return tuple(MAP_CLASSES) if "segmentation" in self.heads else ()
+
+    @property
+    def past_frames(self) -> int:
+        """Number of frames before the current one that a window reaches; 0 without a window."""
+        return 0
+
+    @property
+    def later_frames(self) -> int:
+        """Number of frames after the current one that a step needs."""
+        return 0
+
+    @property
+    def uses_history(self) -> bool:
+        """Earlier or later frames change the result."""
+        return True
+
+    def check_training(self, clip_frames: int) -> None:
+        """Raise ConfigError if the model cannot be trained on clips of this many frames."""
+
+    def _most_neck_levels(self) -> int:
+        return self.image_tokens.level_embeddings

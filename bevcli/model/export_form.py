@@ -1,0 +1,185 @@
+"""The exported form of a model: names, shapes and units of a file's inputs and outputs, as its metadata states them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from bevcli.model.config import ModelConfig
+from bevcli.model.segmentation import STUFF_CLASSES
+from bevcli.model.step import ModelInputs, PreparedFrame
+
+
+@dataclass(frozen=True)
+class Port:
+    """An input or an output of an exported file.
+
+    Attributes:
+        name: in the file.
+        shape: of the tensor.
+        meaning: axes, units and frames, for the file's metadata.
+        dtype: of the tensor.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    meaning: str
+    dtype: torch.dtype = torch.float32
+
+
+class ExportForm:
+    """One step of a model as an exported file: its inputs and outputs, and the memory between them.
+
+    Attributes:
+        step: class of the module that is exported, an `ExportedStep`.
+        config: of the model.
+        cameras: N, the number of cameras.
+    """
+
+    step: ClassVar[type[nn.Module]]
+
+    def __init__(self, config: ModelConfig, cameras: int) -> None:
+        self.config, self.cameras = config, cameras
+
+    @property
+    def inputs(self) -> tuple[Port, ...]:
+        """The inputs, in the order of the arguments of the step's `forward`."""
+        raise NotImplementedError
+
+    def outputs(self, *, decode: bool) -> tuple[Port, ...]:
+        """The outputs, in the order of the results of the step's `forward`. decode: with boxes."""
+        return (*_output_ports(self.config), *(_box_ports(self.config) if decode else ()))
+
+    def facts(self) -> dict[str, Any]:
+        """Further metadata of the file."""
+        return {}
+
+    def feed(self, prepared: PreparedFrame, memory: Any) -> dict[str, Tensor]:
+        """The inputs of one frame by name. memory: after the frame before; None where the history starts anew."""
+        raise NotImplementedError
+
+    def memory(self, prepared: PreparedFrame, memory: Any, found: Mapping[str, Tensor]) -> Any:
+        """The memory after a frame. memory: before it. found: the file's outputs by name."""
+        raise NotImplementedError
+
+
+def camera_ports(
+    config: ModelConfig, lead: tuple[int, ...], axes: str = "1, N", bev_frame: str = "the bev frame"
+) -> tuple[Port, ...]:
+    """The images of the current frame of N cameras, their projections, and which of them there are.
+
+    lead: shape of what there is for each image, 1 and N, with more axes between them where a model sees more frames.
+    axes: their names. bev_frame: the frame that is projected.
+    """
+    image = config.image
+    width, height = image.padded_size
+    left, top, right, bottom = image.crop_box
+    pad = ", ".join(f"{value:g}" for value in pad_value_bgr(config))
+    cropped = "" if image.crop is None else f", cropped to columns {left} to {right - 1} and rows {top} to {bottom - 1}"
+    level = f", level, {config.bev_frame.height_m:g} m above the ground" if config.bev_frame.level else ""
+    names = ", ".join(f"{index} {name}" for index, name in enumerate(config.cameras))
+    return (
+        Port(
+            "images",
+            (1, lead[-1], height, width, 3),
+            f"(1, N, H, W, 3): undistorted images, channels B G R, 0 to 255, not normalised. Each image is resized by "
+            f"min({image.size[0]} / width, {image.size[1]} / height) as float32{cropped} and written to the top left "
+            f"corner; all other pixels are {pad}.",
+        ),
+        Port(
+            "image_from_bev",
+            (*lead, 4, 4),
+            f"({axes}, 4, 4): from (x, y, z, 1) in metres of {bev_frame} to (u d, v d, d, 1), with {_pixel(config)} "
+            f"and depth d in metres. Bev frame: x to the right, y ahead, z up{level}.",
+        ),
+        Port("camera_index", lead[-1:], f"(N,): the camera embedding of each image: {names}.", torch.int64),
+        Port("has_image", lead, f"({axes}): false for a camera without an image, which then sees nothing.", torch.bool),
+    )
+
+
+def _output_ports(config: ModelConfig) -> Iterator[Port]:
+    """The outputs that the files of all models have."""
+    cells = config.bev_grid.rows * config.bev_grid.columns
+    queries, classes = config.decoder.queries, len(config.classes)
+    yield Port(
+        "bev",
+        (1, cells, config.channels),
+        "(1, Y*X, C): the BEV map; cell row * columns + column, rows by rising y, columns by rising x.",
+    )
+    yield Port("class_logits", (1, queries, classes), "(1, Q, classes): of the last decoder layer.")
+    yield Port(
+        "box_codes",
+        (1, queries, 10),
+        "(1, Q, 10): cx, cy, log w, log l, cz, log h, sin, cos, vx, vy; metres and m/s, bev frame; "
+        "yaw = -atan2(sin, cos) - pi / 2.",
+    )
+    yield Port(
+        "most_cameras_per_cell",
+        (1,),
+        "(1,): the largest number of cameras that see one cell of the BEV map. If it exceeds the metadata's "
+        "cameras_per_cell, cameras are left out, and the results are wrong: export with more.",
+        torch.int64,
+    )
+    if "segmentation" in config.heads:
+        masks = len(STUFF_CLASSES) + config.segmentation.thing_queries
+        yield Port(
+            "mask_logits", (1, masks, cells), f"(1, Q, Y*X): masks of {', '.join(STUFF_CLASSES)}, then of vehicles."
+        )
+        yield Port(
+            "mask_class_logits",
+            (1, masks),
+            "(1, Q): that the object exists. A cell's probability is sigmoid(mask) * sigmoid(class).",
+        )
+
+
+def _box_ports(config: ModelConfig) -> Iterator[Port]:
+    count = min(config.decoder.max_boxes, config.decoder.queries * len(config.classes))
+    yield Port(
+        "boxes",
+        (1, count, 9),
+        "(1, K, 9): centre x, y, z, length, width, height in metres, yaw in radians counter-clockwise from x, "
+        "velocity x, y in m/s; bev frame.",
+    )
+    yield Port("scores", (1, count), "(1, K): 0 to 1, falling.")
+    yield Port("classes", (1, count), "(1, K): index into the metadata's classes.", torch.int64)
+
+
+def camera_feed(inputs: ModelInputs, config: ModelConfig) -> dict[str, Tensor]:
+    """The inputs of `camera_ports` by name."""
+    return {
+        "images": raw_images(inputs.images, config),
+        "image_from_bev": inputs.image_from_bev,
+        "camera_index": inputs.camera_index,
+        "has_image": inputs.has_image,
+    }
+
+
+def raw_images(images: Tensor, config: ModelConfig) -> Tensor:
+    """(1, N, 3, H, W) as the model takes them -> (1, N, H, W, 3) B G R, 0 to 255, as an exported file takes them."""
+    image = config.image
+    pixels = images.movedim(2, -1) * torch.tensor(image.std) + torch.tensor(image.mean)
+    if image.color_order == "rgb":
+        pixels = pixels.flip(-1)
+    return pixels.contiguous()
+
+
+def _pixel(config: ModelConfig) -> str:
+    """The pixels of the network's input, and how those of the camera's image become them."""
+    image = config.image
+    if image.crop is None and not image.half_pixel_shift:
+        return "pixel (u, v) of the resized image"
+    # Of pixels whose centres have whole numbers, see `ImageConfig.half_pixel_shift`.
+    shift = " + (scale - 1) / 2" if image.half_pixel_shift else ""
+    corner = zip("uv", image.crop_box, strict=False)
+    moved = ", ".join(f"{axis} = scale * {axis} of the camera{shift}{f' - {at}' if at else ''}" for axis, at in corner)
+    return f"pixel (u, v) of the {'resized' if image.crop is None else 'cropped'} image, {moved},"
+
+
+def pad_value_bgr(config: ModelConfig) -> tuple[float, ...]:
+    """The pixels outside the resized image: the mean, which normalisation turns into zero."""
+    mean = config.image.mean
+    return mean[::-1] if config.image.color_order == "rgb" else mean

@@ -1,0 +1,198 @@
+"""One step of a model in the form that is exported to ONNX: `forward` with flat inputs and outputs.
+
+The plain model knows nothing of this. A step holds a copy of it, `network`, in which parts that ONNX cannot express are
+replaced by ones of standard operators with the same numbers.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from bevcli.model.config import ModelConfig
+from bevcli.model.deformable_attention import FeatureMaps
+from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, split_offsets_and_mask
+from bevcli.model.encoder import SpatialCrossAttention
+from bevcli.model.kernels.choose import fold_batch_norms
+from bevcli.model.pillar_projection import PillarProjection
+
+
+class ExportedStep(nn.Module):
+    """The base of the exported steps, for batches of one. Images enter before normalisation."""
+
+    network: Any
+    image_mean: Tensor
+    image_std: Tensor
+
+    def __init__(self, model: Any, deformable_convolution: DeformableConvolution, slots: int, *, decode: bool) -> None:
+        """A copy of the model, with its parts replaced; the model itself stays unchanged. slots: see `slot_hits`."""
+        super().__init__()
+        self.network = copy.deepcopy(model).cpu().float().eval().requires_grad_(False)
+        self.config, self.slots, self.decode = model.config, slots, decode
+        fold_batch_norms(self.network, torch.device("meta"))  # for no device: with standard operators
+        replace_parts(self.network, deformable_convolution)
+        image = self.config.image
+        width, height = image.padded_size
+        self.image_size = height, width
+        self.register_buffer("image_mean", torch.tensor(image.mean)[:, None, None])
+        self.register_buffer("image_std", torch.tensor(image.std)[:, None, None])
+
+    def image_features(self, images: Tensor, camera_index: Tensor) -> FeatureMaps:
+        """The tokens of images (1, N, H, W, 3) BGR, 0 to 255; camera_index: (N,)."""
+        planes = images.permute(0, 1, 4, 2, 3)
+        if self.config.image.color_order == "rgb":
+            planes = planes.flip(2)
+        return self.network.image_features((planes - self.image_mean) / self.image_std, camera_index)
+
+    def hits(self, image_from_bev: Tensor, has_image: Tensor) -> SlottedHits:
+        """The cameras that see each cell; arguments as for `Pillars.project`."""
+        return slot_hits(self.network.pillars.project(image_from_bev, self.image_size, has_image), self.slots)
+
+    def outputs(self, bev: Tensor, most_cameras: Tensor) -> tuple[Tensor, ...]:
+        """The outputs that all files have, in their order. bev: (1, Y·X, C). most_cameras: (1,), see `SlottedHits`."""
+        network = self.network
+        class_logits, box_codes, _ = network.decoder(bev, network.detection_head)
+        outputs = [bev, class_logits[-1], box_codes[-1], most_cameras]
+        if network.segmentation_head is not None:
+            segmentation = network.segmentation_head(bev, network.bev_queries.position())
+            outputs += [segmentation.mask_logits[-1], segmentation.class_logits[-1]]
+        if self.decode:
+            outputs += decode_boxes(class_logits[-1], box_codes[-1], self.config)
+        return tuple(outputs)
+
+
+def decode_boxes(class_logits: Tensor, box_codes: Tensor, config: ModelConfig) -> tuple[Tensor, Tensor, Tensor]:
+    """`bevcli.model.box_coding.decode` for a batch of one, in the graph.
+
+    class_logits: (1, Q, classes). box_codes: (1, Q, 10). Returns boxes (1, K, 9): centre x, y, z and length, width,
+    height in metres, yaw in radians, velocity x, y in m/s, all in the bev frame; falling scores (1, K); classes (1, K).
+    """
+    classes = len(config.classes)
+    scores = class_logits.sigmoid().flatten(1)  # (1, Q · classes)
+    best, index = scores.topk(min(config.decoder.max_boxes, scores.shape[1]))
+    code = box_codes[0].index_select(0, index[0] // classes)[None]  # (1, K, 10)
+    x, y, log_width, log_length, z, log_height, sin, cos, *velocity = code.unbind(-1)
+    # The code's angle a is clockwise from -y: yaw = -a - pi / 2, whose sine is -cos a and whose cosine is -sin a.
+    yaw = torch.atan2(-cos, -sin)
+    sizes = [log.exp() for log in (log_length, log_width, log_height)]
+    return torch.stack([x, y, z, *sizes, yaw, *velocity], dim=-1), best, index % classes
+
+
+DeformableConvolution = Literal["operator", "gridsample"]
+
+
+@dataclass(frozen=True)
+class SlottedHits:
+    """The cameras that see each cell, in K slots a cell, so that every shape is fixed. A slot may be empty.
+
+    Attributes:
+        camera: (Y·X, K) int64, the camera of each slot, any camera where it is empty.
+        filled: (Y·X, K) float32, 1 for a slot with a camera that sees the cell, else 0.
+        reference_points: (Y·X, K, Z, 2) float32, the points of the cell's pillar in the slot's camera, 0 to 1 over the
+            padded image.
+        cameras_per_cell: (Y·X, 1) float32, the number of cameras that see a cell, at least 1.
+        most_cameras: (1,) int64, the largest number of cameras that see one cell. Those beyond K have no slot.
+    """
+
+    camera: Tensor
+    filled: Tensor
+    reference_points: Tensor
+    cameras_per_cell: Tensor
+    most_cameras: Tensor
+
+
+def slot_hits(projection: PillarProjection, slots: int) -> SlottedHits:
+    """The hits of one batch element. slots: K, at most the number of cameras."""
+    hit = projection.hit[0].float()  # (N, Y·X)
+    cells = hit.shape[1]
+    filled, camera = hit.t().topk(slots, dim=1)
+    place = camera * cells + torch.arange(cells)[:, None]  # index in N·Y·X
+    points = projection.reference_points[0].flatten(0, 1).index_select(0, place.flatten())
+    count = hit.sum(0)
+    return SlottedHits(
+        camera=camera,
+        filled=filled,
+        reference_points=points.unflatten(0, (cells, slots)),
+        cameras_per_cell=count.clamp(min=1)[:, None],
+        most_cameras=count.max()[None].long(),
+    )
+
+
+class SlottedSpatialCrossAttention(nn.Module):
+    """Takes the place of `SpatialCrossAttention`, for batches of one and hits in slots.
+
+    The maps of all cameras are stacked into one tall map, with a row of zeros between them, so that GridSample can
+    sample another camera at every point.
+    """
+
+    def __init__(self, original: SpatialCrossAttention) -> None:
+        super().__init__()
+        self.points, self.attention = original.points, original.attention
+
+    def forward(self, query: Tensor, image_features: FeatureMaps, hits: SlottedHits) -> Tensor:
+        """As `SpatialCrossAttention.forward`."""
+        offsets, weights = (part[:, :, 0] for part in self.attention.predict(query[0]))
+        heads, levels = self.attention.shape[0], image_features.level_shapes
+        values = self.attention.value_projection(image_features.tokens).unflatten(-1, (heads, -1))
+        points = hits.reference_points
+        points = points.repeat(1, 1, self.points // points.shape[2], 1)[:, None]  # (Y·X, 1, K, P, 2)
+        summed = torch.zeros(())
+        maps = values.split([height * width for height, width in levels], dim=1)
+        for level, ((height, width), level_map) in enumerate(zip(levels, maps, strict=True)):
+            x = points[..., 0] + offsets[:, :, None, level, :, 0] / width  # (Y·X, heads, K, P)
+            y = points[..., 1] * height + offsets[:, :, None, level, :, 1] - 0.5
+            # One row above or below a map is zero, and so is everything beyond.
+            y = y.clamp(-1, height) + (hits.camera * (height + 1)).float()[:, None, :, None]
+            tall = tall_map(level_map, height, width)
+            grid = torch.stack([2 * x - 1, (2 * y + 1) / tall.shape[2] - 1], dim=-1)
+            sampled = F.grid_sample(tall, grid.transpose(0, 1).flatten(2, 3), align_corners=False)
+            weight = weights[:, :, None, level] * hits.filled[:, None, :, None]  # (Y·X, heads, K, P)
+            summed = summed + (sampled * weight.transpose(0, 1).flatten(2)[:, None]).sum(-1)  # (heads, D, Y·X)
+        found = summed.permute(2, 0, 1).flatten(1)  # (Y·X, C)
+        return self.attention.output_projection(found / hits.cameras_per_cell)[None]
+
+
+def tall_map(values: Tensor, height: int, width: int) -> Tensor:
+    """The maps of all cameras below each other, each followed by a row of zeros.
+
+    values: (N, height·width, heads, D) -> (heads, D, N·(height + 1), width).
+    """
+    planes = values.permute(2, 3, 0, 1).unflatten(-1, (height, width))  # (heads, D, N, height, width)
+    return F.pad(planes, (0, 0, 0, 1)).flatten(2, 3)
+
+
+class DeformConvOperator(nn.Module):
+    """Takes the place of a `ModulatedDeformableConvolution`: the operator DeformConv of ONNX, opset 19."""
+
+    def __init__(self, original: ModulatedDeformableConvolution) -> None:
+        super().__init__()
+        self.weight, self.offset_and_mask, self.stride = original.weight, original.offset_and_mask, original.stride
+
+    def forward(self, x: Tensor) -> Tensor:
+        """x: (B, C, H, W) -> (B, O, H', W'). Only for export: in PyTorch its result is zero."""
+        offsets, mask = split_offsets_and_mask(self.offset_and_mask(x))
+        bias = x.new_zeros(len(self.weight))
+        return torch.onnx.ops.symbolic(
+            "DeformConv",
+            [x, self.weight, offsets.flatten(1, 2), bias, mask],
+            {"kernel_shape": [3, 3], "pads": [1, 1, 1, 1], "strides": [self.stride, self.stride]},
+            dtype=x.dtype,
+            shape=(len(x), len(self.weight), *mask.shape[-2:]),
+            version=19,
+        )
+
+
+def replace_parts(part: nn.Module, deformable_convolution: DeformableConvolution) -> None:
+    """Replaces, in place, the spatial cross-attentions and, for "operator", the deformable convolutions."""
+    for name, child in part.named_children():
+        if isinstance(child, SpatialCrossAttention):
+            setattr(part, name, SlottedSpatialCrossAttention(child))
+        elif isinstance(child, ModulatedDeformableConvolution) and deformable_convolution == "operator":
+            setattr(part, name, DeformConvOperator(child))
+        else:
+            replace_parts(child, deformable_convolution)

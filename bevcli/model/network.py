@@ -1,0 +1,173 @@
+"""The base of the published models: the parts that they share, in the order of the paper's figure 2."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from bevcli.errors import BevcliError
+from bevcli.model.bev_queries import BevQueries
+from bevcli.model.calibration_embedding import CalibrationEmbedding
+from bevcli.model.config import ModelConfig
+from bevcli.model.decoder import Decoder, DecoderLayer, DetectionHead
+from bevcli.model.deformable_attention import FeatureMaps
+from bevcli.model.encoder import Encoder
+from bevcli.model.fpn import FPN
+from bevcli.model.image_tokens import ImageTokens
+from bevcli.model.pillar_projection import PillarHits, Pillars
+from bevcli.model.resnet import ResNet
+from bevcli.model.segmentation import SegmentationHead
+from bevcli.model.step import ClipInputs, ModelOutputs
+from bevcli.model.temporal_model import TemporalModel, build_model
+
+STAGES = {name: name for name in ("backbone", "neck", "encoder", "decoder", "segmentation_head")}
+CALIBRATION_EMBEDDING = "calibration_embedding."
+
+
+class Network(TemporalModel):
+    """The parts that the published models share, in the order of the paper's figure 2.
+
+    A subclass says how a frame goes through them, and which memory it leaves.
+    """
+
+    stages: Mapping[str, str] = STAGES
+    has_parts = True
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__(config)
+        grid, channels, levels = config.bev_grid, config.channels, config.encoder_levels
+        bev_shape = (grid.rows, grid.columns)
+        self.backbone = ResNet(config.backbone)
+        self.neck = FPN(config.backbone.output_channels(), channels, config.neck)
+        self.image_tokens = ImageTokens(len(config.cameras), channels, config.image_tokens)
+        embeds_rays = config.image_tokens.calibration_embedding
+        self.calibration_embedding = CalibrationEmbedding(channels, config.bev_frame.height_m) if embeds_rays else None
+        self.bev_queries = BevQueries(grid, channels, config.ego_motion.can_bus)
+        self.pillars = Pillars(grid)
+        self.encoder = Encoder(config.encoder, channels, levels, grid, config.ego_motion)
+        self.decoder = Decoder(config.decoder, channels, bev_shape)
+        self.detection_head = DetectionHead(config.decoder.layers, channels, len(config.classes), grid)
+        segments = "segmentation" in config.heads
+        self.segmentation_head = SegmentationHead(config.segmentation, channels, bev_shape) if segments else None
+
+    def image_features(self, images: Tensor, camera_index: Tensor) -> FeatureMaps:
+        """The tokens of B·N images, for the encoder.
+
+        images: (B, N, 3, H, W), normalised, padded. camera_index: (N,) or (B, N), the camera embedding of each image.
+        """
+        feature_maps = self.neck(self.backbone(images.flatten(0, 1)))
+        return self.image_tokens(feature_maps[: self.config.encoder_levels], camera_index)
+
+    def detect(self, bev: Tensor) -> ModelOutputs:
+        """The outputs of the decoder and the heads for a BEV map (B, Y·X, C)."""
+        # In float32: half precision is too coarse for the refinement of boxes.
+        with torch.autocast(bev.device.type, enabled=False):
+            class_logits, box_codes, _ = self.decoder(bev.float(), self.detection_head)
+            segmentation = None
+            if self.segmentation_head is not None:
+                segmentation = self.segmentation_head(bev.float(), self.bev_queries.position())
+        return ModelOutputs(bev, class_logits, box_codes, segmentation)
+
+    @property
+    def image_parts(self) -> tuple[nn.Module, ...]:
+        """See `TemporalModel`."""
+        return self.backbone, self.neck
+
+    def exchange_parts(self) -> None:
+        """See `TemporalModel`: the object queries attend to each other before they look at the frame."""
+        self.decoder.layers[0].self_attention = ConstantSelfAttention(self.decoder)
+
+    def remember(self, clip: ClipInputs, place: int, memory: Any) -> Any:
+        """The memory after a frame of training clips that is history only; called without gradient.
+
+        place: index of the frame in the clips. memory: after the frame before; None at the start.
+        """
+        raise NotImplementedError
+
+    def learn(self, clip: ClipInputs, place: int, memory: Any) -> tuple[ModelOutputs, Any]:
+        """The outputs for a frame of training clips, and the memory after it, which has no gradient."""
+        raise NotImplementedError
+
+    def run_on_shapes(self, images: Tensor, camera_index: Tensor, hits: PillarHits) -> Tensor:
+        """Run the parts whose operations `bevcli bench` counts, for a frame with history; return the BEV map.
+
+        images: (1, N, 3, H, W) on the device "meta" like the network. camera_index: (N,). hits: as in a real frame.
+        """
+        raise NotImplementedError
+
+    def resampled(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """A state dict for fine-tuning, from one of a model with another BEV grid or without calibration embedding.
+
+        BEV queries are interpolated. A calibration embedding that is missing keeps its initial weights: no change.
+        """
+        added = {key: value for key, value in self.state_dict().items() if key.startswith(CALIBRATION_EMBEDDING)}
+        return added | dict(self.bev_queries.resampled(state, "bev_queries."))
+
+    @classmethod
+    def part_names(cls, config: ModelConfig) -> Iterator[tuple[str, ...]]:
+        """See `TemporalModel`."""
+        yield "backbone: stem", "backbone.conv1", "backbone.bn1"
+        for stage, blocks in enumerate(config.backbone.blocks):
+            kind = "deformable bottleneck" if stage + 1 in config.backbone.deformable_stages else "bottleneck"
+            yield f"backbone: stage {stage + 1}, {blocks} {kind}{'s' * (blocks > 1)}", f"backbone.stages.{stage}"
+        yield "neck (FPN)", "neck"
+        yield "level embeddings", "image_tokens.level_embedding"
+        yield "camera embeddings", "image_tokens.camera_embedding"
+        yield "calibration embedding", "calibration_embedding"
+        yield "BEV queries", "bev_queries.embedding"
+        yield "position embedding, rows", "bev_queries.row_embedding"
+        yield "position embedding, columns", "bev_queries.column_embedding"
+        yield "can-bus MLP", "bev_queries.can_bus_embedding"
+        attentions = {
+            "temporal_self_attention": "temporal self-attention",
+            "spatial_cross_attention": "spatial cross-attention",
+        }
+        yield from _layer_names("encoder", config.encoder.layers, attentions)
+        yield "object queries (position, content)", "decoder.query_embedding"
+        yield "object queries: reference points", "decoder.reference_points"
+        attentions = {"self_attention": "self-attention", "cross_attention": "cross-attention to BEV"}
+        yield from _layer_names("decoder", config.decoder.layers, attentions)
+        yield f"detection head: {config.decoder.layers} class branches", "detection_head.class_branches"
+        yield f"detection head: {config.decoder.layers} box branches", "detection_head.box_branches"
+        yield "segmentation: stuff queries", "segmentation_head.stuff_queries"
+        yield "segmentation: location decoder", "segmentation_head.location_decoder"
+        for layer in range(config.segmentation.mask_layers):
+            yield f"segmentation: mask decoder layer {layer}", f"segmentation_head.mask_layers.{layer}"
+
+
+def _layer_names(part: str, layers: int, attentions: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    """The parts of each layer of encoder or decoder. attentions: module -> name."""
+    for layer in range(layers):
+        for module, name in {**attentions, "feed_forward": "feed-forward network", "norms": "norms"}.items():
+            yield f"{part} layer {layer}: {name}", f"{part}.layers.{layer}.{module}"
+
+
+def build_network(config: ModelConfig) -> Network:
+    """The network of a configuration, with random weights. Raises BevcliError for a model that is no `Network`."""
+    model = build_model(config)
+    if not isinstance(model, Network):
+        raise BevcliError(f"{config.name}: a {config.architecture} can run only; it lacks the parts of a BEVFormer")
+    return model
+
+
+class ConstantSelfAttention(nn.Module):
+    """Takes the place of the self-attention in the first decoder layer, whose input is the same in every frame."""
+
+    attended: Tensor
+
+    def __init__(self, decoder: Decoder) -> None:
+        super().__init__()
+        first = decoder.layers[0]
+        assert isinstance(first, DecoderLayer)
+        with torch.no_grad():
+            queries = decoder.object_queries(batch=1)
+            key = queries.content + queries.position
+            attended, _ = first.self_attention(key, key, queries.content, need_weights=False)
+        self.register_buffer("attended", attended, persistent=False)  # (1, Q, C)
+
+    def forward(self, query: Tensor, key: Tensor, value: Tensor, *, need_weights: bool) -> tuple[Tensor, None]:
+        """query, key, value: (B, Q, C), of which only B is read -> (B, Q, C), None."""
+        return self.attended.expand_as(value), None

@@ -1,0 +1,153 @@
+"""The data of one step: a preprocessed frame, the tensors that enter a network, and those that leave it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import ClassVar, Protocol
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from bevcli.errors import InputError
+from bevcli.frame import Frame
+from bevcli.geometry.transforms import Pose
+from bevcli.model.camera_assignment import CameraAssignment
+from bevcli.model.config import ModelConfig
+from bevcli.model.ego_motion import ego_motion_inputs
+from bevcli.model.segmentation import SegmentationOutputs
+from bevcli.model.upload import upload
+
+
+@dataclass(frozen=True)
+class PreparedFrame:
+    """A frame and the network's input made of it, for N cameras.
+
+    Attributes:
+        frame: the frame as it was read, but for the bev frame of its rig: see `BevFrameConfig.level`.
+        assignment: the N cameras and the model cameras whose embeddings they use.
+        scales: (N,) pixels of the resized image per pixel of the camera's image.
+        images: (1, N, 3, H, W) float32, normalised; zero where an image is missing. Uploaded ahead to a CUDA GPU.
+        image_from_bev: (1, N, 4, 4) float64, to network pixels.
+        camera_index: (N,) int64, index of each camera's embedding.
+        has_image: (1, N) bool.
+    """
+
+    frame: Frame
+    assignment: CameraAssignment
+    scales: tuple[float, ...]
+    images: Tensor
+    image_from_bev: Tensor
+    camera_index: Tensor
+    has_image: Tensor
+
+
+@dataclass(frozen=True)
+class ModelInputs:
+    """One step of B sequences with N cameras.
+
+    Attributes:
+        images: (B, N, 3, H, W), normalised and padded.
+        image_from_bev: (B, N, 4, 4) float32, bev metres to pixels of the network's input (rows u·d, v·d, d, 1).
+        camera_index: (N,) int64, the camera embedding of each image; (B, N) where the sequences differ.
+        has_image: (B, N) bool; a camera without an image sees no BEV cell.
+        can_bus: (B, 18) float32, the translation and the change of heading since the previous frame included.
+        shift: (B, 2) float32, translation of the history (x, y) in normalised BEV coordinates; zero without history.
+        rotation_deg: (B,) float32, rotation of the history map.
+    """
+
+    images: Tensor
+    image_from_bev: Tensor
+    camera_index: Tensor
+    has_image: Tensor
+    can_bus: Tensor
+    shift: Tensor
+    rotation_deg: Tensor
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(height, width) of the network's input, pixels."""
+        return self.images.shape[-2], self.images.shape[-1]
+
+    def to(self, device: torch.device, *, keep_geometry: bool = False) -> ModelInputs:
+        """The same inputs on a device.
+
+        keep_geometry: image_from_bev, has_image and rotation_deg stay on the CPU, where they are read without a wait.
+        """
+        kept = ("image_from_bev", "has_image", "rotation_deg") if keep_geometry else ()
+        tensors = {part.name: getattr(self, part.name) for part in fields(self)}
+        return ModelInputs(**{name: x if name in kept else upload(x, device) for name, x in tensors.items()})
+
+
+@dataclass(frozen=True)
+class ModelOutputs:
+    """The outputs of one step.
+
+    Attributes:
+        stays_on_device: the boxes are decoded on the model's device; else the last layers are copied to the CPU first.
+        bev: (B, Y·X, C), the BEV map.
+        class_logits: (L, B, Q, classes) of the L decoder layers.
+        box_codes: (L, B, Q, 10): cx, cy, log w, log l, cz, log h, sin, cos, vx, vy; centres in metres, bev frame.
+        segmentation: outputs of the segmentation head, None without one.
+    """
+
+    stays_on_device: ClassVar[bool] = False
+
+    bev: Tensor
+    class_logits: Tensor
+    box_codes: Tensor
+    segmentation: SegmentationOutputs | None = None
+
+
+class ClipInputs(Protocol):
+    """The inputs of B training clips of T frames each."""
+
+    @property
+    def inputs(self) -> Sequence[ModelInputs]:
+        """T inputs, one a frame of the clips."""
+        ...
+
+    @property
+    def world_from_bev(self) -> Tensor:
+        """(T, B, 4, 4) float64, the pose of each frame's bev frame."""
+        ...
+
+
+def model_inputs(
+    frames: Sequence[PreparedFrame], previous_poses: Sequence[Pose | None], config: ModelConfig
+) -> ModelInputs:
+    """B frames, each of another sequence, as a batch.
+
+    previous_poses: world_from_ego of the frame before in each sequence; None at its start.
+    Raises InputError where the sequences do not have the same number of cameras.
+    """
+    indices = [prepared.camera_index for prepared in frames]
+    for prepared in frames:
+        if len(prepared.camera_index) != len(indices[0]):
+            raise InputError(
+                f"cameras {', '.join(prepared.assignment.cameras)} and {', '.join(frames[0].assignment.cameras)} "
+                "cannot go into one batch: use sequences with the same number of cameras, or batches of 1"
+            )
+    same = all(torch.equal(index, indices[0]) for index in indices)
+    motions = [
+        ego_motion_inputs(frame.world_from_ego, pose, frame.kinematics, config.bev_grid, config.ego_motion)
+        for frame, pose in zip((prepared.frame for prepared in frames), previous_poses, strict=True)
+    ]
+    return ModelInputs(
+        # Copying the images of a single frame would take milliseconds.
+        images=frames[0].images if len(frames) == 1 else _together([prepared.images for prepared in frames]),
+        image_from_bev=torch.cat([prepared.image_from_bev for prepared in frames]).float(),
+        camera_index=indices[0] if same else torch.stack(indices),
+        has_image=torch.cat([prepared.has_image for prepared in frames]),
+        can_bus=torch.from_numpy(np.stack([motion.can_bus for motion in motions])),
+        shift=torch.from_numpy(np.stack([motion.shift for motion in motions])),
+        rotation_deg=torch.tensor([motion.rotation_deg for motion in motions], dtype=torch.float32),
+    )
+
+
+def _together(images: list[Tensor]) -> Tensor:
+    """Images (1, N, 3, H, W) of several frames, padded with zeros at right and bottom to the largest of them."""
+    height, width = (max(of_frame.shape[axis] for of_frame in images) for axis in (-2, -1))
+    return torch.cat([F.pad(one, (0, width - one.shape[-1], 0, height - one.shape[-2])) for one in images])

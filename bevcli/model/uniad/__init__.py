@@ -1,0 +1,1 @@
+"""UniAD's first stage (Hu et al. 2023)."""

@@ -1,0 +1,128 @@
+"""Options, each stated once: a frozen dataclass whose fields carry type, default, help text and panel.
+
+Python takes the dataclass or keywords, the command line makes its flags from the fields, and docs/commands.md is made
+from them too. The help text is also what the class's docstring says of the attribute: it stands nowhere else.
+
+    @options("Input")
+    class SequenceOptions:
+        \"""Options of every input format.\"""
+
+        rate_hz: float | None = option(default=None, help="Thin to this many frames per second.", flag="--rate")
+
+An error of the library names the argument in backticks, with its value where that helps: "pass `force=True`". The
+command line prints such a name as its flag: "pass --force".
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import MISSING, Field
+from pathlib import Path
+from typing import Any, TypeVar, dataclass_transform
+
+_Class = TypeVar("_Class", bound=type[Any])
+_Options = TypeVar("_Options")
+
+
+@dataclasses.dataclass(frozen=True)
+class Option:
+    """Help text and spelling of an option, for the command line and the documents.
+
+    Attributes:
+        help: one or two sentences for `--help` and the documents.
+        panel: heading that the option stands under in `--help`; "" for that of its class.
+        flag: spelling on the command line; "" for the field's name with dashes. With "--yes/--no", both; a short one
+            may follow, as in "--out -o".
+        metavar: name of the value in `--help`; "" for that of its type.
+        parse: makes the value from the text of the command line; raises ValueError with the text and what was expected.
+            None where the type says it.
+        repeatable: whether the flag may be given several times; `parse` then takes the list of texts.
+        flag_value: value that the flag alone stands for, such as "static" for --static. None for a flag with a value.
+        complete: the values that complete a text in a shell.
+        hidden: whether only Python has the option.
+    """
+
+    help: str
+    panel: str = ""
+    flag: str = ""
+    metavar: str = ""
+    parse: Callable[[Any], Any] | None = None
+    repeatable: bool = False
+    flag_value: Any = None
+    complete: Callable[[str], Iterable[str]] | None = None
+    minimum: float | None = None
+    maximum: float | None = None
+    hidden: bool = False
+
+
+def option(
+    *, default: Any = MISSING, default_factory: Callable[[], Any] | Any = MISSING, help: str, **settings: Any
+) -> Any:
+    """A field of a dataclass of options. settings: of `Option`."""
+    metadata = {"option": Option(help, **settings)}
+    if default_factory is not MISSING:
+        return dataclasses.field(default_factory=default_factory, metadata=metadata)
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(option, dataclasses.field))
+def options(panel: str = "Options") -> Callable[[_Class], _Class]:
+    """Make a class a frozen dataclass of options. panel: heading of its options in `--help`."""
+
+    def decorate(cls: _Class) -> _Class:
+        made: Any = dataclasses.dataclass(frozen=True)(cls)
+        made.panel = panel
+        stated = ((field.name, option_of(field)) for field in dataclasses.fields(made))
+        attributes = [f"    {name}: {found.help}".replace("\\[", "[") for name, found in stated if found]
+        made.__doc__ = "\n".join([inspect.cleandoc(cls.__doc__ or ""), "", "Attributes:", *attributes])
+        return made
+
+    return decorate
+
+
+def option_of(field: Field[Any]) -> Option | None:
+    """The option of a field; None for a field that is none."""
+    found: Option | None = field.metadata.get("option")
+    return found
+
+
+def flag_of(field: Field[Any]) -> str:
+    """The spelling of a field on the command line, such as "--rate", "--track/--no-track" or "--out -o"."""
+    stated = option_of(field)
+    return (stated.flag if stated else "") or f"--{field.name.replace('_', '-')}"
+
+
+def gather(kind: type[_Options], given: _Options | None, changes: Mapping[str, Any]) -> _Options:
+    """The options of a call that takes the dataclass or keywords: `given` or the defaults, with the changes.
+
+    A text becomes a Path where the field is one. Raises TypeError for a keyword that the dataclass does not have.
+    """
+    paths = {field.name for field in dataclasses.fields(kind) if str(field.type).startswith("Path")}  # type: ignore[arg-type]
+    made = {name: Path(value) if name in paths and isinstance(value, str) else value for name, value in changes.items()}
+    if given is None:
+        return kind(**made)
+    return dataclasses.replace(given, **made) if made else given  # type: ignore[type-var]
+
+
+def defaults(kind: type[Any]) -> dict[str, Any]:
+    """The default of each option of a dataclass that has one."""
+    found = {}
+    for field in dataclasses.fields(kind):
+        if field.default_factory is not MISSING:
+            found[field.name] = field.default_factory()
+        elif field.default is not MISSING:
+            found[field.name] = field.default
+    return found
+
+
+def parse_pairs(texts: Iterable[str], expected: str) -> dict[str, str]:
+    """The texts "NAME=VALUE" of a repeated option as a mapping. Raises ValueError; expected: for its message."""
+    pairs = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not (name and equals and value):
+            raise ValueError(f'"{text}" (expected {expected})')
+        pairs[name] = value
+    return pairs

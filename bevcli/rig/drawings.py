@@ -1,0 +1,253 @@
+"""cameras.png: all cameras' images with their overlay around the coverage map. coverage.png: the map alone."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from bevcli.errors import OutputError
+from bevcli.findings import Finding
+from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.geometry.transforms import apply, inverse
+from bevcli.rig.coverage import Coverage
+from bevcli.rig.mounting import degrees_text, mounting_of, seen_fov_deg, seen_range_deg
+from bevcli.rig.overlay import GROUND, HORIZON, PILLAR_GRID, Pixels, draw_overlay, height_colors
+from bevcli.rig.rig_report import RigReport
+
+SEVERITY_COLORS = {"error": "#ff5c72", "warning": "#ffc857", "info": "#7fb7e6"}
+SIDE_DEG = (75.0, 105.0)  # cameras with a yaw in this range are placed beside the map
+DPI = 100
+# Layout in inches: width of an image, gap between images, title above and details below an image, size of the map.
+SLOT, GAP, TITLE, DETAILS, MIDDLE = 5.2, 0.3, 0.32, 0.38, 5.2
+FOOTER = 3.0  # findings and legend, where cameras are placed beside the map
+LINE = 0.19  # height of a line of text
+IMAGE_WIDTH = 1040  # pixels
+PAPER, INK, FAINT = "#14171c", "#e8ecf1", "#8a93a0"
+COUNT_COLORS = ("#b3324a", "#2b4a63", "#3f8f8a", "#9fd67a", "#f4f1a1")  # of 0, 1, 2, 3, and 4 or more cameras
+LEGEND_STYLE = {"facecolor": PAPER, "edgecolor": "none", "labelcolor": INK, "fontsize": 9}
+CAR_LENGTH_M, CAR_WIDTH_M, AXLE_TO_TAIL_M = 4.6, 1.8, 1.0
+
+
+def write_camera_sheet(path: Path, rig: CameraRig, report: RigReport, images: Mapping[str, Pixels]) -> None:
+    """Write the PNG. Raises OutputError.
+
+    images: by camera, (H, W, 3) BGR; a camera without an image is drawn on a dark background.
+    """
+    front, left, right, back = _cameras_by_side(rig)
+    columns = max(len(front), len(back), 3)
+    ahead, behind = (max(map(_camera_height, row), default=0.0) for row in (front, back))
+    heights = [ahead, max(*(sum(map(_camera_height, column)) for column in (left, right)), MIDDLE), behind]
+    footer = FOOTER if left or right else 0.0
+    sheet = _Sheet(columns * (SLOT + GAP) + GAP, sum(heights) + footer + 2 * GAP)
+    tops = GAP + np.cumsum([0.0, *heights[:2]])
+    for row, top in ((front, tops[0]), (back, tops[2])):
+        start = (sheet.width - len(row) * (SLOT + GAP) + GAP) / 2
+        for place, camera in enumerate(row):
+            _draw_camera(sheet, (start + place * (SLOT + GAP), top), camera, rig, report, images)
+    for column, start in ((left, GAP), (right, sheet.width - SLOT - GAP)):
+        top = tops[1]
+        for camera in column:
+            _draw_camera(sheet, (start, top), camera, rig, report, images)
+            top += _camera_height(camera)
+    size, top = MIDDLE - 1.1, tops[1] + (heights[1] - MIDDLE) / 2 + 0.35
+    draw_coverage(sheet.axes((sheet.width - size) / 2 + 0.1, top, size, size), rig, report.coverage)
+    if footer:
+        top, size = sheet.height - GAP - footer, footer
+    _write_findings(sheet.axes(GAP, top, SLOT, size), size, report.findings)
+    _write_legend(sheet.axes(sheet.width - SLOT - GAP, top, SLOT, size))
+    save(sheet.figure, path)
+
+
+class _Sheet:
+    """A figure on which axes are placed in inches from the top left corner."""
+
+    def __init__(self, width: float, height: float) -> None:
+        self.width, self.height = width, height
+        self.figure = Figure(figsize=(width, height), dpi=DPI, facecolor=PAPER)
+
+    def axes(self, left: float, top: float, width: float, height: float) -> Axes:
+        bottom = self.height - top - height
+        box = (left / self.width, bottom / self.height, width / self.width, height / self.height)
+        return self.figure.add_axes(box)
+
+
+def _camera_height(camera: Camera) -> float:
+    return TITLE + SLOT * min(camera.height / camera.width, 1.0) + DETAILS
+
+
+def _cameras_by_side(rig: CameraRig) -> tuple[list[Camera], list[Camera], list[Camera], list[Camera]]:
+    """The cameras that look ahead (from left to right), left, right, and back (from the vehicle's left to right)."""
+    yaws = {camera.name: float(np.degrees(camera.yaw)) for camera in rig.cameras}
+    low, high = SIDE_DEG
+    ahead = [c for c in rig.cameras if abs(yaws[c.name]) < low]
+    back = [c for c in rig.cameras if abs(yaws[c.name]) > high]
+    sides = [c for c in rig.cameras if low <= abs(yaws[c.name]) <= high]
+    return (
+        sorted(ahead, key=lambda c: -yaws[c.name]),
+        [c for c in sides if yaws[c.name] > 0],
+        [c for c in sides if yaws[c.name] < 0],
+        sorted(back, key=lambda c: yaws[c.name] % 360),
+    )
+
+
+def _draw_camera(
+    sheet: _Sheet,
+    corner: tuple[float, float],
+    camera: Camera,
+    rig: CameraRig,
+    report: RigReport,
+    images: Mapping[str, Pixels],
+) -> None:
+    """Draw a camera's image with title, angles and its first finding. corner: left and top, inches."""
+    left, top = corner
+    axes = sheet.axes(left, top + TITLE, SLOT, _camera_height(camera) - TITLE - DETAILS)
+    image = images.get(camera.name)
+    if image is not None and image.shape[:2] != (camera.height, camera.width):
+        image = cv2.resize(image, (camera.width, camera.height)).astype(np.uint8)
+    axes.imshow(draw_overlay(camera, rig.ego_from_bev, image, IMAGE_WIDTH))
+    axes.set_xticks([])
+    axes.set_yticks([])
+    mounting = mounting_of(camera.ego_from_camera)
+    mine = [finding for finding in report.findings if finding.camera == camera.name]
+    color = SEVERITY_COLORS[mine[0].severity] if mine else FAINT
+    for spine in axes.spines.values():
+        spine.set_color(color)
+        spine.set_linewidth(2.5 if mine else 0.8)
+    axes.set_title(camera.name, loc="left", color=INK, fontsize=11)
+    angles = (degrees_text(mounting.yaw_deg, 0), degrees_text(mounting.pitch_deg), degrees_text(mounting.roll_deg))
+    details = "yaw {}  pitch {}  roll {}".format(*angles)
+    details += f"  height {mounting.height:.2f} m  FOV {seen_fov_deg(camera)[0]:.0f}°"
+    axes.set_xlabel(details, color=FAINT, fontsize=9, loc="left", labelpad=5)
+    if mine:
+        box = {"facecolor": PAPER, "edgecolor": color, "alpha": 0.9, "boxstyle": "round,pad=0.4"}
+        text = textwrap.fill(mine[0].message, 50)
+        axes.text(0.02, 0.96, text, transform=axes.transAxes, va="top", color=color, fontsize=10, bbox=box)
+
+
+def _write_findings(axes: Axes, height: float, findings: Sequence[Finding]) -> None:
+    """Write as many findings as fit. height: of the axes, inches."""
+    axes.axis("off")
+    axes.set_ylim(height, 0)
+    axes.text(0, 0, "Findings", color=INK, fontsize=13, va="top")
+    if not findings:
+        axes.text(0, 0.45, "none: the rig is plausible", color="#7fd6a0", fontsize=10, va="top")
+    top = 0.45
+    for finding in findings:
+        where = f"{finding.camera}: " if finding.camera else ""
+        numbers = f" ({finding.found})" if finding.found else ""
+        lines = textwrap.wrap(f"{where}{finding.message}{numbers}", 56)[:4]
+        if top + LINE * len(lines) > height - LINE:
+            axes.text(0, top, "more in findings.json", color=FAINT, fontsize=9, va="top")
+            break
+        axes.text(0, top, finding.severity, color=SEVERITY_COLORS[finding.severity], fontsize=9, va="top")
+        axes.text(0.15, top, "\n".join(lines), color=INK, fontsize=9, va="top", linespacing=1.25)
+        top += LINE * len(lines) + 0.08
+
+
+def _write_legend(axes: Axes) -> None:
+    axes.axis("off")
+    axes.text(0.1, 1.0, "Legend", color=INK, fontsize=13, va="top", transform=axes.transAxes)
+    heights = PILLAR_GRID.pillar_heights()
+    colors = [tuple(color / 255) for color in height_colors()]
+    dots = [
+        Line2D(
+            [], [], color=color, marker="o", linestyle="none", label=f"pillar point {height:+.1f} m in the bev frame"
+        )
+        for color, height in zip(colors[::-1], heights[::-1], strict=True)
+    ]
+    lines = [
+        Line2D([], [], color=tuple(np.array(HORIZON) / 255), label="horizon: infinitely far, at the camera's height"),
+        Line2D([], [], color=tuple(np.array(GROUND) / 255), label="ground grid of 5 m: should lie on the road"),
+    ]
+    axes.legend(handles=dots + lines, loc="upper left", bbox_to_anchor=(0.08, 0.94), labelspacing=0.9, **LEGEND_STYLE)
+
+
+def write_coverage_map(path: Path, rig: CameraRig, coverage: Coverage) -> None:
+    """Write the map as a PNG. Raises OutputError."""
+    figure = Figure(figsize=(9.6, 8.2), dpi=110, facecolor=PAPER)
+    axes = figure.add_axes((0.08, 0.08, 0.72, 0.85))
+    draw_coverage(axes, rig, coverage)
+    axes.set_title("How many cameras see each BEV cell", color=INK, fontsize=13, loc="left", pad=12)
+    figure.legend(handles=_legend(coverage), loc="upper left", bbox_to_anchor=(0.80, 0.935), **LEGEND_STYLE)
+    save(figure, path)
+
+
+def draw_coverage(axes: Axes, rig: CameraRig, coverage: Coverage) -> None:
+    """Draw the map on axes: x and y of the bev frame in metres, with the vehicle and its cameras."""
+    grid = coverage.grid
+    colors, norm = ListedColormap(COUNT_COLORS), BoundaryNorm(np.arange(-0.5, 5), 5)
+    extent = (*grid.x_range_m, *grid.y_range_m)
+    shown = np.minimum(coverage.counts, 4)
+    axes.imshow(shown, origin="lower", extent=extent, cmap=colors, norm=norm, interpolation="nearest")
+    _draw_rings(axes, rig)
+    _draw_vehicle(axes, rig)
+    for camera in rig.cameras:
+        _draw_field_of_view(axes, camera, rig)
+    axes.set_xlim(*grid.x_range_m)
+    axes.set_ylim(*grid.y_range_m)
+    axes.set_xlabel("x of the bev frame, m", color=FAINT, fontsize=9, labelpad=2)
+    axes.set_ylabel("y of the bev frame, m", color=FAINT, fontsize=9, labelpad=1)
+    axes.tick_params(colors=FAINT, labelsize=8)
+    for spine in axes.spines.values():
+        spine.set_color(FAINT)
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure as a PNG. Raises OutputError."""
+    try:
+        FigureCanvasAgg(figure).print_png(str(path))
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def _legend(coverage: Coverage) -> Sequence[Patch]:
+    words = ("no camera", "1 camera", "2 cameras", "3 cameras", "4 or more")
+    counts = np.bincount(np.minimum(coverage.counts, 4).ravel(), minlength=5)
+    shares = 100 * counts / counts.sum()
+    rows = zip(COUNT_COLORS, words, shares, strict=True)
+    return [
+        Patch(color=color, label=f"{word}: {share:.1f}%") for color, word, share in rows if share or word == words[0]
+    ]
+
+
+def _draw_rings(axes: Axes, rig: CameraRig) -> None:
+    center = inverse(rig.ego_from_bev)[:2, 3]
+    angles = np.linspace(0, 2 * np.pi, 200)
+    for radius in (10, 20, 30, 40, 50):
+        x, y = center[0] + radius * np.cos(angles), center[1] + radius * np.sin(angles)
+        axes.plot(x, y, color=INK, linewidth=0.5, alpha=0.35)
+        axes.text(
+            center[0], center[1] + radius, f"{radius} m", color=INK, fontsize=7, ha="center", va="bottom", alpha=0.8
+        )
+
+
+def _draw_vehicle(axes: Axes, rig: CameraRig) -> None:
+    tail, half = -AXLE_TO_TAIL_M, CAR_WIDTH_M / 2
+    nose = tail + CAR_LENGTH_M
+    outline = [(tail, half), (tail, -half), (nose - 0.8, -half), (nose, 0), (nose - 0.8, half)]
+    points = apply(inverse(rig.ego_from_bev), [(x, y, 0.0) for x, y in outline])
+    axes.fill(points[:, 0], points[:, 1], facecolor=PAPER, edgecolor=INK, linewidth=1.2, zorder=4)
+
+
+def _draw_field_of_view(axes: Axes, camera: Camera, rig: CameraRig) -> None:
+    bev_from_camera = inverse(rig.ego_from_bev) @ camera.ego_from_camera
+    place, forward = bev_from_camera[:2, 3], bev_from_camera[:2, 2]
+    yaw = float(np.degrees(np.arctan2(forward[1], forward[0])))
+    for angle in np.radians(yaw - np.array(seen_range_deg(camera, 0))):
+        end = place + 80 * np.array([np.cos(angle), np.sin(angle)])
+        axes.plot([place[0], end[0]], [place[1], end[1]], color=INK, linewidth=0.7, alpha=0.6, zorder=3)
+    label = place + 27 * np.array([np.cos(np.radians(yaw)), np.sin(np.radians(yaw))])
+    box = {"facecolor": PAPER, "edgecolor": "none", "alpha": 0.75, "boxstyle": "round,pad=0.25"}
+    style: dict[str, Any] = {"color": INK, "fontsize": 8, "ha": "center", "va": "center", "bbox": box}
+    axes.text(float(label[0]), float(label[1]), camera.name, zorder=5, clip_on=True, **style)

@@ -1,0 +1,1 @@
+"""The files of a run: what `bevcli run` adds to `bevcli.run`."""

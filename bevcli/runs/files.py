@@ -1,0 +1,282 @@
+"""The files of a run. Each of them holds all finished frames, whatever ends the run."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bevcli.errors import OutputError
+from bevcli.evaluation.export import CsvWriter
+from bevcli.evaluation.submission import SubmissionWriter
+from bevcli.frame import Frame, Prediction, Sequence
+from bevcli.geometry.boxes import attributes_by_speed
+from bevcli.geometry.transforms import Pose
+from bevcli.inference.load import Model
+from bevcli.recording.writer import LiveSink, Recording, RecordingState
+from bevcli.runs.folder import RunFolder
+from bevcli.runs.options import RunOptions
+from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
+from bevcli.sequences.files.incremental_json import partial_path
+from bevcli.sequences.files.json_fields import pose_to_json
+from bevcli.sequences.files.map_folder import map_path, write_map
+from bevcli.viewer.recording_file import restore_index
+
+BEV = "BEV features"
+RECORDING, PREDICTIONS, SUBMISSION = "recording.rrd", "predictions.json", "results_nusc.json"
+TRACKS, SEGMENTATION = "tracks.csv", "segmentation"
+BLOCK = 1 << 20  # bytes
+
+
+@dataclass(frozen=True)
+class Kept:
+    """The bytes of a file, or of the files of all frames one after the other, that a state keeps: size and SHA-256."""
+
+    size: int
+    sha256: str
+
+
+class _Growing:
+    """The hash of a file's bytes, computed as it grows, and of files of single frames."""
+
+    def __init__(self) -> None:
+        self._size, self._hash = 0, hashlib.sha256()
+
+    def add(self, path: Path) -> None:
+        """Hash one more file; a missing one has no bytes."""
+        with contextlib.suppress(OSError):
+            content = path.read_bytes()
+            self._size += len(content)
+            self._hash.update(content)
+
+    def up_to(self, path: Path, size: int) -> Kept:
+        """What the file holds in its first `size` bytes; fewer if it is shorter."""
+        with contextlib.suppress(OSError), path.open("rb") as file:
+            file.seek(self._size)
+            while self._size < size and (block := file.read(min(BLOCK, size - self._size))):
+                self._hash.update(block)
+                self._size += len(block)
+        return self.kept
+
+    @property
+    def kept(self) -> Kept:
+        """What was hashed so far."""
+        return Kept(self._size, self._hash.hexdigest())
+
+
+@dataclass(frozen=True)
+class FilesState:
+    """Sizes and states with which the files of an interrupted run go on.
+
+    Attributes:
+        recording: of recording.rrd.
+        predictions: bytes of predictions.json.
+        tracks: bytes of tracks.csv, None without one.
+        submission: bytes of results_nusc.json, None without one.
+        kept: what each file holds, by its name; the files of single frames by the name of their folder.
+        map_frames: indices of the frames that have a map.
+        bev_frames: indices of the frames that have BEV features.
+    """
+
+    recording: RecordingState
+    predictions: int
+    tracks: int | None
+    submission: int | None
+    kept: Mapping[str, Kept]
+    map_frames: tuple[int, ...]
+    bev_frames: tuple[int, ...]
+
+    @property
+    def sizes(self) -> dict[str, int | None]:
+        """Bytes of each file that grows, None for one that does not exist."""
+        sizes = self.recording.size, self.predictions, self.tracks, self.submission
+        return dict(zip((RECORDING, PREDICTIONS, TRACKS, SUBMISSION), sizes, strict=True))
+
+
+class RunFiles:
+    """`with RunFiles(…) as files: files.write(frame, prediction)`: recording, boxes, tracks, maps and BEV features."""
+
+    def __init__(
+        self,
+        folder: RunFolder,
+        sequence: Sequence,
+        model: Model,
+        options: RunOptions,
+        live: LiveSink | None = None,
+        resume: FilesState | None = None,
+        *,
+        done: int = 0,
+    ) -> None:
+        """done: number of frames that the files of `resume` hold. Raises OutputError where these were changed."""
+        self._folder, self._out, self._resume = folder, folder.path, resume
+        self._sequence, self._model, self._options, self._live = sequence, model, options, live
+        self._stack = contextlib.ExitStack()
+        self._submission: SubmissionWriter | None = None
+        self._tracks: CsvWriter | None = None
+        self._reference = "world" if sequence.has_ego_motion else "ego"
+        self._is_complete = done == len(sequence.stamps)
+        self._growing = {name: _Growing() for name in (RECORDING, PREDICTIONS, TRACKS, SUBMISSION, SEGMENTATION, BEV)}
+        self._map_frames = [] if resume is None else list(resume.map_frames)
+        self._bev_frames = [] if resume is None else list(resume.bev_frames)
+        if resume is not None:
+            self._check_kept(resume)
+
+    def __enter__(self) -> RunFiles:
+        out, sequence, model, resume = self._out, self._sequence, self._model, self._resume
+        for name in (RECORDING, PREDICTIONS, *((TRACKS,) if self._options.track else ())):
+            self._folder.add(out / name)
+        past = None if resume is None else resume.recording
+        recording = Recording(out / RECORDING, sequence, model, self._options.recording, self._live, past)
+        extras = {
+            "model": model.name,
+            "untrained": model.untrained,
+            "classes": list(model.config.classes),
+            "range_m": model.config.bev_grid.nearest_side_m,
+        }
+        boxes_at, tracks_at = (None, None) if resume is None else (resume.predictions, resume.tracks)
+        boxes = BoxesWriter(out / PREDICTIONS, self._reference, extras, resume_at=boxes_at)
+        with self._stack:  # closes what is open if the next one cannot be opened
+            self._recording = self._stack.enter_context(recording)
+            self._boxes = self._stack.enter_context(boxes)
+            if self._options.track:
+                self._tracks = self._stack.enter_context(CsvWriter(out / TRACKS, tracks_at))
+            if resume is not None and resume.submission is not None:
+                self._open_submission(resume.submission)
+            for note in sequence.notes if resume is None else ():
+                self._recording.event(note, "WARN")
+            self._stack = self._stack.pop_all()
+        return self
+
+    def __exit__(self, *raised: Any) -> None:
+        self._stack.__exit__(*raised)
+        if self._resume is not None and self._is_complete:  # else its bytes must stay for the next resume
+            restore_index(self._out / RECORDING)
+
+    def write(self, frame: Frame, prediction: Prediction) -> None:
+        """Add a frame to every file."""
+        if prediction.segmentation is not None:
+            maps = self._out / SEGMENTATION
+            self._folder.add(map_path(maps, frame.stamp.index))
+            write_map(maps, frame.stamp.index, prediction.segmentation)
+            self._map_frames.append(frame.stamp.index)
+            self._growing[SEGMENTATION].add(map_path(maps, frame.stamp.index))
+        if self._options.save_bev is not None and prediction.bev is not None:
+            _save_bev(self._options.save_bev, prediction, self._model)
+            self._bev_frames.append(frame.stamp.index)
+            self._add_bev(frame.stamp.index)
+        self._recording.log(frame, prediction)
+        boxes = frame_boxes(frame, prediction, world=self._sequence.has_ego_motion)
+        if self._tracks is not None:
+            instances = boxes.boxes.instances
+            tracked = boxes if instances is None else replace(boxes, boxes=boxes.boxes[instances != ""])
+            self._tracks.write(tracked, self._reference)
+        if frame.sample_token is not None:
+            (self._submission or self._open_submission()).write(boxes)
+        self._boxes.write(boxes)  # last: a frame in predictions.json is in the other files too
+        self._check_that_files_exist()
+        self._is_complete = frame.stamp == self._sequence.stamps[-1]
+
+    def state(self) -> FilesState | None:
+        """The state with which later RunFiles go on after the last frame; None as long as they cannot."""
+        recording = self._recording.state()
+        if recording is None:
+            return None
+        tracks, submission = (None if file is None else file.file.size for file in (self._tracks, self._submission))
+        frames = tuple(self._map_frames), tuple(self._bev_frames)
+        state = FilesState(recording, self._boxes.file.size, tracks, submission, {}, *frames)
+        return replace(state, kept=dict(self._kept(state)))
+
+    def _kept(self, state: FilesState) -> Iterator[tuple[str, Kept]]:
+        """What the files hold up to the sizes of a state, by name."""
+        for name, size in state.sizes.items():
+            if size is not None:
+                partial = partial_path(self._out / name)
+                yield name, self._growing[name].up_to(partial if partial.exists() else self._out / name, size)
+        yield SEGMENTATION, self._growing[SEGMENTATION].kept
+        yield BEV, self._growing[BEV].kept
+
+    def _check_kept(self, resume: FilesState) -> None:
+        """Raises OutputError where the files do not hold what the state says."""
+        for index in resume.map_frames:
+            self._growing[SEGMENTATION].add(map_path(self._out / SEGMENTATION, index))
+        for index in resume.bev_frames:
+            self._add_bev(index)
+        for name, found in self._kept(resume):
+            if found != resume.kept.get(name):
+                where = self._options.save_bev if name == BEV else self._out / name
+                raise OutputError(
+                    f"{where}: `resume`: was changed or damaged since the interruption (expected "
+                    f"{resume.kept[name].size if name in resume.kept else 0} bytes as they were written, found "
+                    f"{found.size}): pass `force=True` to start anew"
+                )
+
+    def _add_bev(self, index: int) -> None:
+        assert self._options.save_bev is not None
+        for ending in ("npy", "json"):
+            self._growing[BEV].add(self._options.save_bev / f"{index:06d}.{ending}")
+
+    def _open_submission(self, resume_at: int | None = None) -> SubmissionWriter:
+        self._folder.add(self._out / SUBMISSION)
+        self._submission = self._stack.enter_context(SubmissionWriter(self._out / SUBMISSION, resume_at))
+        return self._submission
+
+    def _check_that_files_exist(self) -> None:
+        deleted = self._recording.is_deleted() or self._boxes.file.is_deleted()
+        if deleted or (self._tracks is not None and self._tracks.file.is_deleted()):
+            raise OutputError(f"{self._out}: the files of this run were deleted while it was writing them")
+
+    def written(self) -> tuple[Path, ...]:
+        """The files and folders that exist so far."""
+        paths = [self._out / name for name in (RECORDING, PREDICTIONS, TRACKS, SUBMISSION, SEGMENTATION)]
+        return tuple(path for path in (*paths, self._options.save_bev) if path is not None and path.exists())
+
+
+def frame_boxes(frame: Frame, prediction: Prediction, *, world: bool) -> FrameBoxes:
+    """A prediction as predictions.json holds it: all boxes, with attributes, in the world frame or the ego frame."""
+    extras: dict[str, object] = {"skipped": True} if prediction.skipped else {}
+    if prediction.not_finite:
+        extras["not_finite"] = prediction.not_finite
+    if frame.sample_token is not None:
+        extras["sample_token"] = frame.sample_token
+    boxes = prediction.boxes_world if world else prediction.boxes_ego
+    boxes = replace(boxes, attributes=attributes_by_speed(boxes))
+    return FrameBoxes(frame.stamp, frame.world_from_ego if world else None, boxes, extras)
+
+
+def _save_bev(folder: Path, prediction: Prediction, model: Model) -> None:
+    """Write a frame's BEV features: NNNNNN.npy, (rows, columns, C) float16, and NNNNNN.json, which describes it.
+
+    Rows run from the smallest y, columns from the smallest x, both in the bev frame.
+
+    folder: made if missing. Raises OutputError.
+    """
+    assert prediction.bev is not None
+    grid = prediction.grid
+    features = prediction.bev.float().cpu().numpy().reshape(grid.rows, grid.columns, -1).astype(np.float16)
+    facts = {
+        "format": "bevcli-bev/1",
+        "frame": prediction.stamp.index,
+        "scene": prediction.stamp.scene,
+        "timestamp_ns": prediction.stamp.timestamp_ns,
+        "shape": list(features.shape),
+        "axes": "rows from the smallest y, columns from the smallest x, channels; bev frame",
+        "x_range_m": list(grid.x_range_m),
+        "y_range_m": list(grid.y_range_m),
+        "ego_from_bev": pose_to_json(Pose.from_matrix(prediction.ego_from_bev)),
+        "world_from_ego": pose_to_json(prediction.world_from_ego),
+        "model": model.name,
+        "untrained": model.untrained,
+    }
+    name = f"{prediction.stamp.index:06d}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        np.save(folder / f"{name}.npy", features)
+        (folder / f"{name}.json").write_text(json.dumps(facts, indent=1) + "\n")
+    except OSError as error:
+        raise OutputError(f"{folder}: BEV features cannot be written ({error.strerror})") from None

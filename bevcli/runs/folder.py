@@ -1,0 +1,201 @@
+"""RunFolder: the output folder of a run, locked against other runs, with a list of the files that runs wrote into it.
+
+Its own files are in the subfolder .bevcli: `lock`, `written` (one path a line) and `state.safetensors` (for `resume`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO
+
+from bevcli.errors import InputError, OutputError
+from bevcli.parsing.documents import read_json
+from bevcli.parsing.files import MIB, read_bytes
+from bevcli.sequences.files.incremental_json import GrowingFile, partial_path
+
+OWN = ".bevcli"
+SUMMARY = "summary.json"
+LARGEST_LIST = 64 * MIB  # of the list of written files
+
+
+class RunFolder:
+    """`with RunFolder(out, force=…, resume=…) as folder:`; the folder is made if it is missing.
+
+    Attributes:
+        path: the folder.
+        state_path: where the state of the run is saved.
+    """
+
+    def __init__(self, path: Path, *, force: bool = False, resume: bool = False) -> None:
+        self.path, self.state_path = path, path / OWN / "state.safetensors"
+        self._force, self._resume = force, resume
+        self._stack = contextlib.ExitStack()
+        self._written: GrowingFile | None = None
+        self._names: set[str] = set()
+
+    def __enter__(self) -> RunFolder:
+        """Raises OutputError: another run uses the folder, or it holds something already, or it cannot be written."""
+        out = self.path
+        if out.exists() and not out.is_dir():
+            raise OutputError(f"{out}: is a file (expected a folder to write to)")
+        with self._stack:  # unlocks the folder if this fails
+            try:
+                if out.exists() and not (self._force or self._resume or self._has_no_run()):
+                    raise OutputError(
+                        f"{out}: exists already; pass `force=True` to overwrite it, `resume=True` to go on with an "
+                        "interrupted run, or `out=DIR` for another folder"
+                    )
+                self._stack.enter_context(folder_lock(out))
+                self._names = set(self._read_written())
+            except OSError as error:
+                raise OutputError(f"{out}: cannot be written ({error.strerror})") from None
+            self._stack = self._stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def add(self, path: Path) -> None:
+        """Put a file on the list before it is written, so that `force` may remove it later.
+
+        Raises OutputError if the file exists and no run wrote it, leads out of the folder through a link, or the list
+        cannot be written.
+        """
+        name = os.path.relpath(path, self.path)
+        if path.is_symlink() or not self._holds(path):
+            raise OutputError(f"{path}: is a link, or leads out of {self.path} through one: remove it")
+        if name in self._names:
+            return
+        if path.exists():
+            raise OutputError(f"{path}: exists already, and no run wrote it: move it, or pass `out=DIR`")
+        if self._written is None:
+            file = self.path / OWN / "written"
+            self._written = GrowingFile(file, file.stat().st_size if file.exists() else None)
+            self._stack.callback(self._written.close)
+        self._written.append(f"{name}\n".encode())
+        self._names.add(name)
+
+    def has_files(self) -> bool:
+        """Runs have written files."""
+        return bool(self._names)
+
+    def remove_written(self) -> None:
+        """Remove the files that earlier runs wrote, and nothing else. Raises OutputError."""
+        named = [path for name in self._names for path in (self.path / name, partial_path(self.path / name))]
+        files = [path for path in named if self._holds(path)]
+        try:
+            for path in (*files, self.state_path, self.path / OWN / "written"):
+                if path.is_file() or path.is_symlink():
+                    path.unlink()
+        except OSError as error:
+            raise OutputError(f"{path}: cannot be removed ({error.strerror})") from None
+        self._names = set()
+
+    def _holds(self, path: Path) -> bool:
+        """The folder of a file is in this one after all links are followed."""
+        return path.parent.resolve().is_relative_to(self.path.resolve())
+
+    def _has_no_run(self) -> bool:
+        return all(entry.name == OWN for entry in self.path.iterdir()) and not (self.path / OWN / "written").exists()
+
+    def _read_written(self) -> Iterator[str]:
+        """The files of earlier runs: the list, or of older versions the files that summary.json names."""
+        file = self.path / OWN / "written"
+        if file.is_file():
+            content = read_bytes(file, LARGEST_LIST, error=OutputError)
+            names = content.decode(errors="replace").splitlines()
+        else:
+            names = [os.path.relpath(path, self.path) for path in _files_in_summary(self.path / SUMMARY)]
+        # A path with ".." would leave the folder: no run of ours writes one.
+        yield from (name for name in names if name and not Path(name).is_absolute() and ".." not in Path(name).parts)
+
+
+@contextlib.contextmanager
+def folder_lock(out: Path) -> Iterator[None]:
+    """Lock a folder, made if it is missing, against other runs. Raises OutputError where it is locked already.
+
+    The lock file names the process. Somebody may delete it; so the folder itself is locked too.
+    """
+    if (out / OWN).is_symlink():
+        raise OutputError(f"{out / OWN}: is a link (expected a folder): remove it")
+    try:
+        (out / OWN).mkdir(parents=True, exist_ok=True)
+        lock = _locked(out / OWN / "lock", out)
+        held = None if sys.platform == "win32" else _locked_folder(out)
+    except OSError as error:
+        raise OutputError(f"{out}: cannot be written ({error.strerror})") from None
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            os.unlink(lock.name)
+        lock.close()
+        if held is not None:
+            os.close(held)
+
+
+def _locked_folder(out: Path) -> int:
+    """The descriptor of the locked folder. Raises OutputError where another run has locked it."""
+    import fcntl
+
+    folder = os.open(out, os.O_RDONLY)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(folder)
+        raise OutputError(f"{out}: is in use by another run: wait, or pass `out=DIR`") from None
+    except OSError:  # a file system without locks for folders
+        pass
+    return folder
+
+
+def replace_file(path: Path, content: bytes) -> None:
+    """Write a file under another name and rename it, so that it is whole at every moment. Raises OutputError."""
+    fresh = path.with_name(path.name + ".new")
+    try:
+        fresh.write_bytes(content)
+        os.replace(fresh, path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            fresh.unlink()
+        raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
+
+
+def _locked(path: Path, out: Path) -> IO[str]:
+    """The open lock file, which holds the number and the command of this process. Raises OutputError."""
+    if sys.platform == "win32":
+        return path.open("w")
+    import fcntl
+
+    while True:
+        file = path.open("a+", errors="replace")
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.seek(0)
+            holder = file.read(500).strip() or "an unknown process"
+            file.close()
+            raise OutputError(f"{out}: is in use by another run ({holder}): wait, or pass `out=DIR`") from None
+        except OSError:  # a file system without locks
+            return file
+        with contextlib.suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                break
+        file.close()  # the run before has just ended and removed its lock file
+    file.truncate(0)
+    file.write(f"process {os.getpid()}: {' '.join(sys.argv)[:400]}\n")
+    file.flush()
+    return file
+
+
+def _files_in_summary(path: Path) -> list[str]:
+    try:
+        summary = read_json(path)
+    except InputError:
+        return []
+    files = summary.get("files") if isinstance(summary, dict) and "bevcli_version" in summary else None
+    return [file for file in files if isinstance(file, str)] if isinstance(files, list) else []

@@ -1,0 +1,151 @@
+"""`run_into_folder`: run a model over a sequence and write files, as `bevcli run` does."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from bevcli.errors import BevcliError, OutputError
+from bevcli.frame import Frame, Prediction, Sequence
+from bevcli.inference.background import write_behind
+from bevcli.inference.load import Model
+from bevcli.inference.run import RunnerState, run_steps
+from bevcli.inference.runner import StepOptions
+from bevcli.model.temporal_model import model_class
+from bevcli.recording.writer import LiveSink
+from bevcli.runs.files import RunFiles
+from bevcli.runs.folder import SUMMARY, RunFolder
+from bevcli.runs.options import RunOptions
+from bevcli.runs.state import START_ANEW, RunState, StateSaver, run_facts, save_state, saved_state
+from bevcli.runs.summary import Counts, RunSummary
+
+
+def run_into_folder(
+    model: Model,
+    sequence: Sequence,
+    out: Path,
+    options: RunOptions | None = None,
+    *,
+    live: LiveSink | None = None,
+    force: bool = False,
+    resume: bool = False,
+    after_frame: Callable[[Frame, Prediction], None] = lambda frame, prediction: None,
+    resumed: Callable[[int], None] = lambda frames: None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> RunSummary:
+    """Run a model over a sequence and write recording, boxes, tracks, maps and summary.json into a folder.
+
+    Whatever ends the run: the files hold all finished frames, summary.json is written, and the state is saved, so that
+    `resume` can go on. The files of a killed process hold all finished frames too, predictions.json as
+    predictions.json.partial; its run goes on from the last saved state.
+
+    Args:
+        model: of `load_model`.
+        sequence: of `open_sequence`.
+        out: the output folder, made where it is missing. No other run can use it meanwhile.
+        options: default `RunOptions()`.
+        live: a viewer that shows the recording while it is written.
+        force: remove the files that earlier runs wrote into `out`.
+        resume: go on with an interrupted run of the same model, options and input; the files then equal those of a run
+            without interruption. Where there is none, the run starts at the first frame.
+        after_frame: called after each frame has been written.
+        resumed: called once with the number of frames that an interrupted run had finished, if there are any.
+        should_stop: asked after each frame; True ends the run.
+
+    Raises:
+        InputError: see `run`.
+        OutputError: the folder holds something already, is in use by another run, cannot be written or was deleted; or
+            the run to resume was another one.
+    """
+    options = RunOptions() if options is None else options
+    if options.recording.probes:
+        model.require_parts("`probes`")
+    if force and resume:
+        raise OutputError("`force` and `resume` exclude each other: pass one of them")
+    with RunFolder(out, force=force, resume=resume) as folder:
+        facts = run_facts(model, sequence, options)
+        state = _state_to_resume(folder, facts, model_class(model.config).memory_type) if resume else None
+        if state is not None and state.files is not None:
+            resumed(state.frames)
+        else:
+            folder.remove_written()
+            state = RunState(facts, None, Counts())
+            save_state(folder.state_path, state)
+        summary = RunSummary(model, sequence, options, state.counts)
+        folder.add(out / SUMMARY)
+        files = RunFiles(folder, sequence, model, options, live, state.files, done=state.frames)
+        began_at = state.frames
+        try:
+            _run_from(state, model, sequence, options, folder, files, summary, after_frame, should_stop)
+        except BaseException as error:
+            with contextlib.suppress(OutputError):  # the first error is the one to report
+                summary.write(out, files.written())
+            if isinstance(error, Exception) and not isinstance(error, BevcliError) and 0 < began_at == summary.frames:
+                reason = f"{type(error).__name__}: {' '.join(str(error).split()):.200}"
+                raise OutputError(
+                    f"{out}: `resume`: the run cannot go on from its state ({reason}); {START_ANEW}"
+                ) from error
+            raise
+        summary.write(out, files.written())
+    return summary
+
+
+def _state_to_resume(folder: RunFolder, facts: Mapping[str, str], memory_type: type) -> RunState[Any] | None:
+    """The state to go on from, None if the folder has no run. Raises OutputError, see `saved_state`."""
+    state = saved_state(folder, facts, RunState[memory_type])  # type: ignore[valid-type]
+    if state is None and folder.has_files():
+        raise OutputError(f"{folder.path}: `resume`: its run saved no state; {START_ANEW}")
+    return state
+
+
+def _run_from(
+    state: RunState[Any],
+    model: Model,
+    sequence: Sequence,
+    options: RunOptions,
+    folder: RunFolder,
+    files: RunFiles,
+    summary: RunSummary,
+    after_frame: Callable[[Frame, Prediction], None],
+    should_stop: Callable[[], bool],
+) -> None:
+    """Run the frames after a state, write them, and save the state."""
+    recording = options.recording
+    asks = recording.shows_internals
+    asked = StepOptions(model.precision, options.temporal, ask_attention=asks, probes=tuple(recording.probes))
+    saver = StateSaver(folder.state_path)
+    start, runner, is_whole = state.frames, state.runner, True
+
+    def save() -> None:
+        parts = files.state()
+        if parts is not None:
+            kept = RunnerState() if summary.is_complete else runner  # nothing comes after the last frame
+            memory, stamp = (None, None) if kept.bev is None else (kept.bev.memory, kept.bev.stamp)
+            saver.save(RunState(state.facts, parts, summary.counts, memory, stamp, kept.tracks))
+
+    def write(step: tuple[Frame, Prediction, RunnerState]) -> float:
+        """The seconds that writing the frame took."""
+        nonlocal is_whole
+        is_whole, writing_began = False, time.perf_counter()
+        files.write(*step[:2])
+        return time.perf_counter() - writing_began
+
+    with files:
+        try:
+            began = time.perf_counter()
+            steps = run_steps(model, sequence, asked, options.cameras, track=options.track, start=start, state=runner)
+            for (frame, prediction, after), recording_s in write_behind(write, steps):
+                now = time.perf_counter()
+                summary.add(frame, prediction, recording_s=recording_s, whole_s=now - began)
+                runner, is_whole, began = after, True, now
+                if saver.is_due(runner):
+                    save()
+                after_frame(frame, prediction)
+                if should_stop():
+                    break
+        finally:
+            if is_whole and summary.frames not in (start, saver.saved_frames):
+                save()

@@ -1,0 +1,265 @@
+"""The state of a run that can be resumed: its file, when it is saved, and if it fits the run that wants to go on.
+
+A state is a dataclass with its tensors, arrays and plain values in a .safetensors file. Tensors and arrays of numbers
+are tensors of the file. Everything else is one more tensor, MessagePack that msgspec writes and reads. The reader names
+the type that it expects, so that nothing in a file decides what is made of it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar, get_origin
+
+import msgspec
+import numpy as np
+import torch
+from safetensors.torch import save
+from torch import Tensor
+
+from bevcli._version import __version__
+from bevcli.errors import InputError, OutputError
+from bevcli.frame import FrameStamp, Sequence
+from bevcli.inference.load import Model
+from bevcli.inference.run import RunnerState
+from bevcli.inference.runner import BevState
+from bevcli.inference.tracking import TrackerState
+from bevcli.parsing.files import read_bytes
+from bevcli.parsing.pth import read_safetensors
+from bevcli.runs.files import FilesState
+from bevcli.runs.folder import RunFolder, replace_file
+from bevcli.runs.summary import Counts
+
+FORMAT = "bevcli-state/4"
+LARGEST_STRINGS = 1 << 28  # bytes of an array of strings: a short text may state an array of gigabytes
+SHARE = 0.02  # of the run's time that saving may take
+ASSUMED_BYTES_PER_S, ASSUMED_S = 3e8, 0.002  # how long the first save takes
+HASHED_BYTES = 1 << 24  # files up to this size are hashed; of larger ones size and modification time count
+START_ANEW = "pass `force=True` to start anew"
+_TREE = "tree"
+
+
+class _HasFacts(Protocol):
+    @property
+    def facts(self) -> Mapping[str, str]: ...
+
+
+Loaded = TypeVar("Loaded")
+State = TypeVar("State", bound=_HasFacts)
+Memory = TypeVar("Memory")
+
+
+@dataclass(frozen=True)
+class RunState(Generic[Memory]):
+    """A run after a number of finished frames.
+
+    Attributes:
+        facts: what the run was made of, see `run_facts`.
+        files: None as long as nothing can be kept; the run then starts anew.
+        counts: of the summary so far.
+        memory: of the model, see `BevState`; None before the first frame and after the last one.
+        stamp: of the last frame, see `BevState`.
+        tracks: of the tracker.
+    """
+
+    facts: Mapping[str, str]
+    files: FilesState | None
+    counts: Counts
+    memory: Memory | None = None
+    stamp: FrameStamp | None = None
+    tracks: TrackerState | None = None
+
+    @property
+    def frames(self) -> int:
+        """Number of finished frames."""
+        return self.counts.whole.count
+
+    @property
+    def runner(self) -> RunnerState:
+        """The state that the next frame needs."""
+        bev: Any = None if self.memory is None else BevState(self.memory, self.stamp)
+        return RunnerState(bev, self.tracks)
+
+
+def run_facts(model: Model, sequence: Sequence, options: object) -> dict[str, str]:
+    """Name -> hash or value of all that the results of a run depend on.
+
+    options: the dataclass of the run's options; each of its fields is a fact.
+    """
+    return {
+        "version of bevcli": __version__,
+        "model": f"{model.name}, {short_hash(model.config_hash)}",
+        "weights": f"{model.weights or 'random'}, {short_hash(model.weights_hash)}",
+        "device": model.device.type,
+        "precision": f"{model.precision}, {model.engine}" if model.is_exported else model.precision,
+        **{f"option {name.replace('_', '-')}": repr(value) for name, value in vars(options).items()},
+        "frames of the input": f"{len(sequence.stamps)}, {short_hash(digest(sequence.stamps))}",
+        "calibration": short_hash(digest(sequence.rig)),
+        "files of the input": short_hash(digest(tuple(map(_file_facts, sequence.input_files)))),
+        "images of the input": _image_facts(sequence),
+    }
+
+
+def saved_state(folder: RunFolder, facts: Mapping[str, str], kind: type[State]) -> State | None:
+    """The state of a kind in a folder, None if there is none.
+
+    Raises OutputError if it is damaged, of another kind, or of a run with other facts.
+    """
+    if not folder.state_path.exists():
+        return None
+    try:
+        state = load_state(folder.state_path, kind)
+    except InputError as error:
+        raise OutputError(f"`resume`: {error}; {START_ANEW}") from None
+    names = [name for name in {**state.facts, **facts} if state.facts.get(name) != facts.get(name)]
+    if names:
+        pairs = (f"{name}: was {state.facts.get(name)}, is {facts.get(name)}" for name in names)
+        raise OutputError(
+            f"{folder.path}: `resume`: the interrupted run differs from this one ({'; '.join(pairs)}): "
+            f"pass the same model, options and input, or {START_ANEW.removeprefix('pass ')}"
+        )
+    return state
+
+
+class StateSaver:
+    """Saves the state of a run as often as SHARE of its time allows."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._began = time.perf_counter()
+        self._spent_s = 0.0
+        self._longest_s: float | None = None
+        self.saved_frames: int | None = None
+
+    def is_due(self, runner: RunnerState) -> bool:
+        """Time has been long enough for another save."""
+        assumed_s = ASSUMED_S + _bytes(runner) / ASSUMED_BYTES_PER_S
+        next_s = assumed_s if self._longest_s is None else self._longest_s
+        return self._spent_s + next_s <= SHARE * (time.perf_counter() - self._began)
+
+    def save(self, state: RunState[Any]) -> None:
+        """Save a state. Raises OutputError."""
+        began = time.perf_counter()
+        save_state(self._path, state)
+        took = time.perf_counter() - began
+        self.saved_frames = state.frames
+        self._spent_s += took
+        self._longest_s = max(self._longest_s or 0.0, took)
+
+
+def _bytes(tree: Any) -> int:
+    if isinstance(tree, Tensor):
+        return tree.nbytes
+    if isinstance(tree, tuple):
+        return sum(map(_bytes, tree))
+    return sum(map(_bytes, vars(tree).values())) if hasattr(tree, "__dataclass_fields__") else 0
+
+
+def _file_facts(path: Path) -> tuple[str, int, str]:
+    """Name, size, and hash or time of a file of the input."""
+    try:
+        facts = path.stat()
+        if facts.st_size > HASHED_BYTES:
+            return path.name, facts.st_size, str(facts.st_mtime_ns)
+        return path.name, facts.st_size, hashlib.sha256(read_bytes(path, HASHED_BYTES)).hexdigest()
+    except OSError as error:
+        return path.name, -1, str(error.strerror)
+    except InputError as error:
+        return path.name, -1, str(error)
+
+
+def _image_facts(sequence: Sequence) -> str:
+    """Number, and hash of names, sizes and times of change, of the image files and videos of all frames."""
+    paths = dict.fromkeys(path for place in range(len(sequence.stamps)) for path in sequence.image_files(place))
+    found = hashlib.sha256()
+    for path in paths:
+        try:
+            facts = path.stat()
+            found.update(f"{path.name} {facts.st_size} {facts.st_mtime_ns}\n".encode(errors="surrogateescape"))
+        except OSError as error:
+            found.update(f"{path.name} {error.errno}\n".encode(errors="surrogateescape"))
+    return f"{len(paths)}, {short_hash(found.hexdigest())}"
+
+
+def short_hash(hexdigest: str) -> str:
+    """The first digits of a hash, for texts."""
+    return hexdigest[:12]
+
+
+def save_state(path: Path, state: object) -> None:
+    """Write a state. The file is replaced at once, so that it is whole at every moment. Raises OutputError."""
+    tensors = _tensors_of(state)
+    replace_file(path, save(tensors, {"format": FORMAT, "sha256": _hash(tensors)}))
+
+
+def load_state(path: Path, kind: type[Loaded]) -> Loaded:
+    """Read a state that `save_state` wrote; tensors are on the CPU.
+
+    kind: the type of the state. Its dataclasses state the type of every field.
+    Raises InputError for a changed or damaged file, and for a state of another type.
+    """
+    tensors, metadata = read_safetensors(path)
+    if metadata.get("format") != FORMAT:
+        raise InputError(
+            f'{path}: is not a state file of this version: "format" must be "{FORMAT}", '
+            f'found "{metadata.get("format", ""):.40}"'
+        )
+    if _TREE not in tensors or metadata.get("sha256") != _hash(tensors):
+        raise InputError(f"{path}: the state cannot be read: the file is damaged")
+
+    def decoded(expected: type, found: Any) -> Any:
+        if expected is Tensor:
+            return tensors[found]
+        assert get_origin(expected) is np.ndarray, expected
+        return tensors[found].numpy() if isinstance(found, str) else _strings(*found)
+
+    try:
+        return msgspec.msgpack.decode(tensors[_TREE].numpy().tobytes(), type=kind, dec_hook=decoded)
+    except (msgspec.MsgspecError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        raise InputError(f"{path}: the state cannot be read ({error})") from None
+
+
+def digest(tree: object) -> str:
+    """The hash of a tree that `save_state` could write."""
+    return _hash(_tensors_of(tree))
+
+
+def _tensors_of(tree: object) -> dict[str, Tensor]:
+    """The tensors of a state file."""
+    tensors: dict[str, Tensor] = {}
+
+    def encoded(value: Any) -> Any:
+        if isinstance(value, np.generic):
+            return value.item()
+        if isinstance(value, np.ndarray) and value.dtype.kind == "U":
+            return value.tolist(), value.dtype.str
+        if isinstance(value, np.ndarray):
+            value = torch.from_numpy(np.array(value, order="C"))
+        assert isinstance(value, Tensor), f"a state cannot hold a {type(value).__name__}"
+        name = str(len(tensors))
+        tensors[name] = value.detach().cpu().clone(memory_format=torch.contiguous_format)
+        return name
+
+    text = msgspec.msgpack.encode(tree, enc_hook=encoded)
+    return tensors | {_TREE: torch.frombuffer(bytearray(text), dtype=torch.uint8)}
+
+
+def _hash(tensors: dict[str, Tensor]) -> str:
+    """SHA-256 of names, types, shapes and numbers."""
+    found = hashlib.sha256()
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        found.update(f"{name}{tensor.dtype}{list(tensor.shape)}".encode())
+        found.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+    return found.hexdigest()
+
+
+def _strings(content: Any, dtype: str) -> np.ndarray:
+    """An array of strings of a type such as "<U20"."""
+    width = int(dtype.removeprefix("<U"))
+    if width < 0 or 4 * width * len(content) > LARGEST_STRINGS:
+        raise ValueError(f"an array of the type {dtype:.20}")
+    return np.array(content, dtype=f"<U{width}")

@@ -1,0 +1,202 @@
+"""RunSummary: counts and times of a run, as summary.json and as a short table."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from bevcli._version import __version__
+from bevcli.duration import duration
+from bevcli.frame import Frame, Prediction, Sequence
+from bevcli.inference.load import Model
+from bevcli.runs.folder import SUMMARY, replace_file
+from bevcli.runs.options import RunOptions
+
+RATIO = 1.01  # of two neighbouring bins of a `RunningMedian`
+LAST_BIN = 5000  # 1e21 seconds
+
+
+@dataclass
+class RunningMedian:
+    """A histogram with logarithmic bins. Its median is at most 0.5 % wrong.
+
+    Attributes:
+        count: number of values.
+        total_s: their sum, seconds.
+        bins: place of a bin -> number of values in it; a bin is at RATIO ** place seconds.
+
+    Raises ValueError where these do not fit together, as in a state that was written by hand.
+    """
+
+    count: int = 0
+    total_s: float = 0.0
+    bins: dict[int, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        is_sound = all(abs(place) <= LAST_BIN and number > 0 for place, number in self.bins.items())
+        if not is_sound or self.count != sum(self.bins.values()) or not 0 <= self.total_s < math.inf:
+            raise ValueError("impossible times")
+
+    def add(self, seconds: float) -> None:
+        """Add a value. Values below 1 µs count as 1 µs."""
+        place = round(math.log(max(seconds, 1e-6), RATIO))
+        self.count += 1
+        self.total_s += seconds
+        self.bins[place] = self.bins.get(place, 0) + 1
+
+    def value(self) -> float:
+        """The median in seconds; of an even number of values the lower of the two in the middle. 0 without values."""
+        before = 0
+        for place in sorted(self.bins):
+            before += self.bins[place]
+            if 2 * before >= self.count:
+                return float(RATIO**place)
+        return 0.0
+
+
+@dataclass
+class Counts:
+    """Counts and times of a run so far. A resumed run goes on from them.
+
+    Attributes:
+        seconds: by stage.
+        whole: of whole frames.
+        boxes: class -> number of boxes.
+        tracks: identity -> class; None without tracks.
+        dropped: (frame, camera, reason) of each missing image.
+        skipped: frames without any image.
+        not_finite: (frame, where) of frames whose numbers stopped being finite.
+        started_anew: (frame, reason) of frames without history.
+        embeddings: camera of the rig -> camera of the model.
+    """
+
+    seconds: dict[str, RunningMedian] = field(default_factory=dict)
+    whole: RunningMedian = field(default_factory=RunningMedian)
+    boxes: dict[str, int] = field(default_factory=dict)
+    tracks: dict[str, str] | None = None
+    dropped: list[tuple[int, str, str]] = field(default_factory=list)
+    skipped: list[int] = field(default_factory=list)
+    not_finite: list[tuple[int, str]] = field(default_factory=list)
+    started_anew: list[tuple[int, str]] = field(default_factory=list)
+    embeddings: dict[str, str] = field(default_factory=dict)
+
+
+class RunSummary:
+    """Counts and times of a run. It keeps no frame.
+
+    Attributes:
+        files: that the run wrote.
+        counts: so far.
+    """
+
+    def __init__(self, model: Model, sequence: Sequence, options: RunOptions, counts: Counts) -> None:
+        self.files: tuple[Path, ...] = ()
+        self._model, self._sequence, self._options, self.counts = model, sequence, options, counts
+
+    def add(self, frame: Frame, prediction: Prediction, recording_s: float, whole_s: float) -> None:
+        """Count a frame. recording_s: spent on writing. whole_s: since the frame before was done."""
+        counts = self.counts
+        counts.embeddings = counts.embeddings or dict(prediction.camera_embeddings)
+        counts.whole.add(whole_s)
+        for stage, seconds in {**prediction.stage_seconds, "recording": recording_s}.items():
+            counts.seconds.setdefault(stage, RunningMedian()).add(seconds)
+        scores = prediction.boxes.scores
+        if scores is not None:
+            shown = prediction.boxes[scores >= self._options.recording.score]
+            counts.boxes = dict(Counter(counts.boxes) + Counter(shown.classes.tolist()))
+            if shown.instances is not None:
+                owners = zip(shown.instances.tolist(), shown.classes.tolist(), strict=True)
+                counts.tracks = counts.tracks or {}
+                counts.tracks.update({instance: name for instance, name in owners if instance})
+        index = frame.stamp.index
+        counts.dropped += [(index, camera, reason) for camera, reason in frame.dropped.items()]
+        if prediction.skipped:
+            counts.skipped.append(index)
+        if prediction.not_finite:
+            counts.not_finite.append((index, prediction.not_finite))
+        if prediction.started_anew:
+            counts.started_anew.append((index, str(prediction.started_anew)))
+
+    @property
+    def frames(self) -> int:
+        """The number of frames that are done."""
+        return self.counts.whole.count
+
+    @property
+    def is_complete(self) -> bool:
+        """All frames are done."""
+        return self.frames == len(self._sequence.stamps)
+
+    def to_dict(self) -> dict[str, object]:
+        """The contents of summary.json."""
+        model, counts = self._model, self.counts
+        return {
+            "bevcli_version": __version__,
+            "sequence": self._sequence.name,
+            "model": model.name,
+            "weights": None if model.weights is None else str(model.weights),
+            "untrained": model.untrained,
+            "device": model.device.type,
+            "precision": model.precision,
+            "engine": model.engine,
+            "temporal": self._options.temporal,
+            "frames": counts.whole.count,
+            "frames_asked_for": len(self._sequence.stamps),
+            "score": self._options.recording.score,
+            "boxes": sum(counts.boxes.values()),
+            "boxes_by_class": dict(counts.boxes),
+            "tracks": None if counts.tracks is None else len(counts.tracks),
+            "tracks_by_class": dict(Counter((counts.tracks or {}).values())),
+            "frames_per_second": self._rate(),
+            "stage_ms": {stage: round(1000 * s.value(), 3) for stage, s in counts.seconds.items()},
+            "camera_embeddings": counts.embeddings,
+            "dropped_images": _rows(counts.dropped, "frame", "camera", "reason"),
+            "skipped_frames": counts.skipped,
+            "not_finite_frames": _rows(counts.not_finite, "frame", "where"),
+            "started_anew": _rows(counts.started_anew, "frame", "reason"),
+            "notes": [*self._sequence.notes, *self._model.rig_notes(self._sequence.rig)],
+            "files": [str(path) for path in self.files],
+        }
+
+    def write(self, folder: Path, files: Iterable[Path]) -> None:
+        """Write summary.json into a folder. files: that the run wrote. Raises OutputError."""
+        path = folder / SUMMARY
+        self.files = (*files, path)
+        replace_file(path, (json.dumps(self.to_dict(), indent=1) + "\n").encode())
+
+    def table(self) -> str:
+        """The summary as a few aligned lines."""
+        counts = self.counts
+        guessed = [f"{name} as {given}" for name, given in counts.embeddings.items() if name != given]
+        stages = ", ".join(f"{stage} {1000 * s.value():.0f} ms" for stage, s in counts.seconds.items())
+        rows = [
+            ("frames", f"{self.frames} in {duration(counts.whole.total_s)}, {self._rate():.2f} per second"),
+            ("boxes", f"{sum(counts.boxes.values())} with a score of {self._options.recording.score:g} or more"),
+            ("stages", f"{stages} (medians)"),
+        ]
+        if counts.tracks is not None:
+            rows.insert(2, ("tracks", f"{len(counts.tracks)} objects have such boxes"))
+        if guessed:
+            rows.append(("cameras", f"{', '.join(guessed)} (embeddings; `cameras` changes them)"))
+        if counts.dropped:
+            rows.append(("dropped", f"{len(counts.dropped)} images, {len(counts.skipped)} frames without any"))
+        if counts.not_finite:
+            _, where = counts.not_finite[0]
+            rows.append(("failed", f"{len(counts.not_finite)} frames: NaN or infinity, first in {where}"))
+        if self._model.untrained:
+            rows.append(("weights", "UNTRAINED: random weights, the boxes are meaningless"))
+        rows += [("rig", note) for note in self._model.rig_notes(self._sequence.rig)]
+        rows += [("written", str(path)) for path in self.files]
+        return "\n".join(f"{name:<8} {text}" for name, text in rows)
+
+    def _rate(self) -> float:
+        whole = self.counts.whole
+        return whole.count / whole.total_s if whole.total_s else 0.0
+
+
+def _rows(values: Iterable[tuple[object, ...]], *keys: str) -> list[dict[str, object]]:
+    return [dict(zip(keys, value, strict=True)) for value in values]

@@ -1,0 +1,125 @@
+"""Format: an input format, found through the entry points `bevcli.sequences`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import Field, dataclass, fields
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Any
+
+from bevcli.errors import BevcliError, InputError
+from bevcli.options import defaults, gather, option_of
+from bevcli.registry import entries, load
+from bevcli.sequences.options import FormatOptions, SequenceOptions
+
+if TYPE_CHECKING:
+    from bevcli.frame import Sequence
+
+GROUP = "bevcli.sequences"
+
+
+@dataclass(frozen=True)
+class Format:
+    """An input format.
+
+    Attributes:
+        name: with an article, for messages: "a nuScenes root".
+        expected: the files that it is recognised by, for messages: "v1.0-*/scene.json".
+        recognises: whether a path that exists has this format. Looks at names, or at a few bytes.
+        opener: opens a path with the common options and its own, or the name of what does, "module:attribute", which is
+            imported when it is needed. `open_sequence` itself selects the scene and the frames, and takes away the
+            ground truth. Raises InputError.
+        options: the dataclass of its own options.
+        precedence: the format with the highest one is taken where several recognise a path. A format that needs little
+            to recognise a path has a low one.
+    """
+
+    name: str
+    expected: str
+    recognises: Callable[[Path], bool]
+    opener: str | Callable[[Path, SequenceOptions, Any], Sequence]
+    options: type[FormatOptions] = FormatOptions
+    precedence: int = 0
+
+    def open(self, path: Path, common: SequenceOptions, own: FormatOptions) -> Sequence:
+        """A path of this format as a Sequence. Raises InputError."""
+        opener = resolve_name(self.opener) if isinstance(self.opener, str) else self.opener
+        opened: Sequence = opener(path, common, own)
+        return opened
+
+
+def formats() -> tuple[Format, ...]:
+    """All formats, in the order of the names of their entry points. Those that cannot be imported are left out."""
+    return _loaded()[0]
+
+
+def _loaded() -> tuple[tuple[Format, ...], tuple[BevcliError, ...]]:
+    """The formats, and the errors of those that cannot be imported: a package of somebody else may be broken."""
+    found, broken = [], []
+    for name in entries(GROUP):
+        try:
+            found.append(load(GROUP, name))
+        except BevcliError as error:
+            broken.append(error)
+    return tuple(found), tuple(broken)
+
+
+def option_classes() -> list[type[FormatOptions]]:
+    """The dataclasses of the formats' own options."""
+    return [one.options for one in formats()]
+
+
+def format_of(path: Path) -> Format:
+    """The format of a path. Raises InputError if it is missing, or has no known format or two."""
+    known, broken = _loaded()
+    if not path.exists():
+        raise InputError(f"{path}: is missing (expected {_either([one.name for one in known])})")
+    matching = [one for one in known if one.recognises(path)]
+    if not matching:
+        kind = "is a file, and not" if path.is_file() else "is not"
+        expected = _either([f"{one.name} (expected {one.expected})" for one in known])
+        raise InputError("; ".join([f"{path}: {kind} {expected}", *map(str, broken)]))
+    highest = max(one.precedence for one in matching)
+    first, *others = [one for one in matching if one.precedence == highest]
+    if others:
+        raise InputError(f"{path}: is {first.name} and {others[0].name}: keep the files of one format there")
+    return first
+
+
+def format_options() -> dict[str, Field[Any]]:
+    """The options that not every format has, by name. Raises BevcliError where two formats define one differently."""
+    found: dict[str, Field[Any]] = {}
+    for one in formats():
+        for field in fields(one.options):
+            other = found.setdefault(field.name, field)
+            if option_of(other) != option_of(field):
+                raise BevcliError(f"{GROUP}: two formats define the option `{field.name}` differently: rename one")
+    return found
+
+
+def own_options(path: Path, chosen: Format, values: dict[str, Any]) -> FormatOptions:
+    """The own options of a path's format. Raises as `check_options`."""
+    check_options(values, [chosen], f"{path}: is {chosen.name}")
+    own = defaults(chosen.options)
+    return gather(chosen.options, None, {name: value for name, value in values.items() if name in own})
+
+
+def check_options(values: Mapping[str, Any], chosen: Iterable[Format], where: str) -> None:
+    """Check that formats have the options that are given. Values that are the default are accepted for every format.
+
+    where: start of a message. Raises InputError for an option that only other formats have; TypeError for one that no
+    format has, or BevcliError if a format cannot be imported that may have it.
+    """
+    own = {name for one in chosen for name in defaults(one.options)}
+    for name in (name for name in values if name not in own):
+        known, broken = _loaded()
+        having = [one for one in known if name in defaults(one.options)]
+        if not having:
+            raise broken[0] if broken else TypeError(f"open_sequence() has no option `{name}`")
+        if values[name] != defaults(having[0].options)[name]:
+            raise InputError(f"{where}: `{name}` is for {_either([one.name for one in having])}: remove it")
+
+
+def _either(names: list[str]) -> str:
+    return " or ".join(part for part in (", ".join(names[:-1]), names[-1]) if part)

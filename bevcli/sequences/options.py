@@ -1,0 +1,137 @@
+"""The options of `open_sequence` that all input formats have, and those that several share."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from bevcli.errors import InputError
+from bevcli.options import option, options
+
+if TYPE_CHECKING:
+    from bevcli.geometry.cameras import CameraRig
+    from bevcli.model.config import ModelConfig
+
+# required: the ego-motion must exist. optional: without it there are no poses, and boxes are in the ego frame only.
+# static: the vehicle stands, and the ego-motion is not read.
+EgoMotionUse = Literal["required", "optional", "static"]
+
+
+def parse_frames(text: str) -> slice:
+    """A frame range "A:B" with optional ends. Raises ValueError."""
+    ends = text.split(":")
+    if len(ends) != 2 or not all(end == "" or end.isdecimal() for end in ends):
+        raise ValueError(f'"{text}" (expected A:B with integers, such as 0:10 or 5:)')
+    start, stop = (int(end) if end else None for end in ends)
+    return slice(start, stop)
+
+
+def parse_rate(text: str) -> float | Literal["all"]:
+    """A frame rate in Hz, or "all". Raises ValueError."""
+    if text == "all":
+        return "all"
+    try:
+        rate_hz = float(text)
+    except ValueError:
+        rate_hz = 0.0
+    if not 0 < rate_hz < float("inf"):
+        raise ValueError(f'"{text}" (expected frames per second, such as 2, or all)')
+    return rate_hz
+
+
+@options("Input")
+class SequenceOptions:
+    """The options of every input format: which frames, and how strictly they are read."""
+
+    frames: slice | None = option(
+        default=None, help="Frame range A:B after thinning; B is excluded.", metavar="A:B", parse=parse_frames
+    )
+    rate_hz: float | Literal["all"] | None = option(
+        default=None,
+        help="Thin to this many frames per second. Default: the model's rate; all with `sweeps`.",
+        flag="--rate",
+        metavar="HZ|all",
+        parse=parse_rate,
+    )
+    every: int | None = option(default=None, help="Use every N-th frame instead of a frame rate.", minimum=1)
+    ego_motion: EgoMotionUse = option(
+        default="required",
+        help="The vehicle stands still; ego_motion.csv is not needed.",
+        flag="--static",
+        flag_value="static",
+    )
+    strict: bool = option(default=False, help="Treat a missing or unreadable image as an error.")
+    scene: str | None = option(default=None, help="Only this scene, such as scene-0103.")
+    ground_truth: bool = option(
+        default=True, help="Read the ground truth, if any.", flag="--ground-truth/--no-ground-truth"
+    )
+    allow_outside: bool = option(
+        default=False,
+        help='Read images outside of the folder too: absolute paths, "..", and links that lead out of it.',
+    )
+    model_rate_hz: float | None = option(
+        default=None, help="Frame rate of a model, used without `rate_hz` and `every`.", hidden=True
+    )
+
+    def __post_init__(self) -> None:
+        if self.rate_hz is not None and self.every is not None:
+            raise InputError("`rate_hz` and `every` exclude each other: pass one of them")
+        if isinstance(self.rate_hz, (int, float)) and not 0 < self.rate_hz < float("inf"):
+            raise InputError(f"`rate_hz={self.rate_hz:g}`: expected frames per second, above 0")
+        if self.every is not None and self.every < 1:
+            raise InputError(f"`every={self.every}`: expected an integer, 1 or more")
+
+    def for_model(self, config: ModelConfig, *, temporal: bool = True) -> SequenceOptions:
+        """The options for a run of a model: at its rate, and with ego-motion required only where history needs it."""
+        use = "optional" if self.ego_motion == "required" and not temporal else self.ego_motion
+        return replace(self, ego_motion=use, model_rate_hz=config.rate_hz)
+
+
+@options()
+class WriteOptions:
+    """The options of a native folder that is written."""
+
+    force: bool = option(default=False, help="Overwrite an existing sequence in OUT_SEQUENCE.")
+
+
+@options("Input")
+class FormatOptions:
+    """The options that only one format has: the base class of each format's own."""
+
+    @property
+    def wants_all_frames(self) -> bool:
+        """True where an option asks for frames that thinning to a model's rate would drop."""
+        return False
+
+
+@options("Input")
+class RigOptions(FormatOptions):
+    """Files that replace the calibration and the ego-motion of an input. A format that takes them inherits them."""
+
+    intrinsics: Path | None = option(
+        default=None, help="Kalibr camchain or ROS camera_info YAML, or a folder of these; replaces calibration.json."
+    )
+    extrinsics: Path | None = option(
+        default=None, help='JSON with the "ego_from_camera" of each camera; required with `intrinsics`.'
+    )
+    calibration: Path | None = option(
+        default=None, help="A calibration.json that replaces the calibration of the input.", metavar="FILE"
+    )
+    ego_motion_file: Path | None = option(
+        default=None,
+        help="An ego_motion.csv that replaces the ego-motion of the input.",
+        flag="--ego-motion",
+        metavar="FILE",
+    )
+
+    def rig(self) -> CameraRig | None:
+        """The rig of the given files; None if none is given. Raises InputError."""
+        from bevcli.sequences.files.calibration_file import read_calibration
+        from bevcli.sequences.files.kalibr_ros import read_rig
+
+        if self.calibration is None:
+            return read_rig(self.intrinsics, self.extrinsics)
+        if self.intrinsics or self.extrinsics:
+            raise InputError("`calibration` excludes `intrinsics` and `extrinsics`: pass one of them")
+        return read_calibration(self.calibration)

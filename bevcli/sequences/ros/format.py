@@ -1,0 +1,57 @@
+"""MCAP files and ROS 2 bags as an input format."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+
+from bevcli.options import option, options, parse_pairs
+from bevcli.parsing.files import open_regular
+from bevcli.sequences.format import Format
+from bevcli.sequences.options import RigOptions
+
+SUFFIXES = (".mcap", ".db3")
+METADATA = "metadata.yaml"
+
+
+@options("Input")
+class BagOptions(RigOptions):
+    """The options of a bag."""
+
+    topics: Mapping[str, str] = option(
+        default_factory=dict,
+        help="ROS bags: the image topic of a camera, where it is not found. Repeatable.",
+        flag="--topic",
+        metavar="CAMERA=/TOPIC",
+        parse=partial(parse_pairs, expected="CAMERA=/TOPIC, such as CAM_FRONT=/camera/front/image_raw"),
+        repeatable=True,
+    )
+    topics_file: Path | None = option(
+        default=None,
+        help="ROS bags: topics and frames of a vehicle (docs/other-inputs.md).",
+        flag="--topics",
+        metavar="FILE.toml",
+    )
+
+
+def is_ros_bag(path: Path) -> bool:
+    """True for an .mcap or .db3 file, or a folder with some."""
+    if not path.is_dir():
+        return path.suffix in SUFFIXES
+    if any(file.suffix in SUFFIXES for file in path.iterdir()):
+        return True
+    if not (path / METADATA).is_file():
+        return False
+    with open_regular(path / METADATA) as file:
+        return b"rosbag2_bagfile_information" in file.read(4096)
+
+
+FORMAT = Format(
+    name="a ROS bag",
+    expected=".mcap or .db3 files",
+    recognises=lambda path: is_ros_bag(path) or path.suffix == ".bag",
+    opener="bevcli.sequences.ros.sequence:RosSequence",
+    options=BagOptions,
+    precedence=10,
+)

@@ -1,0 +1,285 @@
+"""The files of a bag, MCAP and SQLite: topics, the times of messages from the index, and messages on demand."""
+
+from __future__ import annotations
+
+import sqlite3
+import struct
+from collections import OrderedDict
+from collections.abc import Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
+from mcap.records import Channel, Chunk, ChunkIndex, Schema
+from mcap.summary import Summary
+from numpy.typing import NDArray
+
+from bevcli.errors import InputError
+from bevcli.parsing.files import MIB, decompressed
+from bevcli.sequences.ros.messages import Topic
+
+MAGIC = b"\x89MCAP0\r\n"
+RECORD_HEAD = struct.Struct("<BQ")  # opcode, length of what follows
+MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence number, log time, publish time
+CACHE_BYTES = 256 * 2**20  # of decompressed chunks
+LARGEST_CHUNK = 512 * 2**20  # bytes after decompression
+NO_CHUNK = -1  # the message lies outside of chunks
+Entries = list[tuple[int, int, int]]  # log time ns, start of the chunk in the file or NO_CHUNK, offset
+TABLES = ("topics", "messages", "message_definitions", "sqlite_master")
+BUSY_TIMEOUT_S = 5.0
+LARGEST_VALUE = 512 * MIB  # bytes of a message
+
+
+class McapFile:
+    """An MCAP file, see `BagFile`.
+
+    Opening it reads the summary at its end. A file without one (its recording was cut off) is scanned up to its end.
+    Raises InputError if it is not an MCAP file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.notes: tuple[str, ...] = ()
+        try:
+            self._file: BinaryIO = path.open("rb")
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+        if self._file.read(len(MAGIC)) != MAGIC:
+            raise InputError(f"{path}: is not an MCAP file (its first bytes are different)")
+        self._chunks: OrderedDict[int, bytes] = OrderedDict()
+        self._chunk_indexes: list[ChunkIndex] = []
+        self._scanned: dict[int, Entries] | None = None  # by channel, if the file has no index
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        summary = self._summary()
+        if summary is None:
+            self._scan()
+        else:
+            self._schemas, self._channels = summary.schemas, summary.channels
+            self._chunk_indexes = sorted(summary.chunk_indexes, key=lambda chunk: chunk.chunk_start_offset)
+        self.topics = {topic.name: topic for topic in self._topics()}
+        self._references: dict[str, NDArray[np.int64]] = {}
+
+    def times(self, topic: str) -> NDArray[np.int64]:
+        """(N,) log times of a topic's messages in order, ns. Only the index is read."""
+        return self._references_of(topic)[:, 0]
+
+    def read(self, topic: str, index: int) -> bytes:
+        """The bytes of message `index` of a topic. Raises InputError if they are broken."""
+        _, chunk, offset = (int(number) for number in self._references_of(topic)[index])
+        try:
+            return self._message(chunk, offset)
+        except (McapError, ValueError, EOFError, struct.error, RuntimeError) as error:
+            raise InputError(f"{self.path}: {topic}: message {index} is broken ({error})") from None
+
+    def _summary(self) -> Summary | None:
+        """The summary, None if the file has none, or one that does not list all messages."""
+        try:
+            summary = SeekingReader(self._file).get_summary()
+        except (McapError, ValueError, EOFError, OSError, struct.error, StopIteration, OverflowError, MemoryError):
+            return None
+        if summary is None or not summary.chunk_indexes or not summary.channels:
+            return None
+        unindexed = any(not chunk.message_index_length for chunk in summary.chunk_indexes)
+        return None if unindexed else summary
+
+    def _topics(self) -> Iterator[Topic]:
+        for channel in self._channels.values():
+            schema = self._schemas.get(channel.schema_id)
+            if schema is not None:
+                yield Topic(channel.topic, schema.name, channel.message_encoding, schema.encoding, schema.data)
+
+    def _references_of(self, topic: str) -> NDArray[np.int64]:
+        """(N, 3) log time, start of the chunk or NO_CHUNK, and offset of a topic's messages, in order of time."""
+        if topic not in self._references:
+            channels = [number for number, channel in self._channels.items() if channel.topic == topic]
+            if self._scanned is not None:
+                parts = [np.array(self._scanned.get(n, []), dtype=np.int64).reshape(-1, 3) for n in channels]
+            else:
+                parts = [part for n in channels for part in self._indexed(n)]
+            rows = np.concatenate([np.zeros((0, 3), dtype=np.int64), *parts])
+            self._references[topic] = rows[np.argsort(rows[:, 0], kind="stable")]
+        return self._references[topic]
+
+    def _indexed(self, channel: int) -> Iterator[NDArray[np.int64]]:
+        for chunk in self._chunk_indexes:
+            if channel not in chunk.message_index_offsets:
+                continue
+            content = self._record(chunk.message_index_offsets[channel], Opcode.MESSAGE_INDEX)
+            pairs = np.frombuffer(content[6:], dtype="<u8").reshape(-1, 2).astype(np.int64)
+            starts = np.full(len(pairs), chunk.chunk_start_offset, dtype=np.int64)
+            yield np.column_stack([pairs[:, 0], starts, pairs[:, 1]])
+
+    def _record(self, position: int, opcode: int) -> bytes:
+        self._file.seek(position)
+        found, length = RECORD_HEAD.unpack(self._file.read(RECORD_HEAD.size))
+        if found != opcode or length > self.path.stat().st_size:
+            raise InputError(f"{self.path}: the index is broken (at byte {position})")
+        return self._file.read(length)
+
+    def _message(self, chunk: int, offset: int) -> bytes:
+        if chunk == NO_CHUNK:
+            return self._record(offset, Opcode.MESSAGE)[MESSAGE_HEAD.size :]
+        content = self._chunk(chunk)
+        opcode, length = RECORD_HEAD.unpack_from(content, offset)
+        start = offset + RECORD_HEAD.size
+        if opcode != Opcode.MESSAGE or start + length > len(content):
+            raise ValueError("the index does not fit the chunk")
+        return content[start + MESSAGE_HEAD.size : start + length]
+
+    def _chunk(self, position: int) -> bytes:
+        """The decompressed records of a chunk, from a cache of the chunks used last."""
+        content = self._chunks.get(position)
+        if content is None:
+            content = _decompressed(self._record(position, Opcode.CHUNK))
+            self._chunks[position] = content
+            while len(self._chunks) > 1 and sum(map(len, self._chunks.values())) > CACHE_BYTES:
+                self._chunks.popitem(last=False)
+        self._chunks.move_to_end(position)
+        return content
+
+    def _scan(self) -> None:
+        """Find schemas, channels and messages by reading the file from its start, as far as its records are whole."""
+        self._scanned = {}
+        end = self.path.stat().st_size
+        position = len(MAGIC)
+        is_whole = False
+        while position + RECORD_HEAD.size <= end:
+            self._file.seek(position)
+            opcode, length = RECORD_HEAD.unpack(self._file.read(RECORD_HEAD.size))
+            if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+                is_whole = True
+                break
+            if position + RECORD_HEAD.size + length > end or not self._scan_record(opcode, length, position):
+                break
+            position += RECORD_HEAD.size + length
+        if not is_whole:
+            share = f"{position / 2**20:.1f} of {end / 2**20:.1f} MiB"
+            self.notes = (f"{self.path.name} is cut off: its first {share} are read",)
+
+    def _scan_record(self, opcode: int, length: int, position: int) -> bool:
+        """Note what a record has; False if it is damaged."""
+        if opcode == Opcode.CHUNK:
+            try:
+                content = _decompressed(self._file.read(length))
+            except (McapError, ValueError, EOFError, struct.error, RuntimeError):
+                return False
+            self._scan_chunk(content, position)
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+            self._note(opcode, self._file.read(length), NO_CHUNK, position)
+        return True
+
+    def _scan_chunk(self, content: bytes, chunk: int) -> None:
+        offset = 0
+        while offset + RECORD_HEAD.size <= len(content):
+            opcode, length = RECORD_HEAD.unpack_from(content, offset)
+            start = offset + RECORD_HEAD.size
+            self._note(opcode, content[start : start + length], chunk, offset)
+            offset = start + length
+
+    def _note(self, opcode: int, content: bytes, chunk: int, offset: int) -> None:
+        """Keep a schema, a channel, or the place of a message."""
+        assert self._scanned is not None
+        stream = ReadDataStream(BytesIO(content))
+        if opcode == Opcode.SCHEMA:
+            schema = Schema.read(stream)
+            self._schemas[schema.id] = schema
+        elif opcode == Opcode.CHANNEL:
+            channel = Channel.read(stream)
+            self._channels[channel.id] = channel
+        elif opcode == Opcode.MESSAGE:
+            number, _, log_time, _ = MESSAGE_HEAD.unpack(content[: MESSAGE_HEAD.size])
+            self._scanned.setdefault(number, []).append((log_time, chunk, offset))
+
+
+def _decompressed(content: bytes) -> bytes:
+    """The records of a chunk. Raises ValueError for a damaged one."""
+    chunk = Chunk.read(ReadDataStream(BytesIO(content)))
+    if chunk.uncompressed_size > LARGEST_CHUNK:
+        raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes (expected at most {LARGEST_CHUNK})")
+    data = decompressed(chunk.compression, chunk.data, chunk.uncompressed_size)
+    if len(data) < chunk.uncompressed_size:
+        raise ValueError(f"a chunk of {len(data)} bytes (expected {chunk.uncompressed_size})")
+    return data
+
+
+class SqliteFile:
+    """A .db3 file, see `BagFile`. Opening it reads the list of topics; a damaged file is read up to the damage.
+
+    Raises InputError if it is not a rosbag2 database.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.notes: tuple[str, ...] = ()
+        try:
+            # A recording that was cut off leaves a -wal file beside the database, which SQLite must be able to apply.
+            options = "mode=ro" if path.with_name(path.name + "-wal").exists() else "mode=ro&immutable=1"
+            uri = f"{path.resolve().as_uri()}?{options}"
+            self._database = sqlite3.connect(uri, uri=True, check_same_thread=False, timeout=BUSY_TIMEOUT_S)
+            self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_VALUE)
+            self._check_tables()
+            rows = self._database.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
+            definitions = self._definitions()
+        except sqlite3.Error as error:
+            raise InputError(f"{path}: cannot be read as a rosbag2 database ({error})") from None
+        self._ids: dict[str, list[int]] = {}
+        self.topics: dict[str, Topic] = {}
+        for number, name, kind, serialization in rows:
+            self._ids.setdefault(name, []).append(number)
+            self.topics[name] = Topic(name, kind, serialization, *definitions.get(kind, ("", b"")))
+        self._references: dict[str, NDArray[np.int64]] = {}
+
+    def times(self, topic: str) -> NDArray[np.int64]:
+        """(N,) log times of a topic's messages in order, ns. The messages themselves are not read."""
+        return self._references_of(topic)[:, 0]
+
+    def read(self, topic: str, index: int) -> bytes:
+        """The bytes of message `index` of a topic. Raises InputError if they are broken."""
+        row = int(self._references_of(topic)[index, 1])
+        try:
+            return self._database.execute("SELECT data FROM messages WHERE id = ?", (row,)).fetchone()[0]
+        except (sqlite3.Error, TypeError) as error:
+            raise InputError(f"{self.path}: {topic}: message {index} is broken ({error})") from None
+
+    def _references_of(self, topic: str) -> NDArray[np.int64]:
+        """(N, 2) log time and row of a topic's messages, in order of time."""
+        if not self._references:
+            self._read_index()
+        return self._references.get(topic, np.zeros((0, 2), dtype=np.int64))
+
+    def _read_index(self) -> None:
+        """Read time, topic and row of every message in one pass, because the table has no index by topic."""
+        rows: list[tuple[int, int, int]] = []
+        try:
+            for row in self._database.execute("SELECT timestamp, id, topic_id FROM messages"):
+                rows.append(row)
+        except sqlite3.Error as error:
+            self.notes = (f"{self.path.name} is damaged ({error}): its first {len(rows)} messages are read",)
+        table = np.array(rows, dtype=np.int64).reshape(-1, 3)
+        for name, numbers in self._ids.items():
+            part = table[np.isin(table[:, 2], numbers), :2]
+            self._references[name] = part[np.argsort(part[:, 0], kind="stable")]
+
+    def _check_tables(self) -> None:
+        """Raises sqlite3.Error if a table of the bag is a view: a query in the file can compute for ever."""
+        self._database.execute("PRAGMA trusted_schema = OFF")
+        kinds = self._database.execute("SELECT name, type FROM sqlite_master").fetchall()
+        views = [name for name, kind in kinds if name in TABLES and kind not in ("table", "index")]
+        if views:
+            raise sqlite3.DatabaseError(f"{views[0]} is a view (expected a table)")
+
+    def _definitions(self) -> dict[str, tuple[str, bytes]]:
+        """Encoding and text of each type's definition; files of older ROS releases have none."""
+        try:
+            rows = self._database.execute(
+                "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+            ).fetchall()
+        except sqlite3.OperationalError:
+            return {}
+        return {kind: (encoding, text.encode()) for kind, encoding, text in rows if text}

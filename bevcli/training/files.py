@@ -1,0 +1,189 @@
+"""Files of a training: resumable checkpoints, released weights, and learning curves.
+
+A file is written under a temporary name and renamed: a kill leaves the old one intact.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import safetensors.torch
+import torch
+from torch import Tensor, nn
+
+from bevcli.errors import InputError, OutputError, WeightsError
+from bevcli.inference.training_rigs import weights_facts
+from bevcli.model.network import Network
+from bevcli.parsing.files import MIB, read_text
+from bevcli.parsing.pth import read_pth
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+FORMAT = "bevcli-training/1"
+LARGEST_CSV_BYTES = 256 * MIB
+Row = Mapping[str, float]
+# What PyTorch raises for contents that belong to another model.
+_DAMAGE = (RuntimeError, ValueError, LookupError, TypeError, AttributeError, OverflowError)
+
+
+def save_checkpoint(
+    path: Path,
+    step: int,
+    trained: nn.Module,
+    optimizer: torch.optim.AdamW,
+    average: Mapping[str, Tensor] | None = None,
+) -> None:
+    """Writes the state after `step` steps, to resume from. Random numbers are drawn from seed and step, not stored.
+
+    Args:
+        trained: the model and its auxiliary heads.
+        average: the running average of the model's weights, None without one.
+    """
+    contents = {"format": FORMAT, "step": step, "model": trained.state_dict(), "optimizer": optimizer.state_dict()}
+    if average is not None:
+        contents["average"] = dict(average)
+    replace_file(path, lambda unfinished: torch.save(contents, unfinished))
+
+
+def load_checkpoint(
+    path: Path, trained: nn.Module, optimizer: torch.optim.AdamW, average: dict[str, Tensor] | None = None
+) -> int:
+    """Restores model, auxiliary heads, optimizer and, in place, the running average of the weights.
+
+    Returns the number of steps done. Raises WeightsError.
+    """
+    if not path.exists():
+        raise WeightsError(f"{path}: no checkpoint to resume from; leave out `resume` to start a training")
+    file = read_pth(path)
+    if file.left_out:
+        raise WeightsError(f"{path}: is not a checkpoint of this model: it holds objects ({file.left_out[0]:.100})")
+    try:
+        contents = file.with_tensors()
+        if contents["format"] != FORMAT:
+            raise WeightsError(f'{path}: "format" must be "{FORMAT}", found {contents["format"]!r}')
+        if any(key.startswith("picture_reader.") for key in contents["model"]):
+            raise WeightsError(
+                f"{path}: was written by an earlier version, with [training.picture_loss], and cannot be resumed; "
+                f"start a new training with `weights={path.with_name('weights.safetensors')}` and another `out`"
+            )
+        trained.load_state_dict(contents["model"])
+        optimizer.load_state_dict(contents["optimizer"])
+        for key, value in {} if average is None else average.items():
+            value.copy_(contents["average"][key])
+        return int(contents["step"])
+    except _DAMAGE as error:
+        reason = " ".join(line.strip() for line in str(error).split("\n")[:2])
+        raise WeightsError(f"{path}: is not a checkpoint of this model: {reason}") from error
+
+
+def save_weights(path: Path, model: Network, dtype: torch.dtype) -> None:
+    """Writes the model's weights as .safetensors, for `bevcli run --weights`, with the frame and rigs they expect."""
+    state = {
+        key: (tensor.to(dtype) if tensor.is_floating_point() else tensor).contiguous().cpu()
+        for key, tensor in model.state_dict().items()
+    }
+    replace_file(path, lambda unfinished: safetensors.torch.save_file(state, unfinished, weights_facts(model.config)))
+
+
+def replace_file(path: Path, write: Callable[[Path], object]) -> None:
+    """Writes a file by calling `write` with a temporary path beside `path`, then renames it. Raises OutputError."""
+    unfinished = path.with_name(f"{path.name}.unfinished")
+    try:
+        write(unfinished)
+        os.replace(unfinished, path)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
+
+
+class LearningCurve:
+    """A CSV file with a column `step` and one row a step.
+
+    Attributes:
+        path: the file.
+        rows: its rows.
+    """
+
+    def __init__(self, path: Path, done: int = 0) -> None:
+        """Opens the file of a resumed training, or starts a new one.
+
+        Raises OutputError, and InputError for a damaged file.
+
+        Args:
+            done: steps done. Rows after them, of an interrupted run, are dropped; 0 starts a new file.
+        """
+        self.path = path
+        self.rows: list[Row] = [row for row in _read(path) if row["step"] <= done] if done else []
+        replace_file(path, lambda unfinished: _write(unfinished, self.rows, "w"))
+
+    def add(self, step: int, numbers: Row) -> None:
+        """Appends a row and writes it to the file at once."""
+        row = {"step": step, **numbers}
+        _write(self.path, [row], "a", header=not self.rows)
+        self.rows.append(row)
+
+
+def draw_learning_curves(loss: LearningCurve, validation: LearningCurve, path: Path) -> None:
+    """Writes a PNG: smoothed losses on the left, scores on the right."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 4.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2)
+    _draw_rows(left, _smoothed(loss.rows), skipped=("step", "learning rate", "gradient norm"))
+    _draw_rows(right, [_scores(row) for row in validation.rows], skipped=("step",), marker="o")
+    left.set(title="Training loss", xlabel="step", yscale="log")
+    right.set(title="Validation", xlabel="step", ylim=(0, 1))
+    figure.savefig(path, dpi=110)
+
+
+def _draw_rows(axes: Axes, rows: list[Row], skipped: tuple[str, ...], marker: str = "") -> None:
+    for name in rows[0] if rows else ():
+        if name not in skipped:
+            axes.plot([row["step"] for row in rows], [row[name] for row in rows], label=name, marker=marker)
+    if rows:
+        axes.legend(fontsize=8)
+    axes.grid(alpha=0.3)
+
+
+def _scores(row: Row) -> Row:
+    """The step and the scores from 0 to 1 over all classes: mAP, NDS and IoU."""
+    return {name: row[name] for name in row if name in ("step", "mAP", "NDS") or name.startswith("IoU")}
+
+
+def _smoothed(rows: list[Row], points: int = 200) -> list[Row]:
+    """Means over blocks of equal length, at least `points` blocks if there are so many rows."""
+    size = max(1, len(rows) // points)
+    blocks = [rows[start : start + size] for start in range(0, len(rows) - size + 1, size)]
+    return [{name: sum(row[name] for row in block) / size for name in block[0]} for block in blocks]
+
+
+def _read(path: Path) -> list[Row]:
+    """The rows of a file. Raises InputError."""
+    if not path.is_file():
+        return []
+    text = read_text(path, LARGEST_CSV_BYTES)
+    try:
+        rows: list[Row] = [
+            {name: float(value) for name, value in row.items()} for row in csv.DictReader(io.StringIO(text))
+        ]
+    except (ValueError, TypeError, csv.Error) as error:  # no number, a missing or an additional one, a null byte
+        raise InputError(f"{path}: is damaged ({error}): move it away, or start a new training") from None
+    if rows and "step" not in rows[0]:
+        raise InputError(f"{path}: has no column step: move it away, or start a new training")
+    return rows
+
+
+def _write(path: Path, rows: list[Row], mode: str, *, header: bool = True) -> None:
+    with path.open(mode, newline="") as file:
+        if rows:
+            writer = csv.DictWriter(file, list(rows[0]))
+            if header:
+                writer.writeheader()
+            writer.writerows({name: f"{value:.6g}" for name, value in row.items()} for row in rows)

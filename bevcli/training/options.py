@@ -1,0 +1,47 @@
+"""TrainOptions: the options of a training."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bevcli.options import option, options
+
+
+@options()
+class TrainOptions:
+    """The output, the start and the length of a training. Default of steps and held_out: the [training] table."""
+
+    out: Path | None = option(
+        default=None,
+        help="Folder for weights, checkpoint, learning curves and rendered drives. Default: runs/train-MODEL.",
+    )
+    resume: bool = option(default=False, help="Resume from the checkpoint in the output folder.")
+    weights: Path | None = option(default=None, help="Start from these weights (fine-tuning) instead of random ones.")
+    steps: int | None = option(default=None, help="Number of steps. Default: as in the training table.", minimum=1)
+    held_out: int | None = option(
+        default=None,
+        help="Hold out the last N drives for evaluation; 0 evaluates on the training drives. Default: as in the "
+        "training table.",
+        metavar="N",
+        minimum=0,
+    )
+    seed: int = option(default=0, help="Random seed.", minimum=0)
+
+
+@options()
+class ValidationOptions:
+    """The rig and the scores of a validation."""
+
+    rig: str | None = option(
+        default=None,
+        help="Cameras of the rendered drives: a calibration.json, scaled to the model's image size, or a random rig "
+        "for each drive, from training.rigs of the model. Default: six cameras like nuScenes.",
+        metavar="FILE|random",
+    )
+    max_range: float | None = option(
+        default=None,
+        help="Ignore boxes beyond this distance. Default: the nearest side of the BEV grid.",
+        metavar="METRES",
+    )
+    tracking: bool = option(default=False, help="Also run the tracker and score its tracks: AMOTA, identity switches.")
+    each: bool = option(default=False, help="Also score each drive alone, with the mean and the lowest mAP.")

@@ -1,0 +1,55 @@
+"""ViewOptions: the options of `bevcli viz`."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+from bevcli.options import option, options
+
+
+def parse_host(text: str) -> str:
+    """An address of this machine to listen on, unchanged. Raises ValueError."""
+    expected = "expected an address of this machine, such as 127.0.0.1"
+    if not text.strip():
+        raise ValueError(f"is empty ({expected})")
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(text, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as tried:
+            tried.bind(address)
+    except (OSError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or "not a host name"
+        raise ValueError(f'"{text[:60]}": cannot listen there ({reason}; {expected})') from None
+    return text
+
+
+@options()
+class ViewOptions:
+    """The viewer, or what is written in its place."""
+
+    web: bool = option(default=False, help="Show it in the browser, even if there is a display.")
+    host: str = option(
+        default="127.0.0.1",
+        help="Address that the web viewer listens on. 0.0.0.0 allows access from other machines. Default: 127.0.0.1.",
+        metavar="ADDRESS",
+        parse=parse_host,
+    )
+    port: int = option(
+        default=9090,
+        help="Port of the web viewer. If it is in use, the next free one is taken.",
+        minimum=1,
+        maximum=65535,
+    )
+    screenshot: Path | None = option(
+        default=None, help="Write a screenshot of the viewer. Needs no screen.", metavar="OUT.png|.jpg"
+    )
+    frame: int | None = option(default=None, help="Frame index for `screenshot`. Default: the first frame.")
+    summary: bool = option(default=False, help="Print the frames, time span, boxes per class and sizes.")
+    video: Path | None = option(
+        default=None,
+        help="Write a video of all cameras and the BEV, with boxes: H.264 if PyAV is installed, else VP9.",
+        metavar="OUT.mp4|.webm",
+    )
+    export: Path | None = option(
+        default=None, help="Write the shown boxes in the world frame.", metavar="BOXES.csv|.json"
+    )

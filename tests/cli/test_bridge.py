@@ -1,0 +1,170 @@
+"""Commands made from dataclasses of options, and the flags that stand for arguments in messages."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from bevcli.cli.bridge import Part, as_flags, command
+from bevcli.errors import InputError
+from bevcli.options import option, options
+
+
+def parse_range(text):
+    try:
+        start, stop = map(int, text.split(":"))
+    except ValueError:
+        raise ValueError(f'"{text}" (expected A:B)') from None
+    return slice(start, stop)
+
+
+@options("Input")
+class ReadOptions:
+    rate_hz: float | None = option(default=None, help="Frames per second.", flag="--rate", metavar="HZ", maximum=100)
+    frames: slice | None = option(default=None, help="Frame range.", parse=parse_range)
+    motion: Literal["required", "static"] = option(
+        default="required", help="Stands.", flag="--static", flag_value="static"
+    )
+    calibration: str | Path | None = option(default=None, help="A file.")
+    track: bool = option(default=True, help="Track.", flag="--track/--no-track")
+    strict: bool = option(default=False, help="Strict.", panel="Checks")
+    names: tuple[str, ...] = option(default=(), help="Names, in order of `rate_hz`.", repeatable=True)
+    secret: int = option(default=3, help="Only Python has it.", hidden=True)
+
+
+@options()
+class FileOptions:
+    files: tuple[Path, ...] = option(default=(), help="Files.", flag="--file -f", repeatable=True)
+    force: bool = option(default=False, help="Overwrite.")
+
+
+def invoke(function, *arguments):
+    app = typer.Typer(add_completion=False)
+    app.command()(command(function))
+    return CliRunner().invoke(app, arguments)
+
+
+def options_of(*arguments):
+    got = []
+
+    def read(source: ReadOptions, force: Annotated[bool, typer.Option("--force", help="Overwrite.")] = False) -> None:
+        got.append((source, force))
+
+    done = invoke(read, *arguments)
+    assert done.exit_code == 0, done.output
+    return got[0]
+
+
+def test_options_arrive_as_the_dataclass():
+    given = ("--rate", "2", "--frames", "1:3", "--static", "--no-track", "--strict", "--names", "a", "--names", "b")
+    source, force = options_of(*given, "--calibration", "c.json", "--force")
+    assert force
+    assert source == ReadOptions(2.0, slice(1, 3), "static", Path("c.json"), False, True, ("a", "b"))
+
+
+def test_options_that_are_not_given_have_their_defaults():
+    assert options_of() == (ReadOptions(), False)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--frames", "3"), "expected A:B"),
+        (("--rate", "101"), "100"),
+        (("--rate", "x"), "number"),
+        (("--secret", "1"), ""),
+    ],
+)
+def test_a_wrong_value_is_a_usage_error(arguments, message):
+    def read(source: ReadOptions) -> None:
+        raise AssertionError
+
+    done = invoke(read, *arguments)
+    assert done.exit_code == 2
+    assert message in done.output
+    assert arguments[0] in done.output
+
+
+def test_a_command_may_take_a_part_of_the_options():
+    def read(source: Annotated[ReadOptions, Part(only=("strict",))]) -> None:
+        assert source == ReadOptions(strict=True)
+
+    assert invoke(read, "--strict").exit_code == 0
+    assert invoke(read, "--rate", "2").exit_code == 2
+
+
+def test_fields_of_several_classes_arrive_as_a_mapping():
+    @options("Input")
+    class Other:
+        topic: str = option(default="t", help="A topic.")
+
+    def read(values: Annotated[dict, Part(without=("names",), classes=lambda: [ReadOptions, Other])]) -> None:
+        assert values["topic"] == "x"
+        assert values["rate_hz"] == 2
+        assert "names" not in values
+
+    assert invoke(read, "--topic", "x", "--rate", "2").exit_code == 0
+
+
+def test_help_groups_options_by_panel():
+    def read(source: ReadOptions) -> None:
+        pass
+
+    text = invoke(read, "--help").output
+    assert text.index("Input") < text.index("--rate") < text.index("Checks") < text.index("--strict")
+    assert "secret" not in text
+    assert "Names, in order of --rate." in text
+
+
+def test_a_repeated_option_has_a_short_spelling():
+    def read(file: FileOptions) -> None:
+        assert file == FileOptions((Path("a"), Path("b")))
+
+    assert invoke(read, "-f", "a", "--file", "b").exit_code == 0
+
+
+def test_a_required_option_that_is_missing_is_a_usage_error():
+    @options()
+    class Required:
+        places: tuple[int, ...] = option(help="Places.", repeatable=True)
+
+    def read(given: Required) -> None:
+        assert given.places == (3, 4)
+
+    assert invoke(read, "--places", "3", "--places", "4").exit_code == 0
+    assert invoke(read).exit_code == 2
+
+
+def test_the_docstring_of_a_class_has_the_help_texts():
+    assert "\n    frames: Frame range.\n" in ReadOptions.__doc__
+
+
+@pytest.mark.parametrize(
+    ("library", "shown"),
+    [
+        ("pass `rate_hz`", "pass --rate"),
+        ("`rate_hz=2.5`: too low", "--rate 2.5: too low"),
+        ("pass `force=True`", "pass --force"),
+        ("pass `track=False`", "pass --no-track"),
+        ('pass `motion="static"`', "pass --static"),
+        ("pass `calibration=FILE`", "pass --calibration FILE"),
+        ('`names="a b"`', "--names a b"),
+        ('pass `names={"CAM": "/topic"}`', "pass --names CAM=/topic"),
+        ("`calibration=(1, -2.5)`", "--calibration 1,-2.5"),
+        ("`rate_hz` and `strict` exclude each other", "--rate and --strict exclude each other"),
+        ("`unknown=3`, `bevcli run` and `READ`", "`unknown=3`, `bevcli run` and `READ`"),
+    ],
+)
+def test_arguments_in_messages_become_flags(library, shown):
+    def read(source: ReadOptions, file: FileOptions) -> None:
+        raise InputError(library)
+
+    error = invoke(read).exception
+    assert isinstance(error, InputError)
+    assert str(error) == shown
+
+
+def test_arguments_stay_as_they_are_outside_a_command():
+    assert as_flags("pass `force=True`") == "pass `force=True`"

@@ -1,0 +1,19 @@
+"""Runs a model over frames of a sequence, as several tests do."""
+
+import torch
+
+from bevcli.inference.preprocess import Preprocessor
+from bevcli.inference.runner import Runner, StepOptions
+
+CPU = torch.device("cpu")
+
+
+def run(model, sequence, places=None, state=None, **options):
+    """The predictions at these places, by default all, and the state after them. options: of `StepOptions`."""
+    runner = Runner(model, CPU, StepOptions(**options))
+    places = range(len(sequence.stamps)) if places is None else places
+    predictions = []
+    for _, prediction, after in runner.run(sequence, places, Preprocessor(model.config), state):
+        predictions.append(prediction)
+        state = after
+    return predictions, state

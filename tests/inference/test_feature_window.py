@@ -1,0 +1,204 @@
+"""BEVFormerV2 in a run: its window of image features, at scene starts, gaps and cuts, and with later frames."""
+
+from __future__ import annotations
+
+import gc
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from memory_drive import MemorySequence, WithoutImages
+from stepping import CPU, run
+
+from bevcli.geometry.transforms import Pose, inverse
+from bevcli.inference.load import Model
+from bevcli.inference.preprocess import Preprocessor
+from bevcli.inference.runner import Runner
+from bevcli.model.bevformer_v2.window import fill_window, other_bev_from_bev
+from bevcli.runs.run_into_folder import run_into_folder
+
+
+def assert_same(one, other):
+    assert one.bev.numpy() == pytest.approx(other.bev.numpy(), abs=1e-5)
+    assert one.boxes.centers == pytest.approx(other.boxes.centers, abs=1e-4)
+    assert one.boxes.scores == pytest.approx(other.boxes.scores, abs=1e-5)
+
+
+def differs(one, other) -> bool:
+    return bool((one.bev - other.bev).abs().max() > 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("frames", "exists", "sources"),
+    [
+        ([-2, -1, 0], [True, True, True], [0, 1, 2]),
+        ([-2, -1, 0], [False, True, True], [1, 1, 2]),
+        ([-2, -1, 0], [False, False, True], [2, 2, 2]),
+        ([-4, -2, 0], [False, False, True], [2, 2, 2]),
+        ([-1, 0, 1, 2], [False, True, True, False], [1, 1, 2, 2]),
+        ([0, 1, 2], [True, False, False], [0, 0, 0]),
+    ],
+)
+def test_a_missing_frame_takes_the_nearest_towards_the_current(frames, exists, sources):
+    assert fill_window(frames, exists) == sources
+
+
+@pytest.mark.parametrize("frames", [(0,), (-1, 0), (-3, -2, -1, 0), (-1, 0, 1)])
+def test_every_frame_passes_the_backbone_once(window_model, frames):
+    model, calls = window_model(*frames), []
+    with model.backbone.register_forward_hook(lambda module, inputs, output: calls.append(len(inputs[0]))):
+        predictions, _ = run(model, MemorySequence(6))
+    assert len(predictions) == 6
+    assert calls == [6] * 6  # six cameras, six frames
+
+
+def test_each_frame_of_the_window_is_encoded_once_a_step(window_model):
+    model, calls = window_model(-3, -2, -1, 0), []
+    with model.encoder.register_forward_hook(lambda *_: calls.append(1)):
+        run(model, MemorySequence(5))
+    assert len(calls) == 1 + 2 + 3 + 4 + 4
+
+
+def test_every_frame_of_the_window_matters(window_model):
+    model = window_model(-2, -1, 0)
+    whole = run(model, MemorySequence(3))[0][2]
+    for dropped in (0, 1):
+        assert differs(whole, run(model, WithoutImages({dropped: "all"}, count=3))[0][2])
+
+
+def test_the_state_has_a_fixed_length(window_model):
+    for frames, lengths in [((-3, -2, -1, 0), [1, 2, 3, 3, 3]), ((-1, 0, 1), [2, 2, 2, 2, 1]), ((0,), [0] * 5)]:
+        runner = Runner(window_model(*frames), CPU)
+        steps = runner.run(MemorySequence(5), range(5), Preprocessor(runner.config))
+        assert [len(state.memory.frames) for _, _, state in steps] == lengths
+
+
+@pytest.mark.parametrize("cut", [1, 2, 4])
+def test_a_run_cut_in_two_equals_the_whole(window_model, cut):
+    model, sequence = window_model(-2, -1, 0), MemorySequence(5)
+    whole, _ = run(model, sequence)
+    first, state = run(model, sequence, range(cut))
+    second, _ = run(model, sequence, range(cut, 5), state)
+    for one, other in zip(whole, first + second, strict=True):
+        assert_same(one, other)
+
+
+def test_an_interrupted_run_that_looks_ahead_goes_on_from_state(window_model):
+    model, sequence = window_model(-1, 0, 1, 2), MemorySequence(6)
+    whole, _ = run(model, sequence)
+    steps = Runner(model, CPU).run(sequence, range(6), Preprocessor(model.config))
+    for _ in range(3):
+        _, _, state = next(steps)
+    steps.close()
+    rest, _ = run(model, sequence, range(3, 6), state)
+    for one, other in zip(whole[3:], rest, strict=True):
+        assert_same(one, other)
+
+
+def test_a_scene_change_inside_the_window_equals_a_fresh_start(window_model):
+    for frames in [(-3, -2, -1, 0), (-1, 0, 1)]:
+        model, sequence = window_model(*frames), MemorySequence(5, scenes="aaabb")
+        whole, _ = run(model, sequence)
+        assert [str(p.started_anew or "") for p in whole] == ["first frame", "", "", "new scene", ""]
+        for places in (range(3), range(3, 5)):
+            fresh, _ = run(model, sequence, places)
+            for place, prediction in zip(places, fresh, strict=True):
+                assert_same(whole[place], prediction)
+
+
+def test_a_gap_in_time_starts_anew(window_model):
+    sequence = MemorySequence(2, step_s=2.5)
+    for frames in [(-1, 0), (0, 1)]:
+        predictions, _ = run(window_model(*frames), sequence)
+        alone, _ = run(window_model(*frames), sequence, [1])
+        assert str(predictions[1].started_anew) == "gap of 2.5 s"
+        assert_same(predictions[1], alone[0])
+
+
+def test_without_history_every_frame_stands_alone(window_model):
+    sequence = MemorySequence(3)
+    for frames in [(-1, 0), (-1, 0, 1)]:
+        predictions, _ = run(window_model(*frames), sequence, temporal=False)
+        assert {str(p.started_anew or "") for p in predictions} == {"history is off"}
+        alone, _ = run(window_model(*frames), sequence, [1], temporal=False)
+        assert_same(predictions[1], alone[0])
+
+
+def test_the_first_frame_of_a_scene_fills_the_window_with_itself(window_model):
+    model, sequence = window_model(-2, -1, 0), MemorySequence(3)
+    with_history, without = run(model, sequence)[0], run(model, sequence, temporal=False)[0]
+    assert_same(with_history[0], without[0])
+    assert differs(with_history[1], without[1])
+
+
+def test_a_later_frame_changes_the_current_one(window_model):
+    model, sequence = window_model(-1, 0, 1), MemorySequence(3)
+    whole, cut = run(model, sequence)[0], run(model, sequence, range(2))[0]
+    assert_same(whole[0], cut[0])
+    assert differs(whole[1], cut[1])
+
+
+def test_a_model_of_one_frame_says_that_it_uses_no_history(window_model):
+    predictions, _ = run(window_model(0), MemorySequence(2))
+    assert {str(p.started_anew or "") for p in predictions} == {"the model uses no history"}
+
+
+def test_a_frame_without_images_passes_the_state_on(window_model):
+    for frames in [(-1, 0), (-1, 0, 1, 2)]:
+        model = window_model(*frames)
+        predictions, _ = run(model, WithoutImages({1: "all"}, count=4))
+        assert [p.skipped for p in predictions] == [False, True, False, False]
+        spanned, _ = run(model, MemorySequence(4), [0, 2, 3])
+        assert_same(predictions[2], spanned[1])
+
+
+def test_a_probe_sees_the_current_frame(window_model):
+    model, probes = window_model(-1, 0), ((0.0, 12.0),)
+    sequence = MemorySequence(2)
+    view = run(model, sequence, ask_attention=True, probes=probes)[0][1].attention
+    alone = run(model, sequence, [1], ask_attention=True, probes=probes)[0][0].attention
+    assert view.history_weight is None
+    assert view.probes[0].cameras["CAM_FRONT"].pixels == pytest.approx(alone.probes[0].cameras["CAM_FRONT"].pixels)
+
+
+def test_every_stage_is_timed(window_model):
+    prediction = run(window_model(-1, 0), MemorySequence(2))[0][1]
+    assert list(prediction.stage_seconds) == ["backbone", "neck", "encoder", "fusion", "decoder", "box_decoding"]
+
+
+@pytest.mark.slow
+def test_memory_stays_flat_over_200_frames_of_a_window_of_eight(window_model):
+    model = window_model(*range(-7, 1))
+    runner = Runner(model, CPU)
+    prepared = [Preprocessor(model.config)(MemorySequence(1).load(0))] * 200
+    state, counts = None, []
+    for index, frame in enumerate(prepared):
+        stamp = replace(frame.frame.stamp, index=index, timestamp_ns=10**18 + index * 500_000_000)
+        state, _ = runner.step(state, replace(frame, frame=replace(frame.frame, stamp=stamp)))
+        if index in (20, 199):
+            gc.collect()
+            counts.append(sum(issubclass(type(thing), torch.Tensor) for thing in gc.get_objects()))
+    assert len(state.memory.frames) == 7
+    assert counts[1] <= counts[0] + 5
+
+
+def test_the_bev_frame_moves_with_the_vehicle():
+    """Both near the world's origin (float32) and far from it (float64)."""
+    ego_from_bev = MemorySequence(1).rig.ego_from_bev
+    for origin in (0.0, 5e6):
+        now, then = (
+            Pose(np.array([origin + x, origin / 2, 0.0]), np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]))
+            for x, yaw in ((4.0, 0.3), (0.0, 0.1))
+        )
+        expected = inverse(then.matrix @ ego_from_bev) @ now.matrix @ ego_from_bev
+        assert other_bev_from_bev(now, then, ego_from_bev) == pytest.approx(expected, abs=1e-5)
+
+
+def test_an_interrupted_run_is_resumed_with_its_window(window_model, tmp_path):
+    model = Model(window_model(-1, 0, 1))
+    run_into_folder(model, MemorySequence(5), tmp_path / "whole")
+    run_into_folder(model, MemorySequence(5), tmp_path / "cut", should_stop=iter([False, False, True]).__next__)
+    run_into_folder(model, MemorySequence(5), tmp_path / "cut", resume=True)
+    for name in ("predictions.json", "tracks.csv"):
+        assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()

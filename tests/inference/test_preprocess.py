@@ -1,0 +1,200 @@
+import gc
+import os
+import threading
+import time
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from memory_drive import MemorySequence, WithoutImages, make_camera, make_rig
+
+from bevcli.geometry.cameras import CameraRig, Distortion
+from bevcli.geometry.transforms import Pose, apply, inverse
+from bevcli.inference.preprocess import Preprocessor, image_for_rig
+from bevcli.model.step import model_inputs
+
+
+def textbook_image(pixels, image):
+    """The original's order: normalise as float, resize, pad right and bottom."""
+    rgb = pixels[..., ::-1] if image.color_order == "rgb" else pixels
+    normalised = (rgb.astype(np.float32) - np.float32(image.mean)) / np.float32(image.std)
+    resized = cv2.resize(normalised, image.size, interpolation=cv2.INTER_LINEAR)
+    width, height = image.padded_size
+    padded = np.zeros((height, width, 3), np.float32)
+    padded[: resized.shape[0], : resized.shape[1]] = resized
+    return padded.transpose(2, 0, 1)
+
+
+@pytest.mark.parametrize("order", ["rgb", "bgr"])
+def test_images_equal_normalising_before_resizing(mini_config, order):
+    config = replace(mini_config, image=replace(mini_config.image, color_order=order))
+    frame = MemorySequence().load(1)
+    images = Preprocessor(config)(frame).images[0].numpy()
+    expected = [textbook_image(frame.images[name].pixels_bgr, config.image) for name in config.cameras]
+    assert images == pytest.approx(np.stack(expected), abs=1e-5)
+
+
+def test_area_resizing_averages_pixels(mini_config):
+    """Stripes that are finer than the network's pixels become grey."""
+    config = replace(mini_config, image=replace(mini_config.image, resize="area"))
+    frame = MemorySequence().load(1)
+    name = config.cameras[0]
+    stripes = np.zeros_like(frame.images[name].pixels_bgr)
+    stripes[:, ::2] = 200  # a network pixel covers two by two pixels
+    frame = replace(frame, images={**frame.images, name: replace(frame.images[name], pixels_bgr=stripes)})
+    image = Preprocessor(config)(frame).images[0, 0].numpy()
+    width, height = config.image.size
+    mean, std = (np.array(values)[:, None, None] for values in (config.image.mean, config.image.std))
+    expected = np.broadcast_to((100 - mean) / std, (3, height, width))
+    assert image[:, :height, :width] == pytest.approx(expected, abs=1e-4)
+
+
+def test_projection_uses_the_pose_at_each_cameras_time(mini_config):
+    frame = MemorySequence().load(1)
+    late = Pose(frame.world_from_ego.translation + [1.5, 0, 0], frame.world_from_ego.quaternion)
+    frame = replace(frame, world_from_ego_at={**frame.world_from_ego_at, "CAM_FRONT": late})
+    point_bev = np.array([2.0, 15.0, -1.0])
+    point_world = apply(frame.world_from_ego.matrix @ frame.rig.ego_from_bev, point_bev)
+    expected, depth = frame.rig["CAM_FRONT"].project_ego(apply(inverse(late.matrix), point_world))
+    u, v, d, one = Preprocessor(mini_config)(frame).image_from_bev[0, 0].numpy() @ [*point_bev, 1]
+    assert (u / d, v / d) == pytest.approx(expected * 0.5, abs=1e-3)  # 320 pixels become 160
+    assert (d, one) == pytest.approx((float(depth), 1.0), abs=1e-4)
+
+
+def test_an_image_of_another_aspect_ratio_is_fitted_as_its_rig(mini_config):
+    camera = make_camera("CAM_FRONT", 0, width=300, height=300)
+    sequence = MemorySequence(rig=CameraRig((camera,), make_rig().ego_from_bev))
+    prepared = Preprocessor(mini_config)(sequence.load(0))
+    assert prepared.images.shape == (1, 1, 3, 96, 160)
+    assert prepared.scales == (pytest.approx(0.3),)
+    assert (prepared.images[0, 0, :, :, 90:] == 0).all()
+    assert (prepared.images[0, 0, :, 90:] == 0).all()
+    assert (prepared.images[0, 0, :, :90, :90] != 0).any()
+    expected, _ = camera.project_ego([12.0, 1.0, 0.5])
+    point_bev = apply(inverse(sequence.rig.ego_from_bev), [12.0, 1.0, 0.5])
+    u, v, d, _ = prepared.image_from_bev[0, 0].numpy() @ [*point_bev, 1]
+    assert (u / d, v / d) == pytest.approx(0.3 * expected, abs=1e-3)
+
+
+def test_images_of_different_sizes_form_one_batch(mini_config):
+    cameras = (make_camera("CAM_FRONT", 0, 320, 180), make_camera("CAM_BACK", 180, 640, 400))
+    sequence = MemorySequence(rig=CameraRig(cameras, make_rig().ego_from_bev))
+    prepared = Preprocessor(mini_config)(sequence.load(0))
+    assert prepared.images.shape == (1, 2, 3, 96, 160)
+    assert prepared.scales == (0.5, 90 / 400)
+
+
+def test_images_are_undistorted_before_resizing(mini_config):
+    lens = Distortion("kannala_brandt", (0.05, -0.01, 0.0, 0.0))
+    plain = make_camera("CAM_FRONT", 0)
+    bent = replace(plain, distortion=lens)
+    point_ego = np.array([12.0, 5.0, 3.5])
+    drawn = np.zeros((180, 320, 3), np.uint8)
+    seen, _ = bent.project_ego(point_ego)
+    cv2.circle(drawn, np.round(seen * 16).astype(int).tolist(), 5 * 16, (255, 255, 255), -1, shift=4)
+    sequence = MemorySequence(rig=CameraRig((bent,), make_rig().ego_from_bev))
+    frame = sequence.load(0)
+    frame = replace(frame, images={"CAM_FRONT": replace(frame.images["CAM_FRONT"], pixels_bgr=drawn)})
+    bright = Preprocessor(mini_config)(frame).images[0, 0, 0].numpy() > 0
+    ys, xs = np.nonzero(bright)
+    expected, _ = plain.project_ego(point_ego)
+    assert (xs.mean(), ys.mean()) == pytest.approx(expected / 2, abs=0.6)
+    assert np.linalg.norm(seen - expected) > 2
+
+
+def test_missing_image_is_black_and_marked(mini_config):
+    prepared = Preprocessor(mini_config)(WithoutImages({0: ["CAM_BACK"]}).load(0))
+    place = prepared.assignment.cameras.index("CAM_BACK")
+    assert prepared.has_image[0].tolist() == [name != "CAM_BACK" for name in prepared.assignment.cameras]
+    assert (prepared.images[0, place] == 0).all()
+
+
+def test_projections_follow_the_resized_image_within_a_pixel(mini_config):
+    """A bright spot, resized to a quarter, lies where its ray is projected to."""
+    config = replace(mini_config, image=replace(mini_config.image, resize="area", half_pixel_shift=True))
+    camera = make_camera("CAM_FRONT", 0, width=640, height=384)
+    sequence = MemorySequence(rig=CameraRig((camera,), make_rig().ego_from_bev))
+    frame = sequence.load(0)
+    dark = np.zeros((384, 640, 3), np.uint8)
+    dark[100:107, 300:307] = 255  # its centre is pixel (303, 103)
+    frame = replace(frame, images={"CAM_FRONT": replace(frame.images["CAM_FRONT"], pixels_bgr=dark)})
+    prepared = Preprocessor(config)(frame)
+    image = prepared.images[0, 0, 0, :90, :150].numpy()  # without the padding
+    weights = image - image.min()
+    rows, columns = np.indices(weights.shape)
+    seen = (columns * weights).sum() / weights.sum(), (rows * weights).sum() / weights.sum()
+    in_camera = 10.0 * np.linalg.inv(camera.intrinsics) @ [303, 103, 1]
+    point_bev = apply(inverse(sequence.rig.ego_from_bev) @ camera.ego_from_camera, in_camera)
+    u, v, d, _ = prepared.image_from_bev[0, 0].numpy() @ [*point_bev, 1]
+    assert seen == pytest.approx((u / d, v / d), abs=0.1)
+
+
+def wide_rig(half_width_over_focal: float, count: int = 3) -> CameraRig:
+    cameras = tuple(make_camera(f"CAM_{index}", 90.0 * index) for index in range(count))
+    focal = 160 / half_width_over_focal
+    lens = np.array([[focal, 0, 160], [0, focal, 90], [0, 0, 1]])
+    return CameraRig(tuple(replace(camera, intrinsics=lens) for camera in cameras), make_rig().ego_from_bev)
+
+
+def test_images_of_wide_cameras_are_enlarged_to_the_focal_length(mini_config):
+    config = replace(mini_config, image=replace(mini_config.image, focal_px=120.0, max_pixels=10**6))
+    sequence = MemorySequence(rig=wide_rig(2.0))  # 80 pixels of focal length, 40 in images of the model's size
+    prepared = Preprocessor(config)(sequence.load(0))
+    assert prepared.scales == pytest.approx((1.5, 1.5, 1.5))
+    assert prepared.images.shape == (1, 3, 3, 288, 480)
+    camera = prepared.frame.rig["CAM_0"]
+    expected, _ = camera.project_ego([12.0, 1.0, 0.5])
+    point_bev = apply(inverse(prepared.frame.rig.ego_from_bev), [12.0, 1.0, 0.5])
+    u, v, d, _ = prepared.image_from_bev[0, 0].numpy() @ [*point_bev, 1]
+    assert (u / d, v / d) == pytest.approx(1.5 * expected, abs=1e-3)
+
+
+def test_images_are_enlarged_only_as_far_as_max_pixels_allows(mini_config):
+    image = replace(mini_config.image, focal_px=120.0, max_pixels=4 * 3 * 160 * 90)
+    assert image_for_rig(wide_rig(2.0, count=3), image).size == (320, 180)
+    width, height = image_for_rig(wide_rig(2.0, count=6), image).size
+    assert width * height * 6 == pytest.approx(image.max_pixels, rel=0.02)
+
+
+def test_images_of_long_focal_lengths_keep_the_models_size(mini_config):
+    image = replace(mini_config.image, focal_px=120.0, max_pixels=10**6)
+    assert image_for_rig(wide_rig(0.5), image).size == mini_config.image.size
+    assert image_for_rig(wide_rig(2.0), mini_config.image) is mini_config.image
+    with pytest.raises(ValueError, match="must be given together"):
+        replace(mini_config.image, focal_px=120.0)
+    with pytest.raises(ValueError, match="exclude each other"):
+        replace(image, crop=(0, 0, 10, 10))
+
+
+def test_frames_with_images_of_different_sizes_form_one_batch(mini_config):
+    config = replace(mini_config, image=replace(mini_config.image, focal_px=120.0, max_pixels=10**6))
+    prepared = [Preprocessor(config)(MemorySequence(rig=wide_rig(wide)).load(0)) for wide in (2.0, 1.0)]
+    batch = model_inputs(prepared, [None, None], config)
+    assert batch.images.shape == (2, 3, 3, 288, 480)
+    height, width = prepared[1].images.shape[-2:]
+    torch.testing.assert_close(batch.images[1, ..., :height, :width], prepared[1].images[0])
+    assert (batch.images[1, ..., height:, :] == 0).all()
+    assert (batch.images[1, ..., width:] == 0).all()
+
+
+def preprocessing_threads() -> set[int | None]:
+    return {thread.ident for thread in threading.enumerate() if thread.name.startswith("preprocess")}
+
+
+def test_one_pool_of_threads_prepares_all_frames(mini_config, monkeypatch):
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    before, sequence = preprocessing_threads(), MemorySequence(8)
+    preprocess = Preprocessor(mini_config)
+    used = set()
+    for place in range(8):
+        preprocess(sequence.load(place))
+        used |= preprocessing_threads() - before
+    assert 1 <= len(used) <= 2
+    del preprocess
+    gc.collect()
+    ended_by = time.monotonic() + 10
+    while preprocessing_threads() & used and time.monotonic() < ended_by:
+        time.sleep(0.01)
+    assert not preprocessing_threads() & used

@@ -1,0 +1,45 @@
+import threading
+
+import pytest
+
+from bevcli.inference.background import read_ahead
+
+
+def test_everything_comes_in_order():
+    assert list(read_ahead(lambda x: x * x, range(10))) == [x * x for x in range(10)]
+
+
+def test_several_threads_keep_the_order():
+    late = threading.Event()
+
+    def work(item):
+        if item == 0:
+            late.wait(5)  # the first item is done after the second
+        else:
+            late.set()
+        return item
+
+    assert list(read_ahead(work, range(6), depth=4, threads=3)) == list(range(6))
+
+
+def test_an_error_is_raised_at_its_item_and_not_before():
+    results = read_ahead(lambda x: 1 / (2 - x), range(5))
+    assert [next(results), next(results)] == [0.5, 1.0]
+    with pytest.raises(ZeroDivisionError):
+        next(results)
+
+
+def test_it_works_ahead_of_the_consumer_but_only_so_far():
+    started = []
+    reached = threading.Event()
+
+    def work(item):
+        started.append(item)
+        if item == 3:
+            reached.set()
+        return item
+
+    results = read_ahead(work, range(100), depth=3)
+    assert next(results) == 0
+    assert reached.wait(5)
+    assert max(started) == 3

@@ -1,0 +1,142 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from memory_drive import MemorySequence, WithoutImages, make_rig
+from stepping import CPU, run
+
+from bevcli.errors import InputError
+from bevcli.geometry.transforms import apply
+from bevcli.inference.preprocess import Preprocessor
+from bevcli.inference.runner import Runner, StepOptions
+from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.camera_assignment import NUSCENES_YAWS_DEG
+from bevcli.model.pillar_projection import project_pillars
+
+
+def assert_same(one, other):
+    assert one.bev.numpy() == pytest.approx(other.bev.numpy(), abs=1e-6)
+    assert one.boxes.centers == pytest.approx(other.boxes.centers, abs=1e-5)
+    assert one.boxes.scores == pytest.approx(other.boxes.scores, abs=1e-6)
+
+
+def test_history_matters(mini_model):
+    sequence = MemorySequence(2)
+    with_history, without = run(mini_model, sequence)[0][1], run(mini_model, sequence, temporal=False)[0][1]
+    assert (with_history.bev - without.bev).abs().max() > 1e-3
+    assert (with_history.started_anew, str(without.started_anew)) == (None, "history is off")
+
+
+def test_a_run_cut_in_two_equals_the_whole(mini_model):
+    sequence = MemorySequence(4)
+    whole, _ = run(mini_model, sequence)
+    first, state = run(mini_model, sequence, range(2))
+    second, _ = run(mini_model, sequence, range(2, 4), state)
+    for one, other in zip(whole, first + second, strict=True):
+        assert_same(one, other)
+
+
+def test_a_new_scene_equals_a_fresh_start(mini_model):
+    whole, _ = run(mini_model, MemorySequence(4, scenes="aabb"))
+    fresh, _ = run(mini_model, MemorySequence(4, scenes="aabb"), range(2, 4))
+    assert [str(p.started_anew or "") for p in whole] == ["first frame", "", "new scene", ""]
+    assert_same(whole[2], fresh[0])
+    assert_same(whole[3], fresh[1])
+
+
+def test_a_gap_in_time_starts_anew(mini_model):
+    predictions, _ = run(mini_model, MemorySequence(2, step_s=2.5))
+    assert str(predictions[1].started_anew) == "gap of 2.5 s"
+
+
+def test_a_frame_without_images_passes_the_state_on(mini_model):
+    sequence = WithoutImages({1: "all"}, count=3)
+    predictions, _ = run(mini_model, sequence)
+    assert [p.skipped for p in predictions] == [False, True, False]
+    assert len(predictions[1].boxes) == 0
+    assert predictions[2].started_anew is None
+    spanned, _ = run(mini_model, MemorySequence(3), [0, 2])
+    assert_same(predictions[2], spanned[1])
+
+
+@pytest.mark.parametrize(
+    "yaws", [{"CAM_FRONT": 0.0}, dict(list(NUSCENES_YAWS_DEG.items())[:5]), {**NUSCENES_YAWS_DEG, "seventh": 90.0}]
+)
+def test_any_number_of_cameras_runs(mini_model, yaws):
+    predictions, _ = run(mini_model, MemorySequence(2, rig=make_rig(yaws)))
+    assert all(np.isfinite(p.boxes.centers).all() and len(p.boxes) == 20 for p in predictions)
+
+
+def test_boxes_move_to_the_world_by_the_pose_of_their_frame(mini_model):
+    sequence = MemorySequence(2)
+    prediction = run(mini_model, sequence)[0][1]
+    matrix = sequence.pose(1).matrix @ sequence.rig.ego_from_bev
+    assert prediction.boxes_world.centers == pytest.approx(apply(matrix, prediction.boxes.centers))
+
+
+def test_the_probe_answers_in_pixels_and_shares(mini_model):
+    predictions, _ = run(mini_model, MemorySequence(2), ask_attention=True, probes=((0.0, 12.0),))
+    view = predictions[1].attention
+    assert predictions[0].attention.history_weight is None
+    assert view.history_weight.shape == (12, 10)
+    assert view.history_weight.min() >= 0
+    assert view.history_weight.max() <= 1
+    samples = view.probes[0].cameras["CAM_FRONT"]
+    assert sum(camera.weights.sum() for camera in view.probes[0].cameras.values()) == pytest.approx(1)
+    # Freshly made offsets stay near the pillar, which stands ahead of the camera: near the image's middle column.
+    assert np.average(samples.pixels[:, 0], weights=samples.weights) == pytest.approx(160, abs=60)
+
+
+def test_a_probe_outside_the_map_is_a_mistake(mini_model):
+    with pytest.raises(InputError, match="outside the BEV map"):
+        run(mini_model, MemorySequence(1), ask_attention=True, probes=((100.0, 0.0),))
+
+
+def test_every_stage_is_timed(mini_model):
+    prediction = run(mini_model, MemorySequence(1))[0][0]
+    assert list(prediction.stage_seconds) == ["backbone", "neck", "encoder", "decoder", "box_decoding"]
+    assert all(seconds > 0 for seconds in prediction.stage_seconds.values())
+
+
+def test_a_segmentation_head_fills_the_prediction(mini_config):
+    torch.manual_seed(0)
+    model = BEVFormer(replace(mini_config, heads=("detection", "segmentation")))
+    predictions, _ = run(model, MemorySequence(2))
+    # Four cells of the map along each side of a BEV cell; there are 12 x 10 of those.
+    assert [prediction.segmentation.cells.shape for prediction in predictions] == [(48, 40)] * 2
+    assert list(predictions[0].stage_seconds)[-3:] == ["segmentation_head", "box_decoding", "map_merging"]
+
+
+def test_removing_a_camera_changes_only_the_cells_that_it_saw(mini_model):
+    """After the first spatial cross-attention; later layers spread the change."""
+    seen = {}
+
+    def keep(module, inputs, output):
+        seen["queries"] = output
+
+    runner = Runner(mini_model, CPU, StepOptions())
+    handle = runner.model.encoder.layers[0].spatial_cross_attention.register_forward_hook(keep)
+    preprocess = Preprocessor(mini_model.config)
+    whole = preprocess(MemorySequence(1).load(0))
+    runner.step(None, whole)
+    with_camera = seen["queries"]
+    runner.step(None, preprocess(WithoutImages({0: ["CAM_FRONT_LEFT"]}, count=1).load(0)))
+    handle.remove()
+    changed = (seen["queries"] - with_camera).abs().amax(-1)[0] > 1e-6
+    projection = project_pillars(whole.image_from_bev, mini_model.pillars.points, (96, 160), whole.has_image)
+    hits = projection.hit[0, mini_model.config.cameras.index("CAM_FRONT_LEFT")]
+    assert changed.any()
+    assert not (changed & ~hits).any()
+    assert (changed == hits).float().mean() > 0.99
+
+
+def test_runners_leave_no_hooks_on_a_model(mini_model):
+    """Several runners in turn, as in training, and one whose step fails."""
+    for _ in range(3):
+        run(mini_model, MemorySequence(1), ask_attention=True, probes=((0.0, 12.0),))
+    runner = Runner(mini_model, CPU)
+    prepared = Preprocessor(mini_model.config)(MemorySequence(1).load(0))
+    with pytest.raises(RuntimeError):
+        runner.step(None, replace(prepared, images=prepared.images[:, :, :1]))
+    assert not any(module._forward_hooks or module._forward_pre_hooks for module in mini_model.modules())

@@ -1,0 +1,357 @@
+"""Interrupted runs: resumed they equal uninterrupted ones, and the output folder keeps what is not theirs."""
+
+import json
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from memory_drive import MemorySequence
+
+from bevcli.errors import OutputError
+from bevcli.frame import FrameStamp
+from bevcli.geometry.transforms import Pose
+from bevcli.inference.load import Model
+from bevcli.inference.tracking import TrackerConfig
+from bevcli.model.bevformer.bevformer import BEVFormer, BevHistory
+from bevcli.recording.options import RecordingOptions
+from bevcli.runs import state as run_state
+from bevcli.runs.run_into_folder import RunOptions, run_into_folder
+from bevcli.runs.state import RunState, load_state, save_state
+from bevcli.runs.summary import Counts
+from bevcli.sequences.files.boxes_file import read_boxes
+from bevcli.viewer.recording_file import open_recording
+from bevcli.viewer.recording_reader import RecordingReader
+
+FRAMES, NINE = 6, np.ones(9)
+pytestmark = pytest.mark.usefixtures("unchecked_recordings")
+
+
+class Drive(MemorySequence):
+    """A drive with the tokens of nuScenes keyframes; loading the frame `broken` fails."""
+
+    broken = FRAMES
+
+    def __init__(self, count=FRAMES, **options):
+        super().__init__(count, **options)
+
+    def load(self, place):
+        if place == self.broken:
+            raise KeyboardInterrupt
+        return replace(super().load(place), sample_token=f"token-{place}")
+
+
+@pytest.fixture(scope="module")
+def model(mini_config):
+    torch.manual_seed(1)
+    config = replace(mini_config, heads=("detection", "segmentation"))
+    return Model(BEVFormer(config).eval(), tracker=TrackerConfig(birth_score=0.0, keep_score=0.0))
+
+
+def run_all(model, out, sequence=None, score=0.0, **arguments):
+    options = RunOptions(recording=RecordingOptions(score=score), save_bev=out.parent / f"{out.name}-bev")
+    return run_into_folder(model, Drive() if sequence is None else sequence, out, options, **arguments)
+
+
+def contents(out: Path) -> dict[str, bytes]:
+    """The files whose bytes do not depend on the time that a run took."""
+    folders = (out, out.parent / f"{out.name}-bev")
+    files = [path for folder in folders for path in folder.rglob("*") if path.is_file() and ".bevcli" not in path.parts]
+    return {path.name: path.read_bytes() for path in files if path.name not in ("recording.rrd", "summary.json")}
+
+
+@pytest.fixture(scope="module")
+def whole(model, tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs") / "out"
+    run_all(model, out)
+    return out
+
+
+def assert_equals(out: Path, whole: Path) -> None:
+    assert contents(out) == contents(whole)
+    with open_recording(out / "recording.rrd") as file:
+        assert not file.repaired
+        assert [frame.index for frame in RecordingReader(file.path).frames()] == list(range(FRAMES))
+    one, other = (json.loads((folder / "summary.json").read_text()) for folder in (out, whole))
+    for key in ("frames", "boxes", "boxes_by_class", "tracks", "started_anew", "dropped_images"):
+        assert one[key] == other[key]
+
+
+@pytest.mark.parametrize(
+    "finished", [pytest.param(n, marks=[pytest.mark.slow] * (n in (1, 2, 4))) for n in range(FRAMES + 1)]
+)
+def test_a_resumed_run_equals_an_uninterrupted_one(model, whole, tmp_path, finished):
+    drive = Drive()
+    drive.broken = finished
+    out = tmp_path / "out"
+    if finished < FRAMES:
+        with pytest.raises(KeyboardInterrupt):
+            run_all(model, out, drive)
+    else:
+        run_all(model, out, drive)
+    assert len(read_boxes(out / "predictions.json").frames) == finished
+    run_all(model, out, resume=True)
+    assert_equals(out, whole)
+
+
+def test_a_run_may_be_interrupted_after_every_frame(model, whole, tmp_path):
+    out, resumed = tmp_path / "out", []
+    run_all(model, out, should_stop=iter([False, True]).__next__)
+    for _ in range(FRAMES):
+        run_all(model, out, resume=True, should_stop=lambda: True, resumed=resumed.append)
+    assert resumed == [2, 3, 4, 5, 6, 6]
+    assert_equals(out, whole)
+
+
+def test_a_resumed_run_keeps_the_frames_that_failed(model, tmp_path):
+    calls = []
+
+    def spoil(module, arguments, output):
+        calls.append(module)
+        if len(calls) in (2, 3):  # the second frame, and the search in it
+            output[0][0] = float("nan")
+
+    hook = model.prepared.observed.get_submodule("neck").register_forward_hook(spoil)
+    try:
+        first = run_all(model, tmp_path / "out", should_stop=iter([False, False, True]).__next__)
+    finally:
+        hook.remove()
+    failed = first.to_dict()["not_finite_frames"]
+    assert [each["frame"] for each in failed] == [1]
+    assert run_all(model, tmp_path / "out", resume=True).to_dict()["not_finite_frames"] == failed
+
+
+def test_a_killed_run_goes_on_from_its_last_saved_state(model, whole, tmp_path, monkeypatch):
+    monkeypatch.setattr(run_state, "SHARE", 1.0)
+    monkeypatch.setattr(run_state, "ASSUMED_S", 0.0)
+    out, copy = tmp_path / "out", tmp_path / "copy"
+
+    def copy_at_four(frame, prediction):
+        if frame.stamp.index == 3:  # what a kill here leaves
+            shutil.copytree(out, copy)
+
+    run_all(model, out, after_frame=copy_at_four)
+    assert (copy / "predictions.json.partial").exists()
+    assert not (copy / "predictions.json").exists()
+    assert len(read_boxes(copy / "predictions.json").frames) == 4
+    resumed = []
+    (tmp_path / "out-bev").rename(tmp_path / "copy-bev")
+    shutil.rmtree(out)
+    copy.rename(out)
+    (tmp_path / "copy-bev").rename(tmp_path / "out-bev")
+    run_all(model, out, resume=True, resumed=resumed.append)
+    assert 2 <= resumed[0] <= 4
+    assert_equals(out, whole)
+
+
+@pytest.fixture
+def interrupted(model, tmp_path):
+    run_all(model, tmp_path / "out", should_stop=iter([False, False, True]).__next__)
+    return tmp_path / "out"
+
+
+def test_another_run_is_not_resumed_and_the_difference_is_named(model, mini_model, interrupted):
+    before = contents(interrupted)
+    shifted = Drive()
+    shifted.stamps = (FrameStamp(0, "b", 5), *shifted.stamps[1:])
+    with pytest.raises(OutputError, match=r"frames of the input: was 6, \w+, is 6, \w+"):
+        run_all(model, interrupted, shifted, resume=True)
+    with pytest.raises(OutputError, match=r"option recording: was .*0.0.*is .*0.5") as error:
+        run_all(model, interrupted, score=0.5, resume=True)
+    assert "\n" not in str(error.value)
+    with pytest.raises(OutputError, match=r"model: was .* weights: was"):
+        run_all(Model(mini_model), interrupted, resume=True)
+    with pytest.raises(OutputError, match="exclude each other"):
+        run_all(model, interrupted, resume=True, force=True)
+    assert contents(interrupted) == before
+
+
+def test_an_interrupted_run_is_not_overwritten_unasked(model, interrupted):
+    with pytest.raises(OutputError, match="`resume=True`"):
+        run_all(model, interrupted)
+
+
+def test_a_broken_state_is_an_error_of_one_line(model, interrupted):
+    (interrupted / ".bevcli/state.safetensors").write_bytes(b"no state")
+    with pytest.raises(OutputError, match="`force=True` to start anew") as error:
+        run_all(model, interrupted, resume=True)
+    assert "\n" not in str(error.value)
+
+
+def with_memory(**changes):
+    return lambda state: replace(state, memory=replace(state.memory, **changes))
+
+
+def with_times(**changes):
+    def change(state):
+        for name, value in changes.items():
+            object.__setattr__(state.counts.whole, name, value)
+        return state
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        with_memory(bev=torch.zeros(1, 3, 2)),
+        with_memory(bev=torch.zeros(0)),
+        with_memory(pose=Pose(np.zeros(1), np.zeros((2, 2)))),
+        lambda state: replace(state, files=replace(state.files, predictions=1 << 63)),
+        lambda state: replace(state, files=replace(state.files, tracks=-1)),
+        lambda state: replace(state, tracks=replace(state.tracks, tracks=replace(state.tracks.tracks, frames=NINE))),
+        with_times(count=-1),
+        with_times(total_s=float("nan")),
+        with_times(bins={10**6: 3}),
+    ],
+)  # fmt: skip
+def test_a_state_of_wrong_content_is_an_error_of_one_line(model, interrupted, change):
+    path = interrupted / ".bevcli/state.safetensors"
+    save_state(path, change(load_state(path, RunState[BevHistory])))
+    with pytest.raises(OutputError) as error:
+        run_all(model, interrupted, resume=True)
+    assert "\n" not in str(error.value)
+
+
+def test_resume_without_an_earlier_run_starts_at_the_first_frame(model, whole, tmp_path):
+    run_all(model, tmp_path / "out", resume=True)
+    assert_equals(tmp_path / "out", whole)
+
+
+def test_force_removes_only_what_a_run_wrote(model, tmp_path):
+    out = tmp_path / "out"
+    run_all(model, out)
+    kept = [out / "segmentation/0001.png", out / "segmentation/000099.png", out / "notes.txt", tmp_path / "a.json"]
+    for path in kept:
+        path.write_text("mine")
+    (out / ".bevcli/written").open("a").write("../a.json\n")
+    run_all(model, out, Drive(2), force=True)
+    assert all(path.read_text() == "mine" for path in kept)
+    assert {path.name for path in out.glob("segmentation/00000*.png")} == {"000000.png", "000001.png"}
+
+
+def test_a_file_that_no_run_wrote_is_not_overwritten(model, tmp_path):
+    (tmp_path / "out/segmentation").mkdir(parents=True)
+    mine = tmp_path / "out/segmentation/000000.png"
+    mine.write_text("mine")
+    with pytest.raises(OutputError, match=r"000000\.png: exists already, and no run wrote it"):
+        run_all(model, tmp_path / "out", force=True)
+    assert mine.read_text() == "mine"
+
+
+def test_a_second_run_in_a_folder_is_refused_and_names_the_first(model, whole, tmp_path):
+    refusals = []
+
+    def start_another(frame, prediction):
+        for how in ({"force": True}, {"resume": True}):
+            with pytest.raises(OutputError, match=f"in use by another run .process {os.getpid()}: ") as error:
+                run_all(model, tmp_path / "out", **how)
+            refusals.append(error)
+
+    run_all(model, tmp_path / "out", after_frame=start_another)
+    assert len(refusals) == 2 * FRAMES
+    assert_equals(tmp_path / "out", whole)
+    assert not (tmp_path / "out/.bevcli/lock").exists()
+
+
+def test_a_folder_that_is_deleted_during_the_run_is_an_error(model, tmp_path):
+    def delete(frame, prediction):
+        if frame.stamp.index == 2:
+            shutil.rmtree(tmp_path / "out")
+
+    with pytest.raises(OutputError, match=r"deleted|cannot be written"):
+        run_all(model, tmp_path / "out", after_frame=delete)
+
+
+def test_saving_states_takes_two_percent_of_the_time_at_most(model, tmp_path, monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr(run_state.time, "perf_counter", lambda: clock[0])
+
+    def slow_save(path, state):
+        clock[0] += 0.5
+
+    monkeypatch.setattr(run_state, "save_state", slow_save)
+    saver = run_state.StateSaver(tmp_path / "state")
+    spent = 0
+    for _ in range(10_000):
+        clock[0] += 0.1
+        if saver.is_due(run_state.RunnerState()):
+            saver.save(run_state.RunState({}, None, Counts()))
+            spent += 1
+        assert spent * 0.5 <= 0.02 * clock[0] + 0.5  # the first save's time is not known before
+    assert spent >= 30
+
+
+DAMAGE = {
+    "predictions.json": lambda path: path.write_bytes(path.read_bytes()[:400] + bytes(path.stat().st_size - 400)),
+    "tracks.csv": lambda path: path.write_bytes(bytes(33_000)),
+    "results_nusc.json": lambda path: path.write_bytes(path.read_bytes().replace(b"token-0", b"token-9", 1)),
+    "recording.rrd": lambda path: os.truncate(path, path.stat().st_size // 4),
+    "segmentation": lambda path: (path / "000001.png").unlink(),
+    "../out-bev": lambda path: (path / "000000.npy").unlink(),
+}
+
+
+def test_damaged_files_are_named_and_left_alone(model, interrupted):
+    kept = contents(interrupted)
+    for name, damage in DAMAGE.items():
+        folder = interrupted.with_name("damaged")
+        shutil.copytree(interrupted.parent, folder, ignore=lambda *_: ["damaged"])
+        damage(interrupted / name)
+        before = contents(interrupted)
+        named = (interrupted / name).resolve().name
+        with pytest.raises(OutputError, match=rf"{named}: `resume`: was changed or damaged.*`force=True`"):
+            run_all(model, interrupted, resume=True)
+        assert contents(interrupted) == before
+        shutil.copytree(folder, interrupted.parent, dirs_exist_ok=True)
+        shutil.rmtree(folder)
+        assert contents(interrupted) == kept
+
+
+def test_changed_images_are_seen(model, tmp_path):
+    class WithImages(Drive):
+        def image_files(self, place):
+            return (tmp_path / f"{place}.jpg",)
+
+    for place in range(FRAMES):
+        (tmp_path / f"{place}.jpg").write_bytes(bytes(place))
+    out = tmp_path / "out"
+    run_all(model, out, WithImages(), should_stop=iter([False, True]).__next__)
+    shutil.copy(tmp_path / "5.jpg", tmp_path / "3.jpg")
+    with pytest.raises(OutputError, match=r"images of the input: was 6, \w+, is 6, \w+"):
+        run_all(model, out, WithImages(), resume=True)
+
+
+def test_nothing_is_deleted_or_written_through_links(model, interrupted, tmp_path):
+    elsewhere = tmp_path / "elsewhere"
+    (elsewhere / "maps").mkdir(parents=True)
+    precious = elsewhere / "maps" / "000000.png"
+    precious.write_bytes(b"precious")
+    shutil.rmtree(interrupted / "segmentation")
+    (interrupted / "segmentation").symlink_to(elsewhere / "maps")
+    with (interrupted / ".bevcli" / "written").open("a") as file:
+        file.write(f"segmentation/000000.png\n{precious}\n../elsewhere/maps/000000.png\n")
+    with pytest.raises(OutputError, match=r"segmentation/000000\.png: is a link, or leads out of"):
+        run_all(model, interrupted, force=True)
+    (interrupted / "segmentation").unlink()
+    (interrupted / "predictions.json").unlink(missing_ok=True)
+    (interrupted / "predictions.json").symlink_to(elsewhere / "new")
+    run_all(model, interrupted, force=True)
+    assert precious.read_bytes() == b"precious"
+    assert [path.name for path in elsewhere.rglob("*")] == ["maps", "000000.png"]
+
+
+def test_a_deleted_lock_admits_no_second_run(model, tmp_path):
+    out, refused = tmp_path / "out", []
+
+    def start_another(frame, prediction):
+        (out / ".bevcli" / "lock").unlink(missing_ok=True)
+        with pytest.raises(OutputError, match="in use by another run"):
+            run_all(model, out, resume=True)
+        refused.append(frame.stamp.index)
+
+    run_all(model, out, after_frame=start_another)
+    assert refused == list(range(FRAMES))

@@ -1,0 +1,165 @@
+"""Formats: each option is stated once, an option of another format is refused, and a package can add a format."""
+
+import importlib
+import shutil
+import subprocess
+import sys
+from dataclasses import fields
+
+import cv2
+import numpy as np
+import pytest
+from memory_drive import make_camera
+
+from bevcli import registry
+from bevcli.errors import BevcliError, InputError
+from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
+from bevcli.options import option_of
+from bevcli.sequences.files.calibration_file import write_calibration
+from bevcli.sequences.format import format_of, format_options, formats, option_classes
+from bevcli.sequences.open import open_sequence
+from bevcli.sequences.options import RigOptions, SequenceOptions
+
+PLUG_IN = '''
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from bevcli.errors import BevcliError, InputError
+from bevcli.frame import CameraImage, Frame, FrameStamp, Sequence
+from bevcli.geometry.transforms import Pose
+from bevcli.options import option, options
+from bevcli.sequences.format import Format
+from bevcli.sequences.images import AT_REST
+from bevcli.sequences.options import RigOptions
+
+
+@options("Input")
+class StripOptions(RigOptions):
+    images_per_second: float = option(default=2.0, help="Strips: images per second.")
+
+
+class Strip(Sequence):
+    """A file name.strip: one camera's images below each other, in a PNG. The calibration is given with it."""
+
+    has_ego_motion = False
+
+    def __init__(self, path, common, own):
+        self.name, self.rig = path.stem, own.rig()
+        if self.rig is None:
+            raise InputError(f"{path}: states no calibration: pass `calibration`")
+        pixels = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
+        self.images = np.split(pixels, len(pixels) // self.rig.cameras[0].height)
+        self.stamps = tuple(FrameStamp(i, "", int(i * 1e9 / own.images_per_second)) for i in range(len(self.images)))
+
+    def load(self, place):
+        stamp, (camera,) = self.stamps[place], self.rig.names
+        images = {camera: CameraImage(stamp.timestamp_ns, self.images[place])}
+        return Frame(stamp, self.rig, images, Pose.identity(), {camera: Pose.identity()}, AT_REST)
+
+
+FORMAT = Format("a strip", "name.strip", lambda path: path.suffix == ".strip", Strip, StripOptions)
+'''
+
+
+@pytest.fixture
+def plug_in(tmp_path, monkeypatch):
+    """A package with a format, installed into a folder of its own."""
+    site = tmp_path / "site"
+    facts = site / "strips-1.0.dist-info"
+    facts.mkdir(parents=True)
+    (facts / "METADATA").write_text("Metadata-Version: 2.1\nName: strips\nVersion: 1.0\n")
+    (facts / "entry_points.txt").write_text("[bevcli.sequences]\nstrips = strips:FORMAT\n")
+    (site / "strips.py").write_text(PLUG_IN)
+    monkeypatch.syspath_prepend(str(site))
+    registry.entries.cache_clear()
+    yield
+    sys.modules.pop("strips", None)
+    monkeypatch.undo()
+    importlib.invalidate_caches()
+    registry.entries.cache_clear()
+    registry.load.cache_clear()
+
+
+@pytest.fixture
+def strip(tmp_path, drive) -> dict:
+    """Three images of 6 x 4 pixels below each other, and the calibration of their camera."""
+    pixels = np.repeat(np.array([10, 20, 30], dtype=np.uint8), 4)[:, None, None] * np.ones((1, 6, 3), dtype=np.uint8)
+    (tmp_path / "day.strip").write_bytes(cv2.imencode(".png", pixels)[1].tobytes())
+    rig = CameraRig((make_camera("CAM_FRONT", 0, 6, 4),), default_ego_from_bev())
+    write_calibration(tmp_path / "calibration.json", rig)
+    return {"path": tmp_path / "day.strip", "calibration": tmp_path / "calibration.json"}
+
+
+def test_each_option_is_stated_once():
+    common = {field.name for field in fields(SequenceOptions)}
+    shared = {field.name for field in fields(RigOptions)}
+    own = [{field.name for field in fields(one.options)} for one in formats()]
+    assert not common & set().union(*own)
+    for number, names in enumerate(own):
+        for others in own[number + 1 :]:
+            assert names & others <= shared
+    stated = [*fields(SequenceOptions), *format_options().values()]
+    assert all(option_of(field).help for field in stated)
+
+
+def test_an_option_of_another_format_is_refused_by_name(drive):
+    with pytest.raises(InputError, match=r"a sequence folder: .*sweeps.* for a nuScenes root"):
+        open_sequence(drive, sweeps=True)
+    assert open_sequence(drive, sweeps=False, version=None, topics={}).stamps
+    with pytest.raises(TypeError, match="`swept`"):
+        open_sequence(drive, swept=True)
+
+
+def test_the_dataclass_and_keywords_mean_the_same(drive):
+    options = SequenceOptions(every=2, frames=slice(1, 2))
+    by_class = open_sequence(drive, options).stamps
+    assert by_class == open_sequence(drive, every=2, frames=slice(1, 2)).stamps
+    assert open_sequence(drive, options, frames=None).stamps == open_sequence(drive, every=2).stamps
+
+
+def test_the_rate_of_a_model_is_used_unless_another_is_given(drive):
+    """The drive has two frames per second."""
+    assert len(open_sequence(drive, model_rate_hz=1.0).stamps) == 2
+    assert len(open_sequence(drive, model_rate_hz=1.0, rate_hz="all").stamps) == 4
+    assert len(open_sequence(drive, model_rate_hz=1.0, every=1).stamps) == 4
+
+
+def test_the_strongest_format_is_taken(drive, tmp_path):
+    assert format_of(drive).name == "a sequence folder"
+    shutil.copytree(drive, tmp_path / "both")
+    (tmp_path / "both/v1.0-mini").mkdir()
+    (tmp_path / "both/v1.0-mini/scene.json").write_text("[]")
+    assert format_of(tmp_path / "both").name == "a nuScenes root"
+
+
+def test_a_package_can_add_a_format(plug_in, strip, drive):
+    assert len([line for line in PLUG_IN.splitlines() if line]) <= 40
+    sequence = open_sequence(**strip, images_per_second=4, frames=slice(1, None))
+    assert [stamp.timestamp_ns for stamp in sequence.stamps] == [250_000_000, 500_000_000]
+    assert [int(sequence.load(place).images["CAM_FRONT"].pixels_bgr[0, 0, 0]) for place in (0, 1)] == [20, 30]
+    with pytest.raises(InputError, match=r"images.per.second"):
+        open_sequence(drive, images_per_second=4)
+    with pytest.raises(InputError, match="a sequence folder, a nuScenes root, a ROS bag or a strip"):
+        open_sequence(drive / "missing")
+
+
+def test_a_broken_package_stops_only_what_needs_its_format(plug_in, strip, drive):
+    (strip["path"].parent / "site/strips.py").write_text("import a_package_that_is_missing")
+    assert open_sequence(drive).stamps
+    for path, options in ((strip["path"], {}), (drive, {"images_per_second": 4})):
+        with pytest.raises(BevcliError, match=r"strips = strips:FORMAT cannot be imported.*a_package") as error:
+            open_sequence(path, **options)
+        assert "\n" not in str(error.value)
+    assert len(formats()) == len(option_classes()) == 3
+
+
+def test_recognising_a_path_imports_no_reader(tmp_path):
+    code = (
+        "import sys; from pathlib import Path; from bevcli.sequences.format import formats\n"
+        "[one.recognises(Path(sys.argv[1])) for one in formats()]\n"
+        "print(sorted({'numpy', 'mcap', 'rosbags', 'cv2', 'torch'} & set(sys.modules)))"
+    )
+    shown = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, check=True)
+    assert shown.stdout.strip() == "[]"

@@ -1,0 +1,144 @@
+"""The package of docs/extend.md, installed and run, and the places that an extension touches."""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from textwrap import dedent
+
+import pytest
+from command_line import MINI_TOML
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs/extend.md").read_text()
+PACKAGE = ROOT / "bevcli"
+ENTRIES = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]
+NAMED_BLOCK = re.compile(r"^ *`([\w./]+)`:\n\n *```\w+\n(.*?)^ *```", flags=re.MULTILINE | re.DOTALL)
+FILES = {name: dedent(text) for name, text in NAMED_BLOCK.findall(PAGE)}
+
+
+def lines(name: str) -> int:
+    return len(FILES[name].splitlines())
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The files of the page with the metadata that pip writes, and a drive file."""
+    folder = tmp_path_factory.mktemp("extension")
+    for name, text in FILES.items():
+        path = folder / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text)
+    (folder / "bevcli_ground/__init__.py").touch()
+    groups = tomllib.loads(FILES["pyproject.toml"])["project"]["entry-points"]
+    metadata = folder / "bevcli_ground-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: bevcli-ground\nVersion: 1.0\n")
+    texts = [f"[{group}]\n" + "".join(f"{n} = {v}\n" for n, v in found.items()) for group, found in groups.items()]
+    (metadata / "entry_points.txt").write_text("\n".join(texts))
+    (folder / "samples").symlink_to(ROOT / "samples")
+    python(folder, "make_drive.py")
+    return folder
+
+
+def python(folder: Path, *arguments: str) -> str:
+    """The output of Python with the package installed."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), *sys.path])}
+    command = [sys.executable, *arguments]
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"{shlex.join(command)}\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+def test_format_and_model_of_the_page_are_short():
+    assert lines("bevcli_ground/drive_file.py") <= 42
+    assert lines("bevcli_ground/ground.py") <= 80
+
+
+def test_the_pages_commands_run(folder):
+    [block] = re.findall(r"^```sh\n(.*?)^```", PAGE, flags=re.MULTILINE | re.DOTALL)
+    install, make_drive, *commands = block.splitlines()
+    assert (install, make_drive) == ("pip install .", "python make_drive.py")  # the fixture does both
+    for line in commands:
+        program, *arguments = shlex.split(line)
+        assert program == "bevcli"
+        printed = python(folder, "-m", "bevcli", *arguments)
+    assert re.fullmatch(r"((car|pedestrian) \d+\n)+", printed)
+    summary = json.loads((folder / "runs/ground/summary.json").read_text())
+    assert summary["frames"] == 2  # of three, by --skip 1
+
+
+def test_help_lists_the_command_of_the_page(folder):
+    assert "Print the number of boxes of each class in a run." in python(folder, "-m", "bevcli", "--help")
+    assert "--min-score" in python(folder, "-m", "bevcli", "count", "--help")
+    assert "--skip" in python(folder, "-m", "bevcli", "run", "--help")
+
+
+def test_a_formats_option_is_one_line(folder):
+    assert sum("skip: int" in line for line in FILES["bevcli_ground/drive_file.py"].splitlines()) == 1
+    code = "import bevcli; print(len(bevcli.open_sequence('street.drive.json', skip=1).stamps))"
+    assert python(folder, "-c", code) == "2\n"
+
+
+@pytest.mark.slow
+def test_the_engine_of_the_page_runs_an_exported_file(folder):
+    pytest.importorskip("onnxruntime")
+    (folder / "mini.toml").write_text(MINI_TOML)
+    python(folder, "-m", "bevcli", "export-onnx", "mini.toml", "--untrained", "-o", "mini.onnx")
+    code = (
+        "import bevcli; drive = bevcli.open_sequence('samples/street', frames=slice(0, 1))\n"
+        "for engine in ('unoptimised', 'onnxruntime'):\n"
+        "    _, prediction = next(bevcli.run(bevcli.load_model('mini.onnx', engine=engine), drive))\n"
+        "    print(prediction.boxes.centers.round(3).tolist())"
+    )
+    plain, optimised = python(folder, "-c", code).splitlines()
+    assert plain == optimised
+    options = ("--engine", "unoptimised", "--frames", "0:1", "--out", "runs/engine")
+    python(folder, "-m", "bevcli", "run", "samples/street", "--model", "mini.onnx", *options)
+    assert json.loads((folder / "runs/engine/summary.json").read_text())["frames"] == 1
+
+
+def imported(path: Path) -> Iterator[str]:
+    """The modules that a file imports anywhere, also by a text "module:attribute"."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            yield from [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.startswith("bevcli."):
+            yield node.value.partition(":")[0]
+
+
+def folders(group: str) -> set[str]:
+    """The packages of a group's entry points, such as "bevcli.model.uniad"."""
+    return {value.partition(":")[0].rpartition(".")[0] for value in ENTRIES[group].values()}
+
+
+def test_nothing_outside_its_folder_names_a_model():
+    inside = tuple(f"{folder}." for folder in folders("bevcli.models"))
+    for path in PACKAGE.rglob("*.py"):
+        module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        if not module.startswith(inside):
+            assert not [name for name in imported(path) if f"{name}.".startswith(inside)], module
+
+
+def test_opening_a_sequence_names_no_format():
+    inside = tuple(f"{folder}." for folder in folders("bevcli.sequences"))
+    files = [PACKAGE / "sequences" / f"{name}.py" for name in ("open", "format", "options", "selection")]
+    for path in [*files, PACKAGE / "cli/run.py", *PACKAGE.glob("inference/*.py"), *PACKAGE.glob("runs/*.py")]:
+        assert not [name for name in imported(path) if f"{name}.".startswith(inside)], path
+
+
+def test_a_command_is_one_file_that_its_entry_names():
+    files = {value.partition(":")[0] for value in ENTRIES["bevcli.commands"].values()}
+    assert len(files) == len(ENTRIES["bevcli.commands"])
+    for name in ("__main__", "cli/__init__", "cli/main", "cli/bridge"):
+        assert not files & set(imported(PACKAGE / f"{name}.py")), name

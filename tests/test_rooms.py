@@ -1,0 +1,71 @@
+"""Rooms: a model is known by its own folder only, and found through its entry point."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import bevcli
+from bevcli.model.temporal_model import TemporalModel
+from bevcli.registry import entries, load
+
+ROOT = Path(bevcli.__file__).parent
+MODEL = ROOT / "model"
+FOLDERS = sorted(path for path in MODEL.iterdir() if path.is_dir() and path.name not in ("kernels", "__pycache__"))
+
+
+def classes_of(folder: Path) -> set[str]:
+    trees = (ast.parse(path.read_text()) for path in folder.rglob("*.py"))
+    return {node.name for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
+
+
+def names_in(path: Path) -> Iterator[str]:
+    """Every name and imported module in a file's code; texts and comments are free to speak of models."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Name):
+            yield node.id
+        elif isinstance(node, ast.Attribute):
+            yield node.attr
+        elif isinstance(node, ast.ImportFrom):
+            yield from (node.module or "", *(alias.name for alias in node.names))
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+
+
+def test_the_folders_of_models_are_those_of_the_entry_points():
+    folders = {entry.value.split(":")[0].split(".")[2] for entry in entries("bevcli.models").values()}
+    assert folders == {folder.name for folder in FOLDERS}
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+def test_no_other_room_names_a_model(folder):
+    """UniAD extends BEVFormer, so that the models' folders may name each other."""
+    own, module = classes_of(folder), f"bevcli.model.{folder.name}"
+    others = (path for path in ROOT.rglob("*.py") if not any(path.is_relative_to(one) for one in FOLDERS))
+    named = [
+        f"{path.relative_to(ROOT)}: {name}"
+        for path in others
+        for name in names_in(path)
+        if name in own or name == module or name.startswith(f"{module}.")
+    ]
+    assert not named
+
+
+def test_no_other_room_asks_for_the_kind_of_a_model():
+    """`Network` has the shared parts, which training, timing and figures need."""
+    kinds = {name for folder in FOLDERS for name in classes_of(folder)} | {"ExportedModel", "PreparedModel"}
+    asked = []
+    for path in ROOT.rglob("*.py"):
+        if any(path.is_relative_to(folder) for folder in FOLDERS):
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "isinstance":
+                asked += [path for name in ast.walk(node.args[1]) if isinstance(name, ast.Name) and name.id in kinds]
+    assert not asked
+
+
+@pytest.mark.parametrize("name", entries("bevcli.models"))
+def test_entry_point_and_configuration_name_the_same_model(name):
+    model: type[TemporalModel] = load("bevcli.models", name)
+    assert model.config_class.architecture == name
