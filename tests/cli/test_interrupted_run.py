@@ -3,23 +3,19 @@
 import json
 import os
 import random
-import resource
 import shutil
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
 
 import pytest
-import torch
 from command_line import MINI_TOML
-from forks import FORKS
+from forks import FORKS, run_in_fork
 from memory_drive import MemorySequence
 from small_fleet import RIG
 
-from bevcli.cli.main import run_app
 from bevcli.sequences.files.boxes_file import read_boxes
 from bevcli.sequences.native.writer import NativeWriter
 from bevcli.viewer.recording_file import open_recording
@@ -54,18 +50,6 @@ class Run:
 
 
 ARGUMENTS = ["run", "drive", "--model", "mini.toml", "--untrained", "--rate", "all", "--out"]
-
-
-def run_in_fork(folder: Path, arguments: list[str], texts: str, file_size: int | None) -> None:
-    os.chdir(folder)
-    with open(texts, "w") as output:
-        os.dup2(output.fileno(), 1)
-        os.dup2(output.fileno(), 2)
-    sys.argv = ["bevcli", *arguments]
-    torch.set_num_threads(1)  # the last bits of a result depend on the number of threads
-    if file_size is not None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (file_size, file_size))
-    run_app()
 
 
 @pytest.fixture(scope="module")

@@ -169,6 +169,7 @@ def test_every_command_runs_demo_from_a_file(tmp_path, monkeypatch):
     assert (timed["precision"], timed["engine"]) == ("int8", "onnxruntime")
 
 
+@pytest.mark.slow
 def test_openvino_opens_no_connection(small_file):
     watched = f"""
 import sys

@@ -75,15 +75,17 @@ def agree(differences: list[FrameDifference], frames: int, logits: float = 1e-3)
     assert max(row.box_m for row in differences) < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", list(entries("bevcli.engines")))
-@pytest.mark.parametrize("frames", [pytest.param((0,), marks=pytest.mark.slow), WINDOW])
+@pytest.mark.parametrize("frames", [(0,), WINDOW])
 def test_a_file_equals_the_model_over_a_drive(cropping_model, window_file, frames, engine):
     differences = list(check_exported(window_file(frames), Model(cropping_model(*frames)), DRIVE, engine))
     agree(differences, 7)
     assert max(row.bev for row in differences) < 1e-4
 
 
-@pytest.mark.parametrize("frames", [pytest.param((0,), marks=pytest.mark.slow), WINDOW])
+@pytest.mark.slow
+@pytest.mark.parametrize("frames", [(0,), WINDOW])
 def test_a_file_documents_its_window_and_all_inputs_and_outputs(window_file, frames):
     proto = onnx.load(window_file(frames))
     assert {node.domain for node in proto.graph.node} <= {"", "ai.onnx"}
@@ -105,6 +107,7 @@ def test_levels_of_image_features_follow_from_the_configuration(cropping_model):
     assert features.level_shapes == model.config.level_shapes
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_of_a_file_is_resumed_with_its_window(window_file, tmp_path):
     model = load_model(window_file())
     run_into_folder(model, DRIVE, tmp_path / "whole")

@@ -28,7 +28,6 @@ from bevcli.model.uniad.uniad import UniADConfig
 CPU = torch.device("cpu")
 FRAMES = 3
 MODELS = known_models()
-FAST_MODELS = ("demo", "v2-t2", "uniad-track-map")  # one of each kind
 
 
 def small_version(name: str) -> ModelConfig:
@@ -92,10 +91,9 @@ def sample_plainly(values, shapes, locations, weights, ends, out, queries, maps,
 @pytest.mark.parametrize(
     ("name", "device_name"),
     [
-        *((name, "cuda:1") for name in FAST_MODELS),
-        ("demo", "mps"),
-        *(pytest.param(name, "cuda:1", marks=pytest.mark.slow) for name in MODELS if name not in FAST_MODELS),
-        pytest.param("v2-t1", "mps", marks=pytest.mark.slow),
+        ("demo", "cuda:1"),
+        *(pytest.param(name, "cuda:1", marks=pytest.mark.slow) for name in MODELS if name != "demo"),
+        *(pytest.param(name, "mps", marks=pytest.mark.slow) for name in ("demo", "v2-t1")),
     ],
 )
 def test_a_step_computes_on_its_device_and_waits_for_results(name, device_name, monkeypatch):

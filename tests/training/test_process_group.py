@@ -49,6 +49,7 @@ def train(group: ProcessGroup, folder: Path) -> None:
     torch.save(trainer.job.model.state_dict(), folder / f"{group.rank}-of-{group.size}.pt")
 
 
+@pytest.mark.slow
 def test_two_processes_train_one_model_and_the_leader_writes(tmp_path: Path) -> None:
     group = [FORKS.Process(target=train_in_a_group_of_two, args=(rank, tmp_path)) for rank in range(2)]
     for process in group:
