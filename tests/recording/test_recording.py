@@ -225,6 +225,7 @@ def test_a_file_that_cannot_be_written_is_one_line(tmp_path):
         pass
 
 
+@pytest.mark.slow
 def test_every_frame_survives_a_crash(tmp_path):
     script = f"""
 import os, sys

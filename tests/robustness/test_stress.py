@@ -126,6 +126,7 @@ def test_finished_scenes_are_not_run_again(model, drives, tmp_path):
     assert len(again) == 2 * 2 * FRAMES - FRAMES
 
 
+@pytest.mark.slow
 def test_a_resumed_test_may_get_more_conditions_no_other_options(whole, model, drives, tmp_path):
     for part in (CONDITIONS[3:4], CONDITIONS):
         stress(model, drives, part, tmp_path, resume=True)

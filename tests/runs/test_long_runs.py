@@ -88,6 +88,7 @@ def assert_flat(found: list[Usage], memory: int) -> None:
         assert max(getattr(later, name) for later in found) <= getattr(first, name) + 3, name
 
 
+@pytest.mark.slow
 def test_memory_files_threads_and_sockets_stay_flat(mini_model, tmp_path, monkeypatch):
     monkeypatch.setattr(writer, "INDEXED_FRAMES", 10)  # one index of 100 frames takes 28 MB
     assert_flat(measured_run(mini_model, tmp_path / "out", 60, range(20, 60, 10)), 9 * MIB)

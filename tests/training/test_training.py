@@ -124,6 +124,7 @@ def test_alternated_iterators_give_one_item_each_in_turn() -> None:
     assert "".join(alternated([iter("abc"), iter("de"), iter("fgh")])) == "adfbegch"
 
 
+@pytest.mark.slow
 def test_a_training_with_all_options_on_resumes_exactly_too(tmp_path: Path) -> None:
     """Updates on every frame, alternating batches, query groups, averaged weights, the dense and perspective loss."""
     settings = replace(

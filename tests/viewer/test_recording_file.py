@@ -92,6 +92,7 @@ def assert_same_frames(path, expected):
         assert len(RrdReader(path).recordings()) == 1
 
 
+@pytest.mark.slow
 def test_a_long_recording_of_several_streams_is_one_recording(tmp_path, monkeypatch):
     sequence, finished = MemorySequence(6), 5
     record(tmp_path / "whole.rrd", sequence, truth=False)

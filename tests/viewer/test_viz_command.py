@@ -70,8 +70,8 @@ def test_the_boxes_file_has_the_shown_boxes(drive, tmp_path):
 @pytest.mark.parametrize(
     ("ending", "with_av", "codecs"),
     [
-        ("mp4", True, (b"h264", b"avc1")),
-        ("mp4", False, (b"vp09", b"vp90")),
+        pytest.param("mp4", True, (b"h264", b"avc1"), marks=pytest.mark.slow),
+        pytest.param("mp4", False, (b"vp09", b"vp90"), marks=pytest.mark.slow),
         pytest.param("webm", True, (b"vp90", b"vp09"), marks=pytest.mark.slow),
     ],
 )
