@@ -48,8 +48,9 @@ demo: $(USER)
 # Compiled modules are kept, also where the environment says not to: programs that tests start import in a third of the time.
 test test-all: export PYTHONDONTWRITEBYTECODE :=
 
+# A worker that crashes ends the tests: pytest-xdist's scheduler of groups waits for ever when it is replaced.
 test: $(DEVELOPER)
-	OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder -m "not slow and not gpu"
+	OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0 -m "not slow and not gpu"
 
 test-all: $(VIEWERS)
 	$(BIN)/pytest

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Mapping
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -103,7 +104,6 @@ class OpenVinoEngine(Engine):
         require("openvino", "onnx", extra="openvino")
         import onnx
 
-        openvino = import_openvino()
         settings: dict[str, Any] = {
             # By default OpenVINO rounds everything to bfloat16 where the CPU has it, which moves boxes by decimetres.
             "INFERENCE_PRECISION_HINT": "f32",
@@ -114,7 +114,7 @@ class OpenVinoEngine(Engine):
             check_size(file)
             # OpenVINO drops the metadata of a file.
             proto = onnx.load(str(file), load_external_data=False)
-            self.model = openvino.Core().compile_model(str(file), "CPU", settings)
+            self.model = _openvino_core().compile_model(str(file), "CPU", settings)
         except Exception as error:  # both have classes of their own
             raise _cannot_load(file, "OpenVINO", error) from error
         self.metadata = {entry.key: entry.value for entry in proto.metadata_props}
@@ -126,6 +126,16 @@ class OpenVinoEngine(Engine):
         """See `Engine`."""
         found = self.request.infer(dict(feed), share_inputs=True)
         return {name: found[name] for name in self.outputs}
+
+
+@cache
+def _openvino_core() -> Any:
+    """OpenVINO's one core of this process, which is never deleted.
+
+    On a processor with AMX each core sets a stack for signals and, when it is deleted, brings back the one before, which
+    another core may have freed: the next Ctrl-C would then end the process with a segmentation fault (2026.4).
+    """
+    return import_openvino().Core()
 
 
 def check_size(file: Path) -> None:

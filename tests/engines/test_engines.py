@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import json
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -72,6 +74,16 @@ def test_an_engine_equals_the_model_with_and_without_history(small_file, engine)
         torch.testing.assert_close(found.bev, expected.bev, rtol=1e-4, atol=1e-4)
         torch.testing.assert_close(found.class_logits[-1], expected.class_logits[-1], rtol=1e-4, atol=1e-3)
         torch.testing.assert_close(found.box_codes[-1], expected.box_codes[-1], rtol=1e-4, atol=1e-3)
+
+
+def test_ctrl_c_reaches_python_after_openvino_models_are_gone(small_file):
+    """On processors with AMX it ended the process with a segmentation fault."""
+    models = [load_exported(small_file, "openvino") for _ in range(2)]
+    while models:
+        del models[0]
+        gc.collect()
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
 
 
 def test_a_file_tells_its_model_and_that_its_weights_are_random(small_file):
