@@ -5,8 +5,6 @@ deep, integers that no array can hold, YAML objects that contain themselves. The
 readers.
 """
 
-from __future__ import annotations
-
 import gc
 import json
 import re

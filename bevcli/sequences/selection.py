@@ -1,7 +1,5 @@
 """A part of a sequence as a sequence: one scene, a range of frames, or a lower frame rate."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence as Indices
 from dataclasses import replace
 from pathlib import Path

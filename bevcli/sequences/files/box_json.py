@@ -1,7 +1,5 @@
 """Conversion between Boxes3D and JSON, one object per box. All boxes of a frame are checked at once, for speed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """calibration.json: the cameras of the rig, the bev frame in which the model predicts, and facts of the drive."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -3,11 +3,9 @@
 `bevcli run` stops at the first finding; `bevcli project-debug` shows all of them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -33,11 +31,11 @@ class Report:
     prefix: str = ""
     findings: list[Finding] = field(default_factory=list)
 
-    def about(self, camera: str) -> Report:
+    def about(self, camera: str) -> Self:
         """A report on one camera that adds to the same findings."""
         return replace(self, camera=camera)
 
-    def within(self, name: str) -> Report:
+    def within(self, name: str) -> Self:
         """A report on the fields inside the field `name` that adds to the same findings."""
         return replace(self, prefix=f"{self.prefix}{name}.")
 

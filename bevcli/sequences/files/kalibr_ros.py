@@ -1,7 +1,5 @@
 """A rig from intrinsics in YAML (Kalibr camchain or ROS camera_info) and extrinsics in JSON."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path

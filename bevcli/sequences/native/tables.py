@@ -1,7 +1,5 @@
 """frames.csv and ego_motion.csv: strict CSV, with error messages that name line and column."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re

@@ -1,7 +1,5 @@
 """Reads nuScenes' tables: JSON lists of objects. Large tables, some over a gigabyte, are read in batches."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A nuScenes dataset root as a Sequence."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache, partial

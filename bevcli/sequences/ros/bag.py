@@ -1,7 +1,5 @@
 """The files of one recording as topics with indexed messages."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import threading

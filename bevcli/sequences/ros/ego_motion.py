@@ -1,7 +1,5 @@
 """The vehicle's poses in a bag, read around a time on demand: from a topic with poses, or from transforms."""
 
-from __future__ import annotations
-
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache

@@ -3,8 +3,6 @@
 OpenCV decodes files only. So the packets from a keyframe to the next are written to a temporary file, and read from it.
 """
 
-from __future__ import annotations
-
 import struct
 import tempfile
 import threading

@@ -4,8 +4,6 @@ ROS messages and Foxglove's schemas (in CDR, JSON or Protobuf) name the same thi
 that knows the names.
 """
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

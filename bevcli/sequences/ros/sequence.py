@@ -1,7 +1,5 @@
 """A ROS 2 bag or an MCAP file as a Sequence."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """The files of a bag, MCAP and SQLite: topics, the times of messages from the index, and messages on demand."""
 
-from __future__ import annotations
-
 import sqlite3
 import struct
 from collections import OrderedDict

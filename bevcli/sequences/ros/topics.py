@@ -11,8 +11,6 @@ CAM_FRONT = "/sensing/camera/camera0/camera_info"
 CAM_FRONT = "camera0/camera_optical_link"
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
