@@ -65,7 +65,6 @@ class Bag:
             self._files = [_open_file(file) for file in self.file_paths]
         self.topics = {name: topic for file in self._files for name, topic in sorted(file.topics.items())}
         self._decoders: dict[str, Decode] = {}
-        self._starts: dict[str, NDArray[np.int64]] = {}
         self._times: dict[str, NDArray[np.int64]] = {}
 
     @property

@@ -2,7 +2,7 @@
 
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Sequence
-from functools import lru_cache
+from functools import lru_cache, reduce
 from itertools import pairwise
 
 import numpy as np
@@ -161,16 +161,12 @@ class BagEgoMotion:
         return {link: sorted(by_time.items(), key=lambda sample: sample[0]) for link, by_time in found.items()}
 
     def _motion(self, samples: dict[str, list[Sample]], times: list[int]) -> EgoMotion:
-        matrices = []
-        for time in times:
-            matrix = np.eye(4)
-            for link in self._links:
-                matrix = matrix @ _at(samples[link], time).matrix
-            matrices.append(matrix if self._ego is None else matrix @ self._ego)
         if len(self._links) == 1 and self._ego is None:
             poses = [pose for _, pose in samples[self._links[0]]]  # with the sign of the quaternion as stated
         else:
-            poses = [Pose.from_matrix(matrix) for matrix in matrices]
+            last = [] if self._ego is None else [self._ego]
+            chains = ([*(_at(samples[link], time).matrix for link in self._links), *last] for time in times)
+            poses = [Pose.from_matrix(reduce(np.matmul, chain, np.eye(4))) for chain in chains]
         stamps = np.array(times, dtype=np.int64)
         translations = np.stack([pose.translation for pose in poses])
         quaternions = np.stack([pose.quaternion for pose in poses])
