@@ -88,7 +88,6 @@ class RosSequence(Sequence):
         return self._bag.file_paths
 
     def load(self, place: int) -> Frame:
-        """The frame at position `place`, with decoded images. Raises InputError as `ImageReader.read`."""
         return read_frame(self._entries[place], self.rig, self._images, self._motion)
 
 
