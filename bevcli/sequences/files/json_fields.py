@@ -103,11 +103,11 @@ def parse_transform(owner: Mapping[str, Any], name: str, report: Report) -> Arra
     owner: the JSON object that holds the transform under the key `name`.
     """
     value = owner.get(name)
+    expected = '{"translation": [x, y, z], "rotation_wxyz": [w, x, y, z]}'
     if value is None:
-        report.missing(name, '{"translation": [x, y, z], "rotation_wxyz": [w, x, y, z]}')
+        report.missing(name, expected)
         return None
     if not isinstance(value, dict):
-        expected = '{"translation": [x, y, z], "rotation_wxyz": [w, x, y, z]}'
         report.error("wrong-shape", name, "is not a transform", expected=expected, found=value)
         return None
     inside = report.within(name)
