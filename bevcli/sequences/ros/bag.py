@@ -137,8 +137,7 @@ def _metadata(path: Path) -> dict[str, Any]:
 
 
 def _open_file(path: Path) -> BagFile:
-    missing = [name for name in PACKAGES if not _is_installed(name)]
-    if missing:
+    if not all(map(_is_installed, PACKAGES)):
         raise InputError(f"{path}: ROS bags need the packages of an extra: run pip install 'bevcli[ros]'")
     from bevcli.sequences.ros.storage import McapFile, SqliteFile
 

@@ -83,8 +83,7 @@ class McapFile:
             return None
         if summary is None or not summary.chunk_indexes or not summary.channels:
             return None
-        unindexed = any(not chunk.message_index_length for chunk in summary.chunk_indexes)
-        return None if unindexed else summary
+        return summary if all(chunk.message_index_length for chunk in summary.chunk_indexes) else None
 
     def _topics(self) -> Iterator[Topic]:
         for channel in self._channels.values():
