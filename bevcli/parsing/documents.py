@@ -5,8 +5,6 @@ deep, integers that no array can hold, YAML objects that contain themselves. The
 readers.
 """
 
-from __future__ import annotations
-
 import gc
 import json
 import re
@@ -129,10 +127,7 @@ def check_values(document: Any, path: str | Path, error: type[BevcliError] = Inp
 def _check_yaml_depth(text: str, path: Path) -> None:
     depth = 0
     for event in yaml.parse(text, _YamlLoader):
-        if isinstance(event, yaml.CollectionStartEvent):
-            depth += 1
-        elif isinstance(event, yaml.CollectionEndEvent):
-            depth -= 1
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > DEEPEST:
             raise InputError(f"{path}: is nested too deeply (expected at most {DEEPEST} levels)")
 

@@ -1,7 +1,5 @@
 """Reads whole files and compressed data of a limited size. Pipes, devices and sockets are refused: they may not end."""
 
-from __future__ import annotations
-
 import os
 import stat
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Decodes JPEG and PNG images. The size is read from the header first: a small file can state a size of gigabytes."""
 
-from __future__ import annotations
-
 import struct
 
 import cv2

@@ -6,8 +6,6 @@ and a call becomes whatever `call` of the reader makes of it, by default a `Plac
 to set are left out.
 """
 
-from __future__ import annotations
-
 import io
 import pickle
 import pickletools

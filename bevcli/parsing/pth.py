@@ -5,8 +5,6 @@ it is neither imported nor called. The tensors that a pickle describes are check
 before any is made.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import math
@@ -56,6 +54,25 @@ _ATTACKING_BUILTINS = frozenset(("eval", "exec", "execfile", "compile", "__impor
 _Read = Callable[[str, int], bytearray]  # the bytes of a storage, by its key and their number
 
 
+@dataclass(frozen=True, eq=False)
+class Storage:
+    """A row of `count` numbers, by the pickle. key: its name in the file."""
+
+    key: str
+    dtype: torch.dtype
+    count: int
+
+
+@dataclass(frozen=True, eq=False)
+class StoredTensor:
+    """A tensor as the pickle describes it, not checked yet. Offset and strides count numbers."""
+
+    storage: Any
+    offset: Any
+    shape: Any
+    strides: Any
+
+
 @dataclass(frozen=True)
 class PthFile:
     """The contents of a PyTorch file.
@@ -83,25 +100,6 @@ class PthFile:
         """
         with self._open() as read:
             return _filled(self.contents, "", _Storages(self._path, read))
-
-
-@dataclass(frozen=True, eq=False)
-class Storage:
-    """A row of `count` numbers, by the pickle. key: its name in the file."""
-
-    key: str
-    dtype: torch.dtype
-    count: int
-
-
-@dataclass(frozen=True, eq=False)
-class StoredTensor:
-    """A tensor as the pickle describes it, not checked yet. Offset and strides count numbers."""
-
-    storage: Any
-    offset: Any
-    shape: Any
-    strides: Any
 
 
 def read_pth(path: Path) -> PthFile:

@@ -1,7 +1,5 @@
 """A listed frame -> a Frame: its images, read from files or videos and decoded in parallel, and its poses."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor

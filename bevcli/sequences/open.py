@@ -1,7 +1,5 @@
 """`open_sequence`: recognises the format of an input and opens it as a Sequence."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

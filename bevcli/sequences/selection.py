@@ -1,9 +1,8 @@
 """A part of a sequence as a sequence: one scene, a range of frames, or a lower frame rate."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence as Indices
 from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -98,11 +97,8 @@ def select_rate(sequence: Sequence, rate_hz: float) -> Sequence:
 
 def scenes_of(stamps: Indices[FrameStamp]) -> Iterator[list[int]]:
     """The indices of each scene: a run of consecutive frames with the same scene name."""
-    start = 0
-    for index in range(1, len(stamps) + 1):
-        if index == len(stamps) or stamps[index].scene != stamps[start].scene:
-            yield list(range(start, index))
-            start = index
+    for _, indices in groupby(range(len(stamps)), key=lambda index: stamps[index].scene):
+        yield list(indices)
 
 
 def _median_rate_hz(times_ns: np.ndarray) -> float:

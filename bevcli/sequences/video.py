@@ -1,7 +1,5 @@
 """Reads a video from front to back. It never seeks, because OpenCV's seeking is inexact in many codecs."""
 
-from __future__ import annotations
-
 import contextlib
 from dataclasses import dataclass
 from pathlib import Path

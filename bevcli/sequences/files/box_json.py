@@ -1,7 +1,5 @@
 """Conversion between Boxes3D and JSON, one object per box. All boxes of a frame are checked at once, for speed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -27,7 +25,6 @@ PLAIN: dict[str, tuple[Any, Any, str]] = {
     "duplicate": (bool, False, "true or false"),
     "num_points": (int, -1, "an integer, 0 or more"),
 }
-_UNKNOWN_VELOCITY = [None, None]
 _OWN_NAMES = ClassNames()
 
 
@@ -76,9 +73,7 @@ def boxes_to_json(boxes: Boxes3D) -> list[dict[str, Any]]:
         "yaw": boxes.yaws.tolist(),
         "velocity": velocities,
     }
-    objects: list[dict[str, Any]] = [
-        dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)
-    ]
+    objects = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
     optional = (
         ("score", boxes.scores, lambda value: True),
         ("attribute", boxes.attributes, lambda value: value != ""),
@@ -119,19 +114,13 @@ def _numbers(values: list[Any], width: int, where: str, key: str) -> Array:
         array = np.asarray(None)
     if array.shape == shape and array.dtype.kind in "iuf":
         return array.astype(np.float64, copy=False)
-    if len(values) == 1:
-        raise InputError(f"{where} 0: {key}: {_expected(width)}, found {values[0]!r:.60}")
+    expected = "a number" if width == 1 else f"{width} numbers"
     for place, value in enumerate(values):
         single = np.asarray(value, dtype=object) if isinstance(value, list) else np.asarray(value)
         entries = value if isinstance(value, list) else [value]
-        fits = single.shape == shape[1:] and all(type(entry) in (int, float) for entry in entries)
-        if not fits:
-            raise InputError(f"{where} {place}: {key}: {_expected(width)}, found {value!r:.60}")
+        if single.shape != shape[1:] or not all(type(entry) in (int, float) for entry in entries):
+            raise InputError(f"{where} {place}: {key}: expected {expected}, found {value!r:.60}")
     return np.asarray(values, dtype=np.float64)  # integers too large for int64
-
-
-def _expected(width: int) -> str:
-    return "expected a number" if width == 1 else f"expected {width} numbers"
 
 
 def _require(good: NDArray[np.bool_], column: Array, where: str, key: str, expected: str) -> None:
@@ -143,7 +132,7 @@ def _require(good: NDArray[np.bool_], column: Array, where: str, key: str, expec
 def _velocities(values: list[Any], where: str) -> Array:
     with_nan = [
         [math.nan if number is None else number for number in value] if isinstance(value, list) else value
-        for value in (_UNKNOWN_VELOCITY if value is None else value for value in values)
+        for value in ([None, None] if value is None else value for value in values)
     ]
     return _numbers(with_nan, 2, f"{where}: box", "velocity")
 

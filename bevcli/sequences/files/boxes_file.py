@@ -3,14 +3,12 @@
 A file is read as a whole and written frame by frame.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Self
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
@@ -140,7 +138,7 @@ class BoxesWriter:
         row["boxes"] = boxes_to_json(frame.boxes)
         self.file.append(row, f"frame {frame.stamp.index}")
 
-    def __enter__(self) -> BoxesWriter:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(

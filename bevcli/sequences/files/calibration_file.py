@@ -1,7 +1,5 @@
 """calibration.json: the cameras of the rig, the bev frame in which the model predicts, and facts of the drive."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -130,18 +128,16 @@ def _parse_geo_origin(document: Mapping[str, Any], report: Report) -> GeoOrigin 
         return None
     within = report.within("geo_origin")
     limits = {"latitude": 90.0, "longitude": 180.0, "heading_deg": 360.0}
-    numbers = []
+    numbers: list[float] = []
     for name, limit in limits.items():
         given = {name: [value[name]] if name in value else [EAST_DEG] if name == "heading_deg" else None}
         number = parse_numbers(given, name, (1,), within)
         if number is not None and abs(number[0]) > limit:
             wanted = f"degrees, -{limit:g} to {limit:g}"
             within.error("wrong-size", name, "is out of range", expected=wanted, found=value[name])
-            number = None
-        numbers.append(number)
-    if any(number is None for number in numbers):
-        return None
-    return GeoOrigin(*(float(number[0]) for number in numbers if number is not None))
+        elif number is not None:
+            numbers.append(float(number[0]))
+    return GeoOrigin(*numbers) if len(numbers) == len(limits) else None
 
 
 def _facts_to_json(facts: DriveFacts) -> dict[str, Any]:

@@ -1,7 +1,5 @@
 """Class names of other data sets: compared without case, renamed by a class map, counted where they stay unknown."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path

@@ -4,8 +4,6 @@ While it is written, the file has the suffix ".partial" and only grows: the head
 the tail and renames it. A partial file lacks its tail; `read_entries` adds it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

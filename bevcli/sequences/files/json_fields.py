@@ -3,11 +3,10 @@
 `bevcli run` stops at the first finding; `bevcli project-debug` shows all of them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from pathlib import Path
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from bevcli.geometry.transforms import Array, Pose, rigid, rotation_from_quatern
 
 LARGEST_NUMBER = 1e12
 TOLERANCE = 1e-3  # largest deviation of a quaternion's norm from 1, and of R Rᵀ from the identity
+_Value = TypeVar("_Value")
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,11 @@ class Report:
     prefix: str = ""
     findings: list[Finding] = field(default_factory=list)
 
-    def about(self, camera: str) -> Report:
+    def about(self, camera: str) -> Self:
         """A report on one camera that adds to the same findings."""
         return replace(self, camera=camera)
 
-    def within(self, name: str) -> Report:
+    def within(self, name: str) -> Self:
         """A report on the fields inside the field `name` that adds to the same findings."""
         return replace(self, prefix=f"{self.prefix}{name}.")
 
@@ -51,6 +51,13 @@ class Report:
     def missing(self, name: str, expected: str) -> None:
         """Add an error for a missing key."""
         self.error("missing-key", name, "is missing", expected=expected)
+
+    def require(self, value: _Value | None, where: Path | str) -> _Value:
+        """The value that was read. Raises InputError with the first finding. where: start of the message."""
+        for finding in self.findings:
+            raise InputError(f"{where}: {finding.line}")
+        assert value is not None
+        return value
 
 
 def parse_numbers(owner: Mapping[str, Any], name: str, shape: tuple[int, ...], report: Report) -> Array | None:
@@ -96,11 +103,11 @@ def parse_transform(owner: Mapping[str, Any], name: str, report: Report) -> Arra
     owner: the JSON object that holds the transform under the key `name`.
     """
     value = owner.get(name)
+    expected = '{"translation": [x, y, z], "rotation_wxyz": [w, x, y, z]}'
     if value is None:
-        report.missing(name, '{"translation": [x, y, z], "rotation_wxyz": [w, x, y, z]}')
+        report.missing(name, expected)
         return None
     if not isinstance(value, dict):
-        expected = '{"translation": [x, y, z], "rotation_wxyz": [w, x, y, z]}'
         report.error("wrong-shape", name, "is not a transform", expected=expected, found=value)
         return None
     inside = report.within(name)
@@ -120,9 +127,7 @@ def pose_from_json(value: Any, name: str, where: str) -> Pose:
     Raises InputError for a transform that is missing or invalid.
     """
     report = Report()
-    matrix = parse_transform({name: value}, name, report)
-    if report.findings or matrix is None:
-        raise InputError(f"{where}: {report.findings[0].line}")
+    matrix = report.require(parse_transform({name: value}, name, report), where)
     if "rotation_wxyz" not in value:
         return Pose.from_matrix(matrix)
     return Pose(matrix[:3, 3], np.array(value["rotation_wxyz"], dtype=np.float64))

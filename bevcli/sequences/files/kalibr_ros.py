@@ -1,14 +1,11 @@
 """A rig from intrinsics in YAML (Kalibr camchain or ROS camera_info) and extrinsics in JSON."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from bevcli.errors import InputError
-from bevcli.findings import errors_of
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.parsing.documents import read_json, read_yaml
@@ -42,10 +39,7 @@ def read_rig(intrinsics: Path | None, extrinsics: Path | None) -> CameraRig | No
     if "ego_from_bev" not in document:
         return CameraRig(rig_cameras, default_ego_from_bev(), ego_from_bev_assumed=True)
     report = Report()
-    ego_from_bev = parse_transform(document, "ego_from_bev", report)
-    _raise_first(report, extrinsics)
-    assert ego_from_bev is not None
-    return CameraRig(rig_cameras, ego_from_bev)
+    return CameraRig(rig_cameras, report.require(parse_transform(document, "ego_from_bev", report), extrinsics))
 
 
 def _read_intrinsics(path: Path) -> Iterator[tuple[str, Fields]]:
@@ -94,9 +88,7 @@ def _kalibr_fields(entry: Any, where: str) -> Fields:
     }
     if "T_cn_cnm1" in entry:
         report = Report()
-        matrix = parse_numbers(entry, "T_cn_cnm1", (4, 4), report)
-        _raise_first(report, where)
-        fields[CHAIN] = matrix
+        fields[CHAIN] = report.require(parse_numbers(entry, "T_cn_cnm1", (4, 4), report), where)
     return fields
 
 
@@ -121,10 +113,7 @@ def _data(document: Mapping[str, Any], name: str) -> Any:
 
 def _numbers(owner: Mapping[str, Any], name: str, count: int, where: str) -> list[float]:
     report = Report()
-    numbers = parse_numbers(owner, name, (count,), report)
-    _raise_first(report, where)
-    assert numbers is not None
-    return [float(number) for number in numbers]
+    return report.require(parse_numbers(owner, name, (count,), report), where).tolist()
 
 
 def _lens(model: object, coefficients: object, known: Mapping[str, str], where: str) -> Fields:
@@ -155,9 +144,7 @@ def _poses(stated: Mapping[str, Any], cameras: Mapping[str, Fields], path: Path)
     for name, entry in stated.items():
         report = Report(camera=name)
         pose = parse_transform(entry if isinstance(entry, dict) else {}, "ego_from_camera", report)
-        _raise_first(report, path)
-        assert pose is not None
-        poses[name] = pose
+        poses[name] = report.require(pose, path)
     order = list(cameras)
     for earlier, name in pairwise(order):  # along the chain
         if name not in poses and earlier in poses and CHAIN in cameras[name]:
@@ -174,11 +161,4 @@ def _camera(name: str, fields: Fields, ego_from_camera: Array | None, path: Path
     report = Report(camera=name)
     own = {key: value for key, value in fields.items() if key != CHAIN}
     camera = parse_camera(name, {**own, "ego_from_camera": transform_to_json(ego_from_camera)}, report)
-    _raise_first(report, path)
-    assert camera is not None
-    return camera
-
-
-def _raise_first(report: Report, path: Path | str) -> None:
-    for error in errors_of(report.findings):
-        raise InputError(f"{path}: {error.line}")
+    return report.require(camera, path)

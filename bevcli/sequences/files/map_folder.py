@@ -1,7 +1,5 @@
 """BEV maps in ground_truth_map/ and segmentation/: one PNG per frame, and map.json ("bevcli-map/1")."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass

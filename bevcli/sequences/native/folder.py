@@ -1,7 +1,5 @@
 """The native sequence folder as a Sequence."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -11,7 +9,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
 from bevcli.geometry.transforms import Array, Pose, inverse
-from bevcli.sequences.files.boxes_file import BoxesFile, read_boxes
+from bevcli.sequences.files.boxes_file import read_boxes
 from bevcli.sequences.files.calibration_file import read_rig_and_facts
 from bevcli.sequences.files.class_names import ClassNames, count_other_classes, other_classes_note
 from bevcli.sequences.files.incremental_json import existing
@@ -67,12 +65,10 @@ class FolderSequence(Sequence):
         return tuple(sorted(path for path in self.path.iterdir() if path.is_file()))
 
     def image_files(self, place: int) -> tuple[Path, ...]:
-        """See `Sequence`."""
         sources = self._entries[place].sources.values()
         return tuple(source.path for source in sources if isinstance(source, ImageSource))
 
     def load(self, place: int) -> Frame:
-        """The frame at position `place`, with decoded images. Raises InputError as `ImageReader.read`."""
         entry = self._entries[place]
         stamp = entry.stamp
         pose = self.ego_motion.pose_at(stamp.timestamp_ns) if self.ego_motion else None
@@ -150,8 +146,9 @@ class FolderGroundTruth:
     def __init__(self, folder: Path, class_map: Mapping[str, str], *, is_read: bool = True) -> None:
         boxes_path, maps_path = folder / BOXES_FILE, folder / MAPS_FOLDER
         has_boxes = is_read and existing(boxes_path).is_file()
-        self._boxes: BoxesFile | None = read_boxes(boxes_path, ClassNames(class_map)) if has_boxes else None
-        self.notes = _notes(boxes_path, self._boxes)
+        self._boxes = read_boxes(boxes_path, ClassNames(class_map)) if has_boxes else None
+        others = count_other_classes(frame.boxes for frame in self._boxes.frames) if self._boxes else None
+        self.notes = (other_classes_note(others, str(boxes_path)),) if others else ()
         self._frames = {frame.stamp.index: frame for frame in self._boxes.frames} if self._boxes else {}
         self._maps = open_maps(maps_path) if is_read and maps_path.is_dir() else None
 
@@ -178,8 +175,3 @@ class FolderGroundTruth:
     def bev_map(self, frame: int) -> BevMap | None:
         """A frame's map, None if there is none."""
         return self._maps.load(frame) if self._maps and self._maps.has(frame) else None
-
-
-def _notes(path: Path, boxes: BoxesFile | None) -> tuple[str, ...]:
-    others = count_other_classes(frame.boxes for frame in boxes.frames) if boxes else None
-    return (other_classes_note(others, str(path)),) if others else ()

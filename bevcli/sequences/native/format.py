@@ -1,7 +1,5 @@
 """The native sequence folder as an input format."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,12 +1,11 @@
 """frames.csv and ego_motion.csv: strict CSV, with error messages that name line and column."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -137,15 +136,13 @@ def read_frames_table(path: Path, cameras: Sequence[str]) -> tuple[FrameEntry, .
 
 def check_times(entries: Iterable[FrameEntry]) -> None:
     """Raise InputError unless times increase within each scene, a run of frames with the same scene name."""
-    earlier: FrameEntry | None = None
-    for entry in entries:
-        stamp = entry.stamp
-        if earlier and earlier.stamp.scene == stamp.scene and stamp.timestamp_ns <= earlier.stamp.timestamp_ns:
+    for earlier, entry in pairwise(entries):
+        before, stamp = earlier.stamp, entry.stamp
+        if before.scene == stamp.scene and stamp.timestamp_ns <= before.timestamp_ns:
             raise InputError(
                 f"{entry.origin}: timestamp_ns {stamp.timestamp_ns} is not later than the previous frame's "
-                f"({earlier.stamp.timestamp_ns}): sort the frames by time, or give them different scenes"
+                f"({before.timestamp_ns}): sort the frames by time, or give them different scenes"
             )
-        earlier = entry
 
 
 def _read_columns(path: Path, cameras: Sequence[str]) -> CsvTable:

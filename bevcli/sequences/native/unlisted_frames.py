@@ -8,8 +8,6 @@ offset_ns = 25000000             # its first image is this much later than start
 rate_hz = 24.0
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Writes frames one by one as a native sequence folder."""
 
-from __future__ import annotations
-
 import csv
 import shutil
 from collections.abc import Mapping
@@ -9,6 +7,7 @@ from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
+from typing import Self
 
 import cv2
 import numpy as np
@@ -73,7 +72,7 @@ class NativeWriter:
         if frame.ground_truth_map is not None:
             write_map(self.folder / MAPS_FOLDER, frame.stamp.index, frame.ground_truth_map)
 
-    def __enter__(self) -> NativeWriter:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(

@@ -1,10 +1,9 @@
 """Builds a NuScenesIndex from nuScenes' JSON tables: joins them by token and sorts rows by scene and time."""
 
-from __future__ import annotations
-
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,8 +42,8 @@ class _SensorData:
     sizes: Ints
     files: NDArray[np.bytes_]
 
-    def __getitem__(self, rows: NDArray) -> _SensorData:
-        return _SensorData(**{name: values[rows] for name, values in vars(self).items()})
+    def __getitem__(self, rows: NDArray) -> Self:
+        return replace(self, **{name: values[rows] for name, values in vars(self).items()})
 
 
 def build_index(tables: Path) -> NuScenesIndex:

@@ -5,8 +5,6 @@ folder for each version's path. The index is rebuilt if the size or modification
 Small versions are not cached.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """The part of a nuScenes dataset that is read: version, official split, scenes, and keyframes or sweeps."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A nuScenes dataset root as an input format."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from bevcli.options import option, options

@@ -1,7 +1,5 @@
 """The contents of nuScenes' tables that bevcli needs, as arrays ordered by scene and time."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Reads nuScenes' tables: JSON lists of objects. Large tables, some over a gigabyte, are read in batches."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -59,12 +57,9 @@ def column(rows: list[Row], name: str, path: Path) -> list[Any]:
 def integers(rows: list[Row], name: str, path: Path) -> NDArray[np.int64]:
     """(N,) int64 values of a column. Raises InputError for anything but integers."""
     values = column(rows, name, path)
-    array = np.array(values) if set(map(type, values)) <= {int, bool} else np.array("")
-    if len(values) and (
-        array.dtype.kind not in "iub" or np.abs(array.astype(np.int64)).max() > LARGEST_INTEGER // 1000
-    ):
+    if not set(map(type, values)) <= {int, bool} or max(map(abs, values), default=0) > LARGEST_INTEGER // 1000:
         raise InputError(f'{path}: "{name}": expected an integer of at most 52 bits in every row')
-    return array.astype(np.int64) if len(values) else np.zeros(0, dtype=np.int64)
+    return np.array(values, dtype=np.int64)
 
 
 def vectors(rows: list[Row], name: str, path: Path, size: int) -> Array:

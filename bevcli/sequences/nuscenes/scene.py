@@ -1,7 +1,5 @@
 """One nuScenes scene: its rig, its poses, and the data of the CAN bus expansion."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

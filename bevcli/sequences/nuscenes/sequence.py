@@ -1,7 +1,5 @@
 """A nuScenes dataset root as a Sequence."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -63,11 +61,9 @@ class NuScenesSequence(Sequence):
         return tuple(sorted(self.tables.glob("*.json")))
 
     def image_files(self, place: int) -> tuple[Path, ...]:
-        """See `Sequence`."""
         return tuple(self._source(int(row)).path for row in self._frames[place].rows)
 
     def load(self, place: int) -> Frame:
-        """The frame at position `place`, with decoded images. Raises InputError as `ImageReader.read`."""
         entry = self._frames[place]
         facts = self._facts(entry.scene)
         rows = {facts.sensor_names[int(self.index.images.sensors[row])]: int(row) for row in entry.rows}

@@ -1,7 +1,5 @@
 """The files of one recording as topics with indexed messages."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import threading
@@ -67,7 +65,6 @@ class Bag:
             self._files = [_open_file(file) for file in self.file_paths]
         self.topics = {name: topic for file in self._files for name, topic in sorted(file.topics.items())}
         self._decoders: dict[str, Decode] = {}
-        self._starts: dict[str, NDArray[np.int64]] = {}
         self._times: dict[str, NDArray[np.int64]] = {}
 
     @property
@@ -140,8 +137,7 @@ def _metadata(path: Path) -> dict[str, Any]:
 
 
 def _open_file(path: Path) -> BagFile:
-    missing = [name for name in PACKAGES if not _is_installed(name)]
-    if missing:
+    if not all(map(_is_installed, PACKAGES)):
         raise InputError(f"{path}: ROS bags need the packages of an extra: run pip install 'bevcli[ros]'")
     from bevcli.sequences.ros.storage import McapFile, SqliteFile
 

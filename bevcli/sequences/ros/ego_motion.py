@@ -1,10 +1,8 @@
 """The vehicle's poses in a bag, read around a time on demand: from a topic with poses, or from transforms."""
 
-from __future__ import annotations
-
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Sequence
-from functools import lru_cache
+from functools import lru_cache, reduce
 from itertools import pairwise
 
 import numpy as np
@@ -114,14 +112,11 @@ class BagEgoMotion:
 
     def pose_at(self, timestamp_ns: int) -> Pose:
         """world_from_ego at a time, interpolated. Raises InputError if there is no pose around it."""
-        return self._window(self._message_at(timestamp_ns), timestamp_ns).pose_at(timestamp_ns)
+        return self._window(timestamp_ns).pose_at(timestamp_ns)
 
     def kinematics_at(self, timestamp_ns: int) -> Kinematics:
         """Acceleration, angular rate and velocity at a time. Raises InputError as `pose_at`."""
-        return self._window(self._message_at(timestamp_ns), timestamp_ns).kinematics_at(timestamp_ns)
-
-    def _message_at(self, timestamp_ns: int) -> int:
-        return int(np.searchsorted(self._times, timestamp_ns))
+        return self._window(timestamp_ns).kinematics_at(timestamp_ns)
 
     def _end(self, indices: range, outermost: Callable[[list[int]], int]) -> int:
         """Time of the first sample of every link from one end of the bag on."""
@@ -133,8 +128,9 @@ class BagEgoMotion:
                 return outermost(list(found.values()))
         raise InputError(f"{self._source}: has no poses of {' and '.join(self._links)}")
 
-    def _read_window(self, message: int, timestamp_ns: int) -> EgoMotion:
+    def _read_window(self, timestamp_ns: int) -> EgoMotion:
         """The poses around a time."""
+        message = int(np.searchsorted(self._times, timestamp_ns))
         grow = MESSAGES_AT_ONCE
         low, high = message - grow, message + grow
         while True:
@@ -144,9 +140,8 @@ class BagEgoMotion:
             has_all = all(samples.values())
             before = has_all and _reaches(times[::-1], timestamp_ns, -1)
             after = has_all and _reaches(times, timestamp_ns, 1)
-            if (before or indices.start == 0) and (after or indices.stop == len(self._times)):
-                break
-            if len(indices) > MOST_MESSAGES:
+            is_complete = (before or indices.start == 0) and (after or indices.stop == len(self._times))
+            if is_complete or len(indices) > MOST_MESSAGES:
                 break
             low, high = low - (0 if before else grow), high + (0 if after else grow)
             grow *= 2
@@ -163,16 +158,12 @@ class BagEgoMotion:
         return {link: sorted(by_time.items(), key=lambda sample: sample[0]) for link, by_time in found.items()}
 
     def _motion(self, samples: dict[str, list[Sample]], times: list[int]) -> EgoMotion:
-        matrices = []
-        for time in times:
-            matrix = np.eye(4)
-            for link in self._links:
-                matrix = matrix @ _at(samples[link], time).matrix
-            matrices.append(matrix if self._ego is None else matrix @ self._ego)
         if len(self._links) == 1 and self._ego is None:
             poses = [pose for _, pose in samples[self._links[0]]]  # with the sign of the quaternion as stated
         else:
-            poses = [Pose.from_matrix(matrix) for matrix in matrices]
+            last = [] if self._ego is None else [self._ego]
+            chains = ([*(_at(samples[link], time).matrix for link in self._links), *last] for time in times)
+            poses = [Pose.from_matrix(reduce(np.matmul, chain, np.eye(4))) for chain in chains]
         stamps = np.array(times, dtype=np.int64)
         translations = np.stack([pose.translation for pose in poses])
         quaternions = np.stack([pose.quaternion for pose in poses])

@@ -1,7 +1,5 @@
 """MCAP files and ROS 2 bags as an input format."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path

@@ -3,8 +3,6 @@
 OpenCV decodes files only. So the packets from a keyframe to the next are written to a temporary file, and read from it.
 """
 
-from __future__ import annotations
-
 import struct
 import tempfile
 import threading
@@ -161,20 +159,10 @@ def is_keyframe(packet: bytes, video_format: str) -> bool:
         return bool(packet) and _is_vp9_keyframe(packet[0])
     if video_format == "av1":
         return bool(packet) and any(kind == 1 for kind in _av1_units(packet))  # a sequence header
-    for kind in _nal_headers(packet):
-        if (kind & 0x1F) == 7 if video_format == "h264" else ((kind >> 1) & 0x3F) in (32, 33):
-            return True  # a parameter set
-    return False
-
-
-def _nal_headers(packet: bytes) -> list[int]:
-    """The first byte of every NAL unit of H.264 or H.265 in Annex B."""
-    headers = []
-    at = packet.find(b"\x00\x00\x01")
-    while 0 <= at < len(packet) - 3:
-        headers.append(packet[at + 3])
-        at = packet.find(b"\x00\x00\x01", at + 3)
-    return headers
+    heads = [unit[0] for unit in packet.split(b"\x00\x00\x01")[1:] if unit]  # first bytes of NAL units in Annex B
+    if video_format == "h264":
+        return any(head & 0x1F == 7 for head in heads)  # a parameter set, as for H.265
+    return any(head >> 1 & 0x3F in (32, 33) for head in heads)
 
 
 def _is_vp9_keyframe(first: int) -> bool:

@@ -4,8 +4,6 @@ ROS messages and Foxglove's schemas (in CDR, JSON or Protobuf) name the same thi
 that knows the names.
 """
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -88,10 +86,8 @@ def _cdr(topic: Topic) -> Decode:
     name = topic.type_name if "/msg/" in topic.type_name else topic.type_name.replace("/", "/msg/")
     text = topic.definition.decode(errors="replace")
     try:
-        if not text:
-            store = get_typestore(Stores.LATEST)
-        else:
-            store = get_typestore(Stores.EMPTY)
+        store = get_typestore(Stores.EMPTY if text else Stores.LATEST)
+        if text:
             is_idl = topic.schema == "ros2idl"
             store.register(get_types_from_idl(text) if is_idl else get_types_from_msg(text, name))
         store.get_msgdef(name)
@@ -182,18 +178,10 @@ def payload(message: Any) -> bytes:
 
 def transforms_of(message: Any) -> Iterator[Transform]:
     """The transforms of a message: TFMessage, TransformStamped, FrameTransform or FrameTransforms."""
-    parts = message.transforms if hasattr(message, "transforms") else (message,)
-    for part in parts:
-        if hasattr(part, "transform"):
-            parent, child, inner = frame_of(part), part.child_frame_id, part.transform
-        else:
-            parent, child, inner = part.parent_frame_id, part.child_frame_id, part
-        yield Transform(
-            str(parent).lstrip("/"),
-            str(child).lstrip("/"),
-            timestamp_ns(part),
-            _pose(inner.translation, inner.rotation),
-        )
+    for part in message.transforms if hasattr(message, "transforms") else (message,):
+        parent = frame_of(part) if hasattr(part, "transform") else str(part.parent_frame_id).lstrip("/")
+        child, inner = str(part.child_frame_id).lstrip("/"), getattr(part, "transform", part)
+        yield Transform(parent, child, timestamp_ns(part), _pose(inner.translation, inner.rotation))
 
 
 def pose_of(message: Any) -> Transform:

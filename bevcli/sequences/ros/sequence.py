@@ -1,7 +1,5 @@
 """A ROS 2 bag or an MCAP file as a Sequence."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -90,7 +88,6 @@ class RosSequence(Sequence):
         return self._bag.file_paths
 
     def load(self, place: int) -> Frame:
-        """The frame at position `place`, with decoded images. Raises InputError as `ImageReader.read`."""
         return read_frame(self._entries[place], self.rig, self._images, self._motion)
 
 

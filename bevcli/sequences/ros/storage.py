@@ -1,7 +1,5 @@
 """The files of a bag, MCAP and SQLite: topics, the times of messages from the index, and messages on demand."""
 
-from __future__ import annotations
-
 import sqlite3
 import struct
 from collections import OrderedDict
@@ -85,8 +83,7 @@ class McapFile:
             return None
         if summary is None or not summary.chunk_indexes or not summary.channels:
             return None
-        unindexed = any(not chunk.message_index_length for chunk in summary.chunk_indexes)
-        return None if unindexed else summary
+        return summary if all(chunk.message_index_length for chunk in summary.chunk_indexes) else None
 
     def _topics(self) -> Iterator[Topic]:
         for channel in self._channels.values():

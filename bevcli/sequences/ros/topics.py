@@ -11,8 +11,6 @@ CAM_FRONT = "/sensing/camera/camera0/camera_info"
 CAM_FRONT = "camera0/camera_optical_link"
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
@@ -177,15 +175,13 @@ class TopicFinder:
     def table(self, pose: str) -> str:
         """A table of the topics that are used and those that are not. pose: where poses come from, "" for nowhere."""
         rows = []
-        used = set()
         for one in self.cameras:
             rows.append((one.camera, one.images))
             if one.calibration:
                 rows.append(("  calibration", one.calibration))
-            used |= {one.images, one.calibration}
         rows += [("ego-motion", pose)] if pose else []
         rows += [("transforms", name) for name in self.of_kind("transforms") if name != pose]
-        used |= {pose, *self.of_kind("transforms")}
+        used = {name for _, name in rows}
         rows += [("not used", name) for name in self._bag.topics if name not in used]
         lines = [(role, name, *self._facts(name)) for role, name in rows]
         widths = [max(len(line[column]) for line in lines) for column in range(3)]
