@@ -1,7 +1,5 @@
 """Reads TOML files into frozen dataclasses. An unknown key or a wrong type is an error that names file and key."""
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 import math

@@ -1,7 +1,5 @@
 """The types that pass between the parts: a frame as readers return it, and a prediction as the model returns it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
@@ -281,7 +279,7 @@ class Prediction:
     ego_from_bev: Array
     world_from_ego: Pose
     grid: BevGrid
-    bev: Tensor | None
+    bev: "Tensor | None"
     started_anew: NewStart | None
     camera_embeddings: Mapping[str, str] = field(default_factory=dict)
     skipped: bool = False

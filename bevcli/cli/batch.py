@@ -1,7 +1,5 @@
 """`bevcli batch`: many drives in, boxes and a recording of each out, with tables and a report."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -85,7 +83,7 @@ def batch(
     if alone and workers.count is None:
         notes = (*notes, "Ray is not installed: one worker (pip install 'bevcli[ray]' for several)")
 
-    def show(row: Record) -> None:
+    def show(row: "Record") -> None:
         if row.get("error"):
             progress.message(f"failed: {row['drive']}: {row['error']}")
         progress.advance()

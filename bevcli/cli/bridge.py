@@ -1,7 +1,5 @@
 """Commands for typer from functions that take dataclasses of options, and the flags in place of arguments' names."""
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import re
@@ -64,7 +62,7 @@ class _Flag:
     def takes_value(self) -> bool:
         return self.kind is not bool and self.option.flag_value is None
 
-    def parameter(self, flags: Mapping[str, _Flag]) -> Parameter:
+    def parameter(self, flags: Mapping[str, "_Flag"]) -> Parameter:
         """The parameter of a function, as typer reads it. flags: for the help text."""
         stated, default = self.option, self.default
         kind: Any = _plain(self.kind)

@@ -1,7 +1,5 @@
 """`bevcli run`: a sequence in, boxes and a recording out."""
 
-from __future__ import annotations
-
 import shlex
 import sys
 from dataclasses import replace
@@ -56,7 +54,7 @@ def run(
 
         view = LiveView()
 
-    def show(frame: Frame, prediction: Prediction) -> None:
+    def show(frame: "Frame", prediction: "Prediction") -> None:
         for warning in frame_warnings(frame, prediction):
             progress.message(f"warning: {warning}")
         progress.advance()

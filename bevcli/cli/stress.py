@@ -1,7 +1,5 @@
 """`bevcli stress`: how a model copes with corrupted images, calibration, times and ego-motion."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path
@@ -58,7 +56,7 @@ def stress(
         raise InputError("choose the drives: give either SEQUENCE folders or `rendered=SEEDS`, not both")
     loaded = load_model(options=model)
 
-    def opened() -> list[Sequence]:
+    def opened() -> list["Sequence"]:
         if drive_options.rendered is None:
             chosen = source.for_model(loaded.config)
             return [open_sequence(path, chosen, **format_options) for path in sequence or ()]

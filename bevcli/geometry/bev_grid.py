@@ -1,7 +1,5 @@
 """The BEV grid: conversion between cells and metres in the bev frame, and the pillars' heights."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The vehicle's poses and kinematics over time, with interpolation between the stored times."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,7 +1,5 @@
 """From a frame to the network's input. Images are resized only here, together with their calibration."""
 
-from __future__ import annotations
-
 import os
 import weakref
 from collections.abc import Iterator, Mapping, Sequence as Items
@@ -201,7 +199,7 @@ class Taps:
     first: NDArray[np.int64]
     weights: NDArray[np.float32]
 
-    def __getitem__(self, chosen: slice) -> Taps:
+    def __getitem__(self, chosen: slice) -> "Taps":
         """The taps of some of the n pixels."""
         return Taps(self.first[chosen], np.ascontiguousarray(self.weights[:, chosen]))
 

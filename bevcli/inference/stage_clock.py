@@ -1,7 +1,5 @@
 """StageClock: the time of each stage of a step, measured by forward hooks on the model."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -45,7 +43,7 @@ class StageClock:
         self._ends = [(modules[name], stage) for name, stage in stages.items() if name in modules]
         self._starts = [(modules[name], stage) for name, stage in (starts or {}).items()]
 
-    def __enter__(self) -> StageClock:
+    def __enter__(self) -> "StageClock":
         """A new step begins now."""
         for module, stage in self._ends:
             self._hooks.enter_context(module.register_forward_hook(lambda *_, stage=stage: self.mark(stage)))

@@ -1,7 +1,5 @@
 """A drive's rig next to the rigs that a model's weights were trained on."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Between CPU and GPU: images go up while the model computes, results come back with one wait and are checked."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack

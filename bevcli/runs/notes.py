@@ -1,7 +1,5 @@
 """Notes on a run and on its frames, for the user."""
 
-from __future__ import annotations
-
 from bevcli.frame import Frame, Prediction, Sequence, StartReason
 from bevcli.inference.load import Model
 
