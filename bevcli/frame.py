@@ -174,15 +174,12 @@ class DerivedSequence(Sequence):
 
     @property
     def input_files(self) -> tuple[Path, ...]:
-        """Those of the other sequence."""
         return self.sequence.input_files
 
     def image_files(self, place: int) -> tuple[Path, ...]:
-        """Those of the other sequence."""
         return self.sequence.image_files(place)
 
     def load(self, place: int) -> Frame:
-        """The frame of the other sequence at a place."""
         return self.sequence.load(place)
 
 
