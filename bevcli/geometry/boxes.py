@@ -56,9 +56,8 @@ class Boxes3D:
     def __getitem__(self, selection: ArrayLike | slice) -> "Boxes3D":
         """The boxes of a mask (N,) bool, an index array or a slice."""
         key = selection if isinstance(selection, slice) else np.asarray(selection)
-        columns = {field.name: getattr(self, field.name) for field in fields(self)}
-        chosen: dict[str, Any] = {name: None if c is None else c[key] for name, c in columns.items()}
-        return replace(self, **chosen)
+        chosen: dict[str, Any] = {name: None if c is None else c[key] for name, c in vars(self).items()}
+        return Boxes3D(**chosen)
 
     def scored(self, least: float) -> "Boxes3D":
         """The boxes with a score of at least `least`; all boxes where they have no scores."""
@@ -140,13 +139,9 @@ BOX_EDGES = (
 MOVING_MPS = 0.2  # a faster box counts as moving
 # Attribute of a moving and of a standing box. A standing bus is "stopped", not "parked", as in the original code.
 _MOVING_AND_STILL = {
-    "car": ("vehicle.moving", "vehicle.parked"),
-    "truck": ("vehicle.moving", "vehicle.parked"),
-    "construction_vehicle": ("vehicle.moving", "vehicle.parked"),
+    **dict.fromkeys(("car", "truck", "construction_vehicle", "trailer"), ("vehicle.moving", "vehicle.parked")),
     "bus": ("vehicle.moving", "vehicle.stopped"),
-    "trailer": ("vehicle.moving", "vehicle.parked"),
-    "motorcycle": ("cycle.with_rider", "cycle.without_rider"),
-    "bicycle": ("cycle.with_rider", "cycle.without_rider"),
+    **dict.fromkeys(("motorcycle", "bicycle"), ("cycle.with_rider", "cycle.without_rider")),
     "pedestrian": ("pedestrian.moving", "pedestrian.standing"),
 }
 

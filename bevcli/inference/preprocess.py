@@ -56,9 +56,7 @@ class Preprocessor:
         for task in wait(tasks).done:
             task.result()
         scales = tuple(network_scale(frame.rig[name], image) for name in names)
-        matrices = [image_from_bev(frame, name) for name in names]
-        networks = [network_from_image(frame.rig[name], image) for name in names]
-        projections = [network @ matrix for network, matrix in zip(networks, matrices, strict=True)]
+        projections = [network_from_image(frame.rig[name], image) @ image_from_bev(frame, name) for name in names]
         return PreparedFrame(
             frame=frame,
             assignment=self._assignment,
