@@ -11,8 +11,6 @@
 Every name is imported when it is first used: `import bevcli` itself loads no PyTorch. See docs/python.md.
 """
 
-from __future__ import annotations
-
 import importlib
 from typing import TYPE_CHECKING, Any
 

@@ -1,7 +1,5 @@
 """Weights files: reads the official .pth and our .safetensors into the state dict of our model."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property

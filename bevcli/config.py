@@ -1,7 +1,5 @@
 """Reads TOML files into frozen dataclasses. An unknown key or a wrong type is an error that names file and key."""
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 import math
@@ -88,14 +86,8 @@ def as_table(config: ModelConfig, tracking: object = None) -> dict[str, Any]:
 
 def _plain(settings: Any) -> dict[str, Any]:
     """The fields of a dataclass as TOML has them: nested dictionaries; lists for tuples; None is left out."""
-    found: dict[str, Any] = {}
-    for field in dataclasses.fields(settings):
-        value = getattr(settings, field.name)
-        if dataclasses.is_dataclass(value):
-            found[field.name] = _plain(value)
-        elif value is not None:
-            found[field.name] = list(value) if isinstance(value, tuple) else value
-    return found
+    table = settings if isinstance(settings, dict) else msgspec.to_builtins(settings)
+    return {key: _plain(each) if isinstance(each, dict) else each for key, each in table.items() if each is not None}
 
 
 def _read_model(name: str) -> tuple[dict[str, Any], str]:

@@ -1,7 +1,5 @@
 """A time span in words."""
 
-from __future__ import annotations
-
 
 def duration(seconds: float) -> str:
     """Seconds in words: "8 s", "2 min 05 s", "1 h 12 min"."""

@@ -1,7 +1,5 @@
 """A finding: one mistake or oddity in a calibration or sequence, with numbers and advice."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal

@@ -1,7 +1,5 @@
 """The types that pass between the parts: a frame as readers return it, and a prediction as the model returns it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
@@ -176,15 +174,12 @@ class DerivedSequence(Sequence):
 
     @property
     def input_files(self) -> tuple[Path, ...]:
-        """Those of the other sequence."""
         return self.sequence.input_files
 
     def image_files(self, place: int) -> tuple[Path, ...]:
-        """Those of the other sequence."""
         return self.sequence.image_files(place)
 
     def load(self, place: int) -> Frame:
-        """The frame of the other sequence at a place."""
         return self.sequence.load(place)
 
 
@@ -281,7 +276,7 @@ class Prediction:
     ego_from_bev: Array
     world_from_ego: Pose
     grid: BevGrid
-    bev: Tensor | None
+    bev: "Tensor | None"
     started_anew: NewStart | None
     camera_embeddings: Mapping[str, str] = field(default_factory=dict)
     skipped: bool = False

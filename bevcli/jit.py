@@ -4,8 +4,6 @@ numba keeps compiled functions beside the source file, or in the user's cache fo
 for a read-only installation without a home, numba itself raises an error at import.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import stat

@@ -13,14 +13,12 @@ An error of the library names the argument in backticks, with its value where th
 command line prints such a name as its flag: "pass --force".
 """
 
-from __future__ import annotations
-
 import dataclasses
 import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, Field
 from pathlib import Path
-from typing import Any, TypeVar, dataclass_transform
+from typing import Any, TypeVar, dataclass_transform, get_type_hints
 
 _Class = TypeVar("_Class", bound=type[Any])
 _Options = TypeVar("_Options")
@@ -99,7 +97,7 @@ def gather(kind: type[_Options], given: _Options | None, changes: Mapping[str, A
 
     A text becomes a Path where the field is one. Raises TypeError for a keyword that the dataclass does not have.
     """
-    paths = {field.name for field in dataclasses.fields(kind) if str(field.type).startswith("Path")}  # type: ignore[arg-type]
+    paths = {name for name, hint in get_type_hints(kind).items() if hint in (Path, Path | None)}
     made = {name: Path(value) if name in paths and isinstance(value, str) else value for name, value in changes.items()}
     if given is None:
         return kind(**made)

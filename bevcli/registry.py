@@ -4,8 +4,6 @@ An installed package adds one by an entry point of a group below (docs/extend.md
 used.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal

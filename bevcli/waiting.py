@@ -1,7 +1,5 @@
 """Waits with a time limit. A disk, a network folder or another program may never answer."""
 
-from __future__ import annotations
-
 from concurrent.futures import Future, TimeoutError as FutureTimeout
 from typing import TypeVar
 

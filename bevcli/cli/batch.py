@@ -1,10 +1,8 @@
 """`bevcli batch`: many drives in, boxes and a recording of each out, with tables and a report."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -15,9 +13,6 @@ from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import RunOptions
 from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
-
-if TYPE_CHECKING:
-    from bevcli.batch.job import Record
 
 SOME_FAILED = 3  # exit code
 
@@ -85,7 +80,7 @@ def batch(
     if alone and workers.count is None:
         notes = (*notes, "Ray is not installed: one worker (pip install 'bevcli[ray]' for several)")
 
-    def show(row: Record) -> None:
+    def show(row: dict[str, Any]) -> None:
         if row.get("error"):
             progress.message(f"failed: {row['drive']}: {row['error']}")
         progress.advance()

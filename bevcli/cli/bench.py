@@ -1,7 +1,5 @@
 """`bevcli bench`: the speed of a model on this machine."""
 
-from __future__ import annotations
-
 import json
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Commands for typer from functions that take dataclasses of options, and the flags in place of arguments' names."""
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import re
@@ -53,18 +51,10 @@ class _Flag:
 
     @property
     def yes(self) -> str:
+        """Spelling without that of the opposite."""
         return flag_of(self.field).split()[0].partition("/")[0]
 
-    @property
-    def no(self) -> str:
-        """Spelling of the opposite, or ""."""
-        return flag_of(self.field).split()[0].partition("/")[2]
-
-    @property
-    def takes_value(self) -> bool:
-        return self.kind is not bool and self.option.flag_value is None
-
-    def parameter(self, flags: Mapping[str, _Flag]) -> Parameter:
+    def parameter(self, flags: Mapping[str, "_Flag"]) -> Parameter:
         """The parameter of a function, as typer reads it. flags: for the help text."""
         stated, default = self.option, self.default
         kind: Any = _plain(self.kind)
@@ -170,8 +160,8 @@ def _as_flag(flag: _Flag, value: str | None) -> str:
     except (ValueError, SyntaxError):
         literal = value
     if literal is False:
-        return flag.no or f"no {flag.yes}"
-    if not flag.takes_value:
+        return flag_of(flag.field).split()[0].partition("/")[2] or f"no {flag.yes}"
+    if flag.kind is bool or flag.option.flag_value is not None:
         return flag.yes
     if isinstance(literal, dict):
         return " ".join(f"{flag.yes} {key}={each}" for key, each in literal.items())

@@ -1,7 +1,5 @@
 """The page docs/commands.md: `python -m bevcli.cli.commands_page > docs/commands.md`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any, get_args
 

@@ -1,7 +1,5 @@
 """`bevcli convert`: writes any input as a native sequence folder."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any

@@ -1,7 +1,5 @@
 """`bevcli demo`: render a short drive, run the model on it and open the viewer; needs no other data."""
 
-from __future__ import annotations
-
 from bevcli.inference.options import ModelOptions
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import OutputOptions, RunOptions

@@ -1,7 +1,5 @@
 """`bevcli eval`: score predictions against ground truth."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Annotated, Any

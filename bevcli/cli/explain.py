@@ -1,7 +1,5 @@
 """`bevcli explain`: figures of what each step of BEVFormer does with one frame."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """`bevcli export`: write boxes in formats of other tools."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """`bevcli export-onnx`: one step of a model as an ONNX file."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated

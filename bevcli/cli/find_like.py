@@ -1,7 +1,5 @@
 """`bevcli find-like`: the frames of a batch that are most similar to one frame."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

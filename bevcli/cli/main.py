@@ -4,8 +4,6 @@ Exit codes: 0 success, 1 a mistake in the input, 2 a mistake in usage (click's o
 143 by SIGTERM; a command may have one of its own. No command module imports torch, OpenCV or rerun before it is called.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Iterator, Mapping

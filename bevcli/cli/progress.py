@@ -1,7 +1,5 @@
 """Progress of a command on stderr: a bar on a terminal, about ten plain lines on a pipe."""
 
-from __future__ import annotations
-
 import os
 import sys
 import time
@@ -39,7 +37,7 @@ class Progress:
         self.started = self._printed = time.perf_counter()
         self._bar: rich.progress.Progress | None = None
 
-    def __enter__(self) -> Progress:
+    def __enter__(self) -> "Progress":
         if self.stream.isatty() and os.environ.get("TERM") not in ("dumb", "unknown"):
             self._bar = _bar(self.stream)
             self._bar.add_task("", total=self.total, state=self.state())
@@ -90,7 +88,7 @@ class Progress:
         return self.done == self.total or self.done // step != (self.done - count) // step
 
 
-def _bar(stream: TextIO) -> rich.progress.Progress:
+def _bar(stream: TextIO) -> "rich.progress.Progress":
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
 

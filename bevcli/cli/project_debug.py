@@ -1,7 +1,5 @@
 """`bevcli project-debug`: find mistakes in a calibration."""
 
-from __future__ import annotations
-
 import textwrap
 from pathlib import Path
 from typing import Annotated, Any

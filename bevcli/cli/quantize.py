@@ -1,7 +1,5 @@
 """`bevcli quantize`: an exported model with backbone and neck in INT8."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """`bevcli render`: a drive through a rendered city as a sequence folder with ground truth."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """`bevcli run`: a sequence in, boxes and a recording out."""
 
-from __future__ import annotations
-
 import shlex
 import sys
 from dataclasses import replace
@@ -18,7 +16,8 @@ from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
 
 if TYPE_CHECKING:
-    from bevcli.frame import Frame, Prediction
+    from bevcli.frame import Frame, Prediction, Sequence
+    from bevcli.inference.load import Model
 
 
 def run(
@@ -42,7 +41,6 @@ def run(
     from bevcli.cli.progress import Progress
     from bevcli.cli.stop_signals import StopSignals
     from bevcli.inference.load import load_model
-    from bevcli.runs.notes import frame_warnings, run_notes
     from bevcli.runs.run_into_folder import run_into_folder
     from bevcli.sequences.open import open_sequence
 
@@ -56,12 +54,12 @@ def run(
 
         view = LiveView()
 
-    def show(frame: Frame, prediction: Prediction) -> None:
-        for warning in frame_warnings(frame, prediction):
+    def show(frame: "Frame", prediction: "Prediction") -> None:
+        for warning in _frame_warnings(frame, prediction):
             progress.message(f"warning: {warning}")
         progress.advance()
 
-    notes = run_notes(loaded, drive, live=output.live)
+    notes = _run_notes(loaded, drive, live=output.live)
     with Progress(len(drive.stamps), "frames", notes) as progress, StopSignals("frame") as signals:
         summary = run_into_folder(
             loaded,
@@ -80,3 +78,38 @@ def run(
         print(f"stopped; `--resume` goes on with frame {summary.frames + 1} of {len(drive.stamps)}", file=sys.stderr)
         raise typer.Exit(signals.exit_code)
     print(f"next     bevcli viz {shlex.quote(str(out))}")
+
+
+def _run_notes(model: "Model", drive: "Sequence", *, live: bool = False) -> list[str]:
+    """Notes on a model and a drive before the run starts. live: whether a viewer follows the run."""
+    found = list(drive.notes)
+    if model.untrained:
+        found.append("the weights are UNTRAINED: random weights, the boxes are meaningless")
+    if model.is_exported:
+        found.append("an exported file shows no attention: the recording has no history map, pillars and probes")
+    if model.left_out:
+        found.append(f"{model.weights}: left out {model.left_out}, which only training uses")
+    if model.not_read:
+        found.append(f"{model.weights}: objects that were not read, and not run: {', '.join(model.not_read)}")
+    later = model.config.later_frames
+    if live and later:
+        found.append(f"model {model.name} looks ahead: the viewer shows a frame when {later} more are read")
+    found += model.rig_notes(drive.rig)
+    if model.bundled:
+        found.append("these weights were trained on rendered streets, not on the real world (docs/model-card.md)")
+    return found
+
+
+def _frame_warnings(frame: "Frame", prediction: "Prediction") -> list[str]:
+    """Warnings on missing images, results that are not finite, and gaps in time; the recording logs its own events."""
+    from bevcli.frame import StartReason
+
+    where = f"frame {frame.stamp.index}"
+    found = [f"{where}: camera {camera} has no image: {why}" for camera, why in frame.dropped.items()]
+    if prediction.skipped:
+        found.append(f"{where}: no camera has an image; the state is passed on to the next frame")
+    if prediction.not_finite:
+        found.append(f"{where}: NaN or infinity in {prediction.not_finite}; no boxes, the history starts anew")
+    if prediction.started_anew and prediction.started_anew.reason is StartReason.GAP:
+        found.append(f"{where}: {prediction.started_anew}; the history starts anew")
+    return found

@@ -1,7 +1,5 @@
 """`bevcli samples`: copy the sample drive of the package into the current folder."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """StopSignals: Ctrl-C and SIGTERM end a long command after the current piece of work."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading
@@ -23,7 +21,7 @@ class StopSignals:
         self._number = 0
         self._before: dict[signal.Signals, object] = {}
 
-    def __enter__(self) -> StopSignals:
+    def __enter__(self) -> "StopSignals":
         if threading.current_thread() is threading.main_thread():  # Python allows handlers there only
             self._before = {number: signal.signal(number, self._receive) for number in SIGNALS}
         return self

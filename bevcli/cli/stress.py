@@ -1,11 +1,9 @@
 """`bevcli stress`: how a model copes with corrupted images, calibration, times and ego-motion."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -15,9 +13,6 @@ from bevcli.robustness.options import StressOptions, StressOutputOptions
 from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
 from bevcli.synth.options import DriveOptions
-
-if TYPE_CHECKING:
-    from bevcli.frame import Sequence
 
 
 def stress(
@@ -57,16 +52,14 @@ def stress(
     if bool(sequence) == (drive_options.rendered is not None):
         raise InputError("choose the drives: give either SEQUENCE folders or `rendered=SEEDS`, not both")
     loaded = load_model(options=model)
-
-    def opened() -> list[Sequence]:
-        if drive_options.rendered is None:
-            chosen = source.for_model(loaded.config)
-            return [open_sequence(path, chosen, **format_options) for path in sequence or ()]
+    if drive_options.rendered is None:
+        chosen = source.for_model(loaded.config)
+        drives = [open_sequence(path, chosen, **format_options) for path in sequence or ()]
+    else:
         rendered = open_drives((), drive_options.rendered, drive_options.cache, loaded.config)
         drives = [rendered.open(index) for index in range(len(rendered))]
-        return drives if source.frames is None else [select_range(drive, source.frames) for drive in drives]
-
-    drives = opened()
+        if source.frames is not None:
+            drives = [select_range(drive, source.frames) for drive in drives]
     out = output.out or Path("runs") / f"stress-{loaded.name}"
     total = len(conditions) * sum(len(drive.stamps) for drive in drives)
     notes = [note for drive in drives for note in drive.notes]

@@ -1,7 +1,5 @@
 """`bevcli train`: train a model on sequences with ground truth or on rendered drives."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

@@ -1,7 +1,5 @@
 """`bevcli validate`: run a model on several drives with ground truth and score them together."""
 
-from __future__ import annotations
-
 import json
 from typing import Annotated
 

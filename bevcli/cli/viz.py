@@ -1,7 +1,5 @@
 """`bevcli viz`: shows a recording, or writes an image, a video, its boxes or a summary of it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

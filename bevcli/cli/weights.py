@@ -1,7 +1,5 @@
 """`bevcli weights`: inspects and converts weights files, and lists the parts of a model."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from pathlib import Path
@@ -75,7 +73,7 @@ def convert(
     print(_as_text(convert_file(source, options.target(destination))))
 
 
-def _as_data(checkpoint: Checkpoint) -> dict[str, object]:
+def _as_data(checkpoint: "Checkpoint") -> dict[str, object]:
     return {
         "file": str(checkpoint.path),
         "models": list(checkpoint.models),
@@ -89,7 +87,7 @@ def _as_data(checkpoint: Checkpoint) -> dict[str, object]:
     }
 
 
-def _as_text(checkpoint: Checkpoint) -> str:
+def _as_text(checkpoint: "Checkpoint") -> str:
     not_read = ", ".join(checkpoint.not_read)
     rows = [
         ("key names", "the original BEVFormer" if checkpoint.official else "bevcli"),
@@ -106,7 +104,7 @@ def _as_text(checkpoint: Checkpoint) -> str:
     return "\n".join(lines)
 
 
-def _parts_as_text(model: str, parts: tuple[ModelPart, ...]) -> str:
+def _parts_as_text(model: str, parts: tuple["ModelPart", ...]) -> str:
     from bevcli.model.parts import describe_shapes
 
     width = max(len(part.name) for part in parts)

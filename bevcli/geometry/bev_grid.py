@@ -1,7 +1,5 @@
 """The BEV grid: conversion between cells and metres in the bev frame, and the pillars' heights."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,8 +31,7 @@ class BevGrid:
     @property
     def cell_size_m(self) -> tuple[float, float]:
         """Size of a cell along x and y, metres."""
-        x0, x1 = self.x_range_m
-        y0, y1 = self.y_range_m
+        (x0, x1), (y0, y1) = self.x_range_m, self.y_range_m
         return (x1 - x0) / self.columns, (y1 - y0) / self.rows
 
     @property

@@ -1,7 +1,5 @@
 """Oriented 3D boxes in one frame of reference, with class, score, velocity and further optional columns."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -55,24 +53,23 @@ class Boxes3D:
     def __len__(self) -> int:
         return len(self.centers)
 
-    def __getitem__(self, selection: ArrayLike | slice) -> Boxes3D:
+    def __getitem__(self, selection: ArrayLike | slice) -> "Boxes3D":
         """The boxes of a mask (N,) bool, an index array or a slice."""
         key = selection if isinstance(selection, slice) else np.asarray(selection)
-        columns = {field.name: getattr(self, field.name) for field in fields(self)}
-        chosen: dict[str, Any] = {name: None if c is None else c[key] for name, c in columns.items()}
-        return replace(self, **chosen)
+        chosen: dict[str, Any] = {name: None if c is None else c[key] for name, c in vars(self).items()}
+        return Boxes3D(**chosen)
 
-    def scored(self, least: float) -> Boxes3D:
+    def scored(self, least: float) -> "Boxes3D":
         """The boxes with a score of at least `least`; all boxes where they have no scores."""
         return self if self.scores is None else self[self.scores >= least]
 
     @staticmethod
-    def empty() -> Boxes3D:
+    def empty() -> "Boxes3D":
         """Zero boxes."""
         return Boxes3D(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2)), np.zeros(0, "<U1"))
 
     @staticmethod
-    def concatenate(parts: Iterable[Boxes3D]) -> Boxes3D:
+    def concatenate(parts: Iterable["Boxes3D"]) -> "Boxes3D":
         """All boxes of the parts. An optional column is kept if every part with boxes has it."""
         filled = [part for part in parts if len(part)]
         if not filled:
@@ -83,7 +80,7 @@ class Boxes3D:
             columns[field.name] = None if any(v is None for v in values) else np.concatenate(values)
         return Boxes3D(**columns)
 
-    def transformed(self, a_from_b: ArrayLike) -> Boxes3D:
+    def transformed(self, a_from_b: ArrayLike) -> "Boxes3D":
         """The boxes moved from frame b to frame a. Yaws and velocities rotate too; boxes stay upright.
 
         a_from_b: (4, 4) rigid transform, metres.
@@ -142,13 +139,9 @@ BOX_EDGES = (
 MOVING_MPS = 0.2  # a faster box counts as moving
 # Attribute of a moving and of a standing box. A standing bus is "stopped", not "parked", as in the original code.
 _MOVING_AND_STILL = {
-    "car": ("vehicle.moving", "vehicle.parked"),
-    "truck": ("vehicle.moving", "vehicle.parked"),
-    "construction_vehicle": ("vehicle.moving", "vehicle.parked"),
+    **dict.fromkeys(("car", "truck", "construction_vehicle", "trailer"), ("vehicle.moving", "vehicle.parked")),
     "bus": ("vehicle.moving", "vehicle.stopped"),
-    "trailer": ("vehicle.moving", "vehicle.parked"),
-    "motorcycle": ("cycle.with_rider", "cycle.without_rider"),
-    "bicycle": ("cycle.with_rider", "cycle.without_rider"),
+    **dict.fromkeys(("motorcycle", "bicycle"), ("cycle.with_rider", "cycle.without_rider")),
     "pedestrian": ("pedestrian.moving", "pedestrian.standing"),
 }
 

@@ -3,8 +3,6 @@
 The camera frame has x right, y down, z forward. Pixel (0, 0) is the centre of the top left pixel, as in OpenCV.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -92,7 +90,7 @@ class Camera:
             inside = (p > 0).all(-1) & (p[..., 0] < self.width) & (p[..., 1] < self.height)
         return inside & (np.asarray(depth) > NEAR_M)
 
-    def scaled(self, factor_x: float, factor_y: float | None = None) -> Camera:
+    def scaled(self, factor_x: float, factor_y: float | None = None) -> "Camera":
         """The camera of the resized image. Pixel coordinates are multiplied by the factors, without a half-pixel shift.
 
         factor_y: equal to `factor_x` by default.
@@ -147,7 +145,7 @@ class CameraRig:
         """The cameras' names, in the rig's order."""
         return tuple(camera.name for camera in self.cameras)
 
-    def __getitem__(self, name: str) -> Camera:
+    def __getitem__(self, name: str) -> "Camera":
         return next(camera for camera in self.cameras if camera.name == name)
 
 

@@ -1,7 +1,5 @@
 """The vehicle's poses and kinematics over time, with interpolation between the stored times."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -84,8 +82,7 @@ class EgoMotion:
         return Kinematics(mix(self.accelerations), mix(self.angular_rates), mix(self.velocities))
 
     def _locate(self, timestamp_ns: int) -> tuple[int, float]:
-        times = self.timestamps_ns
-        first, last = int(times[0]), int(times[-1])
+        times, first, last = self.timestamps_ns, self.first_ns, self.last_ns
         if timestamp_ns < first - TOLERANCE_NS or timestamp_ns > last + TOLERANCE_NS:
             raise InputError(
                 f"ego-motion covers {first} to {last} ns, but an image or frame is at {timestamp_ns} ns "

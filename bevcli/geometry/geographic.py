@@ -1,7 +1,5 @@
 """The place of a drive on Earth: world coordinates in metres as latitude and longitude."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

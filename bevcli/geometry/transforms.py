@@ -3,8 +3,6 @@
 Quaternions are (w, x, y, z). Rotations are right-handed; yaw is counter-clockwise about z, 0 along x.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,13 +34,13 @@ class Pose:
         return yaw_of_quaternion(self.quaternion)
 
     @staticmethod
-    def from_matrix(a_from_b: ArrayLike) -> Pose:
+    def from_matrix(a_from_b: ArrayLike) -> "Pose":
         """The pose of a rigid matrix (4, 4). Its quaternion has w >= 0."""
         matrix = np.asarray(a_from_b, dtype=np.float64)
         return Pose(matrix[:3, 3].copy(), quaternion_from_rotation(matrix[:3, :3]))
 
     @staticmethod
-    def identity() -> Pose:
+    def identity() -> "Pose":
         """The pose in which both frames coincide."""
         return Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 

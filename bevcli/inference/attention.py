@@ -1,7 +1,5 @@
 """The attention of an encoder layer, observed in the model and converted to BEV cells and pixels for display."""
 
-from __future__ import annotations
-
 import math
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -65,7 +63,7 @@ class AttentionProbe:
         self._layer = observed
         self._hooks = ExitStack()
 
-    def __enter__(self) -> AttentionProbe:
+    def __enter__(self) -> "AttentionProbe":
         temporal, spatial = self._layer.temporal_self_attention, self._layer.spatial_cross_attention
         for module, see in (
             (temporal.attention.sampling, self._see_temporal_samples),

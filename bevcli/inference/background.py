@@ -1,7 +1,5 @@
 """While the model computes a frame, other threads prepare the next ones and write the one before."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait

@@ -1,7 +1,5 @@
 """Settings of memory allocator and threads for the whole process. The command line sets them at its start."""
 
-from __future__ import annotations
-
 import ctypes
 
 # Libraries read these variables when they are loaded.

@@ -1,7 +1,5 @@
 """`load_model`: a configured model with its weights, on a device."""
 
-from __future__ import annotations
-
 import copy
 import hashlib
 import re
@@ -90,7 +88,7 @@ class Model:
         """The contents of the model's TOML file, [training] excluded."""
         return as_table(self.config, self.tracker)
 
-    def for_rig(self, rig: CameraRig) -> Model:
+    def for_rig(self, rig: CameraRig) -> "Model":
         """The model with images of one size, that of a rig, for an exported file: see `ImageConfig.focal_px`."""
         network = copy.copy(self.network)  # the copy has the same weights
         network.config = replace(self.config, image=image_for_rig(rig, self.config.image))

@@ -1,7 +1,5 @@
 """ModelOptions: a model, its weights, and the device that it runs on."""
 
-from __future__ import annotations
-
 from importlib import resources
 from pathlib import Path
 from typing import Literal

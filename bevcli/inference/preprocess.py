@@ -1,7 +1,5 @@
 """From a frame to the network's input. Images are resized only here, together with their calibration."""
 
-from __future__ import annotations
-
 import os
 import weakref
 from collections.abc import Iterator, Mapping, Sequence as Items
@@ -58,9 +56,7 @@ class Preprocessor:
         for task in wait(tasks).done:
             task.result()
         scales = tuple(network_scale(frame.rig[name], image) for name in names)
-        matrices = [image_from_bev(frame, name) for name in names]
-        networks = [network_from_image(frame.rig[name], image) for name in names]
-        projections = [network @ matrix for network, matrix in zip(networks, matrices, strict=True)]
+        projections = [network_from_image(frame.rig[name], image) @ image_from_bev(frame, name) for name in names]
         return PreparedFrame(
             frame=frame,
             assignment=self._assignment,
@@ -201,7 +197,7 @@ class Taps:
     first: NDArray[np.int64]
     weights: NDArray[np.float32]
 
-    def __getitem__(self, chosen: slice) -> Taps:
+    def __getitem__(self, chosen: slice) -> "Taps":
         """The taps of some of the n pixels."""
         return Taps(self.first[chosen], np.ascontiguousarray(self.weights[:, chosen]))
 

@@ -1,7 +1,5 @@
 """The loop over a sequence: `run` yields predictions."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 

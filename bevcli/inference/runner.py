@@ -1,7 +1,5 @@
 """The temporal run: frame by frame, with the memory that the model keeps."""
 
-from __future__ import annotations
-
 import contextlib
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence as Items

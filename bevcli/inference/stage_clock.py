@@ -1,9 +1,7 @@
 """StageClock: the time of each stage of a step, measured by forward hooks on the model."""
 
-from __future__ import annotations
-
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from typing import Any
 
@@ -42,15 +40,14 @@ class StageClock:
         self._marks: list[tuple[str, Any]] = []  # with seconds, or events of a GPU's queue
         self._hooks = ExitStack()
         modules = dict(model.named_modules())
-        self._ends = [(modules[name], stage) for name, stage in stages.items() if name in modules]
-        self._starts = [(modules[name], stage) for name, stage in (starts or {}).items()]
+        ends = [(modules[name].register_forward_hook, stage) for name, stage in stages.items() if name in modules]
+        begins = [(modules[name].register_forward_pre_hook, stage) for name, stage in (starts or {}).items()]
+        self._marked: list[tuple[Callable[..., Any], str]] = [*ends, *begins]
 
-    def __enter__(self) -> StageClock:
+    def __enter__(self) -> "StageClock":
         """A new step begins now."""
-        for module, stage in self._ends:
-            self._hooks.enter_context(module.register_forward_hook(lambda *_, stage=stage: self.mark(stage)))
-        for module, stage in self._starts:
-            self._hooks.enter_context(module.register_forward_pre_hook(lambda *_, stage=stage: self.mark(stage)))
+        for register, stage in self._marked:
+            self._hooks.enter_context(register(lambda *_, stage=stage: self.mark(stage)))
         self._marks = []
         self.mark("")
         return self

@@ -5,8 +5,6 @@ the tracks move to the frame's time, and the boxes, highest score first, each ta
 within the class's gate. Added here: two score thresholds, scores of tracks, and the suppression of duplicates.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
@@ -111,12 +109,12 @@ class Tracks:
     def __len__(self) -> int:
         return len(self.numbers)
 
-    def __getitem__(self, selection: NDArray[Any]) -> Tracks:
+    def __getitem__(self, selection: NDArray[Any]) -> "Tracks":
         """The tracks of a mask (T,) bool or of an index array."""
         return Tracks(*(getattr(self, column.name)[selection] for column in fields(self)))
 
     @staticmethod
-    def empty() -> Tracks:
+    def empty() -> "Tracks":
         """No track at all."""
         nothing, no_numbers = np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
         return Tracks(no_numbers, np.zeros(0, "<U1"), nothing, nothing, no_numbers, no_numbers, np.zeros(0))

@@ -1,7 +1,5 @@
 """A drive's rig next to the rigs that a model's weights were trained on."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 
 import numpy as np
@@ -31,10 +29,10 @@ def weights_facts(config: ModelConfig) -> dict[str, str]:
     rigs = config.training_rigs
     if not rigs.known:
         return facts
-    cameras = "{} to {} cameras".format(*rigs.cameras) if rigs.cameras[0] < rigs.cameras[1] else f"{rigs.cameras[0]}"
+    count = "{} to {}".format(*rigs.cameras) if rigs.cameras[0] < rigs.cameras[1] else f"{rigs.cameras[0]}"
     lenses = "field of view {:g} to {:g}°".format(*rigs.fov_deg)
     places = "height {:g} to {:g} m, pitch and roll up to {:g}°".format(*rigs.height_m, rigs.tilt_deg)
-    return facts | {"training_rigs": f"{cameras}{'' if 'cameras' in cameras else ' cameras'}, {lenses}, {places}"}
+    return facts | {"training_rigs": f"{count} cameras, {lenses}, {places}"}
 
 
 def facts_notes(facts: Mapping[str, str], config: ModelConfig) -> Iterator[str]:

@@ -1,7 +1,5 @@
 """Between CPU and GPU: images go up while the model computes, results come back with one wait and are checked."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -87,7 +85,8 @@ def origin(model: nn.Module, step: Callable[[], object]) -> str:
     found: list[str] = []
 
     def check(value: object, place: str = "") -> None:
-        bad = [name for name, tensor in _tensors(value, "history") if not _is_finite(tensor)]
+        tensors = [(name, tensor) for name, tensor in _tensors(value, "history") if tensor.is_floating_point()]
+        bad = [name for name, tensor in tensors if not torch.isfinite(tensor).all()]
         if bad and not found:
             found.append(place or f"input {bad[0]}")
 
@@ -118,7 +117,3 @@ def _tensors(value: object, name: str) -> Iterator[tuple[str, Tensor]]:
     elif is_dataclass(value) and not isinstance(value, type):
         for field in fields(value):
             yield from _tensors(getattr(value, field.name), field.name)
-
-
-def _is_finite(tensor: Tensor) -> bool:
-    return not tensor.is_floating_point() or bool(torch.isfinite(tensor).all())

@@ -1,7 +1,5 @@
 """The files of a run. Each of them holds all finished frames, whatever ends the run."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json
@@ -127,7 +125,7 @@ class RunFiles:
         if resume is not None:
             self._check_kept(resume)
 
-    def __enter__(self) -> RunFiles:
+    def __enter__(self) -> "RunFiles":
         out, sequence, model, resume = self._out, self._sequence, self._model, self._resume
         for name in (RECORDING, PREDICTIONS, *((TRACKS,) if self._options.track else ())):
             self._folder.add(out / name)

@@ -3,8 +3,6 @@
 Its own files are in the subfolder .bevcli: `lock`, `written` (one path a line) and `state.safetensors` (for `resume`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import sys
@@ -37,7 +35,7 @@ class RunFolder:
         self._written: GrowingFile | None = None
         self._names: set[str] = set()
 
-    def __enter__(self) -> RunFolder:
+    def __enter__(self) -> "RunFolder":
         """Raises OutputError: another run uses the folder, or it holds something already, or it cannot be written."""
         out = self.path
         if out.exists() and not out.is_dir():

@@ -1,7 +1,5 @@
 """The options of a run and its files."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import field
 from functools import partial

@@ -1,7 +1,5 @@
 """`run_into_folder`: run a model over a sequence and write files, as `bevcli run` does."""
 
-from __future__ import annotations
-
 import contextlib
 import time
 from collections.abc import Callable, Mapping

@@ -5,8 +5,6 @@ are tensors of the file. Everything else is one more tensor, MessagePack that ms
 the type that it expects, so that nothing in a file decides what is made of it.
 """
 
-from __future__ import annotations
-
 import hashlib
 import time
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """RunSummary: counts and times of a run, as summary.json and as a short table."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections import Counter
