@@ -1,7 +1,5 @@
 """Parameters of the detection score (nuScenes' detection_cvpr_2019) and of the tracking score (tracking_nips_2019)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

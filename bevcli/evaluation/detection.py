@@ -1,7 +1,5 @@
 """The nuScenes detection score: AP, mAP, true-positive errors and NDS of boxes. Reads no files."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

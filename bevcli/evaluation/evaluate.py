@@ -1,7 +1,5 @@
 """`evaluate`: read predictions and ground truth, match their frames, and score boxes and maps."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise

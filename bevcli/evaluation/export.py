@@ -1,12 +1,10 @@
 """Boxes in the formats of other tools: a CSV table, and KITTI object labels of one camera."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -48,7 +46,7 @@ class CsvWriter:
         csv.DictWriter(text, COLUMNS, lineterminator="\n").writerows(rows)
         self.file.append(text.getvalue().encode())
 
-    def __enter__(self) -> CsvWriter:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:

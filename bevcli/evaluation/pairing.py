@@ -1,7 +1,5 @@
 """Pairs the frames of predictions and ground truth, and moves their boxes into one frame of reference."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace

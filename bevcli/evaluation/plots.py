@@ -1,7 +1,5 @@
 """Plots of detection scores: precision and recall, errors by range, misses and false positives from above."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Scores as a dict for JSON, with the key names of the nuScenes devkit, and as a table for the terminal."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from typing import Any

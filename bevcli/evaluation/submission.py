@@ -1,10 +1,8 @@
 """Predictions as a nuScenes submission for detection (results_nusc.json) or tracking, read and written."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +40,7 @@ class SubmissionWriter:
         if token is not None:
             self.file.append(self._boxes(frame.boxes, token), f"frame {frame.stamp.index}", key=token)
 
-    def __enter__(self) -> SubmissionWriter:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:

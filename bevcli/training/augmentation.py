@@ -3,8 +3,6 @@
 Boxes and maps stay as they are.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

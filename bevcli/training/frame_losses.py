@@ -1,7 +1,5 @@
 """All losses of a frame, and the auxiliary heads that exist in training only."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 from collections.abc import Iterator, Mapping, Sequence

@@ -5,8 +5,6 @@ the features of the pixels that show it. Head and loss exist in training only. T
 2021): a box is detected on one level, chosen by its size in the image, by the pixels near its projected centre.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

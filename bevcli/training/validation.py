@@ -1,7 +1,5 @@
 """Scores of a model over several drives: each is run as by `bevcli run`, and all are scored as by `bevcli eval`."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace

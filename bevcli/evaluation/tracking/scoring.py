@@ -1,7 +1,5 @@
 """evaluate_tracking: from boxes with identities to AMOTA and the metrics that come with it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
