@@ -45,7 +45,9 @@ def detection_targets(boxes: Boxes3D, config: ModelConfig) -> DetectionTargets:
     Args:
         boxes: ground truth in the bev frame.
     """
-    return box_targets(boxes[in_range(boxes, config)], config.classes)
+    grid = config.bev_grid
+    low, high = np.array([grid.x_range_m, grid.y_range_m, grid.z_range_m]).T
+    return box_targets(boxes[((boxes.centers >= low) & (boxes.centers <= high)).all(-1)], config.classes)
 
 
 def box_targets(boxes: Boxes3D, classes: tuple[str, ...]) -> DetectionTargets:
@@ -62,13 +64,6 @@ def box_targets(boxes: Boxes3D, classes: tuple[str, ...]) -> DetectionTargets:
 def has_points(boxes: Boxes3D) -> NDArray[np.bool_]:
     """(N,) bool, false where the ground truth counts 0 points; boxes without a count are kept."""
     return np.ones(len(boxes), dtype=bool) if boxes.num_points is None else boxes.num_points != 0
-
-
-def in_range(boxes: Boxes3D, config: ModelConfig) -> NDArray[np.bool_]:
-    """(N,) bool: whether the centre (bev frame) lies in the model's x, y and z range."""
-    grid = config.bev_grid
-    low, high = np.array([grid.x_range_m, grid.y_range_m, grid.z_range_m]).T
-    return ((boxes.centers >= low) & (boxes.centers <= high)).all(-1)
 
 
 def focal_loss(logits: Tensor, targets: Tensor) -> Tensor:
@@ -207,10 +202,29 @@ def _layer_loss(
     class_logits: Tensor, box_codes: Tensor, targets: Sequence[DetectionTargets], config: DetectionLossConfig
 ) -> Tensor:
     """(2,) class loss and box loss of one decoder layer."""
+    layer = zip(class_logits, box_codes, targets, strict=True)
+    matches = [hungarian_matching(matching_costs(*element, config)) for element in layer]
+    return assigned_loss(class_logits, box_codes, targets, matches, config)
+
+
+def assigned_loss(
+    class_logits: Tensor,
+    box_codes: Tensor,
+    targets: Sequence[DetectionTargets],
+    assignments: Sequence[tuple[Tensor, Tensor]],
+    config: DetectionLossConfig,
+) -> Tensor:
+    """(2,) class loss of all queries and box loss of those with an object, divided by the number of the latter.
+
+    Args:
+        class_logits: (B, Q, classes).
+        box_codes: (B, Q, 10).
+        targets: B.
+        assignments: B pairs: (K,) int64 indices of the queries with an object, and (K,) of their objects.
+    """
     class_targets = torch.zeros_like(class_logits)  # (B, Q, classes)
     predicted, truths = [], []
-    for element, truth in enumerate(targets):
-        queries, objects = hungarian_matching(matching_costs(class_logits[element], box_codes[element], truth, config))
+    for element, (truth, (queries, objects)) in enumerate(zip(targets, assignments, strict=True)):
         class_targets[element, queries, truth.labels[objects]] = 1
         predicted.append(box_codes[element, queries])
         truths.append(truth.codes[objects])
