@@ -103,14 +103,12 @@ def evaluate(
     found = open_predictions(Path(predictions), class_map)
     pairs = pair_frames(found.boxes, truth.boxes, count_missing=count_missing)
     pairs = without_cycles_in_racks(pairs, truth.bicycle_racks)
-    model_range = None if max_range is not None else _model_range_m(found, pairs)
+    model_range = _model_range_m(found, pairs) if max_range is None else None
     limit = max_range if model_range is None else model_range
     config = _config(DetectionConfig(), pairs, limit)
     detection = evaluate_detections(_with_attributes(pairs.predictions), pairs.ground_truth, config, pairs.ego_xy)
     segmentation, map_notes = _score_maps(found, truth, pairs)
-    tracks, track_notes = None, list[str]()
-    if tracking:
-        tracks, track_notes = _score_tracks(pairs, _config(TrackingConfig(), pairs, limit))
+    tracks, track_notes = _score_tracks(pairs, _config(TrackingConfig(), pairs, limit)) if tracking else (None, [])
     limits = _range_notes(max_range, model_range, pairs)
     notes = (*pairs.notes, *map_notes, *_other_class_notes(pairs), *limits, *_detection_notes(detection), *track_notes)
     return Scores(pairs, config, detection, segmentation, tracks, notes)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.evaluation.config import TRACKING_CLASSES
+from bevcli.evaluation.config import TRACKING_RANGES_M
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.transforms import rotation_from_quaternion, yaw_of_rotation
@@ -68,7 +68,7 @@ def tracking_submission_boxes(boxes: Boxes3D, sample_token: str) -> list[dict[st
     """
     if boxes.instances is None or boxes.track_scores is None:
         return []
-    tracked = boxes[(boxes.instances != "") & np.isin(boxes.classes, TRACKING_CLASSES)]
+    tracked = boxes[(boxes.instances != "") & np.isin(boxes.classes, tuple(TRACKING_RANGES_M))]
     assert tracked.instances is not None
     assert tracked.track_scores is not None
     best = np.argsort(-tracked.track_scores, kind="stable")[:MAX_BOXES]
