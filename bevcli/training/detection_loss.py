@@ -40,22 +40,14 @@ class DetectionTargets:
 
 
 def detection_targets(boxes: Boxes3D, config: ModelConfig) -> DetectionTargets:
-    """Targets from the boxes that have one of the model's classes, a centre inside the BEV grid, and visible points.
-
-    Args:
-        boxes: ground truth in the bev frame.
-    """
+    """The `box_targets` of the boxes (ground truth, bev frame) with a centre inside the BEV grid."""
     grid = config.bev_grid
     low, high = np.array([grid.x_range_m, grid.y_range_m, grid.z_range_m]).T
     return box_targets(boxes[((boxes.centers >= low) & (boxes.centers <= high)).all(-1)], config.classes)
 
 
 def box_targets(boxes: Boxes3D, classes: tuple[str, ...]) -> DetectionTargets:
-    """Targets from all boxes that have one of the classes and visible points.
-
-    Args:
-        boxes: ground truth in the bev frame.
-    """
+    """Targets from all boxes (ground truth, bev frame) that have one of the classes and visible points."""
     kept = boxes[np.isin(boxes.classes, classes) & has_points(boxes)]
     labels = [classes.index(name) for name in kept.classes]
     return DetectionTargets(torch.tensor(labels, dtype=torch.int64), torch.from_numpy(encode(kept)).float())
@@ -181,9 +173,7 @@ def matching_costs(
 def box_loss(predicted: Tensor, truth: Tensor, config: DetectionLossConfig) -> Tensor:
     """() L1 loss of matched box codes, summed. Boxes of unknown velocity are left out entirely, as published.
 
-    Args:
-        predicted: (K, 10).
-        truth: (K, 10).
+    predicted and truth: (K, 10).
     """
     known = truth.isfinite().all(-1)
     predicted, truth = predicted[known], truth[known]
