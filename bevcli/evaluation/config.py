@@ -1,7 +1,5 @@
 """Parameters of the detection score (nuScenes' detection_cvpr_2019) and of the tracking score (tracking_nips_2019)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -80,7 +78,6 @@ class DetectionConfig(ClassRanges):
 TRACKING_RANGES_M = {
     "bicycle": 40.0, "bus": 50.0, "car": 50.0, "motorcycle": 40.0, "pedestrian": 40.0, "trailer": 50.0, "truck": 50.0,
 }  # fmt: skip
-TRACKING_CLASSES = tuple(TRACKING_RANGES_M)
 
 
 @dataclass(frozen=True)

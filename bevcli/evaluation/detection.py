@@ -1,7 +1,5 @@
 """The nuScenes detection score: AP, mAP, true-positive errors and NDS of boxes. Reads no files."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -45,8 +43,7 @@ def evaluate_detections(
     assert len(predictions) == len(ground_truth)
     config = config or DetectionConfig()
     ego = np.zeros((len(predictions), 2)) if ego_xy is None else np.asarray(ego_xy, dtype=np.float64)
-    truth, found = gather(ground_truth, ego), gather(predictions, ego)
-    truth, found = _with_points(truth), _with_points(found)
+    truth, found = (_with_points(gather(side, ego)) for side in (ground_truth, predictions))
     matches = tuple(match_class(name, truth, found, config) for name in config.class_ranges_m)
     return score_matches(len(predictions), matches, _unmeasured(truth.boxes), config)
 
@@ -126,13 +123,12 @@ def _true_positive_errors(class_name: str, truth: Boxes3D, found: Boxes3D) -> di
     turn = wrap_angle(half_turns * (truth.yaws - found.yaws)) / half_turns
     assert truth.attributes is not None
     assert found.attributes is not None
-    wrong = (truth.attributes != found.attributes).astype(np.float64)
     errors = (
         np.hypot(offsets[:, 0], offsets[:, 1]),
         1 - intersection / union,
         np.abs(turn),
         np.linalg.norm(found.velocities - truth.velocities, axis=1),
-        np.where(truth.attributes == "", np.nan, wrong),
+        np.where(truth.attributes == "", np.nan, truth.attributes != found.attributes),
     )
     return dict(zip(ERRORS, errors, strict=True))
 

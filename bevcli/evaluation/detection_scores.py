@@ -41,8 +41,7 @@ class RecallCurve:
         first, last = round(100 * config.min_recall) + 1, int(np.flatnonzero(self.score).max(initial=0))
         if last < first:
             return 1.0
-        running = _running_mean(errors)
-        along = np.interp(self.score[::-1], scores[::-1], running[::-1])[::-1]
+        along = np.interp(self.score[::-1], scores[::-1], _running_mean(errors)[::-1])[::-1]
         return float(np.mean(along[first : last + 1]))
 
 

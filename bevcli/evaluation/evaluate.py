@@ -1,7 +1,5 @@
 """`evaluate`: read predictions and ground truth, match their frames, and score boxes and maps."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -14,7 +12,7 @@ from bevcli.evaluation.detection import evaluate_detections
 from bevcli.evaluation.detection_scores import DetectionScores
 from bevcli.evaluation.inputs import ScoredInput, open_ground_truth, open_predictions, without_cycles_in_racks
 from bevcli.evaluation.pairing import FramePairs, pair_frames
-from bevcli.evaluation.scores_report import scores_table, scores_to_dict, tracking_table, tracking_to_dict
+from bevcli.evaluation.scores_report import scores_table, scores_to_dict
 from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmentation
 from bevcli.evaluation.tracking.scoring import TrackingScores, evaluate_tracking
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
@@ -46,32 +44,23 @@ class Scores:
 
     def to_dict(self) -> dict[str, Any]:
         """All scores as a dict for JSON, with the devkit's key names; undefined numbers are None."""
-        scores = scores_to_dict(self.detection, self.config, self.segmentation, self.notes)
-        return scores if self.tracking is None else {**scores, "tracking": tracking_to_dict(self.tracking)}
+        return scores_to_dict(self.detection, self.config, self.segmentation, self.notes, self.tracking)
 
     def table(self) -> str:
         """The scores as text for a terminal."""
         frames = f"{self.detection.frame_count} frames, matched by {self.pairs.matched_by}"
-        parts = [frames, scores_table(self.detection, self.segmentation)]
-        if self.tracking is not None:
-            parts.append(tracking_table(self.tracking))
-        return "\n\n".join(parts)
+        return f"{frames}\n\n{scores_table(self.detection, self.segmentation, self.tracking)}"
 
     def write_plots(self, folder: Path | str) -> list[Path]:
         """Write plots as PNG files into a folder, made where it is missing; return their paths. Raises OutputError."""
-        from bevcli.evaluation.plots import (
-            draw_bev_sheet,  # only plots need matplotlib
-            draw_errors_by_range,
-            draw_precision_recall,
-            save_figures,
-        )
+        from bevcli.evaluation import plots  # only plots need matplotlib
 
         figures = {
-            "precision_recall.png": draw_precision_recall(self.detection),
-            "errors_by_range.png": draw_errors_by_range(self.detection),
-            "misses_and_false_alarms.png": draw_bev_sheet(self.detection, self.config, self.pairs),
+            "precision_recall.png": plots.draw_precision_recall(self.detection),
+            "errors_by_range.png": plots.draw_errors_by_range(self.detection),
+            "misses_and_false_alarms.png": plots.draw_bev_sheet(self.detection, self.config, self.pairs),
         }
-        return save_figures(figures, Path(folder))
+        return plots.save_figures(figures, Path(folder))
 
 
 def evaluate(
@@ -114,14 +103,12 @@ def evaluate(
     found = open_predictions(Path(predictions), class_map)
     pairs = pair_frames(found.boxes, truth.boxes, count_missing=count_missing)
     pairs = without_cycles_in_racks(pairs, truth.bicycle_racks)
-    model_range = None if max_range is not None else _model_range_m(found, pairs)
+    model_range = _model_range_m(found, pairs) if max_range is None else None
     limit = max_range if model_range is None else model_range
     config = _config(DetectionConfig(), pairs, limit)
     detection = evaluate_detections(_with_attributes(pairs.predictions), pairs.ground_truth, config, pairs.ego_xy)
     segmentation, map_notes = _score_maps(found, truth, pairs)
-    tracks, track_notes = None, list[str]()
-    if tracking:
-        tracks, track_notes = _score_tracks(pairs, _config(TrackingConfig(), pairs, limit))
+    tracks, track_notes = _score_tracks(pairs, _config(TrackingConfig(), pairs, limit)) if tracking else (None, [])
     limits = _range_notes(max_range, model_range, pairs)
     notes = (*pairs.notes, *map_notes, *_other_class_notes(pairs), *limits, *_detection_notes(detection), *track_notes)
     return Scores(pairs, config, detection, segmentation, tracks, notes)

@@ -1,12 +1,10 @@
 """Boxes in the formats of other tools: a CSV table, and KITTI object labels of one camera."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -48,7 +46,7 @@ class CsvWriter:
         csv.DictWriter(text, COLUMNS, lineterminator="\n").writerows(rows)
         self.file.append(text.getvalue().encode())
 
-    def __enter__(self) -> CsvWriter:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -154,12 +152,11 @@ def _image_box(corners: Array, camera: Camera) -> tuple[Array, float] | None:
 
 def _in_front_of_camera(corners: Array) -> Array:
     """The corners (8, 3) in front of the camera, and the points where box edges intersect the plane at NEAR_M."""
-    points = [corner for corner in corners if corner[2] >= NEAR_M]
-    for start, end in BOX_EDGES:
-        a, b = corners[start], corners[end]
-        if (a[2] < NEAR_M) != (b[2] < NEAR_M):
-            points.append(a + (NEAR_M - a[2]) / (b[2] - a[2]) * (b - a))
-    return np.array(points)
+    a, b = corners[np.array(BOX_EDGES)].swapaxes(0, 1)  # (12, 3) each
+    crosses = (a[:, 2] < NEAR_M) != (b[:, 2] < NEAR_M)
+    a, b = a[crosses], b[crosses]
+    cut = a + ((NEAR_M - a[:, 2]) / (b[:, 2] - a[:, 2]))[:, None] * (b - a)
+    return np.concatenate([corners[corners[:, 2] >= NEAR_M], cut])
 
 
 def read_kitti_camera(calibration: Path, name: str | None) -> tuple[Camera, Array]:

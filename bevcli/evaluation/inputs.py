@@ -1,7 +1,5 @@
 """Reads predictions and ground truth from files, folders or a nuScenes root."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -11,7 +11,7 @@ from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import score_matches
 from bevcli.evaluation.detection_scores import DetectionScores
 from bevcli.evaluation.evaluate import Scores
-from bevcli.evaluation.matching import ClassMatches, ScoredBoxes, descending_scores
+from bevcli.evaluation.matching import ClassMatches, ScoredBoxes
 from bevcli.evaluation.segmentation import SegmentationScores
 from bevcli.geometry.boxes import Boxes3D
 
@@ -57,21 +57,19 @@ def score_jointly(
 
 def _merged(parts: Sequence[ClassMatches]) -> ClassMatches:
     """The matching of one class in all drives. Equal scores stay in the order of a joint matching."""
-    ascending = [part.predictions[np.arange(len(part.predictions))[::-1]] for part in parts]
     starts = np.cumsum([0, *(len(part.ground_truth) for part in parts)])
     moved = [np.where(p.matched < 0, -1, p.matched + start) for p, start in zip(parts, starts, strict=False)]
-    matched = np.concatenate([indices[:, ::-1] for indices in moved], axis=1)
-    counts = np.concatenate([part.counts[:, ::-1] for part in parts], axis=1)
-    predictions = _concatenated(ascending)
+    # Of equal scores the later one is first, as in `descending_scores`: the last drive comes first.
+    predictions = _concatenated([part.predictions for part in parts[::-1]])
     assert predictions.boxes.scores is not None
-    order = descending_scores(predictions.boxes.scores)
+    order = np.argsort(-predictions.boxes.scores, kind="stable")
     return ClassMatches(
         parts[0].name,
         _concatenated([part.ground_truth for part in parts]),
         predictions[order],
-        matched[:, order],
+        np.concatenate(moved[::-1], axis=1)[:, order],
         np.concatenate([part.truth_counts for part in parts]),
-        counts[:, order],
+        np.concatenate([part.counts for part in parts[::-1]], axis=1)[:, order],
     )
 
 

@@ -1,7 +1,5 @@
 """The options of scoring and of the export of boxes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Literal
 

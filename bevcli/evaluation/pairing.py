@@ -1,7 +1,5 @@
 """Pairs the frames of predictions and ground truth, and moves their boxes into one frame of reference."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
@@ -134,8 +132,6 @@ def _described(frame: FrameBoxes) -> str:
 
 
 def _common_frame_of_reference(one: BoxesFile, other: BoxesFile) -> str:
-    if one.frame_of_reference == other.frame_of_reference != "bev":
-        return one.frame_of_reference
     references = {one.frame_of_reference, other.frame_of_reference}
     if "world" in references:
         return "world"
@@ -177,9 +173,8 @@ def _notes(key: _Key, pairs: int, predictions: int, ground_truth: int, count_mis
     if not key.is_reliable:
         notes.append(f"timestamps or scenes differ between the files: frames are matched by {key.name}")
     if pairs < ground_truth:
-        treatment = (
-            "all their boxes count as missed" if count_missing else "left out (`count_missing=True` counts them)"
-        )
+        left_out = "left out (`count_missing=True` counts them)"
+        treatment = "all their boxes count as missed" if count_missing else left_out
         notes.append(f"{ground_truth - pairs} of {ground_truth} ground-truth frames have no prediction: {treatment}")
     if pairs < predictions:
         notes.append(f"{predictions - pairs} of {predictions} predicted frames have no ground truth: left out")

@@ -1,7 +1,5 @@
 """Plots of detection scores: precision and recall, errors by range, misses and false positives from above."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -84,8 +82,7 @@ def draw_errors_by_range(detection: DetectionScores) -> Figure:
     middles = [(part.low_m + part.high_m) / 2 for part in bins]
     for axes, error in zip(panels.flat, (None, *ERRORS), strict=True):
         for name in detection.overall.classes:
-            found = [part.table.classes.get(name) for part in bins]
-            values = [_value(scores, error) for scores in found]
+            values = [_value(part.table.classes.get(name), error) for part in bins]
             axes.plot(middles, values, color=PLOT_COLORS[name], linewidth=1, marker=".", label=name, alpha=0.8)
         means = [part.table.mean_ap if error is None else part.table.errors[error] for part in bins]
         axes.plot(middles, means, color="black", linewidth=2.5, marker="o", label="mean")
@@ -142,12 +139,9 @@ def draw_bev_sheet(detection: DetectionScores, config: DetectionConfig, pairs: F
     """
     row = config.distances_m.index(config.error_distance_m)
     outcomes = [_best_outcome(matches, row) for matches in detection.matches]
-    limit = f"{config.error_distance_m:g} m"
-    figure = titled_figure(
-        (12, 10),
-        "Missed ground truth and false positives, seen from above",
-        f"score threshold: largest F1 of each class at {limit}; forward is up, rings every 10 m",
-    )
+    threshold = f"largest F1 of each class at {config.error_distance_m:g} m"
+    subtitle = f"score threshold: {threshold}; forward is up, rings every 10 m"
+    figure = titled_figure((12, 10), "Missed ground truth and false positives, seen from above", subtitle)
     grid = figure.add_gridspec(2, 2 * WORST_FRAMES, height_ratios=(2, 1.15))
     radius = _radius(detection)
     missed = {matches.name: matches.ground_truth[chosen] for matches, chosen, _ in outcomes}

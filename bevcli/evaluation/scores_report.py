@@ -1,13 +1,11 @@
 """Scores as a dict for JSON, with the key names of the nuScenes devkit, and as a table for the terminal."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 from bevcli.evaluation.config import ERRORS, DetectionConfig
-from bevcli.evaluation.detection_scores import DetectionScores, ScoreTable, VisibilityRecall
+from bevcli.evaluation.detection_scores import DetectionScores, ScoreTable
 from bevcli.evaluation.segmentation import SegmentationScores
 from bevcli.evaluation.tracking.scoring import METRICS, TrackingScores
 
@@ -19,6 +17,7 @@ def scores_to_dict(
     config: DetectionConfig,
     segmentation: SegmentationScores | None = None,
     notes: tuple[str, ...] = (),
+    tracking: TrackingScores | None = None,
 ) -> dict[str, Any]:
     """All scores as a dict for JSON; undefined numbers are None. docs/scoring.md explains the keys."""
     present = detection.overall.of_classes_with_ground_truth()
@@ -32,7 +31,17 @@ def scores_to_dict(
         "by_range": [
             {"from_m": part.low_m, "to_m": part.high_m, **_table_to_dict(part.table)} for part in detection.by_range
         ],
-        "recall_by_visibility": [_visibility_to_dict(part) for part in detection.by_visibility],
+        "recall_by_visibility": [
+            {
+                "from": part.low,
+                "to": part.high,
+                "recall": part.mean_recall,
+                "ground_truth_boxes": part.ground_truth_count,
+                "found_boxes": part.found_count,
+                "label_recalls": dict(part.recalls),
+            }
+            for part in detection.by_visibility
+        ],
         "iou": None if segmentation is None else dict(segmentation.iou),
         "frames": detection.frame_count,
         "map_frames": 0 if segmentation is None else segmentation.frame_count,
@@ -47,17 +56,22 @@ def scores_to_dict(
             "min_precision": config.min_precision,
             "mean_ap_weight": config.mean_ap_weight,
         },
+        **({} if tracking is None else {"tracking": _tracking_to_dict(tracking)}),
     }
     return finite(content)
 
 
-def scores_table(detection: DetectionScores, segmentation: SegmentationScores | None = None) -> str:
-    """Detection scores by class, range and visibility, and IoU if there are maps, as text for a terminal."""
+def scores_table(
+    detection: DetectionScores, segmentation: SegmentationScores | None, tracking: TrackingScores | None
+) -> str:
+    """Detection scores by class, range and visibility, and those of maps and tracks, as text for a terminal."""
     parts = [_classes(detection), _ranges(detection)]
     if detection.by_visibility:
         parts.append(_visibilities(detection))
     if segmentation is not None:
         parts.append(_maps(segmentation))
+    if tracking is not None:
+        parts.append(_tracks(tracking))
     return "\n\n".join(parts)
 
 
@@ -75,17 +89,6 @@ def _table_to_dict(table: ScoreTable) -> dict[str, Any]:
         "label_tp_errors": {name: dict(scores.errors) for name, scores in table.classes.items()},
         "label_recalls": {name: scores.recall for name, scores in table.classes.items()},
         "label_ground_truth_boxes": {name: scores.ground_truth_count for name, scores in table.classes.items()},
-    }
-
-
-def _visibility_to_dict(part: VisibilityRecall) -> dict[str, Any]:
-    return {
-        "from": part.low,
-        "to": part.high,
-        "recall": part.mean_recall,
-        "ground_truth_boxes": part.ground_truth_count,
-        "found_boxes": part.found_count,
-        "label_recalls": dict(part.recalls),
     }
 
 
@@ -162,14 +165,17 @@ _ERRORS = {
 }  # fmt: skip
 
 
-def tracking_table(scores: TrackingScores) -> str:
+def _tracks(scores: TrackingScores) -> str:
     """The tracking metrics by class, and their sums or means over the classes, in two tables."""
     overall = scores.overall
     rows = {**{name: scored.metrics for name, scored in scores.classes.items()}, "all": overall}
     tables = []
     for columns in (_QUALITY, _ERRORS):
-        cells = [[_number(values[metric], digits) for metric, digits in columns.values()] for values in rows.values()]
-        tables.append(aligned([("class", *columns), *((name, *row) for name, row in zip(rows, cells, strict=True))]))
+        cells = [
+            (name, *(_number(values[metric], digits) for metric, digits in columns.values()))
+            for name, values in rows.items()
+        ]
+        tables.append(aligned([("class", *columns), *cells]))
     switches = overall["ids"] / scores.scenes if scores.scenes else math.nan
     heading = (
         f"AMOTA {_number(overall['amota'])}   AMOTP {_number(overall['amotp'])} m   "
@@ -178,10 +184,9 @@ def tracking_table(scores: TrackingScores) -> str:
     return "\n\n".join([*tables, heading])
 
 
-def tracking_to_dict(scores: TrackingScores) -> dict[str, Any]:
-    """The tracking metrics as a dict for JSON; undefined numbers are None. docs/scoring.md explains the keys."""
+def _tracking_to_dict(scores: TrackingScores) -> dict[str, Any]:
     config = scores.config
-    content = {
+    return {
         "label_metrics": {
             name: {label: scored.metrics[name] for label, scored in scores.classes.items()} for name in METRICS
         },
@@ -196,4 +201,3 @@ def tracking_to_dict(scores: TrackingScores) -> dict[str, Any]:
             "min_recall": config.min_recall,
         },
     }
-    return finite(content)

@@ -1,7 +1,5 @@
 """IoU of BEV maps by class: intersection over union in cells, each summed over all frames."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

@@ -1,16 +1,14 @@
 """Predictions as a nuScenes submission for detection (results_nusc.json) or tracking, read and written."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.evaluation.config import TRACKING_CLASSES
+from bevcli.evaluation.config import TRACKING_RANGES_M
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.transforms import rotation_from_quaternion, yaw_of_rotation
@@ -42,7 +40,7 @@ class SubmissionWriter:
         if token is not None:
             self.file.append(self._boxes(frame.boxes, token), f"frame {frame.stamp.index}", key=token)
 
-    def __enter__(self) -> SubmissionWriter:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -70,7 +68,7 @@ def tracking_submission_boxes(boxes: Boxes3D, sample_token: str) -> list[dict[st
     """
     if boxes.instances is None or boxes.track_scores is None:
         return []
-    tracked = boxes[(boxes.instances != "") & np.isin(boxes.classes, TRACKING_CLASSES)]
+    tracked = boxes[(boxes.instances != "") & np.isin(boxes.classes, tuple(TRACKING_RANGES_M))]
     assert tracked.instances is not None
     assert tracked.track_scores is not None
     best = np.argsort(-tracked.track_scores, kind="stable")[:MAX_BOXES]

@@ -3,9 +3,6 @@
 Boxes and maps stay as they are.
 """
 
-from __future__ import annotations
-
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import cv2
@@ -72,12 +69,10 @@ class ImageVariation:
         """A copy of the frame with its images changed and some of them left out."""
         config, names = self._config, list(frame.images)
         if config.drop_image:
-            kept = [name for name in names if self._random.random() >= config.drop_image]
-            names = kept or names[:1]
+            names = [name for name in names if self._random.random() >= config.drop_image] or names[:1]
         if not (config.exposure or config.white_balance or self._noise) and len(names) == len(frame.images):
             return frame
-        images = {name: self._changed(name, frame.images[name]) for name in names}
-        return replace(frame, images=images)
+        return replace(frame, images={name: self._changed(name, frame.images[name]) for name in names})
 
     def _changed(self, name: str, image: CameraImage) -> CameraImage:
         if name not in self._tables:
@@ -125,11 +120,8 @@ def distort_images(frame: Frame, probability: float, random: np.random.Generator
     """A copy of the frame with `distort` applied to each image."""
     if probability == 0:
         return frame
-    images: Mapping[str, CameraImage] = {
-        name: replace(image, pixels_bgr=distort(image.pixels_bgr, probability, random))
-        for name, image in frame.images.items()
-    }
-    return replace(frame, images=images)
+    pixels = {name: distort(image.pixels_bgr, probability, random) for name, image in frame.images.items()}
+    return replace(frame, images={name: replace(frame.images[name], pixels_bgr=each) for name, each in pixels.items()})
 
 
 def distort(pixels_bgr: NDArray[np.uint8], probability: float, random: np.random.Generator) -> NDArray[np.uint8]:

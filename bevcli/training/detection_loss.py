@@ -40,20 +40,14 @@ class DetectionTargets:
 
 
 def detection_targets(boxes: Boxes3D, config: ModelConfig) -> DetectionTargets:
-    """Targets from the boxes that have one of the model's classes, a centre inside the BEV grid, and visible points.
-
-    Args:
-        boxes: ground truth in the bev frame.
-    """
-    return box_targets(boxes[in_range(boxes, config)], config.classes)
+    """The `box_targets` of the boxes (ground truth, bev frame) with a centre inside the BEV grid."""
+    grid = config.bev_grid
+    low, high = np.array([grid.x_range_m, grid.y_range_m, grid.z_range_m]).T
+    return box_targets(boxes[((boxes.centers >= low) & (boxes.centers <= high)).all(-1)], config.classes)
 
 
 def box_targets(boxes: Boxes3D, classes: tuple[str, ...]) -> DetectionTargets:
-    """Targets from all boxes that have one of the classes and visible points.
-
-    Args:
-        boxes: ground truth in the bev frame.
-    """
+    """Targets from all boxes (ground truth, bev frame) that have one of the classes and visible points."""
     kept = boxes[np.isin(boxes.classes, classes) & has_points(boxes)]
     labels = [classes.index(name) for name in kept.classes]
     return DetectionTargets(torch.tensor(labels, dtype=torch.int64), torch.from_numpy(encode(kept)).float())
@@ -62,13 +56,6 @@ def box_targets(boxes: Boxes3D, classes: tuple[str, ...]) -> DetectionTargets:
 def has_points(boxes: Boxes3D) -> NDArray[np.bool_]:
     """(N,) bool, false where the ground truth counts 0 points; boxes without a count are kept."""
     return np.ones(len(boxes), dtype=bool) if boxes.num_points is None else boxes.num_points != 0
-
-
-def in_range(boxes: Boxes3D, config: ModelConfig) -> NDArray[np.bool_]:
-    """(N,) bool: whether the centre (bev frame) lies in the model's x, y and z range."""
-    grid = config.bev_grid
-    low, high = np.array([grid.x_range_m, grid.y_range_m, grid.z_range_m]).T
-    return ((boxes.centers >= low) & (boxes.centers <= high)).all(-1)
 
 
 def focal_loss(logits: Tensor, targets: Tensor) -> Tensor:
@@ -186,9 +173,7 @@ def matching_costs(
 def box_loss(predicted: Tensor, truth: Tensor, config: DetectionLossConfig) -> Tensor:
     """() L1 loss of matched box codes, summed. Boxes of unknown velocity are left out entirely, as published.
 
-    Args:
-        predicted: (K, 10).
-        truth: (K, 10).
+    predicted and truth: (K, 10).
     """
     known = truth.isfinite().all(-1)
     predicted, truth = predicted[known], truth[known]
@@ -207,10 +192,29 @@ def _layer_loss(
     class_logits: Tensor, box_codes: Tensor, targets: Sequence[DetectionTargets], config: DetectionLossConfig
 ) -> Tensor:
     """(2,) class loss and box loss of one decoder layer."""
+    layer = zip(class_logits, box_codes, targets, strict=True)
+    matches = [hungarian_matching(matching_costs(*element, config)) for element in layer]
+    return assigned_loss(class_logits, box_codes, targets, matches, config)
+
+
+def assigned_loss(
+    class_logits: Tensor,
+    box_codes: Tensor,
+    targets: Sequence[DetectionTargets],
+    assignments: Sequence[tuple[Tensor, Tensor]],
+    config: DetectionLossConfig,
+) -> Tensor:
+    """(2,) class loss of all queries and box loss of those with an object, divided by the number of the latter.
+
+    Args:
+        class_logits: (B, Q, classes).
+        box_codes: (B, Q, 10).
+        targets: B.
+        assignments: B pairs: (K,) int64 indices of the queries with an object, and (K,) of their objects.
+    """
     class_targets = torch.zeros_like(class_logits)  # (B, Q, classes)
     predicted, truths = [], []
-    for element, truth in enumerate(targets):
-        queries, objects = hungarian_matching(matching_costs(class_logits[element], box_codes[element], truth, config))
+    for element, (truth, (queries, objects)) in enumerate(zip(targets, assignments, strict=True)):
         class_targets[element, queries, truth.labels[objects]] = 1
         predicted.append(box_codes[element, queries])
         truths.append(truth.codes[objects])

@@ -1,7 +1,5 @@
 """All losses of a frame, and the auxiliary heads that exist in training only."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,9 +17,8 @@ from bevcli.training.detection_loss import (
     DetectionLoss,
     DetectionLossConfig,
     DetectionTargets,
-    box_loss,
+    assigned_loss,
     detection_loss,
-    focal_loss,
 )
 from bevcli.training.perspective_loss import PerspectiveHead, PerspectiveLossConfig, perspective_loss
 from bevcli.training.samples import Targets
@@ -82,17 +79,9 @@ def dense_loss(
         detection: the weights of classes and boxes, as in the detection loss.
     """
     logits, codes = head(bev)
-    class_targets = torch.zeros_like(logits)
-    predicted, truths = [], []
-    for element, truth in enumerate(targets):
-        cells, objects = _positive_cells(head.centers, truth.codes[:, :2], config.reach_m)
-        class_targets[element, cells, truth.labels[objects]] = 1
-        predicted.append(codes[element, cells])
-        truths.append(truth.codes[objects])
-    count = max(sum(map(len, predicted)), 1)
-    classes = detection.class_weight * focal_loss(logits, class_targets).sum() / count
-    boxes = detection.box_weight * box_loss(torch.cat(predicted), torch.cat(truths), detection) / count
-    return DetectionLoss(config.weight * classes, config.weight * boxes)
+    positives = [_positive_cells(head.centers, truth.codes[:, :2], config.reach_m) for truth in targets]
+    classes, boxes = config.weight * assigned_loss(logits, codes, targets, positives, detection)
+    return DetectionLoss(classes, boxes)
 
 
 def _positive_cells(cells: Tensor, objects: Tensor, reach_m: float) -> tuple[Tensor, Tensor]:
@@ -174,10 +163,8 @@ class FrameLosses:
 
         Call it inside `watching`, right after the forward pass that made the outputs.
         """
-        weights = self.configs.detection_loss
-        detection = detection_loss(
-            outputs.class_logits, outputs.box_codes, targets.detection, weights, self._query_groups
-        )
+        logits, codes, weights = outputs.class_logits, outputs.box_codes, self.configs.detection_loss
+        detection = detection_loss(logits, codes, targets.detection, weights, self._query_groups)
         losses = {"classes": detection.classes, "boxes": detection.boxes}
         if self._dense_head is not None:
             bev, config = outputs.bev.float(), self.configs.dense_loss

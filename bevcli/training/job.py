@@ -1,7 +1,5 @@
 """Inputs of a training: the [training] table of a model file, a model, drives, an output folder and its processes."""
 
-from __future__ import annotations
-
 import math
 import os
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """TrainOptions: the options of a training."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from bevcli.options import option, options

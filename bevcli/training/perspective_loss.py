@@ -5,8 +5,6 @@ the features of the pixels that show it. Head and loss exist in training only. T
 2021): a box is detected on one level, chosen by its size in the image, by the pixels near its projected centre.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -142,12 +140,12 @@ def perspective_targets(
 
     positive = detects.any(-1)
     detected = torch.where(detects, to_anchor.norm(dim=-1), torch.inf)[positive].argmin(-1)  # (K,)
-    return PerspectiveTargets(
-        positive.nonzero()[:, 0],
-        truth.labels[detected],
-        _box_numbers(objects, detected, locations.pixels[positive], locations.strides[levels[detected]]),
-        (inside & objects.visible & ~usable).any(-1) & ~positive,
-    )
+    strides = locations.strides[levels[detected]]  # (K, 2)
+    offset = (objects.centers[detected] - locations.pixels[positive]) / strides
+    depth = objects.depths[detected] * strides.prod(-1).sqrt() / objects.focal
+    numbers = [offset, depth.log()[:, None], objects.log_sizes[detected], objects.rotations[detected]]
+    ignored = (inside & objects.visible & ~usable).any(-1) & ~positive
+    return PerspectiveTargets(positive.nonzero()[:, 0], truth.labels[detected], torch.cat(numbers, -1), ignored)
 
 
 def project_objects(image_from_bev: Tensor, codes: Tensor, image_size: tuple[int, int]) -> ImageObjects:
@@ -178,19 +176,6 @@ def project_objects(image_from_bev: Tensor, codes: Tensor, image_size: tuple[int
     return ImageObjects(
         visible, outlines, centers, depths, focal, codes[:, [3, 2, 5]], torch.stack([sine, cosine], -1)
     )  # fmt: skip
-
-
-def _box_numbers(objects: ImageObjects, detected: Tensor, pixels: Tensor, strides: Tensor) -> Tensor:
-    """(K, 8) targets of K locations.
-
-    Args:
-        detected: (K,) int64, indices of the boxes.
-        pixels: (K, 2) of the locations.
-        strides: (K, 2) of their levels.
-    """
-    offset = (objects.centers[detected] - pixels) / strides
-    depth = objects.depths[detected] * strides.prod(-1).sqrt() / objects.focal
-    return torch.cat([offset, depth.log()[:, None], objects.log_sizes[detected], objects.rotations[detected]], -1)
 
 
 def _outlines(image_from_bev: Tensor, codes: Tensor, image_size: tuple[int, int]) -> Tensor:

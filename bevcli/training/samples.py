@@ -85,8 +85,7 @@ def draw_clips(drives: Drives, config: ClipConfig, random: np.random.Generator, 
     if frames > 1 and random.random() < config.short_share:
         frames = int(random.integers(1, frames))
     clips: list[Clip] = []
-    shapes = drives.input_shapes
-    leave_out = with_gap and config.learn == "last"
+    shapes, leave_out = drives.input_shapes, with_gap and config.learn == "last"
     for _ in range(config.batch):
         alike = range(len(drives)) if not clips or shapes is None else _similar_drives(shapes, clips[0].drive)
         drive = int(alike[random.integers(len(alike))])
@@ -181,8 +180,7 @@ def load_batch(
     Raises:
         InputError: a frame to train on has no ground truth.
     """
-    loaded = [_load_clip(drives, clip, config, augmentation, random) for clip in clips]
-    frames = list(zip(*loaded, strict=True))
+    frames = list(zip(*(_load_clip(drives, clip, config, augmentation, random) for clip in clips), strict=True))
     inputs = []
     for index, prepared in enumerate(frames):
         previous_poses = [one.frame.world_from_ego for one in frames[index - 1]] if index else [None] * len(clips)

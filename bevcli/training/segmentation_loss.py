@@ -183,7 +183,10 @@ def segmentation_loss(
     classes = config.class_weight * (_class_losses(outputs.class_logits, assignments, targets) * shares).sum()
     masks, locations = classes.new_zeros(()), classes.new_zeros(())
     for element, assigned in enumerate(assignments):
-        losses = _mask_losses(outputs.mask_logits[:, element, assigned.queries], assigned.masks, config)
+        logits = outputs.mask_logits[:, element, assigned.queries]  # (M, K, Y·X)
+        truth = assigned.masks.expand_as(logits)
+        losses = config.dice_weight * dice_loss(logits, truth)
+        losses = losses + config.pixel_weight * focal_loss(logits, truth).mean(-1)
         masks = masks + (losses * shares[assigned.queries]).sum()
         errors = outputs.locations[:, element, assigned.things] - assigned.locations
         locations = locations + config.location_weight * errors.abs().sum() / max(things, 1)
@@ -249,9 +252,3 @@ def _class_losses(
         if truth.stuff is None:
             trained[:, element, : len(STUFF_CLASSES)] = 0
     return focal_loss(class_logits, class_targets) * trained
-
-
-def _mask_losses(logits: Tensor, masks: Tensor, config: SegmentationLossConfig) -> Tensor:
-    """(M, K) losses of mask logits (M, K, Y·X) against target masks (K, Y·X)."""
-    masks = masks.expand_as(logits)
-    return config.dice_weight * dice_loss(logits, masks) + config.pixel_weight * focal_loss(logits, masks).mean(-1)

@@ -1,7 +1,5 @@
 """Scores of a model over several drives: each is run as by `bevcli run`, and all are scored as by `bevcli eval`."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +11,7 @@ import numpy as np
 from bevcli.evaluation.config import DetectionConfig, TrackingConfig
 from bevcli.evaluation.detection import evaluate_detections
 from bevcli.evaluation.detection_scores import DetectionScores
-from bevcli.evaluation.scores_report import scores_table, scores_to_dict, tracking_table, tracking_to_dict
+from bevcli.evaluation.scores_report import scores_table, scores_to_dict
 from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmentation
 from bevcli.evaluation.tracking.scoring import TrackingScores, evaluate_tracking
 from bevcli.frame import MAP_CLASSES, Frame, Prediction
@@ -83,15 +81,13 @@ class Validation:
 
     def to_dict(self) -> dict[str, Any]:
         """All scores for JSON; undefined numbers are None."""
-        content = scores_to_dict(self.detection, self.config, self.segmentation)
-        content |= {} if self.tracking is None else {"tracking": tracking_to_dict(self.tracking)}
+        content = scores_to_dict(self.detection, self.config, self.segmentation, tracking=self.tracking)
         return content | ({"drives": [drive.to_dict() for drive in self.drives]} if self.drives else {})
 
     def table(self) -> str:
         """The scores as text for a terminal."""
-        parts = [scores_table(self.detection, self.segmentation)]
-        parts += [] if self.tracking is None else [tracking_table(self.tracking)]
-        return "\n\n".join([*parts, *([drives_table(self.drives)] if self.drives else [])])
+        scores = scores_table(self.detection, self.segmentation, self.tracking)
+        return f"{scores}\n\n{drives_table(self.drives)}" if self.drives else scores
 
 
 def validate(

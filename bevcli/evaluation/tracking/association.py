@@ -42,11 +42,7 @@ class TrackedBoxes:
 
     def __getitem__(self, selection: NDArray[Any]) -> TrackedBoxes:
         """The boxes of a mask (N,) bool or of an index array."""
-        return TrackedBoxes(*(column[selection] for column in self.columns()))
-
-    def columns(self) -> tuple[NDArray[Any], ...]:
-        """Frames, tracks, positions, classes and scores."""
-        return self.frames, self.tracks, self.xy, self.classes, self.scores
+        return TrackedBoxes(*(column[selection] for column in vars(self).values()))
 
 
 def scored_tracks(
@@ -93,10 +89,8 @@ def _means_of_tracks(tracks: Indices, scores: Array) -> Array:
 
 def time_order(stamps: Sequence[FrameStamp]) -> list[int]:
     """The places of frames ordered by scene (in the order of first appearance), then by time."""
-    first: dict[str, int] = {}
-    for place, stamp in enumerate(stamps):
-        first.setdefault(stamp.scene, place)
-    return sorted(range(len(stamps)), key=lambda place: (first[stamps[place].scene], stamps[place].timestamp_ns))
+    order = {scene: number for number, scene in enumerate(dict.fromkeys(stamp.scene for stamp in stamps))}
+    return sorted(range(len(stamps)), key=lambda place: (order[stamps[place].scene], stamps[place].timestamp_ns))
 
 
 def _columns(
@@ -104,8 +98,7 @@ def _columns(
 ) -> tuple[Indices, NDArray[np.str_], NDArray[np.str_], Array, Array]:
     """Frame, identity, class, position and score of the boxes of a frame that are scored."""
     limits = np.array([ranges_m.get(str(name), -1.0) for name in boxes.classes])
-    away = np.linalg.norm(boxes.centers[:, :2] - ego_xy, axis=1)
-    kept = away < limits
+    kept = np.linalg.norm(boxes.centers[:, :2] - ego_xy, axis=1) < limits
     if boxes.num_points is not None:
         kept &= boxes.num_points != 0
     names = np.full(len(boxes), "") if boxes.instances is None else boxes.instances
@@ -150,7 +143,7 @@ def _interpolated(boxes: TrackedBoxes, times_ns: Indices) -> TrackedBoxes:
     np.minimum.at(first_appearance, boxes.tracks, np.arange(len(boxes)))
     added = TrackedBoxes(frames, boxes.tracks[right], xy, boxes.classes[right], scores)
     added = added[np.argsort(first_appearance[added.tracks], kind="stable")]
-    both = TrackedBoxes(*map(np.concatenate, zip(boxes.columns(), added.columns(), strict=True)))
+    both = TrackedBoxes(*map(np.concatenate, zip(vars(boxes).values(), vars(added).values(), strict=True)))
     return both[np.argsort(both.frames, kind="stable")]
 
 
@@ -254,9 +247,8 @@ def _assignment(pairs: list[Pair]) -> list[Pair]:
         return pairs
     most = sum(pair[2] for pair in pairs) + 1.0  # one more pair is always worth more than shorter distances
     cost = np.full((len(rows), len(columns)), most)
-    chosen = {}
-    for pair in pairs:
-        cost[rows[pair[0]], columns[pair[1]]] = pair[2]
-        chosen[rows[pair[0]], columns[pair[1]]] = pair
+    chosen = {(rows[pair[0]], columns[pair[1]]): pair for pair in pairs}
+    for place, (_, _, distance) in chosen.items():
+        cost[place] = distance
     found = zip(*(indices.tolist() for indices in linear_sum_assignment(cost)), strict=True)
     return [chosen[place] for place in found if place in chosen]

@@ -1,7 +1,5 @@
 """evaluate_tracking: from boxes with identities to AMOTA and the metrics that come with it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -56,8 +54,7 @@ class ClassTracking:
 
 def score_class(truth: TrackedBoxes, predictions: TrackedBoxes, config: TrackingConfig) -> ClassTracking:
     """Scores the boxes of one class. Without ground truth every number is NaN."""
-    names = (*WORST, "confidence", "recall_hypo")
-    levels = {name: np.full(config.recall_levels, np.nan) for name in names}
+    levels = {name: np.full(config.recall_levels, np.nan) for name in (*WORST, "confidence", "recall_hypo")}
     if not len(truth):
         return ClassTracking(dict.fromkeys(METRICS, np.nan), levels)
     recalls = np.linspace(config.min_recall, 1, config.recall_levels).round(12)
@@ -89,11 +86,8 @@ def metrics_at(
     fn, tp, ids = int(counts[MISS]), int(counts[MATCH]), int(counts[SWITCH])
     fp = len(kept) - tp - ids
     gt = len(truth)
-    recall_of_matches = tp / gt
-    motar = np.nan
-    if tp:
-        excess = ids + fp + fn - (1 - recall_of_matches) * gt
-        motar = max(0.0, 1 - excess / (recall_of_matches * gt))
+    recall = tp / gt  # of matches without switches
+    motar = max(0.0, 1 - (ids + fp + fn - (1 - recall) * gt) / (recall * gt)) if tp else np.nan
     counted = np.unique(np.concatenate([truth.frames, kept.frames]))
     return {
         "recall": (tp + ids) / gt,
@@ -126,12 +120,9 @@ def _over_objects(
     share = hits / lengths
     places = np.flatnonzero(hit)
     owners = np.repeat(np.arange(len(starts)), lengths)[places]  # the object of each match
-    first, last = (
-        np.searchsorted(owners, np.arange(len(starts))),
-        np.searchsorted(owners, np.arange(len(starts)), "right"),
-    )
     seen = hits > 0
-    first_hit, last_hit = places[first[seen]], places[last[seen] - 1]
+    after = np.cumsum(hits)  # of the places of each object's matches, the one after the last
+    first_hit, last_hit = places[(after - hits)[seen]], places[after[seen] - 1]
     waits = frames[first_hit] - frames[starts[seen]]
     gaps = np.maximum(waits, frames[ends[seen] - 1] - frames[last_hit])
     same = owners[1:] == owners[:-1]
@@ -190,8 +181,8 @@ class TrackingScores:
     @property
     def overall(self) -> dict[str, float]:
         """Metric -> its sum or its mean over the classes that have ground truth; NaN where no class has any."""
-        values = {name: [scores.metrics[name] for scores in self.classes.values()] for name in METRICS}
-        return {name: _over_classes(name, np.array(column, dtype=np.float64)) for name, column in values.items()}
+        classes = self.classes.values()
+        return {name: _over_classes(name, [scores.metrics[name] for scores in classes]) for name in METRICS}
 
 
 def evaluate_tracking(
@@ -244,8 +235,8 @@ def _require_identities(
         )
 
 
-def _over_classes(name: str, values: Array) -> float:
-    known = values[~np.isnan(values)]
+def _over_classes(name: str, values: Sequence[float]) -> float:
+    known = np.array([value for value in values if not np.isnan(value)], dtype=np.float64)
     if not len(known):
         return np.nan
     return float(known.sum() if name in SUMMED else known.mean())
