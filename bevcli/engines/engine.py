@@ -92,7 +92,6 @@ class OnnxRuntimeEngine(Engine):
         self.outputs = tuple(value.name for value in self.session.get_outputs())
 
     def forward(self, feed: Arrays) -> dict[str, np.ndarray]:
-        """See `Engine`."""
         return dict(zip(self.outputs, self.session.run(self.outputs, dict(feed)), strict=True))
 
 
@@ -123,7 +122,6 @@ class OpenVinoEngine(Engine):
         self.request = self.model.create_infer_request()
 
     def forward(self, feed: Arrays) -> dict[str, np.ndarray]:
-        """See `Engine`."""
         found = self.request.infer(dict(feed), share_inputs=True)
         return {name: found[name] for name in self.outputs}
 

@@ -73,7 +73,6 @@ class Network(TemporalModel):
 
     @property
     def image_parts(self) -> tuple[nn.Module, ...]:
-        """See `TemporalModel`."""
         return self.backbone, self.neck
 
     def exchange_parts(self) -> None:
@@ -108,7 +107,6 @@ class Network(TemporalModel):
 
     @classmethod
     def part_names(cls, config: ModelConfig) -> Iterator[tuple[str, ...]]:
-        """See `TemporalModel`."""
         yield "backbone: stem", "backbone.conv1", "backbone.bn1"
         for stage, blocks in enumerate(config.backbone.blocks):
             kind = "deformable bottleneck" if stage + 1 in config.backbone.deformable_stages else "bottleneck"

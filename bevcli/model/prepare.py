@@ -90,25 +90,20 @@ class PreparedModel(TemporalModel):
     def step(
         self, prepared: PreparedFrame, memory: Memory | None, upcoming: Sequence[PreparedFrame] = ()
     ) -> tuple[ModelOutputs, Memory]:
-        """See `TemporalModel`."""
         with torch.autocast(self.device.type, enabled=False):
             return self.network.step(prepared, memory, upcoming)
 
     def restarted(self, memory: Memory) -> Memory | None:
-        """See `TemporalModel`."""
         return self.network.restarted(memory)
 
     def decode_boxes(self, outputs: ModelOutputs) -> Boxes3D:
-        """See `TemporalModel`."""
         return self.network.decode_boxes(outputs)
 
     def decode_map(self, outputs: ModelOutputs) -> BevMap | None:
-        """See `TemporalModel`."""
         return self.network.decode_map(outputs)
 
     @property
     def observed(self) -> nn.Module:
-        """See `TemporalModel`."""
         return self.network
 
 
