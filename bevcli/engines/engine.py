@@ -1,7 +1,5 @@
 """Engines: ONNX Runtime and OpenVINO on the CPU, with one interface. Each runs an exported file."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Modulated deformable convolution, DCNv2 (Zhu et al. 2019), with one deformable group."""
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn

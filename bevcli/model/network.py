@@ -1,7 +1,5 @@
 """The base of the published models: the parts that they share, in the order of the paper's figure 2."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import Any
 

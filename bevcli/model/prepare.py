@@ -3,8 +3,6 @@
 The plain model knows nothing of this. A prepared model holds a copy whose parts are exchanged for faster ones.
 """
 
-from __future__ import annotations
-
 import atexit
 import copy
 import threading
@@ -30,7 +28,7 @@ LOADING_TIMEOUT_S = 120.0  # the compilation takes half a minute where there is 
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 
 
-def prepare_for_inference(model: TemporalModel, device: torch.device, precision: Precision = "fp32") -> PreparedModel:
+def prepare_for_inference(model: TemporalModel, device: torch.device, precision: Precision = "fp32") -> "PreparedModel":
     """A copy of the model on the device, for inference only; the model itself stays unchanged.
 
     Batch norms are folded into their convolutions, which run in channels-last layout. Deformable attention and

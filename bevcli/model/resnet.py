@@ -1,7 +1,5 @@
 """ResNet (He et al. 2016) with bottlenecks: the image backbone."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal

@@ -1,7 +1,5 @@
 """BEVFormer (Li et al. 2022): camera images and ego-motion in, a BEV map and objects out. Then its exported form."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -85,7 +83,7 @@ class BEVFormer(Network):
         return bev
 
     @classmethod
-    def export_form(cls, config: ModelConfig, cameras: int) -> RecurrentForm:
+    def export_form(cls, config: ModelConfig, cameras: int) -> "RecurrentForm":
         return RecurrentForm(config, cameras)
 
 

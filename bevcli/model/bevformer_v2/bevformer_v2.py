@@ -4,8 +4,6 @@ There is no recurrence: every frame of the window is encoded in the current fram
 inference, temporal self-attentions without a history are exchanged for ones that compute beforehand what is constant.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar

@@ -3,8 +3,6 @@
 The image features of the earlier frames enter, and those of the current one come out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any

@@ -5,8 +5,6 @@ for memory. The operators are those that PyTorch's compiler uses; where a build 
 own layers.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import torch

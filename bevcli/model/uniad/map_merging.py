@@ -1,7 +1,5 @@
 """Merges the masks of the map head into one map."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Key names of the released weights files of UniAD, and ours."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 

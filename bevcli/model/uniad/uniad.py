@@ -1,7 +1,5 @@
 """UniAD's first stage (Hu et al. 2023): BEVFormer's BEV map, track queries that follow objects, and a panoptic map."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, NoReturn
