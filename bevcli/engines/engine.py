@@ -128,8 +128,8 @@ class OpenVinoEngine(Engine):
 def _openvino_core() -> Any:
     """OpenVINO's one core of this process, which is never deleted.
 
-    On a processor with AMX each core sets a stack for signals and, when it is deleted, brings back the one before, which
-    another core may have freed: the next Ctrl-C would then end the process with a segmentation fault (2026.4).
+    On a processor with AMX each core sets a stack for signals and, when it is deleted, brings back the one before,
+    which another core may have freed: the next Ctrl-C would then end the process with a segmentation fault (2026.4).
     """
     return import_openvino().Core()
 

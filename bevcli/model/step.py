@@ -105,12 +105,10 @@ class ClipInputs(Protocol):
     @property
     def inputs(self) -> Sequence[ModelInputs]:
         """T inputs, one a frame of the clips."""
-        ...
 
     @property
     def world_from_bev(self) -> Tensor:
         """(T, B, 4, 4) float64, the pose of each frame's bev frame."""
-        ...
 
 
 def model_inputs(
