@@ -1,7 +1,4 @@
-"""The exported form of a BEVFormerV2 whose window ends with the current frame.
-
-The image features of the earlier frames enter, and those of the current one come out.
-"""
+"""The exported form of a BEVFormerV2 whose window ends with the current frame."""
 
 from collections.abc import Mapping
 from dataclasses import replace

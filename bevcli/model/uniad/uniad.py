@@ -23,7 +23,7 @@ from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame, model_in
 from bevcli.model.uniad.map_head import MapHead, MapHeadConfig, MapOutputs
 from bevcli.model.uniad.map_merging import merge_map
 from bevcli.model.uniad.memory_bank import Memories, MemoryBank
-from bevcli.model.uniad.official_keys import NAMES, unused_keys
+from bevcli.model.uniad.official_keys import NAMES, QUERIES, UNUSED
 from bevcli.model.uniad.query_interaction import QueryInteraction
 from bevcli.model.uniad.track_queries import (
     EGO,
@@ -241,7 +241,7 @@ class UniAD(BEVFormer):
 
     @classmethod
     def without_training_parts(cls, state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
-        unused = unused_keys(state)
+        unused = [key for key in state if UNUSED.match(key)] if QUERIES in state else []
         left = {key: tensor for key, tensor in state.items() if key not in unused}
         return left, f"{len(unused)} keys, such as {unused[0]}" if unused else ""
 
