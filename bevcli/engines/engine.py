@@ -1,7 +1,5 @@
 """Engines: ONNX Runtime and OpenVINO on the CPU, with one interface. Each runs an exported file."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from collections.abc import Mapping
@@ -92,7 +90,6 @@ class OnnxRuntimeEngine(Engine):
         self.outputs = tuple(value.name for value in self.session.get_outputs())
 
     def forward(self, feed: Arrays) -> dict[str, np.ndarray]:
-        """See `Engine`."""
         return dict(zip(self.outputs, self.session.run(self.outputs, dict(feed)), strict=True))
 
 
@@ -123,7 +120,6 @@ class OpenVinoEngine(Engine):
         self.request = self.model.create_infer_request()
 
     def forward(self, feed: Arrays) -> dict[str, np.ndarray]:
-        """See `Engine`."""
         found = self.request.infer(dict(feed), share_inputs=True)
         return {name: found[name] for name in self.outputs}
 

@@ -1,7 +1,5 @@
 """`export_onnx`: writes one step of a model as an ONNX file."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

@@ -1,7 +1,5 @@
 """An exported file in the place of a model."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """The options of the export of models and of their quantisation."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Literal
 

@@ -5,8 +5,6 @@ ONNX Runtime's static quantisation after training: weights in 8 bits, one scale 
 stays in float32: it is a small part of the work, and rounding it would move boxes.
 """
 
-from __future__ import annotations
-
 import logging
 import tempfile
 from collections.abc import Iterable, Mapping

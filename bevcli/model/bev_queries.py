@@ -1,7 +1,5 @@
 """BEV queries (paper, section 3.2): one learned vector a BEV cell, its position embedding, and the can-bus MLP."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import torch

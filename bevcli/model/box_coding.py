@@ -4,8 +4,6 @@ A code is (cx, cy, log w, log l, cz, log h, sin, cos, vx, vy). As in the release
 from -y: yaw = -angle - pi/2, with yaw counter-clockwise from +x.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from bevcli.geometry.boxes import Boxes3D

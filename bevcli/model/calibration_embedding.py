@@ -1,7 +1,5 @@
 """Image features that know their camera: an embedding of each feature's viewing ray, computed from the calibration."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

@@ -1,7 +1,5 @@
 """The order in which a rig's cameras enter the model, and the camera embedding that each of them takes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

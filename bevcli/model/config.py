@@ -1,7 +1,5 @@
 """The configuration that every model has: images, BEV grid, and the parts that models share."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 

@@ -1,7 +1,5 @@
 """The object decoder and its detection head, after Deformable DETR: queries that attend to the BEV map find objects."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -78,7 +76,7 @@ class Decoder(nn.Module):
         nn.init.zeros_(self.reference_points.bias)
 
     def forward(
-        self, bev: Tensor, head: DetectionHead, queries: ObjectQueries | None = None
+        self, bev: Tensor, head: "DetectionHead", queries: ObjectQueries | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Class logits (L, B, Q, classes) and box codes (L, B, Q, 10) of all L layers; the last queries (B, Q, C).
 

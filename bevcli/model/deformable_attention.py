@@ -1,7 +1,5 @@
 """Deformable attention (Zhu et al. 2021): each query samples a few values instead of attending to all of them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Modulated deformable convolution, DCNv2 (Zhu et al. 2019), with one deformable group."""
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -48,11 +46,10 @@ def modulated_deformable_convolution(
         weight: (O, C, 3, 3).
         stride: of the output positions, in cells of x.
     """
-    taps = weight.flatten(2).unbind(-1)
     tap_y, tap_x = _tap_positions(offsets.shape[-2:], stride, x.device)  # (9, H', 1), (9, 1, W')
     result = x.new_zeros(())
     # One tap at a time, so that only one sampled map is held in memory.
-    for k, tap in enumerate(taps):
+    for k, tap in enumerate(weight.flatten(2).unbind(-1)):
         y = tap_y[k] + offsets[:, k, 0]
         sampled = _sample(x, y, tap_x[k] + offsets[:, k, 1]) * mask[:, k, None].to(x.dtype)
         result = result + F.conv2d(sampled, tap[..., None, None])

@@ -1,7 +1,5 @@
 """Ego-motion in the model (paper, section 3.4): can-bus numbers, and the shift and rotation of the history map."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """The BEV encoder: layers of temporal self-attention, spatial cross-attention and a feed-forward network."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """The exported form of a model: names, shapes and units of a file's inputs and outputs, as its metadata states them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar

@@ -1,7 +1,5 @@
 """The feed-forward network of a transformer layer."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import torch.nn.functional as F

@@ -1,7 +1,5 @@
 """Feature pyramid network (Lin et al. 2017): the neck."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Image features as tokens, with the embeddings of their camera and feature level."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

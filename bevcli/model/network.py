@@ -1,7 +1,5 @@
 """The base of the published models: the parts that they share, in the order of the paper's figure 2."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -73,7 +71,6 @@ class Network(TemporalModel):
 
     @property
     def image_parts(self) -> tuple[nn.Module, ...]:
-        """See `TemporalModel`."""
         return self.backbone, self.neck
 
     def exchange_parts(self) -> None:
@@ -108,7 +105,6 @@ class Network(TemporalModel):
 
     @classmethod
     def part_names(cls, config: ModelConfig) -> Iterator[tuple[str, ...]]:
-        """See `TemporalModel`."""
         yield "backbone: stem", "backbone.conv1", "backbone.bn1"
         for stage, blocks in enumerate(config.backbone.blocks):
             kind = "deformable bottleneck" if stage + 1 in config.backbone.deformable_stages else "bottleneck"

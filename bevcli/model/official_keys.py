@@ -1,7 +1,5 @@
 """Translates the key names of the official weights files to ours."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any

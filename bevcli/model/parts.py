@@ -1,7 +1,5 @@
 """The parts of a model in the paper's terms, with the shapes and the number of their parameters."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Pillars of the BEV cells in the cameras: where they appear, and which cameras see a cell (paper, section 3.3)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -3,8 +3,6 @@
 The plain model knows nothing of this. A prepared model holds a copy whose parts are exchanged for faster ones.
 """
 
-from __future__ import annotations
-
 import atexit
 import copy
 import threading
@@ -30,7 +28,7 @@ LOADING_TIMEOUT_S = 120.0  # the compilation takes half a minute where there is 
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 
 
-def prepare_for_inference(model: TemporalModel, device: torch.device, precision: Precision = "fp32") -> PreparedModel:
+def prepare_for_inference(model: TemporalModel, device: torch.device, precision: Precision = "fp32") -> "PreparedModel":
     """A copy of the model on the device, for inference only; the model itself stays unchanged.
 
     Batch norms are folded into their convolutions, which run in channels-last layout. Deformable attention and
@@ -90,25 +88,20 @@ class PreparedModel(TemporalModel):
     def step(
         self, prepared: PreparedFrame, memory: Memory | None, upcoming: Sequence[PreparedFrame] = ()
     ) -> tuple[ModelOutputs, Memory]:
-        """See `TemporalModel`."""
         with torch.autocast(self.device.type, enabled=False):
             return self.network.step(prepared, memory, upcoming)
 
     def restarted(self, memory: Memory) -> Memory | None:
-        """See `TemporalModel`."""
         return self.network.restarted(memory)
 
     def decode_boxes(self, outputs: ModelOutputs) -> Boxes3D:
-        """See `TemporalModel`."""
         return self.network.decode_boxes(outputs)
 
     def decode_map(self, outputs: ModelOutputs) -> BevMap | None:
-        """See `TemporalModel`."""
         return self.network.decode_map(outputs)
 
     @property
     def observed(self) -> nn.Module:
-        """See `TemporalModel`."""
         return self.network
 
 

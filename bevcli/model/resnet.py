@@ -1,7 +1,5 @@
 """ResNet (He et al. 2016) with bottlenecks: the image backbone."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -59,13 +57,7 @@ class ResNet(nn.Module):
         self.conv1 = nn.Conv2d(3, width, 7, stride=2, padding=3, bias=False)
         self.bn1 = nn.BatchNorm2d(width)
         self.pool = nn.MaxPool2d(3, stride=2, padding=1)
-        stages = []
-        in_channels = width
-        for stage, blocks in enumerate(config.blocks[: max(config.output_stages)], start=1):
-            channels = width * 2 ** (stage - 1)
-            stages.append(_stage(in_channels, channels, blocks, stage, config))
-            in_channels = 4 * channels
-        self.stages = nn.ModuleList(stages)
+        self.stages = nn.ModuleList(_stage(number, config) for number in range(1, max(config.output_stages) + 1))
         nn.init.kaiming_normal_(self.conv1.weight, mode="fan_out", nonlinearity="relu")
 
     def freeze(self, stages: int) -> None:
@@ -110,20 +102,17 @@ class Bottleneck(nn.Module):
         if stride != 1 or in_channels != 4 * channels:
             shortcut = nn.Conv2d(in_channels, 4 * channels, 1, stride, bias=False)
             self.downsample = nn.Sequential(shortcut, nn.BatchNorm2d(4 * channels))
-        self._initialize()
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d) and module.bias is None:
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+        # An untrained block is the identity, so that deep networks train.
+        nn.init.zeros_(self.bn3.weight)
 
     def forward(self, x: Tensor) -> Tensor:
         """x: (B, in_channels, H, W) -> (B, 4 · channels, H / stride, W / stride)."""
         y = F.relu(self.bn1(self.conv1(x)))
         y = F.relu(self.bn2(self.conv2(y)))
         return F.relu(self.bn3(self.conv3(y)) + self.downsample(x))
-
-    def _initialize(self) -> None:
-        for module in self.modules():
-            if isinstance(module, nn.Conv2d) and module.bias is None:
-                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
-        # An untrained block is the identity, so that deep networks train.
-        nn.init.zeros_(self.bn3.weight)
 
 
 class BasicBlock(nn.Module):
@@ -149,11 +138,10 @@ class BasicBlock(nn.Module):
         return F.relu(self.bn2(self.conv2(y)) + self.downsample(x))
 
 
-def _stage(in_channels: int, channels: int, blocks: int, stage: int, config: ResNetConfig) -> nn.Sequential:
-    deformable = stage in config.deformable_stages
-    layers = []
-    for block in range(blocks):
-        stride = 2 if block == 0 and stage > 1 else 1
-        layers.append(Bottleneck(in_channels, channels, stride, config.style, deformable))
-        in_channels = 4 * channels
-    return nn.Sequential(*layers)
+def _stage(number: int, config: ResNetConfig) -> nn.Sequential:
+    """The bottlenecks of a stage (1 to 4); the first of them has the stride."""
+    channels, deformable = config.width * 2 ** (number - 1), number in config.deformable_stages
+    # The stage before has half the channels, the stem as many as the first stage.
+    first = (config.width, 1) if number == 1 else (2 * channels, 2)
+    inputs = [first] + (config.blocks[number - 1] - 1) * [(4 * channels, 1)]
+    return nn.Sequential(*(Bottleneck(size, channels, stride, config.style, deformable) for size, stride in inputs))

@@ -3,8 +3,6 @@
 The head's location decoder gives thing queries a place, and its mask decoder turns all queries into masks.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The data of one step: a preprocessed frame, the tensors that enter a network, and those that leave it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import ClassVar, Protocol
@@ -71,7 +69,7 @@ class ModelInputs:
         """(height, width) of the network's input, pixels."""
         return self.images.shape[-2], self.images.shape[-1]
 
-    def to(self, device: torch.device, *, keep_geometry: bool = False) -> ModelInputs:
+    def to(self, device: torch.device, *, keep_geometry: bool = False) -> "ModelInputs":
         """The same inputs on a device.
 
         keep_geometry: image_from_bev, has_image and rotation_deg stay on the CPU, where they are read without a wait.
@@ -107,12 +105,10 @@ class ClipInputs(Protocol):
     @property
     def inputs(self) -> Sequence[ModelInputs]:
         """T inputs, one a frame of the clips."""
-        ...
 
     @property
     def world_from_bev(self) -> Tensor:
         """(T, B, 4, 4) float64, the pose of each frame's bev frame."""
-        ...
 
 
 def model_inputs(

@@ -3,10 +3,8 @@
 A network, the same network prepared for inference, and an exported file are each a `TemporalModel`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -17,12 +15,10 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
 from bevcli.model.box_coding import decode
 from bevcli.model.config import ModelConfig
+from bevcli.model.export_form import ExportForm
 from bevcli.model.segmentation import decode_maps
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.registry import entries, load
-
-if TYPE_CHECKING:
-    from bevcli.model.export_form import ExportForm
 
 Memory = Any  # a frozen dataclass of the model's own; whoever runs the model only passes it on
 

@@ -1,7 +1,5 @@
 """Copies from the CPU to a device that the CPU does not wait for, and tables that are copied only once."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

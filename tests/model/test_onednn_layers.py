@@ -14,7 +14,7 @@ from bevcli.model.feed_forward import FeedForward
 from bevcli.model.kernels import onednn as onednn_layers
 from bevcli.model.kernels.choose import fold_batch_norms
 from bevcli.model.kernels.compiled import CompiledDeformableConvolution
-from bevcli.model.kernels.onednn import FusedBottleneck, PackedConvolution, PackedLinear, has_onednn, use_onednn
+from bevcli.model.kernels.onednn import FusedBlock, PackedConvolution, PackedLinear, has_onednn, use_onednn
 from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.resnet import Bottleneck, ResNet, ResNetConfig
 
@@ -67,7 +67,7 @@ def test_a_fused_bottleneck_equals_a_bottleneck(style, in_channels, stride, defo
             expected = block(x)
             whole = nn.Sequential(block)
             use_onednn(whole)
-            assert isinstance(whole[0], FusedBottleneck)
+            assert isinstance(whole[0], FusedBlock)
             found = whole(x)
             torch.testing.assert_close(found, expected, atol=TOLERANCE[dtype], rtol=TOLERANCE[dtype])
         if isinstance(block.downsample, nn.Identity):
@@ -109,5 +109,5 @@ def test_without_onednn_a_model_keeps_its_layers(monkeypatch):
         expected = prepare_for_inference(model, cpu)(small_inputs(0)).bev
         monkeypatch.setattr(onednn_layers, "has_onednn", lambda dtype: False)
         kept = prepare_for_inference(model, cpu)
-        assert not any(isinstance(module, PackedLinear | FusedBottleneck) for module in kept.modules())
+        assert not any(isinstance(module, PackedLinear | FusedBlock) for module in kept.modules())
         torch.testing.assert_close(kept(small_inputs(0)).bev, expected, atol=1e-4, rtol=1e-4)

@@ -1,7 +1,5 @@
 """BEVFormer (Li et al. 2022): camera images and ego-motion in, a BEV map and objects out. Then its exported form."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -65,7 +63,6 @@ class BEVFormer(Network):
     def step(
         self, prepared: PreparedFrame, memory: BevHistory | None, upcoming: Sequence[PreparedFrame] = ()
     ) -> tuple[ModelOutputs, BevHistory]:
-        """See `TemporalModel`."""
         inputs = model_inputs([prepared], [None if memory is None else memory.pose], self.config)
         outputs = self(inputs.to(self.device, keep_geometry=True), None if memory is None else memory.bev)
         return outputs, BevHistory(outputs.bev, prepared.frame.world_from_ego)
@@ -75,12 +72,10 @@ class BEVFormer(Network):
         return self.bev_map(clip.inputs[place], memory)
 
     def learn(self, clip: ClipInputs, place: int, memory: Tensor | None) -> tuple[ModelOutputs, Tensor]:
-        """See `Network`."""
         outputs = self(clip.inputs[place], memory)
         return outputs, outputs.bev.detach()
 
     def run_on_shapes(self, images: Tensor, camera_index: Tensor, hits: PillarHits) -> Tensor:
-        """See `Network`."""
         features = self.image_features(images, camera_index)
         query, position = self.bev_queries(torch.empty(1, 18)), self.bev_queries.position()
         bev: Tensor = self.encoder(query, position, features, hits, torch.empty_like(query), torch.empty(1, 2))
@@ -88,8 +83,7 @@ class BEVFormer(Network):
         return bev
 
     @classmethod
-    def export_form(cls, config: ModelConfig, cameras: int) -> RecurrentForm:
-        """See `TemporalModel`."""
+    def export_form(cls, config: ModelConfig, cameras: int) -> "RecurrentForm":
         return RecurrentForm(config, cameras)
 
 
@@ -135,16 +129,13 @@ class RecurrentForm(ExportForm):
 
     @property
     def inputs(self) -> tuple[Port, ...]:
-        """See `ExportForm`."""
         return (*camera_ports(self.config, (1, self.cameras)), *_history_ports(self.config))
 
     def feed(self, prepared: PreparedFrame, memory: BevHistory | None) -> dict[str, Tensor]:
-        """See `ExportForm`."""
         inputs = model_inputs([prepared], [None if memory is None else memory.pose], self.config)
         return recurrent_feed(inputs, None if memory is None else memory.bev, self.config)
 
     def memory(self, prepared: PreparedFrame, memory: BevHistory | None, found: Mapping[str, Tensor]) -> BevHistory:
-        """See `ExportForm`."""
         return BevHistory(found["bev"], prepared.frame.world_from_ego)
 
 

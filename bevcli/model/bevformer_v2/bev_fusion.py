@@ -1,7 +1,5 @@
 """Temporal fusion of BEVFormerV2: the BEV maps of a window of frames become one (paper of V2, section 3.4)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

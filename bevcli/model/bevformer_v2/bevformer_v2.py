@@ -4,8 +4,6 @@ There is no recurrence: every frame of the window is encoded in the current fram
 inference, temporal self-attentions without a history are exchanged for ones that compute beforehand what is constant.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
@@ -64,21 +62,17 @@ class BEVFormerV2Config(ModelConfig):
 
     @property
     def past_frames(self) -> int:
-        """See `ModelConfig`."""
         return -self.frames[0]
 
     @property
     def later_frames(self) -> int:
-        """See `ModelConfig`."""
         return self.frames[-1]
 
     @property
     def uses_history(self) -> bool:
-        """See `ModelConfig`."""
         return len(self.frames) > 1
 
     def check_training(self, clip_frames: int) -> None:
-        """See `ModelConfig`."""
         if self.later_frames:
             raise ConfigError(
                 f"{self.name}: frames after the current one cannot be trained; expected frames that end with 0, "
@@ -164,7 +158,6 @@ class BEVFormerV2(Network):
 
     @property
     def convolutional_parts(self) -> tuple[nn.Module, ...]:
-        """See `TemporalModel`."""
         return self.image_parts if self.fusion is None else (*self.image_parts, self.fusion)
 
     def exchange_parts(self) -> None:
@@ -202,7 +195,6 @@ class BEVFormerV2(Network):
 
     @classmethod
     def export_form(cls, config: ModelConfig, cameras: int) -> WindowForm:
-        """See `TemporalModel`."""
         assert isinstance(config, BEVFormerV2Config)
         if config.later_frames:
             raise BevcliError(
@@ -221,7 +213,6 @@ class BEVFormerV2(Network):
 
     @classmethod
     def without_training_parts(cls, state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
-        """See `TemporalModel`."""
         head = [key for key in state if key.startswith(PERSPECTIVE_HEAD)]
         left = {key: tensor for key, tensor in state.items() if key not in head}
         parts = [f"{len(head)} keys {PERSPECTIVE_HEAD}*"] if head else []

@@ -1,9 +1,4 @@
-"""The exported form of a BEVFormerV2 whose window ends with the current frame.
-
-The image features of the earlier frames enter, and those of the current one come out.
-"""
-
-from __future__ import annotations
+"""The exported form of a BEVFormerV2 whose window ends with the current frame."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -73,7 +68,6 @@ class WindowForm(ExportForm):
 
     @property
     def inputs(self) -> tuple[Port, ...]:
-        """See `ExportForm`."""
         lead, bev_frame = (1, len(self.frames), self.cameras), "the current frame's bev frame"
         images, projection, camera_index, has_image = camera_ports(self.config, lead, "1, F, N", bev_frame)
         window = (
@@ -95,7 +89,6 @@ class WindowForm(ExportForm):
         return (*ports, Port("previous_features", (len(self.frames) - 1, *self._features_shape), meaning))
 
     def outputs(self, *, decode: bool) -> tuple[Port, ...]:
-        """See `ExportForm`."""
         ports = super().outputs(decode=decode)
         if len(self.frames) == 1:
             return ports
@@ -103,7 +96,6 @@ class WindowForm(ExportForm):
         return (*ports, Port("image_features", self._features_shape, meaning))
 
     def facts(self) -> dict[str, Any]:
-        """See `ExportForm`."""
         return {"window": self.frames}
 
     def feed(self, prepared: PreparedFrame, memory: FeatureWindow | None) -> dict[str, Tensor]:
@@ -129,7 +121,6 @@ class WindowForm(ExportForm):
     def memory(
         self, prepared: PreparedFrame, memory: FeatureWindow | None, found: Mapping[str, Tensor]
     ) -> FeatureWindow:
-        """See `ExportForm`."""
         past = self._past(prepared, memory)
         if "image_features" not in found:
             return kept(past, len(past), -self.frames[0])

@@ -1,7 +1,5 @@
 """The window of a BEVFormerV2: the frames that a step sees, and the image features that are kept for the next steps."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -56,7 +54,7 @@ class FrameFeatures:
     has_image: Tensor
 
     @staticmethod
-    def of(prepared: PreparedFrame, features: FeatureMaps) -> FrameFeatures:
+    def of(prepared: PreparedFrame, features: FeatureMaps) -> "FrameFeatures":
         """The features of a frame's images."""
         frame, projections = prepared.frame, prepared.image_from_bev
         maps = (features.tokens, features.level_shapes)

@@ -7,8 +7,6 @@ The sums of bilinear samples stay in vector registers. The compiler cannot know 
 overlap in memory, so that a loop over channels would load and store the sums for every sample.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

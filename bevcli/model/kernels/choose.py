@@ -1,7 +1,5 @@
 """The fastest parts for a device, in the place of the plain ones: kernels, memory layout, folded batch norms."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 
 import torch

@@ -1,7 +1,5 @@
 """Deformable attention and deformable convolution on the CPU, by compiled loops that hold no sampled values."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial

@@ -5,8 +5,6 @@ for memory. The operators are those that PyTorch's compiler uses; where a build 
 own layers.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import torch
@@ -75,36 +73,26 @@ class PackedConvolution(nn.Module):
         return self.packed
 
 
-class FusedBottleneck(nn.Module):
-    """A `Bottleneck` whose batch norms are folded."""
+class FusedBlock(nn.Module):
+    """A `Bottleneck` or a `BasicBlock` whose batch norms are folded."""
 
-    def __init__(self, block: Bottleneck) -> None:
+    def __init__(self, block: Bottleneck | BasicBlock) -> None:
         super().__init__()
-        self.conv1, self.conv3 = PackedConvolution(block.conv1, "relu"), PackedConvolution(block.conv3, "relu")
-        if isinstance(block.conv2, nn.Conv2d):
-            self.conv2: nn.Module = PackedConvolution(block.conv2, "relu")
-        else:
-            self.conv2 = nn.Sequential(block.conv2, nn.ReLU(inplace=True))  # a deformable convolution
-        self.downsample = block.downsample
+        *first, last = [child for name, child in block.named_children() if name.startswith("conv")]
+        self.first = nn.Sequential(*(_with_relu(convolution) for convolution in first))
+        assert isinstance(last, nn.Conv2d)
+        self.last, self.downsample = PackedConvolution(last, "relu"), block.downsample
 
     def forward(self, x: Tensor) -> Tensor:
-        """As `Bottleneck.forward`. Without a `downsample` the result is written over x."""
-        y = self.conv2(self.conv1(x))
-        return self.conv3.add_to(self.downsample(x), y)
+        """As the block's own `forward`. Without a `downsample` the result is written over x."""
+        y = self.first(x)
+        return self.last.add_to(self.downsample(x), y)
 
 
-class FusedBasicBlock(nn.Module):
-    """A `BasicBlock` whose batch norms are folded."""
-
-    def __init__(self, block: BasicBlock) -> None:
-        super().__init__()
-        self.conv1, self.conv2 = PackedConvolution(block.conv1, "relu"), PackedConvolution(block.conv2, "relu")
-        self.downsample = block.downsample
-
-    def forward(self, x: Tensor) -> Tensor:
-        """As `BasicBlock.forward`. Without a `downsample` the result is written over x."""
-        y = self.conv1(x)
-        return self.conv2.add_to(self.downsample(x), y)
+def _with_relu(convolution: nn.Module) -> nn.Module:
+    if isinstance(convolution, nn.Conv2d):
+        return PackedConvolution(convolution, "relu")
+    return nn.Sequential(convolution, nn.ReLU(inplace=True))  # a deformable convolution
 
 
 def use_onednn(part: nn.Module) -> None:
@@ -123,10 +111,8 @@ def _fast(layer: nn.Module) -> nn.Module:
     parameter = next(layer.parameters(), None)
     if parameter is None or not has_onednn(parameter.dtype):
         return layer
-    if isinstance(layer, Bottleneck):
-        return FusedBottleneck(layer)
-    if isinstance(layer, BasicBlock):
-        return FusedBasicBlock(layer)
+    if isinstance(layer, Bottleneck | BasicBlock):
+        return FusedBlock(layer)
     if isinstance(layer, FeedForward):  # dropout has no effect in inference
         return nn.Sequential(PackedLinear(layer.expand, layer.activation), PackedLinear(layer.reduce))
     # Not subclasses, such as the layer in multi-head attention whose weight is read by its owner.

@@ -1,7 +1,5 @@
 """Deformable attention on a GPU as one Triton kernel. Import it only where Triton is installed."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import accumulate
 

@@ -1,7 +1,5 @@
 """The map head's encoder: layers of deformable self-attention among the cells of the BEV map."""
 
-from __future__ import annotations
-
 import math
 
 import torch

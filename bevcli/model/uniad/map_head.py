@@ -4,8 +4,6 @@ After Panoptic SegFormer (Li et al. 2022): an encoder refines the BEV map, a loc
 decoders paint the masks of things and of stuff.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """Merges the masks of the map head into one map."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,11 +51,11 @@ def merge_map(outputs: MapOutputs, config: MapHeadConfig, grid: BevGrid) -> list
     A cell has a stuff class where its mask is larger than `config.min_mask`. Things are written by falling score, with
     the rules of the released code: see `_merge_things`.
     """
+    found = (outputs.thing_masks, outputs.stuff_masks, outputs.scores)
+    columns = (*(each.detach().float() for each in found), outputs.labels)
     return [
-        _merged(masks.detach().float(), stuff.detach().float(), scores.detach().float(), labels, config, grid)
-        for masks, stuff, scores, labels in zip(
-            outputs.thing_masks, outputs.stuff_masks, outputs.scores, outputs.labels, strict=True
-        )
+        _merged(masks, stuff, scores, labels, config, grid)
+        for masks, stuff, scores, labels in zip(*columns, strict=True)
     ]
 
 
@@ -119,12 +117,7 @@ def _merge_things(
 
 def _moved(layers: NDArray[np.bool_], rows: int, columns: int) -> NDArray[np.bool_]:
     """Layers (K, Y, X), moved by whole cells; what leaves the grid is lost."""
-    moved = np.zeros_like(layers)
-    (to_y, from_y), (to_x, from_x) = _overlap(rows), _overlap(columns)
-    moved[:, to_y, to_x] = layers[:, from_y, from_x]
-    return moved
-
-
-def _overlap(shift: int) -> tuple[slice, slice]:
-    """The part of an axis that receives cells in a move by `shift`, and the part that they come from."""
-    return slice(max(shift, 0), shift if shift < 0 else None), slice(max(-shift, 0), -shift if shift > 0 else None)
+    _, height, width = layers.shape
+    y, x = abs(rows), abs(columns)
+    padded = np.pad(layers, ((0, 0), (y, y), (x, x)))
+    return padded[:, y - rows : y - rows + height, x - columns : x - columns + width]

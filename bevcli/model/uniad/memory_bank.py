@@ -44,11 +44,8 @@ class Memories:
 
     def followed_by(self, others: Memories) -> Memories:
         """These memories, then the others."""
-        return Memories(
-            torch.cat([self.embeddings, others.embeddings]),
-            torch.cat([self.is_empty, others.is_empty]),
-            torch.cat([self.wait, others.wait]),
-        )
+        columns = zip(vars(self).values(), vars(others).values(), strict=True)
+        return Memories(*map(torch.cat, columns))
 
 
 class MemoryBank(nn.Module):

@@ -1,11 +1,6 @@
 """Key names of the released weights files of UniAD, and ours."""
 
-from __future__ import annotations
-
 import re
-from collections.abc import Mapping
-
-from torch import Tensor
 
 # The file of the first stage has its own object queries at the top level, beside those of BEVFormer.
 QUERIES = "query_embedding.weight"
@@ -67,8 +62,3 @@ NAMES = (
     (r"^(map_head\.\w+_masks\..*)\.k\.", r"\1.key_projection."),
     (r"^(map_head\.\w+_masks\..*)\.v\.", r"\1.value_projection."),
 )
-
-
-def unused_keys(state: Mapping[str, Tensor]) -> list[str]:
-    """The keys of an official UniAD file that have no effect at inference; none for other files."""
-    return [key for key in state if UNUSED.match(key)] if QUERIES in state else []

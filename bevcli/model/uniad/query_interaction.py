@@ -1,7 +1,5 @@
 """Query interaction (UniAD, after MOTR, Zeng et al. 2022): tracks update their queries for the next frame."""
 
-from __future__ import annotations
-
 import torch.nn.functional as F
 from torch import Tensor, nn
 

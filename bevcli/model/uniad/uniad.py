@@ -1,7 +1,5 @@
 """UniAD's first stage (Hu et al. 2023): BEVFormer's BEV map, track queries that follow objects, and a panoptic map."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, NoReturn
@@ -25,7 +23,7 @@ from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame, model_in
 from bevcli.model.uniad.map_head import MapHead, MapHeadConfig, MapOutputs
 from bevcli.model.uniad.map_merging import merge_map
 from bevcli.model.uniad.memory_bank import Memories, MemoryBank
-from bevcli.model.uniad.official_keys import NAMES, unused_keys
+from bevcli.model.uniad.official_keys import NAMES, QUERIES, UNUSED
 from bevcli.model.uniad.query_interaction import QueryInteraction
 from bevcli.model.uniad.track_queries import (
     EGO,
@@ -65,11 +63,9 @@ class UniADConfig(ModelConfig):
 
     @property
     def map_classes(self) -> tuple[str, ...]:
-        """See `ModelConfig`."""
         return self.map_head.classes
 
     def check_training(self, clip_frames: int) -> None:
-        """See `ModelConfig`."""
         raise ConfigError(f"{self.name}: a UniAD cannot be trained; expected a BEVFormer, such as tiny, small or base")
 
 
@@ -202,7 +198,6 @@ class UniAD(BEVFormer):
     def step(  # type: ignore[override]  # with a memory of its own
         self, prepared: PreparedFrame, memory: TrackMemory | None, upcoming: Sequence[PreparedFrame] = ()
     ) -> tuple[UniADOutputs, TrackMemory]:
-        """See `TemporalModel`."""
         frame, device = prepared.frame, self.device
         is_known = memory is not None and (memory.bev is not None or self.config.ego_motion.first_frame == "original")
         previous_pose = memory.pose if memory is not None and is_known else None
@@ -221,12 +216,10 @@ class UniAD(BEVFormer):
         return replace(memory, bev=None, tracks=memory.tracks.ended())
 
     def decode_boxes(self, outputs: ModelOutputs) -> Boxes3D:
-        """See `TemporalModel`."""
         assert isinstance(outputs, UniADOutputs)
         return decode_tracks(outputs, self.config)
 
     def decode_map(self, outputs: ModelOutputs) -> BevMap | None:
-        """See `TemporalModel`."""
         assert isinstance(outputs, UniADOutputs)
         grid, head = self.config.bev_grid, self.config.map_head
         return None if outputs.map is None else merge_map(outputs.map, head, grid)[0].bev_map(grid, head)
@@ -235,14 +228,12 @@ class UniAD(BEVFormer):
         """See `TemporalModel`: nothing is constant, because the tracks and the learned queries attend to each other."""
 
     def run_on_shapes(self, images: Tensor, camera_index: Tensor, hits: PillarHits) -> Tensor:
-        """See `Network`."""
         bev = super().run_on_shapes(images, camera_index, hits)
         self.map_head(bev)
         return bev
 
     @classmethod
     def export_form(cls, config: ModelConfig, cameras: int) -> NoReturn:
-        """See `TemporalModel`."""
         raise BevcliError(
             f"{config.name}: a UniAD cannot be exported: the number of its tracks changes from frame to frame "
             "(expected a BEVFormer or a BEVFormerV2, such as tiny, base, demo or v2-t2)"
@@ -250,14 +241,12 @@ class UniAD(BEVFormer):
 
     @classmethod
     def without_training_parts(cls, state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
-        """See `TemporalModel`."""
-        unused = unused_keys(state)
+        unused = [key for key in state if UNUSED.match(key)] if QUERIES in state else []
         left = {key: tensor for key, tensor in state.items() if key not in unused}
         return left, f"{len(unused)} keys, such as {unused[0]}" if unused else ""
 
     @classmethod
     def part_names(cls, config: ModelConfig) -> Iterator[tuple[str, ...]]:
-        """See `TemporalModel`."""
         yield from super().part_names(config)
         yield "tracks: memory bank", "memory_bank"
         yield "tracks: query interaction", "query_interaction"
