@@ -4,8 +4,6 @@ Every scene of a nuScenes root in an object store needs the tables of its versio
 them, in $XDG_CACHE_HOME/bevcli/nuscenes-tables (default ~/.cache). Images are copied scene by scene.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -3,8 +3,6 @@
 An object store is named by a URL, such as s3://bucket/fleet. fsspec and its package for the protocol read it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import glob
 import os
@@ -46,11 +44,6 @@ class StoredFile:
 def is_url(text: str) -> bool:
     """A text names a folder in an object store. file:// is a local path."""
     return bool(_URL.match(text)) and not text.startswith("file://")
-
-
-def open_storage(where: str) -> Storage:
-    """The folder of a path or URL. Raises BevcliError where a package for the protocol is not installed."""
-    return RemoteFolder(where) if is_url(where) else LocalFolder(Path(where.removeprefix("file://")))
 
 
 def expand(pattern: str) -> list[str]:
@@ -150,7 +143,7 @@ class LocalFolder:
 
 
 class RemoteFolder:
-    """A folder in an object store, see `LocalFolder`. Raises BevcliError where a package is not installed."""
+    """A folder in an object store, with the methods of `LocalFolder`. Raises BevcliError where a package is missing."""
 
     def __init__(self, where: str) -> None:
         self.where = where.rstrip("/")
@@ -158,7 +151,6 @@ class RemoteFolder:
         self._root = str(path).rstrip("/")
 
     def files(self) -> list[StoredFile]:
-        """See `LocalFolder`."""
         with _one_line(self.where, InputError):
             self._system.invalidate_cache()
             found = self._system.find(self._root, detail=True)
@@ -167,7 +159,6 @@ class RemoteFolder:
         return sorted(described, key=lambda file: file.name)
 
     def names(self, folder: str) -> set[str]:
-        """See `LocalFolder`."""
         with _one_line(f"{self.where}/{folder}", InputError):
             try:
                 self._system.invalidate_cache()
@@ -177,7 +168,6 @@ class RemoteFolder:
         return {PurePosixPath(name).name for name in found}
 
     def read(self, name: str) -> bytes | None:
-        """See `LocalFolder`."""
         with _one_line(f"{self.where}/{name}", InputError):
             try:
                 return bytes(self._system.cat_file(self._path(name)))
@@ -186,7 +176,6 @@ class RemoteFolder:
 
     @contextlib.contextmanager
     def copied(self, name: str) -> Iterator[Path]:
-        """See `LocalFolder`."""
         content = self.read(name)
         if content is None:
             raise InputError(f"{self.where}/{name}: is missing")
@@ -196,17 +185,15 @@ class RemoteFolder:
             yield path
 
     def write(self, name: str, content: bytes) -> None:
-        """See `LocalFolder`."""
         with _one_line(f"{self.where}/{name}", OutputError):
             self._system.pipe_file(self._path(name), content)
 
     def remove(self, name: str) -> None:
-        """See `LocalFolder`."""
         with _one_line(f"{self.where}/{name}", OutputError), contextlib.suppress(FileNotFoundError):
             self._system.rm(self._path(name), recursive=True)
 
     def land(self, folder: Path, name: str, last: str) -> None:
-        """See `LocalFolder`. An object store cannot rename a folder: the file `last` is uploaded last."""
+        """As of a `LocalFolder`. An object store cannot rename a folder: the file `last` is uploaded last."""
         files = [path for path in folder.rglob("*") if path.is_file()]
         files.sort(key=lambda path: path == folder / last)
         with _one_line(f"{self.where}/{name}", OutputError):
@@ -244,6 +231,11 @@ class RemoteFolder:
 
 
 Storage = LocalFolder | RemoteFolder
+
+
+def open_storage(where: str) -> Storage:
+    """The folder of a path or URL. Raises BevcliError where a package for the protocol is not installed."""
+    return RemoteFolder(where) if is_url(where) else LocalFolder(Path(where.removeprefix("file://")))
 
 
 def _stored(path: Path, name: str) -> StoredFile:

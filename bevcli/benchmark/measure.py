@@ -1,7 +1,5 @@
 """The benchmark: times every stage, and compares with the plain version and with the machine's peak throughput."""
 
-from __future__ import annotations
-
 import contextlib
 import platform
 import resource

@@ -1,7 +1,5 @@
 """The result of a benchmark, as JSON, as text, and in the table of docs/speed.md."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Corruptions of images with the parameters of RoboBEV; those of the weather are from imagecorruptions (ImageNet-C)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

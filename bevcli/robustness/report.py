@@ -1,7 +1,5 @@
 """The table, the plot and the contact sheet of a stress test."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence as Items
 from pathlib import Path

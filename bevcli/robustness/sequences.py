@@ -1,7 +1,5 @@
 """Sequences that wrap another one: with faults of images, calibration, times and poses; in memory; at a lower rate."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Collection

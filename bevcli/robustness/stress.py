@@ -1,7 +1,5 @@
 """`stress`: runs a model over the same drives under each condition, scores each, and writes the results."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator, Sequence as Items
 from dataclasses import dataclass, replace
