@@ -1,7 +1,5 @@
 """Parts that the figures share: titles, BEV axes, camera images, boxes and feature colours."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any

@@ -1,7 +1,5 @@
 """ExplainOptions: the frame and the BEV cell that are explained, and the figures."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Literal
 

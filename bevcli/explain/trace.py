@@ -1,7 +1,5 @@
 """A trace: one frame through the model, with the intermediate results that the figures show."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
