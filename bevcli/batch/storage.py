@@ -12,9 +12,8 @@ import tempfile
 import uuid
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 
 from bevcli.errors import BevcliError, InputError, OutputError
 from bevcli.parsing.files import read_bytes
@@ -26,8 +25,7 @@ FETCHING_THREADS = 16  # copying small files from an object store is waiting
 LARGEST_RECORD = 1 << 28  # bytes of a small file that is read as a whole
 
 
-@dataclass(frozen=True)
-class StoredFile:
+class StoredFile(NamedTuple):
     """A file below a folder.
 
     Attributes:
@@ -77,13 +75,12 @@ class LocalFolder:
         if self.path.is_file():
             return [_stored(self.path, self.path.name)]
         found = []
-        for folder, folders, names in os.walk(self.path):
-            folders.sort()
+        for folder, _, names in os.walk(self.path):
             for name in names:
                 path = Path(folder, name)
                 with contextlib.suppress(OSError):  # a broken link
                     found.append(_stored(path, path.relative_to(self.path).as_posix()))
-        return sorted(found, key=lambda file: file.name)
+        return sorted(found)
 
     def names(self, folder: str) -> set[str]:
         """The entries of a subfolder, empty without it. Raises InputError."""
@@ -155,8 +152,7 @@ class RemoteFolder:
             self._system.invalidate_cache()
             found = self._system.find(self._root, detail=True)
         own_name = PurePosixPath(self._root).name  # where the folder is a file
-        described = [_described(name[len(self._root) + 1 :] or own_name, facts) for name, facts in found.items()]
-        return sorted(described, key=lambda file: file.name)
+        return sorted(_described(name[len(self._root) + 1 :] or own_name, facts) for name, facts in found.items())
 
     def names(self, folder: str) -> set[str]:
         with _one_line(f"{self.where}/{folder}", InputError):
@@ -202,10 +198,7 @@ class RemoteFolder:
         shutil.rmtree(folder)
 
     def fetch(self, local: Path, names: Sequence[str] | None = None) -> None:
-        """Copy the folder, or the file that it is, to a local path. Raises InputError.
-
-        names: only these files of the folder; those that are missing are left out.
-        """
+        """Copy the folder, or the file that it is. names: only those of these files that exist. Raises InputError."""
         with _one_line(self.where, InputError), ThreadPoolExecutor(FETCHING_THREADS) as pool:
             if names is None and self._system.isfile(self._root):
                 local.parent.mkdir(parents=True, exist_ok=True)
