@@ -92,6 +92,5 @@ def _best_seconds(work: Callable[[], object], device: torch.device) -> float:
     return best
 
 
-def _sampling_operations(*_shapes: Any, out_val: Any = None, out_shape: Any = None, **_options: Any) -> int:
-    shape = out_val.shape if out_val is not None else out_shape
-    return OPERATIONS_PER_SAMPLE * math.prod(shape)
+def _sampling_operations(*_shapes: Any, out_shape: Any, **_options: Any) -> int:
+    return OPERATIONS_PER_SAMPLE * math.prod(out_shape)
