@@ -1,5 +1,7 @@
 """Figures of the steps that look into the images: features, pillars, spatial cross-attention."""
 
+from itertools import cycle
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
@@ -64,8 +66,8 @@ def pillars(trace: Trace) -> Figure:
             _empty(axes, "no further camera sees this cell" if cameras else "no camera sees this cell")
     axes = figure.add_subplot(grid[:, 1])
     _draw_camera_counts(axes, trace)
-    for i, z in reversed(list(enumerate(heights))):
-        axes.plot([], [], "o", color=_height_color(i), ms=9, label=f"z = {z:.2f} m")
+    for z, color in reversed(list(zip(heights, cycle(HEIGHT_COLORS)))):
+        axes.plot([], [], "o", color=color, ms=9, label=f"z = {z:.2f} m")
     drawing.legend(axes, title="pillar points", title_fontsize=11)
     return figure
 
@@ -124,8 +126,8 @@ def _draw_pillars(axes: Axes, trace: Trace, name: str) -> None:
     own, _ = drawing.project_bev(trace.frame, camera, grid.pillars()[trace.cell])
     axes.plot(*own.T, "-", color="white", lw=4, zorder=4)
     axes.plot(*own.T, "-", color=INK, lw=1.6, zorder=5)
-    for place, pixel in enumerate(own):
-        axes.plot(*pixel, "o", color=_height_color(place), ms=10, mec="white", mew=1.6, zorder=6, clip_on=True)
+    for pixel, color in zip(own, cycle(HEIGHT_COLORS)):
+        axes.plot(*pixel, "o", color=color, ms=10, mec="white", mew=1.6, zorder=6, clip_on=True)
 
 
 def _draw_camera_counts(axes: Axes, trace: Trace) -> None:
@@ -179,10 +181,6 @@ def _inside(samples: CameraSamples, size: Array) -> tuple[Array, Array]:
     with np.errstate(invalid="ignore"):
         inside = ((samples.pixels >= 0) & (samples.pixels < size)).all(-1)
     return samples.pixels[inside], samples.weights[inside]
-
-
-def _height_color(place: int) -> str:
-    return HEIGHT_COLORS[place % len(HEIGHT_COLORS)]
 
 
 def _empty(axes: Axes, text: str) -> None:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,6 +17,7 @@ from bevcli.explain.bev_figures import bev_queries, can_bus, encoder_layers, rec
 from bevcli.explain.camera_figures import image_features, pillars, spatial_attention
 from bevcli.explain.drawing import ACCENT, GREY, INK, LEAST_SCORE, SECOND
 from bevcli.explain.head_figures import box_code, decoder, segmentation
+from bevcli.explain.options import ImageFormat
 from bevcli.explain.trace import Trace
 
 HEIGHT = 7.7  # inches
@@ -126,8 +127,6 @@ def _arrow(canvas: Axes, start: tuple[float, float], end: tuple[float, float], c
     style: dict[str, Any] = {"arrowstyle": "-|>", "mutation_scale": 17, "lw": 2, "shrinkA": 0, "shrinkB": 0}
     canvas.add_patch(FancyArrowPatch(start, end, color=color, **style))
 
-
-ImageFormat = Literal["png", "jpg"]
 
 # In the order of the model.
 FIGURES: dict[str, Callable[[Trace], Figure]] = {
