@@ -4,8 +4,6 @@ Every scene of a nuScenes root in an object store needs the tables of its versio
 them, in $XDG_CACHE_HOME/bevcli/nuscenes-tables (default ~/.cache). Images are copied scene by scene.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -111,15 +109,12 @@ def _scenes(root: Drive, options: NuScenesOptions) -> Iterator[Drive]:
 
 
 def _hash(name: str, scene: str | None, files: list[StoredFile]) -> str:
-    facts = [name, scene, [[file.name, file.size, file.version] for file in files]]
-    return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
+    return hashlib.sha256(json.dumps([name, scene, files]).encode()).hexdigest()
 
 
 def _safe_name(source: str) -> str:
     """The last part of a path or URL as the name of a folder."""
-    name = source.rstrip("/").rpartition("/")[2]
-    for suffix in (".mcap", ".db3"):
-        name = name.removesuffix(suffix)
+    name = source.rstrip("/").rpartition("/")[2].removesuffix(".mcap").removesuffix(".db3")
     return re.sub(r"[^\w.+-]", "_", name).lstrip(".")[:LONGEST_NAME] or "drive"
 
 
@@ -150,7 +145,7 @@ def _copy_tables(url: str, version: str | None) -> tuple[Path, list[StoredFile]]
     chosen = choose_version(url, _versions_at(RemoteFolder(url)), version)
     storage = RemoteFolder(f"{url}/{chosen}")
     files = storage.files()
-    facts = repr((url, [(file.name, file.size, file.version) for file in files]))
+    facts = repr((url, [tuple(file) for file in files]))
     tables = user_cache() / "nuscenes-tables" / hashlib.sha256(facts.encode()).hexdigest()[:16] / chosen
     if not tables.is_dir():
         unfinished = tables.parent / f"{uuid.uuid4().hex[:8]}.new"

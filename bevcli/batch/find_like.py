@@ -1,7 +1,5 @@
 """A vector per frame, the BEV features pooled over the grid, and the frames of a batch that are most similar to one."""
 
-from __future__ import annotations
-
 import base64
 from collections import Counter
 from collections.abc import Sequence

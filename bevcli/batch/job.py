@@ -1,7 +1,5 @@
 """Job: the model and the options that every drive of a batch is run with."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """The options of a batch, of its workers on Ray, and of a search for similar frames."""
 
-from __future__ import annotations
-
 import importlib.util
 from pathlib import Path
 

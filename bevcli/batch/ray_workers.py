@@ -1,7 +1,5 @@
 """Workers on Ray: started on this machine for a batch, or those of a running cluster."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import logging

@@ -1,7 +1,5 @@
 """report.html: one page about a batch that needs no other file, for light and dark browsers."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from html import escape

@@ -1,7 +1,5 @@
 """`run_batch`: skip drives that are done, hand the others to workers, and write the tables and the report."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import io

@@ -3,8 +3,6 @@
 An object store is named by a URL, such as s3://bucket/fleet. fsspec and its package for the protocol read it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import glob
 import os
@@ -14,9 +12,8 @@ import tempfile
 import uuid
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 
 from bevcli.errors import BevcliError, InputError, OutputError
 from bevcli.parsing.files import read_bytes
@@ -28,8 +25,7 @@ FETCHING_THREADS = 16  # copying small files from an object store is waiting
 LARGEST_RECORD = 1 << 28  # bytes of a small file that is read as a whole
 
 
-@dataclass(frozen=True)
-class StoredFile:
+class StoredFile(NamedTuple):
     """A file below a folder.
 
     Attributes:
@@ -46,11 +42,6 @@ class StoredFile:
 def is_url(text: str) -> bool:
     """A text names a folder in an object store. file:// is a local path."""
     return bool(_URL.match(text)) and not text.startswith("file://")
-
-
-def open_storage(where: str) -> Storage:
-    """The folder of a path or URL. Raises BevcliError where a package for the protocol is not installed."""
-    return RemoteFolder(where) if is_url(where) else LocalFolder(Path(where.removeprefix("file://")))
 
 
 def expand(pattern: str) -> list[str]:
@@ -84,13 +75,12 @@ class LocalFolder:
         if self.path.is_file():
             return [_stored(self.path, self.path.name)]
         found = []
-        for folder, folders, names in os.walk(self.path):
-            folders.sort()
+        for folder, _, names in os.walk(self.path):
             for name in names:
                 path = Path(folder, name)
                 with contextlib.suppress(OSError):  # a broken link
                     found.append(_stored(path, path.relative_to(self.path).as_posix()))
-        return sorted(found, key=lambda file: file.name)
+        return sorted(found)
 
     def names(self, folder: str) -> set[str]:
         """The entries of a subfolder, empty without it. Raises InputError."""
@@ -150,7 +140,7 @@ class LocalFolder:
 
 
 class RemoteFolder:
-    """A folder in an object store, see `LocalFolder`. Raises BevcliError where a package is not installed."""
+    """A folder in an object store, with the methods of `LocalFolder`. Raises BevcliError where a package is missing."""
 
     def __init__(self, where: str) -> None:
         self.where = where.rstrip("/")
@@ -158,16 +148,13 @@ class RemoteFolder:
         self._root = str(path).rstrip("/")
 
     def files(self) -> list[StoredFile]:
-        """See `LocalFolder`."""
         with _one_line(self.where, InputError):
             self._system.invalidate_cache()
             found = self._system.find(self._root, detail=True)
         own_name = PurePosixPath(self._root).name  # where the folder is a file
-        described = [_described(name[len(self._root) + 1 :] or own_name, facts) for name, facts in found.items()]
-        return sorted(described, key=lambda file: file.name)
+        return sorted(_described(name[len(self._root) + 1 :] or own_name, facts) for name, facts in found.items())
 
     def names(self, folder: str) -> set[str]:
-        """See `LocalFolder`."""
         with _one_line(f"{self.where}/{folder}", InputError):
             try:
                 self._system.invalidate_cache()
@@ -177,7 +164,6 @@ class RemoteFolder:
         return {PurePosixPath(name).name for name in found}
 
     def read(self, name: str) -> bytes | None:
-        """See `LocalFolder`."""
         with _one_line(f"{self.where}/{name}", InputError):
             try:
                 return bytes(self._system.cat_file(self._path(name)))
@@ -186,7 +172,6 @@ class RemoteFolder:
 
     @contextlib.contextmanager
     def copied(self, name: str) -> Iterator[Path]:
-        """See `LocalFolder`."""
         content = self.read(name)
         if content is None:
             raise InputError(f"{self.where}/{name}: is missing")
@@ -196,17 +181,15 @@ class RemoteFolder:
             yield path
 
     def write(self, name: str, content: bytes) -> None:
-        """See `LocalFolder`."""
         with _one_line(f"{self.where}/{name}", OutputError):
             self._system.pipe_file(self._path(name), content)
 
     def remove(self, name: str) -> None:
-        """See `LocalFolder`."""
         with _one_line(f"{self.where}/{name}", OutputError), contextlib.suppress(FileNotFoundError):
             self._system.rm(self._path(name), recursive=True)
 
     def land(self, folder: Path, name: str, last: str) -> None:
-        """See `LocalFolder`. An object store cannot rename a folder: the file `last` is uploaded last."""
+        """As of a `LocalFolder`. An object store cannot rename a folder: the file `last` is uploaded last."""
         files = [path for path in folder.rglob("*") if path.is_file()]
         files.sort(key=lambda path: path == folder / last)
         with _one_line(f"{self.where}/{name}", OutputError):
@@ -215,10 +198,7 @@ class RemoteFolder:
         shutil.rmtree(folder)
 
     def fetch(self, local: Path, names: Sequence[str] | None = None) -> None:
-        """Copy the folder, or the file that it is, to a local path. Raises InputError.
-
-        names: only these files of the folder; those that are missing are left out.
-        """
+        """Copy the folder, or the file that it is. names: only those of these files that exist. Raises InputError."""
         with _one_line(self.where, InputError), ThreadPoolExecutor(FETCHING_THREADS) as pool:
             if names is None and self._system.isfile(self._root):
                 local.parent.mkdir(parents=True, exist_ok=True)
@@ -244,6 +224,11 @@ class RemoteFolder:
 
 
 Storage = LocalFolder | RemoteFolder
+
+
+def open_storage(where: str) -> Storage:
+    """The folder of a path or URL. Raises BevcliError where a package for the protocol is not installed."""
+    return RemoteFolder(where) if is_url(where) else LocalFolder(Path(where.removeprefix("file://")))
 
 
 def _stored(path: Path, name: str) -> StoredFile:

@@ -1,7 +1,5 @@
 """Worker: runs one drive after another, each exactly as `bevcli run` does, and lands its results."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

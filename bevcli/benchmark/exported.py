@@ -1,7 +1,5 @@
 """`check_exported`: runs a drive through an exported file and through our model, and compares what they compute."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path

@@ -6,8 +6,6 @@ It runs the tests marked `gpu`, compares CPU and GPU for every model and precisi
 speed. Each part is a process of its own with a time limit, so that one that fails or hangs does not end the others.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import json

@@ -1,7 +1,5 @@
 """The machine's peak throughput, measured, and the number of operations of a frame, counted."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable
@@ -37,7 +35,7 @@ class MachineLimits:
     gemm_gflops: float
     copy_gbs: float
 
-    def fastest(self, other: MachineLimits) -> MachineLimits:
+    def fastest(self, other: "MachineLimits") -> "MachineLimits":
         """The higher of two measurements; disturbances only make a measurement lower."""
         return MachineLimits(max(self.gemm_gflops, other.gemm_gflops), max(self.copy_gbs, other.copy_gbs))
 
@@ -94,6 +92,5 @@ def _best_seconds(work: Callable[[], object], device: torch.device) -> float:
     return best
 
 
-def _sampling_operations(*_shapes: Any, out_val: Any = None, out_shape: Any = None, **_options: Any) -> int:
-    shape = out_val.shape if out_val is not None else out_shape
-    return OPERATIONS_PER_SAMPLE * math.prod(shape)
+def _sampling_operations(*_shapes: Any, out_shape: Any, **_options: Any) -> int:
+    return OPERATIONS_PER_SAMPLE * math.prod(out_shape)

@@ -1,7 +1,5 @@
 """Made-up inputs for timing: a drive with six cameras, and a model with random weights."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

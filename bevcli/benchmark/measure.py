@@ -1,7 +1,5 @@
 """The benchmark: times every stage, and compares with the plain version and with the machine's peak throughput."""
 
-from __future__ import annotations
-
 import contextlib
 import platform
 import resource
@@ -107,17 +105,16 @@ def _time_stages(fast: Version, drive: MadeUpDrive, first: int, timed: range) ->
             if place == timed.start:
                 times.clear()
                 fast.seconds = []
-            marks = [time.perf_counter()]
+            began = time.perf_counter()
             frame = drive.load(place)
-            marks.append(time.perf_counter())
+            loaded = time.perf_counter()
             prepared = preprocessor(frame)
-            marks.append(time.perf_counter())
+            before = {"decode": loaded - began, "preprocess": time.perf_counter() - loaded}
             prediction = fast.step(prepared)
             recording_began = time.perf_counter()
             recording.log(frame, prediction)
-            recording_s = time.perf_counter() - recording_began
-            outside = {"decode": marks[1] - marks[0], "preprocess": marks[2] - marks[1]}
-            for stage, seconds in {**outside, **prediction.stage_seconds, "recording": recording_s}.items():
+            after = {"recording": time.perf_counter() - recording_began}
+            for stage, seconds in {**before, **prediction.stage_seconds, **after}.items():
                 times[stage].append(seconds)
     return {stage: tuple(seconds) for stage, seconds in times.items()}
 

@@ -1,7 +1,5 @@
 """BenchOptions: the options of the benchmark."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """The result of a benchmark, as JSON, as text, and in the table of docs/speed.md."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -152,19 +150,16 @@ class BenchmarkResult:
             f"{self.limits.copy_gbs:.1f} GB/s (copying)",
             f"peak memory                {memory:.0f} MB",
         ]
-        return "\n".join(lines + self._comparison_lines())
-
-    def _comparison_lines(self) -> list[str]:
-        if self.comparison is None:
-            return []
         found = self.comparison
-        return [
-            f"plain version              {1000 * median(found.plain_frame_s):.0f} ms per frame, "
-            f"{self.speedup:.2f} times the prepared model's",
-            f"largest difference to it   {found.max_box_difference_m:.2g} m "
-            f"({found.share_within_tenth_m:.1%} of the boxes within 0.1 m), "
-            f"{found.max_score_difference:.2g} in the scores",
-        ]
+        if found is not None:
+            lines += [
+                f"plain version              {1000 * median(found.plain_frame_s):.0f} ms per frame, "
+                f"{self.speedup:.2f} times the prepared model's",
+                f"largest difference to it   {found.max_box_difference_m:.2g} m "
+                f"({found.share_within_tenth_m:.1%} of the boxes within 0.1 m), "
+                f"{found.max_score_difference:.2g} in the scores",
+            ]
+        return "\n".join(lines)
 
 
 def write_table(path: Path, device: torch.device, frames: int) -> None:

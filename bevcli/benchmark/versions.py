@@ -1,7 +1,5 @@
 """Versions of a model: the plain one as a yardstick of speed and results, and the prepared one, compared with it."""
 
-from __future__ import annotations
-
 import copy
 import time
 from collections.abc import Iterable, Sequence

@@ -1,6 +1,6 @@
 """Figures of the steps that look into the images: features, pillars, spatial cross-attention."""
 
-from __future__ import annotations
+from itertools import cycle
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -8,24 +8,8 @@ from matplotlib.collections import PathCollection
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
-from bevcli.explain.drawing import (
-    ACCENT,
-    GREY,
-    INK,
-    SECOND,
-    bare,
-    bev_axes,
-    color_bar,
-    legend,
-    mark_cell,
-    outline,
-    paper,
-    project_bev,
-    show_bev,
-    show_camera,
-    show_lengths,
-    titled_figure,
-)
+from bevcli.explain import drawing
+from bevcli.explain.drawing import ACCENT, GREY, INK, SECOND
 from bevcli.explain.trace import Trace
 from bevcli.frame import CameraSamples
 from bevcli.geometry.transforms import Array
@@ -38,7 +22,7 @@ def image_features(trace: Trace) -> Figure:
     """The neck's feature maps over the images."""
     names = trace.prepared.assignment.cameras[:MOST_CAMERAS]
     rows = len(trace.feature_maps) + 1
-    figure = titled_figure(
+    figure = drawing.titled_figure(
         1.35 + 1.42 * rows,
         "Image features: what the backbone and the neck make of the images",
         "Top: the images. Below: the length of the feature vector at each position, one row per feature level.\n"
@@ -48,13 +32,13 @@ def image_features(trace: Trace) -> Figure:
     grid = figure.add_gridspec(rows, len(names), wspace=0.04, hspace=0.22, left=0.06, right=0.99, bottom=0.02)
     for column, name in enumerate(names):
         axes = figure.add_subplot(grid[0, column])
-        show_camera(axes, trace.frame, name)
+        drawing.show_camera(axes, trace.frame, name)
         axes.title.set_fontsize(10)
     for row, maps in enumerate(trace.feature_maps, start=1):
         lengths = maps.norm(dim=1).float().cpu().numpy()  # (N, H_l, W_l)
         for column in range(len(names)):
             axes = figure.add_subplot(grid[row, column])
-            show_lengths(axes, trace, lengths, column)
+            drawing.show_lengths(axes, trace, lengths, column)
             if column == 0:
                 shape = " × ".join(map(str, maps.shape[-3:]))
                 axes.set_ylabel(f"level {row}\n{shape}", fontsize=11, color=INK)
@@ -65,7 +49,7 @@ def pillars(trace: Trace) -> Figure:
     """The pillar of the followed cell in the cameras that see it, and how many cameras see each cell."""
     heights = trace.grid.pillar_heights()
     cameras = _cameras_of_cell(trace)
-    figure = titled_figure(
+    figure = drawing.titled_figure(
         8.2,
         "Pillars and 3D reference points: from a BEV cell into the cameras",
         f"A pillar of {len(heights)} points stands on each BEV cell. Its points are projected into every camera with "
@@ -76,15 +60,15 @@ def pillars(trace: Trace) -> Figure:
     for place in range(2):
         axes = figure.add_subplot(grid[place, 0])
         if place < len(cameras):
-            show_camera(axes, trace.frame, cameras[place])
+            drawing.show_camera(axes, trace.frame, cameras[place])
             _draw_pillars(axes, trace, cameras[place])
         else:
             _empty(axes, "no further camera sees this cell" if cameras else "no camera sees this cell")
     axes = figure.add_subplot(grid[:, 1])
     _draw_camera_counts(axes, trace)
-    for i, z in reversed(list(enumerate(heights))):
-        axes.plot([], [], "o", color=_height_color(i), ms=9, label=f"z = {z:.2f} m")
-    legend(axes, title="pillar points", title_fontsize=11)
+    for z, color in reversed(list(zip(heights, cycle(HEIGHT_COLORS)))):
+        axes.plot([], [], "o", color=color, ms=9, label=f"z = {z:.2f} m")
+    drawing.legend(axes, title="pillar points", title_fontsize=11)
     return figure
 
 
@@ -96,7 +80,7 @@ def spatial_attention(trace: Trace) -> Figure:
     samples = dict(probes[0].cameras) if probes else {}
     cameras = list(samples)[:2]
     rows = max(len(cameras), 1)
-    figure = titled_figure(
+    figure = drawing.titled_figure(
         1.6 + 3.55 * rows,
         "Spatial cross-attention: where one BEV cell looks in the images",
         f"Cell at x = {x:.1f} m, y = {y:.1f} m, last encoder layer, all heads and feature levels. Crosses: projected "
@@ -110,14 +94,14 @@ def spatial_attention(trace: Trace) -> Figure:
     largest = max(float(part.weights.max()) for part in samples.values())
     for row, name in enumerate(cameras):
         whole, zoomed = (figure.add_subplot(grid[row, column]) for column in range(2))
-        show_camera(whole, trace.frame, name)
-        show_camera(zoomed, trace.frame, name, "enlarged")
+        drawing.show_camera(whole, trace.frame, name)
+        drawing.show_camera(zoomed, trace.frame, name, "enlarged")
         window = _zoom_window(trace, name, samples[name])
-        outline(whole, window, (3, 1.6))
+        drawing.outline(whole, window, (3, 1.6))
         _draw_samples(whole, trace, name, samples[name], largest, size=30)
         dots = _draw_samples(zoomed, trace, name, samples[name], largest, size=160)
         zoomed.set(xlim=(window[0], window[0] + window[2]), ylim=(window[1] + window[3], window[1]))
-    color_bar(figure, dots, (0.944, 0.08, 0.011, 0.6)).set_label("attention weight", fontsize=11, color=GREY)
+    drawing.color_bar(figure, dots, (0.944, 0.08, 0.011, 0.6)).set_label("attention weight", fontsize=11, color=GREY)
     return figure
 
 
@@ -134,16 +118,16 @@ def _draw_pillars(axes: Axes, trace: Trace, name: str) -> None:
     grid = trace.grid
     step = max(1, round(4.0 / grid.cell_size_m[0]))
     pillars = grid.pillars()[trace.cell[0] % step :: step, trace.cell[1] % step :: step]
-    pixels, visible = project_bev(trace.frame, camera, pillars.reshape(-1, grid.pillar_points, 3))
+    pixels, visible = drawing.project_bev(trace.frame, camera, pillars.reshape(-1, grid.pillar_points, 3))
     for column, seen in zip(pixels, visible, strict=True):
         if seen.all():
             axes.plot(*column.T, "-", color="white", lw=0.6, alpha=0.55, zorder=2)
             axes.plot(*column.T, ".", color="white", ms=2.5, alpha=0.7, zorder=2)
-    own, _ = project_bev(trace.frame, camera, grid.pillars()[trace.cell])
+    own, _ = drawing.project_bev(trace.frame, camera, grid.pillars()[trace.cell])
     axes.plot(*own.T, "-", color="white", lw=4, zorder=4)
     axes.plot(*own.T, "-", color=INK, lw=1.6, zorder=5)
-    for place, pixel in enumerate(own):
-        axes.plot(*pixel, "o", color=_height_color(place), ms=10, mec="white", mew=1.6, zorder=6, clip_on=True)
+    for pixel, color in zip(own, cycle(HEIGHT_COLORS)):
+        axes.plot(*pixel, "o", color=color, ms=10, mec="white", mew=1.6, zorder=6, clip_on=True)
 
 
 def _draw_camera_counts(axes: Axes, trace: Trace) -> None:
@@ -152,12 +136,12 @@ def _draw_camera_counts(axes: Axes, trace: Trace) -> None:
     most = max(int(counts.max()), 2)
     shades = ["#f1f2f4", "#bcd9ee", "#5fa3d3", "#1769aa", "#0b3d68"]
     colors = ListedColormap(shades[: most + 1] if most < len(shades) else shades)
-    bev_axes(axes, trace, "Number of cameras that see each BEV cell")
-    image = show_bev(axes, trace, counts, cmap=colors, vmin=-0.5, vmax=colors.N - 0.5)
-    mark_cell(axes, trace)
+    drawing.bev_axes(axes, trace, "Number of cameras that see each BEV cell")
+    image = drawing.show_bev(axes, trace, counts, cmap=colors, vmin=-0.5, vmax=colors.N - 0.5)
+    drawing.mark_cell(axes, trace)
     text = f"followed cell\nrow {trace.cell[0]}, column {trace.cell[1]}"
     label = axes.annotate(text, tuple(trace.cell_center), (-14, 14), textcoords="offset points", ha="right", zorder=12)
-    label.set(fontsize=12, color=ACCENT, fontweight="bold", bbox=paper(0.25, 0.85))
+    label.set(fontsize=12, color=ACCENT, fontweight="bold", bbox=drawing.paper(0.25, 0.85))
     bar = axes.figure.colorbar(image, ax=axes, ticks=range(colors.N), shrink=0.55, pad=0.02)
     bar.ax.tick_params(labelsize=11, colors=GREY, length=0)
 
@@ -182,7 +166,7 @@ def _draw_samples(
     points, weights = _inside(samples, np.array([camera.width, camera.height], dtype=np.float64))
     order = np.argsort(weights)
     shares = weights[order] / largest
-    own, visible = project_bev(trace.frame, camera, trace.grid.pillars()[trace.cell])
+    own, visible = drawing.project_bev(trace.frame, camera, trace.grid.pillars()[trace.cell])
     x, y = own[visible].T
     axes.scatter(x, y, marker="x", s=3 * size, c="white", linewidths=0.03 * size + 1.5, zorder=3)
     axes.scatter(x, y, marker="x", s=2.4 * size, c=SECOND, linewidths=0.014 * size + 0.8, zorder=3)
@@ -199,11 +183,7 @@ def _inside(samples: CameraSamples, size: Array) -> tuple[Array, Array]:
     return samples.pixels[inside], samples.weights[inside]
 
 
-def _height_color(place: int) -> str:
-    return HEIGHT_COLORS[place % len(HEIGHT_COLORS)]
-
-
 def _empty(axes: Axes, text: str) -> None:
-    bare(axes)
+    drawing.bare(axes)
     axes.set_facecolor("#f6f7f9")
     axes.text(0.5, 0.5, text, ha="center", va="center", fontsize=14, color=GREY, transform=axes.transAxes)

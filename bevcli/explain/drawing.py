@@ -1,7 +1,5 @@
 """Parts that the figures share: titles, BEV axes, camera images, boxes and feature colours."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
@@ -136,8 +134,7 @@ def paper(pad: float, alpha: float) -> dict[str, Any]:
 
 def legend(axes: Axes, handles: list[Line2D] | None = None, size: float = 11, **options: Any) -> None:
     """The legend at the lower right, on top of all else. handles: default all that has a label."""
-    lines = {} if handles is None else {"handles": handles}
-    axes.legend(**lines, fontsize=size, loc="lower right", framealpha=0.95, **options).set_zorder(20)
+    axes.legend(handles=handles, fontsize=size, loc="lower right", framealpha=0.95, **options).set_zorder(20)
 
 
 def grid_lines(axes: Axes, grid: BevGrid, color: str, width: float, most: int | None = None) -> None:
@@ -178,10 +175,7 @@ def outline(
 def outline_boxes(
     axes: Axes, boxes: Boxes3D, color: str, width: float = 1.6, style: str = "-", halo: bool = False
 ) -> None:
-    """Boxes in the bev frame from above; a line from the centre shows the heading.
-
-    halo: a white border around the lines, for boxes on coloured maps.
-    """
+    """Boxes in the bev frame from above, with a line to the front. halo: a white border, for boxes on coloured maps."""
     corners = boxes.corners()[:, :4, :2]
     effects: list[AbstractPathEffect] = [Normal()]
     if halo:

@@ -1,11 +1,9 @@
 """All figures of one traced frame with their files, and the overview of the whole model."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,25 +12,12 @@ from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 from numpy.typing import NDArray
 
 from bevcli.errors import OutputError
+from bevcli.explain import drawing
 from bevcli.explain.bev_figures import bev_queries, can_bus, encoder_layers, recurrence, temporal_attention
 from bevcli.explain.camera_figures import image_features, pillars, spatial_attention
-from bevcli.explain.drawing import (
-    ACCENT,
-    GREY,
-    INK,
-    LEAST_SCORE,
-    SECOND,
-    bare,
-    bev_axes,
-    feature_colors,
-    outline_boxes,
-    rgb_image,
-    show_bev,
-    show_lengths,
-    show_map,
-    titled_figure,
-)
+from bevcli.explain.drawing import ACCENT, GREY, INK, LEAST_SCORE, SECOND
 from bevcli.explain.head_figures import box_code, decoder, segmentation
+from bevcli.explain.options import ImageFormat
 from bevcli.explain.trace import Trace
 
 HEIGHT = 7.7  # inches
@@ -48,7 +33,7 @@ FLOW = (
 
 def overview(trace: Trace) -> Figure:
     """All steps of one frame."""
-    figure = titled_figure(
+    figure = drawing.titled_figure(
         HEIGHT,
         "BEVFormer: one frame through the model",
         f"Model {trace.config.name}, frame {trace.frame.stamp.index}. Blue: learned parts of the model. "
@@ -62,8 +47,8 @@ def overview(trace: Trace) -> Figure:
     maps = [trace.cell_map(trace.outputs.bev[0])]
     if trace.aligned_history is not None:
         maps.append(trace.cell_map(trace.aligned_history))
-    colors = feature_colors(maps)
-    _bev(figure, trace, (0.435, 0.645), "BEV queries", feature_colors([trace.cell_map(trace.bev_embedding)])[0])
+    colors = drawing.feature_colors(maps)
+    _bev(figure, trace, (0.435, 0.645), "BEV queries", drawing.feature_colors([trace.cell_map(trace.bev_embedding)])[0])
     if trace.aligned_history is not None:
         image = colors[1]
         image[(maps[1] == 0).all(-1)] = 255
@@ -80,10 +65,10 @@ def _images_and_features(figure: Figure, trace: Trace) -> None:
     for place, name in enumerate(names):
         bottom = 0.79 - 0.127 * (place + 1)
         axes = figure.add_axes((0.012, bottom, 0.125, 0.118))
-        image = rgb_image(trace.frame, name)
+        image = drawing.rgb_image(trace.frame, name)
         axes.imshow(np.full((9, 16, 3), 225, np.uint8) if image is None else image, aspect="auto")
-        bare(axes)
-        show_lengths(figure.add_axes((0.265, bottom, 0.125, 0.118)), trace, lengths, place, aspect="auto")
+        drawing.bare(axes)
+        drawing.show_lengths(figure.add_axes((0.265, bottom, 0.125, 0.118)), trace, lengths, place, aspect="auto")
     figure.text(0.012, 0.8, f"{len(trace.frame.rig.cameras)} cameras", fontsize=12.5, color=INK)
     figure.text(0.265, 0.8, "image features", fontsize=12.5, color=INK)
 
@@ -92,20 +77,20 @@ def _bev(
     figure: Figure, trace: Trace, corner: tuple[float, float], title: str, image: NDArray | None, width: float = 0.1
 ) -> Axes:
     axes = figure.add_axes((*corner, width, width * 14.0 / HEIGHT))
-    bev_axes(axes, trace, title, ticks=False)
+    drawing.bev_axes(axes, trace, title, ticks=False)
     axes.title.set_fontsize(12.5)
     if image is not None:
-        show_bev(axes, trace, image)
+        drawing.show_bev(axes, trace, image)
     return axes
 
 
 def _results(figure: Figure, trace: Trace) -> None:
     axes = _bev(figure, trace, (0.875, 0.56), "Objects", None, width=0.118)
-    outline_boxes(axes, trace.prediction.boxes.scored(LEAST_SCORE), ACCENT, width=1.3)
+    drawing.outline_boxes(axes, trace.prediction.boxes.scored(LEAST_SCORE), ACCENT, width=1.3)
     bev_map = trace.prediction.segmentation
     if bev_map is not None:
         axes = _bev(figure, trace, (0.875, 0.145), "Segmentation", None, width=0.118)
-        show_map(axes, trace, bev_map)
+        drawing.show_map(axes, trace, bev_map)
 
 
 def _flow(canvas: Axes, trace: Trace) -> None:
@@ -142,8 +127,6 @@ def _arrow(canvas: Axes, start: tuple[float, float], end: tuple[float, float], c
     style: dict[str, Any] = {"arrowstyle": "-|>", "mutation_scale": 17, "lw": 2, "shrinkA": 0, "shrinkB": 0}
     canvas.add_patch(FancyArrowPatch(start, end, color=color, **style))
 
-
-ImageFormat = Literal["png", "jpg"]
 
 # In the order of the model.
 FIGURES: dict[str, Callable[[Trace], Figure]] = {

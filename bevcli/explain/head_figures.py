@@ -1,7 +1,5 @@
 """Figures of the heads: the object decoder, one box code, and segmentation."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from matplotlib.axes import Axes
@@ -10,29 +8,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
-from bevcli.explain.drawing import (
-    ACCENT,
-    FAINT,
-    GREY,
-    INK,
-    LEAST_SCORE,
-    PALE,
-    SECOND,
-    THIRD,
-    arrow,
-    bev_axes,
-    bev_panel,
-    color_bar,
-    ground_truth_in_bev,
-    legend,
-    outline_boxes,
-    page_colors,
-    paper,
-    show_bev,
-    show_map,
-    table_text,
-    titled_figure,
-)
+from bevcli.explain import drawing
+from bevcli.explain.drawing import ACCENT, FAINT, GREY, INK, LEAST_SCORE, PALE, SECOND, THIRD
 from bevcli.explain.trace import Trace
 from bevcli.frame import MAP_CLASSES
 from bevcli.geometry.boxes import Boxes3D
@@ -49,7 +26,7 @@ def decoder(trace: Trace) -> Figure:
     points = reference_points(trace)  # (L + 1, Q, 2)
     scores = trace.outputs.class_logits[:, 0].float().sigmoid().amax(-1).cpu().numpy()  # (L, Q)
     chosen = np.flatnonzero(scores[-1] >= LEAST_SCORE)
-    figure = titled_figure(
+    figure = drawing.titled_figure(
         7.35,
         "Object decoder: reference points move to the objects",
         f"{points.shape[1]} object queries, {len(points) - 1} layers. Left: every query starts at a learned place; "
@@ -57,9 +34,11 @@ def decoder(trace: Trace) -> Figure:
         "Right: the boxes of these queries.",
     )
     spec = figure.add_gridspec(1, 2, wspace=0.1, bottom=0.075)
-    _draw_paths(bev_panel(figure, spec[0], trace, "Reference points from the start to the last layer"), points, chosen)
+    _draw_paths(
+        drawing.bev_panel(figure, spec[0], trace, "Reference points from the start to the last layer"), points, chosen
+    )
     title = f"Boxes with a score of at least {LEAST_SCORE:g}; arrows: velocity"
-    _draw_boxes(bev_panel(figure, spec[1], trace, title), trace)
+    _draw_boxes(drawing.bev_panel(figure, spec[1], trace, title), trace)
     return figure
 
 
@@ -70,7 +49,7 @@ def box_code(trace: Trace) -> Figure:
     query = _query_at_cell(trace, codes[-1], scores[-1])
     label = int(scores[-1, query].argmax())
     name = trace.config.classes[label]
-    figure = titled_figure(
+    figure = drawing.titled_figure(
         6.1,
         "Box code: ten numbers per object query",
         f"Query {query}, class {name}. Left: its code after each decoder layer, and what the last one means.\n"
@@ -79,11 +58,11 @@ def box_code(trace: Trace) -> Figure:
     )
     spec = figure.add_gridspec(1, 2, width_ratios=(1.75, 1), wspace=0.09, left=0.015, right=0.985, bottom=0.085)
     _draw_code_table(figure.add_subplot(spec[0]), codes[:, query], scores[:, query, label], name)
-    axes = bev_panel(figure, spec[1], trace, "Box after each layer")
+    axes = drawing.bev_panel(figure, spec[1], trace, "Box after each layer")
     center = codes[-1, query, :2]
     for layer in range(len(codes) - 1):
-        outline_boxes(axes, _box_of(trace, layer, query), SECOND, width=1.4, style=":")
-    outline_boxes(axes, _box_of(trace, len(codes) - 1, query), ACCENT, width=2.4)
+        drawing.outline_boxes(axes, _box_of(trace, layer, query), SECOND, width=1.4, style=":")
+    drawing.outline_boxes(axes, _box_of(trace, len(codes) - 1, query), ACCENT, width=2.4)
     truth = _draw_truth(axes, trace, width=1.2)
     path = reference_points(trace)[:, query]
     axes.plot(*path.T, "-", color=GREY, lw=1, zorder=5)
@@ -92,7 +71,7 @@ def box_code(trace: Trace) -> Figure:
     axes.set(xlim=(center[0] - reach, center[0] + reach), ylim=(center[1] - reach, center[1] + reach))
     earlier = axes.plot([], [], ":", color=SECOND, label="earlier layers")
     last = axes.plot([], [], "-", color=ACCENT, lw=2.4, label="last layer")
-    legend(axes, [*earlier, *last, *truth])
+    drawing.legend(axes, [*earlier, *last, *truth])
     return figure
 
 
@@ -106,7 +85,7 @@ def segmentation(trace: Trace) -> Figure:
     stuff = STUFF_CLASSES
     layers = torch.cat([masks[: len(stuff)], masks[len(stuff) :].amax(0, keepdim=True)])
     shares = layers.cpu().numpy().reshape(-1, grid.rows, grid.columns)
-    figure = titled_figure(
+    figure = drawing.titled_figure(
         8.9,
         "Segmentation head: each query paints one mask on the BEV grid",
         "Top: mask probability times class probability of the three stuff queries, and the maximum over the "
@@ -115,10 +94,10 @@ def segmentation(trace: Trace) -> Figure:
     )
     spec = figure.add_gridspec(1, 4, wspace=0.1, left=0.045, right=0.94, top=0.805, bottom=0.52)
     for column, (name, share) in enumerate(zip((*stuff, THING_CLASS), shares, strict=True)):
-        axes = bev_panel(figure, spec[column], trace, name.replace("_", " "), y_labels=column == 0)
-        image = show_bev(axes, trace, share, cmap="magma", vmin=0, vmax=1)
+        axes = drawing.bev_panel(figure, spec[column], trace, name.replace("_", " "), y_labels=column == 0)
+        image = drawing.show_bev(axes, trace, share, cmap="magma", vmin=0, vmax=1)
         axes.set_xlabel("")
-    color_bar(figure, image, (0.95, 0.55, 0.01, 0.22), (0, 0.5, 1))
+    drawing.color_bar(figure, image, (0.95, 0.55, 0.01, 0.22), (0, 0.5, 1))
     lower = figure.add_gridspec(1, 3, wspace=0.1, left=0.045, right=1.06, top=0.445, bottom=0.06)
     shown = {"Merged map of the model": trace.prediction.segmentation, "Ground truth": trace.frame.ground_truth_map}
     for column, (title, bev_map) in enumerate(shown.items()):
@@ -127,11 +106,11 @@ def segmentation(trace: Trace) -> Figure:
             axes.axis("off")
             axes.text(0.5, 0.5, "no ground truth map\nin this sequence", ha="center", color=GREY, fontsize=13)
             continue
-        bev_axes(axes, trace, title)
-        show_map(axes, trace, bev_map, interpolation="nearest")
+        drawing.bev_axes(axes, trace, title)
+        drawing.show_map(axes, trace, bev_map, interpolation="nearest")
     axes = figure.add_subplot(lower[2])
     axes.axis("off")
-    colors = page_colors(MAP_CLASSES)
+    colors = drawing.page_colors(MAP_CLASSES)
     handles = [Patch(fc=np.array(color) / 255, label=name.replace("_", " ")) for name, color in colors.items()]
     axes.legend(handles=handles, loc="center left", fontsize=13, frameon=False)
     return figure
@@ -158,27 +137,27 @@ def _draw_paths(axes: Axes, points: Array, chosen: np.ndarray) -> None:
         dots.set_label(f"after layer {layer + 1}")
     start = axes.plot(*points[0, chosen].T, "o", mfc="white", mec=INK, ms=6, mew=1.3, zorder=4)
     start[0].set_label("start of a coloured query")
-    legend(axes, size=10.5)
+    drawing.legend(axes, size=10.5)
 
 
 def _draw_boxes(axes: Axes, trace: Trace) -> None:
     handles = _draw_truth(axes, trace, width=1.3)
     boxes = trace.prediction.boxes.scored(LEAST_SCORE)
-    outline_boxes(axes, boxes, ACCENT, width=2.0)
+    drawing.outline_boxes(axes, boxes, ACCENT, width=2.0)
     handles += axes.plot([], [], "-", color=ACCENT, lw=2, label="prediction")
     for center, velocity in zip(boxes.centers[:, :2], boxes.velocities, strict=True):
         if np.hypot(*velocity) > 0.5:
-            arrow(axes, center, center + velocity, 1.6, zorder=9, annotation_clip=True)
+            drawing.arrow(axes, center, center + velocity, 1.6, zorder=9, annotation_clip=True)
     _label_boxes(axes, boxes, trace.extent_m * (0.19, 0.033))
-    legend(axes, handles)
+    drawing.legend(axes, handles)
 
 
 def _draw_truth(axes: Axes, trace: Trace, width: float) -> list[Line2D]:
     """Draws the ground truth, if there is any; returns its line for the legend."""
-    truth = ground_truth_in_bev(trace.frame)
+    truth = drawing.ground_truth_in_bev(trace.frame)
     if truth is None:
         return []
-    outline_boxes(axes, truth, PALE, width=width, style="--")
+    drawing.outline_boxes(axes, truth, PALE, width=width, style="--")
     return axes.plot([], [], "--", color=PALE, label="ground truth")
 
 
@@ -195,7 +174,7 @@ def _label_boxes(axes: Axes, boxes: Boxes3D, room: Array) -> None:
             continue
         labelled.append(place)
         label = axes.text(place[0], place[1], f"{name.replace('_', ' ')} {score:.2f}", fontsize=9, color=INK)
-        label.set(zorder=10, clip_on=True, bbox=paper(0.1, 0.7))
+        label.set(zorder=10, clip_on=True, bbox=drawing.paper(0.1, 0.7))
 
 
 def _query_at_cell(trace: Trace, codes: Array, scores: Array) -> int:
@@ -217,7 +196,7 @@ def _box_of(trace: Trace, layer: int, query: int) -> Boxes3D:
 
 
 def _draw_code_table(axes: Axes, codes: Array, scores: Array, name: str) -> None:
-    layers, write = len(codes), table_text(axes)
+    layers, write = len(codes), drawing.table_text(axes)
     shown = sorted({0, layers // 2, layers - 1})
     axes.set(xlim=(0, 10), ylim=(11.3, -1.5))
     axes.axis("off")

@@ -1,7 +1,5 @@
 """ExplainOptions: the frame and the BEV cell that are explained, and the figures."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Literal
 
@@ -10,6 +8,7 @@ from bevcli.options import option, options
 from bevcli.recording.options import parse_position
 
 DEFAULT_FRAME = 10
+ImageFormat = Literal["png", "jpg"]
 
 
 @options()
@@ -28,7 +27,7 @@ class ExplainOptions:
         metavar="X,Y",
         parse=parse_position,
     )
-    image_format: Literal["png", "jpg"] = option(default="png", help="File format of the figures.", flag="--format")
+    image_format: ImageFormat = option(default="png", help="File format of the figures.", flag="--format")
     out: Path = option(
         default=Path("explained"), help="Folder for the figures; files of the same name are overwritten."
     )

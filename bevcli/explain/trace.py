@@ -1,7 +1,5 @@
 """A trace: one frame through the model, with the intermediate results that the figures show."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -21,6 +19,7 @@ from bevcli.model.network import Network
 from bevcli.model.pillar_projection import project_pillars
 from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import TemporalModel
+from bevcli.sequences.selection import scenes_of
 
 RECENT = 4  # frames that the figure of the recurrence shows, the traced one included
 DEFAULT_DISTANCE_M = 10.0  # of the default cell, ahead of the vehicle, where no box is
@@ -115,7 +114,8 @@ def trace(
     cell = None if cell_xy is None else cell_at(cell_xy, model.config.bev_grid)
     runner = Runner(model, device, StepOptions())
     preprocessor = Preprocessor(model.config)
-    places = range(_scene_start(sequence, place), place)
+    scene = next(places for places in scenes_of(sequence.stamps) if place in places)
+    places = range(scene[0], place)
     state: BevState | None = None
     recent: list[tuple[Frame, Prediction]] = []
     for frame, prediction, state in runner.run(sequence, places, preprocessor):  # noqa: B007
@@ -141,24 +141,15 @@ def cell_at(cell_xy: tuple[float, float], grid: BevGrid) -> tuple[int, int]:
     return row, column
 
 
-def _scene_start(sequence: Sequence, place: int) -> int:
-    scene = sequence.stamps[place].scene
-    start = place
-    while start > 0 and sequence.stamps[start - 1].scene == scene:
-        start -= 1
-    return start
-
-
 def _default_cell(frame: Frame, prediction: Prediction) -> tuple[float, float]:
     """The centre of the best-scored box ahead of the vehicle; without one, a place ahead of the vehicle."""
     boxes = prediction.boxes
     ahead = prediction.boxes_ego.centers[:, 0] > 0
     inside = (prediction.grid.cell_of(boxes.centers[:, :2]) >= 0).all(-1)
     chosen = np.flatnonzero(ahead & inside)
+    x, y = (inverse(frame.rig.ego_from_bev) @ [DEFAULT_DISTANCE_M, 0.0, 0.0, 1.0])[:2]
     if boxes.scores is not None and len(chosen) and boxes.scores[chosen[0]] > 0.25:
         x, y = boxes.centers[chosen[0], :2]
-        return float(x), float(y)
-    x, y = (inverse(frame.rig.ego_from_bev) @ [DEFAULT_DISTANCE_M, 0.0, 0.0, 1.0])[:2]
     return float(x), float(y)
 
 

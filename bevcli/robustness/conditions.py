@@ -1,7 +1,5 @@
 """The corruptions with their severities: what `bevcli stress` runs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence as Items
 from dataclasses import dataclass
 from enum import Enum, auto

@@ -1,7 +1,5 @@
 """Corruptions of images with the parameters of RoboBEV; those of the weather are from imagecorruptions (ImageNet-C)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -51,8 +49,7 @@ def blur_kernel(radius: int, sigma: float, angle_deg: float, scale: float) -> ND
 
 def color_quantisation(pixels_bgr: Pixels, level: Level, random: np.random.Generator) -> Pixels:
     """Each colour value keeps its highest 5 - level bits; the others are 0."""
-    mask = 0xFF & ~((1 << (8 - (BITS - level))) - 1)
-    return pixels_bgr & np.uint8(mask)
+    return pixels_bgr & np.uint8(0xFF << (8 - (BITS - level)) & 0xFF)
 
 
 def to_uint8(values: NDArray[Any]) -> Pixels:

@@ -1,7 +1,5 @@
 """The options of a stress test and of its files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """The table, the plot and the contact sheet of a stress test."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence as Items
 from pathlib import Path
@@ -11,7 +9,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bevcli.errors import OutputError
 from bevcli.evaluation.plots import titled_figure
 from bevcli.evaluation.scores_report import aligned
 from bevcli.frame import Frame, Sequence
@@ -21,6 +18,7 @@ from bevcli.robustness.conditions import Condition, Corruption, Shown
 from bevcli.robustness.corruptions import Pixels
 from bevcli.robustness.options import StressOptions
 from bevcli.robustness.results import ConditionScores, StressResults
+from bevcli.runs.folder import replace_file
 
 SEVERITY_COLORS = ("#b8c9e8", "#7d9fd3", "#3f6fb5", "#173e7a")  # from the easiest severity to the hardest
 _OTHER_COLOR = "#d62728"
@@ -126,7 +124,7 @@ PAPER, INK, BOX = (28, 23, 20), (241, 236, 232), (60, 220, 255)  # BGR
 
 
 def write_contact_sheet(path: Path, scene: Sequence, conditions: Items[Condition], options: StressOptions) -> None:
-    """Writes corruptions.png: the middle frame of a scene, one row a corruption, one column a severity.
+    """Write corruptions.png: the middle frame of a scene, one row a corruption, one column a severity.
 
     Raises OutputError.
     """
@@ -144,10 +142,7 @@ def write_contact_sheet(path: Path, scene: Sequence, conditions: Items[Condition
     if not rows:
         return
     _, encoded = cv2.imencode(".png", _sheet(list(rows.values())))
-    try:
-        path.write_bytes(encoded.tobytes())
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
+    replace_file(path, encoded.tobytes())
 
 
 def _tile(frame: Frame, corruption: Corruption) -> Pixels:

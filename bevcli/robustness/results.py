@@ -1,12 +1,10 @@
 """The result of a stress test: scores by condition, resilience rates, corruption errors, and the file stress.json."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from bevcli.errors import InputError
 from bevcli.evaluation.scores_report import finite
@@ -82,7 +80,7 @@ class StressResults:
             return math.nan
         return sum(scores.nd_score for scores in found) / len(found) / self.clean.nd_score
 
-    def corruption_error(self, name: str, against: StressResults) -> float:
+    def corruption_error(self, name: str, against: Self) -> float:
         """Corruption error: the sum of 1 - NDS over the severities that both runs have, over that of the other run."""
         own, other = self.of(name), against.of(name)
         common = [severity for severity in own if severity in other]
@@ -93,11 +91,11 @@ class StressResults:
         """mRR: the mean resilience rate of RoboBEV's corruptions that were tested; NaN without any."""
         return _mean(self.resilience(part.name) for part in self.tested() if part.published)
 
-    def mean_corruption_error(self, against: StressResults) -> float:
+    def mean_corruption_error(self, against: Self) -> float:
         """mCE: the mean corruption error of RoboBEV's corruptions that both runs have; NaN without any."""
         return _mean(self.corruption_error(part.name, against) for part in self.tested() if part.published)
 
-    def to_dict(self, against: StressResults | None = None) -> dict[str, Any]:
+    def to_dict(self, against: Self | None = None) -> dict[str, Any]:
         """All of it for JSON; undefined numbers are None. docs/robustness.md explains the keys."""
         names = [corruption.name for corruption in self.tested()]
         content: dict[str, Any] = {
@@ -114,7 +112,7 @@ class StressResults:
             content["mCE"] = self.mean_corruption_error(against)
         return finite(content)
 
-    def differences(self, other: StressResults) -> tuple[str, ...]:
+    def differences(self, other: Self) -> tuple[str, ...]:
         """Settings other than model and weights that differ between the tests: their scores cannot be compared."""
         names = ("drives", "max_range_m", "seed", "lost_images")
         return tuple(name for name in names if self.header.get(name) != other.header.get(name))

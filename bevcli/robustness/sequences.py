@@ -1,7 +1,5 @@
 """Sequences that wrap another one: with faults of images, calibration, times and poses; in memory; at a lower rate."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Collection
@@ -53,16 +51,15 @@ class ChangedSequence(DerivedSequence):
         self._level, self._draws, self._lost_images = level, draws, lost_images
 
     def load(self, place: int) -> Frame:
-        """The changed frame at a place."""
         return self.change(place, self.sequence.load(place))
 
     def change(self, place: int, frame: Frame) -> Frame:
         """The frame at a place with its change."""
         raise NotImplementedError
 
-    def scene_key(self, stamp: FrameStamp) -> str:
-        """A name of the frame's scene for `Draws`, which does not depend on where the drive is stored."""
-        return f"{self.name}/{stamp.scene}"
+    def random(self, stamp: FrameStamp, *keys: str | int) -> np.random.Generator:
+        """A generator for the scene of a frame and further keys; it does not depend on where the drive is stored."""
+        return self._draws.generator(f"{self.name}/{stamp.scene}", *keys)
 
 
 class CorruptedImages(ChangedSequence):
@@ -73,11 +70,8 @@ class CorruptedImages(ChangedSequence):
         self._corrupt = corrupt
 
     def change(self, place: int, frame: Frame) -> Frame:
-        """The frame with corrupted images; the cameras are computed in parallel."""
-        scene = self.scene_key(frame.stamp)
-
         def corrupted(name: str) -> CameraImage:
-            random = self._draws.generator(scene, frame.stamp.index, name)
+            random = self.random(frame.stamp, frame.stamp.index, name)
             return _with_pixels(frame.images[name], self._corrupt(frame.images[name].pixels_bgr, self._level, random))
 
         with ThreadPoolExecutor(min(max(len(frame.images), 1), os.cpu_count() or 1)) as threads:
@@ -101,10 +95,7 @@ class FrameStore:
 
 
 class KeptFrames(DerivedSequence):
-    """A sequence that keeps its decoded frames while the memory lasts, because every condition needs them.
-
-    The bytes of the image files are not kept.
-    """
+    """Keeps decoded frames, without the bytes of files, while the memory lasts, because every condition needs them."""
 
     def __init__(self, sequence: Sequence, store: FrameStore) -> None:
         super().__init__(sequence)
@@ -112,7 +103,6 @@ class KeptFrames(DerivedSequence):
         self._frames: dict[int, Frame] = {}
 
     def load(self, place: int) -> Frame:
-        """The frame at a place, from memory if it is there."""
         if place in self._frames:
             return self._frames[place]
         frame = self.sequence.load(place)
@@ -142,18 +132,17 @@ def at_lower_rate(sequence: Sequence, step: int) -> tuple[Sequence, ...]:
 
 
 MOST_CRASHES = 5  # draws of cameras at the hardest level
-FRAME_LOST_PARTS = 6  # level L loses an image with probability L/6
+LOST_PARTS = 6  # level L loses an image or a pose with probability L/6
 
 
 class LostImages(ChangedSequence):
-    """A sequence that loses images. A subclass overrides `lost`."""
+    """A sequence that loses images: they are missing or black. A subclass overrides `lost`."""
 
     def lost(self, frame: Frame) -> Collection[str]:
         """The cameras whose images are lost."""
         raise NotImplementedError
 
     def change(self, place: int, frame: Frame) -> Frame:
-        """The frame without the lost images, or with black ones."""
         lost = [name for name in frame.images if name in self.lost(frame)]
         if self._lost_images == "missing":
             kept = {name: image for name, image in frame.images.items() if name not in lost}
@@ -167,9 +156,8 @@ class CameraCrash(LostImages):
     """Level L draws L cameras of the rig, with replacement; they deliver nothing for the whole scene."""
 
     def lost(self, frame: Frame) -> Collection[str]:
-        """The crashed cameras of the scene."""
         names = frame.rig.names
-        drawn = self._draws.generator(self.scene_key(frame.stamp)).integers(0, len(names), MOST_CRASHES)
+        drawn = self.random(frame.stamp).integers(0, len(names), MOST_CRASHES)
         return {names[index] for index in drawn[: self._level]}
 
 
@@ -177,34 +165,26 @@ class FrameLost(LostImages):
     """Level L loses each image with a probability of L/6, independently of the others."""
 
     def lost(self, frame: Frame) -> Collection[str]:
-        """The cameras whose images of this frame are lost."""
-        scene, index = self.scene_key(frame.stamp), frame.stamp.index
-        limit = self._level / FRAME_LOST_PARTS
-        return {name for name in frame.rig.names if self._draws.generator(scene, index, name).random() < limit}
+        stamp, limit = frame.stamp, self._level / LOST_PARTS
+        return {name for name in frame.rig.names if self.random(stamp, stamp.index, name).random() < limit}
 
 
 class CalibrationNoise(ChangedSequence):
-    """A sequence whose cameras state wrong poses, the same ones for a whole scene.
+    """A sequence whose cameras state wrong poses, the same ones for a whole scene; levels of `camera_pose_noise`."""
 
-    `camera_pose_noise` describes the levels.
-    """
-
+    # A rig, its scene and the noisy rig, which the frames of a scene with one rig share.
     _noisy: tuple[CameraRig, str, CameraRig] | None = None
 
     def change(self, place: int, frame: Frame) -> Frame:
-        """The frame with a noisy rig. Frames of a scene with one rig share one noisy rig."""
-        scene = self.scene_key(frame.stamp)
-        if self._noisy is None or self._noisy[0] is not frame.rig or self._noisy[1] != scene:
-            cameras = tuple(self._with_noise(camera, scene) for camera in frame.rig.cameras)
-            self._noisy = (frame.rig, scene, replace(frame.rig, cameras=cameras))
+        stamp = frame.stamp
+        if self._noisy is None or self._noisy[0] is not frame.rig or self._noisy[1] != stamp.scene:
+            cameras = tuple(self._with_noise(camera, stamp) for camera in frame.rig.cameras)
+            self._noisy = (frame.rig, stamp.scene, replace(frame.rig, cameras=cameras))
         return replace(frame, rig=self._noisy[2])
 
-    def _with_noise(self, camera: Camera, scene: str) -> Camera:
-        noise = camera_pose_noise(self._level, self._draws.generator(scene, camera.name))
+    def _with_noise(self, camera: Camera, stamp: FrameStamp) -> Camera:
+        noise = camera_pose_noise(self._level, self.random(stamp, camera.name))
         return replace(camera, ego_from_camera=camera.ego_from_camera @ noise)
-
-
-POSE_LOST_PARTS = 6  # level L loses a pose with probability L/6
 
 
 class TimeOffsets(ChangedSequence):
@@ -215,9 +195,7 @@ class TimeOffsets(ChangedSequence):
     """
 
     def change(self, place: int, frame: Frame) -> Frame:
-        """The frame with wrong times and the poses at these times."""
-        scene = self.scene_key(frame.stamp)
-        draws = {name: self._draws.generator(scene, name).uniform(-1, 1) for name in frame.rig.names}
+        draws = {name: self.random(frame.stamp, name).uniform(-1, 1) for name in frame.rig.names}
         offsets_s = {name: self._level / 1000 * draw for name, draw in draws.items()}
         poses = {
             name: Pose.from_matrix(pose.matrix @ motion_during(offsets_s[name], frame.kinematics))
@@ -242,7 +220,6 @@ class EgoMotionLost(ChangedSequence):
         self._arrived: dict[int, tuple[Pose, Kinematics]] = {}
 
     def change(self, place: int, frame: Frame) -> Frame:
-        """The frame with the last pose that arrived."""
         last = self._last_arrived(place)
         if last == place:
             self._arrived[place] = frame.world_from_ego, frame.kinematics
@@ -264,18 +241,14 @@ class EgoMotionLost(ChangedSequence):
     def _last_arrived(self, place: int) -> int:
         stamps = self.stamps
         while place > 0 and stamps[place - 1].scene == stamps[place].scene:
-            random = self._draws.generator(self.scene_key(stamps[place]), stamps[place].index)
-            if random.random() >= self._level / POSE_LOST_PARTS:
+            if self.random(stamps[place], stamps[place].index).random() >= self._level / LOST_PARTS:
                 break
             place -= 1
         return place
 
 
 def motion_during(seconds: float, kinematics: Kinematics) -> Array:
-    """(4, 4) ego_from_later_ego: the motion of the vehicle during a time with constant velocity and angular rate.
-
-    seconds: negative for an earlier time.
-    """
+    """(4, 4) ego_from_later_ego: the motion at constant velocity and angular rate. seconds: may be negative."""
     turn, _ = cv2.Rodrigues(seconds * kinematics.angular_rate)
     half_turn, _ = cv2.Rodrigues(seconds / 2 * kinematics.angular_rate)
     return rigid(half_turn @ (seconds * np.asarray(kinematics.velocity)), turn)

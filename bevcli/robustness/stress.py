@@ -1,7 +1,5 @@
 """`stress`: runs a model over the same drives under each condition, scores each, and writes the results."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator, Sequence as Items
 from dataclasses import dataclass, replace
@@ -166,11 +164,9 @@ class _Test:
     def done_frames(self, conditions: Items[Condition], state: StressState) -> int:
         """The number of frames of these conditions that need not be run again."""
         each = [len(scene.stamps) for scene in self.scenes]
-        finished = sum(state.has(condition) for condition in conditions) * sum(each)
-        kept = next((condition for condition in conditions if not state.has(condition)), None)
-        if kept is None:
-            return finished
-        return finished + sum(n for place, n in enumerate(each) if self._boxes_path(kept, place).exists())
+        left = [condition for condition in conditions if not state.has(condition)]
+        kept = sum(n for place, n in enumerate(each) if left and self._boxes_path(left[0], place).exists())
+        return (len(conditions) - len(left)) * sum(each) + kept
 
     def run(self, condition: Condition) -> ConditionScores:
         """The scores under a condition. Raises _Stopped."""
