@@ -51,7 +51,7 @@ def rasterise(soup: TriangleSoup, camera: Camera, camera_from_world: Array, obje
     k = camera.intrinsics
     pinhole = np.array([k[0, 0], k[0, 1], k[0, 2], k[1, 1], k[1, 2]])
     rasterise_meshes(
-        (soup.triangles.corners, soup.triangles.normals),
+        (soup.corners, soup.normals),
         (soup.mesh_ranges, soup.mesh_objects, soup.mesh_spheres),
         np.ascontiguousarray(camera_from_world[:3]), pinhole, inverse(camera_from_world)[:3, 3].copy(),
         triangles, inverse_depth, last_objects, unoccluded,
