@@ -70,7 +70,7 @@ class Walker:
         inside = min(places[1] - self.road[0], self.road[1] - places[1])  # metres into the road, negative on pavements
         position = np.array([here[0], here[1], KERB_M * float(np.clip(0.5 - inside / 0.3, 0, 1))])
         attribute = "pedestrian.moving" if moving else "pedestrian.standing"
-        return ActorState(self.body, position, yaw, velocity, attribute, int(places[1] / STRIDE_M) % 2)
+        return ActorState(self.body, position, yaw, attribute, velocity, int(places[1] / STRIDE_M) % 2)
 
 
 def _unit(way: Array) -> Array:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -106,38 +105,22 @@ def right_of(direction: int) -> Array:
     return DIRECTIONS[(direction - 1) % 4]
 
 
-def draw_turns(city: CityPlan, start: LaneStart, rng: np.random.Generator, straight_on: float = 0.6) -> Iterator[int]:
-    """Draw turns without end, each one allowed from the lane that the vehicle is in."""
-    node, direction, lane = start.node, start.direction, start.lane
-    while True:
-        lanes = street_of(city, node, direction).lanes
-        options = (
-            [1, -1, -1] if lanes == 1 else ([1] if lane == 0 else [-1])
-        )  # left turns are rarer: they block the lane
-        turn = 0 if rng.random() < straight_on else int(options[int(rng.integers(len(options)))])
-        yield turn
-        direction = (direction + turn) % 4
-        node = (node[0] + int(DIRECTIONS[direction][0]), node[1] + int(DIRECTIONS[direction][1]))
-        lane = _lane_after(city, node, direction, turn, lane)
-
-
-def bicycle_turns(rng: np.random.Generator) -> Iterator[int]:
-    """Draw turns of a bicycle without end: straight on or right."""
-    while True:
-        yield 0 if rng.random() < 0.7 else -1
-
-
-def _lane_after(city: CityPlan, node: tuple[int, int], direction: int, turn: int, lane: int) -> int:
-    lanes = street_of(city, node, direction).lanes
-    return min(lane, lanes - 1) if turn == 0 else (0 if turn > 0 else lanes - 1)
+def _draw_turn(rng: np.random.Generator, street: Street, lane: int, straight_on: float, bicycle: bool) -> int:
+    """Draw a turn that is allowed from the lane of a street; a bicycle goes straight on or turns right."""
+    if bicycle:
+        return 0 if rng.random() < 0.7 else -1
+    # Left turns are rarer: they block the lane.
+    turns = [1, -1, -1] if street.lanes == 1 else ([1] if lane == 0 else [-1])
+    return 0 if rng.random() < straight_on else turns[int(rng.integers(len(turns)))]
 
 
 def build_route(
-    city: CityPlan, start: LaneStart, turns: Iterable[int], length: float, speed: float, bicycle: bool = False
-) -> Route:
-    """Build a route.
+    city: CityPlan, start: LaneStart, rng: np.random.Generator, length: float, speed: float,
+    straight_on: float = 0.6, bicycle: bool = False,
+) -> Route:  # fmt: skip
+    """Build a route with random turns.
 
-    turns: turn at each junction. length: least length, metres. speed: limit on straight road, m/s.
+    length: least length, metres. speed: limit on straight road, m/s. straight_on: share of junctions without a turn, except for bicycles.
     bicycle: whether it keeps right of the lanes.
     """
     node, direction, lane = start.node, start.direction, start.lane
@@ -145,15 +128,14 @@ def build_route(
     offset = lane_offset(street, lane, bicycle)
     at = node_center(city, node) - DIRECTIONS[direction] * start.before + right_of(direction) * offset
     corners, marks, travelled = [at[None]], [], 0.0
-    choose = iter(turns)
     while travelled < length:
-        turn = next(choose)
+        turn = _draw_turn(rng, street, lane, straight_on, bicycle)
         center, cross = node_center(city, node), street_of(city, node, direction + 1)
         after = (direction + turn) % 4
         following = (node[0] + int(DIRECTIONS[after][0]), node[1] + int(DIRECTIONS[after][1]))
-        lane = _lane_after(city, following, after, turn, lane)
-        new_street = street_of(city, following, after)
-        new_offset = lane_offset(new_street, lane, bicycle)
+        street = street_of(city, following, after)
+        lane = min(lane, street.lanes - 1) if turn == 0 else (0 if turn > 0 else street.lanes - 1)
+        new_offset = lane_offset(street, lane, bicycle)
         corner = center + right_of(direction) * offset
         if turn != 0:
             corner = corner + DIRECTIONS[direction] * (right_of(after) @ DIRECTIONS[direction]) * new_offset
