@@ -1,7 +1,5 @@
 """A rendered drive: its frames, ground truth and ego-motion, made in memory when they are asked for."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass

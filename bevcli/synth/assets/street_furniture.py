@@ -1,7 +1,5 @@
 """Meshes of objects that are not annotated: trees, lamps, signs, traffic signals, benches, bins."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from bevcli.synth.assets.mesh import Mesh, ball, block, cone, crossbar, joined, rod

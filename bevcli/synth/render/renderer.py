@@ -5,8 +5,6 @@ no triangles: a pixel that sees none and looks down sees the plane z = 0. The im
 resampled from a wider pinhole image.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import lru_cache
 

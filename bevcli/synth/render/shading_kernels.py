@@ -7,8 +7,6 @@ Positions are in the world frame in metres, colours are linear RGB.
 # mypy: disable-error-code="no-untyped-def"
 # The kernels have no type hints: numba takes the types from the first call.
 
-from __future__ import annotations
-
 import numpy as np
 
 from bevcli.jit import njit

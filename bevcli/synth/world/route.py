@@ -1,7 +1,5 @@
 """Routes: the smooth line that a vehicle follows, with its speed limits and the junctions on it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,9 +62,7 @@ class Route:
     def at(self, position: ArrayLike) -> Array:
         """World points (..., 2) at positions (...,) in metres along the route."""
         s = np.asarray(position, dtype=np.float64)
-        return np.stack(
-            [np.interp(s, self.positions, self.points[:, 0]), np.interp(s, self.positions, self.points[:, 1])], -1
-        )
+        return np.stack([np.interp(s, self.positions, self.points[:, k]) for k in (0, 1)], -1)
 
     def yaw_at(self, position: ArrayLike) -> Array:
         """Heading (...,) in radians."""
@@ -115,13 +111,18 @@ def _draw_turn(rng: np.random.Generator, street: Street, lane: int, straight_on:
 
 
 def build_route(
-    city: CityPlan, start: LaneStart, rng: np.random.Generator, length: float, speed: float,
-    straight_on: float = 0.6, bicycle: bool = False,
-) -> Route:  # fmt: skip
+    city: CityPlan,
+    start: LaneStart,
+    rng: np.random.Generator,
+    length: float,
+    speed: float,
+    straight_on: float = 0.6,
+    bicycle: bool = False,
+) -> Route:
     """Build a route with random turns.
 
-    length: least length, metres. speed: limit on straight road, m/s. straight_on: share of junctions without a turn, except for bicycles.
-    bicycle: whether it keeps right of the lanes.
+    length: least length, metres. speed: limit on straight road, m/s. straight_on: share of junctions without a turn,
+    where it is not a bicycle. bicycle: whether it keeps right of the lanes, and never turns left.
     """
     node, direction, lane = start.node, start.direction, start.lane
     street = street_of(city, node, direction)
@@ -139,7 +140,7 @@ def build_route(
         corner = center + right_of(direction) * offset
         if turn != 0:
             corner = corner + DIRECTIONS[direction] * (right_of(after) @ DIRECTIONS[direction]) * new_offset
-        radius = _radius(cross, new_offset, turn)
+        radius = cross.half_width + turn * new_offset + (1.5 if turn < 0 else 0.0)
         begin, end = corner - DIRECTIONS[direction] * radius, corner + DIRECTIONS[after] * radius
         stop = _lane_point(center, direction, offset, -(cross.half_width + STOP_LINE_M))
         across = street_of(city, node, after + 1)
@@ -163,12 +164,6 @@ def lane_offset(street: Street, lane: int, bicycle: bool) -> float:
     return street.lanes * street.lane_m + BICYCLE_OFFSET_M if bicycle else street.lane_offset(lane)
 
 
-def _radius(cross: Street, new_offset: float, turn: int) -> float:
-    if turn == 0:
-        return cross.half_width
-    return cross.half_width + turn * new_offset + (1.5 if turn < 0 else 0.0)
-
-
 def _arc(begin: Array, corner: Array, end: Array) -> Array:
     """(17, 2) quarter of an ellipse from begin to end, tangent to the lines from begin and end to the corner."""
     center = begin + end - corner
@@ -181,12 +176,11 @@ def _finish(city: CityPlan, corners: Array, marks: list, speed: float) -> Route:
 
     marks: of each junction: node, direction, turn, and the plan points of stop and leave.
     """
-    along_corners = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    along_corners = distances_along(corners)
     samples = np.arange(0, along_corners[-1], STEP_M)
     plan = np.stack([np.interp(samples, along_corners, corners[:, k]) for k in (0, 1)], -1)
     points = gaussian_filter1d(city.bend(plan), SMOOTHING_M / STEP_M, axis=0, mode="nearest")
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    positions = np.concatenate([[0], np.cumsum(steps)])
+    positions = distances_along(points)
     way = np.gradient(points, axis=0)
     yaws = np.unwrap(np.arctan2(way[:, 1], way[:, 0]))
     limits = _speed_limits(positions, yaws, speed)
@@ -199,6 +193,11 @@ def _finish(city: CityPlan, corners: Array, marks: list, speed: float) -> Route:
             found.append(float(positions[start]))
         passes.append(JunctionPass(node, direction, turn, *found))
     return Route(points, positions, yaws, limits, tuple(passes))
+
+
+def distances_along(points: Array) -> Array:
+    """(P,) distance of each point (P, 2) of a line from its start, along the line."""
+    return np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
 
 
 def _speed_limits(positions: Array, yaws: Array, speed: float) -> NDArray[np.float64]:

@@ -1,7 +1,5 @@
 """Objects without annotations: houses, kerbs, trees, street furniture and traffic signals."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product

@@ -1,7 +1,5 @@
 """The simulation of a drive: traffic and pedestrians over its whole time, and the ego vehicle's motion."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache, partial
 

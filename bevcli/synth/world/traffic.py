@@ -1,7 +1,5 @@
 """Traffic: signals, vehicles that keep their distance, obey signals and give way, and the states of actors."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
@@ -146,8 +144,7 @@ def _acceleration(
     gap, other = _nearest_in_way(route.points, route.positions, vehicle.front, obstacles, owners, index, corridor)
     wanted = free
     if gap < np.inf:
-        lead = float(speeds[other]) if other >= 0 else 0.0
-        lead = lead if _same_way(vehicle, vehicles, other) else 0.0
+        lead = float(speeds[other]) if _same_way(vehicle, vehicles, other) else 0.0
         wanted = min(wanted, _follow(speed, limit, strongest, gap, lead))
     crossing = vehicle.next_pass()
     if crossing is not None and vehicle.front < crossing.stop + 0.5:
