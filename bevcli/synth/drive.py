@@ -1,7 +1,5 @@
 """A rendered drive: its frames, ground truth and ego-motion, made in memory when they are asked for."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -16,7 +14,7 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid, rotation_about_z
 from bevcli.synth.assets.catalog import Assets, Body
-from bevcli.synth.assets.triangles import MeshTemplate, PlacedMesh, TriangleSoup
+from bevcli.synth.assets.triangles import TriangleSoup
 from bevcli.synth.render.ground import GroundTexture, MapWindow, draw_map, paint_ground
 from bevcli.synth.render.rasteriser import ShadowMap
 from bevcli.synth.render.renderer import RenderedView, WorldSnapshot, render_view
@@ -117,8 +115,8 @@ class RenderedDrive:
         self._texels_m = texel_sizes(max(camera.width for camera in self.rig.cameras) * supersampling)
         self._scenery = Scenery(self._city, self._assets.furniture)
         self._around = lru_cache(maxsize=1)(self._make_surroundings)
-        self._templates: dict[tuple[str, int], MeshTemplate] = {}
-        self._placed: dict[tuple[str, int], tuple[PlacedMesh, tuple[float, ...]]] = {}
+        self._templates: dict[tuple[str, int], TriangleSoup] = {}
+        self._placed: dict[tuple[str, int], tuple[TriangleSoup, tuple[float, ...]]] = {}
 
     def time_s(self, index: int) -> float:
         """Time of a frame, seconds since the start of the drive."""
@@ -197,8 +195,8 @@ class RenderedDrive:
         actors = [self._place(states[k]) for k in near_first]
         signals = signal_meshes(self._city, self.simulation.signals, self._assets.furniture, here, time_s)
         moving = TriangleSoup.gather([*actors, *signals], [*near_first.tolist(), *[-1] * len(signals)])
-        shadows = shadows.with_shadows_of([moving.triangles.corners, self._ego_corners(world_from_ego)])
-        snapshot = WorldSnapshot(scenery.joined(moving), len(actors), ground, shadows, self.weather)
+        shadows = shadows.with_shadows_of([moving.corners, self._ego_corners(world_from_ego)])
+        snapshot = WorldSnapshot(TriangleSoup.gather([scenery, moving]), len(actors), ground, shadows, self.weather)
 
         def render_one(name: str) -> RenderedView:
             return render_view(snapshot, self.rig[name], world_from_ego.matrix, self._supersampling)
@@ -213,10 +211,10 @@ class RenderedDrive:
         center, extent, (ground_m, shadow_m) = (x, y), NEAR_GROUND_M + SNAP_M, self._texels_m
         texture = paint_ground(self._ground.pieces_around(center, extent * 0.71), center, extent, ground_m)
         scenery = self._scenery.around(center, SCENERY_M)
-        shadows = ShadowMap.of(scenery.triangles.corners, self.weather.to_sun, center, extent, shadow_m)
+        shadows = ShadowMap.of(scenery.corners, self.weather.to_sun, center, extent, shadow_m)
         return scenery, texture, shadows
 
-    def _place(self, state: ActorState) -> PlacedMesh:
+    def _place(self, state: ActorState) -> TriangleSoup:
         """The mesh of an actor in the world; kept while the actor stands still."""
         key = (state.body.instance, state.pose)
         x, y, z = (float(c) for c in state.position)
@@ -225,19 +223,19 @@ class RenderedDrive:
             self._placed[key] = (self._template(state.body, state.pose).placed((x, y, z), state.yaw), here)
         return self._placed[key][0]
 
-    def _template(self, body: Body, pose: int) -> MeshTemplate:
+    def _template(self, body: Body, pose: int) -> TriangleSoup:
         """The mesh of a body in its size and colours."""
         key = (body.instance, pose)
         if key not in self._templates:
             mesh = body.variant.poses[pose % len(body.variant.poses)].fitted(body.size_lwh)
-            self._templates[key] = MeshTemplate.of(mesh).painted(body.paint, body.dye)
+            self._templates[key] = TriangleSoup.from_mesh(mesh).painted(body.paint, body.dye)
         return self._templates[key]
 
     def _ego_corners(self, world_from_ego: Pose) -> NDArray[np.float32]:
         """(T, 3, 3) triangles of the ego vehicle, for its shadow. Its middle is 1.4 m in front of the rear axle."""
         x, y, _ = apply(world_from_ego.matrix, (1.4, 0.0, 0.0))
         template = self._template(self.simulation.ego_body, 0)
-        return template.placed((x, y, 0.0), world_from_ego.yaw).triangles.corners
+        return template.placed((x, y, 0.0), world_from_ego.yaw).corners
 
     def _boxes(self, states: list[ActorState], views: Mapping[str, RenderedView], pose: Pose) -> Boxes3D:
         """Ground truth boxes in the world frame, within ANNOTATED_M of the origin of the bev frame."""

@@ -1,7 +1,5 @@
 """Drives with ground truth, for training, validation and stress tests: sequence folders, or rendered from seeds."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil

@@ -1,7 +1,5 @@
 """A rendered drive as a sequence folder: `render` makes the drive and writes it, `export_drive` writes a given one."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -122,8 +120,5 @@ def _encode_jpeg(pixels_bgr: NDArray[np.uint8], quality: int) -> bytes:
 def _rounded(boxes: Boxes3D) -> Boxes3D:
     """The boxes rounded to 0.1 mm and 10 microradians, which keeps the files small."""
     decimals = {"centers": 4, "sizes_lwh": 4, "yaws": 5, "velocities": 4, "visibilities": 4}
-    values = {name: getattr(boxes, name) for name in decimals}
-    rounded: dict[str, Any] = {
-        name: None if value is None else np.round(value, decimals[name]) for name, value in values.items()
-    }
-    return replace(boxes, **rounded)
+    values: dict[str, Any] = {name: getattr(boxes, name) for name in decimals}
+    return replace(boxes, **{name: np.round(v, decimals[name]) for name, v in values.items() if v is not None})

@@ -1,7 +1,5 @@
 """The options of rendered drives, and of drives with ground truth for training and scoring."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import fields
 from pathlib import Path

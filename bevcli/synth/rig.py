@@ -1,7 +1,5 @@
 """The rigs that are rendered: the default one, one from a file, or one drawn at random for training and validation."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import astuple, dataclass, field, replace
 from pathlib import Path

@@ -79,7 +79,7 @@ def test_visibility_agrees_with_rendering_each_object_alone(drive: RenderedDrive
 
 def _silhouette(drive: RenderedDrive, state: ActorState, camera, frame: RenderedFrame):
     """(H, W) bool mask of an object without occlusion, filled triangle by triangle with OpenCV."""
-    faces = drive._template(state.body, state.pose).mesh.faces.astype(np.float64)
+    faces = drive._template(state.body, state.pose).corners.astype(np.float64)
     c, s = np.cos(state.yaw), np.sin(state.yaw)
     world = faces @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + state.position
     fine = 8

@@ -9,7 +9,7 @@ import pytest
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import inverse, rigid, rotation_about_z
 from bevcli.synth.assets.mesh import Mesh
-from bevcli.synth.assets.triangles import PlacedMesh, TriangleSoup
+from bevcli.synth.assets.triangles import TriangleSoup
 from bevcli.synth.render.rasteriser import rasterise
 from bevcli.synth.rig import nuscenes_like_rig
 
@@ -21,7 +21,7 @@ def draw(corners, camera: Camera = CAMERA, objects=None):
     """Rasterise triangles, each as a mesh of its own."""
     corners = np.asarray(corners, np.float32)
     white, plain = np.ones((1, 3), np.float32), np.zeros(1, np.uint8)
-    meshes = [PlacedMesh.from_mesh(Mesh(corner[None], white, plain)) for corner in corners]
+    meshes = [TriangleSoup.from_mesh(Mesh(corner[None], white, plain)) for corner in corners]
     soup = TriangleSoup.gather(meshes, objects if objects is not None else range(len(meshes)))
     return rasterise(soup, camera, inverse(WORLD_FROM_CAMERA), int(soup.mesh_objects.max()) + 1)
 

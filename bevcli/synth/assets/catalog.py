@@ -1,7 +1,5 @@
 """The catalog of annotated objects: the variants of each class, and a drawn individual of a variant."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
@@ -115,7 +113,7 @@ class Assets:
     furniture: StreetFurniture
 
     @staticmethod
-    def build() -> Assets:
+    def build() -> "Assets":
         """Build every mesh. This takes about half a second."""
         return Assets(Catalog(), StreetFurniture())
 

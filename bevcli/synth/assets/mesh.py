@@ -3,8 +3,6 @@
 A mesh has its own frame: x forward, y left, z up, the origin in the middle of the bottom. Lengths are in metres.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -38,7 +36,7 @@ class Mesh:
         points = self.faces.reshape(-1, 3).astype(np.float64)
         return points.max(0) - points.min(0)
 
-    def fitted(self, size_lwh: ArrayLike) -> Mesh:
+    def fitted(self, size_lwh: ArrayLike) -> "Mesh":
         """The mesh stretched to this size (3,), standing on z = 0 and centred in x and y."""
         points = self.faces.reshape(-1, 3).astype(np.float64)
         low, high = points.min(0), points.max(0)

@@ -1,7 +1,5 @@
 """Colours: in sRGB where they are chosen, in linear RGB where light is computed."""
 
-from __future__ import annotations
-
 from enum import IntEnum
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Meshes of people, and of bicycles and motorcycles with and without riders."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from bevcli.synth.assets.mesh import Mesh, ball, block, cone, crossbar, loft, rod, side_profile

@@ -3,8 +3,6 @@
 A barrier's long side is its width, as in nuScenes annotations.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from bevcli.synth.assets.mesh import Mesh, block, cone, crossbar, rod, side_profile, wheel

@@ -1,12 +1,10 @@
 """Meshes of objects that are not annotated: trees, lamps, signs, traffic signals, benches, bins."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from bevcli.synth.assets.mesh import Mesh, ball, block, cone, crossbar, joined, rod
 from bevcli.synth.assets.paint import Color, Finish, Material
-from bevcli.synth.assets.triangles import MeshTemplate
+from bevcli.synth.assets.triangles import TriangleSoup
 
 BARK: Color = (92, 74, 58)
 GALVANISED_STEEL: Color = (112, 116, 120)
@@ -29,8 +27,8 @@ class StreetFurniture:
 
     def __init__(self) -> None:
         rng = np.random.Generator(np.random.PCG64(20))
-        self.trees = [MeshTemplate.of(tree(k, rng)) for k in range(TREE_KINDS)]
-        self.bushes = [MeshTemplate.of(bush(rng)) for _ in range(4)]
+        self.trees = [TriangleSoup.from_mesh(tree(k, rng)) for k in range(TREE_KINDS)]
+        self.bushes = [TriangleSoup.from_mesh(bush(rng)) for _ in range(4)]
         self.lamp = _template(lamp_post())
         self.signs = [_template(sign_post(k)) for k in range(6)]
         self.small = [_template(parts) for parts in (bench(), litter_bin(), hydrant())]
@@ -38,8 +36,8 @@ class StreetFurniture:
         self.signals = {light: _template(signal_head(light)) for light in ("red", "yellow", "green")}
 
 
-def _template(parts: list[Mesh]) -> MeshTemplate:
-    return MeshTemplate.of(joined(parts))
+def _template(parts: list[Mesh]) -> TriangleSoup:
+    return TriangleSoup.from_mesh(joined(parts))
 
 
 def tree(variant: int, rng: np.random.Generator) -> Mesh:

@@ -1,13 +1,13 @@
-"""Meshes placed in the world, and all triangles of a scene in one set of arrays.
+"""Meshes placed in the world, all in one set of arrays.
 
-A `MeshTemplate` is a mesh that is placed many times. Placing it gives a `PlacedMesh`. A `TriangleSoup` holds many
-placed meshes; each of them is a range of its triangles, which the rasteriser can skip as a whole.
+A `TriangleSoup` holds any number of meshes; each of them is a range of its triangles, which the rasteriser can skip as
+a whole. A soup of one mesh in its own frame is a template: its normals and its sphere are computed once, and it is
+placed many times.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +19,8 @@ NO_FACADES = np.zeros((0, 16), np.float32)
 
 
 @dataclass(frozen=True)
-class Triangles:
-    """T triangles in the world frame.
+class TriangleSoup:
+    """T triangles of M meshes in the world frame.
 
     Attributes:
         corners: (T, 3, 3) corner points, metres; counter-clockwise seen from outside.
@@ -28,7 +28,10 @@ class Triangles:
         albedo: (T, 3) linear RGB.
         material: (T,) values of `Material`.
         facade: (T,) row of `facades`; -1 for a triangle that is not part of a facade.
-        facades: (K, 16) rows made by `world.buildings.facade_row`.
+        facades: (K, 16) descriptions of walls, made in `world.scenery`.
+        mesh_ranges: (M, 2) first triangle of each mesh, and one past its last.
+        mesh_objects: (M,) index of the annotated object that the mesh belongs to; -1 for none.
+        mesh_spheres: (M, 4) bounding spheres: centre x, y, z and radius, metres.
     """
 
     corners: NDArray[np.float32]
@@ -37,132 +40,65 @@ class Triangles:
     material: NDArray[np.uint8]
     facade: NDArray[np.int32]
     facades: NDArray[np.float32]
+    mesh_ranges: NDArray[np.int64]
+    mesh_objects: NDArray[np.int32]
+    mesh_spheres: NDArray[np.float32]
 
     def __len__(self) -> int:
         return len(self.corners)
 
-    @staticmethod
-    def joined(parts: Sequence[Triangles]) -> Triangles:
-        """All triangles of all parts, in their order."""
-        starts = np.cumsum([0, *(len(part.facades) for part in parts)])
-        facade = [np.where(part.facade >= 0, part.facade + k, -1) for part, k in zip(parts, starts, strict=False)]
-        corners, normals, albedo, material, facades = (
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ("corners", "normals", "albedo", "material", "facades")
-        )
-        return Triangles(corners, normals, albedo, material, np.concatenate(facade).astype(np.int32), facades)
-
-
-@dataclass(frozen=True)
-class PlacedMesh:
-    """One mesh in the world.
-
-    Attributes:
-        triangles: the mesh's triangles.
-        sphere: (4,) bounding sphere: centre x, y, z and radius, metres.
-    """
-
-    triangles: Triangles
-    sphere: NDArray[np.float32]
-
-    @staticmethod
+    @classmethod
     def from_mesh(
-        mesh: Mesh, facade: NDArray[np.int32] | None = None, facades: NDArray[np.float32] | None = None
-    ) -> PlacedMesh:
-        """Place a mesh whose faces are in world coordinates already. facade, facades: as in `Triangles`."""
+        cls, mesh: Mesh, facade: NDArray[np.int32] | None = None, facades: NDArray[np.float32] = NO_FACADES
+    ) -> Self:
+        """One mesh, in its own frame or with its faces in world coordinates already. facade: default: none."""
         corners = mesh.faces
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
         points = corners.reshape(-1, 3)
         low, high = points.min(0), points.max(0)
-        sphere = np.array([*((low + high) / 2), np.linalg.norm(high - low) / 2 + 1e-3], np.float32)
-        if facade is None or facades is None:
-            facade, facades = np.full(len(corners), -1, np.int32), NO_FACADES
-        return PlacedMesh(Triangles(corners, normals, mesh.albedo, mesh.material, facade, facades), sphere)
+        sphere = np.array([[*((low + high) / 2), np.linalg.norm(high - low) / 2 + 1e-3]], np.float32)
+        facade = np.full(len(corners), -1, np.int32) if facade is None else facade
+        whole, no_object = np.array([[0, len(corners)]]), np.full(1, -1, np.int32)
+        return cls(corners, normals, mesh.albedo, mesh.material, facade, facades, whole, no_object, sphere)
 
+    @classmethod
+    def gather(cls, parts: Sequence[Self], objects: Sequence[int] | None = None) -> Self:
+        """All meshes of all parts, in their order.
 
-@dataclass(frozen=True)
-class MeshTemplate:
-    """A mesh that is placed many times; its normals and its bounding sphere are computed once.
+        objects: (M,) index of each mesh's object, -1 for none; default: those of the parts. Meshes of one object must
+        follow each other.
+        """
+        rows = np.cumsum([0, *(len(part.facades) for part in parts)], dtype=np.int32)
+        starts = np.cumsum([0, *(len(part) for part in parts)])
+        shifted = [
+            replace(
+                part, facade=np.where(part.facade >= 0, part.facade + row, -1), mesh_ranges=part.mesh_ranges + start
+            )
+            for part, row, start in zip(parts, rows, starts, strict=False)
+        ]
+        soup = cls(*(np.concatenate([getattr(part, field.name) for part in shifted]) for field in fields(cls)))
+        return soup if objects is None else replace(soup, mesh_objects=np.asarray(objects, np.int32))
 
-    Attributes:
-        mesh: the mesh in its own frame.
-        normals: (F, 3) unit vectors of its faces.
-        sphere: (4,) bounding sphere: centre x, y, z and radius, metres.
-    """
+    def painted(self, paint: NDArray[np.float32], dye: NDArray[np.float32]) -> Self:
+        """The meshes with these linear colours (3,) on their PAINT and DYE faces."""
+        albedo = self.albedo.copy()
+        albedo[self.material == Material.PAINT] = paint
+        albedo[self.material == Material.DYE] = dye
+        return replace(self, albedo=albedo)
 
-    mesh: Mesh
-    normals: NDArray[np.float32]
-    sphere: NDArray[np.float32]
-
-    @staticmethod
-    def of(mesh: Mesh) -> MeshTemplate:
-        """The template of a mesh."""
-        placed = PlacedMesh.from_mesh(mesh)
-        return MeshTemplate(mesh, placed.triangles.normals, placed.sphere)
-
-    def painted(self, paint: NDArray[np.float32], dye: NDArray[np.float32]) -> MeshTemplate:
-        """The template with these linear colours (3,) on its PAINT and DYE faces."""
-        albedo = self.mesh.albedo.copy()
-        albedo[self.mesh.material == Material.PAINT] = paint
-        albedo[self.mesh.material == Material.DYE] = dye
-        return replace(self, mesh=replace(self.mesh, albedo=albedo))
-
-    def placed(self, position: tuple[float, float, float], yaw: float) -> PlacedMesh:
-        """The mesh turned by `yaw` (radians) and moved to a world position (metres)."""
+    def placed(self, position: tuple[float, float, float], yaw: float) -> Self:
+        """A soup of one mesh, turned by `yaw` (radians) and moved to a world position (metres)."""
         cosine, sine = float(np.cos(yaw)), float(np.sin(yaw))
-        corners = (_turned(self.mesh.faces, cosine, sine) + position).astype(np.float32)
+        corners = (_turned(self.corners, cosine, sine) + position).astype(np.float32)
         normals = _turned(self.normals, cosine, sine).astype(np.float32)
         x, y, z = position
-        cx, cy, cz, radius = self.sphere
-        sphere = np.array([cosine * cx - sine * cy + x, sine * cx + cosine * cy + y, cz + z, radius], np.float32)
-        no_facade = np.full(len(corners), -1, np.int32)
-        mesh = self.mesh
-        return PlacedMesh(Triangles(corners, normals, mesh.albedo, mesh.material, no_facade, NO_FACADES), sphere)
+        cx, cy, cz, radius = self.mesh_spheres[0]
+        sphere = np.array([[cosine * cx - sine * cy + x, sine * cx + cosine * cy + y, cz + z, radius]], np.float32)
+        return replace(self, corners=corners, normals=normals, mesh_spheres=sphere)
 
 
 def _turned(vectors: NDArray[np.float32], cosine: float, sine: float) -> NDArray[np.float64]:
     """Vectors (..., 3) turned about z."""
     x, y, z = np.moveaxis(vectors.astype(np.float64), -1, 0)
     return np.stack([cosine * x - sine * y, sine * x + cosine * y, z], -1)
-
-
-@dataclass(frozen=True)
-class TriangleSoup:
-    """M placed meshes in one set of arrays.
-
-    Attributes:
-        triangles: the triangles of all meshes.
-        mesh_ranges: (M, 2) first triangle of each mesh, and one past its last.
-        mesh_objects: (M,) index of the annotated object that the mesh belongs to; -1 for none.
-        mesh_spheres: (M, 4) bounding spheres: centre x, y, z and radius, metres.
-    """
-
-    triangles: Triangles
-    mesh_ranges: NDArray[np.int64]
-    mesh_objects: NDArray[np.int32]
-    mesh_spheres: NDArray[np.float32]
-
-    @staticmethod
-    def gather(meshes: Sequence[PlacedMesh], objects: Sequence[int]) -> TriangleSoup:
-        """Put meshes into one set of arrays.
-
-        objects: (M,) index of each mesh's object, -1 for none. Meshes of one object must follow each other.
-        """
-        counts = np.array([len(mesh.triangles) for mesh in meshes], np.int64)
-        ends = np.cumsum(counts)
-        return TriangleSoup(
-            Triangles.joined([mesh.triangles for mesh in meshes]),
-            np.stack([ends - counts, ends], -1),
-            np.asarray(objects, np.int32),
-            np.stack([mesh.sphere for mesh in meshes]),
-        )
-
-    def joined(self, other: TriangleSoup) -> TriangleSoup:
-        """This soup followed by another one."""
-        return TriangleSoup(
-            Triangles.joined([self.triangles, other.triangles]),
-            np.concatenate([self.mesh_ranges, other.mesh_ranges + len(self.triangles)]),
-            np.concatenate([self.mesh_objects, other.mesh_objects]),
-            np.concatenate([self.mesh_spheres, other.mesh_spheres]),
-        )

@@ -1,7 +1,5 @@
 """Meshes of cars, trucks, trailers and buses."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from bevcli.synth.assets.mesh import Mesh, block, rod, side_profile, wheel

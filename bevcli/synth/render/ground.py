@@ -1,7 +1,5 @@
 """The painted ground: as a texture with mip levels, and as the ground truth map."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -47,8 +45,7 @@ def paint_ground(pieces: list[GroundPiece], center: ArrayLike, extent_m: float, 
     block = 2 ** (LEVELS - 1)
     size = round(extent_m / texel_m / block) * block
     origin = np.asarray(center, dtype=np.float64) - size * texel_m / 2
-    canvas = np.empty((size, size, 3), np.uint8)
-    canvas[:] = _stored(ASPHALT)
+    canvas = np.full((size, size, 3), _stored(ASPHALT), np.uint8)
     for piece in pieces:
         for paint in piece.paints:
             if paint.width_m > texel_m / 2:
@@ -56,8 +53,7 @@ def paint_ground(pieces: list[GroundPiece], center: ArrayLike, extent_m: float, 
     levels = [canvas]
     for _ in range(LEVELS - 1):
         levels.append(cv2.resize(levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
-    counts = [level.shape[0] ** 2 for level in levels]
-    offsets = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
+    offsets = np.cumsum([0, *(level.shape[0] ** 2 for level in levels[:-1])])
     texels = np.concatenate([level.reshape(-1, 3) for level in levels])
     return GroundTexture(texels, roughness(), offsets, (float(origin[0]), float(origin[1])), texel_m, size)
 
@@ -126,9 +122,7 @@ def draw_map(pieces: list[GroundPiece], boxes_world: Boxes3D, bev_from_world: Ar
         world = np.column_stack([points[:, :2], np.zeros(len(points))])
         return window.pixels(apply(bev_from_world, world))
 
-    layers: dict[str, NDArray[np.uint8]] = {
-        name: np.zeros((window.cells, window.cells), np.uint8) for name in MAP_CLASSES
-    }
+    layers = {name: np.zeros((window.cells, window.cells), np.uint8) for name in MAP_CLASSES}
     for piece in pieces:
         for outline in piece.roads:
             fill(layers["drivable_road"], pixels(outline), 1)

@@ -5,8 +5,6 @@ other, so the pixels that it would cover without occlusion are counted in the sa
 compiles are in one file because its cache is invalidated only when the file of the called function changes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
@@ -51,7 +49,7 @@ def rasterise(soup: TriangleSoup, camera: Camera, camera_from_world: Array, obje
     k = camera.intrinsics
     pinhole = np.array([k[0, 0], k[0, 1], k[0, 2], k[1, 1], k[1, 2]])
     rasterise_meshes(
-        (soup.triangles.corners, soup.triangles.normals),
+        (soup.corners, soup.normals),
         (soup.mesh_ranges, soup.mesh_objects, soup.mesh_spheres),
         np.ascontiguousarray(camera_from_world[:3]), pinhole, inverse(camera_from_world)[:3, 3].copy(),
         triangles, inverse_depth, last_objects, unoccluded,
@@ -281,7 +279,7 @@ class ShadowMap:
     @staticmethod
     def of(
         corners: NDArray[np.float32], to_sun: ArrayLike, center: ArrayLike, extent_m: float, texel_m: float
-    ) -> ShadowMap:
+    ) -> "ShadowMap":
         """The shadows of triangles on a square of `extent_m` metres around a world point.
 
         corners: (T, 3, 3) world, metres. to_sun: (3,) unit vector. center: (2,) metres; it is rounded to whole texels,
@@ -295,7 +293,7 @@ class ShadowMap:
         empty = ShadowMap(np.full((size, size), -1.0, np.float32), origin, texel_m, shear)
         return empty.with_shadows_of([corners])
 
-    def with_shadows_of(self, parts: Iterable[NDArray[np.float32]]) -> ShadowMap:
+    def with_shadows_of(self, parts: Iterable[NDArray[np.float32]]) -> "ShadowMap":
         """A copy of the map with the shadows of more triangles. parts: arrays (T, 3, 3), world, metres."""
         heights = self.heights.copy()
         for corners in parts:

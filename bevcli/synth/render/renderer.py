@@ -5,8 +5,6 @@ no triangles: a pixel that sees none and looks down sees the plane z = 0. The im
 resampled from a wider pinhole image.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -120,13 +118,13 @@ def shade(
 
     camera: the buffer's camera; its distortion is ignored. world_from_camera: (4, 4).
     """
-    triangles, ground, shadows, w = snapshot.soup.triangles, snapshot.ground, snapshot.shadows, snapshot.weather
+    soup, ground, shadows, w = snapshot.soup, snapshot.ground, snapshot.shadows, snapshot.weather
     light = np.stack([w.sun, w.sky, w.bounce, w.zenith, w.horizon, w.haze, w.cloud_color]).astype(np.float64)
     ray_from_image = world_from_camera[:3, :3] @ np.linalg.inv(camera.intrinsics)
     image = np.empty((*buffer.triangles.shape, 3), np.uint8)
     shade_pixels(
         (buffer.triangles, buffer.inverse_depth),
-        (triangles.normals, triangles.albedo, triangles.material, triangles.facade, triangles.facades),
+        (soup.normals, soup.albedo, soup.material, soup.facade, soup.facades),
         (ground.texels, ground.offsets, ground.rough, *ground.origin, ground.texel_m, ground.size),
         (shadows.heights, *shadows.origin, shadows.texel_m, *shadows.shear, w.shadow_softness_m),
         (light, w.to_sun, w.clouds, w.haze_m, w.lamps),

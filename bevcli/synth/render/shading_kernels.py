@@ -7,8 +7,6 @@ Positions are in the world frame in metres, colours are linear RGB.
 # mypy: disable-error-code="no-untyped-def"
 # The kernels have no type hints: numba takes the types from the first call.
 
-from __future__ import annotations
-
 import numpy as np
 
 from bevcli.jit import njit
@@ -26,7 +24,7 @@ def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, image)
     """Colour every pixel of `image` (H, W, 3) uint8 BGR, in place.
 
     buffer: triangles and inverse depths of `VisibilityBuffer`.
-    surfaces: normals, albedo, material, facade, facades of `Triangles`.
+    surfaces: normals, albedo, material, facade, facades of `TriangleSoup`.
     ground: texels, offsets, roughness, x and y of the origin, texel size and size of `GroundTexture`.
     shadows: heights, x and y of the origin, texel size and shear of `ShadowMap`, softness in metres.
     weather: light (7, 3) with rows sun, sky, bounce, zenith, horizon, haze, cloud; to_sun; clouds; haze_m; lamps.
@@ -248,7 +246,7 @@ def _ground(ground, x, y, across, along, rx, ry, out):
 def _facade(row, x, y, z, footprint, lamps, out):
     """Albedo of a wall at a point into out (3,). Returns whether the point is glass.
 
-    row: (16,) made by `facade_row`. footprint: size of the pixel on the wall, metres; finer details fade out.
+    row: (16,) of `TriangleSoup.facades`. footprint: size of the pixel on the wall, metres; finer details fade out.
     lamps: brightness of lit windows.
     """
     u = (x - row[0]) * row[2] + (y - row[1]) * row[3]

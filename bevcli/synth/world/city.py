@@ -6,8 +6,6 @@ a random angle. Every street and block has random numbers of its own, so the pla
 calls.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product

@@ -3,8 +3,6 @@
 The ground texture and the ground truth map are both drawn from these polygons.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache

@@ -1,17 +1,15 @@
 """People who walk: along the pavements, and over the streets at junctions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from bevcli.geometry.transforms import Array
 from bevcli.synth.assets.catalog import Body, Catalog, draw_body
 from bevcli.synth.assets.people import PERSON_NAMES
 from bevcli.synth.world.city import KERB_M, CityPlan, along, rounded_rectangle
-from bevcli.synth.world.route import DIRECTIONS, node_center, street_of
+from bevcli.synth.world.route import DIRECTIONS, distances_along, node_center, street_of
 from bevcli.synth.world.traffic import MOVING_M_S, ActorState, Signals
 
 STRIDE_M = 0.72  # distance after which the pose changes
@@ -43,45 +41,43 @@ class Walker:
     places: NDArray[np.float64]
     road: tuple[float, float]
 
-    def plan_at(self, time_s: float) -> Array:
-        """Plan point (2,) at a time in seconds."""
-        place = np.interp(time_s, self.times, self.places)
-        return np.array([np.interp(place, self.positions, self.path[:, k]) for k in (0, 1)])
+    def plan_at(self, time_s: ArrayLike) -> Array:
+        """Plan points (..., 2) at times (...,) in seconds."""
+        places = np.interp(np.asarray(time_s, dtype=np.float64), self.times, self.places)
+        return np.stack([np.interp(places, self.positions, self.path[:, k]) for k in (0, 1)], -1)
+
+    def _place(self, time_s: float) -> float:
+        """Position along the path at a time in seconds, metres."""
+        return float(np.interp(time_s, self.times, self.places))
 
     def on_road(self, time_s: float) -> bool:
         """True while the person is on the road, so that vehicles must stop."""
-        return self.road[0] - 0.3 < float(np.interp(time_s, self.times, self.places)) < self.road[1] + 0.3
+        return self.road[0] - 0.3 < self._place(time_s) < self.road[1] + 0.3
 
     def state(self, time_s: float) -> ActorState | None:
         """The state, or None before the walk begins and after it ends."""
         if not self.times[0] <= time_s <= self.times[-1]:
             return None
-        times = np.array([time_s - 0.02, time_s, time_s + 0.02])
-        places = np.interp(times, self.times, self.places)
-        plan = np.stack([np.interp(places, self.positions, self.path[:, k]) for k in (0, 1)], -1)
+        place, plan = self._place(time_s), self.plan_at([time_s - 0.02, time_s, time_s + 0.02])
         before, here, after = self.city.bend(plan)
         velocity = (after - before) / 0.04
         moving = float(np.hypot(*velocity)) > MOVING_M_S
         if moving:
             yaw = float(np.arctan2(velocity[1], velocity[0]))
         else:  # a waiting person faces along the path
-            segment = int(np.searchsorted(self.positions, places[1], side="right"))
-            yaw = self.city.heading(plan[1], _unit(self.path[segment] - self.path[segment - 1]))
-        inside = min(places[1] - self.road[0], self.road[1] - places[1])  # metres into the road, negative on pavements
+            segment = int(np.searchsorted(self.positions, place, side="right"))
+            way = self.path[segment] - self.path[segment - 1]
+            yaw = self.city.heading(plan[1], way / max(float(np.hypot(*way)), 1e-9))
+        inside = min(place - self.road[0], self.road[1] - place)  # metres into the road, negative on pavements
         position = np.array([here[0], here[1], KERB_M * float(np.clip(0.5 - inside / 0.3, 0, 1))])
         attribute = "pedestrian.moving" if moving else "pedestrian.standing"
-        return ActorState(self.body, position, yaw, velocity, attribute, int(places[1] / STRIDE_M) % 2)
-
-
-def _unit(way: Array) -> Array:
-    return way / max(float(np.hypot(*way)), 1e-9)
+        return ActorState(self.body, position, yaw, attribute, velocity, int(place / STRIDE_M) % 2)
 
 
 def _make(
     city: CityPlan, body: Body, path: Array, times: list[float], places: list[float], road: tuple[float, float]
 ) -> Walker:
-    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
-    return Walker(city, body, path, np.concatenate([[0], np.cumsum(steps)]), np.array(times), np.array(places), road)
+    return Walker(city, body, path, distances_along(path), np.array(times), np.array(places), road)
 
 
 def strollers(city: CityPlan, catalog: Catalog, span_s: tuple[float, float], column: int, row: int) -> list[Walker]:
@@ -97,10 +93,9 @@ def strollers(city: CityPlan, catalog: Catalog, span_s: tuple[float, float], col
             ring = ring[::-1]
         speed = rng.uniform(0.8, 1.7)
         lap = float(np.linalg.norm(np.diff(ring, axis=0, append=ring[:1]), axis=1).sum())
-        laps = int(np.ceil((span_s[1] - span_s[0]) * speed / lap)) + 1
-        path = np.concatenate([ring] * laps + [ring[:1]])
-        body = _person(catalog, rng, f"stroller-{column}-{row}-{k}")
         walked = (span_s[1] - span_s[0]) * speed
+        path = np.concatenate([ring] * (int(np.ceil(walked / lap)) + 1) + [ring[:1]])
+        body = _person(catalog, rng, f"stroller-{column}-{row}-{k}")
         walkers.append(_make(city, body, path, list(span_s), [0.0, walked], (-1.0, -1.0)))
     return walkers
 

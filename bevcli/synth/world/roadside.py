@@ -1,7 +1,5 @@
 """Annotated objects that stand still: parked vehicles, road works, building sites, standing people."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from functools import lru_cache
 

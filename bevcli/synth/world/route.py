@@ -1,8 +1,5 @@
 """Routes: the smooth line that a vehicle follows, with its speed limits and the junctions on it."""
 
-from __future__ import annotations
-
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,9 +62,7 @@ class Route:
     def at(self, position: ArrayLike) -> Array:
         """World points (..., 2) at positions (...,) in metres along the route."""
         s = np.asarray(position, dtype=np.float64)
-        return np.stack(
-            [np.interp(s, self.positions, self.points[:, 0]), np.interp(s, self.positions, self.points[:, 1])], -1
-        )
+        return np.stack([np.interp(s, self.positions, self.points[:, k]) for k in (0, 1)], -1)
 
     def yaw_at(self, position: ArrayLike) -> Array:
         """Heading (...,) in radians."""
@@ -106,58 +101,46 @@ def right_of(direction: int) -> Array:
     return DIRECTIONS[(direction - 1) % 4]
 
 
-def draw_turns(city: CityPlan, start: LaneStart, rng: np.random.Generator, straight_on: float = 0.6) -> Iterator[int]:
-    """Draw turns without end, each one allowed from the lane that the vehicle is in."""
-    node, direction, lane = start.node, start.direction, start.lane
-    while True:
-        lanes = street_of(city, node, direction).lanes
-        options = (
-            [1, -1, -1] if lanes == 1 else ([1] if lane == 0 else [-1])
-        )  # left turns are rarer: they block the lane
-        turn = 0 if rng.random() < straight_on else int(options[int(rng.integers(len(options)))])
-        yield turn
-        direction = (direction + turn) % 4
-        node = (node[0] + int(DIRECTIONS[direction][0]), node[1] + int(DIRECTIONS[direction][1]))
-        lane = _lane_after(city, node, direction, turn, lane)
-
-
-def bicycle_turns(rng: np.random.Generator) -> Iterator[int]:
-    """Draw turns of a bicycle without end: straight on or right."""
-    while True:
-        yield 0 if rng.random() < 0.7 else -1
-
-
-def _lane_after(city: CityPlan, node: tuple[int, int], direction: int, turn: int, lane: int) -> int:
-    lanes = street_of(city, node, direction).lanes
-    return min(lane, lanes - 1) if turn == 0 else (0 if turn > 0 else lanes - 1)
+def _draw_turn(rng: np.random.Generator, street: Street, lane: int, straight_on: float, bicycle: bool) -> int:
+    """Draw a turn that is allowed from the lane of a street; a bicycle goes straight on or turns right."""
+    if bicycle:
+        return 0 if rng.random() < 0.7 else -1
+    # Left turns are rarer: they block the lane.
+    turns = [1, -1, -1] if street.lanes == 1 else ([1] if lane == 0 else [-1])
+    return 0 if rng.random() < straight_on else turns[int(rng.integers(len(turns)))]
 
 
 def build_route(
-    city: CityPlan, start: LaneStart, turns: Iterable[int], length: float, speed: float, bicycle: bool = False
+    city: CityPlan,
+    start: LaneStart,
+    rng: np.random.Generator,
+    length: float,
+    speed: float,
+    straight_on: float = 0.6,
+    bicycle: bool = False,
 ) -> Route:
-    """Build a route.
+    """Build a route with random turns.
 
-    turns: turn at each junction. length: least length, metres. speed: limit on straight road, m/s.
-    bicycle: whether it keeps right of the lanes.
+    length: least length, metres. speed: limit on straight road, m/s. straight_on: share of junctions without a turn,
+    where it is not a bicycle. bicycle: whether it keeps right of the lanes, and never turns left.
     """
     node, direction, lane = start.node, start.direction, start.lane
     street = street_of(city, node, direction)
     offset = lane_offset(street, lane, bicycle)
     at = node_center(city, node) - DIRECTIONS[direction] * start.before + right_of(direction) * offset
     corners, marks, travelled = [at[None]], [], 0.0
-    choose = iter(turns)
     while travelled < length:
-        turn = next(choose)
+        turn = _draw_turn(rng, street, lane, straight_on, bicycle)
         center, cross = node_center(city, node), street_of(city, node, direction + 1)
         after = (direction + turn) % 4
         following = (node[0] + int(DIRECTIONS[after][0]), node[1] + int(DIRECTIONS[after][1]))
-        lane = _lane_after(city, following, after, turn, lane)
-        new_street = street_of(city, following, after)
-        new_offset = lane_offset(new_street, lane, bicycle)
+        street = street_of(city, following, after)
+        lane = min(lane, street.lanes - 1) if turn == 0 else (0 if turn > 0 else street.lanes - 1)
+        new_offset = lane_offset(street, lane, bicycle)
         corner = center + right_of(direction) * offset
         if turn != 0:
             corner = corner + DIRECTIONS[direction] * (right_of(after) @ DIRECTIONS[direction]) * new_offset
-        radius = _radius(cross, new_offset, turn)
+        radius = cross.half_width + turn * new_offset + (1.5 if turn < 0 else 0.0)
         begin, end = corner - DIRECTIONS[direction] * radius, corner + DIRECTIONS[after] * radius
         stop = _lane_point(center, direction, offset, -(cross.half_width + STOP_LINE_M))
         across = street_of(city, node, after + 1)
@@ -181,12 +164,6 @@ def lane_offset(street: Street, lane: int, bicycle: bool) -> float:
     return street.lanes * street.lane_m + BICYCLE_OFFSET_M if bicycle else street.lane_offset(lane)
 
 
-def _radius(cross: Street, new_offset: float, turn: int) -> float:
-    if turn == 0:
-        return cross.half_width
-    return cross.half_width + turn * new_offset + (1.5 if turn < 0 else 0.0)
-
-
 def _arc(begin: Array, corner: Array, end: Array) -> Array:
     """(17, 2) quarter of an ellipse from begin to end, tangent to the lines from begin and end to the corner."""
     center = begin + end - corner
@@ -199,12 +176,11 @@ def _finish(city: CityPlan, corners: Array, marks: list, speed: float) -> Route:
 
     marks: of each junction: node, direction, turn, and the plan points of stop and leave.
     """
-    along_corners = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    along_corners = distances_along(corners)
     samples = np.arange(0, along_corners[-1], STEP_M)
     plan = np.stack([np.interp(samples, along_corners, corners[:, k]) for k in (0, 1)], -1)
     points = gaussian_filter1d(city.bend(plan), SMOOTHING_M / STEP_M, axis=0, mode="nearest")
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    positions = np.concatenate([[0], np.cumsum(steps)])
+    positions = distances_along(points)
     way = np.gradient(points, axis=0)
     yaws = np.unwrap(np.arctan2(way[:, 1], way[:, 0]))
     limits = _speed_limits(positions, yaws, speed)
@@ -217,6 +193,11 @@ def _finish(city: CityPlan, corners: Array, marks: list, speed: float) -> Route:
             found.append(float(positions[start]))
         passes.append(JunctionPass(node, direction, turn, *found))
     return Route(points, positions, yaws, limits, tuple(passes))
+
+
+def distances_along(points: Array) -> Array:
+    """(P,) distance of each point (P, 2) of a line from its start, along the line."""
+    return np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
 
 
 def _speed_limits(positions: Array, yaws: Array, speed: float) -> NDArray[np.float64]:

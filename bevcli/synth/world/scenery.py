@@ -1,7 +1,5 @@
 """Objects without annotations: houses, kerbs, trees, street furniture and traffic signals."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
@@ -13,7 +11,7 @@ from bevcli.geometry.transforms import Array
 from bevcli.synth.assets.mesh import Mesh, from_faces, joined, prism
 from bevcli.synth.assets.paint import Color, Finish, Material, darker, linear
 from bevcli.synth.assets.street_furniture import TREE_KINDS, StreetFurniture
-from bevcli.synth.assets.triangles import MeshTemplate, PlacedMesh, TriangleSoup
+from bevcli.synth.assets.triangles import TriangleSoup
 from bevcli.synth.world.city import CORNER_M, KERB_M, Block, CityPlan, rounded_rectangle
 from bevcli.synth.world.route import DIRECTIONS, node_center, right_of, street_of
 from bevcli.synth.world.traffic import Signals
@@ -52,51 +50,18 @@ class FacadeStyle:
     seed: int
 
 
-def facade_row(
-    style: FacadeStyle, origin: NDArray[np.float64], tangent: NDArray[np.float64], height: float, length: float
-) -> NDArray[np.float32]:
-    """(16,) numbers that describe a wall to the shading kernel.
-
-    origin: (2,) world point of the wall's start, metres. tangent: (2,) unit vector along the wall, counter-clockwise
-    around the house. height, length: of the wall, metres.
-    """
-    wall = linear(style.wall)
-    return np.array(
-        [*origin, *tangent, height, length, style.floor_m, style.pitch_m, *style.window_m, style.shop_m, style.brick,
-         float(style.band) + 2.0 * (style.seed % 4096), *wall], np.float32,
-    )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class House:
-    """One building, in the world frame.
-
-    Attributes:
-        walls: two triangles for each of its four walls, with the material FACADE.
-        facades: (4, 16) made by `facade_row`.
-        rest: roof, awnings and roof structures.
-    """
-
-    walls: Mesh
-    facades: NDArray[np.float32]
-    rest: Mesh
-
-    def placed(self) -> list[PlacedMesh]:
-        """The walls and the rest as meshes in the world."""
-        rows = np.repeat(np.arange(4), 2).astype(np.int32)
-        return [PlacedMesh.from_mesh(self.walls, rows, self.facades), PlacedMesh.from_mesh(self.rest)]
-
-
-def houses(city: CityPlan, land: Block) -> list[House]:
-    """Row houses along the four sides of a block, with some gaps."""
+def houses(city: CityPlan, land: Block) -> list[TriangleSoup]:
+    """Row houses along the four sides of a block, with some gaps: of each house its walls, and the rest of it."""
     rng = city.stream("houses", land.column, land.row)
     (x0, y0), (x1, y1) = land.inside()
     depth = min(14.0, (x1 - x0) / 2 - 2, (y1 - y0) / 2 - 2)
-    built = []
+    built: list[TriangleSoup] = []
     for low, high in ((y0, y0 + depth), (y1 - depth, y1)):
-        built += [_house(city, rng, (a, low), (b, high)) for a, b in _lots(rng, x0, x1)]
+        for a, b in _lots(rng, x0, x1):
+            built += _house(city, rng, (a, low), (b, high))
     for low, high in ((x0, x0 + depth), (x1 - depth, x1)):
-        built += [_house(city, rng, (low, a), (high, b)) for a, b in _lots(rng, y0 + depth + 0.5, y1 - depth - 0.5)]
+        for a, b in _lots(rng, y0 + depth + 0.5, y1 - depth - 0.5):
+            built += _house(city, rng, (low, a), (high, b))
     return built
 
 
@@ -128,8 +93,10 @@ def _style(rng: np.random.Generator, height: float) -> FacadeStyle:
     return FacadeStyle(wall, rng.uniform(3.0, 3.5), pitch, window, shop, brick, band, seed)
 
 
-def _house(city: CityPlan, rng: np.random.Generator, low: tuple[float, float], high: tuple[float, float]) -> House:
-    """A house on a plan rectangle, with its four corners mapped to the world."""
+def _house(
+    city: CityPlan, rng: np.random.Generator, low: tuple[float, float], high: tuple[float, float]
+) -> list[TriangleSoup]:
+    """The walls and the rest of a house on a plan rectangle, with its four corners mapped to the world."""
     storeys = int(rng.choice([2, 3, 4, 5, 6, 8, 11], p=[0.12, 0.22, 0.22, 0.18, 0.12, 0.09, 0.05]))
     style = _style(rng, storeys * 3.2)
     height = style.shop_m + storeys * style.floor_m + 0.9 + KERB_M
@@ -146,15 +113,21 @@ def _house(city: CityPlan, rng: np.random.Generator, low: tuple[float, float], h
         at = middle + rng.uniform(-3, 3, 2)
         square = at + np.array([(1.1, 0.8), (-1.1, 0.8), (-1.1, -0.8), (1.1, -0.8)])
         rest.append(prism([np.column_stack([square, np.full(4, height + z)]) for z in (0.0, 1.3)], (150, 150, 148)))
-    return House(joined(walls), np.stack(rows), joined(rest))
+    facade = np.repeat(np.arange(4), 2).astype(np.int32)
+    return [TriangleSoup.from_mesh(joined(walls), facade, np.stack(rows)), TriangleSoup.from_mesh(joined(rest))]
 
 
 def _wall(start: Array, end: Array, height: float, style: FacadeStyle) -> tuple[Mesh, NDArray[np.float32]]:
-    """One wall between two world points (2,), and its row of `House.facades`."""
+    """Two triangles between two world points (2,), and the (16,) numbers that describe them to the shading kernel."""
     length = float(np.hypot(*(end - start)))
+    tangent = (end - start) / length  # counter-clockwise around the house
     a, b, top_a, top_b = (*start, 0.0), (*end, 0.0), (*start, height), (*end, height)
     mesh = from_faces([[a, b, top_b], [a, top_b, top_a]], Finish(style.wall, Material.FACADE))
-    return mesh, facade_row(style, start, (end - start) / length, height, length)
+    row = [
+        *start, *tangent, height, length, style.floor_m, style.pitch_m, *style.window_m, style.shop_m, style.brick,
+        float(style.band) + 2.0 * style.seed, *linear(style.wall),
+    ]  # fmt: skip
+    return mesh, np.array(row, np.float32)
 
 
 def _roof(ground: Array, height: float, style: FacadeStyle) -> Mesh:
@@ -212,17 +185,17 @@ class Scenery:
     def around(self, center: ArrayLike, reach_m: float) -> TriangleSoup:
         """Meshes within `reach_m` metres of a world point (2,)."""
         found = [mesh for block in self.city.around(center, reach_m).blocks for mesh in self._block(*block)]
-        distances = [np.hypot(*(mesh.sphere[:2] - np.asarray(center, dtype=np.float64))) for mesh in found]
-        near = [(mesh, at) for mesh, at in zip(found, distances, strict=True) if at < reach_m + mesh.sphere[3]]
+        spheres = np.concatenate([mesh.mesh_spheres for mesh in found])
+        distances = np.hypot(*(spheres[:, :2] - np.asarray(center, dtype=np.float64)).T)
         # Draw walls first, near ones before far ones: they hide most of the rest, which is then skipped.
-        near.sort(key=lambda item: (len(item[0].triangles.facades) == 0, item[1]))
-        return TriangleSoup.gather([mesh for mesh, _ in near], [-1] * len(near))
+        order = np.lexsort([distances, [len(mesh.facades) == 0 for mesh in found]])
+        return TriangleSoup.gather([found[k] for k in order if distances[k] < reach_m + spheres[k, 3]])
 
-    def _make_block(self, column: int, row: int) -> list[PlacedMesh]:
+    def _make_block(self, column: int, row: int) -> list[TriangleSoup]:
         land, use = self.city.block(column, row), self.city.landuse(column, row)
-        meshes = [PlacedMesh.from_mesh(kerb_slab(self.city, rounded_rectangle(land.low, land.high, CORNER_M)))]
+        meshes = [TriangleSoup.from_mesh(kerb_slab(self.city, rounded_rectangle(land.low, land.high, CORNER_M)))]
         if use == "houses":
-            meshes += [mesh for house in houses(self.city, land) for mesh in house.placed()]
+            meshes += houses(self.city, land)
         rng = self.city.stream("furniture", column, row)
         if use == "park":
             meshes += self._park(land, rng)
@@ -230,7 +203,7 @@ class Scenery:
             meshes += self._side(land, side, rng)
         return meshes
 
-    def _park(self, land: Block, rng: np.random.Generator) -> list[PlacedMesh]:
+    def _park(self, land: Block, rng: np.random.Generator) -> list[TriangleSoup]:
         """Trees and bushes all over a block."""
         low, high = land.inside(1.5)
         count = int(np.prod(high - low) / 75)
@@ -240,7 +213,7 @@ class Scenery:
             meshes.append(self._put(kinds[int(rng.integers(len(kinds)))], point, rng.uniform(0, 6.3)))
         return meshes
 
-    def _side(self, land: Block, side: int, rng: np.random.Generator) -> list[PlacedMesh]:
+    def _side(self, land: Block, side: int, rng: np.random.Generator) -> list[TriangleSoup]:
         """The pavement on one side of a block: trees, lamps and signs near the kerb, benches and bins between them."""
         start, way, inward, length = land.side(side)
         street = self.city.street(side % 2, (land.row, land.column + 1, land.row + 1, land.column)[side])
@@ -267,14 +240,14 @@ class Scenery:
             meshes.append(self._put(self.furniture.shelter, spot, outward))
         return meshes
 
-    def _put(self, template: MeshTemplate, point: Array, yaw: float) -> PlacedMesh:
+    def _put(self, template: TriangleSoup, point: Array, yaw: float) -> TriangleSoup:
         x, y = self.city.bend(point)
         return template.placed((float(x), float(y), KERB_M), yaw)
 
 
 def signal_meshes(
     city: CityPlan, signals: Signals, furniture: StreetFurniture, here: ArrayLike, time_s: float
-) -> list[PlacedMesh]:
+) -> list[TriangleSoup]:
     """Traffic signals around a world point (2,), with their lights at a time in seconds.
 
     Each junction has one signal for each approach, behind the junction on the right.

@@ -1,7 +1,5 @@
 """The simulation of a drive: traffic and pedestrians over its whole time, and the ego vehicle's motion."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache, partial
 
@@ -19,9 +17,7 @@ from bevcli.synth.world.route import (
     DIRECTIONS,
     LaneStart,
     Route,
-    bicycle_turns,
     build_route,
-    draw_turns,
     lane_offset,
     node_center,
     right_of,
@@ -56,7 +52,7 @@ class VehicleSpawner:
         edge = street_of(self.city, (0, 0), direction + 1).half_width + STOP_LINE_M
         start = LaneStart((0, 0), direction, lane, edge + rng.uniform(18, 78))
         speed = float(rng.uniform(8.0, 12.0))
-        route = build_route(self.city, start, draw_turns(self.city, start, rng, 0.4), self.route_m, speed)
+        route = build_route(self.city, start, rng, self.route_m, speed, straight_on=0.4)
         return Vehicle(route, units, 8.0, speed * 0.6, 1.0)
 
     def spawn(self, around: Array, near_m: float, far_m: float, taken: Array, bicycle: bool) -> Vehicle | None:
@@ -92,9 +88,8 @@ class VehicleSpawner:
         if np.sqrt((gaps**2).sum(-1).min()) < (1.6 if bicycle else 2.2):
             return None
         start = LaneStart(node, direction, lane, before + length + 2)
-        turns = bicycle_turns(rng) if bicycle else draw_turns(self.city, start, rng)
         speed = float(rng.uniform(3.5, 6.0) if bicycle else rng.uniform(7.5, 12.5))
-        route = build_route(self.city, start, turns, self.route_m * speed / 12 + length, speed, bicycle)
+        route = build_route(self.city, start, rng, self.route_m * speed / 12 + length, speed, bicycle=bicycle)
         return Vehicle(route, units, length + 2, speed * 0.7, float(rng.uniform(0.7, 1.25)), bicycle)
 
     def _next_node(self, axis: int, index: int, at: float, direction: int) -> tuple[int, int]:
@@ -138,28 +133,24 @@ class EgoTrack:
 
     Attributes:
         route: its route.
-        times: (T,) seconds.
-        positions: (T,) route positions, metres.
-        speeds: (T,) m/s.
+        track: (3, T) times (seconds), route positions (metres), speeds (m/s).
     """
 
     route: Route
-    times: Array
-    positions: Array
-    speeds: Array
+    track: Array
 
     def pose(self, time_s: float) -> tuple[Array, float]:
         """World point (2,) of the rear axle in metres, and yaw in radians, at a time in seconds."""
-        s = interpolated_track(self.times, self.positions, self.speeds, time_s)
+        s = interpolated_track(self.track, time_s)
         return self.route.at(s), float(self.route.yaw_at(s))
 
     def motion(self, time_s: float) -> tuple[Array, Array, Array]:
         """Acceleration with gravity (m/s²), angular rate (rad/s) and velocity (m/s), each (3,), ego frame."""
         h = 0.05
-        s = [interpolated_track(self.times, self.positions, self.speeds, time_s + d) for d in (-h, 0.0, h)]
+        s = [interpolated_track(self.track, time_s + d) for d in (-h, 0.0, h)]
         speed = (s[2] - s[0]) / (2 * h)
         rate = float(self.route.yaw_at(s[2]) - self.route.yaw_at(s[0])) / (2 * h)
-        before, after = np.interp([time_s - h, time_s + h], self.times, self.speeds)
+        before, after = np.interp([time_s - h, time_s + h], self.track[0], self.track[2])
         forward = float(after - before) / (2 * h)
         return np.array([forward, speed * rate, GRAVITY]), np.array([0.0, 0.0, rate]), np.array([speed, 0.0, 0.0])
 
@@ -207,7 +198,8 @@ class Simulation:
             step(vehicles, self._people_on_roads(vehicles, time_s), self.signals, time_s)
             if k % 10 == 9:
                 gone += self._renew(vehicles, time_s + STEP_S)
-        self._driving = [d for v in [*gone, *vehicles[1:]] if len(v.track) > 1 for d in DrivingActor.of(v)]
+        seen = [vehicle for vehicle in [*gone, *vehicles[1:]] if len(vehicle.track) > 1]
+        self._driving = [DrivingActor(v, unit, np.array(v.track).T) for v in seen for unit in v.units]
 
     def _populate(self, vehicles: list[Vehicle], near_m: float) -> None:
         """Spawn vehicles around the ego vehicle, at least `near_m` metres away, until there are enough."""
@@ -260,4 +252,4 @@ def _smoothed(ego: Vehicle) -> EgoTrack:
     times, fronts, speeds = np.array(ego.track).T
     soft = gaussian_filter1d(speeds, EGO_SMOOTHING_S / STEP_S, mode="nearest")
     moved = np.concatenate([[0], np.cumsum((soft[1:] + soft[:-1]) / 2 * STEP_S)])
-    return EgoTrack(ego.route, times, fronts[0] - EGO_REAR_AXLE_M + moved, soft)
+    return EgoTrack(ego.route, np.stack([times, fronts[0] - EGO_REAR_AXLE_M + moved, soft]))

@@ -1,7 +1,5 @@
 """Traffic: signals, vehicles that keep their distance, obey signals and give way, and the states of actors."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
@@ -21,34 +19,8 @@ YELLOW_S, CLEARING_S = 1.5, 2.0  # durations of yellow, and of red in all direct
 WALK_START_S = 4.5  # people may start to cross until this time after parallel traffic got green
 
 
-@dataclass(frozen=True)
-class SignalCycle:
-    """The cycle of one junction: axis 0 has green first, then axis 1.
-
-    Attributes:
-        greens: duration of green for axis 0 and for axis 1, seconds.
-        offset: position in the cycle at time 0, seconds.
-    """
-
-    greens: tuple[float, float]
-    offset: float
-
-    @property
-    def length(self) -> float:
-        """Length of the cycle, seconds."""
-        return sum(self.greens) + 2 * (YELLOW_S + CLEARING_S)
-
-    def since_green(self, axis: int, time_s: float) -> float:
-        """Seconds since an axis last got green, at a time in seconds."""
-        return (time_s + self.offset - self.green_start(axis)) % self.length
-
-    def green_start(self, axis: int) -> float:
-        """Position in the cycle at which an axis gets green, seconds."""
-        return 0.0 if axis == 0 else self.greens[0] + YELLOW_S + CLEARING_S
-
-
 class Signals:
-    """The signals of a city.
+    """The signals of a city. In the cycle of a junction axis 0 has green first, then axis 1.
 
     first: node and axis of the ego vehicle's approach to its first junction. Its light turns green early in the
     drive, so that the ego vehicle does not wait for the whole drive.
@@ -56,27 +28,32 @@ class Signals:
 
     def __init__(self, city: CityPlan, first: tuple[tuple[int, int], int]) -> None:
         self._city, self._first = city, first
-        self.cycle = lru_cache(maxsize=None)(self._cycle)
+        self._cycle = lru_cache(maxsize=None)(self._make_cycle)
 
-    def _cycle(self, node: tuple[int, int]) -> SignalCycle:
+    def _make_cycle(self, node: tuple[int, int]) -> tuple[tuple[float, float], tuple[float, float], float]:
+        """For both axes the duration of green and its start in the cycle, and the position at time 0; seconds."""
         rng = self._city.stream("signals", *node)
         greens = (15.0, 10.0) if rng.random() < 0.5 else (10.0, 15.0)
-        cycle = SignalCycle(greens, float(rng.uniform(0, 40)))
+        starts, offset = (0.0, greens[0] + YELLOW_S + CLEARING_S), float(rng.uniform(0, 40))
         if node == self._first[0]:
-            return SignalCycle(greens, cycle.green_start(self._first[1]) + float(rng.uniform(-3, 11)))
-        return cycle
+            offset = starts[self._first[1]] + float(rng.uniform(-3, 11))
+        return greens, starts, offset
+
+    def _since_green(self, node: tuple[int, int], axis: int, time_s: float) -> float:
+        """Seconds since an axis last got green, at a time in seconds."""
+        greens, starts, offset = self._cycle(node)
+        return (time_s + offset - starts[axis]) % (sum(greens) + 2 * (YELLOW_S + CLEARING_S))
 
     def light(self, node: tuple[int, int], axis: int, time_s: float) -> Light:
         """The light for vehicles on a street of this axis."""
-        cycle = self.cycle(node)
-        since = cycle.since_green(axis, time_s)
-        if since < cycle.greens[axis]:
+        green, since = self._cycle(node)[0][axis], self._since_green(node, axis, time_s)
+        if since < green:
             return "green"
-        return "yellow" if since < cycle.greens[axis] + YELLOW_S else "red"
+        return "yellow" if since < green + YELLOW_S else "red"
 
     def walk(self, node: tuple[int, int], axis: int, time_s: float) -> bool:
         """True while people may start to cross a street of this axis: shortly after the other axis got green."""
-        return self.cycle(node).since_green(1 - axis, time_s) < WALK_START_S
+        return self._since_green(node, 1 - axis, time_s) < WALK_START_S
 
 
 STEP_S = 0.1  # time step of the simulation
@@ -167,8 +144,7 @@ def _acceleration(
     gap, other = _nearest_in_way(route.points, route.positions, vehicle.front, obstacles, owners, index, corridor)
     wanted = free
     if gap < np.inf:
-        lead = float(speeds[other]) if other >= 0 else 0.0
-        lead = lead if _same_way(vehicle, vehicles, other) else 0.0
+        lead = float(speeds[other]) if _same_way(vehicle, vehicles, other) else 0.0
         wanted = min(wanted, _follow(speed, limit, strongest, gap, lead))
     crossing = vehicle.next_pass()
     if crossing is not None and vehicle.front < crossing.stop + 0.5:
@@ -273,16 +249,16 @@ class ActorState:
         body: size and looks.
         position: (3,) middle of the bottom, world, metres.
         yaw: world, radians.
-        velocity: (2,) world, m/s.
         attribute: nuScenes attribute, such as "vehicle.moving"; empty for classes without attributes.
+        velocity: (2,) world, m/s.
         pose: index of the mesh among the variant's poses; taken modulo their number.
     """
 
     body: Body
     position: Array
     yaw: float
-    velocity: Array
     attribute: str
+    velocity: Array = field(default_factory=lambda: np.zeros(2))
     pose: int = 0
 
 
@@ -294,25 +270,12 @@ class Actor(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class StandingActor:
-    """An actor that never moves.
-
-    Attributes:
-        body: size and looks.
-        position: (3,) middle of the bottom, world, metres.
-        yaw: world, radians.
-        attribute: nuScenes attribute.
-    """
-
-    body: Body
-    position: Array
-    yaw: float
-    attribute: str
+class StandingActor(ActorState):
+    """An actor that never moves."""
 
     def state(self, time_s: float) -> ActorState:
         """The same state at all times."""
-        return ActorState(self.body, self.position, self.yaw, np.zeros(2), self.attribute)
+        return self
 
 
 @dataclass(frozen=True)
@@ -322,37 +285,28 @@ class DrivingActor:
     Attributes:
         vehicle: the vehicle, after the simulation.
         unit: the unit.
-        times: (T,) times of the simulation steps, seconds.
-        fronts: (T,) route positions of the vehicle's front, metres.
-        speeds: (T,) m/s.
+        track: (3, T) times of the simulation steps (seconds), route positions of the vehicle's front (metres), speeds
+            (m/s).
     """
 
     vehicle: Vehicle
     unit: Unit
-    times: NDArray[np.float64]
-    fronts: NDArray[np.float64]
-    speeds: NDArray[np.float64]
-
-    @staticmethod
-    def of(vehicle: Vehicle) -> list[DrivingActor]:
-        """One actor for each unit of a vehicle. Call it after the simulation."""
-        times, fronts, speeds = np.array(vehicle.track).T
-        return [DrivingActor(vehicle, unit, times, fronts, speeds) for unit in vehicle.units]
+    track: Array
 
     def state(self, time_s: float) -> ActorState | None:
         """The state, or None before the vehicle appears and after it leaves."""
-        if time_s < self.times[0] or time_s > self.times[-1]:
+        first, last = self.track[0, 0], self.track[0, -1]
+        if not first <= time_s <= last:
             return None
         center, yaw = self._pose(time_s)
-        early, late = max(time_s - _DIFFERENCE_S, self.times[0]), min(time_s + _DIFFERENCE_S, self.times[-1])
+        early, late = max(time_s - _DIFFERENCE_S, first), min(time_s + _DIFFERENCE_S, last)
         velocity = (self._pose(late)[0] - self._pose(early)[0]) / max(late - early, 1e-9)
-        body = self.unit.body
-        position = np.array([center[0], center[1], 0.0])
         moving = float(np.hypot(*velocity)) > MOVING_M_S
-        return ActorState(body, position, yaw, velocity, driving_attribute(body.variant, moving))
+        attribute = driving_attribute(self.unit.body.variant, moving)
+        return ActorState(self.unit.body, np.array([*center, 0.0]), yaw, attribute, velocity)
 
     def _pose(self, time_s: float) -> tuple[Array, float]:
-        front = interpolated_track(self.times, self.fronts, self.speeds, time_s)
+        front = interpolated_track(self.track, time_s)
         length = float(self.unit.body.size_lwh[0])
         middle = front - self.unit.lag - length / 2
         route = self.vehicle.route
@@ -360,11 +314,12 @@ class DrivingActor:
         return (rear + fore) / 2, math.atan2(fore[1] - rear[1], fore[0] - rear[0])
 
 
-def interpolated_track(times: Array, fronts: Array, speeds: Array, time_s: float) -> float:
+def interpolated_track(track: Array, time_s: float) -> float:
     """Route position in metres at a time: cubic Hermite interpolation between the steps of a track.
 
-    times, fronts, speeds: (T,) seconds, metres and m/s of the steps.
+    track: (3, T) times, route positions and speeds of the steps; seconds, metres and m/s.
     """
+    times, fronts, speeds = track
     k = min(max(int(times.searchsorted(time_s, side="right")) - 1, 0), len(times) - 2)
     span = times[k + 1] - times[k]
     u = (time_s - times[k]) / span

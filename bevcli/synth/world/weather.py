@@ -1,7 +1,5 @@
 """Weather: the light of the sun and the sky, the clouds and the haze of one drive."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2
