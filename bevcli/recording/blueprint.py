@@ -1,7 +1,5 @@
 """The layout of a recording in the viewer: cameras above and below scene and BEV; curves and texts to the right."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

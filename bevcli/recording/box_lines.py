@@ -1,7 +1,5 @@
 """The edges of 3D boxes in a camera's image, and labels of boxes that do not overlap."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

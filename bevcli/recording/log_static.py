@@ -1,7 +1,5 @@
 """Writes the static parts of a recording: rig, vehicle, range rings, pillars, colours, legend, the page "About"."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 
 import numpy as np

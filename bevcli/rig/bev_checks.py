@@ -3,8 +3,6 @@
 Published weights expect nuScenes' LIDAR_TOP: x right, y forward, 1.84 m above the ground.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from bevcli.findings import Finding

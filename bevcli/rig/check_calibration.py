@@ -1,7 +1,5 @@
 """`check_calibration`: read a calibration and the data of its sequence, run all checks, and keep what they found."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace

@@ -1,7 +1,5 @@
 """cameras.png: all cameras' images with their overlay around the coverage map. coverage.png: the map alone."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Checks of intrinsics and lens distortion: implausible values, and values for images of another size."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

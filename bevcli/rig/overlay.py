@@ -1,7 +1,5 @@
 """A camera's image with pillars, ground grid and horizon, as its calibration projects them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

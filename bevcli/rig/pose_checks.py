@@ -5,8 +5,6 @@ rolled. Then each common mistake is undone in turn (units, inversion, quaternion
 results, the mistake is reported, not its consequences.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

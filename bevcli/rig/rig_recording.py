@@ -1,7 +1,5 @@
 """recording.rrd of a calibration check: rig, images with pillars, ground and horizon, coverage and findings."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """All checks of a rig in their order, the findings that suppress others, and the report for the terminal."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Checks of a sequence: ego-motion (units, jumps, axes) and the timestamps of the cameras' images."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Exports the boxes of a recording: as a table (.csv), or as a boxes file that `bevcli eval` reads (.json)."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Iterator
 from pathlib import Path

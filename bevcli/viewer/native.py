@@ -1,7 +1,5 @@
 """Starts and stops rerun's viewer as a child process, on loopback and without telemetry."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

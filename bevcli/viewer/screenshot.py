@@ -1,7 +1,5 @@
 """Screenshots of a recording in the viewer, which runs without a screen and draws with Vulkan."""
 
-from __future__ import annotations
-
 import subprocess
 import threading
 import time

@@ -1,7 +1,5 @@
 """The summary of a recording: frames, time span, boxes per class, bytes per entity."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Writes a video of a recording: H.264 in MP4, which plays everywhere, if PyAV is installed; VP9 else and in WebM."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction

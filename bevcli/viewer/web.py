@@ -5,8 +5,6 @@ viewer from the installed viewer once, and serves them and the recording from on
 lets the pages connect to that origin only; so the viewer in the browser cannot send telemetry.
 """
 
-from __future__ import annotations
-
 import ipaddress
 import os
 import re
