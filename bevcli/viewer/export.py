@@ -38,8 +38,7 @@ def export_boxes(recording: Path, path: Path) -> tuple[int, int]:
 
 def recorded_boxes(frame: RecordedFrame) -> FrameBoxes:
     """The shown boxes of a frame in the sequence's world frame, highest score first; recordings store float32."""
-    entity = entities.BOXES
-    origin = frame.array(entities.WORLD, "origin", 3).reshape(-1)[:3]
+    entity, origin = entities.BOXES, frame.array(entities.WORLD, "origin", 3).reshape(-1)[:3]
     origin = origin if len(origin) == 3 else np.zeros(3)
     quaternions = frame.array(entity, "Boxes3D:quaternions", 4)  # x, y, z, w
     boxes = Boxes3D(
@@ -71,10 +70,10 @@ def _rows(frame: FrameBoxes) -> Iterator[list[object]]:
     stamp, boxes = frame.stamp, frame.boxes
     assert boxes.scores is not None
     for i, score in enumerate(boxes.scores):
-        numbers = (*boxes.centers[i], *boxes.sizes_lwh[i], boxes.yaws[i], *boxes.velocities[i])
-        rounded = [f"{number:.4f}" for number in numbers]
+        numbers = (score, *boxes.centers[i], *boxes.sizes_lwh[i], boxes.yaws[i], *boxes.velocities[i])
         instance = "" if boxes.instances is None else boxes.instances[i]
-        yield [stamp.index, stamp.scene, stamp.timestamp_ns, boxes.classes[i], f"{score:.4f}", *rounded, instance]
+        rounded = (f"{number:.4f}" for number in numbers)
+        yield [stamp.index, stamp.scene, stamp.timestamp_ns, boxes.classes[i], *rounded, instance]
 
 
 def _write_json(path: Path, frames: list[FrameBoxes]) -> None:

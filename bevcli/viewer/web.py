@@ -203,7 +203,6 @@ class _Handler(BaseHTTPRequestHandler):
                 self.wfile.write(b"\r\n")
                 sent = size
         self.wfile.write(b"0\r\n\r\n")
-        """Sends the bytes from start to end. Raises ConnectionError where the file is cut meanwhile."""
 
     def _copy(self, start: int, end: int) -> None:
         """Sends the bytes from start to end. Raises ConnectionError where the file is cut meanwhile."""
