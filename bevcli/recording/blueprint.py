@@ -1,7 +1,5 @@
 """The layout of a recording in the viewer: cameras above and below scene and BEV; curves and texts to the right."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -139,7 +137,7 @@ def _bev_tabs(titled: str, facts: LayoutFacts) -> rrb.Tabs:
 
     def view(name: str, *without: str) -> rrb.Spatial2DView:
         contents = [f"/{entities.BEV}/**", *(f"- /{entity}/**" for entity in without)]
-        return _flat(entities.BEV, name, (-margin, margin), (-margin, margin), contents=contents)
+        return flat_view(entities.BEV, name, (-margin, margin), (-margin, margin), contents=contents)
 
     features, history, segmentation = entities.BEV_FEATURES, entities.BEV_HISTORY, entities.BEV_SEGMENTATION
     views: list[rrb.View] = [
@@ -172,7 +170,7 @@ def _texts(facts: LayoutFacts) -> rrb.Vertical:
     events = rrb.TextLogView(origin=entities.EVENTS, name="Events", columns=columns)
     about = rrb.TextDocumentView(origin=entities.RUN, name="About")
     width, height = legend_size(facts.legend_entries)
-    legend = _flat(entities.LEGEND, "Legend", (0, width), (0, height))
+    legend = flat_view(entities.LEGEND, "Legend", (0, width), (0, height))
     pages = rrb.Tabs(events, about, active_tab=0)
     return rrb.Vertical(rrb.Tabs(*plots, active_tab=0), legend, pages, row_shares=[3, 3, 4])
 
@@ -180,11 +178,13 @@ def _texts(facts: LayoutFacts) -> rrb.Vertical:
 def _camera(rig: CameraRig, name: str, *, probes: bool) -> rrb.Spatial2DView:
     hidden = ("pillars",) if probes else ("pillars", "probes")
     overrides = {entities.overlay(name, kind): HIDDEN for kind in hidden}
-    return _flat(entities.camera(name), name, (0, rig[name].width), (0, rig[name].height), overrides=overrides)
+    shown = rig[name]
+    return flat_view(entities.camera(name), name, (0, shown.width), (0, shown.height), overrides=overrides)
 
 
-def _flat(
+def flat_view(
     origin: str, name: str, x_range: tuple[float, float], y_range: tuple[float, float], **options: Any
 ) -> rrb.Spatial2DView:
+    """A 2D view of an entity that first shows these ranges. options: of `rrb.Spatial2DView`."""
     bounds = rrb.VisualBounds2D(x_range=x_range, y_range=y_range)
     return rrb.Spatial2DView(origin=origin, name=name, background=list(BACKGROUND), visual_bounds=bounds, **options)

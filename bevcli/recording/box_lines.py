@@ -1,7 +1,5 @@
 """The edges of 3D boxes in a camera's image, and labels of boxes that do not overlap."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,7 +41,7 @@ def lines_in_image(boxes: Boxes3D, camera: Camera, camera_from_boxes: Array) -> 
     ends, kept = clip_near(edges.reshape(-1, 2, 3))
     ends, owners = ends[kept], owners[kept]
     if camera.distortion is not None:
-        ends, owners = _cut(ends, PIECES_PER_EDGE), np.repeat(owners, PIECES_PER_EDGE)
+        ends, owners = _cut(ends), np.repeat(owners, PIECES_PER_EDGE)
     pixels, _ = camera.project(ends)
     segments, inside = clip_to_image(pixels, camera.width, camera.height)
     return ImageLines(segments[inside], owners[inside])
@@ -77,8 +75,8 @@ def clip_to_image(segments: Array, width: int, height: int) -> tuple[Array, NDAr
     return start[:, None] + shares[..., None] * step[:, None], kept
 
 
-def _cut(ends: Array, pieces: int) -> Array:
-    shares = np.linspace(0, 1, pieces + 1)[:, None]
+def _cut(ends: Array) -> Array:
+    shares = np.linspace(0, 1, PIECES_PER_EDGE + 1)[:, None]
     points = ends[:, None, 0] + shares * (ends[:, None, 1] - ends[:, None, 0])  # (M, pieces + 1, 3)
     return np.stack([points[:, :-1], points[:, 1:]], axis=2).reshape(-1, 2, 3)
 

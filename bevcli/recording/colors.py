@@ -1,7 +1,5 @@
 """The colours of classes, ground truth, misses and curves, and colour maps. Colours are RGB, 0 to 255."""
 
-from __future__ import annotations
-
 import colorsys
 from collections.abc import Iterable, Mapping
 from itertools import cycle

@@ -5,8 +5,6 @@ in float32). `bev` is a flat image of the bev frame in metres: x to the right, -
 longitudes, where the drive states its place on Earth.
 """
 
-from __future__ import annotations
-
 WORLD = "world"
 EGO = "world/ego"
 VEHICLE = "world/ego/vehicle"

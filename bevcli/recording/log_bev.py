@@ -1,7 +1,5 @@
 """Writes BEV maps into a recording: features as colours, segmentation, history weights, probed cells."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 

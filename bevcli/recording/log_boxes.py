@@ -1,7 +1,5 @@
 """Writes boxes into a recording: in the 3D scene, in the BEV view, on the street map; finds misses and duplicates."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Writes one camera of a frame into a recording: pose, image, and the overlays of the image."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

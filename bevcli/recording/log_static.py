@@ -1,7 +1,5 @@
 """Writes the static parts of a recording: rig, vehicle, range rings, pillars, colours, legend, the page "About"."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -116,8 +114,7 @@ def log_pillars(stream: rr.RecordingStream, grid: BevGrid, ego_from_bev: Array, 
 
 def pillar_colors(grid: BevGrid, cells: int) -> np.ndarray:
     """(cells * Z, 3) uint8 RGB: the lowest point of each pillar is blue, the highest red."""
-    heights = np.linspace(0.1, 0.95, grid.pillar_points)
-    return np.tile(colormap(heights, "turbo"), (cells, 1))
+    return np.tile(colormap(np.linspace(0.1, 0.95, grid.pillar_points), "turbo"), (cells, 1))
 
 
 def _log_pinhole(stream: rr.RecordingStream, camera: Camera) -> None:
@@ -153,10 +150,8 @@ def ring_distances_m(grid: BevGrid | None) -> list[int]:
 def _log_rings(stream: rr.RecordingStream, rig: CameraRig, grid: BevGrid | None) -> None:
     angles = np.linspace(0, 2 * np.pi, 121)
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    distances = ring_distances_m(grid)
-    rings = [circle * distance for distance in distances]
-    width = rr.Radius.ui_points(0.6)
-    lines = rings
+    distances, width = ring_distances_m(grid), rr.Radius.ui_points(0.6)
+    lines = rings = [circle * distance for distance in distances]
     if grid is not None:
         border = rectangle(grid.x_range_m, grid.y_range_m)[[0, 1, 2, 3, 0]]
         lines = [*rings, apply(rig.ego_from_bev, border)[:, :2]]

@@ -1,7 +1,5 @@
 """Writes tracks into a recording: each has an entity of its own with its past, its footprint and the next second."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field

@@ -7,8 +7,6 @@ rerun keeps the index of a stream in memory until the stream ends, about 0.3 MB 
 consists of several streams, one after the other in one file without an index.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import select

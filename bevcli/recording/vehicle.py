@@ -1,11 +1,9 @@
 """The ego vehicle as a mesh: a plain car by default, or any mesh file that trimesh reads."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +12,6 @@ from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.files import MIB, open_regular
 from bevcli.recording.colors import EGO_COLOR, Color
-
-if TYPE_CHECKING:
-    import trimesh
 
 BODY_LWH = (4.6, 1.86, 0.75)
 REAR_AXLE_TO_MIDDLE = 1.35  # metres ahead; the ego frame's origin is on the ground under the rear axle
@@ -67,8 +62,9 @@ def load_vehicle(path: Path) -> VehicleMesh:
     low, high = vertices.min(0), vertices.max(0)
     if not np.isfinite(vertices).all() or not (high - low).max() <= LONGEST_M:
         size = " x ".join(f"{length:.4g}" for length in high - low)
-        expected = f"expected at most {LONGEST_M:g} m; scale it to metres"
-        raise InputError(f"{path}: the vehicle's size is {size} m ({expected})")
+        raise InputError(
+            f"{path}: the vehicle's size is {size} m (expected at most {LONGEST_M:g} m; scale it to metres)"
+        )
     shifted = np.concatenate([part + start for part, start in zip(faces, starts, strict=True)])
     return VehicleMesh(vertices, np.concatenate(normals), shifted, np.concatenate(colors), _top_view(low, high))
 
@@ -85,8 +81,7 @@ def _read_parts(path: Path) -> list[Part]:
         scene = trimesh.load_scene(path)
         if path.suffix.lower() in GLTF_FILES:
             scene.apply_transform(EGO_FROM_GLTF)
-        meshes = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
-        parts = [_part(mesh) for mesh in meshes]
+        parts = [_part(mesh) for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
     except Exception as error:  # each of trimesh's many readers raises errors of its own
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(
@@ -97,11 +92,11 @@ def _read_parts(path: Path) -> list[Part]:
     return parts
 
 
-def _part(mesh: trimesh.Trimesh) -> Part:
-    """Vertices, normals, faces and colours of one mesh, with sharp edges."""
+def _part(mesh: Any) -> Part:
+    """Vertices, normals, faces and colours of a trimesh.Trimesh, with sharp edges."""
     import trimesh
 
-    visual: Any = mesh.visual
+    visual = mesh.visual
     if visual.kind == "face":
         mesh.unmerge_vertices()  # no vertex may be shared by faces of different colours
         visual = mesh.visual
@@ -110,8 +105,7 @@ def _part(mesh: trimesh.Trimesh) -> Part:
     colors = visual.vertex_colors if visual.defined else (*EGO_COLOR, 255)
     mesh.visual = trimesh.visual.ColorVisuals(vertex_colors=np.broadcast_to(colors, (len(mesh.vertices), 4)))
     mesh = trimesh.graph.smooth_shade(mesh, angle=SMOOTH_BELOW_RAD, facet_minarea=None)
-    shaded: Any = mesh.visual
-    colors = np.array(shaded.vertex_colors, dtype=np.uint8)[:, :3]
+    colors = np.array(mesh.visual.vertex_colors, dtype=np.uint8)[:, :3]
     return np.array(mesh.vertices), np.array(mesh.vertex_normals), np.array(mesh.faces), colors
 
 

@@ -1,7 +1,5 @@
 """Camera images as an AV1 video stream, for recordings that stay small. Needs PyAV, the extra `bevcli[video]`."""
 
-from __future__ import annotations
-
 import os
 from fractions import Fraction
 

@@ -20,9 +20,7 @@ from bevcli.recording import entities, log_bev, log_boxes, log_cameras, log_stat
 from bevcli.recording.blueprint import LayoutFacts, recording_blueprint
 from bevcli.recording.colors import EGO_COLOR
 from bevcli.recording.log_bev import BevColors, BevImages
-from bevcli.recording.log_boxes import detectable, false_and_duplicate
 from bevcli.recording.log_cameras import PosedCamera, VideoImages
-from bevcli.recording.log_static import legend_entries, log_legend
 from bevcli.recording.log_tracks import TrackHistory, TrackLog
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.rrd_file import RrdFile
@@ -147,11 +145,10 @@ class Recording:
             self._bev_images = BevImages(self.options.bev)
 
     def __enter__(self) -> Recording:
-        mesh = self.options.vehicle_mesh
+        mesh, grid = self.options.vehicle_mesh, self._config.bev_grid
         vehicle = None if mesh is None else load_vehicle(mesh)
-        grid = self._config.bev_grid
         map_classes = self._config.map_classes if self.options.shows_internals else ()
-        legend = legend_entries(self.class_names, map_classes)
+        legend = log_static.legend_entries(self.class_names, map_classes)
         facts = LayoutFacts(
             note=self.note,
             probes=bool(self.options.probes),
@@ -169,7 +166,7 @@ class Recording:
             self._live.open(self.path)
         log_static.log_scene(self._stream, self.rig, self.class_names, vehicle, grid)
         self._log_about(map_classes)
-        log_legend(self._stream, legend)
+        log_static.log_legend(self._stream, legend)
         if self._resume is not None:
             self._origin, self._last = self._resume.origin, self._resume.last
             self._tracks.go_on_from(self._resume.tracks)
@@ -237,7 +234,9 @@ class Recording:
         self._log_ego(frame)
         cameras = self._log_cameras(frame)
         self._log_boxes(frame, prediction, cameras)
-        self._log_curves(prediction)
+        if self._last is None:
+            log_static.log_curve_names(self._stream, prediction.stage_seconds, self.class_names)
+        self._stream.log(entities.STAGE_CURVES, rr.Scalars(list(prediction.stage_seconds.values())))
         self._log_frame_events(frame, prediction)
         if self.options.shows_internals:
             self._log_internals(frame, prediction, cameras)
@@ -293,7 +292,7 @@ class Recording:
         )
         if self._has_ego_motion:
             log_static.log_speed(self._stream, float(np.linalg.norm(frame.kinematics.velocity[:2])))
-        before = self._before(frame)
+        before = self._last if self._last is not None and self._last.scene == frame.stamp.scene else None
         if self._geo_origin is not None:
             last = None if before is None else before.world_from_ego.translation
             log_boxes.log_ego_on_map(self._stream, self._geo_origin, frame.world_from_ego.translation, last)
@@ -301,10 +300,6 @@ class Recording:
             poses = (before.world_from_ego, frame.world_from_ego)
             piece = [self._moved_to_origin(pose.matrix)[:3, 3] for pose in poses]
             self._stream.log(entities.TRAJECTORY, rr.LineStrips3D([piece], colors=EGO_COLOR, radii=0.06))
-
-    def _before(self, frame: Frame) -> LastFrame | None:
-        """The frame before, None where it is of another scene."""
-        return self._last if self._last is not None and self._last.scene == frame.stamp.scene else None
 
     def _moved_to_origin(self, world_from_a: Array) -> Array:
         """world_from_a (4, 4) of the sequence's world -> of the recording's world."""
@@ -332,13 +327,13 @@ class Recording:
         shown = prediction.boxes.scored(self.options.score)
         world_from_bev = self._world_from_bev(prediction)
         in_world = shown.transformed(world_from_bev)
-        marks = false_and_duplicate(shown, None)
+        marks = log_boxes.false_and_duplicate(shown, None)
         if frame.ground_truth is not None:
             in_recording = frame.ground_truth.transformed(self._moved_to_origin(np.eye(4)))
-            truth = detectable(in_recording.transformed(inverse(world_from_bev)), prediction.grid)
+            truth = log_boxes.detectable(in_recording.transformed(inverse(world_from_bev)), prediction.grid)
             found = np.ones(len(truth), dtype=bool)
             if not self.untrained:  # random boxes match nothing: a scene all in red would be useless
-                marks = false_and_duplicate(shown, truth)
+                marks = log_boxes.false_and_duplicate(shown, truth)
                 found = marks.found | log_boxes.other_classes(truth, self.class_names)
             self._log_ground_truth(truth, found, world_from_bev, cameras)
         stream, names = self._stream, self.class_names
@@ -363,12 +358,6 @@ class Recording:
         log_boxes.log_ground_truth_bev(self._stream, truth, found, colors)
         for posed in cameras:
             log_cameras.log_ground_truth_in_image(self._stream, posed, in_world, colors)
-
-    def _log_curves(self, prediction: Prediction) -> None:
-        stages = prediction.stage_seconds
-        if self._last is None:
-            log_static.log_curve_names(self._stream, stages, self.class_names)
-        self._stream.log(entities.STAGE_CURVES, rr.Scalars(list(stages.values())))
 
     def _log_frame_events(self, frame: Frame, prediction: Prediction) -> None:
         if self._last is None and self.note in WARNINGS:

@@ -3,8 +3,6 @@
 Published weights expect nuScenes' LIDAR_TOP: x right, y forward, 1.84 m above the ground.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from bevcli.findings import Finding
@@ -52,10 +50,8 @@ def _mistake(pose: Array) -> Finding | None:
     # KITTI, Waymo and Argoverse have x forward: rotated to x right, such a frame is plausible.
     turned = rigid(pose[:3, 3], pose[:3, :3] @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
     if _is_plausible(turned):
-        advice = "rotate it by 90° about z, unless your weights were trained with x forward"
-        return _error(
-            "bev-x-forward", '"ego_from_bev" has x forward', "x forward, y left", "x right, y forward", advice
-        )
+        message, advice = "has x forward", "rotate it by 90° about z, unless your weights were trained with x forward"
+        return _error("bev-x-forward", f'"ego_from_bev" {message}', "x forward, y left", "x right, y forward", advice)
     if _is_plausible(inverse(pose)):
         code, message, advice = "transform-inverted", "is bev_from_ego, the inverse", "invert it"
     elif _is_plausible(reordered(pose, 1)) or _is_plausible(reordered(pose, -1)):
@@ -86,14 +82,13 @@ def _defect(pose: Array) -> Finding:
 def _warnings(pose: Array) -> tuple[Finding, ...]:
     findings = []
     if abs(pose[2, 3] - HEIGHT_M) > HEIGHT_WARNING_M:
-        message, advice = '"ego_from_bev" is higher or lower than nuScenes\'', "place it 1.84 m above the ground"
-        found, expected = f"{pose[2, 3]:.2f} m", f"about {HEIGHT_M} m"
-        findings.append(Finding("bev-height", "warning", None, message, found, expected, advice))
+        message, found = '"ego_from_bev" is higher or lower than nuScenes\'', f"{pose[2, 3]:.2f} m"
+        advice = "place it 1.84 m above the ground"
+        findings.append(Finding("bev-height", "warning", None, message, found, f"about {HEIGHT_M} m", advice))
+    message, found = '"ego_from_bev" is tilted', f"{_tilt_deg(pose):.1f}°"
     if _tilt_deg(pose) > TILT_WARNING_DEG:
-        message, found = '"ego_from_bev" is tilted', f"{_tilt_deg(pose):.1f}°"
         findings.append(Finding("bev-tilted", "warning", None, message, found, "under 6°", "level it"))
     elif _tilt_deg(pose) > TILT_INFO_DEG:
-        message, found = '"ego_from_bev" is tilted', f"{_tilt_deg(pose):.1f}°"
         expected = "as in training: 1 to 3° in nuScenes, 0° in rendered drives"
         advice = "nothing for the demo model, which levels the frame itself"
         findings.append(Finding("bev-tilted", "info", None, message, found, expected, advice))

@@ -1,7 +1,5 @@
 """`check_calibration`: read a calibration and the data of its sequence, run all checks, and keep what they found."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -63,10 +61,8 @@ class CalibrationCheck:
 
     def to_json(self) -> str:
         """The findings and the coverage as one JSON object, the content of findings.json."""
-        content = {
-            "findings": [asdict(finding) for finding in self.findings],
-            "coverage": _coverage_to_json(self.report.coverage),
-        }
+        findings = [asdict(finding) for finding in self.findings]
+        content = {"findings": findings, "coverage": _coverage_to_json(self.report.coverage)}
         return json.dumps(content, indent=1, ensure_ascii=False)
 
     def write(self, folder: Path | str) -> list[Path]:
@@ -194,10 +190,8 @@ def _split_by_scene(ego_motion: EgoMotion, stamps: tuple[FrameStamp, ...]) -> It
 
 def _check_times(table: Path, rig: CameraRig) -> tuple[Finding, ...]:
     entries = read_frames_table(table, rig.names)
-    times = {
-        name: [entry.sources[name].timestamp_ns if name in entry.sources else None for entry in entries]
-        for name in rig.names
-    }
+    sources = [entry.sources for entry in entries]
+    times = {name: [of[name].timestamp_ns if name in of else None for of in sources] for name in rig.names}
     return check_camera_times([entry.stamp.timestamp_ns for entry in entries], times)
 
 

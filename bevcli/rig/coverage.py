@@ -1,7 +1,5 @@
 """The cells of the BEV grid that the cameras see, and the rig next to nuScenes': published weights know no other."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """cameras.png: all cameras' images with their overlay around the coverage map. coverage.png: the map alone."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -125,9 +123,9 @@ def _draw_camera(
         spine.set_color(color)
         spine.set_linewidth(2.5 if mine else 0.8)
     axes.set_title(camera.name, loc="left", color=INK, fontsize=11)
-    angles = (degrees_text(mounting.yaw_deg, 0), degrees_text(mounting.pitch_deg), degrees_text(mounting.roll_deg))
-    details = "yaw {}  pitch {}  roll {}".format(*angles)
-    details += f"  height {mounting.height:.2f} m  FOV {seen_fov_deg(camera)[0]:.0f}°"
+    details = f"yaw {degrees_text(mounting.yaw_deg, 0)}  pitch {degrees_text(mounting.pitch_deg)}  "
+    details += f"roll {degrees_text(mounting.roll_deg)}  height {mounting.height:.2f} m  "
+    details += f"FOV {seen_fov_deg(camera)[0]:.0f}°"
     axes.set_xlabel(details, color=FAINT, fontsize=9, loc="left", labelpad=5)
     if mine:
         box = {"facecolor": PAPER, "edgecolor": color, "alpha": 0.9, "boxstyle": "round,pad=0.4"}
@@ -227,9 +225,8 @@ def _draw_rings(axes: Axes, rig: CameraRig) -> None:
     for radius in (10, 20, 30, 40, 50):
         x, y = center[0] + radius * np.cos(angles), center[1] + radius * np.sin(angles)
         axes.plot(x, y, color=INK, linewidth=0.5, alpha=0.35)
-        axes.text(
-            center[0], center[1] + radius, f"{radius} m", color=INK, fontsize=7, ha="center", va="bottom", alpha=0.8
-        )
+        style: dict[str, Any] = {"color": INK, "fontsize": 7, "ha": "center", "va": "bottom", "alpha": 0.8}
+        axes.text(center[0], center[1] + radius, f"{radius} m", **style)
 
 
 def _draw_vehicle(axes: Axes, rig: CameraRig) -> None:

@@ -1,7 +1,5 @@
 """Checks of intrinsics and lens distortion: implausible values, and values for images of another size."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -50,9 +48,8 @@ def _distortion(camera: Camera) -> Finding | None:
         reach = float(np.max(radii[valid], initial=0.0))
         needed = VALID_SHARE * min(abs(edge), ideal[-1])
         if reach < needed:
-            return _absurd(
-                camera, f"folds back {reach:.0f} px from the principal point", f"valid over {abs(edge):.0f} px"
-            )
+            found = f"folds back {reach:.0f} px from the principal point"
+            return _absurd(camera, found, f"valid over {abs(edge):.0f} px")
         bent = _ANGLES[valid][np.argmax(radii[valid] >= needed)]
         straight = float(np.interp(needed, ideal, _ANGLES))
         if not 1 / MAX_BEND <= bent / straight <= MAX_BEND:
@@ -103,19 +100,16 @@ def _field_of_view(camera: Camera) -> Finding | None:
         return None
     expected = f"{MIN_FOV_DEG:g}° to {widest:g}°"
     found = f"{horizontal:.1f}° horizontally, focal length {camera.intrinsics[0, 0]:.0f} px, image width {camera.width}"
-    return Finding(
-        "fov-implausible", "error", camera.name, "the field of view is implausible", found, expected,
-        "give the focal length in pixels of these images",
-    )  # fmt: skip
+    message, advice = "the field of view is implausible", "give the focal length in pixels of these images"
+    return Finding("fov-implausible", "error", camera.name, message, found, expected, advice)
 
 
 def _warnings(camera: Camera) -> list[Finding]:
     warnings = []
     fx, fy = camera.intrinsics[0, 0], camera.intrinsics[1, 1]
     if abs(fx / fy - 1) > SQUARE_PIXELS:
+        message, found = "the pixels are not square", f"fx / fy = {fx / fy:.2f}"
         advice = "correct only for images that were scaled along one axis"
-        found = f"fx / fy = {fx / fy:.2f}"
-        message = "the pixels are not square"
         warnings.append(Finding("pixels-not-square", "warning", camera.name, message, found, "about 1", advice))
     center, size = camera.intrinsics[:2, 2], np.array([camera.width, camera.height])
     if (np.abs(2 * center / size - 1) > 2 * CENTER_TOLERANCE).any():

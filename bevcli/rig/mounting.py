@@ -1,7 +1,5 @@
 """The mounting of a camera on the vehicle: position, yaw, pitch, roll, field of view, and its horizon."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

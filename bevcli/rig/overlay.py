@@ -1,7 +1,5 @@
 """A camera's image with pillars, ground grid and horizon, as its calibration projects them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2
@@ -107,10 +105,8 @@ def draw_overlay(camera: Camera, ego_from_bev: Array, image_bgr: Pixels | None, 
 
 
 def _draw_lines(canvas: Pixels, lines: list[Array], color: Color, opacity: float, thickness: int = 1) -> None:
-    layer = canvas.copy()
-    cv2.polylines(
-        layer, [np.round(line * 16).astype(np.int32) for line in lines], False, color, thickness, cv2.LINE_AA, 4
-    )
+    layer, points = canvas.copy(), [np.round(line * 16).astype(np.int32) for line in lines]
+    cv2.polylines(layer, points, False, color, thickness, cv2.LINE_AA, 4)
     cv2.addWeighted(layer, opacity, canvas, 1 - opacity, 0, dst=canvas)
 
 

@@ -5,8 +5,6 @@ rolled. Then each common mistake is undone in turn (units, inversion, quaternion
 results, the mistake is reported, not its consequences.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -196,13 +194,9 @@ def check_poses(cameras: Sequence[Camera]) -> tuple[Finding, ...]:
     unit = units_per_metre(max(lengths.values(), default=0.0))  # all wrong translations of a rig share one unit
     units = {name: unit if length > OTHER_UNIT_M else 1.0 for name, length in lengths.items()}
     findings = [_unit_finding(camera, units[camera.name]) for camera in cameras if units[camera.name] != 1]
-    metric = []
-    for camera in cameras:
-        pose = camera.ego_from_camera
-        metric.append(replace(camera, ego_from_camera=rigid(pose[:3, 3] / units[camera.name], pose[:3, :3])))
-    affected = [camera for camera in metric if _defects(camera)]
-    explained = {camera.name: [m for m in MISTAKES if _explains(m, camera)] for camera in affected}
-    common = _common_mistake(affected, explained)
+    posed = ((camera, camera.ego_from_camera, units[camera.name]) for camera in cameras)
+    metric = [replace(camera, ego_from_camera=rigid(pose[:3, 3] / unit, pose[:3, :3])) for camera, pose, unit in posed]
+    affected, explained, common = _explanations(metric)
     for camera in affected:
         defect, mistake = _defects(camera)[0], _best_explanation(camera, explained)
         if common is not None and common not in explained[camera.name] and _explains(common, camera, by_name=False):
@@ -219,20 +213,23 @@ def corrected(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
 
     Cameras that it does not explain are left out.
     """
-    affected = [camera for camera in cameras if _defects(camera)]
-    explained = {camera.name: [m for m in MISTAKES if _explains(m, camera)] for camera in affected}
-    common = _common_mistake(affected, explained)
+    affected, _, common = _explanations(cameras)
     if common is None:
         return ()
     kept = [camera for camera in affected if _explains(common, camera, by_name=False)]
     return tuple(replace(camera, ego_from_camera=common.undo(camera.ego_from_camera)) for camera in kept)
 
 
-def _common_mistake(affected: Sequence[Camera], explained: Mapping[str, Sequence[Mistake]]) -> Mistake | None:
-    """The mistake that explains most affected cameras, at least three and more than half of them; None without one."""
+def _explanations(cameras: Sequence[Camera]) -> tuple[list[Camera], dict[str, list[Mistake]], Mistake | None]:
+    """The affected cameras, by camera the mistakes that explain it, and the mistake in common.
+
+    That one explains most affected cameras, at least three and more than half of them; None without one.
+    """
+    affected = [camera for camera in cameras if _defects(camera)]
+    explained = {camera.name: [m for m in MISTAKES if _explains(m, camera)] for camera in affected}
     counts = {mistake: sum(mistake in of for of in explained.values()) for mistake in MISTAKES}
     best = max(MISTAKES, key=lambda mistake: counts[mistake])
-    return best if counts[best] >= 3 and 2 * counts[best] > len(affected) else None
+    return affected, explained, best if counts[best] >= 3 and 2 * counts[best] > len(affected) else None
 
 
 def units_per_metre(length: float) -> float:

@@ -1,7 +1,5 @@
 """recording.rrd of a calibration check: rig, images with pillars, ground and horizon, coverage and findings."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -15,7 +13,8 @@ from bevcli.errors import OutputError
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Array, apply
 from bevcli.recording import entities, log_static
-from bevcli.recording.blueprint import camera_rows
+from bevcli.recording.blueprint import camera_rows, flat_view
+from bevcli.recording.colors import BACKGROUND
 from bevcli.rig.coverage import Coverage
 from bevcli.rig.drawings import COUNT_COLORS
 from bevcli.rig.mounting import horizon
@@ -34,7 +33,6 @@ from bevcli.rig.rig_report import RigReport
 
 COVERAGE, COVERAGE_ON_GROUND, FINDINGS = "coverage", f"{entities.EGO}/coverage", "findings"
 PIXELS_PER_CELL = 6
-BACKGROUND = [18, 20, 25]
 JPEG_QUALITY = 90
 
 
@@ -59,9 +57,8 @@ def _findings_markdown(report: RigReport) -> str:
     for finding in report.findings:
         where = f"`{finding.camera}` " if finding.camera else ""
         lines.append(f"- **{finding.severity}** {where}{finding.message}.")
-        numbers = [
-            f"{word} {value}" for word, value in (("found", finding.found), ("expected", finding.expected)) if value
-        ]
+        stated = (("found", finding.found), ("expected", finding.expected))
+        numbers = [f"{word} {value}" for word, value in stated if value]
         lines += [f"    - {text}" for text in (", ".join(numbers), finding.advice) if text]
     if not report.findings:
         lines.append("None: the rig is plausible.")
@@ -128,18 +125,15 @@ def _blueprint(rig: CameraRig) -> rrb.Blueprint:
         origin=entities.EGO,
         contents=[f"/{entities.WORLD}/**", *excluded],
         name="The rig",
-        background=BACKGROUND,
+        background=list(BACKGROUND),
         line_grid=False,
         eye_controls=rrb.EyeControls3D(position=(-5.5, 0.0, 4.5), look_target=(0.9, 0.0, 0.8), eye_up=(0, 0, 1)),
     )
-    seen = rrb.Spatial2DView(origin=COVERAGE, name="Cameras per BEV cell", background=BACKGROUND)
-    middle = rrb.Horizontal(
-        scene, seen, rrb.TextDocumentView(origin=FINDINGS, name="Findings"), column_shares=[4, 3, 4]
-    )
+    seen = rrb.Spatial2DView(origin=COVERAGE, name="Cameras per BEV cell", background=list(BACKGROUND))
+    findings = rrb.TextDocumentView(origin=FINDINGS, name="Findings")
+    middle = rrb.Horizontal(scene, seen, findings, column_shares=[4, 3, 4])
     rows = [rrb.Horizontal(*(_camera_view(rig[name]) for name in row)) for row in camera_rows(rig)]
-    layout = rrb.Vertical(
-        *rows[:1], middle, *rows[1:], row_shares=[3, 5, 3] if len(rows) > 1 else [3, 5][: len(rows) + 1]
-    )
+    layout = rrb.Vertical(*rows[:1], middle, *rows[1:], row_shares=[3, 5, 3][: len(rows) + 1])
     return rrb.Blueprint(
         layout, rrb.TimePanel(state="hidden"), rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"), auto_views=False, auto_layout=False,
@@ -147,7 +141,4 @@ def _blueprint(rig: CameraRig) -> rrb.Blueprint:
 
 
 def _camera_view(camera: Camera) -> rrb.Spatial2DView:
-    bounds = rrb.VisualBounds2D(x_range=[0, camera.width], y_range=[0, camera.height])
-    return rrb.Spatial2DView(
-        origin=entities.camera(camera.name), name=camera.name, background=BACKGROUND, visual_bounds=bounds
-    )
+    return flat_view(entities.camera(camera.name), camera.name, (0, camera.width), (0, camera.height))

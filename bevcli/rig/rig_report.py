@@ -1,7 +1,5 @@
 """All checks of a rig in their order, the findings that suppress others, and the report for the terminal."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -9,14 +7,7 @@ from dataclasses import dataclass, replace
 from bevcli.findings import SEVERITIES, Finding, errors_of
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.rig.bev_checks import check_bev_frame
-from bevcli.rig.coverage import (
-    Coverage,
-    Measure,
-    check_coverage,
-    check_measures,
-    coverage_of,
-    measures_of,
-)
+from bevcli.rig.coverage import Coverage, Measure, check_coverage, check_measures, coverage_of, measures_of
 from bevcli.rig.lens_checks import check_lenses
 from bevcli.rig.mounting import degrees_text, mounting_of, seen_fov_deg
 from bevcli.rig.pose_checks import check_names, check_poses, corrected

@@ -1,12 +1,9 @@
 """Checks of a sequence: ego-motion (units, jumps, axes) and the timestamps of the cameras' images."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bevcli.findings import Finding
 from bevcli.geometry.ego_motion import EgoMotion
@@ -73,9 +70,9 @@ def check_ego_motion(ego_motion: EgoMotion) -> tuple[Finding, ...]:
     cause = None if drive.is_plausible() else _mistake(drive, ego_motion) or _units(drive)
     if cause is not None:
         return (cause,)
-    findings = [finding for finding in (_jump(drive, ego_motion), _direction(drive)) if finding is not None]
+    findings = tuple(filter(None, (_jump(drive, ego_motion), _direction(drive))))
     speed = _stated_speed(drive, ego_motion) if ego_motion.velocities_are_stated and not findings else None
-    return (*findings, speed) if speed is not None else tuple(findings)
+    return (*findings, speed) if speed is not None else findings
 
 
 def check_camera_times(frame_ns: Sequence[int], camera_ns: Mapping[str, Sequence[int | None]]) -> tuple[Finding, ...]:
@@ -84,8 +81,7 @@ def check_camera_times(frame_ns: Sequence[int], camera_ns: Mapping[str, Sequence
     frame_ns: F frame timestamps, nanoseconds. camera_ns: by camera, the timestamps of its F images; None without image.
     An offset of 0.1 s is a warning: ego-motion compensates a known offset for static objects, not for moving ones.
     """
-    findings = (_check_times_of(name, np.array(frame_ns, dtype=np.int64), times) for name, times in camera_ns.items())
-    return tuple(finding for finding in findings if finding is not None)
+    return tuple(filter(None, (_check_times_of(name, frame_ns, times) for name, times in camera_ns.items())))
 
 
 def _drive(ego_motion: EgoMotion, translations: Array, quaternions: Array) -> _Drive:
@@ -128,11 +124,8 @@ def _mistake(drive: _Drive, ego_motion: EgoMotion) -> Finding | None:
 def _direction(drive: _Drive) -> Finding | None:
     """A tilted ego frame, or driving sideways or backwards in most steps."""
     if drive.tilt_deg() > MAX_TILT_DEG:
-        message, advice = (
-            "the ego frame is tilted in the world",
-            "z of the ego frame and of the world frame point up: check the axes",
-        )
-        return _error("ego-tilted", message, _motion_text(drive), "level", advice)
+        advice = "z of the ego frame and of the world frame point up: check the axes"
+        return _error("ego-tilted", "the ego frame is tilted in the world", _motion_text(drive), "level", advice)
     headings = drive.headings_deg()
     if len(headings) == 0:
         return None
@@ -188,9 +181,8 @@ def _error(code: str, message: str, found: str, expected: str, advice: str) -> F
     return Finding(code, "error", None, message, found, expected, advice)
 
 
-def _check_times_of(name: str, frame_ns: NDArray[np.int64], times: Sequence[int | None]) -> Finding | None:
-    pairs = zip(times, frame_ns, strict=True)
-    offsets = np.array([time - int(frame) for time, frame in pairs if time is not None]) / 1e9
+def _check_times_of(name: str, frame_ns: Sequence[int], times: Sequence[int | None]) -> Finding | None:
+    offsets = np.array([time - frame for time, frame in zip(times, frame_ns, strict=True) if time is not None]) / 1e9
     if len(offsets) == 0:
         message = "has no image in any frame"
         return Finding("camera-without-images", "warning", name, message, "0", f"{len(times)}", "check its image paths")

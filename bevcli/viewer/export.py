@@ -1,7 +1,5 @@
 """Exports the boxes of a recording: as a table (.csv), or as a boxes file that `bevcli eval` reads (.json)."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Iterator
 from pathlib import Path
@@ -40,8 +38,7 @@ def export_boxes(recording: Path, path: Path) -> tuple[int, int]:
 
 def recorded_boxes(frame: RecordedFrame) -> FrameBoxes:
     """The shown boxes of a frame in the sequence's world frame, highest score first; recordings store float32."""
-    entity = entities.BOXES
-    origin = frame.array(entities.WORLD, "origin", 3).reshape(-1)[:3]
+    entity, origin = entities.BOXES, frame.array(entities.WORLD, "origin", 3).reshape(-1)[:3]
     origin = origin if len(origin) == 3 else np.zeros(3)
     quaternions = frame.array(entity, "Boxes3D:quaternions", 4)  # x, y, z, w
     boxes = Boxes3D(
@@ -73,10 +70,10 @@ def _rows(frame: FrameBoxes) -> Iterator[list[object]]:
     stamp, boxes = frame.stamp, frame.boxes
     assert boxes.scores is not None
     for i, score in enumerate(boxes.scores):
-        numbers = (*boxes.centers[i], *boxes.sizes_lwh[i], boxes.yaws[i], *boxes.velocities[i])
-        rounded = [f"{number:.4f}" for number in numbers]
+        numbers = (score, *boxes.centers[i], *boxes.sizes_lwh[i], boxes.yaws[i], *boxes.velocities[i])
         instance = "" if boxes.instances is None else boxes.instances[i]
-        yield [stamp.index, stamp.scene, stamp.timestamp_ns, boxes.classes[i], f"{score:.4f}", *rounded, instance]
+        rounded = (f"{number:.4f}" for number in numbers)
+        yield [stamp.index, stamp.scene, stamp.timestamp_ns, boxes.classes[i], *rounded, instance]
 
 
 def _write_json(path: Path, frames: list[FrameBoxes]) -> None:

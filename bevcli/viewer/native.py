@@ -1,7 +1,5 @@
 """Starts and stops rerun's viewer as a child process, on loopback and without telemetry."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal
@@ -29,16 +27,14 @@ def viewer_environment() -> dict[str, str]:
 
 def display_is_there() -> bool:
     """True if a window can be opened here."""
-    if sys.platform in ("darwin", "win32"):
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    has_display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    return sys.platform in ("darwin", "win32") or bool(has_display)
 
 
-def start_viewer(*arguments: str, quiet: bool = True) -> subprocess.Popen[bytes]:
+def start_viewer(*arguments: str) -> subprocess.Popen[bytes]:
     """Starts the viewer in the background with command-line arguments. The caller stops it with `stop`."""
-    output = subprocess.DEVNULL if quiet else None
-    command = [str(viewer_binary()), *arguments]
-    return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, env=viewer_environment())
+    command, null = [str(viewer_binary()), *arguments], subprocess.DEVNULL
+    return subprocess.Popen(command, stdin=null, stdout=null, stderr=null, env=viewer_environment())
 
 
 def stop(process: subprocess.Popen[bytes]) -> None:

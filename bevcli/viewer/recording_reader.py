@@ -1,7 +1,5 @@
 """Reads a recording frame by frame, in the order of writing, with one frame at a time in memory."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Screenshots of a recording in the viewer, which runs without a screen and draws with Vulkan."""
 
-from __future__ import annotations
-
 import subprocess
 import threading
 import time
@@ -99,14 +97,11 @@ def _wait(process: subprocess.Popen[bytes], attempt: Callable[[], Answer | None]
 
 
 def _write(image: Path, png: bytes) -> None:
-    data = png if image.suffix.lower() == ".png" else _jpeg(png)
+    if image.suffix.lower() != ".png":
+        pixels = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+        assert pixels is not None
+        png = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
     try:
-        image.write_bytes(data)
+        image.write_bytes(png)
     except OSError as error:
         raise OutputError(f"{image}: cannot be written ({error.strerror})") from error
-
-
-def _jpeg(png: bytes) -> bytes:
-    pixels = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
-    assert pixels is not None
-    return cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()

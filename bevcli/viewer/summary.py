@@ -1,7 +1,5 @@
 """The summary of a recording: frames, time span, boxes per class, bytes per entity."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -65,17 +63,16 @@ def summarise(path: Path, read_from: Path | None = None) -> RecordingSummary:
         sizes[chunk.entity_path] += chunk.to_record_batch().nbytes
     boxes: Counter[str] = Counter()
     times: list[int] = []
-    title: list[str] = []
-    untrained = False
+    title, untrained = ["a recording"], False
     for frame in reader.frames():
         boxes.update(frame.values(entities.BOXES, "name"))
         times += frame.values(entities.EGO, "timestamp_ns")
-        title = frame.values(entities.RUN, "title")
+        title = frame.values(entities.RUN, "title") or ["a recording"]
         untrained = any(frame.values(entities.RUN, "untrained"))
     return RecordingSummary(
         path=path,
         file_bytes=path.stat().st_size,
-        title=title[0] if title else "a recording",
+        title=title[0],
         untrained=untrained,
         timestamps_ns=tuple(times),
         boxes=dict(boxes.most_common()),

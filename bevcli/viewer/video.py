@@ -1,7 +1,5 @@
 """Writes a video of a recording: H.264 in MP4, which plays everywhere, if PyAV is installed; VP9 else and in WebM."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
@@ -72,16 +70,11 @@ def _unwritable(video: Path) -> OutputError:
 
 
 def frame_rate(recording: Path) -> tuple[int, float]:
-    """The number of frames, and the frames per second: 1 / the median time between frames, limited to 1 to 30."""
-    times = frame_times_ns(recording)
-    steps = np.diff(times)
-    seconds = float(np.median(steps[steps > 0])) / 1e9 if (steps > 0).any() else 1.0
-    return len(times), float(np.clip(1 / seconds, SLOWEST, FASTEST))
+    """The number of frames, and the frames per second: 1 / the median time between frames, limited to 1 to 30.
 
-
-def frame_times_ns(recording: Path) -> np.ndarray:
-    """The timestamps of the frames, (N,) int64, in order; images are not decoded."""
-    times: dict[int, int] = {}
+    Images are not decoded.
+    """
+    times: dict[int, int] = {}  # timestamp in nanoseconds by frame
     for chunk in RecordingReader(recording).chunks():
         if chunk.entity_path.strip("/") == entities.EGO:
             batch = chunk.to_record_batch()
@@ -89,15 +82,16 @@ def frame_times_ns(recording: Path) -> np.ndarray:
                 frames = batch.column(entities.FRAME_TIMELINE).to_pylist()
                 stamps = batch.column("timestamp_ns").to_pylist()
                 times.update({f: stamp[0] for f, stamp in zip(frames, stamps, strict=True) if stamp})
-    return np.array([times[frame] for frame in sorted(times)], dtype=np.int64)
+    steps = np.diff(np.array([times[frame] for frame in sorted(times)], dtype=np.int64))
+    seconds = float(np.median(steps[steps > 0])) / 1e9 if (steps > 0).any() else 1.0
+    return len(times), float(np.clip(1 / seconds, SLOWEST, FASTEST))
 
 
 def _images(recording: Path) -> Iterator[np.ndarray]:
-    layout: tuple[Tile, ...] | None = None
+    layout: tuple[Tile, ...] = ()
     images = CameraImages()
     for frame in RecordingReader(recording).frames():
-        if layout is None:
-            layout = tiles(frame)
+        layout = layout or tiles(frame)
         yield draw_frame(frame, layout, images)
 
 

@@ -1,7 +1,5 @@
 """Draws one frame of a video: all cameras with their boxes, the BEV to the right, a legend below."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass

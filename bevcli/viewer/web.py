@@ -5,8 +5,6 @@ viewer from the installed viewer once, and serves them and the recording from on
 lets the pages connect to that origin only; so the viewer in the browser cannot send telemetry.
 """
 
-from __future__ import annotations
-
 import ipaddress
 import os
 import re
@@ -205,7 +203,6 @@ class _Handler(BaseHTTPRequestHandler):
                 self.wfile.write(b"\r\n")
                 sent = size
         self.wfile.write(b"0\r\n\r\n")
-        """Sends the bytes from start to end. Raises ConnectionError where the file is cut meanwhile."""
 
     def _copy(self, start: int, end: int) -> None:
         """Sends the bytes from start to end. Raises ConnectionError where the file is cut meanwhile."""
