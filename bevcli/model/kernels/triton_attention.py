@@ -1,5 +1,7 @@
 """Deformable attention on a GPU as one Triton kernel. Import it only where Triton is installed."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from itertools import accumulate
 
