@@ -14,7 +14,7 @@ ROOT = Path(bevcli.__file__).parent
 LAYERS = (
     {"_version", "duration", "errors", "findings"},
     {"options", "registry"},
-    {"parsing", "jit", "waiting"},
+    {"parsing", "jit", "waiting", "writing"},
     {"geometry"},
     {"frame"},
     {"model"},

@@ -9,7 +9,6 @@ import os
 import re
 import shutil
 import tempfile
-import uuid
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
@@ -17,6 +16,7 @@ from typing import Any, NamedTuple
 
 from bevcli.errors import BevcliError, InputError, OutputError
 from bevcli.parsing.files import read_bytes
+from bevcli.writing import write_whole
 
 _URL = re.compile(r"(?P<protocol>[a-z][a-z0-9+.-]+)://", re.IGNORECASE)
 # The packages that fsspec needs for a protocol.
@@ -103,16 +103,7 @@ class LocalFolder:
 
     def write(self, name: str, content: bytes) -> None:
         """Write a file. Readers see the old or the new contents. Raises OutputError."""
-        path = self.path / name
-        fresh = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}.new")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            fresh.write_bytes(content)
-            os.replace(fresh, path)
-        except OSError as error:
-            with contextlib.suppress(OSError):
-                fresh.unlink()
-            raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
+        write_whole(self.path / name, content, parents=True)
 
     def remove(self, name: str) -> None:
         """Remove a file or a subfolder, if it is there. Raises OutputError."""

@@ -16,6 +16,7 @@ from bevcli.benchmark.limits import MachineLimits
 from bevcli.config import known_models
 from bevcli.errors import BevcliError
 from bevcli.parsing.files import MIB, read_text
+from bevcli.writing import write_whole
 
 MODEL_TIMEOUT_S = 4 * 3600.0
 LARGEST_DOCUMENT = 16 * MIB
@@ -174,7 +175,7 @@ def write_table(path: Path, device: torch.device, frames: int) -> None:
         raise BevcliError(f"{path}: cannot find where to write the table (expected the lines {BEGIN} and {END})")
     precisions = ("bf16", "fp16") if device.type == "cuda" else ("fp32", "bf16")
     results = [measure(model, precision, device, frames) for model in known_models() for precision in precisions]
-    path.write_text(f"{before}{begin}\n{markdown_table(results)}\n{end}{after}")
+    write_whole(path, f"{before}{begin}\n{markdown_table(results)}\n{end}{after}".encode())
 
 
 def measure(

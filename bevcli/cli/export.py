@@ -27,10 +27,12 @@ def export(
     from bevcli.evaluation.export import read_kitti_camera, write_csv, write_kitti
     from bevcli.evaluation.submission import write_submission
     from bevcli.sequences.files.boxes_file import above_score, read_boxes
+    from bevcli.writing import check_output
 
     file = predictions / "predictions.json" if predictions.is_dir() else predictions
     boxes, form = above_score(read_boxes(file), options.score), options.form
     target = options.out or file.parent / NAMES[form]
+    check_output(target, file)
     if form == "csv":
         typer.echo(f"{target}: {write_csv(boxes, target)} boxes")
     elif form in ("nuscenes", "nuscenes-tracking"):

@@ -23,7 +23,7 @@ def find_like(
     """
     from bevcli.batch.find_like import find_like, open_query, similar_frames_page
     from bevcli.batch.storage import open_storage
-    from bevcli.errors import OutputError
+    from bevcli.writing import write_whole
 
     storage, html = open_storage(options.batch), options.html
     query = open_query(run, options.frame, storage)
@@ -36,8 +36,5 @@ def find_like(
     if html is None:
         storage.write("find-like.html", content.encode())
     else:
-        try:
-            html.write_text(content)
-        except OSError as error:
-            raise OutputError(f"{html}: cannot be written ({error.strerror})") from None
+        write_whole(html, content.encode())
     print(f"written  {html or f'{storage.where}/find-like.html'}")

@@ -16,10 +16,11 @@ from bevcli._version import __version__
 from bevcli.config import as_table
 from bevcli.engines.engine import require
 from bevcli.engines.options import OnnxOptions
-from bevcli.errors import BevcliError, OutputError
+from bevcli.errors import BevcliError
 from bevcli.model.export_form import ExportForm, Port, pad_value_bgr
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.options import gather
+from bevcli.writing import whole_file
 
 NAME_SCOPES = "pkg.torch.onnx.name_scopes"  # the exporter's note of the modules that a node comes from
 
@@ -89,11 +90,8 @@ def export_onnx(
     facts = metadata(form, outputs, contents, slots=slots, untrained=untrained, bundled=bundled)
     onnx.helper.set_model_props(proto, facts)
     onnx.checker.check_model(proto, full_check=True)
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        onnx.save(proto, str(out))
-    except OSError as error:
-        raise OutputError(f"{out}: cannot be written: {error.strerror}") from error
+    with whole_file(out, parents=True) as unfinished:
+        onnx.save(proto, str(unfinished))
 
 
 def metadata(

@@ -6,7 +6,6 @@ stays in float32: it is a small part of the work, and rounding it would move box
 """
 
 import logging
-import tempfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,8 @@ import numpy as np
 
 from bevcli.engines.engine import check_size, require
 from bevcli.engines.exported import read_metadata
-from bevcli.errors import OutputError, WeightsError
+from bevcli.errors import WeightsError
+from bevcli.writing import check_output, whole_file
 
 QUANTIZED_PARTS = ("backbone", "neck")
 QUANTIZED_OPERATORS = ("Conv", "Add", "MaxPool")
@@ -48,16 +48,15 @@ def quantize(file: Path, images: Iterable[np.ndarray], out: Path) -> None:
     metadata = {entry.key: entry.value for entry in proto.metadata_props}
     if read_metadata(metadata, file).precision != "fp32":
         raise WeightsError(f"{file}: is quantised already (expected a file of bevcli export-onnx)")
+    check_output(out, file)
     logger = logging.getLogger()
     before = logger.level
     logger.setLevel(logging.ERROR)  # against advice about models that have not been simplified
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".quantize-", dir=out.parent) as folder:
-            fresh = Path(folder) / out.name
+        with whole_file(out, parents=True) as unfinished:
             quantize_static(
                 proto,
-                str(fresh),
+                str(unfinished),
                 _reader(proto, images),
                 quant_format=QuantFormat.QDQ,
                 op_types_to_quantize=list(QUANTIZED_OPERATORS),
@@ -67,12 +66,9 @@ def quantize(file: Path, images: Iterable[np.ndarray], out: Path) -> None:
                 weight_type=QuantType.QInt8,
                 extra_options={"WeightSymmetric": True, "ActivationSymmetric": False},
             )
-            quantized = onnx.load(str(fresh))
+            quantized = onnx.load(str(unfinished))
             onnx.helper.set_model_props(quantized, metadata | {"precision": "int8"})
-            onnx.save(quantized, str(fresh))
-            fresh.replace(out)
-    except OSError as error:
-        raise OutputError(f"{out}: cannot be written: {error.strerror}") from error
+            onnx.save(quantized, str(unfinished))
     finally:
         logger.setLevel(before)
 

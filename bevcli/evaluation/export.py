@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from bevcli.errors import InputError, OutputError
+from bevcli.errors import InputError
 from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, apply, inverse, wrap_angle
@@ -16,6 +16,7 @@ from bevcli.sequences.files.box_json import boxes_to_json
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 from bevcli.sequences.files.calibration_file import read_calibration
 from bevcli.sequences.files.incremental_json import GrowingFile
+from bevcli.writing import whole_file, write_whole
 
 COLUMNS = (
     "frame", "scene", "timestamp_ns", "frame_of_reference", "class", "score", "x", "y", "z", "length", "width",
@@ -29,9 +30,9 @@ class CsvWriter:
     Metres and radians; a cell is empty where a value is unknown. Raises OutputError where the file cannot be written.
     """
 
-    def __init__(self, path: Path, resume_at: int | None = None) -> None:
-        """resume_at: `file.size` of an earlier writer of this file, to go on from there."""
-        self.file = GrowingFile(path, resume_at)
+    def __init__(self, path: Path, resume_at: int | None = None, *, name: Path | None = None) -> None:
+        """resume_at: `file.size` of an earlier writer of this file, to go on from there. name: for errors."""
+        self.file = GrowingFile(path, resume_at, name=name)
         if resume_at is None:
             self._append([dict(zip(COLUMNS, COLUMNS, strict=True))])
 
@@ -55,7 +56,7 @@ class CsvWriter:
 
 def write_csv(boxes: BoxesFile, path: Path) -> int:
     """Write all boxes in their frame of reference; return their number. Raises OutputError."""
-    with CsvWriter(path) as writer:
+    with whole_file(path) as unfinished, CsvWriter(unfinished, name=path) as writer:
         return sum(writer.write(frame, boxes.frame_of_reference) for frame in boxes.frames)
 
 
@@ -95,17 +96,12 @@ def write_kitti(boxes: BoxesFile, camera: Camera, ego_from_bev: Array, folder: P
     if len(set(numbers)) < len(numbers):
         raise InputError("frame indices repeat (KITTI's files are named by them): export each scene separately")
     count = 0
-    try:
-        for name in ("label_2", "calib"):
-            (folder / name).mkdir(parents=True, exist_ok=True)
-        for frame in boxes.frames:
-            lines = kitti_labels(_in_ego(frame, boxes.frame_of_reference, ego_from_bev), camera)
-            name = f"{frame.stamp.index:06d}.txt"
-            (folder / "label_2" / name).write_text("".join(f"{line}\n" for line in lines))
-            (folder / "calib" / name).write_text(_calibration(camera, ego_from_bev))
-            count += len(lines)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be written ({error.strerror})") from None
+    for frame in boxes.frames:
+        lines = kitti_labels(_in_ego(frame, boxes.frame_of_reference, ego_from_bev), camera)
+        name = f"{frame.stamp.index:06d}.txt"
+        write_whole(folder / "label_2" / name, "".join(f"{line}\n" for line in lines).encode(), parents=True)
+        write_whole(folder / "calib" / name, _calibration(camera, ego_from_bev).encode(), parents=True)
+        count += len(lines)
     return count
 
 

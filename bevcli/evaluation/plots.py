@@ -13,12 +13,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
 from numpy.typing import NDArray
 
-from bevcli.errors import OutputError
 from bevcli.evaluation.config import ERRORS, DetectionConfig
 from bevcli.evaluation.detection_scores import RECALLS, ClassScores, DetectionScores
 from bevcli.evaluation.matching import ClassMatches, ScoredBoxes
 from bevcli.evaluation.pairing import FramePairs
 from bevcli.geometry.transforms import Array, apply, inverse
+from bevcli.writing import whole_file
 
 # Colours of classes on a white background.
 PLOT_COLORS = {
@@ -47,12 +47,9 @@ def titled_figure(size_inches: tuple[float, float], title: str, subtitle: str) -
 
 def save_figures(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
     """Write figures, by file name, into a folder, made where it is missing; return their paths. Raises OutputError."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, figure in figures.items():
-            figure.savefig(folder / name, dpi=110)
-    except OSError as error:
-        raise OutputError(f"{folder}: plots cannot be written ({error.strerror})") from None
+    for name, figure in figures.items():
+        with whole_file(folder / name, parents=True) as unfinished:
+            figure.savefig(unfinished, dpi=110)
     return [folder / name for name in figures]
 
 

@@ -19,6 +19,7 @@ from bevcli.explain.drawing import ACCENT, GREY, INK, LEAST_SCORE, SECOND
 from bevcli.explain.head_figures import box_code, decoder, segmentation
 from bevcli.explain.options import ImageFormat
 from bevcli.explain.trace import Trace
+from bevcli.writing import whole_file
 
 HEIGHT = 7.7  # inches
 MOST_CAMERAS = 6
@@ -201,7 +202,5 @@ def _save(figure: Figure, path: Path, image_format: ImageFormat) -> None:
     # No software version and no date in the file: the same frame gives the same bytes.
     options: dict[str, Any] = {"metadata": {"Software": None}} if image_format == "png" else {}
     options["pil_kwargs"] = {"optimize": True} if image_format == "png" else {"quality": 86, "optimize": True}
-    try:
-        figure.savefig(path, format=image_format, **options)
-    except OSError as error:
-        raise OutputError(f"{path}: the figure cannot be written: {error.strerror}") from error
+    with whole_file(path) as unfinished:
+        figure.savefig(unfinished, format=image_format, **options)

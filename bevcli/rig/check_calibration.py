@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.errors import InputError, OutputError
+from bevcli.errors import InputError
 from bevcli.findings import Finding, errors_of
 from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.cameras import CameraRig
@@ -24,6 +24,7 @@ from bevcli.sequences.native.tables import read_frames_table
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import SequenceOptions
 from bevcli.sequences.ros.format import is_ros_bag
+from bevcli.writing import write_whole
 
 CALIBRATION = "calibration.json"
 _Found = tuple[tuple[Finding, ...], Mapping[str, NDArray[np.uint8]]]  # findings, and images by camera
@@ -76,11 +77,7 @@ class CalibrationCheck:
         from bevcli.rig.rig_recording import write_rig_recording
 
         folder = Path(folder)
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            (folder / "findings.json").write_text(self.to_json() + "\n", encoding="utf-8")
-        except OSError as error:
-            raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
+        write_whole(folder / "findings.json", f"{self.to_json()}\n".encode(), parents=True)
         if not self.rig.cameras:
             return [folder / "findings.json"]
         write_camera_sheet(folder / "cameras.png", self.rig, self.report, self.images)

@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from bevcli.errors import OutputError
 from bevcli.findings import Finding
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import apply, inverse
@@ -22,6 +21,7 @@ from bevcli.rig.coverage import Coverage
 from bevcli.rig.mounting import degrees_text, mounting_of, seen_fov_deg, seen_range_deg
 from bevcli.rig.overlay import GROUND, HORIZON, PILLAR_GRID, Pixels, draw_overlay, height_colors
 from bevcli.rig.rig_report import RigReport
+from bevcli.writing import whole_file
 
 SEVERITY_COLORS = {"error": "#ff5c72", "warning": "#ffc857", "info": "#7fb7e6"}
 SIDE_DEG = (75.0, 105.0)  # cameras with a yaw in this range are placed beside the map
@@ -203,10 +203,8 @@ def draw_coverage(axes: Axes, rig: CameraRig, coverage: Coverage) -> None:
 
 def save(figure: Figure, path: Path) -> None:
     """Write a figure as a PNG. Raises OutputError."""
-    try:
-        FigureCanvasAgg(figure).print_png(str(path))
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
+    with whole_file(path) as unfinished:
+        FigureCanvasAgg(figure).print_png(str(unfinished))
 
 
 def _legend(coverage: Coverage) -> Sequence[Patch]:

@@ -30,6 +30,7 @@ from bevcli.rig.overlay import (
     visible_runs,
 )
 from bevcli.rig.rig_report import RigReport
+from bevcli.writing import whole_file
 
 COVERAGE, COVERAGE_ON_GROUND, FINDINGS = "coverage", f"{entities.EGO}/coverage", "findings"
 PIXELS_PER_CELL = 6
@@ -38,9 +39,9 @@ JPEG_QUALITY = 90
 
 def write_rig_recording(path: Path, rig: CameraRig, report: RigReport, images: Mapping[str, Pixels]) -> None:
     """Write the recording. images: by camera, (H, W, 3) BGR; any may be missing. Raises OutputError."""
-    with rr.RecordingStream("bevcli-project-debug") as stream:
+    with whole_file(path) as unfinished, rr.RecordingStream("bevcli-project-debug") as stream:
         try:
-            stream.save(path, default_blueprint=_blueprint(rig))
+            stream.save(unfinished, default_blueprint=_blueprint(rig))
         except RuntimeError as error:
             raise OutputError(f"{path}: the recording cannot be written ({error})") from error
         log_static.log_scene(stream, rig, ())

@@ -18,7 +18,7 @@ from bevcli.robustness.conditions import Condition, Corruption, Shown
 from bevcli.robustness.corruptions import Pixels
 from bevcli.robustness.options import StressOptions
 from bevcli.robustness.results import ConditionScores, StressResults
-from bevcli.runs.folder import replace_file
+from bevcli.writing import write_whole
 
 SEVERITY_COLORS = ("#b8c9e8", "#7d9fd3", "#3f6fb5", "#173e7a")  # from the easiest severity to the hardest
 _OTHER_COLOR = "#d62728"
@@ -142,7 +142,7 @@ def write_contact_sheet(path: Path, scene: Sequence, conditions: Items[Condition
     if not rows:
         return
     _, encoded = cv2.imencode(".png", _sheet(list(rows.values())))
-    replace_file(path, encoded.tobytes())
+    write_whole(path, encoded.tobytes())
 
 
 def _tile(frame: Frame, corruption: Corruption) -> Pixels:

@@ -18,9 +18,10 @@ from bevcli.robustness.conditions import Condition, choose_conditions
 from bevcli.robustness.options import StressOptions
 from bevcli.robustness.results import ConditionScores, StressResults, read_results
 from bevcli.robustness.sequences import FrameStore, KeptFrames, split_scenes
-from bevcli.runs.folder import RunFolder, replace_file
+from bevcli.runs.folder import RunFolder
 from bevcli.runs.state import digest, load_state, run_facts, save_state, saved_state, short_hash
 from bevcli.training.validation import boxes_ego
+from bevcli.writing import write_whole
 
 RESULTS, SHEET, PLOT = "stress.json", "corruptions.png", "stress.png"
 _INPUT_FACTS = ("frames of the input", "calibration", "files of the input")
@@ -233,7 +234,7 @@ def _facts(model: Model, drives: Items[Sequence], options: StressOptions) -> dic
 def _write_results(folder: RunFolder, results: StressResults, against: StressResults | None) -> None:
     path = folder.path / RESULTS
     folder.add(path)
-    replace_file(path, (json.dumps(results.to_dict(against), indent=1) + "\n").encode())
+    write_whole(path, (json.dumps(results.to_dict(against), indent=1) + "\n").encode())
 
 
 def _write_figures(

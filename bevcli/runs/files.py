@@ -25,6 +25,7 @@ from bevcli.sequences.files.incremental_json import partial_path
 from bevcli.sequences.files.json_fields import pose_to_json
 from bevcli.sequences.files.map_folder import map_path, write_map
 from bevcli.viewer.recording_file import restore_index
+from bevcli.writing import whole_file, write_whole
 
 BEV = "BEV features"
 RECORDING, PREDICTIONS, SUBMISSION = "recording.rrd", "predictions.json", "results_nusc.json"
@@ -272,9 +273,6 @@ def _save_bev(folder: Path, prediction: Prediction, model: Model) -> None:
         "untrained": model.untrained,
     }
     name = f"{prediction.stamp.index:06d}"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        np.save(folder / f"{name}.npy", features)
-        (folder / f"{name}.json").write_text(json.dumps(facts, indent=1) + "\n")
-    except OSError as error:
-        raise OutputError(f"{folder}: BEV features cannot be written ({error.strerror})") from None
+    with whole_file(folder / f"{name}.npy", parents=True) as unfinished:
+        np.save(unfinished, features)
+    write_whole(folder / f"{name}.json", f"{json.dumps(facts, indent=1)}\n".encode())

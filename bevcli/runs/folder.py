@@ -151,18 +151,6 @@ def _locked_folder(out: Path) -> int:
     return folder
 
 
-def replace_file(path: Path, content: bytes) -> None:
-    """Write a file under another name and rename it, so that it is whole at every moment. Raises OutputError."""
-    fresh = path.with_name(path.name + ".new")
-    try:
-        fresh.write_bytes(content)
-        os.replace(fresh, path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            fresh.unlink()
-        raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
-
-
 def _locked(path: Path, out: Path) -> IO[str]:
     """The open lock file, which holds the number and the command of this process. Raises OutputError."""
     if sys.platform == "win32":

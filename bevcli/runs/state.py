@@ -28,8 +28,9 @@ from bevcli.inference.tracking import TrackerState
 from bevcli.parsing.files import read_bytes
 from bevcli.parsing.pth import read_safetensors
 from bevcli.runs.files import FilesState
-from bevcli.runs.folder import RunFolder, replace_file
+from bevcli.runs.folder import RunFolder
 from bevcli.runs.summary import Counts
+from bevcli.writing import write_whole
 
 FORMAT = "bevcli-state/4"
 LARGEST_STRINGS = 1 << 28  # bytes of an array of strings: a short text may state an array of gigabytes
@@ -190,7 +191,7 @@ def short_hash(hexdigest: str) -> str:
 def save_state(path: Path, state: object) -> None:
     """Write a state. The file is replaced at once, so that it is whole at every moment. Raises OutputError."""
     tensors = _tensors_of(state)
-    replace_file(path, save(tensors, {"format": FORMAT, "sha256": _hash(tensors)}))
+    write_whole(path, save(tensors, {"format": FORMAT, "sha256": _hash(tensors)}))
 
 
 def load_state(path: Path, kind: type[Loaded]) -> Loaded:

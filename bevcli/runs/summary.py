@@ -11,8 +11,9 @@ from bevcli._version import __version__
 from bevcli.duration import duration
 from bevcli.frame import Frame, Prediction, Sequence
 from bevcli.inference.load import Model
-from bevcli.runs.folder import SUMMARY, replace_file
+from bevcli.runs.folder import SUMMARY
 from bevcli.runs.options import RunOptions
+from bevcli.writing import write_whole
 
 RATIO = 1.01  # of two neighbouring bins of a `RunningMedian`
 LAST_BIN = 5000  # 1e21 seconds
@@ -164,7 +165,7 @@ class RunSummary:
         """Write summary.json into a folder. files: that the run wrote. Raises OutputError."""
         path = folder / SUMMARY
         self.files = (*files, path)
-        replace_file(path, (json.dumps(self.to_dict(), indent=1) + "\n").encode())
+        write_whole(path, (json.dumps(self.to_dict(), indent=1) + "\n").encode())
 
     def table(self) -> str:
         """The summary as a few aligned lines."""

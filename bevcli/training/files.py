@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
-import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,11 +15,12 @@ import safetensors.torch
 import torch
 from torch import Tensor, nn
 
-from bevcli.errors import InputError, OutputError, WeightsError
+from bevcli.errors import InputError, WeightsError
 from bevcli.inference.training_rigs import weights_facts
 from bevcli.model.network import Network
 from bevcli.parsing.files import MIB, read_text
 from bevcli.parsing.pth import read_pth
+from bevcli.writing import whole_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -48,7 +48,8 @@ def save_checkpoint(
     contents = {"format": FORMAT, "step": step, "model": trained.state_dict(), "optimizer": optimizer.state_dict()}
     if average is not None:
         contents["average"] = dict(average)
-    replace_file(path, lambda unfinished: torch.save(contents, unfinished))
+    with whole_file(path) as unfinished:
+        torch.save(contents, unfinished)
 
 
 def load_checkpoint(
@@ -88,17 +89,8 @@ def save_weights(path: Path, model: Network, dtype: torch.dtype) -> None:
         key: (tensor.to(dtype) if tensor.is_floating_point() else tensor).contiguous().cpu()
         for key, tensor in model.state_dict().items()
     }
-    replace_file(path, lambda unfinished: safetensors.torch.save_file(state, unfinished, weights_facts(model.config)))
-
-
-def replace_file(path: Path, write: Callable[[Path], object]) -> None:
-    """Writes a file by calling `write` with a temporary path beside `path`, then renames it. Raises OutputError."""
-    unfinished = path.with_name(f"{path.name}.unfinished")
-    try:
-        write(unfinished)
-        os.replace(unfinished, path)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
+    with whole_file(path) as unfinished:
+        safetensors.torch.save_file(state, unfinished, weights_facts(model.config))
 
 
 class LearningCurve:
@@ -119,7 +111,8 @@ class LearningCurve:
         """
         self.path = path
         self.rows: list[Row] = [row for row in _read(path) if row["step"] <= done] if done else []
-        replace_file(path, lambda unfinished: _write(unfinished, self.rows, "w"))
+        with whole_file(path) as unfinished:
+            _write(unfinished, self.rows, "w")
 
     def add(self, step: int, numbers: Row) -> None:
         """Appends a row and writes it to the file at once."""
@@ -140,7 +133,8 @@ def draw_learning_curves(loss: LearningCurve, validation: LearningCurve, path: P
     _draw_rows(right, [_scores(row) for row in validation.rows], skipped=("step",), marker="o")
     left.set(title="Training loss", xlabel="step", yscale="log")
     right.set(title="Validation", xlabel="step", ylim=(0, 1))
-    figure.savefig(path, dpi=110)
+    with whole_file(path) as unfinished:
+        figure.savefig(unfinished, dpi=110)
 
 
 def _draw_rows(axes: Axes, rows: list[Row], skipped: tuple[str, ...], marker: str = "") -> None:

@@ -6,13 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from bevcli.errors import InputError, OutputError
+from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
 from bevcli.recording import entities
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
+from bevcli.writing import whole_file
 
 COLUMNS = (
     "frame", "scene", "timestamp_ns", "class", "score", "x", "y", "z", "length", "width", "height", "yaw",
@@ -29,10 +30,7 @@ def export_boxes(recording: Path, path: Path) -> tuple[int, int]:
     if path.suffix.lower() not in writers:
         raise InputError(f"{path}: the file must end in .csv or .json")
     frames = [recorded_boxes(frame) for frame in RecordingReader(recording).frames()]
-    try:
-        writers[path.suffix.lower()](path, frames)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror})") from error
+    writers[path.suffix.lower()](path, frames)
     return len(frames), sum(len(frame.boxes) for frame in frames)
 
 
@@ -59,7 +57,7 @@ def recorded_boxes(frame: RecordedFrame) -> FrameBoxes:
 
 
 def _write_csv(path: Path, frames: list[FrameBoxes]) -> None:
-    with path.open("w", newline="") as file:
+    with whole_file(path) as unfinished, unfinished.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
         for frame in frames:

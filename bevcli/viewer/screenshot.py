@@ -15,6 +15,7 @@ from rerun.experimental._viewer_client import ViewerState
 from bevcli.errors import InputError, OutputError, WaitError
 from bevcli.recording import entities
 from bevcli.viewer.native import LOOPBACK, free_port, start_viewer, stop
+from bevcli.writing import write_whole
 
 Answer = TypeVar("Answer")
 START_TIMEOUT_S = 40.0
@@ -101,7 +102,4 @@ def _write(image: Path, png: bytes) -> None:
         pixels = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
         assert pixels is not None
         png = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
-    try:
-        image.write_bytes(png)
-    except OSError as error:
-        raise OutputError(f"{image}: cannot be written ({error.strerror})") from error
+    write_whole(image, png)

@@ -1,5 +1,6 @@
 """Writes a video of a recording: H.264 in MP4, which plays everywhere, if PyAV is installed; VP9 else and in WebM."""
 
+import errno
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
@@ -13,6 +14,7 @@ from bevcli.recording import entities
 from bevcli.recording.video_images import has_av
 from bevcli.viewer.recording_reader import RecordingReader
 from bevcli.viewer.video_frame import HEIGHT, WIDTH, CameraImages, Tile, draw_frame, tiles
+from bevcli.writing import whole_file
 
 FOURCC = {".mp4": "vp09", ".webm": "VP90"}  # VP9: OpenCV's wheels cannot write H.264
 H264_QUALITY = 21  # x264's crf
@@ -30,12 +32,21 @@ def write_video(recording: Path, video: Path, on_frame: Callable[[], None] = lam
     count, rate = frame_rate(recording)
     if not count:
         raise InputError(f"{recording}: the recording has no frames")
-    opened = _h264(video, rate) if video.suffix.lower() == ".mp4" and has_av() else _vp9(video, rate)
-    with opened as write:
-        for image in _images(recording):
-            write(image)
-            on_frame()
+    encoder = _h264 if video.suffix.lower() == ".mp4" and has_av() else _vp9
+    with whole_file(video) as unfinished:
+        with encoder(unfinished, rate) as write:
+            for image in _images(recording):
+                write(image)
+                on_frame()
+        _check_complete(unfinished, count)
     return count
+
+
+def _check_complete(video: Path, count: int) -> None:
+    """Raises OSError where a video lacks frames: OpenCV does not tell that a disk is full."""
+    found = cv2.VideoCapture(str(video))
+    if not (found.isOpened() and found.get(cv2.CAP_PROP_FRAME_COUNT) >= count - 1):  # computed from the times in a WebM
+        raise OSError(errno.ENOSPC, "not all frames are in the file: is the disk full?")
 
 
 @contextmanager

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import csv
+import resource
+import shutil
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
-from bevcli.errors import InputError
+from bevcli.cli.main import app
+from bevcli.errors import InputError, OutputError
 from bevcli.evaluation.export import kitti_labels, write_csv, write_kitti
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, default_ego_from_bev
 from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
-from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes
 
 # Camera axes in the ego frame, as columns: x right, y down, z forward.
 LOOKING_AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -149,3 +153,26 @@ def test_csv_has_a_row_a_box(tmp_path: Path) -> None:
     assert rows[0]["frame"] == "7"
     assert rows[0]["frame_of_reference"] == "world"
     assert rows[0]["attribute"] == ""
+
+
+def test_the_command_does_not_replace_its_input(tmp_path: Path) -> None:
+    path = tmp_path / "boxes.json"
+    shutil.copy(Path(__file__).parents[2] / "samples/street/ground_truth.json", path)
+    before = path.read_bytes()
+    result = CliRunner().invoke(app, ["export", str(path), "--format", "csv", "--out", str(path)])
+    assert isinstance(result.exception, OutputError)
+    assert path.read_bytes() == before
+
+
+def test_a_table_that_does_not_fit_leaves_the_old_one(tmp_path: Path) -> None:
+    boxes = read_boxes(Path(__file__).parents[2] / "samples/street/ground_truth.json")
+    path, before = tmp_path / "boxes.csv", resource.getrlimit(resource.RLIMIT_FSIZE)
+    path.write_text("old")
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    try:
+        with pytest.raises(OutputError, match=r"boxes\.csv: cannot be written"):
+            write_csv(boxes, path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]

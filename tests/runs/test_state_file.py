@@ -1,6 +1,8 @@
 """State files give back what was written, bit by bit, and run nothing."""
 
+import errno
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -112,9 +114,13 @@ def test_a_state_with_one_changed_byte_is_refused(tmp_path):
         assert "\n" not in str(error.value)
 
 
-def test_a_failed_write_keeps_the_state_before(tmp_path):
+def test_a_failed_write_keeps_the_state_before(tmp_path, monkeypatch):
     save_state(tmp_path / "state", 1)
-    (tmp_path / "state.new").mkdir()
+
+    def full_disk(*arguments):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full_disk)
     with pytest.raises(OutputError):
         save_state(tmp_path / "state", 2)
     assert load_state(tmp_path / "state", int) == 1

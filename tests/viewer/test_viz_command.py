@@ -2,6 +2,7 @@
 
 import csv
 import json
+import resource
 
 import cv2
 import numpy as np
@@ -11,11 +12,12 @@ from recorded_drive import bev_from_world, boxes_ahead, record
 from typer.testing import CliRunner
 
 from bevcli.cli.main import app
-from bevcli.errors import InputError
+from bevcli.errors import InputError, OutputError
 from bevcli.geometry.transforms import apply
 from bevcli.recording.options import RecordingOptions
 from bevcli.viewer import video
 from bevcli.viewer.summary import summarise
+from bevcli.viewer.video import write_video
 
 
 @pytest.fixture(scope="module")
@@ -92,6 +94,21 @@ def test_the_video_has_every_frame_and_the_boxes(drive, tmp_path, monkeypatch, e
     bev = images[0][:, -640:].astype(int)
     car = bev[320 - round(12 * 6.4) - 16 : 320 - round(12 * 6.4) + 16, 310:330]  # 12 m ahead, 6.4 pixels a metre
     assert (np.abs(car - [44, 158, 255]).sum(-1) < 120).any()  # the car's orange, BGR
+
+
+@pytest.mark.parametrize("ending", ["webm", "mp4"])
+def test_a_video_that_does_not_fit_is_an_error(drive, tmp_path, ending):
+    """A limit on the size of files is what a full disk is to OpenCV, which tells neither."""
+    path, before = tmp_path / f"video.{ending}", resource.getrlimit(resource.RLIMIT_FSIZE)
+    path.write_text("old")
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    try:
+        with pytest.raises(OutputError, match="cannot be written"):
+            write_video(drive[1], path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_video_of_av1_images_shows_them(tmp_path):

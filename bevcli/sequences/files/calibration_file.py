@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from bevcli.errors import InputError, OutputError
+from bevcli.errors import InputError
 from bevcli.findings import Finding, errors_of
 from bevcli.frame import DriveFacts
 from bevcli.geometry.cameras import Camera, CameraRig, Distortion, default_ego_from_bev
@@ -16,6 +16,7 @@ from bevcli.geometry.geographic import EAST_DEG, GeoOrigin
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.documents import read_json
 from bevcli.sequences.files.json_fields import Report, parse_numbers, parse_transform, shortened, transform_to_json
+from bevcli.writing import write_whole
 
 FORMAT = "bevcli-calibration/1"
 LARGEST_BYTES = 4 << 20
@@ -82,10 +83,7 @@ def write_calibration(path: Path, rig: CameraRig, facts: DriveFacts | None = Non
     if not rig.ego_from_bev_assumed:
         document["ego_from_bev"] = transform_to_json(rig.ego_from_bev)
     document["cameras"] = {camera.name: _camera_to_json(camera) for camera in rig.cameras}
-    try:
-        path.write_text(_lines(document) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror})") from error
+    write_whole(path, f"{_lines(document)}\n".encode())
 
 
 def _load_object(path: Path) -> dict[str, Any]:

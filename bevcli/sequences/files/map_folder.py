@@ -9,11 +9,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bevcli.errors import InputError, OutputError
+from bevcli.errors import InputError
 from bevcli.frame import MOST_MAP_CLASSES, BevMap
 from bevcli.parsing.documents import read_json
 from bevcli.parsing.files import read_bytes
 from bevcli.parsing.images import decode_image
+from bevcli.writing import write_whole
 
 FORMAT = "bevcli-map/1"
 LEGEND = "map.json"
@@ -67,14 +68,10 @@ def write_map(folder: Path, frame: int, bev_map: BevMap) -> None:
     Raises OutputError if the map cannot be written, and InputError if the folder's maps have another extent or
     other classes.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if not (folder / LEGEND).exists():
-            (folder / LEGEND).write_text(json.dumps(_legend(bev_map), indent=1) + "\n")
-        _check_legend(open_maps(folder), bev_map)
-        map_path(folder, frame).write_bytes(cv2.imencode(".png", bev_map.cells)[1].tobytes())
-    except OSError as error:
-        raise OutputError(f"{folder}: the map cannot be written ({error.strerror})") from None
+    if not (folder / LEGEND).exists():
+        write_whole(folder / LEGEND, f"{json.dumps(_legend(bev_map), indent=1)}\n".encode(), parents=True)
+    _check_legend(open_maps(folder), bev_map)
+    write_whole(map_path(folder, frame), cv2.imencode(".png", bev_map.cells)[1].tobytes())
 
 
 def _check_legend(folder: MapFolder, bev_map: BevMap) -> None:

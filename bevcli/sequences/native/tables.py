@@ -18,6 +18,7 @@ from bevcli.geometry.transforms import Array
 from bevcli.parsing.documents import LARGEST_INTEGER
 from bevcli.parsing.files import read_text
 from bevcli.sequences.images import FrameEntry, ImageSource
+from bevcli.writing import whole_file
 
 LARGEST_BYTES = 256 << 20
 LARGEST_NUMBER = 1e12  # in SI units, far beyond any position or motion of a vehicle
@@ -200,7 +201,7 @@ def read_ego_motion(path: Path) -> EgoMotion:
 
 
 def write_ego_motion(path: Path, ego_motion: EgoMotion) -> None:
-    """Write all columns, so that `read_ego_motion` returns the same numbers."""
+    """Write all columns, so that `read_ego_motion` returns the same numbers. Raises OutputError."""
     columns = (
         ego_motion.translations,
         ego_motion.quaternions,
@@ -209,7 +210,7 @@ def write_ego_motion(path: Path, ego_motion: EgoMotion) -> None:
         ego_motion.velocities,
     )
     numbers = np.concatenate(columns, axis=1)  # (T, 16)
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with whole_file(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["timestamp_ns", *TRANSLATION, *QUATERNION, *ACCELERATION, *ANGULAR_RATE, *VELOCITY])
         for time, row in zip(ego_motion.timestamps_ns, numbers, strict=True):

@@ -22,6 +22,7 @@ from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.sequences.files.map_folder import write_map
 from bevcli.sequences.native.folder import BOXES_FILE, MAPS_FOLDER
 from bevcli.sequences.native.tables import write_ego_motion
+from bevcli.writing import write_whole
 
 # The files that the writer creates and `force` removes. Other files in the folder are kept.
 PARTS = ("calibration.json", "frames.csv", "ego_motion.csv", "images", BOXES_FILE, MAPS_FOLDER)
@@ -111,12 +112,7 @@ class NativeWriter:
         if encoded is None or image.media_type not in SUFFIXES:
             encoded = cv2.imencode(".png", image.pixels_bgr)[1].tobytes()
         name = f"images/{camera}/{number:06d}{suffix}"
-        path = self.folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            path.write_bytes(encoded)
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
+        write_whole(self.folder / name, encoded, parents=True)
         return name
 
     def _write_row(self, frame: Frame, cells: Mapping[str, str]) -> None:

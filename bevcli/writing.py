@@ -1,0 +1,50 @@
+"""Writing of files under another name first, so that an interrupted command leaves no partial file."""
+
+import os
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from bevcli.errors import OutputError
+
+
+@contextmanager
+def whole_file(path: Path, *, parents: bool = False) -> Iterator[Path]:
+    """A path to write to, in the folder of `path`.
+
+        with whole_file(out) as unfinished:
+            unfinished.write_text(text)
+
+    At the end of the block the file takes the place of `path`, also of a link. After an error it is deleted, and `path`
+    stays as it was. A device or a pipe, and what is in /dev, is written directly.
+
+    parents: make the folders that are missing.
+    Raises OutputError where the file cannot be written; every OSError of the block counts as this.
+    """
+    unfinished = path.with_name(f".unfinished-{uuid.uuid4().hex[:8]}{path.suffix}")
+    try:
+        if path.is_relative_to("/dev") or (path.exists() and not path.is_file()):
+            yield path
+            return
+        if parents:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        yield unfinished
+        os.replace(unfinished, path)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from None
+    finally:
+        with suppress(OSError):
+            unfinished.unlink()
+
+
+def write_whole(path: Path, content: bytes, *, parents: bool = False) -> None:
+    """Write a file, so that readers see the old or the new contents; see `whole_file`."""
+    with whole_file(path, parents=parents) as unfinished:
+        unfinished.write_bytes(content)
+
+
+def check_output(path: Path, *inputs: Path) -> None:
+    """Raises OutputError where a file to be written is one that the command reads."""
+    if path.exists() and any(each.exists() and path.samefile(each) for each in inputs):
+        raise OutputError(f"{path}: is the input (expected another file to write)")

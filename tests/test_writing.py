@@ -1,0 +1,64 @@
+"""A file has its old or its new contents, whatever happens while it is written."""
+
+import os
+import threading
+
+import pytest
+
+from bevcli.errors import OutputError
+from bevcli.writing import check_output, whole_file, write_whole
+
+
+def test_a_written_file_has_its_name_and_leaves_nothing_else(tmp_path):
+    write_whole(tmp_path / "new" / "file.txt", b"text", parents=True)
+    assert (tmp_path / "new" / "file.txt").read_bytes() == b"text"
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["file.txt"]
+
+
+@pytest.mark.parametrize(("failure", "raised"), [(OSError(28, "disk full"), OutputError), (ValueError(), ValueError)])
+def test_after_an_error_the_old_file_is_there(tmp_path, failure, raised):
+    def fail(path):
+        with whole_file(path) as unfinished:
+            unfinished.write_text("half")
+            raise failure
+
+    path = tmp_path / "file.txt"
+    path.write_text("old")
+    with pytest.raises(raised):
+        fail(path)
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_link_is_replaced_and_its_target_stays(tmp_path):
+    target, link = tmp_path / "target", tmp_path / "link"
+    target.write_text("old")
+    link.symlink_to(target)
+    write_whole(link, b"new")
+    assert (target.read_text(), link.read_text(), link.is_symlink()) == ("old", "new", False)
+
+
+def test_a_pipe_is_written_directly(tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    found = []
+    reader = threading.Thread(target=lambda: found.append(pipe.read_bytes()))
+    reader.start()
+    write_whole(pipe, b"text")
+    reader.join(10)
+    assert found == [b"text"]
+    assert pipe.is_fifo()
+
+
+def test_a_folder_in_the_place_of_a_file_is_one_line(tmp_path):
+    with pytest.raises(OutputError, match="cannot be written"):
+        write_whole(tmp_path, b"")
+
+
+def test_an_input_is_not_replaced(tmp_path):
+    path = tmp_path / "predictions.json"
+    check_output(path, path)  # neither is there
+    path.touch()
+    check_output(tmp_path / "other", path)
+    with pytest.raises(OutputError, match="is the input"):
+        check_output(tmp_path / "." / "predictions.json", path)
