@@ -73,7 +73,7 @@ def options(panel: str = "Options") -> Callable[[_Class], _Class]:
         made: Any = dataclasses.dataclass(frozen=True)(cls)
         made.panel = panel
         stated = ((field.name, option_of(field)) for field in dataclasses.fields(made))
-        attributes = [f"    {name}: {found.help}".replace("\\[", "[") for name, found in stated if found]
+        attributes = [f"    {name}: {found.help}" for name, found in stated if found]
         made.__doc__ = "\n".join([inspect.cleandoc(cls.__doc__ or ""), "", "Attributes:", *attributes])
         return made
 

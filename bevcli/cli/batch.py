@@ -14,6 +14,7 @@ from bevcli.runs.options import RunOptions
 from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
 
+PANEL = "Run"
 SOME_FAILED = 3  # exit code
 
 

@@ -9,6 +9,8 @@ from bevcli.benchmark.options import BenchOptions
 from bevcli.cli.bridge import Json, Part
 from bevcli.inference.options import ModelOptions
 
+PANEL = "Deploy"
+
 
 def bench(
     model_options: Annotated[ModelOptions, Part(only=("device", "engine", "precision"))],

@@ -60,9 +60,9 @@ def _default(option: Any) -> str:
 
 
 def _escaped(text: str) -> str:
-    """A help text in Markdown, where brackets need no escape, but bars in a table and angles do."""
+    """A help text in Markdown, where bars in a table and angles need an escape."""
     paragraphs = (" ".join(each.split()) for each in text.split("\n\n"))
-    return "\n\n".join(paragraphs).replace("\\[", "[").replace("|", "\\|").replace("<", "\\<")
+    return "\n\n".join(paragraphs).replace("|", "\\|").replace("<", "\\<")
 
 
 if __name__ == "__main__":

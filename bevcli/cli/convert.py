@@ -10,6 +10,8 @@ from bevcli.cli.bridge import Part
 from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions, WriteOptions
 
+PANEL = "Start"
+
 
 def convert(
     source: Annotated[

@@ -7,6 +7,7 @@ from bevcli.sequences.options import SequenceOptions
 from bevcli.synth.options import DemoOptions, RenderOptions
 from bevcli.viewer.options import ViewOptions
 
+PANEL = "Start"
 RESOLUTION = (800, 450)
 
 

@@ -11,6 +11,8 @@ from bevcli.evaluation.options import EvaluationOptions
 from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
 
+PANEL = "Score"
+
 
 def evaluate(
     predictions: Annotated[Path, typer.Argument(help="predictions.json, the folder of a run, or a results_nusc.json.")],

@@ -10,6 +10,8 @@ from bevcli.explain.options import ExplainOptions
 from bevcli.inference.options import ModelOptions
 from bevcli.sequences.options import SequenceOptions
 
+PANEL = "Look"
+
 
 def explain(
     sequence: Annotated[

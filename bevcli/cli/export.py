@@ -7,6 +7,7 @@ import typer
 
 from bevcli.evaluation.options import ExportOptions
 
+PANEL = "Score"
 NAMES = {
     "csv": "boxes.csv",
     "kitti": "kitti",

@@ -10,6 +10,8 @@ from bevcli.cli.bridge import Part
 from bevcli.engines.options import FileOptions, OnnxOptions
 from bevcli.inference.options import ModelOptions
 
+PANEL = "Deploy"
+
 
 def export_onnx(
     model: Annotated[
@@ -23,7 +25,7 @@ def export_onnx(
 
     The number of cameras is fixed, the batch is one; calibrations are inputs. What the model remembers is an input and
     an output: the BEV map, or with v2 models image features. The file's metadata documents every input and output.
-    docs/deploy.md shows how to run it. Needs pip install 'bevcli\\[onnx]'.
+    docs/deploy.md shows how to run it. Needs pip install 'bevcli[onnx]'.
     """
     from bevcli.benchmark.exported import check_exported, difference_lines
     from bevcli.engines.export_onnx import export_onnx as write_onnx

@@ -6,6 +6,8 @@ import typer
 
 from bevcli.batch.options import FindLikeOptions
 
+PANEL = "Look"
+
 
 def find_like(
     run: Annotated[

@@ -10,15 +10,13 @@ from collections.abc import Iterator, Mapping
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
 
 from bevcli._version import __version__
 from bevcli.cli.bridge import command
+from bevcli.cli.help_text import GROUP, PlainCommand, PlainGroup
 from bevcli.errors import BevcliError, WaitError
 from bevcli.inference.cpu_settings import THREAD_SETTINGS, keep_freed_memory
 from bevcli.registry import entries, load
-
-GROUP = "bevcli.commands"
 
 
 class _Commands(Mapping[str, Any]):
@@ -39,7 +37,7 @@ class _Commands(Mapping[str, Any]):
         return len({**entries(GROUP), **self._loaded})
 
 
-class _Group(TyperGroup):
+class _Group(PlainGroup):
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)
         self.commands: Any = _Commands(self.commands)
@@ -53,8 +51,8 @@ def click_command(name: str, found: Any) -> Any:
     """The command of an entry point: a function, which may take dataclasses of options, or a Typer with several."""
     app = found
     if not isinstance(found, typer.Typer):
-        app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-        app.command(name)(command(found))
+        app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+        app.command(name, cls=PlainCommand)(command(found))
     made = typer.main.get_command(app)
     made.name = name
     return made
@@ -62,6 +60,7 @@ def click_command(name: str, found: Any) -> Any:
 
 app = typer.Typer(
     cls=_Group,
+    rich_markup_mode=None,
     help="Run BEVFormer on sequences from any camera rig, and look at the results.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,

@@ -11,6 +11,7 @@ from bevcli.rig.options import CheckOptions
 from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
 
+PANEL = "Look"
 ERRORS_FOUND = 3
 
 

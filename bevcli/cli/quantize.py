@@ -9,6 +9,8 @@ from bevcli.cli.bridge import Part
 from bevcli.engines.options import FileOptions, QuantizeOptions
 from bevcli.inference.options import ModelOptions
 
+PANEL = "Deploy"
+
 
 def quantize(
     model: Annotated[Path, typer.Argument(metavar="FILE.onnx", help="A file of `bevcli export-onnx`.")],
@@ -19,7 +21,7 @@ def quantize(
     """Write a copy of an exported model whose backbone and neck compute in INT8, for CPUs.
 
     `bevcli run`, `validate` and `bench` take the new file as `--model`. Check the accuracy on drives of your own with
-    `bevcli validate`. Needs pip install 'bevcli\\[onnx]'.
+    `bevcli validate`. Needs pip install 'bevcli[onnx]'.
     """
     from bevcli.benchmark.exported import compare_exported, difference_lines
     from bevcli.engines.exported import load_exported

@@ -7,6 +7,8 @@ import typer
 
 from bevcli.synth.options import RenderOptions
 
+PANEL = "Start"
+
 
 def render(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="The sequence folder to write.")],

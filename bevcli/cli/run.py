@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from bevcli.frame import Frame, Prediction, Sequence
     from bevcli.inference.load import Model
 
+PANEL = "Run"
+
 
 def run(
     sequence: Annotated[

@@ -8,6 +8,7 @@ import typer
 
 from bevcli.errors import OutputError
 
+PANEL = "Start"
 NAME = "street"
 
 

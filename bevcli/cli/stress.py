@@ -14,6 +14,8 @@ from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
 from bevcli.synth.options import DriveOptions
 
+PANEL = "Score"
+
 
 def stress(
     sequence: Annotated[

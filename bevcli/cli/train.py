@@ -9,6 +9,8 @@ from bevcli.inference.options import ModelOptions, complete_model
 from bevcli.synth.options import DriveOptions
 from bevcli.training.options import TrainOptions
 
+PANEL = "Train"
+
 
 def train(
     config: Annotated[

@@ -11,6 +11,8 @@ from bevcli.runs.options import RunOptions
 from bevcli.synth.options import DriveOptions
 from bevcli.training.options import ValidationOptions
 
+PANEL = "Score"
+
 
 def validate(
     model: Annotated[

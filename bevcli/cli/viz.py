@@ -7,6 +7,8 @@ import typer
 
 from bevcli.viewer.options import ViewOptions
 
+PANEL = "Look"
+
 
 def viz(
     recording: Annotated[Path, typer.Argument(help="A recording (.rrd), or the output folder of `bevcli run`.")],

@@ -8,16 +8,20 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bevcli.cli.bridge import Json, Part, command
+from bevcli.cli.help_text import PlainCommand
 from bevcli.engines.options import FileOptions
 
 if TYPE_CHECKING:
     from bevcli.checkpoints import Checkpoint
     from bevcli.model.parts import ModelPart
 
-weights_app = typer.Typer(help="Inspect and convert weights files.", no_args_is_help=True)
+PANEL = "Train"
+weights_app = typer.Typer(
+    help="Inspect and convert weights files.", no_args_is_help=True, add_completion=False, rich_markup_mode=None
+)
 
 
-@weights_app.command()
+@weights_app.command(cls=PlainCommand)
 @command
 def inspect(
     file: Annotated[
@@ -32,9 +36,9 @@ def inspect(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Print what FILE contains: the models that it fits, tensors, size and metadata.
+    """Print what a weights file contains.
 
-    With --model, with or without FILE, print the model's parts in the paper's terms (backbone, BEV queries, attentions,
+    The models that it fits, tensors, size and metadata. With --model, with or without FILE, print the model's parts in the paper's terms (backbone, BEV queries, attentions,
     detection head, …) with the shapes of their weights and the number of their parameters.
     """
     from bevcli.checkpoints import expected_state, read_checkpoint, require_fit
@@ -60,14 +64,17 @@ def inspect(
     print(json.dumps(data, indent=1) if as_json else "\n\n".join(texts))
 
 
-@weights_app.command()
+@weights_app.command(cls=PlainCommand)
 @command
 def convert(
     source: Annotated[Path, typer.Argument(help="An official .pth as published, or a .safetensors.")],
     destination: Annotated[Path, typer.Argument(help="The .safetensors to write.")],
     options: Annotated[FileOptions, Part(only=("force",))],
 ) -> None:
-    """Write SOURCE as .safetensors with our key names; it must fit one of our models."""
+    """Write SOURCE as .safetensors with our key names.
+
+    It must fit one of our models.
+    """
     from bevcli.checkpoints import convert as convert_file
 
     print(_as_text(convert_file(source, options.target(destination))))

@@ -66,7 +66,7 @@ class RecordingOptions:
     images: Images = option(
         default="jpeg",
         help="jpeg keeps the bytes of the image files, and writes images of a video as JPEG; av1 is one AV1 video "
-        "stream for each camera, which is smaller, not lossless, and needs bevcli\\[video].",
+        "stream for each camera, which is smaller, not lossless, and needs bevcli[video].",
     )
 
     def __post_init__(self) -> None:

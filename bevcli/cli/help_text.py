@@ -1,0 +1,51 @@
+"""`--help` in plain text: the commands and the options of a command by panels, readable in a terminal of 80 columns."""
+
+import inspect
+import sys
+from typing import Any
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+from bevcli.registry import entries, load
+
+# The order of the commands' panels. A command states its own as `PANEL` in its file; those that state none come last.
+PANELS = ("Start", "Run", "Look", "Score", "Train", "Deploy", "Other commands")
+GROUP = "bevcli.commands"
+
+
+class PlainCommand(TyperCommand):
+    """A command whose `--help` lists its options by their panels."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write the arguments, then the options by panels, last those without one."""
+        panels: dict[str, list[tuple[str, str]]] = {"Arguments": []}
+        for each in self.get_params(ctx):
+            panel = "Arguments" if each.param_type_name == "argument" else getattr(each, "rich_help_panel", None)
+            row = each.get_help_record(ctx)
+            if row is not None:
+                panels.setdefault(panel or "Options", []).append(row)
+        panels["Options"] = panels.pop("Options", [])
+        _write(panels, formatter)
+
+
+class PlainGroup(TyperGroup):
+    """The program, whose `--help` lists the commands by panels. It reads their docstrings and builds none of them."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the commands by panels."""
+        panels: dict[str, list[tuple[str, str]]] = {panel: [] for panel in PANELS}
+        for name, entry in entries(GROUP).items():
+            found = load(GROUP, name)
+            text = found.info.help if isinstance(found, typer.Typer) else found.__doc__
+            summary = " ".join(inspect.cleandoc(text or "").partition("\n\n")[0].split())
+            panel = getattr(sys.modules[entry.module], "PANEL", PANELS[-1])
+            panels.setdefault(panel, []).append((name, summary))
+        _write(panels, formatter)
+
+
+def _write(panels: dict[str, list[tuple[str, str]]], formatter: Any) -> None:
+    for panel, rows in panels.items():
+        if rows:
+            with formatter.section(panel):
+                formatter.write_dl(rows)

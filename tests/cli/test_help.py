@@ -1,0 +1,39 @@
+"""`--help` of the program and of every command, as a terminal of 80 columns shows it."""
+
+import pytest
+from typer.testing import CliRunner
+
+from bevcli.cli import main
+from bevcli.registry import entries
+
+COMMANDS = [name for name in entries("bevcli.commands") if name != "weights"] + ["weights inspect", "weights convert"]
+
+
+def help_of(*arguments: str) -> str:
+    result = CliRunner(env={"COLUMNS": "80", "TERMINAL_WIDTH": "80"}).invoke(main.app, [*arguments, "--help"])
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_help_of_the_program_groups_all_commands_unbuilt(monkeypatch):
+    monkeypatch.setattr(main, "click_command", lambda *_: pytest.fail("a command was built"))
+    text = help_of()
+    places = [text.index(f"\n{panel}:\n") for panel in ("Start", "Run", "Look", "Score", "Train", "Deploy")]
+    assert places == sorted(places)
+    assert "Other commands" not in text
+    for name in entries("bevcli.commands"):
+        assert f"\n  {name} " in text
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_of_a_command_fits_80_columns(name):
+    text = help_of(*name.split())
+    assert max(map(len, text.splitlines())) <= 80
+    assert "bool" not in text
+    assert "\\" not in text
+
+
+def test_options_stand_under_their_panels():
+    text = help_of("run")
+    assert text.index("\nInput:\n") < text.index("  --rate HZ|all")
+    assert text.index("\nOptions:\n") < text.index("  -h, --help")
