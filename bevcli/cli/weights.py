@@ -38,8 +38,9 @@ def inspect(
 ) -> None:
     """Print what a weights file contains.
 
-    The models that it fits, tensors, size and metadata. With --model, with or without FILE, print the model's parts in the paper's terms (backbone, BEV queries, attentions,
-    detection head, …) with the shapes of their weights and the number of their parameters.
+    The models that it fits, tensors, size and metadata. With --model, with or without FILE, print the model's parts in
+    the paper's terms (backbone, BEV queries, attentions, detection head, …) with the shapes of their weights and the
+    number of their parameters.
     """
     from bevcli.checkpoints import expected_state, read_checkpoint, require_fit
     from bevcli.config import load_config
