@@ -11,7 +11,7 @@ from bevcli.errors import InputError
 from bevcli.geometry.cameras import Camera, CameraRig, Distortion, default_ego_from_bev
 from bevcli.geometry.transforms import Array, rigid, rotation_about_z
 from bevcli.sequences.files.calibration_file import read_calibration
-from bevcli.synth.render.renderer import distortion_maps
+from bevcli.synth.render.lens import distortion_maps
 
 # name: x, y, z in the ego frame (metres), yaw (degrees), focal length (pixels at 1600 x 900)
 _MOUNTS = {
