@@ -18,8 +18,27 @@ SIDEWAYS = np.pi / 2 + 1e-6  # a camera that looks exactly sideways belongs to t
 
 
 def camera_rows(rig: CameraRig) -> tuple[tuple[str, ...], ...]:
-    """The camera names of a rig in one or two rows, as `rows_by_yaw` orders them."""
-    return rows_by_yaw({camera.name: camera.yaw for camera in rig.cameras})
+    """The camera names of a rig in one or two rows, as `rows_of_largest_images` finds them for the viewer."""
+    yaws = {camera.name: camera.yaw for camera in rig.cameras}
+    aspect = min(camera.width / camera.height for camera in rig.cameras)
+    return rows_of_largest_images(yaws, aspect, CAMERAS_WIDTH, LARGEST_CAMERAS_SHARE * WINDOW[1], TITLE_HEIGHT)
+
+
+def rows_of_largest_images(
+    yaws: Mapping[str, float], aspect: float, width: float, height: float, title_height: float = 0
+) -> tuple[tuple[str, ...], ...]:
+    """The rows of `rows_by_yaw`, or both in one row, ahead first, if the images are then at least as large.
+
+    yaws: by camera name, radians, in the ego frame. aspect: width / height of the narrowest image. width, height: of
+    the area for all cameras, pixels. title_height: of each image's title, pixels.
+    """
+    rows = rows_by_yaw(yaws)
+    one_row = (sum(rows, ()),)
+
+    def image_width(rows: tuple[tuple[str, ...], ...]) -> float:
+        return min(width / max(map(len, rows)), (height / len(rows) - title_height) * aspect)
+
+    return one_row if image_width(one_row) >= image_width(rows) else rows
 
 
 def rows_by_yaw(yaws: Mapping[str, float]) -> tuple[tuple[str, ...], ...]:
@@ -38,6 +57,7 @@ VIEW_MARGIN_M = 36.0  # the BEV view first shows this much around the vehicle, o
 WINDOW = (1920, 960)  # pixels of a window that the views fill; in others, the images get thin black borders
 TITLE_HEIGHT = 24  # pixels of a view's title
 TEXTS_SHARE = 0.23  # of the window's width, for curves and texts
+CAMERAS_WIDTH = WINDOW[0] * (1 - TEXTS_SHARE)
 LARGEST_CAMERAS_SHARE = 0.62  # of the window's height, for all rows of cameras
 MAP_ZOOM = 17.0
 
@@ -95,15 +115,12 @@ def recording_blueprint(rig: CameraRig, facts: LayoutFacts) -> rrb.Blueprint:
 
 
 def camera_row_shares(rig: CameraRig) -> list[float]:
-    """The share of the window's height of each row of cameras, so that the images fill their views."""
-    width = WINDOW[0] * (1 - TEXTS_SHARE)
-    shares = []
-    for row in camera_rows(rig):
-        aspect = min(rig[name].width / rig[name].height for name in row)
-        shares.append((width / len(row) / aspect + TITLE_HEIGHT) / WINDOW[1])
-    largest = LARGEST_CAMERAS_SHARE / len(shares) if len(shares) == 1 else LARGEST_CAMERAS_SHARE
-    factor = min(1.0, largest / sum(shares))
-    return [share * factor for share in shares]
+    """The share of the window's height of each row of cameras: images are as wide in all rows as in the longest one."""
+    rows = camera_rows(rig)
+    image_width = CAMERAS_WIDTH / max(map(len, rows))
+    aspects = [min(rig[name].width / rig[name].height for name in row) for row in rows]
+    shares = [(image_width / aspect + TITLE_HEIGHT) / WINDOW[1] for aspect in aspects]
+    return [min(share, LARGEST_CAMERAS_SHARE / len(rows)) for share in shares]
 
 
 def _scene(rig: CameraRig, titled: str, facts: LayoutFacts) -> rrb.Spatial3DView:

@@ -11,7 +11,7 @@ from bevcli.errors import InputError
 from bevcli.geometry.cameras import Camera, CameraRig, Distortion, default_ego_from_bev
 from bevcli.geometry.transforms import Array, rigid, rotation_about_z
 from bevcli.sequences.files.calibration_file import read_calibration
-from bevcli.synth.render.renderer import distortion_maps
+from bevcli.synth.render.lens import lens_parts
 
 # name: x, y, z in the ego frame (metres), yaw (degrees), focal length (pixels at 1600 x 900)
 _MOUNTS = {
@@ -41,7 +41,7 @@ def rig_for_rendering(rig: str | Path | CameraRig | None, size: tuple[int, int] 
 
     rig: a rig, or the path of a calibration.json; default: `nuscenes_like_rig`. size: width and height of the images,
     pixels; default: that of the rig.
-    Raises InputError where the file is wrong, or a camera with distortion has too wide a field of view.
+    Raises InputError where the file is wrong, or a camera has too wide a field of view for its lens model.
     """
     if rig is None:
         where, found = "", nuscenes_like_rig()
@@ -54,7 +54,7 @@ def rig_for_rendering(rig: str | Path | CameraRig | None, size: tuple[int, int] 
     for camera in found.cameras:
         if camera.distortion is not None:
             try:
-                distortion_maps(camera)
+                lens_parts(camera)
             except InputError as error:
                 raise InputError(f"{where}camera {camera.name}: {error}") from None
     return found

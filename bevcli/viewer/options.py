@@ -41,7 +41,9 @@ class ViewOptions:
         maximum=65535,
     )
     screenshot: Path | None = option(
-        default=None, help="Write a screenshot of the viewer. Needs no screen.", metavar="OUT.png|.jpg"
+        default=None,
+        help="Write a screenshot of the viewer. Needs a Vulkan driver, but no screen and no GPU.",
+        metavar="OUT.png|.jpg",
     )
     frame: int | None = option(default=None, help="Frame index for `screenshot`. Default: the first frame.")
     summary: bool = option(default=False, help="Print the frames, time span, boxes per class and sizes.")

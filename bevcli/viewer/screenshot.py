@@ -23,7 +23,9 @@ WHOLE_TIMEOUT_S = 180.0
 ENDINGS = (".png", ".jpg", ".jpeg")
 JPEG_QUALITY = 90
 SETTLE_S = 2.5  # the viewer decodes images after it opened the views, and does not report when it is done
-NO_DRIVER = "the viewer cannot draw here: it needs a Vulkan driver (Debian: apt-get install mesa-vulkan-drivers)"
+NO_DRIVER = (
+    "the viewer cannot draw here: it needs a Vulkan driver (Debian, Ubuntu: apt-get install mesa-vulkan-drivers)"
+)
 
 
 def take_screenshot(recording: Path, image: Path, frame: int | None = None) -> tuple[str, ...]:
@@ -36,7 +38,7 @@ def take_screenshot(recording: Path, image: Path, frame: int | None = None) -> t
     """
     if image.suffix.lower() not in ENDINGS:
         raise InputError(f"{image}: the file must end in .png, .jpg or .jpeg")
-    port = free_port()
+    port, deadline = free_port(), time.monotonic() + WHOLE_TIMEOUT_S
     process = start_viewer("--headless", "--bind", LOOPBACK, "--port", str(port))
     # The client waits for the viewer without a limit; its calls fail when the viewer ends.
     limit = threading.Timer(WHOLE_TIMEOUT_S, process.kill)
@@ -51,9 +53,9 @@ def take_screenshot(recording: Path, image: Path, frame: int | None = None) -> t
         _write(image, client.take_screenshot())
         return tuple(view.name for view in client.get_state().views)
     except (ConnectionError, RuntimeError) as error:
-        if limit.is_alive():
-            raise
-        raise WaitError(f"{recording}: the viewer has not drawn it within {WHOLE_TIMEOUT_S:.0f} s") from error
+        if time.monotonic() >= deadline:
+            raise WaitError(f"{recording}: the viewer has not drawn it within {WHOLE_TIMEOUT_S:.0f} s") from error
+        raise OutputError(f"{recording}: the viewer failed while it drew the recording ({error}); try again") from error
     finally:
         limit.cancel()
         stop(process)
@@ -63,7 +65,7 @@ def _connect(process: subprocess.Popen[bytes], port: int) -> ViewerClient:
     def answer() -> ViewerClient | None:
         try:
             client = ViewerClient.connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
-            client.get_state()
+            client.take_screenshot()  # without a driver, the viewer answers other calls until it first draws, and ends
         except ConnectionError:
             return None
         return client

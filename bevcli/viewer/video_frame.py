@@ -12,7 +12,7 @@ from bevcli.frame import MAP_CLASSES
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.images import decode_image
 from bevcli.recording import entities
-from bevcli.recording.blueprint import rows_by_yaw
+from bevcli.recording.blueprint import rows_of_largest_images
 from bevcli.recording.colors import Color, class_color, map_colors
 from bevcli.recording.video_images import Av1Decoder, require_av
 from bevcli.viewer.recording_reader import RecordedFrame
@@ -130,13 +130,15 @@ class Tile:
 
 def tiles(frame: RecordedFrame) -> tuple[Tile, ...]:
     """The rectangles of the cameras of a recording, in rows in the same order as in the viewer."""
-    rows = _camera_rows(frame)
+    sizes = {name: _camera_size(frame, name) for name in frame.values(entities.RUN, "camera_names")}
+    aspect = min(width / height for width, height in sizes.values())
+    rows = rows_of_largest_images(_camera_yaws(frame), aspect, CAMERAS_WIDTH, CAMERAS_HEIGHT)
     cell = CAMERAS_WIDTH // max(len(row) for row in rows), CAMERAS_HEIGHT // len(rows)
     layout = []
     for r, row in enumerate(rows):
         indent = (CAMERAS_WIDTH - len(row) * cell[0]) // 2
         for c, name in enumerate(row):
-            width, height = map(int, frame.array(entities.camera(name), "Pinhole:resolution", 2)[0])
+            width, height = sizes[name]
             scale = min(cell[0] / width, cell[1] / height)
             w, h = round(width * scale), round(height * scale)
             left, top = indent + c * cell[0] + (cell[0] - w) // 2, r * cell[1] + (cell[1] - h) // 2
@@ -144,13 +146,17 @@ def tiles(frame: RecordedFrame) -> tuple[Tile, ...]:
     return tuple(layout)
 
 
-def _camera_rows(frame: RecordedFrame) -> tuple[tuple[str, ...], ...]:
+def _camera_size(frame: RecordedFrame, camera: str) -> Array:
+    return frame.array(entities.camera(camera), "Pinhole:resolution", 2)[0]  # width, height, pixels
+
+
+def _camera_yaws(frame: RecordedFrame) -> dict[str, float]:
     from_world = _rotation(frame, entities.EGO).T
     yaws = {}
     for name in frame.values(entities.RUN, "camera_names"):
         ahead = from_world @ _rotation(frame, entities.camera(name))[:, 2]
         yaws[name] = float(np.arctan2(ahead[1], ahead[0]))
-    return rows_by_yaw(yaws)
+    return yaws
 
 
 def draw_frame(frame: RecordedFrame, layout: tuple[Tile, ...], images: CameraImages) -> Canvas:
@@ -168,7 +174,7 @@ def draw_frame(frame: RecordedFrame, layout: tuple[Tile, ...], images: CameraIma
 
 
 def _draw_camera(canvas: Canvas, frame: RecordedFrame, tile: Tile, image: Canvas | None) -> None:
-    width, height = frame.array(entities.camera(tile.camera), "Pinhole:resolution", 2)[0]
+    width, height = _camera_size(frame, tile.camera)
     if image is not None:
         canvas[:] = cv2.resize(image, (tile.width, tile.height), interpolation=cv2.INTER_AREA)
     scale = np.array([tile.width / width, tile.height / height])

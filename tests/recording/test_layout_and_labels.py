@@ -1,9 +1,19 @@
 """Camera views are ordered by yaw; labels do not overlap."""
 
 import numpy as np
-from memory_drive import make_rig
+import pytest
+from memory_drive import make_camera, make_rig
 
-from bevcli.recording.blueprint import camera_rows, rows_by_yaw
+from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
+from bevcli.model.camera_assignment import NUSCENES_YAWS_DEG
+from bevcli.recording.blueprint import (
+    TEXTS_SHARE,
+    TITLE_HEIGHT,
+    WINDOW,
+    camera_row_shares,
+    camera_rows,
+    rows_by_yaw,
+)
 from bevcli.recording.box_lines import LETTER_HEIGHT, LETTER_WIDTH, ImageLines, labels_in_image
 
 
@@ -23,6 +33,58 @@ def test_other_rigs_are_ordered_by_yaw():
 def test_a_single_camera_has_one_row():
     assert camera_rows(make_rig({"only": 10})) == (("only",),)
     assert camera_rows(make_rig({"only": 180})) == (("only",),)
+
+
+FOUR = {"front": 0, "left": 90, "right": -90, "rear": 180}
+RIGS = {
+    "one": {"front": 0},
+    "two": {"front": 0, "rear": 180},
+    "three": {"left": 60, "right": -60, "rear": 180},
+    "four": FOUR,
+    "five": {"front": 0, "front_left": 55, "front_right": -55, "rear_left": 120, "rear_right": -120},
+    "six": NUSCENES_YAWS_DEG,
+    "seven": {**NUSCENES_YAWS_DEG, "tele": 1},
+    "eight": {**FOUR, "front_left": 45, "front_right": -45, "rear_left": 135, "rear_right": -135},
+}
+
+
+def image_sizes(rig):
+    """The width and height of each image in its view in the viewer's window, pixels."""
+    sizes = {}
+    for row, share in zip(camera_rows(rig), camera_row_shares(rig), strict=True):
+        view = WINDOW[0] * (1 - TEXTS_SHARE) / len(row), share * WINDOW[1] - TITLE_HEIGHT
+        for name in row:
+            scale = min(view[0] / rig[name].width, view[1] / rig[name].height)
+            sizes[name] = scale * rig[name].width, scale * rig[name].height
+    return sizes
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_all_images_of_a_rig_are_equally_large(rig):
+    sizes = np.array(list(image_sizes(make_rig(RIGS[rig])).values()))
+    assert sizes.min(axis=0) == pytest.approx(sizes.max(axis=0))
+    assert sizes[0, 0] > 0.98 * min(WINDOW[0] * (1 - TEXTS_SHARE) / max(map(len, rows_by_yaw(RIGS[rig]))), 480)
+
+
+def test_a_single_rear_camera_does_not_squeeze_the_others():
+    sizes = image_sizes(make_rig(FOUR))
+    assert min(height for _, height in sizes.values()) > 0.25 * WINDOW[1]
+    assert sum(camera_row_shares(make_rig(FOUR))) < 0.63
+
+
+def test_a_narrow_rear_camera_does_not_squeeze_the_others():
+    narrow = make_camera("rear", 180, width=180, height=320)
+    rig = make_rig({"front": 0, "left": 60, "right": -60})
+    sizes = image_sizes(CameraRig((*rig.cameras, narrow), rig.ego_from_bev))
+    assert sizes["front"][1] > 0.2 * WINDOW[1]
+    assert 0.25 * WINDOW[1] < sizes["rear"][1] < 0.63 * WINDOW[1]
+
+
+def test_few_or_square_images_share_one_row():
+    assert camera_rows(make_rig(RIGS["two"])) == (("front", "rear"),)
+    assert camera_rows(make_rig(RIGS["three"])) == (("left", "right", "rear"),)
+    square = tuple(make_camera(name, yaw, width=320, height=320) for name, yaw in FOUR.items())
+    assert camera_rows(CameraRig(square, default_ego_from_bev())) == (("left", "front", "right", "rear"),)
 
 
 def test_labels_do_not_overlap_and_the_largest_box_wins():

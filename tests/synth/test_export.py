@@ -88,7 +88,7 @@ def test_a_wrong_resolution_is_a_usage_error():
             parse_resolution(text)
 
 
-def test_a_fisheye_lens_that_is_too_wide_is_an_error(tmp_path: Path):
+def test_a_lens_too_wide_for_its_model_is_an_error(tmp_path: Path):
     from dataclasses import replace
 
     from bevcli.geometry.cameras import Distortion
@@ -99,7 +99,7 @@ def test_a_fisheye_lens_that_is_too_wide_is_an_error(tmp_path: Path):
     wide = replace(
         camera,
         intrinsics=np.array([[45.0, 0, 80], [0, 45.0, 45], [0, 0, 1]]),
-        distortion=Distortion("kannala_brandt", (0.0, 0.0, 0.0, 0.0)),
+        distortion=Distortion("brown_conrady", (-0.3, 0.0, 0.0, 0.0)),
     )
     write_calibration(tmp_path / "rig.json", type(rig)((wide,), rig.ego_from_bev))
     with pytest.raises(InputError, match=r"rig\.json: camera CAM_FRONT: its field of view is too wide"):

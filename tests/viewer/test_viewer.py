@@ -4,19 +4,20 @@ import os
 import signal
 import socket
 import subprocess
+import sys
 import time
 
 import cv2
 import numpy as np
 import pytest
 from memory_drive import MemorySequence
-from recorded_drive import NamedModel, predict, record
+from recorded_drive import NamedModel, predict, record, screenshot_or_skip
 
 from bevcli.errors import InputError, OutputError
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.video_images import has_av
 from bevcli.recording.writer import Recording
-from bevcli.viewer import web
+from bevcli.viewer import screenshot as screenshot_file, web
 from bevcli.viewer.native import LOOPBACK, free_port, start_viewer, stop
 from bevcli.viewer.recording_reader import RecordingReader
 from bevcli.viewer.screenshot import NO_DRIVER, take_screenshot
@@ -33,12 +34,7 @@ VIEWS = {
 def screenshot(tmp_path_factory):
     folder = tmp_path_factory.mktemp("viewer")
     record(folder / "recording.rrd", MemorySequence(3))
-    try:
-        views = take_screenshot(folder / "recording.rrd", folder / "image.png", 1)
-    except OutputError as error:
-        if str(error) != NO_DRIVER:
-            raise
-        pytest.skip(str(error))
+    views = screenshot_or_skip(folder / "recording.rrd", folder / "image.png", 1)
     return views, cv2.imread(str(folder / "image.png")), folder
 
 
@@ -72,6 +68,40 @@ def test_a_screenshot_can_be_a_jpeg_of_a_video_recording(screenshot):
 def test_a_screenshot_needs_a_known_ending(tmp_path):
     with pytest.raises(InputError, match=r"must end in \.png, \.jpg or \.jpeg"):
         take_screenshot(tmp_path / "r.rrd", tmp_path / "image.webp")
+
+
+class AnswersUntilItDraws:
+    """The client of a viewer without a Vulkan driver, which ends when it first draws."""
+
+    connect = classmethod(lambda cls, url: cls())
+
+    def get_state(self):
+        return None
+
+    def take_screenshot(self):
+        raise ConnectionError("transport error")
+
+    def open(self, url):
+        raise ConnectionError("transport error")
+
+
+def test_without_vulkan_an_early_answer_changes_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(screenshot_file, "ViewerClient", AnswersUntilItDraws)
+    monkeypatch.setattr(screenshot_file, "start_viewer", lambda *_: subprocess.Popen([sys.executable, "-c", ""]))
+    with pytest.raises(OutputError, match="mesa-vulkan-drivers"):
+        take_screenshot(tmp_path / "r.rrd", tmp_path / "image.png")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="the viewer draws with Vulkan on Linux only")
+def test_without_vulkan_each_try_names_the_driver(tmp_path, monkeypatch):
+    record(tmp_path / "recording.rrd", MemorySequence(1))
+    for variable in ("VK_ICD_FILENAMES", "VK_DRIVER_FILES"):  # where the Vulkan loader looks for drivers
+        monkeypatch.setenv(variable, str(tmp_path / "none.json"))
+    for _ in range(10):
+        with pytest.raises(OutputError) as error:
+            take_screenshot(tmp_path / "recording.rrd", tmp_path / "image.png")
+        assert str(error.value) == NO_DRIVER
 
 
 @pytest.mark.slow

@@ -2,9 +2,10 @@
 
 Each pixel is shaded once, in linear RGB. All surfaces are diffuse; glass and paint also reflect the sky. The ground has
 no triangles: a pixel that sees none and looks down sees the plane z = 0. The image of a camera with distortion is
-resampled from a wider pinhole image.
+resampled from a wider pinhole image, that of a wide fisheye from up to five.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -12,11 +13,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.errors import InputError
-from bevcli.geometry.cameras import Camera, distort
+from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.synth.assets.triangles import TriangleSoup
 from bevcli.synth.render.ground import GroundTexture
+from bevcli.synth.render.lens import LensPart, lens_parts
 from bevcli.synth.render.rasteriser import ShadowMap, VisibilityBuffer, rasterise
 from bevcli.synth.render.shading_kernels import LIGHT_LIMIT, shade_pixels
 from bevcli.synth.world.weather import Weather
@@ -62,13 +63,15 @@ def render_view(snapshot: WorldSnapshot, camera: Camera, world_from_ego: Array, 
     """Render the image of a camera.
 
     world_from_ego: (4, 4) at the time of the image. supersampling: samples per pixel along each axis; the image is
-    their mean, `visible` and `unoccluded` count whole pixels. For a camera with distortion a wider pinhole image is
-    rendered and resampled: linearly for colours, by the nearest pixel for objects.
-    Raises InputError where the field of view is too wide.
+    their mean, `visible` and `unoccluded` count whole pixels. For a camera with distortion, pinhole images are
+    rendered and resampled: linearly for colours, by the nearest pixel for objects. What a fisheye sees more than 120
+    degrees off its optical axis is black.
+    Raises InputError where the field of view is too wide for the lens model.
     """
     if camera.distortion is not None:
-        pinhole, columns, rows = distortion_maps(camera)
-        return _distorted(render_view(snapshot, pinhole, world_from_ego, supersampling), columns, rows)
+        parts = lens_parts(camera)
+        views = [render_view(snapshot, part.pinhole, world_from_ego, supersampling) for part in parts]
+        return _distorted(views, parts)
     soup = snapshot.soup
     fine = _supersampled(camera, supersampling)
     world_from_camera = world_from_ego @ camera.ego_from_camera
@@ -83,14 +86,21 @@ def render_view(snapshot: WorldSnapshot, camera: Camera, world_from_ego: Array, 
     return RenderedView(image, objects, visible // area, -(-buffer.unoccluded // area))
 
 
-def _distorted(pinhole: RenderedView, columns: NDArray[np.float32], rows: NDArray[np.float32]) -> RenderedView:
-    """Resample a pinhole image. The ratio of visible to unoccluded pixels of each object stays as it is."""
-    image = cv2.remap(pinhole.pixels_bgr, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-    objects = pinhole.objects[np.round(rows).astype(int), np.round(columns).astype(int)]
-    visible = np.bincount(objects[objects >= 0], minlength=len(pinhole.visible))
-    share = np.minimum(pinhole.visible / np.maximum(pinhole.unoccluded, 1), 1.0)
-    unoccluded = np.where(visible > 0, np.ceil(visible / np.maximum(share, 1e-6)), pinhole.unoccluded)
-    return RenderedView(image.astype(np.uint8), objects, visible, unoccluded.astype(np.int64))
+def _distorted(views: Sequence[RenderedView], parts: Sequence[LensPart]) -> RenderedView:
+    """Resample pinhole images. The ratio of visible to unoccluded pixels of each object stays as it is."""
+    image = np.zeros((*parts[0].inside.shape, 3), np.uint8)
+    objects = np.full(parts[0].inside.shape, -1, np.int32)
+    for view, part in zip(views, parts, strict=True):
+        seen = cv2.remap(view.pixels_bgr, part.columns, part.rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        image[part.inside] = seen[part.inside]
+        rows, columns = np.round(part.rows[part.inside]).astype(int), np.round(part.columns[part.inside]).astype(int)
+        objects[part.inside] = view.objects[rows, columns]
+    seen_flat = np.sum([view.visible for view in views], axis=0)
+    unoccluded_flat = np.sum([view.unoccluded for view in views], axis=0)
+    visible = np.bincount(objects[objects >= 0], minlength=len(seen_flat))
+    share = np.minimum(seen_flat / np.maximum(unoccluded_flat, 1), 1.0)
+    unoccluded = np.where(visible > 0, np.ceil(visible / np.maximum(share, 1e-6)), unoccluded_flat)
+    return RenderedView(image, objects, visible, unoccluded.astype(np.int64))
 
 
 def _supersampled(camera: Camera, factor: int) -> Camera:
@@ -144,41 +154,3 @@ def _display_table() -> NDArray[np.uint8]:
     mapped = np.where(light < shoulder, light, rolled)
     encoded = np.where(mapped <= 0.0031308, 12.92 * mapped, 1.055 * mapped ** (1 / 2.4) - 0.055)
     return np.clip(np.round(encoded * 255), 0, 255).astype(np.uint8)
-
-
-WIDEST = 4.0  # tangent of the widest angle off the optical axis; wider pinhole images would be too large
-REFINEMENTS = 15  # fixed-point steps; OpenCV's result alone is off by some pixels at strong distortion
-
-
-def distortion_maps(camera: Camera) -> tuple[Camera, NDArray[np.float32], NDArray[np.float32]]:
-    """A wider pinhole camera, and column and row (H, W) in its image for each pixel of a camera with distortion.
-
-    Raises InputError where the camera sees more than about 75 degrees off its optical axis.
-    """
-    u, v = np.meshgrid(np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64))
-    rays = _undistorted_rays(camera, np.stack([u, v], -1).reshape(-1, 2)).reshape(camera.height, camera.width, 2)
-    if not np.isfinite(rays).all() or np.abs(rays).max() > WIDEST:
-        raise InputError(
-            "its field of view is too wide to be rendered (expected at most 75 degrees off the optical axis): "
-            'remove "distortion" from the rig or use a narrower lens'
-        )
-    low, high = rays.reshape(-1, 2).min(0), rays.reshape(-1, 2).max(0)
-    focal = np.array([camera.intrinsics[0, 0], camera.intrinsics[1, 1]])
-    width, height = (int(np.ceil(n)) + 2 for n in (high - low) * focal)
-    offset = -low * focal + 1
-    intrinsics = np.array([[focal[0], 0, offset[0]], [0, focal[1], offset[1]], [0, 0, 1.0]])
-    pinhole = replace(camera, width=width, height=height, intrinsics=intrinsics, distortion=None)
-    pixels = (rays * focal + offset).astype(np.float32)
-    return pinhole, np.ascontiguousarray(pixels[..., 0]), np.ascontiguousarray(pixels[..., 1])
-
-
-def _undistorted_rays(camera: Camera, pixels: Array) -> Array:
-    """(P, 2) normalised pinhole coordinates of pixels (P, 2), refined until distortion maps them to these pixels."""
-    assert camera.distortion is not None
-    coefficients = np.array(camera.distortion.coefficients)
-    undistort = cv2.fisheye.undistortPoints if camera.distortion.model == "kannala_brandt" else cv2.undistortPoints
-    rays = np.asarray(undistort(pixels[:, None], camera.intrinsics, coefficients), dtype=np.float64)[:, 0]
-    wanted = (pixels - camera.intrinsics[:2, 2]) @ np.linalg.inv(camera.intrinsics[:2, :2]).T
-    for _ in range(REFINEMENTS):
-        rays = rays + (wanted - distort(rays, camera.distortion))
-    return rays
