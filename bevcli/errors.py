@@ -4,9 +4,14 @@ A message states what is wrong and where, what was expected and found, and what 
 ``calibration.json: camera CAM_BACK: "intrinsics" is missing (expected 3x3)``.
 """
 
+from bevcli.printing import one_line
+
 
 class BevcliError(Exception):
     """A mistake in the user's input. The message is one line and is understandable without a traceback."""
+
+    def __str__(self) -> str:
+        return one_line(super().__str__())
 
 
 class InputError(BevcliError):

@@ -12,7 +12,8 @@ import bevcli
 ROOT = Path(bevcli.__file__).parent
 # From the lowest to the highest; names in one set may not import each other.
 LAYERS = (
-    {"_version", "duration", "errors", "findings"},
+    {"_version", "duration", "findings", "printing"},
+    {"errors"},
     {"options", "registry"},
     {"parsing", "jit", "waiting", "writing"},
     {"geometry"},

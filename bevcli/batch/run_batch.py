@@ -16,9 +16,10 @@ import pyarrow.parquet as pq
 from bevcli.batch.drives import Drive
 from bevcli.batch.job import ATTEMPTS, FAILED, READING_THREADS, RESULTS, Job, Record
 from bevcli.batch.ray_workers import Workers, run_on_ray
+from bevcli.batch.record import RECORD, read_record
 from bevcli.batch.report import write_report
 from bevcli.batch.storage import LocalFolder, Storage, open_storage
-from bevcli.batch.worker import MATCHES, RECORD, StoppedError, Worker, read_record
+from bevcli.batch.worker import MATCHES, StoppedError, Worker
 from bevcli.errors import OutputError
 from bevcli.evaluation.config import ERRORS, DetectionConfig
 from bevcli.evaluation.joint import DriveMatches, score_jointly
@@ -26,6 +27,7 @@ from bevcli.evaluation.scores_report import scores_to_dict
 from bevcli.frame import MAP_CLASSES
 from bevcli.geometry.boxes import CLASSES
 from bevcli.inference.load import Model
+from bevcli.parsing.csv_cells import cell_of
 from bevcli.runs.folder import folder_lock
 from bevcli.runs.state import load_state
 
@@ -182,9 +184,9 @@ def _known_records(out: Storage, drives: Sequence[Drive], job_hash: str, retry_f
     done, failed = out.names(RESULTS), out.names(FAILED)
 
     def find(result: str) -> Record | None:
-        record = read_record(out.read(f"{RESULTS}/{result}/{RECORD}")) if result in done else None
+        record = read_record(out.read(f"{RESULTS}/{result}/{RECORD}"), result) if result in done else None
         if record is None and not retry_failed and f"{result}.json" in failed:
-            record = read_record(out.read(f"{FAILED}/{result}.json"))
+            record = read_record(out.read(f"{FAILED}/{result}.json"), result)
         return record
 
     results = [drive.result(job_hash) for drive in drives]
@@ -207,7 +209,7 @@ def _write_tables(out: Storage, records: Sequence[Record], model: Model) -> tupl
 def row(record: Record) -> dict[str, Any]:
     """The columns of a drive; None for what is not known, such as metrics without ground truth."""
     boxes = record.get("boxes_by_class")
-    flat = {**record, **(record.get("scores") or {})}
+    flat = {**(record.get("scores") or {}), **record}
     if boxes is not None:
         flat |= {f"boxes_{name}": boxes.get(name, 0) for name in CLASSES}
     return {name: flat.get(name) for name in COLUMNS}
@@ -226,7 +228,8 @@ def to_csv(records: Sequence[Record]) -> bytes:
     text = io.StringIO()
     writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
     writer.writeheader()
-    writer.writerows(row(record) for record in records)
+    for record in records:
+        writer.writerow({name: cell_of(cell) if isinstance(cell, str) else cell for name, cell in row(record).items()})
     return text.getvalue().encode()
 
 

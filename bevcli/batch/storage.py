@@ -119,12 +119,13 @@ class LocalFolder:
             raise OutputError(f"{path}: cannot be removed ({error.strerror})") from None
 
     def land(self, folder: Path, name: str, last: str) -> None:
-        """Move a local folder to a name that is free, on the same file system. Raises OutputError.
+        """Move a local folder to a name on the same file system, in place of a damaged one. Raises OutputError.
 
         last: the file of the folder that says that it is whole; it never exists without the others.
         """
         try:
             (self.path / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.rmtree(self.path / name, ignore_errors=True)
             os.rename(folder, self.path / name)
         except OSError as error:
             raise OutputError(f"{self.path / name}: cannot be written ({error.strerror})") from None

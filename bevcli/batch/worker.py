@@ -18,6 +18,7 @@ import torch
 from bevcli.batch.drives import Drive, fetch_scene
 from bevcli.batch.find_like import FramePooling
 from bevcli.batch.job import ATTEMPTS, FAILED, RESULTS, SCORE_BINS, Job, Record
+from bevcli.batch.record import RECORD, read_record
 from bevcli.batch.storage import LocalFolder, RemoteFolder, is_url, open_storage
 from bevcli.errors import BevcliError
 from bevcli.evaluation.evaluate import Scores, evaluate
@@ -31,7 +32,6 @@ from bevcli.runs.summary import RunSummary
 from bevcli.sequences.native.format import NativeOptions
 from bevcli.sequences.nuscenes.format import NuScenesOptions
 
-RECORD = "drive.json"  # in the folder of a drive's results: its record. A folder with it is whole.
 MATCHES = "matches.safetensors"  # in the folder of a drive's results: for the joint metrics
 _SCRATCH = "bevcli-batch-"
 
@@ -57,7 +57,7 @@ class Worker:
         Raises StoppedError if `should_stop` says so after a frame; OutputError if the batch's folder cannot be written.
         """
         result = drive.result(self._job_hash)
-        done = read_record(self._out.read(f"{RESULTS}/{result}/{RECORD}"))
+        done = read_record(self._out.read(f"{RESULTS}/{result}/{RECORD}"), result)
         if done is not None:  # Ray runs a drive again if it lost the answer of a worker
             return done
         marker = f"{ATTEMPTS}/{result}.json"
@@ -131,7 +131,7 @@ class Worker:
             }
             _rewrite_paths(aside, f"{self._out.where}/{RESULTS}/{result}")
             (aside / RECORD).write_text(json.dumps(record, indent=1) + "\n")
-            landed = read_record(self._out.read(f"{RESULTS}/{result}/{RECORD}"))
+            landed = read_record(self._out.read(f"{RESULTS}/{result}/{RECORD}"), result)
             if landed is not None:
                 return landed
             self._out.remove(f"{FAILED}/{result}.json")
@@ -184,15 +184,6 @@ def use_threads(count: int) -> None:
     """Set the number of CPU threads of this process."""
     torch.set_num_threads(count)
     cv2.setNumThreads(count)
-
-
-def read_record(content: bytes | None) -> Record | None:
-    """A stored record; None if there is none, or it is broken: its drive is then run again."""
-    try:
-        record = None if content is None else json.loads(content)
-    except (ValueError, RecursionError):
-        return None
-    return record if isinstance(record, dict) and isinstance(record.get("result"), str) else None
 
 
 def _about(drive: Drive, result: str) -> Record:

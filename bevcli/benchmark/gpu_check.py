@@ -31,6 +31,7 @@ from bevcli.errors import BevcliError
 from bevcli.inference.load import choose_device
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.prepare import Precision, prepare_for_inference
+from bevcli.printing import say
 
 ROOT = Path(__file__).parents[2]  # of the repository
 PRECISIONS: tuple[Precision, ...] = get_args(Precision)
@@ -73,15 +74,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         device = gpu_of(asked.device)
         if asked.compare is not None:
-            print(json.dumps(compare(asked.compare, device)))
+            say(json.dumps(compare(asked.compare, device)))
             return 0
         sections = check(device, tuple(asked.model or known_models()))
     except BevcliError as error:
-        print(f"error: {error}", file=sys.stderr)
+        say(f"error: {error}", err=True)
         return 1
     asked.out.write_text(report(device, sections))
     failed = [section.title for section in sections if not section.passed]
-    print(f"wrote {asked.out}: {'failed: ' + ', '.join(failed) if failed else 'everything passed'}")
+    say(f"wrote {asked.out}: {'failed: ' + ', '.join(failed) if failed else 'everything passed'}")
     return 1 if failed else 0
 
 
@@ -104,7 +105,7 @@ def check(device: torch.device, models: tuple[str, ...]) -> list[Section]:
     ]
     sections = []
     for title, part in parts:
-        print(f"gpu-check: {title} …", file=sys.stderr, flush=True)
+        say(f"gpu-check: {title} …", err=True)
         try:
             sections.append(Section(title, True, part()))
         except CheckFailed as failure:

@@ -16,6 +16,7 @@ from bevcli.benchmark.limits import MachineLimits
 from bevcli.config import known_models
 from bevcli.errors import BevcliError
 from bevcli.parsing.files import MIB, read_text
+from bevcli.printing import say
 from bevcli.writing import write_whole
 
 MODEL_TIMEOUT_S = 4 * 3600.0
@@ -185,7 +186,7 @@ def measure(
 
     Raises BevcliError if it fails or takes longer than limit_s.
     """
-    print(f"measuring {model}, {precision} …", file=sys.stderr)
+    say(f"measuring {model}, {precision} …", err=True)
     options = ["--model", model, "--precision", precision, "--device", str(device), "--frames", str(frames)]
     command = [sys.executable, "-m", "bevcli", "bench", *options, "--against", "plain", "--json"]
     try:

@@ -9,6 +9,7 @@ import typer
 from bevcli.batch.options import BatchOptions, Workers
 from bevcli.cli.bridge import Part
 from bevcli.inference.options import ModelOptions
+from bevcli.printing import say
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import RunOptions
 from bevcli.sequences.format import option_classes
@@ -98,10 +99,10 @@ def batch(
             after_drive=show,
             should_stop=signals.received,
         )
-    print(summary.table())
+    say(summary.table())
     if summary.stopped:
-        typer.echo("stopped; `--resume` goes on with the drives that are left", err=True)
+        say("stopped; `--resume` goes on with the drives that are left", err=True)
         raise typer.Exit(signals.exit_code)
     if summary.failed:
-        typer.echo("some drives failed; `--resume --retry-failed` runs them again", err=True)
+        say("some drives failed; `--resume --retry-failed` runs them again", err=True)
         raise typer.Exit(SOME_FAILED)

@@ -3,11 +3,10 @@
 import json
 from typing import Annotated
 
-import typer
-
 from bevcli.benchmark.options import BenchOptions
 from bevcli.cli.bridge import Json, Part
 from bevcli.inference.options import ModelOptions
+from bevcli.printing import say
 
 PANEL = "Deploy"
 
@@ -31,7 +30,7 @@ def bench(
     target = choose_device(model_options.device)
     if options.table is not None:
         write_table(options.table, target, options.frames)
-        typer.echo(f"wrote {options.table}", err=True)
+        say(f"wrote {options.table}", err=True)
         return
     exported = None
     if options.model.endswith(SUFFIX):
@@ -43,4 +42,4 @@ def bench(
     config, device = (load_config(options.model), target) if exported is None else (exported.config, exported.device)
     precision = choose_precision(model_options.precision, target)
     result = run_benchmark(config, device, precision, options, exported)
-    print(json.dumps(result.as_data(), indent=1) if as_json else result.text())
+    say(json.dumps(result.as_data(), indent=1) if as_json else result.text())

@@ -15,6 +15,7 @@ import typer
 
 from bevcli.errors import BevcliError
 from bevcli.options import Option, defaults, flag_of, option_of
+from bevcli.printing import one_line, say
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
 
@@ -141,7 +142,7 @@ def as_flags(text: str) -> str:
 
 def print_note(text: str) -> None:
     """Print a note of the library to stderr."""
-    typer.echo(f"note: {as_flags(text)}", err=True)
+    say(f"note: {one_line(as_flags(text))}", err=True)
 
 
 def _with_flags(text: str, flags: Mapping[str, _Flag]) -> str:

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from bevcli.cli.bridge import Part
+from bevcli.printing import say
 from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions, WriteOptions
 
@@ -52,4 +53,4 @@ def convert(
             writer.write(frame)
             progress.advance()
     missing = f", {gaps} images missing" if gaps else ""
-    typer.echo(f"{out}: {count} frames, {len(frame.rig.cameras)} cameras{missing}")
+    say(f"{out}: {count} frames, {len(frame.rig.cameras)} cameras{missing}")

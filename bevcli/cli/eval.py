@@ -8,6 +8,7 @@ import typer
 
 from bevcli.cli.bridge import Json, Part, print_note
 from bevcli.evaluation.options import EvaluationOptions
+from bevcli.printing import say
 from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
 
@@ -40,9 +41,9 @@ def evaluate(
         scene=source.scene,
         **format_options,
     )
-    print(json.dumps(scores.to_dict(), indent=1) if as_json else scores.table())
+    say(json.dumps(scores.to_dict(), indent=1) if as_json else scores.table())
     for note in scores.notes:
         print_note(note)
     if options.plot is not None:
         for path in scores.write_plots(options.plot):
-            typer.echo(f"wrote {path}", err=True)
+            say(f"wrote {path}", err=True)

@@ -8,6 +8,7 @@ import typer
 from bevcli.cli.bridge import Part
 from bevcli.explain.options import ExplainOptions
 from bevcli.inference.options import ModelOptions
+from bevcli.printing import say
 from bevcli.sequences.options import SequenceOptions
 
 PANEL = "Look"
@@ -39,8 +40,8 @@ def explain(
     place = options.place([stamp.index for stamp in drive.stamps])
     traced = trace(loaded.network, loaded.device, drive, place, options.cell)
     if loaded.untrained:
-        typer.echo("note: the weights are UNTRAINED (random): the figures only show how data flows", err=True)
+        say("note: the weights are UNTRAINED (random): the figures only show how data flows", err=True)
     x, y = traced.cell_center
-    typer.echo(f"frame {traced.frame.stamp.index}, BEV cell at x {x:.2f} m, y {y:.2f} m (bev frame)")
+    say(f"frame {traced.frame.stamp.index}, BEV cell at x {x:.2f} m, y {y:.2f} m (bev frame)")
     for figure in write_figures(traced, options.out, options.image_format, untrained=loaded.untrained):
-        typer.echo(f"{figure.step}: left out, {figure.left_out}" if figure.path is None else str(figure.path))
+        say(f"{figure.step}: left out, {figure.left_out}" if figure.path is None else str(figure.path))

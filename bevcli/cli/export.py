@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from bevcli.evaluation.options import ExportOptions
+from bevcli.printing import say
 
 PANEL = "Score"
 NAMES = {
@@ -35,13 +36,13 @@ def export(
     target = options.out or file.parent / NAMES[form]
     check_output(target, file)
     if form == "csv":
-        typer.echo(f"{target}: {write_csv(boxes, target)} boxes")
+        say(f"{target}: {write_csv(boxes, target)} boxes")
     elif form in ("nuscenes", "nuscenes-tracking"):
         write_submission(boxes, target, tracking=form == "nuscenes-tracking")
-        typer.echo(f"{target}: {len(boxes.frames)} samples")
+        say(f"{target}: {len(boxes.frames)} samples")
     else:
         if options.calibration is None:
             raise InputError("`form=kitti` needs `calibration`: KITTI labels are in a camera frame")
         chosen, ego_from_bev = read_kitti_camera(options.calibration, options.camera)
         labels = write_kitti(boxes, chosen, ego_from_bev, target)
-        typer.echo(f"{target}: {len(boxes.frames)} frames, {labels} labels of {chosen.name}")
+        say(f"{target}: {len(boxes.frames)} frames, {labels} labels of {chosen.name}")

@@ -9,6 +9,7 @@ import typer
 from bevcli.cli.bridge import Part
 from bevcli.engines.options import FileOptions, OnnxOptions
 from bevcli.inference.options import ModelOptions
+from bevcli.printing import say
 
 PANEL = "Deploy"
 
@@ -51,6 +52,6 @@ def export_onnx(
         untrained=loaded.untrained,
         bundled=loaded.bundled,
     )
-    typer.echo(f"{target}: {target.stat().st_size / 1e6:.1f} MB")
+    say(f"{target}: {target.stat().st_size / 1e6:.1f} MB")
     if drive is not None:
-        typer.echo("\n".join(difference_lines(list(check_exported(target, loaded, drive)))))
+        say("\n".join(difference_lines(list(check_exported(target, loaded, drive)))))

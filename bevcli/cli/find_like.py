@@ -5,6 +5,7 @@ from typing import Annotated
 import typer
 
 from bevcli.batch.options import FindLikeOptions
+from bevcli.printing import say
 
 PANEL = "Look"
 
@@ -31,12 +32,12 @@ def find_like(
     query = open_query(run, options.frame, storage)
     found = find_like(query, storage, options.count, options.per_drive)
     width = max((len(each.result) for each in found), default=0)
-    print(f"{'similarity':>10}  {'drive':<{width}}  frame")
+    say(f"{'similarity':>10}  {'drive':<{width}}  frame")
     for each in found:
-        print(f"{each.similarity:>10.3f}  {each.result:<{width}}  {each.frame:>5}")
+        say(f"{each.similarity:>10.3f}  {each.result:<{width}}  {each.frame:>5}")
     content = similar_frames_page(query, storage, found)
     if html is None:
         storage.write("find-like.html", content.encode())
     else:
         write_whole(html, content.encode())
-    print(f"written  {html or f'{storage.where}/find-like.html'}")
+    say(f"written  {html or f'{storage.where}/find-like.html'}")

@@ -16,6 +16,7 @@ from bevcli.cli.bridge import command
 from bevcli.cli.help_text import GROUP, PlainCommand, PlainGroup
 from bevcli.errors import BevcliError, WaitError
 from bevcli.inference.cpu_settings import THREAD_SETTINGS, keep_freed_memory
+from bevcli.printing import one_line, say
 from bevcli.registry import entries, load
 
 
@@ -70,7 +71,7 @@ app = typer.Typer(
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        print(f"bevcli {__version__}")
+        say(f"bevcli {__version__}")
         raise typer.Exit
 
 
@@ -84,7 +85,7 @@ def root(
 
 
 def run_app() -> None:
-    """The console entry point: a user's mistake is one line on stderr and exit code 1, never a traceback."""
+    """Run the given command: a user's mistake is one line on stderr and exit code 1, never a traceback."""
     for name, value in THREAD_SETTINGS.items():
         os.environ.setdefault(name, value)
     keep_freed_memory()
@@ -94,9 +95,8 @@ def run_app() -> None:
         finally:
             sys.stdout.flush()  # here, where an error can still be told
     except BevcliError as error:
-        print(f"error: {error}", file=sys.stderr)
+        say(f"error: {error}", err=True)
         if isinstance(error, WaitError):  # at its end, Python would wait for the thread that gets no answer
-            sys.stderr.flush()
             os._exit(1)
         sys.exit(1)
     except BrokenPipeError:
@@ -104,6 +104,6 @@ def run_app() -> None:
         sys.exit(0)
     except OSError as error:  # the system refuses: no space, no permission, a name that is too long
         where = "" if error.filename is None else f"{error.filename}: "
-        print(f"error: {where}{error.strerror or error}", file=sys.stderr)
+        say(f"error: {one_line(where + str(error.strerror or error))}", err=True)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more at its end
         sys.exit(1)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, TextIO
 
 from bevcli.cli.bridge import as_flags
 from bevcli.duration import duration
+from bevcli.printing import one_line
 
 if TYPE_CHECKING:
     import rich.progress
@@ -66,7 +67,7 @@ class Progress:
 
     def message(self, text: str) -> None:
         """Print a line, above the bar if there is one. The command's arguments in backticks become flags."""
-        text = as_flags(text)
+        text = one_line(as_flags(text))
         if self._bar is not None:
             self._bar.console.print(text, markup=False, highlight=False, emoji=False, soft_wrap=True)
         else:

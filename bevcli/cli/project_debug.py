@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from bevcli.cli.bridge import Json, Part, as_flags
+from bevcli.printing import say
 from bevcli.rig.options import CheckOptions
 from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
@@ -41,12 +42,12 @@ def project_debug(
     check = check_calibration(calibration, options.sequence, options.frame, allow_outside=source.allow_outside, **given)
     written = check.write(options.out or Path("runs") / f"{check.name}-project-debug")
     if as_json:
-        print(check.to_json())
+        say(check.to_json())
     else:
         notes = [
             textwrap.fill(f"Model {options.model}: {note}.", WIDTH, subsequent_indent=INDENT) + "\n"
             for note in rig_notes(check.rig, load_config(options.model))
         ]
-        print(as_flags(check.text()), "", *notes, "Written: " + ", ".join(map(str, written)), sep="\n")
+        say(as_flags(check.text()), "", *notes, "Written: " + ", ".join(map(str, written)))
     if check.errors:
         raise typer.Exit(ERRORS_FOUND)

@@ -8,6 +8,7 @@ import typer
 from bevcli.cli.bridge import Part
 from bevcli.engines.options import FileOptions, QuantizeOptions
 from bevcli.inference.options import ModelOptions
+from bevcli.printing import say
 
 PANEL = "Deploy"
 
@@ -36,6 +37,6 @@ def quantize(
     drives = [open_sequence(path, rate_hz=config.rate_hz) for path in options.calibrate]
     drive = None if options.check is None else open_sequence(options.check, rate_hz=config.rate_hz)
     write_quantized(model, calibration_images(config, network.cameras, drives, options.frames), target)
-    typer.echo(f"{target}: {target.stat().st_size / 1e6:.1f} MB")
+    say(f"{target}: {target.stat().st_size / 1e6:.1f} MB")
     if drive is not None:
-        typer.echo("\n".join(difference_lines(list(compare_exported(target, model, drive, engine)))))
+        say("\n".join(difference_lines(list(compare_exported(target, model, drive, engine)))))

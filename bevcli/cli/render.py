@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from bevcli.printing import say
 from bevcli.synth.options import RenderOptions
 
 PANEL = "Start"
@@ -18,8 +19,8 @@ def render(
     from bevcli.cli.progress import Progress
     from bevcli.synth.export import render as render_sequence
 
-    typer.echo("note: the first rendering on a computer compiles the renderer, about 15 s", err=True)
+    say("note: the first rendering on a computer compiles the renderer, about 15 s", err=True)
     with Progress(options.frames, "frames") as progress:
         summary = render_sequence(out, options, progress=lambda frame: progress.advance())
     cameras = len(summary.cameras)
-    typer.echo(f"{summary.folder}: {summary.frames} frames, {cameras} cameras, {summary.weather}, seed {summary.seed}")
+    say(f"{summary.folder}: {summary.frames} frames, {cameras} cameras, {summary.weather}, seed {summary.seed}")

@@ -1,7 +1,6 @@
 """`bevcli run`: a sequence in, boxes and a recording out."""
 
 import shlex
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,6 +9,7 @@ import typer
 
 from bevcli.cli.bridge import Part, as_flags
 from bevcli.inference.options import ModelOptions
+from bevcli.printing import say
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import OutputOptions, RunOptions
 from bevcli.sequences.format import option_classes
@@ -75,11 +75,11 @@ def run(
             resumed=progress.skip,
             should_stop=signals.received,
         )
-    print(as_flags(summary.table()))
+    say(as_flags(summary.table()))
     if signals.received() and not summary.is_complete:
-        print(f"stopped; `--resume` goes on with frame {summary.frames + 1} of {len(drive.stamps)}", file=sys.stderr)
+        say(f"stopped; `--resume` goes on with frame {summary.frames + 1} of {len(drive.stamps)}", err=True)
         raise typer.Exit(signals.exit_code)
-    print(f"next     bevcli viz {shlex.quote(str(out))}")
+    say(f"next     bevcli viz {shlex.quote(str(out))}")
 
 
 def _run_notes(model: "Model", drive: "Sequence", *, live: bool = False) -> list[str]:

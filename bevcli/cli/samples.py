@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from bevcli.errors import OutputError
+from bevcli.printing import say
 
 PANEL = "Start"
 NAME = "street"
@@ -21,7 +22,7 @@ def samples(
     """
     target = out / NAME
     if target.exists():
-        typer.echo(f"{target}: exists already")
+        say(f"{target}: exists already")
         return
     package = Path(__file__).parents[1]
     installed = package / "samples" / NAME
@@ -30,4 +31,4 @@ def samples(
         shutil.copytree(installed if installed.is_dir() else package.parent / "samples" / NAME, target)
     except OSError as error:
         raise OutputError(f"{target}: cannot be written ({error.strerror or error})") from None
-    typer.echo(f"{target}: copied; run `bevcli run {target}`")
+    say(f"{target}: copied; run `bevcli run {target}`")

@@ -1,7 +1,6 @@
 """`bevcli stress`: how a model copes with corrupted images, calibration, times and ego-motion."""
 
 import json
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,6 +8,7 @@ import typer
 
 from bevcli.cli.bridge import Json, Part, print_note
 from bevcli.inference.options import ModelOptions
+from bevcli.printing import say
 from bevcli.robustness.options import StressOptions, StressOutputOptions
 from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
@@ -79,12 +79,12 @@ def stress(
             should_stop=signals.received,
         )
     if as_json:
-        print(json.dumps(results.to_dict(other), indent=1))
+        say(json.dumps(results.to_dict(other), indent=1))
     else:
-        print(f"drives  {len(drives)}\n\n{stress_table(results, other)}")
+        say(f"drives  {len(drives)}\n\n{stress_table(results, other)}")
     for name in () if other is None else results.differences(other):
         print_note(f'"{name}" differs from {options.against}: the corruption errors compare unlike tests')
     if not results.is_complete:
-        print("stopped; `--resume` goes on", file=sys.stderr)
+        say("stopped; `--resume` goes on", err=True)
         raise typer.Exit(signals.exit_code)
-    typer.echo(f"wrote {out}", err=True)
+    say(f"wrote {out}", err=True)

@@ -7,6 +7,7 @@ import typer
 
 from bevcli.cli.bridge import Json, Part
 from bevcli.inference.options import ModelOptions, complete_model
+from bevcli.printing import say
 from bevcli.runs.options import RunOptions
 from bevcli.synth.options import DriveOptions
 from bevcli.training.options import ValidationOptions
@@ -49,4 +50,4 @@ def validate(
             after_frame=progress.advance,
             each_drive=options.each,
         )
-    print(json.dumps(scores.to_dict(), indent=1) if as_json else f"drives  {len(drives)}\n\n{scores.table()}")
+    say(json.dumps(scores.to_dict(), indent=1) if as_json else f"drives  {len(drives)}\n\n{scores.table()}")

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from bevcli.printing import say
 from bevcli.viewer.options import ViewOptions
 
 PANEL = "Look"
@@ -26,7 +27,7 @@ def viz(
     recording = recording_in(recording)
     with open_recording(recording) as file:
         if file.repaired:
-            typer.echo(f"note: {recording} is incomplete (its run was stopped or is still going)")
+            say(f"note: {recording} is incomplete (its run was stopped or is still going)")
         if options.summary or options.screenshot or options.video or options.export:
             _write(recording, file.path, options)
         else:
@@ -42,18 +43,18 @@ def _write(recording: Path, read_from: Path, options: ViewOptions) -> None:
     from bevcli.viewer.video import frame_rate, write_video
 
     if options.summary:
-        typer.echo(summarise(recording, read_from).text())
+        say(summarise(recording, read_from).text())
     if options.screenshot is not None:
         views = take_screenshot(read_from, options.screenshot, options.frame)
-        typer.echo(f"{options.screenshot}: {len(views)} views")
+        say(f"{options.screenshot}: {len(views)} views")
     if options.video is not None:
         count, rate = frame_rate(read_from)
         with Progress(count, "frames") as progress:
             write_video(read_from, options.video, progress.advance)
-        typer.echo(f"{options.video}: {count} frames, {rate:.3g} per second")
+        say(f"{options.video}: {count} frames, {rate:.3g} per second")
     if options.export is not None:
         frames, boxes = export_boxes(read_from, options.export)
-        typer.echo(f"{options.export}: {boxes} boxes in {frames} frames")
+        say(f"{options.export}: {boxes} boxes in {frames} frames")
 
 
 def _open(recording: Path, options: ViewOptions) -> None:
@@ -63,7 +64,7 @@ def _open(recording: Path, options: ViewOptions) -> None:
     if display_is_there() and not options.web:
         if show_window(recording):
             return
-        typer.echo("note: the viewer's window did not open; use the browser instead")
+        say("note: the viewer's window did not open; use the browser instead")
     viewer = WebViewer(web_viewer_assets(), recording, options.host, options.port)
-    typer.echo(f"{viewer.address}  Open this address in a browser. Ctrl-C stops the server.")
+    say(f"{viewer.address}  Open this address in a browser. Ctrl-C stops the server.")
     viewer.serve()

@@ -10,6 +10,7 @@ import typer
 from bevcli.cli.bridge import Json, Part, command
 from bevcli.cli.help_text import PlainCommand
 from bevcli.engines.options import FileOptions
+from bevcli.printing import say
 
 if TYPE_CHECKING:
     from bevcli.checkpoints import Checkpoint
@@ -62,7 +63,7 @@ def inspect(
         data |= {"model": config.name, "model_parameters": sum(part.parameters for part in parts)}
         data["parts"] = [asdict(part) for part in parts]
         texts.append(_parts_as_text(config.name, parts))
-    print(json.dumps(data, indent=1) if as_json else "\n\n".join(texts))
+    say(json.dumps(data, indent=1) if as_json else "\n\n".join(texts))
 
 
 @weights_app.command(cls=PlainCommand)
@@ -78,7 +79,7 @@ def convert(
     """
     from bevcli.checkpoints import convert as convert_file
 
-    print(_as_text(convert_file(source, options.target(destination))))
+    say(_as_text(convert_file(source, options.target(destination))))
 
 
 def _as_data(checkpoint: "Checkpoint") -> dict[str, object]:

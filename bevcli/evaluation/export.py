@@ -12,6 +12,7 @@ from bevcli.errors import InputError
 from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, apply, inverse, wrap_angle
+from bevcli.parsing.csv_cells import cell_of
 from bevcli.sequences.files.box_json import boxes_to_json
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 from bevcli.sequences.files.calibration_file import read_calibration
@@ -22,6 +23,7 @@ COLUMNS = (
     "frame", "scene", "timestamp_ns", "frame_of_reference", "class", "score", "x", "y", "z", "length", "width",
     "height", "yaw", "vx", "vy", "attribute", "instance", "track_score", "duplicate", "visibility", "num_points",
 )  # fmt: skip
+NAMES = ("scene", "class", "attribute", "instance")
 
 
 class CsvWriter:
@@ -44,7 +46,8 @@ class CsvWriter:
 
     def _append(self, rows: list[dict[str, Any]]) -> None:
         text = io.StringIO()
-        csv.DictWriter(text, COLUMNS, lineterminator="\n").writerows(rows)
+        cells = [row | {name: cell_of(row[name]) for name in NAMES if row.get(name)} for row in rows]
+        csv.DictWriter(text, COLUMNS, lineterminator="\n").writerows(cells)
         self.file.append(text.getvalue().encode())
 
     def __enter__(self) -> Self:

@@ -10,6 +10,7 @@ from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
+from bevcli.parsing.csv_cells import cell_of
 from bevcli.recording import entities
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
@@ -69,9 +70,9 @@ def _rows(frame: FrameBoxes) -> Iterator[list[object]]:
     assert boxes.scores is not None
     for i, score in enumerate(boxes.scores):
         numbers = (score, *boxes.centers[i], *boxes.sizes_lwh[i], boxes.yaws[i], *boxes.velocities[i])
-        instance = "" if boxes.instances is None else boxes.instances[i]
+        instance = "" if boxes.instances is None else cell_of(boxes.instances[i])
         rounded = (f"{number:.4f}" for number in numbers)
-        yield [stamp.index, stamp.scene, stamp.timestamp_ns, boxes.classes[i], *rounded, instance]
+        yield [stamp.index, cell_of(stamp.scene), stamp.timestamp_ns, cell_of(boxes.classes[i]), *rounded, instance]
 
 
 def _write_json(path: Path, frames: list[FrameBoxes]) -> None:

@@ -23,6 +23,7 @@ from typing import Any, BinaryIO
 from urllib.parse import parse_qs, quote, urlsplit
 
 from bevcli.errors import OutputError
+from bevcli.printing import say
 from bevcli.viewer.native import LOOPBACK, display_is_there, free_port, start_viewer, stop
 
 ASSETS = {
@@ -295,7 +296,7 @@ class LiveView:
         if in_window:
             start_viewer("--bind", LOOPBACK, "--port", "auto", f"{self._web.address}{RECORDING}")
         else:
-            print(f"live view: {self.address}", file=sys.stderr)
+            say(f"live view: {self.address}", err=True)
 
     def close(self) -> None:
         """Sends the rest of the recording, and stops the server. A window stays open."""

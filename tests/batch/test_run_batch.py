@@ -275,3 +275,44 @@ def test_the_hash_of_a_job_follows_model_weights_and_options(fleet, tmp_path):
     ]
     assert len(set(hashes)) == 5
     assert replace(job, out="elsewhere", retries=0).hash(model) == job.hash(model)
+
+
+WRONG = {
+    "attempts": "日本",
+    "error": None,
+    "frames": -1,
+    "boxes": 1 << 80,
+    "boxes_by_class": {"car": 0.5},
+    "score_histogram": [1, 2],
+    "scores": {"mean_ap": "high"},
+    "result": "../elsewhere",
+    "seconds": [],
+}
+
+
+def test_damaged_records_are_run_again(batch, tmp_path):
+    names = [str(tmp_path / "drives" / f"d{number:03d}") for number in range(len(WRONG) + 1)]
+    write_fleet(tmp_path / "drives", len(names), 1)
+    batch(names)
+    results = results_of(tmp_path / "out")
+    before = {name: (folder / "drive.json").read_text() for name, folder in results.items()}
+    for (name, folder), (key, value) in zip(sorted(results.items()), WRONG.items(), strict=False):
+        (folder / "drive.json").write_text(json.dumps(json.loads(before[name]) | {key: value}))
+    summary = batch(names, resume=True)
+    assert (summary.failed, summary.skipped) == (0, 1)
+    for name, folder in results_of(tmp_path / "out").items():
+        old, new = json.loads(before[name]), json.loads((folder / "drive.json").read_text())
+        assert old.keys() == new.keys()
+        assert all(old[key] == new[key] for key in ("drive", "result", "attempts", "error", "boxes_by_class"))
+
+
+def test_names_of_drives_are_no_formulas_in_batch_csv(batch, tmp_path):
+    names = ["+1+1", "-1", "=1+1", "@x"]
+    for seed, name in enumerate(names):
+        write_drive(tmp_path / name, seed, 1)
+    batch([str(tmp_path / name) for name in names])
+    rows = list(csv.DictReader((tmp_path / "out/batch.csv").open()))
+    assert [row["drive"] for row in rows] == ["'+1+1", "'-1", "_1+1", "_x"]
+    assert all(cell[:1] not in ("+", "=", "-", "@") for row in rows for cell in row.values())
+    table = pq.read_table(tmp_path / "out/batch.parquet").to_pylist()
+    assert [row["drive"] for row in table] == ["+1+1", "-1", "_1+1", "_x"]

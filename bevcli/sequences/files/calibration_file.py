@@ -15,7 +15,8 @@ from bevcli.geometry.cameras import Camera, CameraRig, Distortion, default_ego_f
 from bevcli.geometry.geographic import EAST_DEG, GeoOrigin
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.documents import read_json
-from bevcli.sequences.files.json_fields import Report, parse_numbers, parse_transform, shortened, transform_to_json
+from bevcli.printing import one_line
+from bevcli.sequences.files.json_fields import LONGEST_VALUE, Report, parse_numbers, parse_transform, transform_to_json
 from bevcli.writing import write_whole
 
 FORMAT = "bevcli-calibration/1"
@@ -176,7 +177,7 @@ def parse_camera(name: str, value: object, report: Report) -> Camera | None:
     """The camera, or None if a field is invalid. All fields are read, so that all mistakes are reported."""
     if not is_camera_name(name):
         expected = "up to 100 letters, digits and signs, no slash"
-        report.error("camera-name", shortened(name), "is not the name of a camera", expected=expected)
+        report.error("camera-name", one_line(name, LONGEST_VALUE), "is not the name of a camera", expected=expected)
         return None
     if not isinstance(value, dict):
         report.error("wrong-shape", name, "is not a camera", expected="an object with " + ", ".join(KEYS), found=value)

@@ -13,8 +13,10 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.findings import Finding
 from bevcli.geometry.transforms import Array, Pose, rigid, rotation_from_quaternion
+from bevcli.printing import one_line
 
 LARGEST_NUMBER = 1e12
+LONGEST_VALUE = 60  # characters of a value in a message
 TOLERANCE = 1e-3  # largest deviation of a quaternion's norm from 1, and of R Rᵀ from the identity
 _Value = TypeVar("_Value")
 
@@ -46,7 +48,9 @@ class Report:
     ) -> None:
         """Add an error about the field `name`. `message` continues a sentence that begins with the name."""
         text = f'"{self.prefix}{name}" {message}'
-        self.findings.append(Finding(code, "error", self.camera, text, shortened(found), expected, advice))
+        self.findings.append(
+            Finding(code, "error", self.camera, text, one_line(found, LONGEST_VALUE), expected, advice)
+        )
 
     def missing(self, name: str, expected: str) -> None:
         """Add an error for a missing key."""
@@ -79,12 +83,6 @@ def parse_numbers(owner: Mapping[str, Any], name: str, shape: tuple[int, ...], r
         report.error("not-finite", name, "contains NaN or infinity", expected="finite numbers below 1e12", found=value)
         return None
     return array
-
-
-def shortened(value: object) -> str:
-    """The value as text of at most 60 characters."""
-    text = str(value)
-    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _array_of_numbers(value: object) -> Array | None:

@@ -15,6 +15,7 @@ from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
 from bevcli.geometry.transforms import Array
+from bevcli.parsing.csv_cells import name_of
 from bevcli.parsing.documents import LARGEST_INTEGER
 from bevcli.parsing.files import read_text
 from bevcli.sequences.images import FrameEntry, ImageSource
@@ -85,7 +86,7 @@ def read_csv(path: Path, required: Iterable[str], optional: Iterable[str] = ()) 
     lines = _lines(path)
     if not lines:
         raise InputError(f"{path}: the file is empty (expected a header with {', '.join(required)})")
-    columns = tuple(cell.strip() for cell in lines[0][1])
+    columns = tuple(name_of(cell.strip()) for cell in lines[0][1])
     _check_columns(path, columns, required, tuple(optional))
     rows = tuple(_row(path, columns, line, cells) for line, cells in lines[1:])
     if not rows:
@@ -119,7 +120,7 @@ def _check_columns(path: Path, columns: tuple[str, ...], required: tuple[str, ..
 def _row(path: Path, columns: tuple[str, ...], line: int, cells: list[str]) -> CsvRow:
     if len(cells) != len(columns):
         raise InputError(f"{path}: line {line} has {len(cells)} cells (expected {len(columns)}, as in the header)")
-    return CsvRow(path, line, {name: cell.strip() for name, cell in zip(columns, cells, strict=True)})
+    return CsvRow(path, line, {name: name_of(cell.strip()) for name, cell in zip(columns, cells, strict=True)})
 
 
 def read_frames_table(path: Path, cameras: Sequence[str]) -> tuple[FrameEntry, ...]:

@@ -17,6 +17,7 @@ from bevcli.frame import CameraImage, DriveFacts, Frame
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
 from bevcli.geometry.transforms import Pose
+from bevcli.parsing.csv_cells import cell_of
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.sequences.files.map_folder import write_map
@@ -95,8 +96,9 @@ class NativeWriter:
         stamp = frame.stamp
         if self._rig is None:
             self._rig = frame.rig
-            times = [f"{name}.timestamp_ns" for name in frame.rig.names]
-            self._rows.writerow(["frame", "scene", "timestamp_ns", *frame.rig.names, *times])
+            cameras = [cell_of(name) for name in frame.rig.names]
+            times = [f"{name}.timestamp_ns" for name in cameras]
+            self._rows.writerow(["frame", "scene", "timestamp_ns", *cameras, *times])
         elif frame.rig is not self._rig and not same_rig(frame.rig, self._rig):
             raise InputError(
                 f"frame {stamp.index} ({stamp.scene}): its calibration differs from the first frame's, but a native "
@@ -119,7 +121,7 @@ class NativeWriter:
         names = frame.rig.names
         times = [frame.images[name].timestamp_ns if name in cells else "" for name in names]
         stamp = frame.stamp
-        row = [stamp.index, stamp.scene, stamp.timestamp_ns, *(cells.get(name, "") for name in names), *times]
+        row = [stamp.index, cell_of(stamp.scene), stamp.timestamp_ns, *(cells.get(name, "") for name in names), *times]
         self._rows.writerow(row)
 
     def _store_motion(self, frame: Frame) -> None:

@@ -1,0 +1,31 @@
+"""Texts for a terminal. They may hold names and contents of files, so control characters are printed as escapes."""
+
+import sys
+import unicodedata
+
+LONGEST_MESSAGE = 1000  # characters
+
+
+def one_line(value: object, longest: int = LONGEST_MESSAGE) -> str:
+    """The value as one line of text without control characters. Of a text that is too long, the middle is left out."""
+    text = str(value)
+    if not text.isprintable():
+        text = "".join(map(_escaped, text))
+    if len(text) <= longest:
+        return text
+    end = longest // 3  # a message ends with what to do
+    return f"{text[: longest - end - 3]}...{text[len(text) - end :]}"
+
+
+def say(*texts: object, err: bool = False) -> None:
+    """Print texts, each on lines of its own. err: on stderr."""
+    text = "\n".join(map(str, texts))
+    if not text.isprintable():
+        text = "".join(char if char in "\n\t" else _escaped(char) for char in text)
+    print(text, file=sys.stderr if err else sys.stdout, flush=True)
+
+
+def _escaped(char: str) -> str:
+    """The character, or its escape if it could steer a terminal or cannot be seen."""
+    shown = char.isprintable() or unicodedata.category(char) == "Zs"
+    return char if shown else char.encode("unicode_escape").decode()

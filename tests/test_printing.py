@@ -1,0 +1,78 @@
+"""Texts from outside reach the terminal without control characters, on one line, and not at any length."""
+
+import ast
+import shutil
+from pathlib import Path
+
+from command_line import command
+
+import bevcli
+from bevcli.cli.bridge import print_note
+from bevcli.cli.progress import Progress
+from bevcli.errors import InputError
+from bevcli.printing import LONGEST_MESSAGE, one_line, say
+
+ROOT = Path(bevcli.__file__).parent
+SAMPLE = ROOT.parent / "samples/street"
+NASTY = "\x1b]0;owned\x07\r\n\u202e\x9b2J\udc80"
+SHOWN = r"\x1b]0;owned\x07\r\n\u202e\x9b2J\udc80"
+
+
+def test_control_characters_become_escapes():
+    assert one_line(NASTY) == SHOWN
+    assert one_line(SHOWN) == SHOWN
+    assert one_line("Straße °\u3000日本") == "Straße °\u3000日本"
+
+
+def test_a_long_text_keeps_its_beginning_and_its_end():
+    text = one_line("error: " + "x" * 10_000 + " pass `force=True`")
+    assert len(text) == LONGEST_MESSAGE
+    assert text.startswith("error: xxx")
+    assert text.endswith("xxx pass `force=True`")
+    assert one_line(text) == text
+    assert len(one_line(NASTY * 100, 60)) == 60
+
+
+def test_errors_notes_and_progress_are_clean_and_short(capsys):
+    text = f"column {NASTY} " + "x" * 5_000
+    assert str(InputError(text)) == one_line(text)
+    print_note(text)
+    with Progress(1, "frames", [text]) as progress:
+        progress.message(text)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 3
+    assert all(rf"column {SHOWN} xxx" in line and len(line) < LONGEST_MESSAGE + 10 for line in lines)
+
+
+def test_a_table_keeps_its_lines(capsys):
+    say("boxes\t1\nmodel\t\x1b[2J")
+    assert capsys.readouterr().out == "boxes\t1\nmodel\t\\x1b[2J\n"
+
+
+def test_a_column_name_cannot_steer_the_terminal(tmp_path):
+    shutil.copytree(SAMPLE, tmp_path / "drive")
+    table = tmp_path / "drive/frames.csv"
+    header, rest = table.read_text().split("\n", 1)
+    table.write_text(f"{header},\x1b]0;owned\x07{'y' * 4000}\n{rest}")
+    done = command(tmp_path, "run", "drive", "--out", "out")
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert r'unknown column "\x1b]0;owned\x07yyy' in done.stderr
+    assert "\x1b" not in done.stderr
+    assert len(done.stderr) < LONGEST_MESSAGE + 10
+
+
+def test_an_error_of_the_system_is_clean(tmp_path):
+    done = command(tmp_path, "convert", SAMPLE, "out\x1b[2J" + "x" * 300)
+    assert done.returncode == 1
+    assert r"out\x1b[2Jxxx" in done.stderr
+
+
+def test_only_say_prints():
+    printing = {"print", "typer.echo", "typer.secho", "click.echo", "sys.stdout.write", "sys.stderr.write"}
+    wrong = []
+    for path in ROOT.rglob("*.py"):
+        nodes = ast.walk(ast.parse(path.read_text()))
+        if printing & {ast.unparse(node.func) for node in nodes if isinstance(node, ast.Call)}:
+            wrong.append(path.relative_to(ROOT).as_posix())
+    assert sorted(wrong) == ["cli/commands_page.py", "cli/progress.py", "printing.py"]
