@@ -1,7 +1,7 @@
 """An exported file in the place of a model."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -91,11 +91,20 @@ class ExportedModel(TemporalModel):
     def __init__(self, file: Path, engine: Engine, metadata: ExportedFile) -> None:
         super().__init__(metadata.config)
         self.file, self.engine, self.metadata = file, engine, metadata
+        self._require(("images",), engine.input_shapes, "input")
         self.form = model_class(self.config).export_form(self.config, self.cameras)
+        self._require((port.name for port in self.form.outputs(decode=False)), engine.outputs, "output")
         with file.open("rb") as stream:
             digest = hashlib.file_digest(stream, "sha256").digest()
         # The only state of this module: it tells a resumed run whether the weights are the same.
         self.register_buffer("digest", torch.tensor(list(digest), dtype=torch.uint8))
+
+    def _require(self, names: Iterable[str], found: Collection[str], kind: str) -> None:
+        missing = [name for name in names if name not in found]
+        if missing:
+            raise WeightsError(
+                f"{self.file}: has no {kind} {', '.join(missing)} (expected a file of bevcli export-onnx)"
+            )
 
     @property
     def cameras(self) -> int:
@@ -118,9 +127,19 @@ class ExportedModel(TemporalModel):
     def forward(self, feed: Mapping[str, Tensor]) -> ExportedOutputs:
         """The outputs of the file. feed: its inputs by name, see `ExportForm.feed`.
 
-        Raises WeightsError where more cameras see one cell than the file has slots for.
+        Raises WeightsError where the engine cannot run the file, where an output has another shape than the model's,
+        and where more cameras see one cell than the file has slots for.
         """
-        found = self.engine({name: tensor.cpu().numpy() for name, tensor in feed.items()})
+        try:
+            found = self.engine({name: tensor.cpu().numpy() for name, tensor in feed.items()})
+        except Exception as error:  # each engine has classes of its own
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise WeightsError(f"{self.file}: fails when it runs ({reason:.300}); export it again") from error
+        for port in self.form.outputs(decode=False):
+            if (shape := found[port.name].shape) != port.shape:
+                raise WeightsError(
+                    f"{self.file}: output {port.name} has shape {shape} (expected {port.shape}); export it again"
+                )
         most, slots = int(found["most_cameras_per_cell"][0]), self.metadata.cameras_per_cell
         if most > slots:
             raise WeightsError(

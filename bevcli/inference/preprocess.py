@@ -169,8 +169,9 @@ def calibration_images(config: ModelConfig, cameras: int, drives: Items[Sequence
         drives: whose frames are read; frames without any image are left out.
         frames: at most so many, evenly spaced over all frames of all drives.
 
-    Raises InputError where a frame cannot be read, or a rig has another number of cameras.
+    Raises InputError where a frame cannot be read, a rig has another number of cameras, or no frame has an image.
     """
+    empty = True
     places = [(drive, place) for drive in drives for place in range(len(drive.stamps))]
     chosen = np.linspace(0, len(places) - 1, min(frames, len(places))).round().astype(int)
     preprocessors = {id(drive): Preprocessor(config) for drive in drives}
@@ -179,7 +180,13 @@ def calibration_images(config: ModelConfig, cameras: int, drives: Items[Sequence
         if len(prepared.assignment.cameras) != cameras:
             raise InputError(f"{drive.name}: has {len(prepared.assignment.cameras)} cameras (the file takes {cameras})")
         if prepared.frame.images:
+            empty = False
             yield raw_images(prepared.images, config).numpy()
+    if empty:
+        names = ", ".join(drive.name for drive in drives)
+        raise InputError(
+            f"{names}: none of the {len(chosen)} frames for the calibration has an image; add their images"
+        )
 
 
 SMALLEST_OVERLAP = 1e-3  # pixels; OpenCV leaves out what overlaps less with the area of a pixel

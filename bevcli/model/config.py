@@ -1,7 +1,7 @@
 """The configuration that every model has: images, BEV grid, and the parts that models share."""
 
-from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any, ClassVar, Literal
 
 from bevcli.frame import MAP_CLASSES
 from bevcli.geometry.bev_grid import BevGrid
@@ -13,6 +13,14 @@ from bevcli.model.fpn import FPNConfig
 from bevcli.model.image_tokens import ImageTokensConfig
 from bevcli.model.resnet import ResNetConfig
 from bevcli.model.segmentation import SegmentationConfig
+
+# Largest values of the whole numbers of a model, by name or its last word; of any other number LARGEST_NUMBER.
+LARGEST = {
+    "layers": 100, "blocks": 200, "heads": 256, "levels": 16, "points": 256, "groups": 100, "scale": 32,
+    "channels": 4096, "width": 1024, "rows": 2000, "columns": 2000, "queries": 100_000, "pixels": 10**9,
+    "feed_forward_width": 20_000, "mask_feed_forward_width": 20_000,
+}  # fmt: skip
+LARGEST_NUMBER = 20_000
 
 
 @dataclass(frozen=True)
@@ -168,6 +176,7 @@ class ModelConfig:
     segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
 
     def __post_init__(self) -> None:
+        _check_numbers(self)
         grid, levels = self.bev_grid, self.neck.levels
         if min(grid.rows, grid.columns, grid.pillar_points) < 1:
             raise ValueError("bev_grid needs at least one row, column and pillar point")
@@ -229,3 +238,15 @@ class ModelConfig:
 
     def _most_neck_levels(self) -> int:
         return self.image_tokens.level_embeddings
+
+
+def _check_numbers(config: Any, prefix: str = "") -> None:
+    """Raises ValueError for a whole number that no model has, before anything of its size is made."""
+    for each in fields(config):
+        value = getattr(config, each.name)
+        if is_dataclass(value):
+            _check_numbers(value, f"{prefix}{each.name}.")
+        most = LARGEST.get(each.name, LARGEST.get(each.name.rpartition("_")[2], LARGEST_NUMBER))
+        for number in value if isinstance(value, tuple) else (value,):
+            if type(number) is int and abs(number) > most:
+                raise ValueError(f"{prefix}{each.name} is {number} (expected at most {most})")

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from bevcli.errors import BevcliError, InputError, WeightsError
 from bevcli.parsing.files import open_regular
-from bevcli.parsing.pickles import Global, PickleError, Placeholder, read_pickle
+from bevcli.parsing.pickles import MOST_OPCODES, Global, PickleError, Placeholder, read_pickle
 
 LARGEST_PICKLE = 32 << 20
 LARGEST_TENSORS = 8 << 30  # bytes of all tensors that are read
@@ -96,7 +96,8 @@ class PthFile:
     def with_tensors(self) -> Any:
         """The contents with tensors in place of `StoredTensor`.
 
-        Raises WeightsError as `tensors`, and RecursionError where a list contains itself.
+        Raises WeightsError as `tensors`, and for more than two million values: a tuple of a tuple of a tuple, each
+        twice, is small in a file. RecursionError where a list contains itself.
         """
         with self._open() as read:
             return _filled(self.contents, "", _Storages(self._path, read))
@@ -173,6 +174,15 @@ class _Storages:
         self._path, self._read = path, read
         self._loaded: dict[str, Tensor] = {}
         self._bytes = 0
+        self._values = 0
+
+    def count(self) -> None:
+        """Counts a value of the contents. Raises WeightsError where there are too many."""
+        self._values += 1
+        if self._values > MOST_OPCODES:
+            raise WeightsError(
+                f"{self._path}: has more than {MOST_OPCODES} values, those of repeated lists counted each time"
+            )
 
     def tensor(self, name: str, stored: StoredTensor) -> Tensor:
         storage, offset = stored.storage, stored.offset
@@ -208,6 +218,7 @@ class _Storages:
 
 def _filled(value: Any, name: str, storages: _Storages) -> Any:
     """A value with tensors in place of `StoredTensor`. name: of the value, for messages."""
+    storages.count()
     if isinstance(value, StoredTensor):
         return storages.tensor(name, value)
     if isinstance(value, dict):

@@ -67,7 +67,7 @@ def load_checkpoint(
     try:
         contents = file.with_tensors()
         if contents["format"] != FORMAT:
-            raise WeightsError(f'{path}: "format" must be "{FORMAT}", found {contents["format"]!r}')
+            raise WeightsError(f'{path}: "format" must be "{FORMAT}", found {contents["format"]!r:.60}')
         if any(key.startswith("picture_reader.") for key in contents["model"]):
             raise WeightsError(
                 f"{path}: was written by an earlier version, with [training.picture_loss], and cannot be resumed; "

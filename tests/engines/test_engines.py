@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,12 +17,13 @@ import torch
 from typer.testing import CliRunner
 
 from bevcli.cli.main import app
-from bevcli.config import as_table
+from bevcli.config import as_table, load_config
 from bevcli.engines.export_onnx import export_onnx
 from bevcli.engines.exported import load_exported
 from bevcli.engines.quantize import quantize
-from bevcli.errors import BevcliError, ConfigError, WeightsError
+from bevcli.errors import BevcliError, ConfigError, InputError, WeightsError
 from bevcli.inference.load import load_model
+from bevcli.inference.preprocess import calibration_images
 from bevcli.inference.run import run
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.model.export_form import raw_images
@@ -141,6 +143,55 @@ def test_a_model_in_the_metadata_is_checked_like_a_model_file(small_file, tmp_pa
         onnx.save(proto, tmp_path / "changed.onnx")
         with pytest.raises(error, match=message):
             load_model(tmp_path / "changed.onnx")
+
+
+def test_a_node_that_fails_when_it_runs_is_one_line(small_file, tmp_path):
+    """The indices of a Gather lie outside of its data, which ONNX Runtime finds only when it runs."""
+    proto = onnx.load(small_file)
+    name = "most_cameras_per_cell"
+    for node in proto.graph.node:
+        node.output[:] = ["before" if each == name else each for each in node.output]
+    nodes = [
+        onnx.helper.make_node("Add", ["before", "far"], ["outside"]),
+        onnx.helper.make_node("Gather", ["few", "outside"], [name]),
+    ]
+    proto.graph.node.extend(nodes)
+    for each, value in (("far", [1000]), ("few", [1, 2])):
+        proto.graph.initializer.append(onnx.helper.make_tensor(each, onnx.TensorProto.INT64, [len(value)], value))
+    onnx.save(proto, tmp_path / "fails.onnx")
+    model = load_exported(tmp_path / "fails.onnx", "onnxruntime")
+    with pytest.raises(WeightsError, match=r"fails\.onnx: fails when it runs") as caught:
+        step_of_file(model, small_inputs())
+    assert "\n" not in str(caught.value)
+
+
+def test_an_output_that_is_missing_or_misshapen_is_named(small_file, tmp_path):
+    proto = onnx.load(small_file)
+    kept = [value for value in proto.graph.output if value.name != "box_codes"]
+    logits = next(value for value in proto.graph.output if value.name == "class_logits")
+    for change, message in ((kept, "has no output box_codes"), (None, "output box_codes has shape")):
+        del proto.graph.output[:]
+        proto.graph.output.extend(kept)
+        if change is None:
+            proto.graph.node.append(onnx.helper.make_node("Identity", ["class_logits"], ["box_codes"]))
+            wrong = onnx.ValueInfoProto()
+            wrong.CopyFrom(logits)
+            wrong.name = "box_codes"
+            for node in proto.graph.node[:-1]:
+                node.output[:] = ["unused" if each == "box_codes" else each for each in node.output]
+            proto.graph.output.append(wrong)
+        onnx.save(proto, tmp_path / "changed.onnx")
+        with pytest.raises(WeightsError, match=message):
+            step_of_file(load_exported(tmp_path / "changed.onnx", "onnxruntime"), small_inputs())
+
+
+def test_drives_without_images_calibrate_nothing(tmp_path):
+    shutil.copytree(STREET, tmp_path / "street")
+    for image in (tmp_path / "street" / "images").rglob("*.*"):
+        image.unlink()
+    drive = open_sequence(tmp_path / "street")
+    with pytest.raises(InputError, match="none of the 2 frames for the calibration has an image"):
+        list(calibration_images(load_config("demo"), len(drive.rig.cameras), [drive], 2))
 
 
 def test_options_that_do_not_apply_are_named(small_file, int8_file):

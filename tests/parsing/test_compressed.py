@@ -1,5 +1,7 @@
 """Compressed data is read up to a limit, whatever size it states."""
 
+import gc
+import shutil
 import sqlite3
 from types import SimpleNamespace
 
@@ -55,6 +57,54 @@ def test_a_view_in_place_of_a_table_is_refused(tmp_path):
     database.close()
     with pytest.raises(InputError, match="messages is a view"):
         SqliteFile(tmp_path / "a.db3")
+
+
+@pytest.mark.parametrize("table", ["topics", "messages", "Messages", "message_definitions"])
+def test_a_computed_column_is_refused(tmp_path, table):
+    """Each value may take minutes, inside a call that no signal interrupts."""
+    with sqlite3.connect(tmp_path / "a.db3", timeout=5) as database:
+        if table != "topics":
+            database.execute("CREATE TABLE topics (id, name, type, serialization_format)")
+        slow = "length(replace(printf('%.*c', 1000000, 'a'), 'a', 'aa'))"
+        database.execute(f"CREATE TABLE {table} (id INTEGER PRIMARY KEY, topic_id, data, timestamp AS ({slow}))")
+        database.execute(f"INSERT INTO {table} (topic_id) VALUES (1)")
+    database.close()
+    with pytest.raises(InputError, match="column timestamp is computed"):
+        SqliteFile(tmp_path / "a.db3")
+
+
+def test_a_virtual_table_is_refused(tmp_path):
+    with sqlite3.connect(tmp_path / "a.db3", timeout=5) as database:
+        database.execute("CREATE TABLE topics (id, name, type, serialization_format)")
+        database.execute("CREATE VIRTUAL TABLE messages USING fts5(timestamp, id, topic_id, content='endless')")
+    database.close()
+    with pytest.raises(InputError, match="messages is a virtual table"):
+        SqliteFile(tmp_path / "a.db3")
+
+
+def test_a_bag_that_was_cut_off_is_read_without_writing(tmp_path):
+    """Its last messages are in the -wal file. SQLite would put a -shm file beside it, and delete both at the end."""
+    live, folder = tmp_path / "live.db3", tmp_path / "bag"
+    folder.mkdir()
+    with sqlite3.connect(live, timeout=5) as database:
+        database.execute("PRAGMA journal_mode = WAL")
+        database.execute("CREATE TABLE topics (id, name, type, serialization_format)")
+        database.execute("CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id, timestamp, data)")
+        database.execute("INSERT INTO topics VALUES (1, '/a', 'T', 'cdr')")
+        database.execute("INSERT INTO messages VALUES (1, 1, 7, x'05')")
+        database.commit()
+        for end in ("", "-wal"):
+            shutil.copy(f"{live}{end}", folder / f"a.db3{end}")
+    database.close()
+    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+    assert len(before) == 2
+    bag = SqliteFile(folder / "a.db3")
+    assert bag.times("/a").tolist() == [7]
+    assert bag.read("/a", 0) == b"\x05"
+    assert {file.name for file in folder.iterdir()} == set(before)
+    del bag
+    gc.collect()
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
 
 
 def test_only_the_start_of_a_metadata_file_is_read(tmp_path):

@@ -278,6 +278,16 @@ def test_a_key_that_takes_for_ever_to_hash_is_left_out() -> None:
     assert read_pickle(io.BytesIO(b"\x80\x02}" + long + b"K\x01s.")) == {}
 
 
+def test_tuples_that_repeat_each_other_are_refused(tmp_path: Path) -> None:
+    """662 bytes that a training with `resume` would fill with tensors for 2^60 values."""
+    nested: object = (1, 2)
+    for _ in range(60):
+        nested = (nested, nested)
+    torch.save({"format": nested}, tmp_path / "a.pth")
+    with pytest.raises(WeightsError, match="more than 2000000 values"):
+        read_pth(tmp_path / "a.pth").with_tensors()
+
+
 def test_storages_are_read_from_the_place_that_the_pickle_names(tmp_path: Path) -> None:
     path = tmp_path / "short.pth"
     torch.save({"weight": torch.arange(10.0)}, path)

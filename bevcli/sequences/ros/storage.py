@@ -1,5 +1,6 @@
 """The files of a bag, MCAP and SQLite: topics, the times of messages from the index, and messages on demand."""
 
+import os
 import sqlite3
 import struct
 from collections import OrderedDict
@@ -30,6 +31,7 @@ NO_CHUNK = -1  # the message lies outside of chunks
 Entries = list[tuple[int, int, int]]  # log time ns, start of the chunk in the file or NO_CHUNK, offset
 TABLES = ("topics", "messages", "message_definitions", "sqlite_master")
 BUSY_TIMEOUT_S = 5.0
+VFS_WITHOUT_LOCKS = "win32-none" if os.name == "nt" else "unix-none"
 LARGEST_VALUE = 512 * MIB  # bytes of a message
 
 
@@ -216,10 +218,13 @@ class SqliteFile:
         self.notes: tuple[str, ...] = ()
         try:
             # A recording that was cut off leaves a -wal file beside the database, which SQLite must be able to apply.
-            options = "mode=ro" if path.with_name(path.name + "-wal").exists() else "mode=ro&immutable=1"
+            # Without locks and with exclusive access it keeps the index of that file in memory, not in a -shm file.
+            has_wal = path.with_name(path.name + "-wal").exists()
+            options = f"mode=ro&vfs={VFS_WITHOUT_LOCKS}" if has_wal else "mode=ro&immutable=1"
             uri = f"{path.resolve().as_uri()}?{options}"
             self._database = sqlite3.connect(uri, uri=True, check_same_thread=False, timeout=BUSY_TIMEOUT_S)
             self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_VALUE)
+            self._database.execute("PRAGMA locking_mode = EXCLUSIVE")
             self._check_tables()
             rows = self._database.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
             definitions = self._definitions()
@@ -264,12 +269,18 @@ class SqliteFile:
             self._references[name] = part[np.argsort(part[:, 0], kind="stable")]
 
     def _check_tables(self) -> None:
-        """Raises sqlite3.Error if a table of the bag is a view: a query in the file can compute for ever."""
+        """Raises sqlite3.Error unless the tables of the bag hold plain values: code in a file can compute for ever."""
         self._database.execute("PRAGMA trusted_schema = OFF")
-        kinds = self._database.execute("SELECT name, type FROM sqlite_master").fetchall()
-        views = [name for name, kind in kinds if name in TABLES and kind not in ("table", "index")]
-        if views:
-            raise sqlite3.DatabaseError(f"{views[0]} is a view (expected a table)")
+        kinds = self._database.execute("SELECT name, type, rootpage FROM sqlite_master").fetchall()
+        for name, kind, page in kinds:
+            if name.lower() not in TABLES or kind == "index":
+                continue
+            if kind != "table" or not page:
+                found = "virtual table" if kind == "table" else kind
+                raise sqlite3.DatabaseError(f"{name} is a {found} (expected a table)")
+            for _, column, _, _, _, _, hidden in self._database.execute(f"PRAGMA table_xinfo({name})"):
+                if hidden:
+                    raise sqlite3.DatabaseError(f"{name}: column {column:.50} is computed (expected stored values)")
 
     def _definitions(self) -> dict[str, tuple[str, bytes]]:
         """Encoding and text of each type's definition; files of older ROS releases have none."""
