@@ -152,7 +152,7 @@ def test_options_that_do_not_apply_are_named(small_file, int8_file):
     ):
         with pytest.raises(BevcliError, match=message):
             load_model(small_file, **options)
-    with pytest.raises(BevcliError, match=r"bevcli export-onnx --model tiny, then `model=tiny\.onnx`"):
+    with pytest.raises(BevcliError, match=r"export tiny with bevcli export-onnx, then `model=tiny\.onnx`"):
         load_model("tiny", untrained=True, engine="openvino")
     with pytest.raises(WeightsError, match="is quantised already"):
         quantize(int8_file, [], int8_file.with_name("again.onnx"))
