@@ -40,6 +40,8 @@ class Option:
         flag_value: value that the flag alone stands for, such as "static" for --static. None for a flag with a value.
         complete: the values that complete a text in a shell.
         hidden: whether only Python has the option.
+        old: earlier spellings, which work for one more release, with a note; `--help` does not show them.
+        retired: what to use in place of an option that works for one more release, with this note; "" for others.
     """
 
     help: str
@@ -53,6 +55,8 @@ class Option:
     minimum: float | None = None
     maximum: float | None = None
     hidden: bool = False
+    old: tuple[str, ...] = ()
+    retired: str = ""
 
 
 def option(
@@ -87,9 +91,10 @@ def option_of(field: Field[Any]) -> Option | None:
 
 
 def flag_of(field: Field[Any]) -> str:
-    """The spelling of a field on the command line, such as "--rate", "--track/--no-track" or "--out -o"."""
+    """The spelling of a field on the command line, such as "--rate", "--track/--no-track"; --out is -o, too."""
     stated = option_of(field)
-    return (stated.flag if stated else "") or f"--{field.name.replace('_', '-')}"
+    short = " -o" if field.name == "out" else ""
+    return (stated.flag if stated else "") or f"--{field.name.replace('_', '-')}{short}"
 
 
 def gather(kind: type[_Options], given: _Options | None, changes: Mapping[str, Any]) -> _Options:

@@ -92,7 +92,7 @@ def test_a_formats_option_is_one_line(folder):
 def test_the_engine_of_the_page_runs_an_exported_file(folder):
     pytest.importorskip("onnxruntime")
     (folder / "mini.toml").write_text(MINI_TOML)
-    python(folder, "-m", "bevcli", "export-onnx", "mini.toml", "--untrained", "-o", "mini.onnx")
+    python(folder, "-m", "bevcli", "export-onnx", "--model", "mini.toml", "--untrained", "-o", "mini.onnx")
     code = (
         "import bevcli; drive = bevcli.open_sequence('samples/street', frames=slice(0, 1))\n"
         "for engine in ('unoptimised', 'onnxruntime'):\n"

@@ -199,7 +199,10 @@ def train(device: torch.device, model: str = TRAINED_MODEL) -> str:
     with tempfile.TemporaryDirectory(prefix="bevcli-gpu-check-") as folder:
         out = Path(folder) / "train"
         options = ["--data", str(drive), "--held-out", "0", "--steps", str(TRAINED_STEPS), "--out", str(out)]
-        _run([sys.executable, "-m", "bevcli", "train", model, *options, "--device", str(device)], "the training")
+        _run(
+            [sys.executable, "-m", "bevcli", "train", "--model", model, *options, "--device", str(device)],
+            "the training",
+        )
         with (out / "loss.csv").open(newline="") as file:
             losses = [float(row["loss"]) for row in csv.DictReader(file)]
     text = f"Losses of {model}: {', '.join(f'{loss:.3g}' for loss in losses)}."

@@ -16,7 +16,14 @@ class BenchOptions:
         help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, uniad-track-map, a FILE.toml or a FILE.onnx.",
         complete=complete_model,
     )
-    frames: int = option(default=5, help="Number of timed frames, after the warm-up.", minimum=1)
+    frames: int = option(
+        default=5,
+        help="Number of timed frames, after the warm-up.",
+        metavar="N",
+        flag="--count",
+        old=("--frames",),
+        minimum=1,
+    )
     against: Literal["plain"] | None = option(
         default=None, help="Also run the plain version; compare times and results."
     )

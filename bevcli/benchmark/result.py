@@ -187,7 +187,7 @@ def measure(
     Raises BevcliError if it fails or takes longer than limit_s.
     """
     say(f"measuring {model}, {precision} …", err=True)
-    options = ["--model", model, "--precision", precision, "--device", str(device), "--frames", str(frames)]
+    options = ["--model", model, "--precision", precision, "--device", str(device), "--count", str(frames)]
     command = [sys.executable, "-m", "bevcli", "bench", *options, "--against", "plain", "--json"]
     try:
         answer = subprocess.run(command, check=True, capture_output=True, text=True, timeout=limit_s)

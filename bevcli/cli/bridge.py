@@ -1,6 +1,7 @@
 """Commands for typer from functions that take dataclasses of options, and the flags in place of arguments' names."""
 
 import ast
+import copy
 import dataclasses
 import re
 import types
@@ -40,6 +41,43 @@ class Part:
         return name not in self.without and (not self.only or name in self.only)
 
 
+class OldArgument:
+    """In the annotation of an option: it was an argument, and is still taken as one for this release, with a note."""
+
+
+@dataclass(frozen=True)
+class _Old:
+    """An earlier form of an option. option: its parameter. new: its flag. spelling: "" where it was an argument."""
+
+    option: Parameter
+    new: str
+    spelling: str = ""
+
+    @property
+    def parameter(self) -> Parameter:
+        """The hidden parameter of a function, as typer reads it."""
+        kind, info, *_ = get_args(self.option.annotation)
+        if self.spelling:
+            info = copy.copy(info)
+            info.param_decls, info.hidden = (self.spelling,), True
+        else:
+            info = typer.Argument(hidden=True, metavar=f"[{self.option.name.upper()}]")
+        kind, default = (bool, False) if kind is bool else (kind | None, None)
+        name = f"{self.option.name}_{self.spelling.strip('-').replace('-', '_')}"
+        return Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, info])
+
+    def move(self, given: dict[str, Any]) -> None:
+        """Give its value to the option, with a note. Raises click's usage error."""
+        value, name = given.pop(self.parameter.name), self.option.name
+        if value in (None, [], ()) or value is False:
+            return
+        now = self.new if self.spelling else f"{self.new} {value}"
+        if given[name] != self.option.default:
+            raise typer.BadParameter(f"is given twice, also as {self.spelling or value}", param_hint=self.new)
+        print_note(f"{self.spelling or f'the argument {value}'} is now {now}; the old form ends with this release")
+        given[name] = value
+
+
 @dataclass(frozen=True)
 class _Flag:
     """An option of a command. kind: type of the field. default: `Parameter.empty` for a required one."""
@@ -74,12 +112,15 @@ class _Flag:
             min=stated.minimum,
             max=stated.maximum,
             autocompletion=stated.complete,
+            hidden=bool(stated.retired),
         )
         annotation = Annotated[kind, info]
         return Parameter(self.field.name, Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
     def value(self, given: Any) -> Any:
         """The field's value for what typer has read; MISSING for its default. Raises click's usage error."""
+        if self.option.retired and given != self.default:
+            print_note(f"{self.yes} ends with this release: {self.option.retired}")
         if self.option.flag_value is not None:
             return self.option.flag_value if given else MISSING
         if self.option.parse is None and not self.option.repeatable:
@@ -101,6 +142,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     Arguments in backticks in a help text, and in a `BevcliError` of the function, become flags.
     """
     parts: list[Parameter | _Flag] = []
+    arguments: set[str] = set()
     flags: dict[str, _Flag] = {}
     makers: dict[str, tuple[Callable[..., Any], list[str]]] = {}
     hints = get_type_hints(function, include_extras=True)
@@ -109,6 +151,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         make, found = _flags_of(hint)
         if make is None:
             parts.append(parameter.replace(kind=Parameter.KEYWORD_ONLY, annotation=hint))
+            arguments |= {parameter.name} if OldArgument in getattr(hint, "__metadata__", ()) else set()
             continue
         for name in found.keys() & flags.keys():  # one of them is of another package
             raise BevcliError(f"command {function.__name__}: two options are named {name}: rename one")
@@ -119,6 +162,8 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     def called(**given: Any) -> None:
         before = _flags.set(flags)
         try:
+            for each in old:
+                each.move(given)
             for parameter, (make, names) in makers.items():
                 values = {name: flags[name].value(given.pop(name)) for name in names}
                 given[parameter] = make(**{name: value for name, value in values.items() if value is not MISSING})
@@ -131,7 +176,10 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
 
     called.__name__, called.__doc__, called.__module__ = function.__name__, function.__doc__, function.__module__
     parameters = [part.parameter(flags) if isinstance(part, _Flag) else part for part in parts]
-    called.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
+    spelled = [(each, text) for each in parameters if each.name in flags for text in flags[each.name].option.old]
+    old = [_Old(each, flags[each.name].yes, text) for each, text in spelled]
+    old += [_Old(each, f"--{each.name}") for each in parameters if each.name in arguments]
+    called.__signature__ = Signature([*parameters, *(each.parameter for each in old)])  # type: ignore[attr-defined]
     return called
 
 

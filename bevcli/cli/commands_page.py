@@ -25,12 +25,13 @@ def _command(name: str, command: Any) -> Iterator[str]:
         for each in command.commands:
             yield from _command(f"{name} {each}", command.commands[each])
         return
-    arguments = [each for each in command.params if each.param_type_name == "argument"]
+    shown = [each for each in command.params if not each.hidden]
+    arguments = [each for each in shown if each.param_type_name == "argument"]
     places = "".join(f" {_place(each)}" for each in arguments)
     yield from (f"## {name}\n", f"`{name}{places} [OPTIONS]`\n", _escaped(command.help) + "\n")
     yield from (f"- `{_place(each)}`: {_escaped(each.help or '')}" for each in arguments)
     panels: dict[str, list[Any]] = {}
-    for each in command.params:
+    for each in shown:
         if each not in arguments and each.name != "help":
             panels.setdefault(each.rich_help_panel or "Options", []).append(each)
     for panel, options in panels.items():
@@ -55,7 +56,7 @@ def _spelling(option: Any) -> str:
 def _default(option: Any) -> str:
     if option.required:
         return " (required)"
-    is_plain = option.default in (None, False, ()) or (option.is_flag and not option.secondary_opts)
+    is_plain = option.default in (None, False, "", ()) or (option.is_flag and not option.secondary_opts)
     return "" if is_plain else f" [{option.opts[0] if option.is_flag else option.default}]"
 
 

@@ -6,9 +6,9 @@ from typing import Annotated
 
 import typer
 
-from bevcli.cli.bridge import Part
+from bevcli.cli.bridge import OldArgument, Part
 from bevcli.engines.options import FileOptions, OnnxOptions
-from bevcli.inference.options import ModelOptions
+from bevcli.inference.options import ModelOptions, complete_model
 from bevcli.printing import say
 
 PANEL = "Deploy"
@@ -16,13 +16,21 @@ PANEL = "Deploy"
 
 def export_onnx(
     model: Annotated[
-        str, typer.Argument(help="tiny, small, base, demo, v2-t1-base, v2-t1, v2-t2, v2-t8, or a FILE.toml.")
-    ],
+        str | None,
+        typer.Option(
+            autocompletion=complete_model,
+            help="tiny, small, base, demo, v2-t1-base, v2-t1, v2-t2, v2-t8, or a FILE.toml. Default: the model that "
+            "WEIGHTS fit, else demo.",
+            rich_help_panel="Model",
+        ),
+        OldArgument,
+    ] = None,
+    *,
     model_options: Annotated[ModelOptions, Part(only=("weights", "untrained"))],
     file: FileOptions,
     options: OnnxOptions,
 ) -> None:
-    """Write one step of MODEL as an ONNX file of standard operators, without plugins.
+    """Write one step of a model as an ONNX file of standard operators, without plugins.
 
     The number of cameras is fixed, the batch is one; calibrations are inputs. What the model remembers is an input and
     an output: the BEV map, or with v2 models image features. The file's metadata documents every input and output.

@@ -14,7 +14,9 @@ NAME = "street"
 
 
 def samples(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="The folder that gets the sample.")] = Path("samples"),
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="The folder that gets the sample.")] = Path(
+        "samples"
+    ),
 ) -> None:
     """Copy the sample drive, a rendered street, to DIR/street. It is a complete sequence folder.
 

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from bevcli.cli.bridge import Part
+from bevcli.cli.bridge import OldArgument, Part
 from bevcli.inference.options import ModelOptions, complete_model
 from bevcli.synth.options import DriveOptions
 from bevcli.training.options import TrainOptions
@@ -13,13 +13,18 @@ PANEL = "Train"
 
 
 def train(
-    config: Annotated[
+    model: Annotated[
         str,
-        typer.Argument(
-            autocompletion=complete_model, help="A model name or a FILE.toml. Its training table holds the settings."
+        typer.Option(
+            autocompletion=complete_model,
+            help="A model name or a FILE.toml; required. Its training table holds the settings.",
+            rich_help_panel="Model",
+            show_default=False,
         ),
-    ],
-    model: Annotated[ModelOptions, Part(only=("device",))],
+        OldArgument,
+    ] = "",
+    *,
+    model_options: Annotated[ModelOptions, Part(only=("device",))],
     drives: Annotated[DriveOptions, Part(only=("data", "rendered"))],
     options: TrainOptions,
 ) -> None:
@@ -39,8 +44,10 @@ def train(
     from bevcli.training.job import leave_process_group, prepare_training
     from bevcli.training.trainer import Trainer
 
+    if not model:
+        raise typer.BadParameter("is missing (expected a model name or a FILE.toml)", param_hint="--model")
     torch.manual_seed(options.seed)
-    job = prepare_training(config, choose_device(model.device), drives, options)
+    job = prepare_training(model, choose_device(model_options.device), drives, options)
     trainer = Trainer(job, resume=options.resume)
     if not job.group.leads:
         with StopSignals("step") as signals:

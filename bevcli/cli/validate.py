@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from bevcli.cli.bridge import Json, Part
+from bevcli.cli.bridge import Json, OldArgument, Part
 from bevcli.inference.options import ModelOptions, complete_model
 from bevcli.printing import say
 from bevcli.runs.options import RunOptions
@@ -17,8 +17,15 @@ PANEL = "Score"
 
 def validate(
     model: Annotated[
-        str, typer.Argument(autocompletion=complete_model, help="A model name, a FILE.toml or a FILE.onnx.")
-    ],
+        str | None,
+        typer.Option(
+            autocompletion=complete_model,
+            help="A model name, a FILE.toml or a FILE.onnx. Default: the model that WEIGHTS fit, else demo.",
+            rich_help_panel="Model",
+        ),
+        OldArgument,
+    ] = None,
+    *,
     model_options: Annotated[ModelOptions, Part(only=("weights", "device", "engine"))],
     run_options: Annotated[RunOptions, Part(only=("temporal",))],
     drive_options: DriveOptions,
@@ -38,7 +45,7 @@ def validate(
     from bevcli.training.validation import validate as validate_model
 
     loaded = load_model(model, options=model_options)
-    rig = None if options.rig is None else rig_for_drives(options.rig, model)
+    rig = None if options.rig is None else rig_for_drives(options.rig, model or loaded.name)
     drives = open_drives(drive_options.data, drive_options.rendered, drive_options.cache, loaded.config, rig)
     runner = Runner(loaded.prepared, loaded.device, StepOptions(loaded.precision, run_options.temporal))
     with Progress(count_frames(drives), "frames") as progress:

@@ -11,7 +11,7 @@ from bevcli.options import option, options
 class FileOptions:
     """The file that is written."""
 
-    out: Path | None = option(default=None, help="Default: MODEL.onnx, or FILE-int8.onnx.", flag="--out -o")
+    out: Path | None = option(default=None, help="Default: MODEL.onnx, or FILE-int8.onnx.")
     force: bool = option(default=False, help="Overwrite the file if it exists.")
 
     def target(self, default: Path) -> Path:
@@ -61,7 +61,12 @@ class QuantizeOptions:
         help="Drive whose images give the ranges of the numbers. Repeatable.", metavar="SEQUENCE", repeatable=True
     )
     frames: int = option(
-        default=16, help="Number of frames for the calibration, evenly spaced over all drives.", minimum=1
+        default=16,
+        help="Number of frames for the calibration, evenly spaced over all drives.",
+        metavar="N",
+        flag="--count",
+        old=("--frames",),
+        minimum=1,
     )
     check: Path | None = option(
         default=None,

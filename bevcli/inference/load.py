@@ -191,7 +191,7 @@ def _load_network(options: ModelOptions) -> Model:
 def needs_exported_file(engine: str, model: str) -> BevcliError:
     """The error for an engine that is to run a model by its name."""
     return BevcliError(
-        f"`engine={engine}`: runs exported files only: bevcli export-onnx {model}, then `model={model}.onnx`"
+        f"`engine={engine}`: runs exported files: export {model} with bevcli export-onnx, then `model={model}.onnx`"
     )
 
 

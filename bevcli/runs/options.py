@@ -31,7 +31,7 @@ class RunOptions:
     recording: RecordingOptions = field(default_factory=RecordingOptions)
     save_bev: Path | None = option(
         default=None,
-        help="Write the BEV features of each frame, as float16 .npy files.",
+        help="Write the BEV features of each frame, as float16 .npy files; row 0 has the smallest y.",
         panel="Output",
         metavar="DIR",
     )

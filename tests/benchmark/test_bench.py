@@ -59,7 +59,7 @@ def test_json_of_a_whole_benchmark(small_model_file, monkeypatch):
     monkeypatch.setattr(measure, "RUN_FRAMES", 4)
     monkeypatch.setattr(limits, "CPU_EDGE", 256)
     monkeypatch.setattr(limits, "COPIED_FLOATS", 1 << 20)
-    arguments = ["bench", "--model", str(small_model_file), "--frames", "1", "--against", "plain", "--json"]
+    arguments = ["bench", "--model", str(small_model_file), "--count", "1", "--against", "plain", "--json"]
     answer = CliRunner().invoke(app, arguments, catch_exceptions=False)
     data = json.loads(answer.stdout)
     assert set(data) >= {
@@ -81,7 +81,7 @@ def test_json_of_a_whole_benchmark(small_model_file, monkeypatch):
 @pytest.mark.slow
 def test_profile_of_a_frame_in_half_precision(small_model_file, tmp_path):
     profile = tmp_path / "profile.json"
-    options = ["--precision", "bf16", "--frames", "1", "--profile", str(profile)]
+    options = ["--precision", "bf16", "--count", "1", "--profile", str(profile)]
     answer = CliRunner().invoke(app, ["bench", "--model", str(small_model_file), *options], catch_exceptions=False)
     assert "bf16" in answer.stdout
     assert json.loads(profile.read_text())["traceEvents"]
@@ -89,7 +89,7 @@ def test_profile_of_a_frame_in_half_precision(small_model_file, tmp_path):
 
 @pytest.mark.slow
 def test_the_benchmark_of_a_uniad_times_its_map_head(small_uniad_file):
-    options = ["--frames", "1", "--against", "plain", "--json"]
+    options = ["--count", "1", "--against", "plain", "--json"]
     answer = CliRunner().invoke(app, ["bench", "--model", str(small_uniad_file), *options], catch_exceptions=False)
     data = json.loads(answer.stdout)
     assert data["stages_ms"]["map head"] > 0

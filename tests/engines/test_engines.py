@@ -203,7 +203,7 @@ def test_options_that_do_not_apply_are_named(small_file, int8_file):
     ):
         with pytest.raises(BevcliError, match=message):
             load_model(small_file, **options)
-    with pytest.raises(BevcliError, match=r"bevcli export-onnx tiny, then `model=tiny\.onnx`"):
+    with pytest.raises(BevcliError, match=r"export tiny with bevcli export-onnx, then `model=tiny\.onnx`"):
         load_model("tiny", untrained=True, engine="openvino")
     with pytest.raises(WeightsError, match="is quantised already"):
         quantize(int8_file, [], int8_file.with_name("again.onnx"))
@@ -214,8 +214,8 @@ def test_options_that_do_not_apply_are_named(small_file, int8_file):
 @pytest.mark.slow
 def test_every_command_runs_demo_from_a_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    command("export-onnx", "demo")
-    command("quantize", "demo.onnx", "--calibrate", str(STREET), "--frames", "4", "--check", str(STREET))
+    command("export-onnx", "--model", "demo")
+    command("quantize", "demo.onnx", "--calibrate", str(STREET), "--count", "4", "--check", str(STREET))
     expected = [prediction.boxes for _, prediction in run(load_model("demo"), open_sequence(STREET))]
     for engine in entries("bevcli.engines"):
         command("run", str(STREET), "--model", "demo.onnx", "--engine", engine, "--out", engine)
@@ -224,11 +224,11 @@ def test_every_command_runs_demo_from_a_file(tmp_path, monkeypatch):
         np.testing.assert_allclose(first["score"], expected[0].scores[0], atol=1e-3)
         summary = json.loads((tmp_path / engine / "summary.json").read_text())
         assert (summary["model"], summary["engine"], summary["untrained"]) == ("demo", engine, False)
-    scores = json.loads(command("validate", "demo-int8.onnx", "--data", str(STREET), "--json"))
-    reference = json.loads(command("validate", "demo", "--data", str(STREET), "--json"))
+    scores = json.loads(command("validate", "--model", "demo-int8.onnx", "--data", str(STREET), "--json"))
+    reference = json.loads(command("validate", "--model", "demo", "--data", str(STREET), "--json"))
     maps = [found["classes_with_ground_truth"]["mean_ap"] for found in (scores, reference)]
     assert abs(maps[0] - maps[1]) < 0.05  # a drive of few frames; docs/speed.md has more
-    timed = json.loads(command("bench", "--model", "demo-int8.onnx", "--frames", "2", "--json"))
+    timed = json.loads(command("bench", "--model", "demo-int8.onnx", "--count", "2", "--json"))
     assert (timed["precision"], timed["engine"]) == ("int8", "onnxruntime")
 
 

@@ -157,13 +157,13 @@ def test_commands_export_check_and_time_a_window(tmp_path, monkeypatch):
         assert old in text
         text = text.replace(old, new)
     Path("small.toml").write_text(text)
-    checked = command("export-onnx", "small.toml", "--untrained", "--decode", "--check", str(STREET))
+    checked = command("export-onnx", "--model", "small.toml", "--untrained", "--decode", "--check", str(STREET))
     largest = checked.splitlines()[-1].split()
     assert largest[0] == "largest"
     assert float(largest[2]) < 1e-3
-    timed = json.loads(command("bench", "--model", "small-v2.onnx", "--frames", "1", "--json"))
+    timed = json.loads(command("bench", "--model", "small-v2.onnx", "--count", "1", "--json"))
     assert (timed["model"], timed["engine"]) == ("small-v2", "onnxruntime")
-    scores = json.loads(command("validate", "small-v2.onnx", "--data", str(STREET), "--json"))
+    scores = json.loads(command("validate", "--model", "small-v2.onnx", "--data", str(STREET), "--json"))
     assert "classes_with_ground_truth" in scores
 
 

@@ -68,7 +68,7 @@ def test_an_existing_sequence_is_not_overwritten(written: tuple[RenderedDrive, P
 def test_the_command_renders_any_rig_at_any_size(tmp_path: Path):
     rig = nuscenes_like_rig(320, 180)
     write_calibration(tmp_path / "rig.json", type(rig)(rig.cameras[:2], rig.ego_from_bev))
-    arguments = ["render", str(tmp_path / "out"), "--seed", "4", "--frames", "1", "--rig", str(tmp_path / "rig.json")]
+    arguments = ["render", str(tmp_path / "out"), "--seed", "4", "--count", "1", "--rig", str(tmp_path / "rig.json")]
     result = CliRunner().invoke(app, [*arguments, "--resolution", "96x54", "--weather", "overcast"])
     assert result.exit_code == 0, result.output
     frame = open_sequence(tmp_path / "out").load(0)

@@ -1,0 +1,63 @@
+"""One vocabulary in all commands: a flag means the same everywhere; earlier spellings work, with a note."""
+
+import pytest
+import typer
+from command_line import command
+
+from bevcli.cli.main import app
+
+
+def commands(found=None, name=""):
+    """All commands by name."""
+    found = typer.main.get_command(app) if found is None else found
+    if not hasattr(found, "commands"):
+        return {name.strip(): found}
+    return {
+        key: each for part in found.commands for key, each in commands(found.commands[part], f"{name} {part}").items()
+    }
+
+
+def shown(command):
+    return [parameter for parameter in command.params if not getattr(parameter, "hidden", False)]
+
+
+def test_frames_is_a_range_and_count_a_number():
+    found = [(flag, each.metavar) for one in commands().values() for each in shown(one) for flag in each.opts]
+    assert {metavar for flag, metavar in found if flag == "--frames"} == {"A:B"}
+    assert sum(flag == "--count" for flag, _ in found) == 5
+
+
+def test_every_out_has_a_short_form():
+    options = {name: {flag for each in shown(found) for flag in each.opts} for name, found in commands().items()}
+    assert all(("--out" in flags) == ("-o" in flags) for flags in options.values())
+    assert sum("-o" in flags for flags in options.values()) > 8
+
+
+def test_no_command_takes_the_name_of_a_model_as_an_argument():
+    for name, found in commands().items():
+        arguments = [each.name for each in shown(found) if each.param_type_name == "argument"]
+        assert name == "quantize" or "model" not in arguments  # which converts a file
+
+
+@pytest.mark.parametrize(
+    ("arguments", "note"),
+    [
+        (("validate", "demo", "--data", "nowhere"), "the argument demo is now --model demo"),
+        (("train", "demo", "--data", "nowhere"), "the argument demo is now --model demo"),
+        (("export-onnx", "demo", "--rig", "nowhere", "--cameras", 2), "the argument demo is now --model demo"),
+        (("quantize", "nowhere.onnx", "--calibrate", "nowhere", "--frames", 3), "--frames is now --count"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, tuple) else "",
+)
+def test_an_old_form_works_with_a_note(arguments, note, tmp_path):
+    done = command(tmp_path, *arguments)
+    assert done.returncode == 1, done.stderr  # for "nowhere"
+    first, *others = done.stderr.splitlines()
+    assert first == f"note: {note}; the old form ends with this release"
+    assert others[-1].startswith("error: ")
+
+
+def test_train_asks_for_a_model(tmp_path):
+    done = command(tmp_path, "train", "--rendered", "0:2")
+    assert done.returncode == 2
+    assert "--model" in done.stderr
