@@ -41,6 +41,7 @@ def run(
     from bevcli.cli.progress import Progress
     from bevcli.cli.stop_signals import StopSignals
     from bevcli.inference.load import load_model
+    from bevcli.rig.check_drive import input_errors
     from bevcli.runs.run_into_folder import run_into_folder
     from bevcli.sequences.open import open_sequence
 
@@ -59,7 +60,7 @@ def run(
             progress.message(f"warning: {warning}")
         progress.advance()
 
-    notes = _run_notes(loaded, drive, live=output.live)
+    notes = [*input_errors(drive, shlex.quote(str(sequence))), *_run_notes(loaded, drive, live=output.live)]
     with Progress(len(drive.stamps), "frames", notes) as progress, StopSignals("frame") as signals:
         summary = run_into_folder(
             loaded,

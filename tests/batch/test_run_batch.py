@@ -275,3 +275,16 @@ def test_the_hash_of_a_job_follows_model_weights_and_options(fleet, tmp_path):
     ]
     assert len(set(hashes)) == 5
     assert replace(job, out="elsewhere", retries=0).hash(model) == job.hash(model)
+
+
+def test_the_row_of_a_drive_in_millimetres_says_so(batch, tmp_path):
+    calibration = write_drive(tmp_path / "wrong", 0) / "calibration.json"
+    content = json.loads(calibration.read_text())
+    pose = content["cameras"]["CAM_FRONT"]["ego_from_camera"]
+    pose["translation"] = [1000 * metres for metres in pose["translation"]]
+    calibration.write_text(json.dumps(content))
+    batch([str(tmp_path / "wrong")])
+    (row,) = pq.read_table(tmp_path / "out/batch.parquet").to_pylist()
+    assert row["error"] == ""
+    assert "CAM_FRONT" in row["input_errors"]
+    assert "bevcli project-debug" in row["input_errors"]
