@@ -6,14 +6,16 @@ from typing import Annotated
 
 import typer
 
-from bevcli.cli.bridge import Part
+from bevcli.cli.bridge import INPUT_OR_NAME, Part
 from bevcli.engines.options import FileOptions, OnnxOptions
 from bevcli.inference.options import ModelOptions
 
 
 def export_onnx(
     model: Annotated[
-        str, typer.Argument(help="tiny, small, base, demo, v2-t1-base, v2-t1, v2-t2, v2-t8, or a FILE.toml.")
+        str,
+        typer.Argument(help="tiny, small, base, demo, v2-t1-base, v2-t1, v2-t2, v2-t8, or a FILE.toml."),
+        INPUT_OR_NAME,
     ],
     model_options: Annotated[ModelOptions, Part(only=("weights", "untrained"))],
     file: FileOptions,

@@ -5,13 +5,13 @@ from typing import Annotated
 
 import typer
 
-from bevcli.cli.bridge import Part
+from bevcli.cli.bridge import INPUT, Part
 from bevcli.engines.options import FileOptions, QuantizeOptions
 from bevcli.inference.options import ModelOptions
 
 
 def quantize(
-    model: Annotated[Path, typer.Argument(metavar="FILE.onnx", help="A file of `bevcli export-onnx`.")],
+    model: Annotated[Path, typer.Argument(metavar="FILE.onnx", help="A file of `bevcli export-onnx`."), INPUT],
     model_options: Annotated[ModelOptions, Part(only=("engine",))],
     file: FileOptions,
     options: QuantizeOptions,

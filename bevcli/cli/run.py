@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from bevcli.cli.bridge import Part, as_flags
+from bevcli.cli.bridge import INPUT, Part, as_flags
 from bevcli.inference.options import ModelOptions
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import OutputOptions, RunOptions
@@ -24,6 +24,7 @@ def run(
     sequence: Annotated[
         Path,
         typer.Argument(help="Sequence folder (images or videos), nuScenes root, .mcap file or rosbag2 folder."),
+        INPUT,
     ],
     model: ModelOptions,
     run_options: RunOptions,
@@ -96,7 +97,7 @@ def _run_notes(model: "Model", drive: "Sequence", *, live: bool = False) -> list
     if live and later:
         found.append(f"model {model.name} looks ahead: the viewer shows a frame when {later} more are read")
     found += model.rig_notes(drive.rig)
-    if model.bundled:
+    if model.bundled and not drive.facts.rendered:
         found.append("these weights were trained on rendered streets, not on the real world (docs/model-card.md)")
     return found
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from bevcli.cli.bridge import Json, Part, print_note
+from bevcli.cli.bridge import INPUT, Json, Part, print_note
 from bevcli.inference.options import ModelOptions
 from bevcli.robustness.options import StressOptions, StressOutputOptions
 from bevcli.sequences.format import option_classes
@@ -19,6 +19,7 @@ def stress(
     sequence: Annotated[
         list[Path] | None,
         typer.Argument(help="Sequence folders with ground truth, or a nuScenes root. Or give --rendered SEEDS."),
+        INPUT,
     ] = None,
     *,
     model: Annotated[ModelOptions, Part(without=("untrained",))],

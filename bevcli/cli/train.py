@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from bevcli.cli.bridge import Part
+from bevcli.cli.bridge import INPUT_OR_NAME, Part
 from bevcli.inference.options import ModelOptions, complete_model
 from bevcli.synth.options import DriveOptions
 from bevcli.training.options import TrainOptions
@@ -16,6 +16,7 @@ def train(
         typer.Argument(
             autocompletion=complete_model, help="A model name or a FILE.toml. Its training table holds the settings."
         ),
+        INPUT_OR_NAME,
     ],
     model: Annotated[ModelOptions, Part(only=("device",))],
     drives: Annotated[DriveOptions, Part(only=("data", "rendered"))],

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from bevcli.cli.bridge import Json, Part
+from bevcli.cli.bridge import INPUT_OR_NAME, Json, Part
 from bevcli.inference.options import ModelOptions, complete_model
 from bevcli.runs.options import RunOptions
 from bevcli.synth.options import DriveOptions
@@ -14,7 +14,9 @@ from bevcli.training.options import ValidationOptions
 
 def validate(
     model: Annotated[
-        str, typer.Argument(autocompletion=complete_model, help="A model name, a FILE.toml or a FILE.onnx.")
+        str,
+        typer.Argument(autocompletion=complete_model, help="A model name, a FILE.toml or a FILE.onnx."),
+        INPUT_OR_NAME,
     ],
     model_options: Annotated[ModelOptions, Part(only=("weights", "device", "engine"))],
     run_options: Annotated[RunOptions, Part(only=("temporal",))],

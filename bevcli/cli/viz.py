@@ -5,11 +5,12 @@ from typing import Annotated
 
 import typer
 
+from bevcli.cli.bridge import INPUT
 from bevcli.viewer.options import ViewOptions
 
 
 def viz(
-    recording: Annotated[Path, typer.Argument(help="A recording (.rrd), or the output folder of `bevcli run`.")],
+    recording: Annotated[Path, typer.Argument(help="A recording (.rrd), or the output folder of `bevcli run`."), INPUT],
     options: ViewOptions,
 ) -> None:
     """Show a recording in the viewer, or write an image, a video, its boxes or a summary.

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bevcli.cli.bridge import Json, Part, command
+from bevcli.cli.bridge import INPUT, Json, Part, command
 from bevcli.engines.options import FileOptions
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ weights_app = typer.Typer(help="Inspect and convert weights files.", no_args_is_
 @command
 def inspect(
     file: Annotated[
-        Path | None, typer.Argument(help="An official .pth as published, or a .safetensors.", show_default=False)
+        Path | None, typer.Argument(help="An official .pth as published, or a .safetensors.", show_default=False), INPUT
     ] = None,
     model: Annotated[
         str | None,
@@ -63,7 +63,7 @@ def inspect(
 @weights_app.command()
 @command
 def convert(
-    source: Annotated[Path, typer.Argument(help="An official .pth as published, or a .safetensors.")],
+    source: Annotated[Path, typer.Argument(help="An official .pth as published, or a .safetensors."), INPUT],
     destination: Annotated[Path, typer.Argument(help="The .safetensors to write.")],
     options: Annotated[FileOptions, Part(only=("force",))],
 ) -> None:

@@ -45,7 +45,10 @@ class RenderOptions:
     seed: int = option(default=0, help="Seed of the drive. The same seed gives the same files.", minimum=0)
     frames: int = option(default=20, help="Number of frames.", minimum=1)
     rig: str | Path | CameraRig | None = option(
-        default=None, help="The cameras, a calibration.json. Default: six cameras like nuScenes.", metavar="FILE"
+        reads="path or name",
+        default=None,
+        help="The cameras, a calibration.json. Default: six cameras like nuScenes.",
+        metavar="FILE",
     )
     rate_hz: float = option(
         default=2.0, help="Frames per second.", flag="--rate", metavar="HZ", minimum=0.1, maximum=100
@@ -100,6 +103,7 @@ class DriveOptions:
     """Drives with ground truth: sequences, or rendered ones."""
 
     data: tuple[Path, ...] = option(
+        reads="path",
         default=(),
         help="A sequence with ground truth (see bevcli convert). Repeatable.",
         metavar="DIR",
