@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from bevcli.batch.options import BatchOptions, Workers
-from bevcli.cli.bridge import Part
+from bevcli.cli.bridge import Part, in_group
 from bevcli.inference.options import ModelOptions
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import RunOptions
@@ -17,6 +17,7 @@ from bevcli.sequences.options import SequenceOptions
 SOME_FAILED = 3  # exit code
 
 
+@in_group("Run")
 def batch(
     drives: Annotated[
         list[str] | None,

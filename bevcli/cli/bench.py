@@ -6,10 +6,11 @@ from typing import Annotated
 import typer
 
 from bevcli.benchmark.options import BenchOptions
-from bevcli.cli.bridge import Json, Part
+from bevcli.cli.bridge import Json, Part, in_group
 from bevcli.inference.options import ModelOptions
 
 
+@in_group("Deploy")
 def bench(
     model_options: Annotated[ModelOptions, Part(only=("device", "engine", "precision"))],
     options: BenchOptions,

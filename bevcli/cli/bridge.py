@@ -10,7 +10,7 @@ from contextvars import ContextVar
 from dataclasses import MISSING, Field, dataclass
 from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import typer
 
@@ -23,6 +23,7 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instea
 INPUT: Reads = "path"
 INPUT_OR_NAME: Reads = "path or name"
 
+_Listed = TypeVar("_Listed")
 _ARGUMENT = re.compile(r"`([a-z]\w*)(?:=([^`]*))?`")
 
 
@@ -97,6 +98,16 @@ class _Flag:
 
 
 _flags: ContextVar[Mapping[str, _Flag]] = ContextVar("flags", default=types.MappingProxyType({}))
+
+
+def in_group(name: str) -> Callable[[_Listed], _Listed]:
+    """A decorator that lists a command in a group of `bevcli --help`; without it, among those of installed packages."""
+
+    def decorate(found: _Listed) -> _Listed:
+        setattr(found, "group", name)  # noqa: B010, an attribute that functions do not declare
+        return found
+
+    return decorate
 
 
 def command(function: Callable[..., None]) -> Callable[..., None]:

@@ -6,11 +6,12 @@ from typing import Annotated, Any
 
 import typer
 
-from bevcli.cli.bridge import INPUT, Part
+from bevcli.cli.bridge import INPUT, Part, in_group
 from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions, WriteOptions
 
 
+@in_group("Run")
 def convert(
     source: Annotated[
         Path,

@@ -1,5 +1,6 @@
 """`bevcli demo`: render a short drive, run the model on it and open the viewer; needs no other data."""
 
+from bevcli.cli.bridge import in_group
 from bevcli.inference.options import ModelOptions
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import OutputOptions, RunOptions
@@ -10,6 +11,7 @@ from bevcli.viewer.options import ViewOptions
 RESOLUTION = (800, 450)
 
 
+@in_group("Start")
 def demo(options: DemoOptions) -> None:
     """Render a short drive, run BEVFormer on it and open the recording.
 

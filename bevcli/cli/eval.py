@@ -6,12 +6,13 @@ from typing import Annotated, Any
 
 import typer
 
-from bevcli.cli.bridge import INPUT, Json, Part, print_note
+from bevcli.cli.bridge import INPUT, Json, Part, in_group, print_note
 from bevcli.evaluation.options import EvaluationOptions
 from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
 
 
+@in_group("Score")
 def evaluate(
     predictions: Annotated[
         Path, typer.Argument(help="predictions.json, the folder of a run, or a results_nusc.json."), INPUT

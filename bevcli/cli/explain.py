@@ -5,12 +5,13 @@ from typing import Annotated
 
 import typer
 
-from bevcli.cli.bridge import INPUT, Part
+from bevcli.cli.bridge import INPUT, Part, in_group
 from bevcli.explain.options import ExplainOptions
 from bevcli.inference.options import ModelOptions
 from bevcli.sequences.options import SequenceOptions
 
 
+@in_group("Look")
 def explain(
     sequence: Annotated[
         Path, typer.Argument(help="A sequence folder, a folder of videos (one per camera), or a nuScenes root."), INPUT

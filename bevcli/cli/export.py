@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from bevcli.cli.bridge import INPUT
+from bevcli.cli.bridge import INPUT, in_group
 from bevcli.evaluation.options import ExportOptions
 
 NAMES = {
@@ -16,6 +16,7 @@ NAMES = {
 }
 
 
+@in_group("Look")
 def export(
     predictions: Annotated[
         Path, typer.Argument(help="predictions.json, ground_truth.json, or the folder of a run."), INPUT

@@ -6,11 +6,12 @@ from typing import Annotated
 
 import typer
 
-from bevcli.cli.bridge import INPUT_OR_NAME, Part
+from bevcli.cli.bridge import INPUT_OR_NAME, Part, in_group
 from bevcli.engines.options import FileOptions, OnnxOptions
 from bevcli.inference.options import ModelOptions
 
 
+@in_group("Deploy")
 def export_onnx(
     model: Annotated[
         str,

@@ -5,8 +5,10 @@ from typing import Annotated
 import typer
 
 from bevcli.batch.options import FindLikeOptions
+from bevcli.cli.bridge import in_group
 
 
+@in_group("Look")
 def find_like(
     run: Annotated[
         str,

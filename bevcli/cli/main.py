@@ -19,6 +19,8 @@ from bevcli.inference.cpu_settings import THREAD_SETTINGS, keep_freed_memory
 from bevcli.registry import entries, load
 
 GROUP = "bevcli.commands"
+GROUPS = ("Start", "Run", "Look", "Score", "Train", "Deploy")  # of commands in --help
+OTHERS = "Commands of installed packages"
 
 
 class _Commands(Mapping[str, Any]):
@@ -48,6 +50,14 @@ class _Group(TyperGroup):
         """The names of all commands; imports none of them."""
         return list(self.commands)
 
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Print the help with the commands in their groups, in the order of a user's day."""
+        groups = {name: self.commands[name].rich_help_panel for name in self.commands}
+        places = {name: GROUPS.index(group) if group in GROUPS else len(GROUPS) for name, group in groups.items()}
+        order = sorted(places, key=lambda name: (places[name], name))
+        self.list_commands = lambda ctx: order  # type: ignore[method-assign]
+        super().format_help(ctx, formatter)
+
 
 def click_command(name: str, found: Any) -> Any:
     """The command of an entry point: a function, which may take dataclasses of options, or a Typer with several."""
@@ -55,8 +65,8 @@ def click_command(name: str, found: Any) -> Any:
     if not isinstance(found, typer.Typer):
         app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
         app.command(name)(command(found))
-    made = typer.main.get_command(app)
-    made.name = name
+    made: Any = typer.main.get_command(app)
+    made.name, made.rich_help_panel = name, getattr(found, "group", OTHERS)
     return made
 
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from bevcli.cli.bridge import INPUT, Json, Part, as_flags
+from bevcli.cli.bridge import INPUT, Json, Part, as_flags, in_group
 from bevcli.rig.options import CheckOptions
 from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
@@ -14,6 +14,7 @@ from bevcli.sequences.options import SequenceOptions
 ERRORS_FOUND = 3
 
 
+@in_group("Run")
 def project_debug(
     calibration: Annotated[
         Path, typer.Argument(help="A calibration.json, a sequence that contains one, or a ROS bag."), INPUT

@@ -5,11 +5,12 @@ from typing import Annotated
 
 import typer
 
-from bevcli.cli.bridge import INPUT, Part
+from bevcli.cli.bridge import INPUT, Part, in_group
 from bevcli.engines.options import FileOptions, QuantizeOptions
 from bevcli.inference.options import ModelOptions
 
 
+@in_group("Deploy")
 def quantize(
     model: Annotated[Path, typer.Argument(metavar="FILE.onnx", help="A file of `bevcli export-onnx`."), INPUT],
     model_options: Annotated[ModelOptions, Part(only=("engine",))],

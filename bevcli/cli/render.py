@@ -5,9 +5,11 @@ from typing import Annotated
 
 import typer
 
+from bevcli.cli.bridge import in_group
 from bevcli.synth.options import RenderOptions
 
 
+@in_group("Start")
 def render(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="The sequence folder to write.")],
     options: RenderOptions,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from bevcli.cli.bridge import INPUT, Part, as_flags
+from bevcli.cli.bridge import INPUT, Part, as_flags, in_group
 from bevcli.inference.options import ModelOptions
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import OutputOptions, RunOptions
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from bevcli.inference.load import Model
 
 
+@in_group("Run")
 def run(
     sequence: Annotated[
         Path,

@@ -6,11 +6,13 @@ from typing import Annotated
 
 import typer
 
+from bevcli.cli.bridge import in_group
 from bevcli.errors import OutputError
 
 NAME = "street"
 
 
+@in_group("Start")
 def samples(
     out: Annotated[Path, typer.Option(metavar="DIR", help="The folder that gets the sample.")] = Path("samples"),
 ) -> None:

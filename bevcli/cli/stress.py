@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from bevcli.cli.bridge import INPUT, Json, Part, print_note
+from bevcli.cli.bridge import INPUT, Json, Part, in_group, print_note
 from bevcli.inference.options import ModelOptions
 from bevcli.robustness.options import StressOptions, StressOutputOptions
 from bevcli.sequences.format import option_classes
@@ -15,6 +15,7 @@ from bevcli.sequences.options import SequenceOptions
 from bevcli.synth.options import DriveOptions
 
 
+@in_group("Score")
 def stress(
     sequence: Annotated[
         list[Path] | None,

@@ -4,12 +4,13 @@ from typing import Annotated
 
 import typer
 
-from bevcli.cli.bridge import INPUT_OR_NAME, Part
+from bevcli.cli.bridge import INPUT_OR_NAME, Part, in_group
 from bevcli.inference.options import ModelOptions, complete_model
 from bevcli.synth.options import DriveOptions
 from bevcli.training.options import TrainOptions
 
 
+@in_group("Train")
 def train(
     config: Annotated[
         str,

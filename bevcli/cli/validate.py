@@ -5,13 +5,14 @@ from typing import Annotated
 
 import typer
 
-from bevcli.cli.bridge import INPUT_OR_NAME, Json, Part
+from bevcli.cli.bridge import INPUT_OR_NAME, Json, Part, in_group
 from bevcli.inference.options import ModelOptions, complete_model
 from bevcli.runs.options import RunOptions
 from bevcli.synth.options import DriveOptions
 from bevcli.training.options import ValidationOptions
 
 
+@in_group("Score")
 def validate(
     model: Annotated[
         str,

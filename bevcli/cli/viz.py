@@ -5,10 +5,11 @@ from typing import Annotated
 
 import typer
 
-from bevcli.cli.bridge import INPUT
+from bevcli.cli.bridge import INPUT, in_group
 from bevcli.viewer.options import ViewOptions
 
 
+@in_group("Look")
 def viz(
     recording: Annotated[Path, typer.Argument(help="A recording (.rrd), or the output folder of `bevcli run`."), INPUT],
     options: ViewOptions,

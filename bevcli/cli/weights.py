@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bevcli.cli.bridge import INPUT, Json, Part, command
+from bevcli.cli.bridge import INPUT, Json, Part, command, in_group
 from bevcli.engines.options import FileOptions
 
 if TYPE_CHECKING:
     from bevcli.checkpoints import Checkpoint
     from bevcli.model.parts import ModelPart
 
-weights_app = typer.Typer(help="Inspect and convert weights files.", no_args_is_help=True)
+weights_app = in_group("Train")(typer.Typer(help="Inspect and convert weights files.", no_args_is_help=True))
 
 
 @weights_app.command()

@@ -32,6 +32,13 @@ def test_help_names_the_extras_that_a_command_needs(name, extra):
     assert f"bevcli[{extra}]" in command(ROOT, name, "--help").stdout
 
 
+def test_help_lists_every_command_in_a_group_in_order():
+    shown = command(ROOT, "--help").stdout
+    places = [shown.index(f"─ {group} ─") for group in ("Start", "Run", "Look", "Score", "Train", "Deploy")]
+    assert places == sorted(places)
+    assert "─ Commands" not in shown
+
+
 def test_a_mistake_in_usage_exits_2():
     assert command(ROOT, "run").returncode == 2
 
@@ -176,7 +183,8 @@ def test_a_command_of_another_package_appears(tmp_path):
         command = [sys.executable, "-m", "bevcli", *arguments]
         return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
 
-    assert "Print a greeting." in program("--help").stdout
+    shown = program("--help").stdout
+    assert shown.index("Deploy") < shown.index("Commands of installed packages") < shown.index("Print a greeting.")
     assert program("greet", "--to", "me").stdout == "hello me\n"
     assert program("greet", "--to", "nobody").stderr == "error: pass another --to\n"
 
