@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
-from bevcli.geometry.ego_motion import Kinematics
+from bevcli.geometry.ego_motion import EgoMotion, Kinematics
 from bevcli.geometry.geographic import GeoOrigin
 from bevcli.geometry.transforms import Array, Pose
 
@@ -138,6 +138,7 @@ class Sequence(Protocol):
             frame only.
         notes: assumptions and defaults that the user should be told once.
         facts: statements of the drive about itself.
+        ego_motion: the poses of the whole drive, where it has them in one table; else None.
     """
 
     name: str
@@ -146,6 +147,7 @@ class Sequence(Protocol):
     has_ego_motion: bool
     notes: tuple[str, ...] = ()
     facts: DriveFacts = DriveFacts()
+    ego_motion: EgoMotion | None = None
 
     @property
     def input_files(self) -> tuple[Path, ...]:
@@ -171,6 +173,7 @@ class DerivedSequence(Sequence):
         self.sequence = sequence
         self.name, self.rig, self.stamps = sequence.name, sequence.rig, sequence.stamps
         self.has_ego_motion, self.notes, self.facts = sequence.has_ego_motion, sequence.notes, sequence.facts
+        self.ego_motion = sequence.ego_motion
 
     @property
     def input_files(self) -> tuple[Path, ...]:

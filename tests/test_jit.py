@@ -1,5 +1,6 @@
 """A read-only installation without a writable home compiles without a cache, or with one in the temporary folder."""
 
+import importlib
 import os
 import shutil
 import stat
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import bevcli
+from bevcli.jit import is_compiled
 
 CODE = "import bevcli.model.kernels.bilinear, bevcli.synth.render.rasteriser; print('ok')"
 
@@ -63,3 +65,16 @@ def test_a_temporary_folder_that_others_can_write_is_not_used(read_only, tmp_pat
     assert (done.returncode, done.stdout) == (0, "ok\n"), done.stderr
     assert "not cached" in done.stderr
     assert not any(shared.iterdir())
+
+
+def test_a_function_is_compiled_once_its_cache_is_written(tmp_path, monkeypatch):
+    (tmp_path / "doubling.py").write_text(
+        "from bevcli.jit import njit\n\n@njit()\ndef double(number):\n    return 2 * number\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    double = importlib.import_module("doubling").double
+    assert not is_compiled(double)
+    assert double(3) == 6
+    assert is_compiled(double)
+    os.utime(tmp_path / "doubling.py", (2e9, 2e9))  # a later version of the file
+    assert not is_compiled(double)

@@ -55,6 +55,7 @@ class BatchOptions:
 
     out: str = option(help="Folder or URL of the batch.")
     listed: Path | None = option(
+        reads="path",
         default=None,
         help="A text file with one drive per line; # starts a comment.",
         flag="--list",
@@ -82,7 +83,9 @@ class FindLikeOptions:
     """A frame of a batch, and how many similar ones are listed."""
 
     frame: int = option(help="The index of the frame.", metavar="K")
-    batch: str = option(help="Folder or URL of a batch of `bevcli batch --embed`.", flag="--in", metavar="BATCH_DIR")
+    batch: str = option(
+        reads="path", help="Folder or URL of a batch of `bevcli batch --embed`.", flag="--in", metavar="BATCH_DIR"
+    )
     count: int = option(default=12, help="Number of frames.", minimum=1)
     per_drive: int = option(default=3, help="At most this many frames of each drive.", minimum=1)
     html: Path | None = option(

@@ -44,6 +44,7 @@ COLUMNS: dict[str, pa.DataType] = {
     **dict.fromkeys(("mean_ap", "nd_score", *ERRORS, *(f"iou_{name}" for name in MAP_CLASSES)), pa.float64()),
     "ground_truth_boxes": pa.int64(),
     "not_scored": pa.string(),
+    "input_errors": pa.string(),
 }
 
 

@@ -128,6 +128,7 @@ class Worker:
                 "score_histogram": histogram.tolist(),
                 "scores": None if scores is None else _score_columns(scores),
                 "not_scored": why_not,
+                "input_errors": "; ".join(summary.input_errors),
             }
             _rewrite_paths(aside, f"{self._out.where}/{RESULTS}/{result}")
             (aside / RECORD).write_text(json.dumps(record, indent=1) + "\n")

@@ -85,6 +85,8 @@ def batch(
     def show(row: dict[str, Any]) -> None:
         if row.get("error"):
             progress.message(f"failed: {row['drive']}: {row['error']}")
+        if row.get("input_errors"):
+            progress.message(f"warning: {row['drive']}: {row['input_errors']}")
         progress.advance()
 
     with Progress(len(found), "drives", notes) as progress, StopSignals("frame", at_once=not alone) as signals:

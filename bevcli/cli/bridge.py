@@ -3,6 +3,7 @@
 import ast
 import copy
 import dataclasses
+import os
 import re
 import types
 from collections.abc import Callable, Iterable, Mapping
@@ -14,11 +15,15 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import typer
 
-from bevcli.errors import BevcliError
-from bevcli.options import Option, defaults, flag_of, option_of
+from bevcli.errors import BevcliError, InputError
+from bevcli.options import Option, Reads, defaults, flag_of, option_of
 from bevcli.printing import one_line, say
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
+
+# In an annotation of an argument, see `Option.reads`.
+INPUT: Reads = "path"
+INPUT_OR_NAME: Reads = "path or name"
 
 _ARGUMENT = re.compile(r"`([a-z]\w*)(?:=([^`]*))?`")
 
@@ -145,6 +150,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     arguments: set[str] = set()
     flags: dict[str, _Flag] = {}
     makers: dict[str, tuple[Callable[..., Any], list[str]]] = {}
+    inputs: dict[str, Reads] = {}
     hints = get_type_hints(function, include_extras=True)
     for parameter in signature(function).parameters.values():
         hint = hints[parameter.name]
@@ -152,11 +158,14 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         if make is None:
             parts.append(parameter.replace(kind=Parameter.KEYWORD_ONLY, annotation=hint))
             arguments |= {parameter.name} if OldArgument in getattr(hint, "__metadata__", ()) else set()
+            for mark in (each for each in get_args(hint) if each in (INPUT, INPUT_OR_NAME)):
+                inputs[parameter.name] = mark
             continue
         for name in found.keys() & flags.keys():  # one of them is of another package
             raise BevcliError(f"command {function.__name__}: two options are named {name}: rename one")
         makers[parameter.name] = make, list(found)
         flags |= found
+        inputs |= {name: flag.option.reads for name, flag in found.items() if flag.option.reads is not None}
         parts += found.values()
 
     def called(**given: Any) -> None:
@@ -164,9 +173,11 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         try:
             for each in old:
                 each.move(given)
+            paths = [(given[name], reads) for name, reads in inputs.items()]
             for parameter, (make, names) in makers.items():
                 values = {name: flags[name].value(given.pop(name)) for name in names}
                 given[parameter] = make(**{name: value for name, value in values.items() if value is not MISSING})
+            _require_inputs(paths)
             function(**given)
         except BevcliError as error:
             error.args = (as_flags(str(error)), *error.args[1:])
@@ -181,6 +192,27 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     old += [_Old(each, f"--{each.name}") for each in parameters if each.name in arguments]
     called.__signature__ = Signature([*parameters, *(each.parameter for each in old)])  # type: ignore[attr-defined]
     return called
+
+
+def _require_inputs(given: Iterable[tuple[Any, Reads]]) -> None:
+    """Raise InputError for a path that does not exist, before anything is imported that takes seconds."""
+    for values, reads in given:
+        for value in values if isinstance(values, list | tuple) else [values]:
+            text = "" if value is None else str(value)
+            is_name = "://" in text or (reads == "path or name" and not Path(text).suffix and os.sep not in text)
+            if text and not is_name and not (_exists(Path(text)) or _exists(Path(f"{text}.partial"))):
+                raise InputError(f"{text}: there is no such file or folder")
+
+
+def _exists(path: Path) -> bool:
+    """Whether a path may be read; other errors than a missing file are told where it is read."""
+    try:
+        path.stat()
+    except (FileNotFoundError, NotADirectoryError, ValueError):
+        return False
+    except OSError:
+        return True
+    return True
 
 
 def as_flags(text: str) -> str:

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from bevcli.cli.bridge import Part
+from bevcli.cli.bridge import INPUT, Part
 from bevcli.printing import say
 from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions, WriteOptions
@@ -21,6 +21,7 @@ def convert(
             metavar="INPUT",
             help="Sequence folder (images or videos), nuScenes root, .mcap file or rosbag2 folder.",
         ),
+        INPUT,
     ],
     out: Annotated[Path, typer.Argument(metavar="OUT_SEQUENCE", help="The native sequence folder to write.")],
     options: Annotated[SequenceOptions, Part(only=("strict", "scene", "ground_truth", "allow_outside"))],

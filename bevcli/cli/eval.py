@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from bevcli.cli.bridge import Json, Part, print_note
+from bevcli.cli.bridge import INPUT, Json, Part, print_note
 from bevcli.evaluation.options import EvaluationOptions
 from bevcli.printing import say
 from bevcli.sequences.format import option_classes
@@ -16,10 +16,11 @@ PANEL = "Score"
 
 
 def evaluate(
-    predictions: Annotated[Path, typer.Argument(help="predictions.json, the folder of a run, or a results_nusc.json.")],
+    predictions: Annotated[
+        Path, typer.Argument(help="predictions.json, the folder of a run, or a results_nusc.json."), INPUT
+    ],
     ground_truth: Annotated[
-        Path,
-        typer.Argument(help="ground_truth.json, a sequence folder that contains one, or a nuScenes root."),
+        Path, typer.Argument(help="ground_truth.json, a sequence folder that contains one, or a nuScenes root."), INPUT
     ],
     source: Annotated[SequenceOptions, Part(only=("scene",))],
     format_options: Annotated[dict[str, Any], Part(only=("version", "split", "class_map"), classes=option_classes)],

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from bevcli.cli.bridge import Part
+from bevcli.cli.bridge import INPUT, Part
 from bevcli.explain.options import ExplainOptions
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
@@ -16,7 +16,7 @@ PANEL = "Look"
 
 def explain(
     sequence: Annotated[
-        Path, typer.Argument(help="A sequence folder, a folder of videos (one per camera), or a nuScenes root.")
+        Path, typer.Argument(help="A sequence folder, a folder of videos (one per camera), or a nuScenes root."), INPUT
     ],
     model: Annotated[ModelOptions, Part(only=("model", "weights", "untrained", "device"))],
     options: ExplainOptions,

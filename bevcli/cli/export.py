@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from bevcli.cli.bridge import INPUT
 from bevcli.evaluation.options import ExportOptions
 from bevcli.printing import say
 
@@ -18,7 +19,9 @@ NAMES = {
 
 
 def export(
-    predictions: Annotated[Path, typer.Argument(help="predictions.json, ground_truth.json, or the folder of a run.")],
+    predictions: Annotated[
+        Path, typer.Argument(help="predictions.json, ground_truth.json, or the folder of a run."), INPUT
+    ],
     options: ExportOptions,
 ) -> None:
     """Write boxes as a CSV table, as KITTI labels of one camera, or as a nuScenes submission for detection or tracking.

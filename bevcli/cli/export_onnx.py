@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from bevcli.cli.bridge import OldArgument, Part
+from bevcli.cli.bridge import INPUT_OR_NAME, OldArgument, Part
 from bevcli.engines.options import FileOptions, OnnxOptions
 from bevcli.inference.options import ModelOptions, complete_model
 from bevcli.printing import say
@@ -24,6 +24,7 @@ def export_onnx(
             rich_help_panel="Model",
         ),
         OldArgument,
+        INPUT_OR_NAME,
     ] = None,
     *,
     model_options: Annotated[ModelOptions, Part(only=("weights", "untrained"))],

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from bevcli.cli.bridge import Json, Part, as_flags
+from bevcli.cli.bridge import INPUT, Json, Part, as_flags
 from bevcli.printing import say
 from bevcli.rig.options import CheckOptions
 from bevcli.sequences.format import option_classes
@@ -18,7 +18,7 @@ ERRORS_FOUND = 3
 
 def project_debug(
     calibration: Annotated[
-        Path, typer.Argument(help="A calibration.json, a sequence that contains one, or a ROS bag.")
+        Path, typer.Argument(help="A calibration.json, a sequence that contains one, or a ROS bag."), INPUT
     ],
     source: Annotated[SequenceOptions, Part(only=("allow_outside",))],
     format_options: Annotated[dict[str, Any], Part(only=("topics", "topics_file"), classes=option_classes)],

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from bevcli.cli.bridge import Part
+from bevcli.cli.bridge import INPUT, Part
 from bevcli.engines.options import FileOptions, QuantizeOptions
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
@@ -14,7 +14,7 @@ PANEL = "Deploy"
 
 
 def quantize(
-    model: Annotated[Path, typer.Argument(metavar="FILE.onnx", help="A file of `bevcli export-onnx`.")],
+    model: Annotated[Path, typer.Argument(metavar="FILE.onnx", help="A file of `bevcli export-onnx`."), INPUT],
     model_options: Annotated[ModelOptions, Part(only=("engine",))],
     file: FileOptions,
     options: QuantizeOptions,

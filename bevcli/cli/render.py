@@ -17,9 +17,12 @@ def render(
 ) -> None:
     """Render a drive through a procedural city as a sequence with ground truth boxes and maps."""
     from bevcli.cli.progress import Progress
+    from bevcli.jit import is_compiled
     from bevcli.synth.export import render as render_sequence
+    from bevcli.synth.render.shading_kernels import shade_pixels
 
-    say("note: the first rendering on a computer compiles the renderer, about 15 s", err=True)
+    if not is_compiled(shade_pixels):
+        say("note: the first rendering on a computer compiles the renderer, about 15 s", err=True)
     with Progress(options.frames, "frames") as progress:
         summary = render_sequence(out, options, progress=lambda frame: progress.advance())
     cameras = len(summary.cameras)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from bevcli.cli.bridge import Part, as_flags
+from bevcli.cli.bridge import INPUT, Part, as_flags
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
 from bevcli.recording.options import RecordingOptions
@@ -26,6 +26,7 @@ def run(
     sequence: Annotated[
         Path,
         typer.Argument(help="Sequence folder (images or videos), nuScenes root, .mcap file or rosbag2 folder."),
+        INPUT,
     ],
     model: ModelOptions,
     run_options: RunOptions,
@@ -43,6 +44,7 @@ def run(
     from bevcli.cli.progress import Progress
     from bevcli.cli.stop_signals import StopSignals
     from bevcli.inference.load import load_model
+    from bevcli.rig.check_drive import input_errors
     from bevcli.runs.run_into_folder import run_into_folder
     from bevcli.sequences.open import open_sequence
 
@@ -61,7 +63,7 @@ def run(
             progress.message(f"warning: {warning}")
         progress.advance()
 
-    notes = _run_notes(loaded, drive, live=output.live)
+    notes = [*input_errors(drive, shlex.quote(str(sequence))), *_run_notes(loaded, drive, live=output.live)]
     with Progress(len(drive.stamps), "frames", notes) as progress, StopSignals("frame") as signals:
         summary = run_into_folder(
             loaded,
@@ -97,7 +99,7 @@ def _run_notes(model: "Model", drive: "Sequence", *, live: bool = False) -> list
     if live and later:
         found.append(f"model {model.name} looks ahead: the viewer shows a frame when {later} more are read")
     found += model.rig_notes(drive.rig)
-    if model.bundled:
+    if model.bundled and not drive.facts.rendered:
         found.append("these weights were trained on rendered streets, not on the real world (docs/model-card.md)")
     return found
 

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from bevcli.cli.bridge import OldArgument, Part
+from bevcli.cli.bridge import INPUT_OR_NAME, OldArgument, Part
 from bevcli.inference.options import ModelOptions, complete_model
 from bevcli.synth.options import DriveOptions
 from bevcli.training.options import TrainOptions
@@ -22,6 +22,7 @@ def train(
             show_default=False,
         ),
         OldArgument,
+        INPUT_OR_NAME,
     ] = "",
     *,
     model_options: Annotated[ModelOptions, Part(only=("device",))],

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from bevcli.cli.bridge import Json, OldArgument, Part
+from bevcli.cli.bridge import INPUT_OR_NAME, Json, OldArgument, Part
 from bevcli.inference.options import ModelOptions, complete_model
 from bevcli.printing import say
 from bevcli.runs.options import RunOptions
@@ -24,6 +24,7 @@ def validate(
             rich_help_panel="Model",
         ),
         OldArgument,
+        INPUT_OR_NAME,
     ] = None,
     *,
     model_options: Annotated[ModelOptions, Part(only=("weights", "device", "engine"))],

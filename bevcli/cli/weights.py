@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bevcli.cli.bridge import Json, Part, command
+from bevcli.cli.bridge import INPUT, Json, Part, command
 from bevcli.cli.help_text import PlainCommand
 from bevcli.engines.options import FileOptions
 from bevcli.printing import say
@@ -26,7 +26,7 @@ weights_app = typer.Typer(
 @command
 def inspect(
     file: Annotated[
-        Path | None, typer.Argument(help="An official .pth as published, or a .safetensors.", show_default=False)
+        Path | None, typer.Argument(help="An official .pth as published, or a .safetensors.", show_default=False), INPUT
     ] = None,
     model: Annotated[
         str | None,
@@ -69,7 +69,7 @@ def inspect(
 @weights_app.command(cls=PlainCommand)
 @command
 def convert(
-    source: Annotated[Path, typer.Argument(help="An official .pth as published, or a .safetensors.")],
+    source: Annotated[Path, typer.Argument(help="An official .pth as published, or a .safetensors."), INPUT],
     destination: Annotated[Path, typer.Argument(help="The .safetensors to write.")],
     options: Annotated[FileOptions, Part(only=("force",))],
 ) -> None:

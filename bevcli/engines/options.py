@@ -34,6 +34,7 @@ class OnnxOptions:
     )
     cameras: int | None = option(default=None, help="Number of cameras. Default: the model's.", minimum=1)
     rig: Path | None = option(
+        reads="path",
         default=None,
         help="A calibration.json: the file is for its number of cameras and, with demo, in the image size for their "
         "fields of view.",
@@ -47,6 +48,7 @@ class OnnxOptions:
     )
     decode: bool = option(default=False, help="Add the outputs boxes, scores and classes.")
     check: Path | None = option(
+        reads="path",
         default=None,
         help="Run this drive through the file and through our model, and print the largest differences.",
         metavar="SEQUENCE",
@@ -58,7 +60,10 @@ class QuantizeOptions:
     """The drives whose images calibrate a quantised file, and a check of it."""
 
     calibrate: tuple[Path, ...] = option(
-        help="Drive whose images give the ranges of the numbers. Repeatable.", metavar="SEQUENCE", repeatable=True
+        reads="path",
+        help="Drive whose images give the ranges of the numbers. Repeatable.",
+        metavar="SEQUENCE",
+        repeatable=True,
     )
     frames: int = option(
         default=16,
@@ -69,6 +74,7 @@ class QuantizeOptions:
         minimum=1,
     )
     check: Path | None = option(
+        reads="path",
         default=None,
         help="Run this drive through both files, and print the largest differences.",
         metavar="SEQUENCE",

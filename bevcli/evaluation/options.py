@@ -41,7 +41,7 @@ class ExportOptions:
     )
     score: float = option(default=0.0, help="Leave out boxes scored below this.", minimum=0, maximum=1)
     calibration: Path | None = option(
-        default=None, help="kitti: calibration.json, or the sequence folder that contains it."
+        reads="path", default=None, help="kitti: calibration.json, or the sequence folder that contains it."
     )
     camera: str | None = option(
         default=None, help="kitti: the camera. Default: CAM_FRONT, else the one that looks most directly ahead."

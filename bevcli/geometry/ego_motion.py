@@ -1,6 +1,6 @@
 """The vehicle's poses and kinematics over time, with interpolation between the stored times."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +58,11 @@ class EgoMotion:
     def last_ns(self) -> int:
         """Time of the last pose."""
         return int(self.timestamps_ns[-1])
+
+    def of_rows(self, rows: NDArray[np.int64]) -> "EgoMotion":
+        """The poses and kinematics of some rows, by their increasing indices."""
+        columns = [each.name for each in fields(self) if each.name != "velocities_are_stated"]
+        return replace(self, **{name: getattr(self, name)[rows] for name in columns})
 
     def pose_at(self, timestamp_ns: int) -> Pose:
         """world_from_ego at a time. The pose of an exactly matching row is returned unchanged.

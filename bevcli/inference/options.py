@@ -27,12 +27,14 @@ class ModelOptions:
     """The options of `load_model`."""
 
     model: str | Path | None = option(
+        reads="path or name",
         default=None,
         help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, uniad-track-map, demo, a FILE.toml or a FILE.onnx of "
         "`bevcli export-onnx`. Default: the model that WEIGHTS fit, else demo.",
         complete=complete_model,
     )
     weights: Path | None = option(
+        reads="path",
         default=None,
         help="An official .pth file or a .safetensors file. Default: the weights in the package (demo).",
     )

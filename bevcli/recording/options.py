@@ -58,6 +58,7 @@ class RecordingOptions:
         repeatable=True,
     )
     vehicle_mesh: Path | None = option(
+        reads="path",
         default=None,
         help="Draw the ego vehicle from this mesh (.glb, .ply, .obj, …; metres, origin on the ground under the rear "
         "axle; axes in docs/recording.md). Default: a plain car.",

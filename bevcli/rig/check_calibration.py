@@ -1,9 +1,8 @@
 """`check_calibration`: read a calibration and the data of its sequence, run all checks, and keep what they found."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +13,9 @@ from bevcli.errors import InputError
 from bevcli.findings import Finding, errors_of
 from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.cameras import CameraRig
-from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.rig.coverage import Coverage
 from bevcli.rig.rig_report import RigReport, check_rig, report_text, with_findings
-from bevcli.rig.sequence_checks import check_camera_times, check_ego_motion
+from bevcli.rig.sequence_checks import check_camera_times, check_scenes
 from bevcli.sequences.files.calibration_file import draft_calibration
 from bevcli.sequences.native.folder import FolderSequence
 from bevcli.sequences.native.tables import read_frames_table
@@ -154,8 +152,7 @@ def _read_folder(folder: Path, rig: CameraRig, frame: int, allow_outside: bool) 
         except InputError:
             return tuple(findings), {}
     if sequence.ego_motion is not None:
-        for part in _split_by_scene(sequence.ego_motion, sequence.stamps):
-            findings += check_ego_motion(part)
+        findings += check_scenes(sequence.ego_motion, sequence.stamps)
     if (folder / "frames.csv").is_file():
         findings += _check_times(folder / "frames.csv", rig)
     index = _checked_index(sequence.stamps, frame, folder)
@@ -170,19 +167,6 @@ def _checked_index(stamps: tuple[FrameStamp, ...], frame: int, path: Path) -> in
     if not 0 <= frame < len(stamps):
         raise InputError(f"{path}: the sequence has no frame {frame} (it has {len(stamps)} frames, counted from 0)")
     return frame
-
-
-def _split_by_scene(ego_motion: EgoMotion, stamps: tuple[FrameStamp, ...]) -> Iterator[EgoMotion]:
-    """The ego-motion of each scene: cut midway between frames of different scenes, where the pose may jump."""
-    changes = [(a.timestamp_ns + b.timestamp_ns) // 2 for a, b in pairwise(stamps) if a.scene != b.scene]
-    times = ego_motion.timestamps_ns
-    rows = np.split(np.arange(len(times)), np.searchsorted(times, np.sort(np.array(changes, dtype=np.int64))))
-    for part in rows:
-        if len(part) > 1:
-            columns = {
-                name: values[part] for name, values in vars(ego_motion).items() if name != "velocities_are_stated"
-            }
-            yield replace(ego_motion, **columns)
 
 
 def _check_times(table: Path, rig: CameraRig) -> tuple[Finding, ...]:

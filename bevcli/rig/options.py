@@ -13,11 +13,12 @@ class CheckOptions:
     """The sequence that belongs to a calibration, the model that its rig is compared with, and the output."""
 
     sequence: Path | None = option(
-        default=None, help="A sequence folder whose images and ego-motion belong to the calibration."
+        reads="path", default=None, help="A sequence folder whose images and ego-motion belong to the calibration."
     )
     frame: int = option(default=0, help="Index of the frame whose images are drawn on.", minimum=0)
     out: Path | None = option(default=None, help="The output folder. Default: runs/<name>-project-debug.")
     model: str = option(
+        reads="path or name",
         default="demo",
         help="Compare the rig with those that this model's weights were trained on: a model name or a FILE.toml.",
         complete=complete_model,

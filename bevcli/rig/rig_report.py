@@ -43,6 +43,22 @@ def check_rig(rig: CameraRig, found_before: Sequence[Finding] = ()) -> RigReport
     compared only for cameras with plausible poses, and coverage and the comparison with nuScenes are reported only
     where there is no error.
     """
+    findings = _findings(rig, found_before)
+    coverage = coverage_of(rig)
+    measures: tuple[Measure, ...] = ()
+    if rig.cameras and not errors_of(findings):
+        measures = measures_of(rig.cameras, coverage)
+        findings += [*check_coverage(coverage, rig.ego_from_bev), *check_measures(measures)]
+    return RigReport(_by_severity(findings), coverage, measures)
+
+
+def rig_errors(rig: CameraRig) -> tuple[Finding, ...]:
+    """The errors that `check_rig` finds, without the time that the coverage takes."""
+    return errors_of(_findings(rig, ()))
+
+
+def _findings(rig: CameraRig, found_before: Sequence[Finding]) -> list[Finding]:
+    """All findings but those about coverage and the comparison with nuScenes."""
     cameras = _without_errors(rig.cameras, found_before)
     poses, lenses = check_poses(cameras), check_lenses(cameras)
     names = check_names(_without_errors(cameras, poses)) + _names_behind(poses, cameras)
@@ -51,12 +67,7 @@ def check_rig(rig: CameraRig, found_before: Sequence[Finding] = ()) -> RigReport
     findings = [*found_before, *_merged(poses, cameras), *_merged(lenses, cameras), *names, *bev]
     if rig.ego_from_bev_assumed:
         findings.append(BEV_ASSUMED)
-    coverage = coverage_of(rig)
-    measures: tuple[Measure, ...] = ()
-    if rig.cameras and not errors_of(findings):
-        measures = measures_of(rig.cameras, coverage)
-        findings += [*check_coverage(coverage, rig.ego_from_bev), *check_measures(measures)]
-    return RigReport(_by_severity(findings), coverage, measures)
+    return findings
 
 
 def _names_behind(poses: Sequence[Finding], cameras: Sequence[Camera]) -> tuple[Finding, ...]:

@@ -28,6 +28,7 @@ class StressOptions:
         metavar="METRES",
     )
     against: Path | None = option(
+        reads="path",
         default=None,
         help="The stress.json of another model on the same drives: adds corruption errors and mCE.",
         panel="Output",

@@ -11,6 +11,7 @@ from bevcli._version import __version__
 from bevcli.duration import duration
 from bevcli.frame import Frame, Prediction, Sequence
 from bevcli.inference.load import Model
+from bevcli.rig.check_drive import input_errors
 from bevcli.runs.folder import SUMMARY
 from bevcli.runs.options import RunOptions
 from bevcli.writing import write_whole
@@ -90,11 +91,13 @@ class RunSummary:
     Attributes:
         files: that the run wrote.
         counts: so far.
+        input_errors: one line for each, see `bevcli.rig.check_drive`.
     """
 
     def __init__(self, model: Model, sequence: Sequence, options: RunOptions, counts: Counts) -> None:
         self.files: tuple[Path, ...] = ()
         self._model, self._sequence, self._options, self.counts = model, sequence, options, counts
+        self.input_errors = input_errors(sequence)
 
     def add(self, frame: Frame, prediction: Prediction, recording_s: float, whole_s: float) -> None:
         """Count a frame. recording_s: spent on writing. whole_s: since the frame before was done."""
@@ -157,7 +160,7 @@ class RunSummary:
             "skipped_frames": counts.skipped,
             "not_finite_frames": _rows(counts.not_finite, "frame", "where"),
             "started_anew": _rows(counts.started_anew, "frame", "reason"),
-            "notes": [*self._sequence.notes, *self._model.rig_notes(self._sequence.rig)],
+            "notes": [*self._sequence.notes, *self.input_errors, *self._model.rig_notes(self._sequence.rig)],
             "files": [str(path) for path in self.files],
         }
 
@@ -188,6 +191,7 @@ class RunSummary:
             rows.append(("failed", f"{len(counts.not_finite)} frames: NaN or infinity, first in {where}"))
         if self._model.untrained:
             rows.append(("weights", "UNTRAINED: random weights, the boxes are meaningless"))
+        rows += [("rig", note) for note in self.input_errors]
         rows += [("rig", note) for note in self._model.rig_notes(self._sequence.rig)]
         rows += [("written", str(path)) for path in self.files]
         return "\n".join(f"{name:<8} {text}" for name, text in rows)

@@ -110,15 +110,21 @@ class RigOptions(FormatOptions):
     """Files that replace the calibration and the ego-motion of an input. A format that takes them inherits them."""
 
     intrinsics: Path | None = option(
-        default=None, help="Kalibr camchain or ROS camera_info YAML, or a folder of these; replaces calibration.json."
+        reads="path",
+        default=None,
+        help="Kalibr camchain or ROS camera_info YAML, or a folder of these; replaces calibration.json.",
     )
     extrinsics: Path | None = option(
-        default=None, help='JSON with the "ego_from_camera" of each camera; required with `intrinsics`.'
+        reads="path", default=None, help='JSON with the "ego_from_camera" of each camera; required with `intrinsics`.'
     )
     calibration: Path | None = option(
-        default=None, help="A calibration.json that replaces the calibration of the input.", metavar="FILE"
+        reads="path",
+        default=None,
+        help="A calibration.json that replaces the calibration of the input.",
+        metavar="FILE",
     )
     ego_motion_file: Path | None = option(
+        reads="path",
         default=None,
         help="An ego_motion.csv that replaces the ego-motion of the input.",
         flag="--ego-motion",

@@ -47,7 +47,10 @@ class RenderOptions:
         default=20, help="Number of frames.", metavar="N", flag="--count", old=("--frames",), minimum=1
     )
     rig: str | Path | CameraRig | None = option(
-        default=None, help="The cameras, a calibration.json. Default: six cameras like nuScenes.", metavar="FILE"
+        reads="path or name",
+        default=None,
+        help="The cameras, a calibration.json. Default: six cameras like nuScenes.",
+        metavar="FILE",
     )
     rate_hz: float = option(
         default=2.0, help="Frames per second.", flag="--rate", metavar="HZ", minimum=0.1, maximum=100
@@ -104,6 +107,7 @@ class DriveOptions:
     """Drives with ground truth: sequences, or rendered ones."""
 
     data: tuple[Path, ...] = option(
+        reads="path",
         default=(),
         help="A sequence with ground truth (see bevcli convert). Repeatable.",
         metavar="DIR",

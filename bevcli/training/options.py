@@ -14,7 +14,9 @@ class TrainOptions:
         help="Folder for weights, checkpoint, learning curves and rendered drives. Default: runs/train-MODEL.",
     )
     resume: bool = option(default=False, help="Resume from the checkpoint in the output folder.")
-    weights: Path | None = option(default=None, help="Start from these weights (fine-tuning) instead of random ones.")
+    weights: Path | None = option(
+        reads="path", default=None, help="Start from these weights (fine-tuning) instead of random ones."
+    )
     steps: int | None = option(default=None, help="Number of steps. Default: as in the training table.", minimum=1)
     held_out: int | None = option(
         default=None,
@@ -31,6 +33,7 @@ class ValidationOptions:
     """The rig and the scores of a validation."""
 
     rig: str | None = option(
+        reads="path or name",
         default=None,
         help="Cameras of the rendered drives: a calibration.json, scaled to the model's image size, or a random rig "
         "for each drive, from training.rigs of the model. Default: six cameras like nuScenes.",

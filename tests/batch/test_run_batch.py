@@ -316,3 +316,16 @@ def test_names_of_drives_are_no_formulas_in_batch_csv(batch, tmp_path):
     assert all(cell[:1] not in ("+", "=", "-", "@") for row in rows for cell in row.values())
     table = pq.read_table(tmp_path / "out/batch.parquet").to_pylist()
     assert [row["drive"] for row in table] == ["+1+1", "-1", "_1+1", "_x"]
+
+
+def test_the_row_of_a_drive_in_millimetres_says_so(batch, tmp_path):
+    calibration = write_drive(tmp_path / "wrong", 0) / "calibration.json"
+    content = json.loads(calibration.read_text())
+    pose = content["cameras"]["CAM_FRONT"]["ego_from_camera"]
+    pose["translation"] = [1000 * metres for metres in pose["translation"]]
+    calibration.write_text(json.dumps(content))
+    batch([str(tmp_path / "wrong")])
+    (row,) = pq.read_table(tmp_path / "out/batch.parquet").to_pylist()
+    assert row["error"] == ""
+    assert "CAM_FRONT" in row["input_errors"]
+    assert "bevcli project-debug" in row["input_errors"]

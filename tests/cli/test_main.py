@@ -9,7 +9,8 @@ import pytest
 from command_line import command
 
 import bevcli
-from bevcli.cli.main import run_app
+from bevcli.cli.main import app, run_app
+from bevcli.errors import InputError
 
 ROOT = Path(__file__).parents[2]
 SAMPLE = ROOT / "samples" / "street"
@@ -32,6 +33,13 @@ def test_help_names_the_extras_that_a_command_needs(name, extra):
     assert f"bevcli[{extra}]" in command(ROOT, name, "--help").stdout
 
 
+def test_help_lists_every_command_in_a_group_in_order():
+    shown = command(ROOT, "--help").stdout
+    places = [shown.index(f"─ {group} ─") for group in ("Start", "Run", "Look", "Score", "Train", "Deploy")]
+    assert places == sorted(places)
+    assert "─ Commands" not in shown
+
+
 def test_a_mistake_in_usage_exits_2():
     assert command(ROOT, "run").returncode == 2
 
@@ -40,8 +48,8 @@ def test_a_mistake_in_usage_exits_2():
     ("arguments", "message"),
     [
         (("run", "nowhere", "--untrained"), "nowhere"),
-        (("run", "nowhere", "--model", "tinny", "--untrained"), "tinny"),
-        (("run", "nowhere", "--model", "tiny"), "--untrained"),
+        (("run", str(SAMPLE), "--model", "tinny", "--untrained"), "tinny"),
+        (("run", str(SAMPLE), "--model", "tiny"), "--untrained"),
         (("weights", "inspect", "nowhere.pth"), "nowhere.pth"),
     ],
 )
@@ -51,6 +59,43 @@ def test_a_mistake_in_the_input_is_one_line_and_exits_1(arguments, message, tmp_
     assert done.stderr.startswith("error: ")
     assert done.stderr.count("\n") == 1
     assert message in done.stderr
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("run", "nope"),
+        ("run", SAMPLE, "--weights", "nope"),
+        ("run", SAMPLE, "--model", "nope.toml"),
+        ("viz", "nope"),
+        ("eval", SAMPLE, "nope"),
+        ("explain", "nope"),
+        ("export", "nope", "--format", "csv"),
+        ("export-onnx", "nope.toml"),
+        ("find-like", "0", "--frame", "0", "--in", "nope"),
+        ("batch", "--list", "nope", "--out", "out"),
+        ("bench", "--model", "nope.onnx"),
+        ("convert", "nope", "out"),
+        ("project-debug", "nope"),
+        ("project-debug", SAMPLE, "--sequence", "nope"),
+        ("quantize", "nope", "--calibrate", SAMPLE),
+        ("quantize", SAMPLE, "--calibrate", "nope"),
+        ("render", "out", "--rig", "nope.json"),
+        ("stress", "nope"),
+        ("train", "nope.toml"),
+        ("train", "demo", "--data", "nope"),
+        ("validate", "demo", "--rig", "folder/nope"),
+        ("weights", "inspect", "nope"),
+        ("weights", "convert", "nope", "out"),
+    ],
+    ids=lambda arguments: "-".join(str(each) for each in arguments if each != SAMPLE),
+)
+def test_a_missing_path_is_refused_before_slow_imports(arguments, monkeypatch):
+    for name in [name for name in sys.modules if name.partition(".")[0] in HEAVY]:
+        monkeypatch.delitem(sys.modules, name)
+    with pytest.raises(InputError, match=r"nope[.a-z]*: there is no such file or folder"):
+        app([str(each) for each in arguments], standalone_mode=False)
+    assert [name for name in HEAVY if name in sys.modules] == []
 
 
 def test_an_interrupt_exits_130(tmp_path):
@@ -165,7 +210,8 @@ def test_a_command_of_another_package_appears(tmp_path):
         command = [sys.executable, "-m", "bevcli", *arguments]
         return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
 
-    assert "Print a greeting." in program("--help").stdout
+    shown = program("--help").stdout
+    assert shown.index("Deploy") < shown.index("Commands of installed packages") < shown.index("Print a greeting.")
     assert program("greet", "--to", "me").stdout == "hello me\n"
     assert program("greet", "--to", "nobody").stderr == "error: pass another --to\n"
 

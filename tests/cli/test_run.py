@@ -12,6 +12,7 @@ import torch
 from command_line import MINI_TOML, command
 from memory_drive import MemorySequence, WithoutImages
 
+from bevcli.cli.run import _run_notes
 from bevcli.errors import OutputError
 from bevcli.inference.load import Model
 from bevcli.recording.options import RecordingOptions
@@ -143,3 +144,12 @@ def test_a_missing_image_is_a_warning_and_with_strict_an_error(tmp_path):
     strict = command(tmp_path, *arguments, "--force", "--strict")
     assert strict.returncode == 1
     assert "CAM_BACK" in strict.stderr.splitlines()[-1]
+
+
+def test_the_note_on_rendered_streets_is_for_other_drives_only(mini_model):
+    bundled = replace(Model(mini_model), bundled=True)
+    drive = MemorySequence(1)
+    notes = "\n".join(_run_notes(bundled, drive))
+    assert "these weights were trained on rendered streets" in notes
+    drive.facts = replace(drive.facts, rendered=True)
+    assert "trained on rendered streets" not in "\n".join(_run_notes(bundled, drive))

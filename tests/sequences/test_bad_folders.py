@@ -184,3 +184,11 @@ def test_wrong_timing(drive, content, expected):
     line = message(drive)
     assert "timing.toml" in line
     assert expected in line
+
+
+@pytest.mark.parametrize(("character", "name"), [(";", "semicolons"), ("\t", "tabs")])
+@pytest.mark.parametrize("file", ["frames.csv", "ego_motion.csv"])
+def test_a_table_with_another_separator_says_so(drive, file, character, name):
+    table = drive / file
+    table.write_text(table.read_text().replace(",", character))
+    assert f"{table}: the columns are separated by {name} (expected commas)" in message(drive)

@@ -106,6 +106,10 @@ def _lines(path: Path) -> list[tuple[int, list[str]]]:
 
 def _check_columns(path: Path, columns: tuple[str, ...], required: tuple[str, ...], optional: tuple[str, ...]) -> None:
     missing = [name for name in required if name not in columns]
+    if missing and len(columns) == 1:
+        for character, name in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
+            if character in columns[0]:
+                raise InputError(f"{path}: the columns are separated by {name} (expected commas): save it with commas")
     if missing:
         raise InputError(f'{path}: column "{missing[0]}" is missing (found: {", ".join(columns)})')
     known = {*required, *optional}

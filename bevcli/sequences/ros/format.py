@@ -26,6 +26,7 @@ class BagOptions(RigOptions):
         repeatable=True,
     )
     topics_file: Path | None = option(
+        reads="path",
         default=None,
         help="ROS bags: topics and frames of a vehicle (docs/other-inputs.md).",
         flag="--topics",
