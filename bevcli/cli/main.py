@@ -86,7 +86,7 @@ def root(
 
 
 def run_app() -> None:
-    """The console entry point: a user's mistake is one line on stderr and exit code 1, never a traceback."""
+    """Run the given command: a user's mistake is one line on stderr and exit code 1, never a traceback."""
     for name, value in THREAD_SETTINGS.items():
         os.environ.setdefault(name, value)
     keep_freed_memory()

@@ -2,6 +2,7 @@ import contextlib
 import os
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -63,6 +64,32 @@ def test_an_interrupt_exits_130(tmp_path):
     done = subprocess.run([sys.executable, "-c", code, "wait"], capture_output=True, text=True, check=False)
     assert done.returncode == 130
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("other", ["KeyboardInterrupt", "RecursionError", "ImportError", "SystemExit"])
+def test_an_interrupt_of_an_import_exits_130_in_silence(tmp_path, other):
+    (tmp_path / "slow_package.py").write_text(
+        "import os, signal\n"
+        "try:\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "    for _ in range(1000): pass\n"
+        "except KeyboardInterrupt:\n"
+        f"    raise {other} from None\n"
+    )
+    code = (
+        "import signal, bevcli.cli.main as cli, bevcli.__main__ as program\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "cli.run_app = lambda: __import__('slow_package')\n"
+        "program.main()\n"
+    )
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
+def test_the_program_is_the_one_that_handles_interrupts():
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    assert scripts == {"bevcli": "bevcli.__main__:main"}
 
 
 NAME_OF_300 = "x" * 300
