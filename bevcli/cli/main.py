@@ -4,6 +4,7 @@ Exit codes: 0 success, 1 a mistake in the input, 2 a mistake in usage (click's o
 143 by SIGTERM; a command may have one of its own. No command module imports torch, OpenCV or rerun before it is called.
 """
 
+import io
 import os
 import sys
 from collections.abc import Iterator, Mapping
@@ -88,6 +89,9 @@ def run_app() -> None:
     """Run the given command: a user's mistake is one line on stderr and exit code 1, never a traceback."""
     for name, value in THREAD_SETTINGS.items():
         os.environ.setdefault(name, value)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a terminal may know no "°"
     keep_freed_memory()
     try:
         try:

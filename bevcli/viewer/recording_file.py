@@ -71,6 +71,8 @@ def open_recording(path: Path) -> Iterator[RecordingFile]:
     Raises InputError if the file is missing, is not a recording, was cut off before its first frame, or is damaged.
     """
     path = recording_in(path)
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: is not a regular file (expected no folder, pipe or device)")
     if _is_whole(path):
         _check(path, path)
         yield RecordingFile(path, repaired=False)

@@ -1,5 +1,6 @@
 import contextlib
 import os
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -31,13 +32,6 @@ def test_version():
 )
 def test_help_names_the_extras_that_a_command_needs(name, extra):
     assert f"bevcli[{extra}]" in command(ROOT, name, "--help").stdout
-
-
-def test_help_lists_every_command_in_a_group_in_order():
-    shown = command(ROOT, "--help").stdout
-    places = [shown.index(f"─ {group} ─") for group in ("Start", "Run", "Look", "Score", "Train", "Deploy")]
-    assert places == sorted(places)
-    assert "─ Commands" not in shown
 
 
 def test_a_mistake_in_usage_exits_2():
@@ -135,6 +129,33 @@ def test_an_interrupt_of_an_import_exits_130_in_silence(tmp_path, other):
 def test_the_program_is_the_one_that_handles_interrupts():
     scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
     assert scripts == {"bevcli": "bevcli.__main__:main"}
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("run", "--help"), pytest.param(("weights", "inspect", "--model", "demo"), marks=pytest.mark.slow)],
+)
+def test_a_terminal_of_ascii_gets_every_text(arguments):
+    environment = os.environ | {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    program = [sys.executable, "-m", "bevcli", *arguments]
+    done = subprocess.run(program, env=environment, capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert done.stdout.isascii()
+
+
+def test_a_pipe_is_no_recording(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    done = command(tmp_path, "viz", "pipe", "--summary")
+    assert done.returncode == 1
+    assert done.stderr == "error: pipe: is not a regular file (expected no folder, pipe or device)\n"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["a b", "a'b\"c", "a\nb", "a*[?]b", "-r", "x" * 255, "日本", "%s{0}", "a#3"])
+def test_a_drive_of_any_name_is_checked(tmp_path, name):
+    shutil.copytree(SAMPLE, tmp_path / name)
+    assert command(tmp_path, "project-debug", tmp_path / name, "--out", "out").returncode == 0
+    assert (tmp_path / "out/findings.json").is_file()
 
 
 NAME_OF_300 = "x" * 300
