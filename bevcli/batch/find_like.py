@@ -137,14 +137,16 @@ def open_query(run: str, frame: int, batch: Storage) -> Query:
     return Query(found[0], frame, _embeddings(batch, found[0]))
 
 
-def find_like(query: Query, batch: Storage, count: int = 12, per_drive: int = 3) -> list[SimilarFrame]:
+def find_like(
+    query: Query, batch: Storage, count: int = 12, per_drive: int = 3, *, same_drive: bool = False
+) -> list[SimilarFrame]:
     """The frames of a batch that are most similar to a frame, the most similar first.
 
     Each dimension of the vectors is scaled to mean 0 and standard deviation 1 over all frames of the batch; the
     similarity is the cosine of two scaled vectors. The frame itself is left out.
 
-    per_drive: at most this many frames of each drive. Raises InputError where the batch has no vectors, or they are of
-    another model.
+    per_drive: at most this many frames of each drive. same_drive: frames of the query's own drive, too.
+    Raises InputError where the batch has no vectors, or they are of another model.
     """
     results = sorted(batch.names(RESULTS))
 
@@ -172,8 +174,10 @@ def find_like(query: Query, batch: Storage, count: int = 12, per_drive: int = 3)
     taken: Counter[str] = Counter()
     for place in np.argsort(-similarity, kind="stable"):
         result, frame = comparable[owners[place]][0], int(frames[place])
-        is_query = query.recording is None and (result, frame) == (query.result, query.frame)
-        if is_query or taken[result] >= per_drive:
+        is_own = query.recording is None and result == query.result
+        if is_own and (not same_drive or frame == query.frame):
+            continue
+        if taken[result] >= per_drive:
             continue
         taken[result] += 1
         chosen.append(SimilarFrame(result, frame, int(times[place]), float(similarity[place])))

@@ -88,6 +88,9 @@ class FindLikeOptions:
     )
     count: int = option(default=12, help="Number of frames.", minimum=1)
     per_drive: int = option(default=3, help="At most this many frames of each drive.", minimum=1)
+    same_drive: bool = option(
+        default=False, help="List frames of RUN's own drive, too: its neighbours are the most similar."
+    )
     html: Path | None = option(
         default=None, help="The page with thumbnails. Default: find-like.html in the batch.", metavar="FILE"
     )

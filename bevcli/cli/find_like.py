@@ -30,7 +30,7 @@ def find_like(
 
     storage, html = open_storage(options.batch), options.html
     query = open_query(run, options.frame, storage)
-    found = find_like(query, storage, options.count, options.per_drive)
+    found = find_like(query, storage, options.count, options.per_drive, same_drive=options.same_drive)
     width = max((len(each.result) for each in found), default=0)
     say(f"{'similarity':>10}  {'drive':<{width}}  frame")
     for each in found:

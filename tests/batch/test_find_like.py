@@ -59,8 +59,10 @@ def test_the_same_frame_of_a_copy_is_the_most_similar(batch):
     assert found[0].similarity == pytest.approx(1, abs=1e-6)
     assert [each.similarity for each in found] == sorted([each.similarity for each in found], reverse=True)
     assert (query.result, 2) not in [(each.result, each.frame) for each in found]
-    assert len(find_like(query, storage, count=100)) == 8
-    assert len(find_like(query, storage, count=100, per_drive=1)) == 3
+    assert query.result not in [each.result for each in find_like(query, storage, count=100)]
+    assert len(find_like(query, storage, count=100)) == 6
+    assert len(find_like(query, storage, count=100, same_drive=True)) == 8
+    assert len(find_like(query, storage, count=100, per_drive=1, same_drive=True)) == 3
 
 
 def test_a_run_outside_of_the_batch_is_found_in_it(batch, tmp_path):
