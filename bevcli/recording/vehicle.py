@@ -1,6 +1,7 @@
 """The ego vehicle as a mesh: a plain car by default, or any mesh file that trimesh reads."""
 
-import os
+import io
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array
-from bevcli.parsing.files import MIB, open_regular
+from bevcli.parsing.files import MIB, read_bytes
 from bevcli.recording.colors import EGO_COLOR, Color
 
 BODY_LWH = (4.6, 1.86, 0.75)
@@ -21,7 +22,10 @@ RUBBER: Color = (20, 22, 26)
 OUTLINE = np.array([[3.65, -0.93], [3.65, 0.93], [-0.95, 0.93], [-0.95, -0.93], [3.65, -0.93]])  # in ego, from above
 FRONT_ARROW = np.array([[2.2, -0.8], [3.3, 0.0], [2.2, 0.8]])
 SMOOTH_BELOW_RAD = np.radians(40.0)  # faces that meet at a smaller angle are shaded as one curved surface
-LARGEST_BYTES = 256 * MIB
+LARGEST_BYTES = 64 * MIB  # of the file, and of each that it names
+LARGEST_TEXT_BYTES = 16 * MIB  # of a format of text, of which trimesh makes sixty times as much
+TEXT_FORMATS = (".obj", ".off")
+FORMATS = (".glb", ".gltf", ".ply", ".obj", ".stl", ".off")  # no archives, whose contents may have any size
 LONGEST_M = 50.0  # a longer mesh is not in metres
 Part = tuple[Array, Array, NDArray[np.int64], NDArray[np.uint8]]  # vertices, normals, faces, colours
 GLTF_FILES = (".glb", ".gltf")
@@ -48,11 +52,13 @@ class VehicleMesh:
 
 
 def load_vehicle(path: Path) -> VehicleMesh:
-    """The vehicle from a mesh file of any format that trimesh reads (.glb, .gltf, .ply, .obj, .stl, …).
+    """The vehicle from a mesh file: .glb, .gltf, .ply, .obj, .stl or .off, read by trimesh.
 
     The file must be in metres, with its origin on the ground under the middle of the rear axle. Files in glTF format
     (.glb, .gltf) have glTF's axes: x left, y up, z forward. All other files have the ego frame's axes: x forward,
     y left, z up. Parts without a colour get the default car's blue.
+
+    Materials, textures and buffers that the file names are read only in its own folder.
 
     Raises InputError where trimesh cannot read the file, and where it has no triangles or is longer than 50 m.
     """
@@ -73,13 +79,13 @@ def _read_parts(path: Path) -> list[Part]:
     """The triangle meshes of a file in the ego frame. Raises InputError."""
     import trimesh  # only here: it takes half a second to load
 
-    with open_regular(path) as file:
-        size = os.fstat(file.fileno()).st_size
-    if size > LARGEST_BYTES:
-        raise InputError(f"{path}: the mesh has {size / MIB:.0f} MiB (expected at most {LARGEST_BYTES // MIB})")
+    suffix = path.suffix.lower()
+    if suffix not in FORMATS:
+        raise InputError(f"{path}: is not a mesh file (expected a name that ends in {', '.join(FORMATS)})")
+    content = read_bytes(path, LARGEST_TEXT_BYTES if suffix in TEXT_FORMATS else LARGEST_BYTES)
     try:
-        scene = trimesh.load_scene(path)
-        if path.suffix.lower() in GLTF_FILES:
+        scene = trimesh.load_scene(io.BytesIO(content), file_type=suffix[1:], resolver=_Siblings(path.parent))
+        if suffix in GLTF_FILES:
             scene.apply_transform(EGO_FROM_GLTF)
         parts = [_part(mesh) for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
     except Exception as error:  # each of trimesh's many readers raises errors of its own
@@ -90,6 +96,29 @@ def _read_parts(path: Path) -> list[Part]:
     if not parts:
         raise InputError(f"{path}: the file has no triangles (expected a triangle mesh of the vehicle)")
     return parts
+
+
+class _Siblings(Mapping[str, bytes]):
+    """The regular files of a folder by name, as trimesh asks for them: nothing outside of it, and no pipes."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder.resolve()
+
+    def __getitem__(self, name: str) -> bytes:
+        path = (self.folder / name).resolve()
+        if not path.is_relative_to(self.folder):
+            raise InputError(f"{name}: is outside of the mesh file's folder")
+        return read_bytes(path, LARGEST_BYTES)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """The contents of a file. Raises InputError."""
+        return self[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return (path.name for path in self.folder.iterdir())
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
 
 
 def _part(mesh: Any) -> Part:

@@ -1,5 +1,6 @@
 """The ego vehicle's mesh: from files of several formats, and the default car."""
 
+import os
 import subprocess
 import sys
 
@@ -11,7 +12,8 @@ from memory_drive import MemorySequence
 from recorded_drive import record
 
 from bevcli.errors import InputError
-from bevcli.recording import entities
+from bevcli.parsing.files import read_bytes
+from bevcli.recording import entities, vehicle
 from bevcli.recording.colors import EGO_COLOR
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.vehicle import default_vehicle, load_vehicle
@@ -103,9 +105,10 @@ def test_a_recording_has_the_mesh_of_the_file(tmp_path):
     ("name", "content", "message"),
     [
         ("broken.glb", b"glTF and then something else", "trimesh cannot read"),
-        ("notes.txt", b"a car", "trimesh cannot read"),
+        ("notes.txt", b"a car", "is not a mesh file"),
         ("empty.ply", b"", "trimesh cannot read"),
-        ("points.xyz", b"0 0 0\n1 0 0\n0 1 0\n", "no triangles"),
+        ("points.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no triangles"),
+        ("archive.zip", b"PK\x03\x04", "is not a mesh file"),
     ],
 )
 def test_a_file_without_a_mesh_is_an_error_of_one_line(tmp_path, capfd, name, content, message):
@@ -116,6 +119,30 @@ def test_a_file_without_a_mesh_is_an_error_of_one_line(tmp_path, capfd, name, co
     assert str(caught.value).startswith(str(path))
     assert "\n" not in str(caught.value)
     assert capfd.readouterr().err == ""  # trimesh does not print its own message
+
+
+TRIANGLE = "mtllib {}\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl paint\nf 1 2 3\n"
+
+
+@pytest.mark.parametrize("name", ["own.mtl", "pipe.mtl", "../secret.mtl", "missing.mtl"])
+def test_a_mesh_reads_only_regular_files_of_its_folder(tmp_path, monkeypatch, name):
+    folder, read = tmp_path / "mesh", []
+    folder.mkdir()
+    for path in (tmp_path / "secret.mtl", folder / "own.mtl"):
+        path.write_text("newmtl paint\nKd 1 0 0\n")
+    os.mkfifo(folder / "pipe.mtl")
+    (folder / "car.obj").write_text(TRIANGLE.format(name))
+    monkeypatch.setattr(vehicle, "read_bytes", lambda path, most: read.append(path.name) or read_bytes(path, most))
+    assert load_vehicle(folder / "car.obj").faces.tolist() == [[0, 1, 2]]  # a part that is missing has no colour
+    assert ("secret.mtl" in read, "own.mtl" in read) == (False, name == "own.mtl")
+
+
+def test_a_text_mesh_over_16_mib_is_refused_unread(tmp_path):
+    path = tmp_path / "car.obj"
+    with path.open("wb") as file:
+        file.truncate((16 << 20) + 1)
+    with pytest.raises(InputError, match="at most 16 MiB"):
+        load_vehicle(path)
 
 
 def test_a_mesh_in_millimetres_is_an_error(tmp_path):
