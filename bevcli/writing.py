@@ -2,6 +2,7 @@
 
 import os
 import uuid
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -10,7 +11,7 @@ from bevcli.errors import OutputError
 
 
 @contextmanager
-def whole_file(path: Path, *, parents: bool = False) -> Iterator[Path]:
+def whole_file(path: Path, *, parents: bool = False, shared: bool = False) -> Iterator[Path]:
     """A path to write to, in the folder of `path`.
 
         with whole_file(out) as unfinished:
@@ -19,16 +20,19 @@ def whole_file(path: Path, *, parents: bool = False) -> Iterator[Path]:
     At the end of the block the file takes the place of `path`, also of a link. After an error it is deleted, and `path`
     stays as it was. A device or a pipe, and what is in /dev, is written directly.
 
-    parents: make the folders that are missing.
+    parents: make the folders that are missing. shared: several processes may write the file at the same time. Else
+    its unfinished name is always the same, so that killed processes leave one such file at most.
     Raises OutputError where the file cannot be written; every OSError of the block counts as this.
     """
-    unfinished = path.with_name(f".unfinished-{uuid.uuid4().hex[:8]}{path.suffix}")
+    mark = uuid.uuid4().hex[:8] if shared else f"{zlib.crc32(os.fsencode(path.name)):08x}"
+    unfinished = path.with_name(f".unfinished-{mark}{path.suffix}")
     try:
         if path.is_relative_to("/dev") or (path.exists() and not path.is_file()):
             yield path
             return
         if parents:
             path.parent.mkdir(parents=True, exist_ok=True)
+        unfinished.unlink(missing_ok=True)  # it may be a link
         yield unfinished
         os.replace(unfinished, path)
     except OSError as error:
@@ -38,9 +42,9 @@ def whole_file(path: Path, *, parents: bool = False) -> Iterator[Path]:
             unfinished.unlink()
 
 
-def write_whole(path: Path, content: bytes, *, parents: bool = False) -> None:
+def write_whole(path: Path, content: bytes, *, parents: bool = False, shared: bool = False) -> None:
     """Write a file, so that readers see the old or the new contents; see `whole_file`."""
-    with whole_file(path, parents=parents) as unfinished:
+    with whole_file(path, parents=parents, shared=shared) as unfinished:
         unfinished.write_bytes(content)
 
 

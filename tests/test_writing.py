@@ -30,6 +30,26 @@ def test_after_an_error_the_old_file_is_there(tmp_path, failure, raised):
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_what_a_killed_process_left_is_replaced_unfollowed(tmp_path):
+    path, target = tmp_path / "file.txt", tmp_path / "target"
+    with whole_file(path) as left:
+        left.write_text("old")
+    target.write_text("stays")
+    left.symlink_to(target)
+    with whole_file(path) as unfinished:
+        unfinished.write_text("new")
+    assert unfinished == left
+    assert (path.read_text(), target.read_text()) == ("new", "stays")
+    assert sorted(tmp_path.iterdir()) == [path, target]
+
+
+def test_processes_that_share_a_file_have_names_of_their_own(tmp_path):
+    with whole_file(tmp_path / "a", shared=True) as one, whole_file(tmp_path / "a", shared=True) as other:
+        assert one != other
+        one.touch()
+        other.touch()
+
+
 def test_a_link_is_replaced_and_its_target_stays(tmp_path):
     target, link = tmp_path / "target", tmp_path / "link"
     target.write_text("old")
