@@ -17,6 +17,11 @@ def one_line(value: object, longest: int = LONGEST_MESSAGE) -> str:
     return f"{text[: longest - end - 3]}...{text[len(text) - end :]}"
 
 
+def reason_of(error: BaseException) -> str:
+    """The message of a package's error on one line; the name of its class where it has none."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
 def say(*texts: object, err: bool = False) -> None:
     """Print texts, each on lines of its own. err: on stderr."""
     text = "\n".join(map(str, texts))

@@ -16,6 +16,7 @@ from bevcli.batch.options import Workers, ray_is_installed
 from bevcli.batch.worker import Worker, use_threads
 from bevcli.errors import BevcliError
 from bevcli.inference.cpu_settings import THREAD_SETTINGS, keep_freed_memory
+from bevcli.printing import reason_of
 
 OBJECT_STORE_BYTES = 100 << 20  # it holds a drive and a record per worker
 CONNECT_S = 15.0  # for the connection to a cluster
@@ -60,7 +61,7 @@ def run_on_ray(job: Job, job_hash: str, drives: Sequence[Drive], workers: Worker
                 if left:
                     running[worker.run.remote(left.pop())] = worker
         except ray.exceptions.RayError as error:
-            raise BevcliError(f"Ray stopped ({_first_line(error)}); `resume=True` goes on") from None
+            raise BevcliError(f"Ray stopped ({reason_of(error)[:200]}); `resume=True` goes on") from None
 
 
 class _RayWorker:
@@ -105,7 +106,7 @@ def _ray(workers: Workers) -> Iterator[Any]:
         ray.init(log_to_driver=False, logging_level=logging.ERROR, runtime_env=environment, **options)
     except Exception as error:  # Ray raises errors of many types where it cannot start or connect
         where = f"the cluster {workers.address} cannot be reached" if workers.address else "cannot be started"
-        raise BevcliError(f"Ray: {where} ({_first_line(error)})") from None
+        raise BevcliError(f"Ray: {where} ({reason_of(error)[:200]})") from None
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, on_terminate)  # Ray installs its own handler
     try:
@@ -122,7 +123,7 @@ def _check_reachable(address: str) -> None:
     try:
         socket.create_connection((host, int(port)), timeout=CONNECT_S).close()
     except (OSError, OverflowError) as error:
-        raise BevcliError(f"Ray: the cluster {address} cannot be reached ({_first_line(error)})") from None
+        raise BevcliError(f"Ray: the cluster {address} cannot be reached ({reason_of(error)[:200]})") from None
 
 
 def _sizes(ray: Any, job: Job, workers: Workers, drives: int) -> tuple[int, int, float]:
@@ -144,7 +145,3 @@ def _sizes(ray: Any, job: Job, workers: Workers, drives: int) -> tuple[int, int,
             f"pass `count={max(1, possible)}`"
         )
     return count, threads, share
-
-
-def _first_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__

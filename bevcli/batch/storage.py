@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 from bevcli.errors import BevcliError, InputError, OutputError
 from bevcli.parsing.files import read_bytes
+from bevcli.printing import reason_of
 from bevcli.writing import write_whole
 
 _URL = re.compile(r"(?P<protocol>[a-z][a-z0-9+.-]+)://", re.IGNORECASE)
@@ -248,7 +249,7 @@ def _filesystem(url: str) -> tuple[Any, str]:
         with _one_line(url, InputError):
             system, path = fsspec.core.url_to_fs(url)
     except ImportError as error:
-        advice = f"run pip install {package}" if package else " ".join(str(error).split())[:200]
+        advice = f"run pip install {package}" if package else reason_of(error)[:200]
         raise BevcliError(f"{url}: {protocol}:// needs a package that is not installed: {advice}") from None
     return system, str(path)
 
@@ -263,5 +264,5 @@ def _one_line(where: str, kind: type[BevcliError]) -> Iterator[None]:
     except (BevcliError, ImportError):
         raise
     except Exception as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = reason_of(error)
         raise kind(f"{where}: the storage cannot be used ({reason:.200})") from None

@@ -17,6 +17,7 @@ from bevcli.model.segmentation import SegmentationOutputs
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import Memory, TemporalModel, model_class
 from bevcli.parsing.documents import parse_json
+from bevcli.printing import reason_of
 from bevcli.registry import load
 
 SUFFIX = ".onnx"
@@ -133,7 +134,7 @@ class ExportedModel(TemporalModel):
         try:
             found = self.engine({name: tensor.cpu().numpy() for name, tensor in feed.items()})
         except Exception as error:  # each engine has classes of its own
-            reason = " ".join(str(error).split()) or type(error).__name__
+            reason = reason_of(error)
             raise WeightsError(f"{self.file}: fails when it runs ({reason:.300}); export it again") from error
         for port in self.form.outputs(decode=False):
             if (shape := found[port.name].shape) != port.shape:

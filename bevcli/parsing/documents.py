@@ -19,6 +19,7 @@ import yaml
 
 from bevcli.errors import BevcliError, InputError
 from bevcli.parsing.files import MIB, read_bytes, read_text
+from bevcli.printing import reason_of
 
 DEEPEST = 64  # levels of nested lists and objects
 LARGEST_INTEGER = 2**62  # the difference of two such integers still fits 64 bits
@@ -69,7 +70,7 @@ def parse_json(text: bytes, path: Path, *, pairs: Callable[[list[tuple[str, Any]
         where = f"line {error.lineno}, column {error.colno}"
         raise InputError(f"{path}: {where}: broken JSON: {error.msg}") from None
     except UnicodeError as error:
-        raise InputError(f"{path}: cannot be read as JSON ({_first_line(error)})") from None
+        raise InputError(f"{path}: cannot be read as JSON ({reason_of(error)[:200]})") from None
     except RecursionError:
         raise InputError(f"{path}: is nested too deeply to be read as JSON") from None
 
@@ -81,7 +82,7 @@ def parse_toml(text: str, path: str | Path, error: type[BevcliError] = InputErro
     except tomllib.TOMLDecodeError as failure:
         raise error(f"{path}: invalid TOML: {failure}") from None
     except (ValueError, RecursionError, OverflowError) as failure:  # impossible dates, thousands of digits or brackets
-        raise error(f"{path}: cannot be read as TOML ({_first_line(failure)})") from None
+        raise error(f"{path}: cannot be read as TOML ({reason_of(failure)[:200]})") from None
     check_values(document, path, error)
     return document
 
@@ -93,9 +94,9 @@ def read_yaml(path: Path) -> Any:
         _check_yaml_depth(text, path)
         document = yaml.load(text, _YamlLoader)  # the safe loader, which makes no Python objects
     except yaml.YAMLError as error:
-        raise InputError(f"{path}: broken YAML ({_first_line(error)})") from None
+        raise InputError(f"{path}: broken YAML ({reason_of(error)[:200]})") from None
     except (ValueError, TypeError, LookupError, AttributeError, RecursionError, OverflowError) as error:
-        raise InputError(f"{path}: cannot be read as YAML ({_first_line(error)})") from None
+        raise InputError(f"{path}: cannot be read as YAML ({reason_of(error)[:200]})") from None
     check_values(document, path)
     return document
 
@@ -144,10 +145,6 @@ def _depth_bound(text: bytes) -> int:
 def _exact_depth(text: bytes) -> int:
     """The deepest nesting of brackets outside of strings."""
     return _depth_bound(re.sub(rb'"(?:[^"\\]|\\.)*+"', b"", text, flags=re.DOTALL))
-
-
-def _first_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.files import MIB, read_bytes
+from bevcli.printing import reason_of
 from bevcli.recording.colors import EGO_COLOR, Color
 
 BODY_LWH = (4.6, 1.86, 0.75)
@@ -89,7 +90,7 @@ def _read_parts(path: Path) -> list[Part]:
             scene.apply_transform(EGO_FROM_GLTF)
         parts = [_part(mesh) for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
     except Exception as error:  # each of trimesh's many readers raises errors of its own
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = reason_of(error)
         raise InputError(
             f"{path}: trimesh cannot read this mesh file ({reason}); try .glb, .ply, .obj or .stl"
         ) from error

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from bevcli.errors import BevcliError, InputError
 from bevcli.parsing.documents import read_yaml
 from bevcli.parsing.files import MIB, decompressed
+from bevcli.printing import reason_of
 from bevcli.sequences.ros.format import METADATA, SUFFIXES
 from bevcli.sequences.ros.messages import Decode, Topic, decoder
 
@@ -29,7 +30,7 @@ def _broken_files_refused(path: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = reason_of(error)
         if isinstance(error, BevcliError):
             raise type(error)(reason) from None
         raise InputError(f"{path}: is damaged ({reason:.200})") from None
@@ -91,7 +92,7 @@ class Bag:
         try:
             return decode(data)
         except Exception as error:  # the decoders of the packages raise errors of many types for broken bytes
-            reason = " ".join(str(error).split())
+            reason = reason_of(error)
             raise InputError(f"{self.path}: {topic}: message {index} cannot be decoded ({reason:.200})") from None
 
     def _bytes(self, topic: str, index: int) -> bytes:
