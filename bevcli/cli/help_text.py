@@ -14,8 +14,18 @@ PANELS = ("Start", "Run", "Look", "Score", "Train", "Deploy", "Other commands")
 GROUP = "bevcli.commands"
 
 
+def printable(text: str) -> str:
+    """The text in the characters that stdout knows, with escapes for others; typer would print UTF-8 regardless."""
+    encoding = sys.stdout.encoding or "utf-8"
+    return text.encode(encoding, "backslashreplace").decode(encoding)
+
+
 class PlainCommand(TyperCommand):
     """A command whose `--help` lists its options by their panels."""
+
+    def get_help(self, ctx: Any) -> str:
+        """The help text, printable."""
+        return printable(super().get_help(ctx))
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the arguments, then the options by panels, last those without one."""
@@ -31,6 +41,10 @@ class PlainCommand(TyperCommand):
 
 class PlainGroup(TyperGroup):
     """The program, whose `--help` lists the commands by panels. It reads their docstrings and builds none of them."""
+
+    def get_help(self, ctx: Any) -> str:
+        """The help text, printable."""
+        return printable(super().get_help(ctx))
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the commands by panels."""

@@ -140,7 +140,7 @@ def test_a_terminal_of_ascii_gets_every_text(arguments):
     program = [sys.executable, "-m", "bevcli", *arguments]
     done = subprocess.run(program, env=environment, capture_output=True, check=False)
     assert (done.returncode, done.stderr) == (0, b"")
-    assert done.stdout
+    assert done.stdout.isascii()
 
 
 def test_a_pipe_is_no_recording(tmp_path):
