@@ -1,6 +1,6 @@
 """drive.json: the record of a drive that is done or has failed, read as a file that may be damaged."""
 
-from typing import Annotated, TypedDict
+from typing import Annotated, NotRequired, TypedDict
 
 import msgspec
 from msgspec import Meta
@@ -46,6 +46,7 @@ class _Done(TypedDict):
     score_histogram: Annotated[list[_Count], Meta(min_length=SCORE_BINS, max_length=SCORE_BINS)]
     scores: dict[str, _Number | None] | None
     not_scored: str
+    input_errors: NotRequired[str]
 
 
 def read_record(content: bytes | None, result: str) -> Record | None:

@@ -32,6 +32,7 @@ from bevcli.inference.load import choose_device
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.prepare import Precision, prepare_for_inference
 from bevcli.printing import say
+from bevcli.writing import write_whole
 
 ROOT = Path(__file__).parents[2]  # of the repository
 PRECISIONS: tuple[Precision, ...] = get_args(Precision)
@@ -77,10 +78,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             say(json.dumps(compare(asked.compare, device)))
             return 0
         sections = check(device, tuple(asked.model or known_models()))
+        write_whole(asked.out, report(device, sections).encode())
     except BevcliError as error:
         say(f"error: {error}", err=True)
         return 1
-    asked.out.write_text(report(device, sections))
     failed = [section.title for section in sections if not section.passed]
     say(f"wrote {asked.out}: {'failed: ' + ', '.join(failed) if failed else 'everything passed'}")
     return 1 if failed else 0

@@ -287,6 +287,7 @@ WRONG = {
     "scores": {"mean_ap": "high"},
     "result": "../elsewhere",
     "seconds": [],
+    "input_errors": 3,
 }
 
 
