@@ -32,7 +32,7 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 def is_compiled(function: Any) -> bool:
-    """Whether the cache has a compiled function of this file's present state."""
+    """True if the cache has the compiled function of this file's present state."""
     code = function.py_func.__code__
     name = f"{Path(code.co_filename).stem}.{function.py_func.__qualname__}-{code.co_firstlineno}.*.nbi"
     folder, changed = function.stats.cache_path, Path(code.co_filename).stat().st_mtime

@@ -147,7 +147,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     Arguments in backticks in a help text, and in a `BevcliError` of the function, become flags.
     """
     parts: list[Parameter | _Flag] = []
-    arguments: set[str] = set()
+    arguments: list[str] = []
     flags: dict[str, _Flag] = {}
     makers: dict[str, tuple[Callable[..., Any], list[str]]] = {}
     inputs: dict[str, Reads] = {}
@@ -157,9 +157,12 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         make, found = _flags_of(hint)
         if make is None:
             parts.append(parameter.replace(kind=Parameter.KEYWORD_ONLY, annotation=hint))
-            arguments |= {parameter.name} if OldArgument in getattr(hint, "__metadata__", ()) else set()
-            for mark in (each for each in get_args(hint) if each in (INPUT, INPUT_OR_NAME)):
-                inputs[parameter.name] = mark
+            marks = get_args(hint)[1:]  # of an Annotated
+            if OldArgument in marks:
+                arguments.append(parameter.name)
+            for mark in (INPUT, INPUT_OR_NAME):
+                if mark in marks:
+                    inputs[parameter.name] = mark
             continue
         for name in found.keys() & flags.keys():  # one of them is of another package
             raise BevcliError(f"command {function.__name__}: two options are named {name}: rename one")
@@ -200,16 +203,18 @@ def _require_inputs(given: Iterable[tuple[Any, Reads]]) -> None:
         for value in values if isinstance(values, list | tuple) else [values]:
             text = "" if value is None else str(value)
             is_name = "://" in text or (reads == "path or name" and not Path(text).suffix and os.sep not in text)
-            if text and not is_name and not (_exists(Path(text)) or _exists(Path(f"{text}.partial"))):
+            if text and not is_name and not _exists(Path(text)):
                 raise InputError(f"{text}: there is no such file or folder")
 
 
 def _exists(path: Path) -> bool:
-    """Whether a path may be read; other errors than a missing file are told where it is read."""
+    """False for a path without a file, or the partial file of a killed run. Other errors are told where it is read."""
     try:
         path.stat()
     except (FileNotFoundError, NotADirectoryError, ValueError):
-        return False
+        from bevcli.sequences.files.incremental_json import partial_path
+
+        return bool(path.name) and partial_path(path).exists()
     except OSError:
         return True
     return True

@@ -25,10 +25,10 @@ class StopSignals:
     def __enter__(self) -> "StopSignals":
         if threading.current_thread() is threading.main_thread():  # Python allows handlers there only
             self._before = {number: signal.signal(number, self._receive) for number in SIGNALS}
-            self._reader, self._writer = socket.socketpair()
+            reader, self._writer = socket.socketpair()
             self._writer.setblocking(False)
             self._fd_before = signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
-            threading.Thread(target=_end_at_second, args=(self._reader,), daemon=True).start()
+            threading.Thread(target=_end_at_second, args=(reader,), daemon=True).start()
         return self
 
     def __exit__(self, *error: object) -> None:

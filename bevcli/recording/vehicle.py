@@ -1,4 +1,4 @@
-"""The ego vehicle as a mesh: a plain car by default, or any mesh file that trimesh reads."""
+"""The ego vehicle as a mesh: a plain car by default, or a mesh file."""
 
 import io
 from collections.abc import Iterator, Mapping
@@ -110,10 +110,6 @@ class _Siblings(Mapping[str, bytes]):
         if not path.is_relative_to(self.folder):
             raise InputError(f"{name}: is outside of the mesh file's folder")
         return read_bytes(path, LARGEST_BYTES)
-
-    def get(self, name: str, default: Any = None) -> Any:
-        """The contents of a file. Raises InputError."""
-        return self[name]
 
     def __iter__(self) -> Iterator[str]:
         return (path.name for path in self.folder.iterdir())
