@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import struct
 import subprocess
 import sys
@@ -15,8 +14,9 @@ from typing import TYPE_CHECKING, BinaryIO, Literal
 
 import rerun as rr
 
-from bevcli.errors import BevcliError, InputError
+from bevcli.errors import BevcliError, InputError, OutputError
 from bevcli.viewer.native import viewer_binary, viewer_environment
+from bevcli.writing import whole_file
 
 if TYPE_CHECKING:
     from rerun.notebook import Viewer
@@ -115,16 +115,13 @@ def restore_index(path: Path) -> bool:
     """
     if path.stat().st_size > LARGEST_INDEXED:
         return False
-    copy = path.with_name(path.name + ".repaired")
     try:
-        _repair(path, copy)
-        if not _is_whole(copy):
-            return False
-        os.replace(copy, path)
-    except (OSError, InputError):
+        with whole_file(path) as copy:
+            _repair(path, copy)
+            if not _is_whole(copy):
+                raise InputError(f"{path}: its index cannot be made")
+    except (OutputError, InputError):
         return False
-    finally:
-        copy.unlink(missing_ok=True)
     return True
 
 
