@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from bevcli.errors import InputError
-from bevcli.options import option, options
+from bevcli.options import option, options, parse_pairs
 
 if TYPE_CHECKING:
     from bevcli.geometry.cameras import CameraRig
@@ -82,6 +83,11 @@ class SequenceOptions:
         if self.every is not None and self.every < 1:
             raise InputError(f"`every={self.every}`: expected an integer, 1 or more")
 
+    def refuse_static(self, path: Path) -> None:
+        """Raise InputError for `ego_motion="static"`. path: of an input that has its own ego-motion."""
+        if self.ego_motion == "static":
+            raise InputError(f'{path}: has its own ego-motion: remove `ego_motion="static"`')
+
     def for_model(self, config: ModelConfig, *, temporal: bool = True) -> SequenceOptions:
         """The options for a run of a model: at its rate, and with ego-motion required only where history needs it."""
         use = "optional" if self.ego_motion == "required" and not temporal else self.ego_motion
@@ -103,6 +109,31 @@ class FormatOptions:
     def wants_all_frames(self) -> bool:
         """True where an option asks for frames that thinning to a model's rate would drop."""
         return False
+
+
+def parse_class_map(texts: list[str]) -> dict[str, str]:
+    """A class map from texts NAME=CLASS and names of TOML files. Raises ValueError, InputError for a file."""
+    from bevcli.sequences.files.class_names import read_class_map
+
+    files = [text for text in texts if text.endswith(".toml") and "=" not in text]
+    pairs = parse_pairs([text for text in texts if text not in files], "NAME=CLASS or FILE.toml")
+    merged: dict[str, str] = {}
+    for file in files:
+        merged |= read_class_map(Path(file))
+    return merged | pairs
+
+
+@options("Input")
+class ClassMapOptions(FormatOptions):
+    """The class names of the ground truth. A format with ground truth of other data sets inherits it."""
+
+    class_map: Mapping[str, str] = option(
+        default_factory=dict,
+        help="Rename a class of the ground truth, such as Lorry=truck. Repeatable.",
+        metavar="NAME=CLASS|FILE.toml",
+        parse=parse_class_map,
+        repeatable=True,
+    )
 
 
 @options("Input")

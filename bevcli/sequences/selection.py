@@ -28,6 +28,10 @@ class Selection(DerivedSequence):
         """Those of the frame at position `place` of the selection."""
         return self.sequence.image_files(self._indices[place])
 
+    def ground_truth_frame(self, place: int) -> Frame:
+        """The frame at position `place` of the selection, for scoring."""
+        return self.sequence.ground_truth_frame(self._indices[place])
+
     def load(self, place: int) -> Frame:
         """The frame at position `place` of the selection, with decoded images."""
         return self.sequence.load(self._indices[place])
