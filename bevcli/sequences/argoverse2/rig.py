@@ -3,11 +3,9 @@
 Argoverse's egovehicle frame is at the rear axle, above the ground. The ego frame here is below it, on the ground.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_ego_from_bev
@@ -26,37 +24,17 @@ LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3")
 SPACING_NS = 100_000_000  # time between the poses that kinematics are derived from; the table has some 5 µs apart
 
 
-@dataclass(frozen=True)
-class Poses:
-    """The T poses of a log, at increasing times.
-
-    Attributes:
-        times_ns: (T,) nanoseconds.
-        translations: (T, 3) of city_from_axle, metres.
-        quaternions: (T, 4) of city_from_axle, w, x, y, z.
-    """
-
-    times_ns: NDArray[np.int64]
-    translations: Array
-    quaternions: Array
-
-    def motion(self, axle_height_m: float) -> EgoMotion:
-        """The poses of the ego frame, which is below the axle."""
-        down = np.stack([rotation_from_quaternion(q)[:, 2] for q in self.quaternions])
-        table = (self.times_ns, self.translations - axle_height_m * down, self.quaternions)
-        ticks = np.arange(self.times_ns[0], self.times_ns[-1], SPACING_NS)
-        rows = np.unique(np.searchsorted(self.times_ns, ticks))
-        return motion_of_keyframes((table[0][rows], table[1][rows], table[2][rows]), table)
-
-
-def read_poses(path: Path) -> Poses:
-    """The poses in city_SE3_egovehicle.feather. Raises InputError."""
+def read_motion(path: Path, axle_height_m: float) -> EgoMotion:
+    """The poses in city_SE3_egovehicle.feather, as those of the frame below the axle. Raises InputError."""
     table = FeatherTable(path, ("timestamp_ns", *QUATERNION, *TRANSLATION))
     if not len(table):
         raise InputError(f"{path}: has no poses (expected at least one)")
     times, first = np.unique(table.integers("timestamp_ns"), return_index=True)
-    translations, quaternions = table.poses()
-    return Poses(times, translations[first], quaternions[first])
+    axles, quaternions = (column[first] for column in table.poses())
+    up = np.stack([rotation_from_quaternion(q)[:, 2] for q in quaternions])
+    poses = (times, axles - axle_height_m * up, quaternions)
+    rows = np.unique(np.searchsorted(times, np.arange(times[0], times[-1] + 1, SPACING_NS)))
+    return motion_of_keyframes((times[rows], poses[1][rows], quaternions[rows]), poses)
 
 
 def read_rig(folder: Path, own: Argoverse2Options) -> CameraRig:

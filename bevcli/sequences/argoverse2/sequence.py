@@ -10,11 +10,13 @@ from bevcli.errors import InputError
 from bevcli.frame import Frame, FrameStamp, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
+from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import rotation_from_quaternion, yaw_of_rotation
+from bevcli.parsing.documents import LARGEST_INTEGER
 from bevcli.sequences.argoverse2.classes import CLASS_OF_CATEGORY
 from bevcli.sequences.argoverse2.feather import QUATERNION, TRANSLATION, FeatherTable
 from bevcli.sequences.argoverse2.format import Argoverse2Options
-from bevcli.sequences.argoverse2.rig import Poses, read_poses, read_rig
+from bevcli.sequences.argoverse2.rig import read_motion, read_rig
 from bevcli.sequences.files.class_names import ClassNames, count_other_classes, other_classes_note
 from bevcli.sequences.images import FrameEntry, ImageReader, ImageSource, read_frame
 from bevcli.sequences.native.folder import rig_notes
@@ -42,11 +44,10 @@ class Argoverse2Sequence(Sequence):
         common.refuse_static(path)
         self.path, self.name = path, path.resolve().name
         self.rig = read_rig(path / "calibration", own)
-        poses = read_poses(path / "city_SE3_egovehicle.feather")
-        self.ego_motion = poses.motion(own.axle_height_m)
+        self.ego_motion = read_motion(path / "city_SE3_egovehicle.feather", own.axle_height_m)
         images = {name: _image_times(path / "sensors/cameras" / name) for name in self.rig.names}
         annotated = (path / ANNOTATIONS).exists()
-        truth = _read_annotations(path / ANNOTATIONS, poses, own.class_map) if annotated else {}
+        truth = _read_annotations(path / ANNOTATIONS, self.ego_motion, own) if annotated else {}
         self._entries, notes = _entries(path, self.rig, images, np.array(sorted(truth), dtype=np.int64))
         self.stamps = tuple(entry.stamp for entry in self._entries)
         self._truth = truth if common.ground_truth else {}
@@ -79,17 +80,18 @@ class Argoverse2Sequence(Sequence):
 def _image_times(folder: Path) -> Times:
     """(N,) ns, increasing, of the images TIMESTAMP.jpg in a camera's folder; none without the folder."""
     names = [file.stem for file in folder.glob("*.jpg")] if folder.is_dir() else []
-    return np.array(sorted(int(name) for name in names if name.isdecimal() and len(name) < 19), dtype=np.int64)
+    times = [int(name) for name in names if name.isascii() and name.isdecimal() and len(name) <= 19]
+    return np.array(sorted(time for time in times if time <= LARGEST_INTEGER), dtype=np.int64)
 
 
-def _read_annotations(path: Path, poses: Poses, class_map: Mapping[str, str]) -> dict[int, Boxes3D]:
+def _read_annotations(path: Path, motion: EgoMotion, own: Argoverse2Options) -> dict[int, Boxes3D]:
     """The boxes in the city frame by time in ns. Raises InputError."""
     columns = ("timestamp_ns", "track_uuid", "category", *SIZE, *QUATERNION, *TRANSLATION, "num_interior_pts")
     table = FeatherTable(path, columns)
-    names = ClassNames(CLASS_OF_CATEGORY | dict(class_map))
+    names = ClassNames(CLASS_OF_CATEGORY | dict(own.class_map))
     translations, quaternions = table.poses()
     boxes = Boxes3D(
-        translations,
+        translations + [0, 0, own.axle_height_m],
         table.numbers(SIZE),
         np.array([yaw_of_rotation(rotation_from_quaternion(q)) for q in quaternions], dtype=np.float64),
         np.full((len(table), 2), np.nan),
@@ -98,7 +100,7 @@ def _read_annotations(path: Path, poses: Poses, class_map: Mapping[str, str]) ->
         num_points=table.integers("num_interior_pts"),
     )
     times = table.integers("timestamp_ns")
-    frames, motion = np.unique(times), poses.motion(0.0)
+    frames = np.unique(times)
     try:
         in_city = [boxes[times == time].transformed(motion.pose_at(int(time)).matrix) for time in frames]
     except InputError as error:

@@ -113,9 +113,13 @@ def _datum(record: Record, time_ns: int) -> Datum | None:
 
 
 def sizes(sample: Sample) -> dict[str, tuple[int, int]]:
-    """(width, height) of each camera's image in a sample, in order of the cameras' names."""
-    images = sorted((one for one in sample.data if one.is_image), key=lambda one: one.sensor)
-    return {one.sensor: (one.content.integer("width"), one.content.integer("height")) for one in images}
+    """(width, height) of each camera's image in a sample, in the order of the calibration. Raises InputError."""
+    images = {datum.sensor: datum.content for datum in sample.data if datum.is_image}
+    return {
+        name: (images[name].integer("width"), images[name].integer("height"))
+        for name in sample.calibration.ego_from
+        if name in images
+    }
 
 
 def poses(samples: Iterable[Sample], *, keys: bool) -> PoseTable:
