@@ -14,14 +14,16 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from pyarrow import feather
-from written_formats import WRITTEN
+from written_formats import RING, WRITTEN
 
 from bevcli.errors import InputError
 from bevcli.evaluation.evaluate import evaluate
-from bevcli.frame import Frame, Sequence
+from bevcli.frame import DerivedSequence, Frame, Sequence
 from bevcli.geometry.boxes import CLASSES, Boxes3D
 from bevcli.geometry.cameras import Distortion
 from bevcli.geometry.transforms import inverse
+from bevcli.inference.load import Model
+from bevcli.inference.run import run
 from bevcli.rig.rig_report import check_rig
 from bevcli.sequences.format import Format, format_of
 from bevcli.sequences.open import open_sequence
@@ -30,13 +32,14 @@ FORMATS: dict[str, Format] = {name: resolve_name(f"{one.module}:FORMAT") for nam
 TABLES = {"dgp": "scene_s.json", "argoverse2": "annotations.feather", "t4": "annotation/sample_data.json"}
 LENS = Distortion("brown_conrady", (-0.24, -0.21, 0.0, 0.0, 0.32))  # as of a camera of Argoverse 2
 DOCUMENT = (Path(__file__).parents[2] / "docs/other-inputs.md").read_text()
+SAMPLE = Path(__file__).parents[2] / "samples/street"
 ROW = re.compile(r"^\| `(.+?)` +\| `?(\w+|–)`? +\|", flags=re.MULTILINE)
 
 
 @pytest.fixture(scope="module")
 def street() -> list[Frame]:
     """Three frames of the sample drive, with a lens on the front camera."""
-    drive = open_sequence(Path(__file__).parents[2] / "samples/street", frames=slice(0, 3))
+    drive = open_sequence(SAMPLE, frames=slice(0, 3))
     frames = [drive.load(place) for place in range(3)]
     front = replace(drive.rig.cameras[0], distortion=LENS)
     rig = replace(drive.rig, cameras=(front, *drive.rig.cameras[1:]))
@@ -88,8 +91,6 @@ def test_written_frames_are_read_back(written, street):
 
 
 def _order(name: str, ours: tuple[str, ...]) -> Callable[[str], int]:
-    from written_formats import RING
-
     known = RING if name == "argoverse2" else ours
     return known.index
 
@@ -119,6 +120,38 @@ def _pairing(a: Boxes3D, b: Boxes3D) -> np.ndarray:
     distances = np.linalg.norm(a.centers[:, None] - b.centers[None], axis=-1)
     assert distances.shape[0] == distances.shape[1]
     return distances.argmin(axis=1)
+
+
+class _Memory(DerivedSequence):
+    """Frames in memory in place of a drive's own."""
+
+    def __init__(self, drive: Sequence, frames: list[Frame]) -> None:
+        super().__init__(drive)
+        self.frames, self.rig = frames, frames[0].rig
+
+    def load(self, place: int) -> Frame:
+        return self.frames[place]
+
+
+class _WithKinematics(DerivedSequence):
+    """A drive with the kinematics of other frames: these formats derive them from the poses."""
+
+    def __init__(self, drive: Sequence, frames: list[Frame]) -> None:
+        super().__init__(drive)
+        self.frames = frames
+
+    def load(self, place: int) -> Frame:
+        return replace(super().load(place), kinematics=self.frames[place].kinematics)
+
+
+def test_a_written_drive_has_the_same_predictions(written, street, mini_model):
+    drive = open_sequence(written[1], **WRITTEN[written[0]].options)
+    native, model = _Memory(open_sequence(SAMPLE, frames=slice(0, 3)), street), Model(mini_model)
+    expected, found = (
+        [prediction.boxes for _, prediction in run(model, one)] for one in (native, _WithKinematics(drive, street))
+    )
+    for a, b in zip(expected, found, strict=True):
+        np.testing.assert_allclose(b.to_numpy(), a.to_numpy(), atol=1e-4)
 
 
 def test_a_lens_projects_as_opencv_does(written, street):
