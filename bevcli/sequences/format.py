@@ -75,6 +75,7 @@ def option_classes() -> list[type[FormatOptions]]:
 def format_of(path: Path) -> Format:
     """The format of a path. Raises InputError if it is missing, or has no known format or two."""
     known, broken = _loaded()
+    known = tuple(sorted(known, key=lambda one: one.precedence))  # in messages, the most general one comes first
     if not path.exists():
         raise InputError(f"{path}: is missing (expected {_either([one.name for one in known])})")
     matching = [one for one in known if one.recognises(path)]
