@@ -29,8 +29,9 @@ from bevcli.runs.folder import SUMMARY
 from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.runs.state import save_state
 from bevcli.runs.summary import RunSummary
-from bevcli.sequences.native.format import NativeOptions
+from bevcli.sequences.format import format_of
 from bevcli.sequences.nuscenes.format import NuScenesOptions
+from bevcli.sequences.options import ClassMapOptions
 
 MATCHES = "matches.safetensors"  # in the folder of a drive's results: for the joint metrics
 _SCRATCH = "bevcli-batch-"
@@ -141,10 +142,12 @@ class Worker:
 
     def _score(self, drive: Drive, path: Path, aside: Path) -> tuple[Scores | None, str]:
         """The scores of a drive's predictions, or None and why there are none; "" without ground truth."""
-        if not self._job.evaluate or not (drive.scene or (path / "ground_truth.json").is_file()):
+        chosen = format_of(path)
+        if not self._job.evaluate or not (chosen.annotated or (path / "ground_truth.json").is_file()):
             return None, ""
+        own = self._job.own_of(chosen.options)
         version = self._job.own_of(NuScenesOptions).version if drive.scene else None
-        class_map = self._job.own_of(NativeOptions).class_map
+        class_map = own.class_map if isinstance(own, ClassMapOptions) else None
         range_m = self._model.config.bev_grid.nearest_side_m
         try:
             scores = evaluate(aside, path, range_m, scene=drive.scene, version=version, class_map=class_map)

@@ -30,7 +30,7 @@ def velocities_between(centers: Array, times_s: Array, first: NDArray[np.int64],
 
 
 def with_track_velocities(frames: Sequence[Boxes3D], timestamps_ns: Sequence[int]) -> list[Boxes3D]:
-    """The boxes of T frames, in the world frame, with the velocities that follow from their `instances`.
+    """The boxes of T frames, in the world frame, with the velocities that follow from their `instances`; "" is none.
 
     timestamps_ns: (T,) increasing.
     """
@@ -40,7 +40,8 @@ def with_track_velocities(frames: Sequence[Boxes3D], timestamps_ns: Sequence[int
     counts = [len(boxes) for boxes in frames]
     seconds = np.repeat((np.asarray(timestamps_ns) - timestamps_ns[0]) * 1e-9, counts)
     order = np.lexsort((seconds, together.instances))
-    same = together.instances[order][1:] == together.instances[order][:-1]
+    names = together.instances[order]
+    same = (names[1:] == names[:-1]) & (names[1:] != "")
     first, last = np.arange(len(order)), np.arange(len(order))
     first[order[1:][same]], last[order[:-1][same]] = order[:-1][same], order[1:][same]
     velocities = velocities_between(together.centers, seconds, first, last)[:, :2]

@@ -27,6 +27,7 @@ from bevcli.inference.run import run
 from bevcli.rig.rig_report import check_rig
 from bevcli.sequences.format import Format, format_of
 from bevcli.sequences.open import open_sequence
+from bevcli.sequences.tracks import with_track_velocities
 
 FORMATS: dict[str, Format] = {name: resolve_name(f"{one.module}:FORMAT") for name, one in WRITTEN.items()}
 TABLES = {"dgp": "scene_s.json", "argoverse2": "annotations.feather", "t4": "annotation/sample_data.json"}
@@ -306,6 +307,17 @@ def test_a_wrong_lens_of_t4_is_named(street, tmp_path):
 def test_static_is_refused(written):
     with pytest.raises(InputError, match=r'has its own ego-motion: remove `ego_motion="static"`'):
         open_sequence(written[1], ego_motion="static")
+
+
+def test_boxes_without_an_instance_have_no_velocity():
+    """An object that moves by 1 m in half a second has a velocity, two that are nobody's have none."""
+    one = Boxes3D(np.zeros((2, 3)), np.ones((2, 3)), np.zeros(2), np.full((2, 2), np.nan), np.array(["car"] * 2))
+    one = replace(one, instances=np.array(["", "a"]))
+    found = with_track_velocities(
+        [one, Boxes3D.empty(), replace(one, centers=one.centers + 1)], [0, 250_000_000, 500_000_000]
+    )
+    assert np.isnan(found[0].velocities[0]).all()
+    assert found[2].velocities[1].tolist() == [2.0, 2.0]
 
 
 def test_a_class_map_renames_a_class(street, tmp_path):

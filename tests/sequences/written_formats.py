@@ -134,7 +134,7 @@ def write_dgp(frames: Sequence[Frame], folder: Path) -> None:
         annotations = [
             {
                 "class_id": classes.index(name),
-                "instance_id": things.index(instance),
+                "instance_id": things.index(instance) + 1,
                 "num_points": 7,
                 "box": dict(zip(("length", "width", "height"), size, strict=True)) | {"pose": _dgp_pose(pose)},
             }

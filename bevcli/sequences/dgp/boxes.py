@@ -29,12 +29,13 @@ def read_boxes(path: Path, world_from_sensor: Array, classes: Mapping[int, str])
     boxes = [record.record("box") for record in records]
     world_from_box = [world_from_sensor @ box.record("pose").pose().matrix for box in boxes]
     ids = [record.integer("class_id", 0) for record in records]
+    things = [record.integer("instance_id", 0) for record in records]  # 0 is that of a box without one
     return Boxes3D(
         np.stack([pose[:3, 3] for pose in world_from_box]),
         np.stack([box.numbers(SIZE) for box in boxes]),
         np.array([yaw_of_rotation(pose[:3, :3]) for pose in world_from_box]),
         np.full((len(boxes), 2), np.nan),
         np.array([classes.get(number, f"class {number}") for number in ids], dtype=np.str_),
-        instances=np.array([str(record.integer("instance_id", 0)) for record in records], dtype=np.str_),
+        instances=np.array([str(one or "") for one in things], dtype=np.str_),
         num_points=np.array([record.integer("num_points", 0) for record in records], dtype=np.int64),
     )

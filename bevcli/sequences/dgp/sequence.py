@@ -9,12 +9,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.ego_motion import motion_of_keyframes
 from bevcli.sequences.dgp.boxes import read_boxes, read_ontology
 from bevcli.sequences.dgp.format import DgpOptions
-from bevcli.sequences.dgp.records import (
-    BOXES_3D,
-    Record,
-    inside,
-    read_record,
-)
+from bevcli.sequences.dgp.records import BOXES_3D, Record, inside, read_record
 from bevcli.sequences.dgp.samples import Sample, poses, read_samples, sizes
 from bevcli.sequences.files.class_names import count_other_classes, other_classes_note
 from bevcli.sequences.images import FrameEntry, ImageReader, ImageSource, read_frame
