@@ -15,7 +15,10 @@ class TrainOptions:
     )
     resume: bool = option(default=False, help="Resume from the checkpoint in the output folder.")
     weights: Path | None = option(
-        reads="path", default=None, help="Start from these weights (fine-tuning) instead of random ones."
+        reads="path",
+        default=None,
+        help="Start from these weights (fine-tuning) instead of random ones. The model may have other classes, cameras "
+        "and BEV cells; a table lists what is loaded.",
     )
     steps: int | None = option(default=None, help="Number of steps. Default: as in the training table.", minimum=1)
     held_out: int | None = option(
