@@ -44,13 +44,13 @@ def run(
     from bevcli.cli.progress import Progress
     from bevcli.cli.stop_signals import StopSignals
     from bevcli.inference.load import load_model
-    from bevcli.rig.check_drive import input_errors
+    from bevcli.rig.check_drive import CheckedDrive
     from bevcli.runs.run_into_folder import run_into_folder
     from bevcli.sequences.open import open_sequence
 
     loaded = load_model(options=model)
     reading = source.for_model(loaded.config, temporal=run_options.temporal)
-    drive = open_sequence(sequence, reading, **format_options)
+    drive = CheckedDrive(open_sequence(sequence, reading, **format_options), shlex.quote(str(sequence)))
     out = output.out or Path("runs") / f"{drive.name}-{loaded.name}"
     view = None
     if output.live:
@@ -63,7 +63,7 @@ def run(
             progress.message(f"warning: {warning}")
         progress.advance()
 
-    notes = [*input_errors(drive, shlex.quote(str(sequence))), *_run_notes(loaded, drive, live=output.live)]
+    notes = [*drive.input_errors, *_run_notes(loaded, drive, live=output.live)]
     with Progress(len(drive.stamps), "frames", notes) as progress, StopSignals("frame") as signals:
         summary = run_into_folder(
             loaded,
