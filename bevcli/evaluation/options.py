@@ -30,18 +30,20 @@ class EvaluationOptions:
 class ExportOptions:
     """The format of exported boxes and what it needs."""
 
-    form: Literal["csv", "kitti", "nuscenes", "nuscenes-tracking"] = option(
-        help="csv: one table. kitti: label_2 and calib. nuscenes: results_nusc.json. nuscenes-tracking: "
-        "tracking_nusc.json.",
+    form: Literal["csv", "json", "kitti", "nuscenes", "nuscenes-tracking"] = option(
+        help="csv: one table. json: a boxes file, as predictions.json. kitti: label_2 and calib. "
+        "nuscenes: results_nusc.json. nuscenes-tracking: tracking_nusc.json.",
         flag="--format",
     )
     out: Path | None = option(
         default=None,
-        help="Default: boxes.csv, kitti, results_nusc.json or tracking_nusc.json next to PREDICTIONS.",
+        help="Default: boxes.csv, boxes.json, kitti, results_nusc.json or tracking_nusc.json next to PREDICTIONS.",
     )
     score: float = option(default=0.0, help="Leave out boxes scored below this.", minimum=0, maximum=1)
     calibration: Path | None = option(
-        reads="path", default=None, help="kitti: calibration.json, or the sequence folder that contains it."
+        reads="path",
+        default=None,
+        help="kitti: calibration.json, or the sequence folder that contains it. Default: the one next to PREDICTIONS.",
     )
     camera: str | None = option(
         default=None, help="kitti: the camera. Default: CAM_FRONT, else the one that looks most directly ahead."

@@ -176,7 +176,8 @@ def write_figures(
     """Writes `bevformer-STEP.png` (or .jpg) per step into a folder, which is created; yields each file when written.
 
     untrained: whether the weights are random; then every figure is labelled UNTRAINED.
-    Figures that the folder holds are replaced, also those of the other format. Raises OutputError when the folder or a file cannot be written.
+    Figures that the folder holds are replaced, also those of the other format.
+    Raises OutputError when the folder or a file cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)

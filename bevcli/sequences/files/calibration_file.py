@@ -19,7 +19,7 @@ from bevcli.printing import one_line
 from bevcli.sequences.files.json_fields import LONGEST_VALUE, Report, parse_numbers, parse_transform, transform_to_json
 from bevcli.writing import write_whole
 
-FORMAT = "bevcli-calibration/1"
+FORMAT, CALIBRATION = "bevcli-calibration/1", "calibration.json"
 LARGEST_BYTES = 4 << 20
 KEYS = ("width", "height", "intrinsics", "distortion", "ego_from_camera")
 LARGEST_SIZE = 16384  # pixels of a side
