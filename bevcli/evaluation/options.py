@@ -5,6 +5,12 @@ from typing import Literal
 
 from bevcli.options import option, options
 
+# Of every command that scores boxes.
+MAX_RANGE_HELP = (
+    "Score nothing beyond this distance from the ego vehicle, nor beyond nuScenes' range of the class. Default: where "
+    "the model's BEV grid ends."
+)
+
 
 @options()
 class EvaluationOptions:
@@ -17,7 +23,7 @@ class EvaluationOptions:
     )
     max_range: float | None = option(
         default=None,
-        help="Cut nuScenes' class ranges at this distance from the ego vehicle. Default: the model's range.",
+        help=MAX_RANGE_HELP,
         metavar="METRES",
     )
     count_missing: bool = option(default=False, help="Count ground-truth frames without a prediction as missed.")
