@@ -88,7 +88,7 @@ class _Old:
 
 @dataclass(frozen=True)
 class _Read:
-    """A parameter for what is read. label: for messages. reads: see `Option`. names: those that may stand for a path."""
+    """What is read. label: for messages. reads: see `Option`. names: those that may stand for a path."""
 
     label: str
     reads: Reads
