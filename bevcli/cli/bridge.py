@@ -13,7 +13,7 @@ from contextvars import ContextVar
 from dataclasses import MISSING, Field, dataclass
 from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import typer
 
@@ -28,6 +28,7 @@ INPUT: Reads = "path"
 INPUT_OR_NAME: Reads = "path or name"
 INPUT_OR_PATTERN: Reads = "path or pattern"
 
+_METAVARS = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
 _ARGUMENT = re.compile(r"`([a-z]\w*)(?:=([^`]*))?`")
 
 
@@ -231,7 +232,8 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     spelled = [(each, text) for each in parameters if each.name in flags for text in flags[each.name].option.old]
     old = [_Old(each, flags[each.name].yes, text) for each, text in spelled]
     old += [_Old(each, f"--{each.name}") for each in parameters if each.name in arguments]
-    called.__signature__ = Signature([*parameters, *(each.parameter for each in old)])  # type: ignore[attr-defined]
+    made = [*parameters, *(each.parameter for each in old)]
+    called.__signature__ = Signature([_with_metavar(each) for each in made])  # type: ignore[attr-defined]
     return called
 
 
@@ -311,6 +313,22 @@ def _flags_of(hint: Any) -> tuple[Callable[..., Any] | None, dict[str, _Flag]]:
                 found.setdefault(field.name, flag)
     assert set(part.only) <= found.keys(), f"{hint}: {part.only}"
     return (dict if part.classes else hint), found
+
+
+def _with_metavar(parameter: Parameter) -> Parameter:
+    """The parameter with a name for its value in `--help`: that of an argument, else PATH, TEXT or the choices."""
+    kind, info, *_ = get_args(parameter.annotation)
+    kinds = [each for each in get_args(kind) if each is not type(None)] if get_origin(kind) is not Literal else []
+    kind = kinds[0] if kinds else kind
+    kind = get_args(kind)[0] if get_origin(kind) is list else kind
+    if info.metavar is not None or kind is bool:
+        return parameter
+    info = copy.copy(info)
+    if isinstance(info, typer.models.ArgumentInfo):
+        info.metavar = parameter.name.upper()
+    else:
+        info.metavar = "|".join(get_args(kind)) or _METAVARS.get(kind)
+    return parameter.replace(annotation=Annotated[get_args(parameter.annotation)[0], info])
 
 
 def _plain(hint: Any) -> Any:

@@ -20,6 +20,7 @@ def validate(
         str | None,
         typer.Option(
             autocompletion=complete_model,
+            metavar="NAME|FILE",
             help="A model name, a FILE.toml or a FILE.onnx. Default: the model that WEIGHTS fit, else demo.",
             rich_help_panel="Model",
         ),

@@ -35,6 +35,7 @@ def inspect(
             help="List the parts of this model, such as tiny, base or v2-t2, or a FILE.toml; FILE must fit it.",
             show_default=False,
             autocompletion=complete_model,
+            metavar="NAME|FILE",
         ),
         INPUT_OR_NAME,
     ] = None,
