@@ -68,7 +68,7 @@ class _Old:
         kind, info, *_ = get_args(self.option.annotation)
         if self.spelling:
             info = copy.copy(info)
-            info.param_decls, info.hidden = (self.spelling,), True
+            info.default, info.param_decls, info.hidden = ..., (self.spelling,), True  # default has a spelling
         else:
             info = typer.Argument(hidden=True, metavar=f"[{self.option.name.upper()}]")
         kind, default = (bool, False) if kind is bool else (kind | None, None)
