@@ -317,18 +317,21 @@ def _flags_of(hint: Any) -> tuple[Callable[..., Any] | None, dict[str, _Flag]]:
 
 def _with_metavar(parameter: Parameter) -> Parameter:
     """The parameter with a name for its value in `--help`: that of an argument, else PATH, TEXT or the choices."""
-    kind, info, *_ = get_args(parameter.annotation)
-    kinds = [each for each in get_args(kind) if each is not type(None)] if get_origin(kind) is not Literal else []
-    kind = kinds[0] if kinds else kind
+    whole, *marks = get_args(parameter.annotation) if get_origin(parameter.annotation) is Annotated else [None]
+    info = next((each for each in marks if isinstance(each, typer.models.ParameterInfo)), None)
+    if info is None or info.metavar is not None:
+        return parameter
+    kinds = [each for each in get_args(whole) if each is not type(None)] if get_origin(whole) is not Literal else []
+    kind = kinds[0] if kinds else whole
     kind = get_args(kind)[0] if get_origin(kind) is list else kind
-    if info.metavar is not None or kind is bool:
+    if kind is bool:
         return parameter
     info = copy.copy(info)
     if isinstance(info, typer.models.ArgumentInfo):
         info.metavar = parameter.name.upper()
     else:
         info.metavar = "|".join(get_args(kind)) or _METAVARS.get(kind)
-    return parameter.replace(annotation=Annotated[get_args(parameter.annotation)[0], info])
+    return parameter.replace(annotation=Annotated[whole, info])
 
 
 def _plain(hint: Any) -> Any:

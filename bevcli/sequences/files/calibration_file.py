@@ -153,8 +153,8 @@ def _facts_to_json(facts: DriveFacts) -> dict[str, Any]:
 
 def _camera_to_json(camera: Camera) -> dict[str, Any]:
     entry: dict[str, Any] = {
-        "width": camera.width,
-        "height": camera.height,
+        "width": int(camera.width),  # a reader of another package may have NumPy's
+        "height": int(camera.height),
         "intrinsics": camera.intrinsics.tolist(),
         "ego_from_camera": transform_to_json(camera.ego_from_camera),
     }
