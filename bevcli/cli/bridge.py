@@ -317,6 +317,7 @@ def _flags_of(hint: Any) -> tuple[Callable[..., Any] | None, dict[str, _Flag]]:
 
 def _with_metavar(parameter: Parameter) -> Parameter:
     """The parameter with a name for its value in `--help`: that of an argument, else PATH, TEXT or the choices."""
+    whole: Any
     whole, *marks = get_args(parameter.annotation) if get_origin(parameter.annotation) is Annotated else [None]
     info = next((each for each in marks if isinstance(each, typer.models.ParameterInfo)), None)
     if info is None or info.metavar is not None:
