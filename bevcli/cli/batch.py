@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from bevcli.batch.options import BatchOptions, Workers
-from bevcli.cli.bridge import Part
+from bevcli.cli.bridge import INPUT_OR_PATTERN, Part
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
 from bevcli.recording.options import RecordingOptions
@@ -27,6 +27,7 @@ def batch(
             "or URLs such as s3://bucket/fleet/*.",
             show_default=False,
         ),
+        INPUT_OR_PATTERN,
     ] = None,
     *,
     options: BatchOptions,

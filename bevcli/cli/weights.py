@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bevcli.cli.bridge import INPUT, Json, Part, command
+from bevcli.cli.bridge import INPUT, INPUT_OR_NAME, Json, Part, command
 from bevcli.cli.help_text import PlainCommand
 from bevcli.engines.options import FileOptions
+from bevcli.inference.options import complete_model
 from bevcli.printing import say
 
 if TYPE_CHECKING:
@@ -33,7 +34,10 @@ def inspect(
         typer.Option(
             help="List the parts of this model, such as tiny, base or v2-t2, or a FILE.toml; FILE must fit it.",
             show_default=False,
+            autocompletion=complete_model,
+            metavar="NAME|FILE",
         ),
+        INPUT_OR_NAME,
     ] = None,
     as_json: Json = False,
 ) -> None:

@@ -31,6 +31,7 @@ class ModelOptions:
         default=None,
         help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, uniad-track-map, demo, a FILE.toml or a FILE.onnx of "
         "`bevcli export-onnx`. Default: the model that WEIGHTS fit, else demo.",
+        metavar="NAME|FILE",
         complete=complete_model,
     )
     weights: Path | None = option(

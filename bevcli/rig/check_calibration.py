@@ -16,7 +16,7 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.rig.coverage import Coverage
 from bevcli.rig.rig_report import RigReport, check_rig, report_text, with_findings
 from bevcli.rig.sequence_checks import check_camera_times, check_scenes
-from bevcli.sequences.files.calibration_file import draft_calibration
+from bevcli.sequences.files.calibration_file import CALIBRATION, draft_calibration
 from bevcli.sequences.native.folder import FolderSequence
 from bevcli.sequences.native.tables import read_frames_table
 from bevcli.sequences.open import open_sequence
@@ -24,7 +24,6 @@ from bevcli.sequences.options import SequenceOptions
 from bevcli.sequences.ros.format import is_ros_bag
 from bevcli.writing import write_whole
 
-CALIBRATION = "calibration.json"
 _Found = tuple[tuple[Finding, ...], Mapping[str, NDArray[np.uint8]]]  # findings, and images by camera
 
 

@@ -24,6 +24,7 @@ from bevcli.recording.writer import LiveSink, Recording, RecordingState
 from bevcli.runs.folder import RunFolder
 from bevcli.runs.options import RunOptions
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
+from bevcli.sequences.files.calibration_file import CALIBRATION, write_calibration
 from bevcli.sequences.files.incremental_json import partial_path
 from bevcli.sequences.files.json_fields import pose_to_json
 from bevcli.sequences.files.map_folder import map_path, write_map
@@ -151,6 +152,9 @@ class RunFiles:
                 self._tracks = self._stack.enter_context(CsvWriter(out / TRACKS, tracks_at))
             if resume is not None and resume.submission is not None:
                 self._open_submission(resume.submission)
+            if len({stamp.scene for stamp in sequence.stamps}) == 1:  # scenes may have rigs of their own
+                self._folder.add(out / CALIBRATION)
+                write_calibration(out / CALIBRATION, sequence.rig, sequence.facts)
             for note in sequence.notes if resume is None else ():
                 self._recording.event(note, "WARN")
             self._stack = self._stack.pop_all()
@@ -237,7 +241,7 @@ class RunFiles:
 
     def written(self) -> tuple[Path, ...]:
         """The files and folders that exist so far."""
-        paths = [self._out / name for name in (RECORDING, PREDICTIONS, TRACKS, SUBMISSION, SEGMENTATION)]
+        paths = [self._out / name for name in (RECORDING, PREDICTIONS, TRACKS, SUBMISSION, SEGMENTATION, CALIBRATION)]
         return tuple(path for path in (*paths, self._options.save_bev) if path is not None and path.exists())
 
 
