@@ -191,7 +191,7 @@ def short_hash(hexdigest: str) -> str:
 def save_state(path: Path, state: object) -> None:
     """Write a state. The file is replaced at once, so that it is whole at every moment. Raises OutputError."""
     tensors = _tensors_of(state)
-    write_whole(path, save(tensors, {"format": FORMAT, "sha256": _hash(tensors)}))
+    write_whole(path, save(tensors, {"format": FORMAT, "sha256": _hash(tensors)}), regular=True)
 
 
 def load_state(path: Path, kind: type[Loaded]) -> Loaded:

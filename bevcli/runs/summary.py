@@ -168,7 +168,7 @@ class RunSummary:
         """Write summary.json into a folder. files: that the run wrote. Raises OutputError."""
         path = folder / SUMMARY
         self.files = (*files, path)
-        write_whole(path, (json.dumps(self.to_dict(), indent=1) + "\n").encode())
+        write_whole(path, (json.dumps(self.to_dict(), indent=1) + "\n").encode(), regular=True)
 
     def table(self) -> str:
         """The summary as a few aligned lines."""
