@@ -47,10 +47,11 @@ def batch(
     error, and the others go on. Exit code 3: some drives failed. See docs/fleet.md.
     """
     from bevcli.batch.drives import find_drives, read_list
-    from bevcli.batch.job import Job, all_own_options
+    from bevcli.batch.job import Job, all_own_options, with_absolute_paths
     from bevcli.batch.run_batch import run_batch
     from bevcli.batch.storage import is_url
     from bevcli.batch.worker import use_threads
+    from bevcli.cli.fetching import fetch_if_asked
     from bevcli.cli.progress import Progress
     from bevcli.cli.stop_signals import StopSignals
     from bevcli.inference.load import choose_device
@@ -64,7 +65,7 @@ def batch(
         model = replace(model, device="cpu")
     job = Job(
         options.out if is_url(options.out) else str(Path(options.out.removeprefix("file://")).absolute()),
-        replace(model, weights=None if model.weights is None else model.weights.absolute()),
+        with_absolute_paths(model),
         run=replace(run_options, recording=recording),
         embed=options.embed,
         evaluate=options.evaluate,
@@ -74,6 +75,7 @@ def batch(
         use_threads(workers.threads)
     if workers.address is None:
         choose_device(model.device)
+    fetch_if_asked(model)
     # Loaded here, so that a mistake in the model ends the batch at once. Its hash is needed; only one worker runs it.
     loaded = job.load_model(model.device if alone else "cpu")
     found, notes = find_drives(texts, NuScenesOptions(format_options["version"], format_options.pop("split")))
