@@ -27,7 +27,7 @@ class _Bar:
         """Show the bytes that are there. total: None if the server does not state it."""
         if self._progress is None:
             note = f"{self._weights.name}: {self._weights.source.url}"
-            self._progress = Progress(round((total or 0) / UNIT) or done // UNIT + 1, "MB", [note]).__enter__()
+            self._progress = Progress(max(total or 0, done + UNIT) // UNIT, "MB", [note]).__enter__()
             self._progress.skip(done // UNIT)
         if done // UNIT > self._progress.done:
             self._progress.advance(done // UNIT - self._progress.done)

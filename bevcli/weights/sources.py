@@ -5,7 +5,6 @@ import re
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path, PurePosixPath
-from typing import Literal
 from urllib.parse import unquote, urlsplit
 
 import msgspec
@@ -15,7 +14,6 @@ from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import read_text
 from bevcli.user_folders import user_settings
 
-Score = Literal["NDS", "mAP", "mATE", "mASE", "mAOE", "mAVE", "mAAE", "AMOTA"]
 _HUB = re.compile(r"hf://([\w.-]+/[\w.-]+?)(?:@([\w./-]+?))?/((?!.*\.\./)[\w./ -]+)")
 _NAME = re.compile(r"\w[\w.+-]{0,99}")
 
@@ -39,7 +37,7 @@ class Source(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     bytes: int | None = None
     sha256: str = ""
     licence: str = ""
-    published: Mapping[Score, float] = {}
+    published: Mapping[str, float] = {}
 
     def __post_init__(self) -> None:
         if self.sha256 and not re.fullmatch(r"[0-9a-f]{8,64}", self.sha256):
