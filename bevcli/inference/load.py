@@ -198,10 +198,10 @@ def _load_network(options: ModelOptions) -> Model:
 def _named_file(model: str, named: NamedWeights | None, options: ModelOptions) -> Path:
     """The downloaded weights of a model. Raises WeightsError where there are none."""
     if named is not None and named.file is not None:
-        if options.fetch:
-            return fetch_weights(named).path
         if named.here is not None:
             return named.here
+        if options.fetch:
+            return fetch_weights(named).path
         how = f"run {_fetch_command(named.name, options)}, which downloads them"
     elif named is not None:
         how = f"they {by_hand(named)}"

@@ -6,12 +6,13 @@ from typing import Literal
 
 from bevcli.options import option, options
 from bevcli.registry import entries
-from bevcli.weights.sources import read_sources
 
 
 def complete_model(incomplete: str) -> list[str]:
-    """The known models that start with a text, for completion in a shell."""
+    """The known models and weights that start with a text, for completion in a shell."""
     # Not of bevcli.config, which loads PyTorch: completion must be quick.
+    from bevcli.weights.sources import read_sources
+
     files = [file.name for file in resources.files("bevcli").joinpath("configs").iterdir()]
     names = {file.removesuffix(".toml") for file in files if file.endswith(".toml")} | read_sources().keys()
     return sorted(name for name in names if name.startswith(incomplete))

@@ -196,7 +196,9 @@ class _Transfer:
     def _begin(self) -> None:
         """Check what the server states of the file, before its first byte."""
         length, status = self._headers.get("content-length", ""), self._headers["status"]
-        self.total = int(length) + (self.done if status == "206" else 0) if length.isdecimal() else None
+        self.total = (
+            int(length) + (self.done if status == "206" else 0) if length.isdecimal() and len(length) < 16 else None
+        )
         if self.expected_bytes and self.total not in (None, self.expected_bytes):
             raise WeightsError(
                 f"{self.url}: the server states {self.total:,} bytes, expected {self.expected_bytes:,}: it is another "

@@ -1,9 +1,11 @@
 """A web server on loopback that serves one file, well or badly: the first part of a path says how."""
 
+import ssl
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 
 
 class Files(BaseHTTPRequestHandler):
@@ -72,6 +74,13 @@ class Files(BaseHTTPRequestHandler):
         self.wfile.write(self.content + b"x" * 1000)
         self.close_connection = True
 
+    def absurd_length(self) -> None:
+        self.send_response(200)
+        self.send_header("Content-Length", "9" * 5000)
+        self.end_headers()
+        self.wfile.write(self.content)
+        self.close_connection = True
+
     def other(self) -> None:
         self.send(bytes(byte ^ 1 for byte in self.content))
 
@@ -87,6 +96,9 @@ class Files(BaseHTTPRequestHandler):
     def redirect(self) -> None:
         self._to(self.path.replace("/redirect/", "/whole/"))
 
+    def redirect_to_http(self) -> None:
+        self._to("http://127.0.0.1:1/weights.safetensors")
+
     def redirect_for_ever(self) -> None:
         self._to(self.path)
 
@@ -101,15 +113,22 @@ class Files(BaseHTTPRequestHandler):
 
 
 @contextmanager
-def serving(content: bytes) -> Iterator[tuple[str, type[Files]]]:
-    """A server of a file: its address, and its handler, which knows what was asked."""
+def serving(content: bytes, certificate: Path | None = None) -> Iterator[tuple[str, type[Files]]]:
+    """A server of a file: its address, and its handler, which knows what was asked.
+
+    certificate: of a server of https; a file with the key, too.
+    """
     handler = type("Handler", (Files,), {"content": content, "asked": [], "stop": threading.Event()})
     server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
     server.daemon_threads = True
+    if certificate is not None:
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.load_cert_chain(certificate)
+        server.socket = context.wrap_socket(server.socket, server_side=True)
     thread = threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True)
     thread.start()
     try:
-        yield f"http://127.0.0.1:{server.server_port}", handler
+        yield f"http{'s' if certificate else ''}://127.0.0.1:{server.server_port}", handler
     finally:
         handler.stop.set()
         server.shutdown()

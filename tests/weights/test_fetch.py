@@ -4,6 +4,8 @@ import hashlib
 import io
 import os
 import pickle
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -64,7 +66,15 @@ def left(tmp_path: Path) -> list[str]:
 
 @pytest.mark.parametrize(
     ("how", "requests"),
-    [("whole", 1), ("cut", 3), ("changing", 3), ("without_ranges", 3), ("redirect", 2), ("busy_once", 2)],
+    [
+        ("whole", 1),
+        ("cut", 3),
+        ("changing", 3),
+        ("without_ranges", 3),
+        ("redirect", 2),
+        ("busy_once", 2),
+        ("absurd_length", 1),
+    ],
 )
 def test_the_file_arrives_as_it_is(server, model, content, tmp_path, how, requests):
     url, handler = server
@@ -75,7 +85,7 @@ def test_the_file_arrives_as_it_is(server, model, content, tmp_path, how, reques
     assert found.path.read_bytes() == content
     assert found.known.sha256 == hashlib.sha256(content).hexdigest()
     assert found.checked == "nothing"
-    assert seen[-1] == (len(content), len(content))
+    assert seen[-1] == (len(content), None if how == "absurd_length" else len(content))
     assert len(handler.asked) == requests
     assert left(tmp_path) == ["hashes.json", "weights.safetensors"]
 
@@ -130,6 +140,26 @@ def test_another_file_is_refused_in_one_line(server, model, content, tmp_path, h
         fetch_weights(named_weights("own"))
     assert str(raised.value).startswith(url)
     assert not set(left(tmp_path)) & {"weights.safetensors", "hashes.json"}
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="no openssl to make a certificate")
+def test_certificates_are_checked_and_https_stays_https(model, content, server, tmp_path, monkeypatch):
+    certificate = tmp_path / "certificate.pem"
+    make = (
+        "openssl req -x509 -newkey rsa:2048 -nodes -days 2 -subj /CN=test -addext subjectAltName=IP:127.0.0.1 -keyout"
+    )
+    subprocess.run([*make.split(), certificate, "-out", tmp_path / "public.pem"], check=True, timeout=60)
+    certificate.write_text(certificate.read_text() + (tmp_path / "public.pem").read_text())
+    with serving(content, certificate) as (url, handler):
+        add_source(model, f"{url}/whole/weights.safetensors")
+        add_source(model, f"{url}/redirect_to_http/weights.safetensors", "down")
+        with pytest.raises(WeightsError, match=r"cannot be downloaded \(.*certificate"):
+            fetch_weights(named_weights("own"))
+        assert handler.asked == []
+        monkeypatch.setenv("SSL_CERT_FILE", str(tmp_path / "public.pem"))
+        with pytest.raises(WeightsError, match=r"cannot be downloaded .*http"):
+            fetch_weights(named_weights("down"))
+        assert fetch_weights(named_weights("own")).path.read_bytes() == content
 
 
 def test_a_hostile_pickle_is_refused_and_runs_nothing(model, server, tmp_path):
