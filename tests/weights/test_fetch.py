@@ -98,6 +98,21 @@ def test_a_cut_download_goes_on_where_it_ended(server, model, content):
     assert [asked for _, asked in handler.asked] == ["", f"bytes={third}-", f"bytes={len(content) * 2 // 3}-"]
 
 
+def test_ctrl_c_ends_a_download_and_keeps_what_came(server, model, content, tmp_path):
+    def stop(done: int, total: int | None) -> None:
+        if done:
+            raise KeyboardInterrupt
+
+    url, handler = server
+    add_source(model, f"{url}/whole/weights.safetensors")
+    with pytest.raises(KeyboardInterrupt):
+        fetch_weights(named_weights("own"), stop)
+    kept = (tmp_path / "weights/own/.partial-weights.safetensors").stat().st_size
+    assert 0 < kept < len(content)
+    assert fetch_weights(named_weights("own")).path.read_bytes() == content
+    assert handler.asked[1] == ("whole", f"bytes={kept}-")
+
+
 @pytest.mark.parametrize("how", ["cut_for_ever", "stalling", "too_long"])
 def test_the_next_command_goes_on_with_what_was_kept(server, model, content, monkeypatch, how, tmp_path):
     url, handler = server
