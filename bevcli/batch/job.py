@@ -104,9 +104,9 @@ def all_own_options(values: Mapping[str, Any]) -> tuple[FormatOptions, ...]:
 
 
 def with_absolute_paths(model: ModelOptions) -> ModelOptions:
-    """The options for workers in other folders; the folder of downloaded weights is the one of this process."""
+    """The options for workers in other folders: they take the downloaded weights of this process, and fetch none."""
     weights = None if model.weights is None else model.weights.absolute()
-    return replace(model, weights=weights, weights_dir=weights_folder(model.weights_dir).absolute())
+    return replace(model, weights=weights, weights_dir=weights_folder(model.weights_dir).absolute(), fetch=False)
 
 
 def _fact(value: object) -> str:
