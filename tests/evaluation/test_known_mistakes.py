@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bevcli.evaluation.config import DetectionConfig
+from bevcli.evaluation.config import ERRORS, DetectionConfig
 from bevcli.evaluation.detection import evaluate_detections
 from bevcli.evaluation.known_mistakes import known_mistakes
 from bevcli.evaluation.scores_report import scores_to_dict
@@ -55,6 +55,24 @@ def test_exchanged_width_and_length_are_recognised(truth):
     [found] = known_mistakes(metrics)
     assert "width and length are exchanged" in found
     assert metrics["tp_errors"]["scale_err"] == pytest.approx(0.7, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("errors", "mistakes"),
+    [
+        ((0.6725, 0.7089, 1.5625, 0.3936, 0.1975), 1),  # issue 24 of BEVFormer: base
+        ((0.7034, 0.7108, 1.5524, 0.3715, 0.1949), 1),  # issue 72 of BEVDet
+        ((0.673, 0.274, 0.372, 0.394, 0.198), 0),  # the paper: base
+        ((0.725, 0.272, 0.391, 0.802, 0.200), 1),  # the paper: base without history
+    ],
+)
+def test_public_evaluations_are_judged_right(errors, mistakes):
+    metrics = {
+        "mean_dist_aps": dict.fromkeys(CLASSES, 0.4),
+        "classes_with_ground_truth": {"classes": list(CLASSES)},
+        "label_tp_errors": dict.fromkeys(CLASSES, dict(zip(ERRORS, errors, strict=True))),
+    }
+    assert len(known_mistakes(metrics)) == mistakes
 
 
 def test_boxes_without_velocity_are_like_those_without_history(truth):
