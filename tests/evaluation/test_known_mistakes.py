@@ -70,7 +70,7 @@ def test_public_evaluations_are_judged_right(errors, mistakes):
     metrics = {
         "mean_dist_aps": dict.fromkeys(CLASSES, 0.4),
         "classes_with_ground_truth": {"classes": list(CLASSES)},
-        "label_tp_errors": dict.fromkeys(CLASSES, dict(zip(ERRORS, errors, strict=True))),
+        "label_tp_errors": {name: dict(zip(ERRORS, errors, strict=True)) for name in CLASSES},
     }
     assert len(known_mistakes(metrics)) == mistakes
 
