@@ -13,7 +13,7 @@ from command_line import MINI_TOML, command
 from bevcli.batch.options import ray_is_installed
 from bevcli.batch.reproduce import compare_with_published
 from bevcli.config import load_config
-from bevcli.geometry.boxes import CLASSES
+from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.model.temporal_model import build_model
 from bevcli.weights.sources import own_table
 
@@ -23,9 +23,9 @@ METRICS = {
     "mean_ap": 0.4,
     "frames": 6019,
     "tp_errors": ERRORS,
-    "mean_dist_aps": dict.fromkeys(CLASSES, 0.4),
-    "label_tp_errors": dict.fromkeys(CLASSES, ERRORS),
-    "classes_with_ground_truth": {"classes": list(CLASSES)},
+    "mean_dist_aps": dict.fromkeys(NUSCENES_CLASSES, 0.4),
+    "label_tp_errors": dict.fromkeys(NUSCENES_CLASSES, ERRORS),
+    "classes_with_ground_truth": {"classes": list(NUSCENES_CLASSES)},
 }
 
 

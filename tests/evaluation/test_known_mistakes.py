@@ -9,7 +9,8 @@ from bevcli.evaluation.config import ERRORS, DetectionConfig
 from bevcli.evaluation.detection import evaluate_detections
 from bevcli.evaluation.known_mistakes import known_mistakes
 from bevcli.evaluation.scores_report import scores_to_dict
-from bevcli.geometry.boxes import CLASSES, Boxes3D
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.object_classes import NUSCENES_CLASSES
 
 # Length, width and height in metres of a usual object of each class.
 SIZES = {
@@ -23,7 +24,7 @@ SPEED = 1.0  # m/s of every object
 @pytest.fixture(scope="module")
 def truth() -> Boxes3D:
     rng = np.random.default_rng(0)
-    names = np.repeat(CLASSES, 12)
+    names = np.repeat(list(NUSCENES_CLASSES), 12)
     headings = rng.uniform(-3, 3, len(names))
     places = np.stack(np.meshgrid(np.arange(12), np.arange(10)), axis=-1).reshape(-1, 2) * 3.0 - 15
     return Boxes3D(
@@ -68,9 +69,9 @@ def test_exchanged_width_and_length_are_recognised(truth):
 )
 def test_public_evaluations_are_judged_right(errors, mistakes):
     metrics = {
-        "mean_dist_aps": dict.fromkeys(CLASSES, 0.4),
-        "classes_with_ground_truth": {"classes": list(CLASSES)},
-        "label_tp_errors": {name: dict(zip(ERRORS, errors, strict=True)) for name in CLASSES},
+        "mean_dist_aps": dict.fromkeys(NUSCENES_CLASSES, 0.4),
+        "classes_with_ground_truth": {"classes": list(NUSCENES_CLASSES)},
+        "label_tp_errors": {name: dict(zip(ERRORS, errors, strict=True)) for name in NUSCENES_CLASSES},
     }
     assert len(known_mistakes(metrics)) == mistakes
 
