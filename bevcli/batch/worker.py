@@ -29,6 +29,7 @@ from bevcli.runs.folder import SUMMARY
 from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.runs.state import save_state
 from bevcli.runs.summary import RunSummary
+from bevcli.sequences.format import format_of
 from bevcli.sequences.nuscenes.format import NuScenesOptions
 
 MATCHES = "matches.safetensors"  # in the folder of a drive's results: for the joint metrics
@@ -140,7 +141,8 @@ class Worker:
 
     def _score(self, drive: Drive, path: Path, aside: Path) -> tuple[Scores | None, str]:
         """The scores of a drive's predictions, or None and why there are none; "" without ground truth."""
-        if not self._job.evaluate or not (drive.scene or (path / "ground_truth.json").is_file()):
+        chosen = format_of(path)
+        if not self._job.evaluate or not (chosen.annotated or (path / "ground_truth.json").is_file()):
             return None, ""
         version = self._job.own_of(NuScenesOptions).version if drive.scene else None
         class_map = self._job.source.class_map
