@@ -42,6 +42,7 @@ def run(
     drive of one scene calibration.json (the rig).
     Ctrl-C or SIGTERM finish the current frame; a second one ends the program at once.
     """
+    from bevcli.cli.fetching import fetch_if_asked
     from bevcli.cli.progress import Progress
     from bevcli.cli.stop_signals import StopSignals
     from bevcli.inference.load import load_model
@@ -49,6 +50,7 @@ def run(
     from bevcli.runs.run_into_folder import run_into_folder
     from bevcli.sequences.open import open_sequence
 
+    fetch_if_asked(model)
     loaded = load_model(options=model)
     reading = source.for_model(loaded.config, temporal=run_options.temporal)
     drive = CheckedDrive(open_sequence(sequence, reading, **format_options), shlex.quote(str(sequence)))
