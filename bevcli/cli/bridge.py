@@ -64,7 +64,8 @@ class _Old:
         kind, info, *_ = get_args(self.option.annotation)
         if self.spelling:
             info = copy.copy(info)
-            info.param_decls, info.hidden = (self.spelling,), True
+            info.default, info.param_decls = self.spelling, ()  # `Option(FLAG)` in an Annotated has it as its default
+            info.hidden = True
         else:
             info = typer.Argument(hidden=True, metavar=f"[{self.option.name.upper()}]")
         kind, default = (bool, False) if kind is bool else (kind | None, None)
