@@ -25,6 +25,7 @@ from bevcli.evaluation.evaluate import Scores, evaluate
 from bevcli.evaluation.joint import DriveMatches
 from bevcli.frame import Frame, Prediction
 from bevcli.inference.load import Model
+from bevcli.parsing.files import is_there
 from bevcli.runs.folder import SUMMARY
 from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.runs.state import save_state
@@ -141,7 +142,7 @@ class Worker:
 
     def _score(self, drive: Drive, path: Path, aside: Path) -> tuple[Scores | None, str]:
         """The scores of a drive's predictions, or None and why there are none; "" without ground truth."""
-        if not self._job.evaluate or not (drive.scene or (path / "ground_truth.json").is_file()):
+        if not self._job.evaluate or not (drive.scene or is_there(path / "ground_truth.json")):
             return None, ""
         version = self._job.own_of(NuScenesOptions).version if drive.scene else None
         class_map = self._job.own_of(NativeOptions).class_map

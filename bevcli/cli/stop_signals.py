@@ -38,14 +38,20 @@ class _Signals:
             reader, self._writer = socket.socketpair()
             self._writer.setblocking(False)
             self._fd_before = signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
-            threading.Thread(target=_end_at_second, args=(reader, self.limit_s), daemon=True).start()
+            self._thread = threading.Thread(target=_end_at_second, args=(reader, self.limit_s), daemon=True)
+            self._thread.start()
 
     def __exit__(self, *error: object) -> None:
+        self.stop()
+
+    def stop(self) -> None:
+        """Handle them as before `start`."""
         for number, handler in self._before.items():
             signal.signal(number, handler)  # type: ignore[arg-type]
         if threading.current_thread() is threading.main_thread():
             signal.set_wakeup_fd(self._fd_before)
             self._writer.close()  # ends the thread
+            self._thread.join(1.0)
 
     def _handled(self) -> Iterable[signal.Signals]:
         return SIGNALS

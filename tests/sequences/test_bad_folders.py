@@ -1,6 +1,7 @@
 """A mistake in a native folder gives a message of one line that names the file and the camera, line or column."""
 
 import json
+import os
 import shutil
 
 import cv2
@@ -38,6 +39,17 @@ def test_missing_file(drive, file):
     line = message(drive)
     assert f"{drive / file}" in line
     assert "missing" in line
+
+
+@pytest.mark.parametrize("file", ["frames.csv", "ego_motion.csv", "ground_truth.json", "timing.toml"])
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("nowhere")], ids=["pipe", "link"])
+def test_an_optional_file_that_is_no_file_is_not_passed_over(drive, file, make):
+    """A drive is not read as if the file were missing."""
+    (drive / file).unlink(missing_ok=True)
+    if file == "timing.toml":
+        (drive / "frames.csv").unlink()
+    make(drive / file)
+    assert str(drive / file) in message(drive)
 
 
 def test_missing_ego_motion_says_what_to_do(drive):
