@@ -13,6 +13,7 @@ from bevcli.errors import InputError
 from bevcli.findings import Finding, errors_of
 from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.cameras import CameraRig
+from bevcli.parsing.files import is_there
 from bevcli.rig.coverage import Coverage
 from bevcli.rig.rig_report import RigReport, check_rig, report_text, with_findings
 from bevcli.rig.sequence_checks import check_camera_times, check_scenes
@@ -152,7 +153,7 @@ def _read_folder(folder: Path, rig: CameraRig, frame: int, allow_outside: bool) 
             return tuple(findings), {}
     if sequence.ego_motion is not None:
         findings += check_scenes(sequence.ego_motion, sequence.stamps)
-    if (folder / "frames.csv").is_file():
+    if is_there(folder / "frames.csv"):
         findings += _check_times(folder / "frames.csv", rig)
     index = _checked_index(sequence.stamps, frame, folder)
     try:

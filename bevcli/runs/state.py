@@ -180,6 +180,8 @@ def _image_facts(sequence: Sequence) -> str:
             found.update(f"{path.name} {facts.st_size} {facts.st_mtime_ns}\n".encode(errors="surrogateescape"))
         except OSError as error:
             found.update(f"{path.name} {error.errno}\n".encode(errors="surrogateescape"))
+        except ValueError:  # a null byte in the name
+            found.update(b"no name\n")
     return f"{len(paths)}, {short_hash(found.hexdigest())}"
 
 
