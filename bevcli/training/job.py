@@ -22,6 +22,7 @@ from bevcli.training.frame_losses import LossConfigs
 from bevcli.training.options import TrainOptions
 from bevcli.training.samples import ClipConfig
 from bevcli.training.warm_start import WarmStart, warm_start
+from bevcli.weights.local import weights_file
 
 
 @dataclass(frozen=True)
@@ -215,7 +216,7 @@ def prepare_training(
     prepare_folder(out, resume=options.resume)
     model, started = build_network(model_config), None
     if options.weights is not None and not options.resume:
-        started = warm_start(options.weights, model, model_name_or_file, lambda: drives.open(0).rig)
+        started = warm_start(weights_file(options.weights), model, model_name_or_file, lambda: drives.open(0).rig)
     group = join_process_group(device)
     return TrainingJob(model, config, drives, evaluated, out, device, options.seed, group, started)
 

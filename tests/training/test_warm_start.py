@@ -12,6 +12,7 @@ import safetensors.torch
 import torch
 from memory_drive import make_rig
 
+from bevcli.checkpoints import bundled_weights
 from bevcli.errors import WeightsError
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.object_classes import ClassSettings
@@ -19,6 +20,7 @@ from bevcli.inference.training_rigs import facts_notes, weights_facts
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.training.files import save_weights
 from bevcli.training.warm_start import WarmStart, warm_start
+from bevcli.weights.local import weights_file
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
 
@@ -141,3 +143,13 @@ def test_a_run_notes_classes_of_other_names() -> None:
     assert not list(facts_notes(weights_facts(config), config))
     (note,) = facts_notes(weights_facts(config), replace(config, classes=("pedestrian", "car", "barrier")))
     assert "the weights were trained for the classes car, pedestrian, barrier, but the model's file names" in note
+
+
+def test_weights_have_the_name_of_their_model(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("BEVCLI_WEIGHTS_DIR", str(tmp_path))
+    assert weights_file(source) == source
+    assert weights_file(Path("demo")) == bundled_weights("demo")
+    with pytest.raises(WeightsError, match="the weights of base are not there yet: run `bevcli weights fetch base`"):
+        weights_file(Path("base"))
+    with pytest.raises(WeightsError, match='no weights are known as "nothing"'):
+        weights_file(Path("nothing"))
