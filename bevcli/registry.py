@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from bevcli.errors import BevcliError
 
-Group = Literal["bevcli.models", "bevcli.sequences", "bevcli.engines", "bevcli.commands"]
+Group = Literal["bevcli.models", "bevcli.sequences", "bevcli.engines", "bevcli.commands", "bevcli.label_formats"]
 
 
 @cache

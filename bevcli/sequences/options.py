@@ -122,6 +122,24 @@ class SequenceOptions(ClassOptions):
         return replace(self, ego_motion=use, model_rate_hz=config.rate_hz, classes=config.classes)
 
 
+@options("Input")
+class LabelOptions:
+    """Ground truth from a file of labels."""
+
+    labels: Path | None = option(
+        reads="path",
+        default=None,
+        help="Ground truth in place of that of INPUT: a CSV table with the columns of `bevcli export --format csv`, or "
+        "an OpenLABEL file.",
+        metavar="FILE",
+    )
+    only_labelled: bool = option(
+        default=False,
+        help="Frames without a row in a CSV table of labels have no ground truth. By default they are labelled and "
+        "empty.",
+    )
+
+
 @options()
 class WriteOptions:
     """The options of a native folder that is written."""

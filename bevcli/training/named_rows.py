@@ -87,7 +87,7 @@ def named_rows(checkpoint: Checkpoint, model: Network, rig: Callable[[], CameraR
     classes, cameras = _names(checkpoint, config, "classes"), _names(checkpoint, config, "cameras")
     rows = dict.fromkeys(model.class_keys, NamedRows("class rows", config.classes, classes, _likes(config, classes)))
     if model.image_tokens.camera_embedding is not None:
-        starts, remark = _views(config.cameras, cameras, rig), "; the nearest views by heading, all are trained"
+        starts, remark = _views(config.cameras, cameras, rig), "; by heading where it is known; all are trained"
         rows[CAMERA_EMBEDDING] = NamedRows("camera embeddings", config.cameras, cameras, starts, remark)
     return rows
 

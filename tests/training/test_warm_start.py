@@ -86,7 +86,7 @@ def test_cameras_of_other_names_take_the_nearest_view(source: Path) -> None:
     embedding = model.image_tokens.camera_embedding
     torch.testing.assert_close(embedding.data, torch.stack([back, front, back, (front + back) / 2]))
     assert embedding.requires_grad
-    assert "rear from CAM_BACK, front from CAM_FRONT, CAM_BACK, roof from the mean of all; the nearest" in start.table()
+    assert "rear from CAM_BACK, front from CAM_FRONT, CAM_BACK, roof from the mean of all; by heading" in start.table()
 
 
 def test_views_of_unknown_heading_take_the_mean(tmp_path: Path) -> None:
