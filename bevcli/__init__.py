@@ -29,10 +29,12 @@ if TYPE_CHECKING:
         Sequence as Sequence,
     )
     from bevcli.geometry.boxes import Boxes3D as Boxes3D
-    from bevcli.geometry.cameras import Camera as Camera, CameraRig as CameraRig
+    from bevcli.geometry.cameras import Camera as Camera, CameraRig as CameraRig, Distortion as Distortion
+    from bevcli.geometry.ego_motion import Kinematics as Kinematics
     from bevcli.geometry.transforms import Pose as Pose
     from bevcli.inference.load import Model as Model, load_model as load_model
     from bevcli.inference.run import run as run
+    from bevcli.inference.session import Session as Session
     from bevcli.recording.options import RecordingOptions as RecordingOptions
     from bevcli.recording.writer import Recording as Recording
     from bevcli.rig.check_calibration import check_calibration as check_calibration
@@ -47,10 +49,12 @@ _NAMES = {
     "bevcli.evaluation.evaluate": "evaluate",
     "bevcli.frame": "BevMap CameraImage Frame FrameStamp MAP_CLASSES Prediction Sequence",
     "bevcli.geometry.boxes": "Boxes3D",
-    "bevcli.geometry.cameras": "Camera CameraRig",
+    "bevcli.geometry.cameras": "Camera CameraRig Distortion",
+    "bevcli.geometry.ego_motion": "Kinematics",
     "bevcli.geometry.transforms": "Pose",
     "bevcli.inference.load": "Model load_model",
     "bevcli.inference.run": "run",
+    "bevcli.inference.session": "Session",
     "bevcli.recording.options": "RecordingOptions",
     "bevcli.recording.writer": "Recording",
     "bevcli.rig.check_calibration": "check_calibration",
