@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from bevcli.recording.writer import Recording as Recording
     from bevcli.rig.check_calibration import check_calibration as check_calibration
     from bevcli.runs.run_into_folder import RunOptions as RunOptions, run_into_folder as run_into_folder
+    from bevcli.sequences.files.calibration_file import read_calibration as read_calibration
     from bevcli.sequences.open import open_sequence as open_sequence
     from bevcli.synth.export import render as render
     from bevcli.viewer.recording_file import show as show
@@ -59,6 +60,7 @@ _NAMES = {
     "bevcli.recording.writer": "Recording",
     "bevcli.rig.check_calibration": "check_calibration",
     "bevcli.runs.run_into_folder": "RunOptions run_into_folder",
+    "bevcli.sequences.files.calibration_file": "read_calibration",
     "bevcli.sequences.open": "open_sequence",
     "bevcli.synth.export": "render",
     "bevcli.viewer.recording_file": "show",

@@ -42,9 +42,9 @@ class RigDraft:
     facts: DriveFacts = field(default_factory=DriveFacts)
 
 
-def read_calibration(path: Path) -> CameraRig:
+def read_calibration(path: str | Path) -> CameraRig:
     """The rig in calibration.json. Raises InputError with the first mistake in the file."""
-    return read_rig_and_facts(path)[0]
+    return read_rig_and_facts(Path(path))[0]
 
 
 def read_rig_and_facts(path: Path) -> tuple[CameraRig, DriveFacts]:
