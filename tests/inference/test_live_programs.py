@@ -6,6 +6,7 @@ import time
 from collections import namedtuple
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -44,9 +45,9 @@ def wait_until(condition):
 
 
 class Stream:
-    """Stands in for cv2.VideoCapture: the images of one source, as fast as they are read; then the stream breaks off."""
+    """Stands in for cv2.VideoCapture: the images of one source, until the stream breaks off."""
 
-    opened: list = []
+    opened: ClassVar = []
     over = False
 
     def __init__(self, source):
