@@ -2,6 +2,7 @@
 
 import re
 import sys
+import threading
 import time
 from collections import namedtuple
 from pathlib import Path
@@ -56,7 +57,7 @@ class Stream:
 
     def read(self):
         if Stream.over:
-            raise SystemExit  # ends the thread
+            threading.Event().wait()
         time.sleep(0.001)
         self.left -= 1
         return (True, np.full((180, 320, 3), 40, np.uint8)) if self.left >= 0 else (False, None)

@@ -5,6 +5,7 @@ from pathlib import Path
 from bevcli.options import option, options
 from bevcli.sequences.format import Format
 from bevcli.sequences.options import FormatOptions
+from bevcli.sequences.output import OutputFormat
 
 
 @options("Input")
@@ -45,3 +46,5 @@ FORMAT = Format(
     options=NuScenesOptions,
     precedence=20,
 )
+
+OUTPUT = OutputFormat("a nuScenes root", "bevcli.sequences.nuscenes.writer:NuScenesWriter")
