@@ -109,6 +109,9 @@ class WriteOptions:
     boxes: Path | None = option(
         reads="path", default=None, help="mcap: also write the boxes of this run (a folder or predictions.json)."
     )
+    score: float = option(
+        default=0.25, help="mcap: leave out boxes of the run scored below this.", minimum=0, maximum=1
+    )
 
 
 @options("Input")
