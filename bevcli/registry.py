@@ -14,6 +14,7 @@ Group = Literal[
     "bevcli.models",
     "bevcli.sequences",
     "bevcli.drive_writers",
+    "bevcli.box_formats",
     "bevcli.engines",
     "bevcli.commands",
 ]

@@ -7,13 +7,12 @@ from types import TracebackType
 from typing import Self
 
 import cv2
-import numpy as np
 
 from bevcli.errors import BevcliError, OutputError
 from bevcli.frame import CameraImage, Frame, FrameStamp, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
-from bevcli.geometry.transforms import Pose, inverse
+from bevcli.geometry.transforms import Pose
 from bevcli.recording.foxglove import scene
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, above_score, read_boxes
 from bevcli.sequences.options import WriteOptions
@@ -119,13 +118,11 @@ class McapWriter:
         """The run's boxes of a frame, in the frame of the scene; none where the run does not have the frame."""
         if self._boxes is None:
             return None
-        found, kind = self._frames.get(frame.stamp), self._boxes.frame_of_reference
+        found = self._frames.get(frame.stamp)
         if found is None:
             return Boxes3D.empty()
-        fixed_from_ego = frame.world_from_ego.matrix if self._has_ego_motion else np.eye(4)
-        bev = frame.rig.ego_from_bev if self._boxes.ego_from_bev is None else self._boxes.ego_from_bev.matrix
-        ego_from = {"ego": np.eye(4), "bev": bev, "world": inverse(frame.world_from_ego.matrix)}[kind]
-        return found.boxes.transformed(fixed_from_ego @ ego_from)
+        in_ego = self._boxes.in_ego(found)
+        return in_ego.transformed(frame.world_from_ego.matrix) if self._has_ego_motion else in_ego
 
     def _add(self, topic: str, kind: str, time_ns: int, fields: scene.Fields) -> None:
         if kind not in self._schemas:

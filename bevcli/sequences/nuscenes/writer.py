@@ -17,6 +17,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig, same_rig
 from bevcli.geometry.ego_motion import Kinematics
 from bevcli.geometry.transforms import Pose
+from bevcli.sequences.files.calibration_file import is_file_name
 from bevcli.sequences.nuscenes.build import LIDAR
 from bevcli.sequences.nuscenes.format import versions_in
 from bevcli.sequences.nuscenes.index import CLASS_OF_CATEGORY
@@ -66,6 +67,8 @@ class NuScenesWriter:
     def write(self, frame: Frame) -> None:
         """Write the images of a frame; its rows follow at the end."""
         scene = frame.stamp.scene or self._name
+        if not is_file_name(scene):
+            raise InputError(f'scene "{scene:.60}": cannot be the name of a file: rename it')
         samples = self._scenes.setdefault(scene, [])
         time_us = frame.stamp.timestamp_ns // 1000
         if samples and time_us <= samples[-1]["timestamp"]:
