@@ -1,5 +1,6 @@
 """The programs of docs/live.md, run against stand-ins for cameras, ROS 2 and CARLA."""
 
+import inspect
 import re
 import sys
 import threading
@@ -103,6 +104,7 @@ class FakeNode:
         self.heard, self.sent, self.timers = {}, [], []
 
     def create_subscription(self, kind, topic, callback, quality):
+        inspect.signature(callback).bind(object())  # as rclpy does
         self.heard[topic] = callback
 
     def create_publisher(self, kind, topic, depth):

@@ -53,6 +53,7 @@ def test_a_session_equals_a_run_to_the_byte(model, temporal):
         assert_same(step(session, frame), expected)
 
 
+@pytest.mark.slow
 def test_a_session_equals_a_run_on_the_sample_drive():
     model, drive = bevcli.load_model("demo"), bevcli.open_sequence("samples/street", frames=slice(0, 2))
     session = bevcli.Session(model, drive.rig)

@@ -10,7 +10,7 @@ from mcap_ros2.decoder import DecoderFactory
 from memory_drive import MemorySequence
 from recorded_drive import with_truth
 
-from bevcli.errors import OutputError
+from bevcli.errors import InputError, OutputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig, Distortion
@@ -134,6 +134,13 @@ def test_an_interrupted_file_gets_no_name(tmp_path):
 def test_an_existing_file_is_replaced_only_with_force(file):
     with pytest.raises(OutputError, match="exists already: choose another file, or pass `force=True`"):
         open_writer(file, Truthful(), WriteOptions("mcap"))
+
+
+def test_the_boxes_of_another_drive_are_refused(file, tmp_path):
+    other = MemorySequence(3, scenes="bbb")
+    options = WriteOptions("mcap", boxes=file.parent / "predictions.json")
+    with pytest.raises(InputError, match="has none of the frames of memory"):
+        open_writer(tmp_path / "a.mcap", other, options)
 
 
 def test_left_out_fields_are_zero_or_empty():

@@ -125,6 +125,7 @@ def test_predictions_are_the_same(drive, mini_model, tmp_path, lens):
     assert suffix == {".png"}
 
 
+@pytest.mark.slow
 def test_a_real_root_is_converted_to_the_same_frames(nuscenes_root, tmp_path):
     assert convert(nuscenes_root, tmp_path / "out").exit_code == 0
     assert_same_frames(open_sequence(nuscenes_root), open_sequence(tmp_path / "out"), same_bytes=True)

@@ -8,13 +8,13 @@ from typing import Self
 
 import cv2
 
-from bevcli.errors import BevcliError, OutputError
-from bevcli.frame import CameraImage, Frame, FrameStamp, Sequence
+from bevcli.errors import BevcliError, InputError, OutputError
+from bevcli.frame import CameraImage, Frame, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Pose
 from bevcli.recording.foxglove import scene
-from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, above_score, read_boxes
+from bevcli.sequences.files.boxes_file import BoxesFile, above_score, read_boxes
 from bevcli.sequences.options import WriteOptions
 from bevcli.writing import check_output, whole_file
 
@@ -37,13 +37,9 @@ class McapWriter:
         if path.exists() and not options.force:
             raise OutputError(f"{path}: exists already: choose another file, or pass `force=True` to replace it")
         self.path, self._has_ego_motion = path, sequence.has_ego_motion
-        self._boxes: BoxesFile | None = None
-        self._frames: dict[FrameStamp, FrameBoxes] = {}
-        if options.boxes is not None:
-            file = options.boxes / "predictions.json" if options.boxes.is_dir() else options.boxes
-            check_output(path, file)
-            self._boxes = above_score(read_boxes(file), options.score)
-            self._frames = {frame.stamp: frame for frame in self._boxes.frames}
+        self._boxes = None if options.boxes is None else _boxes_of(options.boxes, options.score, sequence, path)
+        frames = () if self._boxes is None else self._boxes.frames
+        self._frames = {frame.stamp: frame for frame in frames}
         self._rig: CameraRig | None = None
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
@@ -132,6 +128,16 @@ class McapWriter:
             self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind])
         data = self._messages.encode(kind, fields)
         self._writer.add_message(self._channels[topic], log_time=time_ns, publish_time=time_ns, data=data)
+
+
+def _boxes_of(run: Path, score: float, sequence: Sequence, out: Path) -> BoxesFile:
+    """The boxes of a run of a sequence, with at least this score."""
+    file = run / "predictions.json" if run.is_dir() else run
+    check_output(out, file)
+    boxes = above_score(read_boxes(file), score)
+    if not {frame.stamp for frame in boxes.frames} & set(sequence.stamps):
+        raise InputError(f"{file}: has none of the frames of {sequence.name}: convert the drive that the run is of")
+    return boxes
 
 
 def _optical(camera: str) -> str:
