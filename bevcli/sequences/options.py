@@ -100,7 +100,8 @@ class WriteOptions:
 
     form: str = option(
         default="native",
-        help="native: a sequence folder. nuscenes: a nuScenes root. Or the format of an installed package.",
+        help="native: a sequence folder. nuscenes: a nuScenes root. mcap: one file for Foxglove and ROS 2, with boxes. "
+        "Or the format of an installed package.",
         flag="--format",
         metavar="NAME",
         complete=_complete_format,

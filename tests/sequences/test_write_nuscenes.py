@@ -131,6 +131,17 @@ def test_a_real_root_is_converted_to_the_same_frames(nuscenes_root, tmp_path):
     assert_same_frames(open_sequence(nuscenes_root), open_sequence(tmp_path / "out"), same_bytes=True)
 
 
+def test_scenes_and_missing_images_are_kept(drive, tmp_path):
+    lines = (drive / "frames.csv").read_text().replace("images/CAM_BACK/1.png", "").splitlines()
+    scenes = ["scene", "first", "first", "second", "second"]
+    (drive / "frames.csv").write_text("\n".join(f"{s},{line}" for s, line in zip(scenes, lines, strict=True)))
+    assert "1 images missing" in convert(drive, tmp_path / "out").output
+    out = open_sequence(tmp_path / "out")
+    assert [stamp.scene for stamp in out.stamps] == scenes[1:]
+    assert out.load(1).images.keys() == {"CAM_FRONT"}
+    assert out.load(0).ground_truth is None
+
+
 def test_what_the_format_cannot_hold_is_refused(drive, tmp_path):
     (drive / "ego_motion.csv").unlink()
     answer = convert(drive, tmp_path / "out")
