@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.geometry.boxes import CLASSES
+from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.bevformer_v2.bev_fusion import BevFusionConfig
 from bevcli.model.bevformer_v2.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config
@@ -76,7 +76,7 @@ def mini_config() -> ModelConfig:
     """A BEVFormer with all its parts, so small that a step takes milliseconds."""
     return ModelConfig(
         name="mini",
-        classes=CLASSES,
+        classes=tuple(NUSCENES_CLASSES),
         cameras=tuple(NUSCENES_YAWS_DEG),
         image=ImageConfig(size=(160, 90), mean=(123.0, 116.0, 103.0), std=(58.0, 57.0, 57.0), color_order="rgb"),
         bev_grid=BevGrid(rows=12, columns=10, x_range_m=(-25, 25), y_range_m=(-30, 30)),

@@ -29,7 +29,6 @@ from bevcli.runs.folder import SUMMARY
 from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.runs.state import save_state
 from bevcli.runs.summary import RunSummary
-from bevcli.sequences.native.format import NativeOptions
 from bevcli.sequences.nuscenes.format import NuScenesOptions
 
 MATCHES = "matches.safetensors"  # in the folder of a drive's results: for the joint metrics
@@ -144,7 +143,7 @@ class Worker:
         if not self._job.evaluate or not (drive.scene or (path / "ground_truth.json").is_file()):
             return None, ""
         version = self._job.own_of(NuScenesOptions).version if drive.scene else None
-        class_map = self._job.own_of(NativeOptions).class_map
+        class_map = self._job.source.class_map
         range_m = self._model.config.bev_grid.nearest_side_m
         try:
             scores = evaluate(aside, path, range_m, scene=drive.scene, version=version, class_map=class_map)

@@ -26,8 +26,8 @@ def stress(
     *,
     model: Annotated[ModelOptions, Part(without=("untrained",))],
     options: StressOptions,
-    source: Annotated[SequenceOptions, Part(only=("frames", "scene"))],
-    format_options: Annotated[dict[str, Any], Part(only=("version", "split", "class_map"), classes=option_classes)],
+    source: Annotated[SequenceOptions, Part(only=("frames", "scene", "class_map"))],
+    format_options: Annotated[dict[str, Any], Part(only=("version", "split"), classes=option_classes)],
     drive_options: Annotated[DriveOptions, Part(only=("rendered", "cache"))],
     output: StressOutputOptions,
     as_json: Json = False,
@@ -59,7 +59,8 @@ def stress(
         chosen = source.for_model(loaded.config)
         drives = [open_sequence(path, chosen, **format_options) for path in sequence or ()]
     else:
-        rendered = open_drives((), drive_options.rendered, drive_options.cache, loaded.config)
+        seeds, cache = drive_options.rendered, drive_options.cache
+        rendered = open_drives((), seeds, cache, loaded.config, class_map=source.class_map)
         drives = [rendered.open(index) for index in range(len(rendered))]
         if source.frames is not None:
             drives = [select_range(drive, source.frames) for drive in drives]

@@ -26,7 +26,7 @@ def train(
     ] = "",
     *,
     model_options: Annotated[ModelOptions, Part(only=("device",))],
-    drives: Annotated[DriveOptions, Part(only=("data", "rendered"))],
+    drives: Annotated[DriveOptions, Part(only=("data", "rendered", "class_map"))],
     options: TrainOptions,
 ) -> None:
     """Train a model; write its weights, checkpoints and learning curves.

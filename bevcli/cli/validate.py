@@ -47,7 +47,8 @@ def validate(
 
     loaded = load_model(model, options=model_options)
     rig = None if options.rig is None else rig_for_drives(options.rig, model or loaded.name)
-    drives = open_drives(drive_options.data, drive_options.rendered, drive_options.cache, loaded.config, rig)
+    data = drive_options
+    drives = open_drives(data.data, data.rendered, data.cache, loaded.config, rig, data.class_map)
     runner = Runner(loaded.prepared, loaded.device, StepOptions(loaded.precision, run_options.temporal))
     with Progress(count_frames(drives), "frames") as progress:
         scores = validate_model(

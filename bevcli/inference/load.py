@@ -14,7 +14,7 @@ import torch
 from bevcli.checkpoints import bundled_weights, load_weights, read_checkpoint
 from bevcli.config import TRACKING, as_table, known_models, load_config, load_table, settings_of_table
 from bevcli.engines.exported import SUFFIX, load_exported
-from bevcli.errors import BevcliError, WeightsError
+from bevcli.errors import BevcliError, ConfigError, WeightsError
 from bevcli.geometry.cameras import CameraRig
 from bevcli.inference.options import ModelOptions
 from bevcli.inference.preprocess import image_for_rig
@@ -162,7 +162,8 @@ def _load_network(options: ModelOptions) -> Model:
         raise WeightsError(f"`weights={weights}` and `untrained` exclude each other: pass one of them")
     if name is None:
         name = DEFAULT_MODEL if weights is None else _model_of(weights)
-    config, tracker = load_config(name), load_table(name, TRACKING, TrackerConfig)
+    config = load_config(name)
+    tracker = _tracker(load_table(name, TRACKING, TrackerConfig), config, str(name))
     bundled = bundled_weights(str(name)) if weights is None and not untrained else None
     file = weights or bundled
     if file is None and not untrained:
@@ -188,6 +189,14 @@ def _load_network(options: ModelOptions) -> Model:
     )
 
 
+def _tracker(stated: TrackerConfig, config: ModelConfig, file: str) -> TrackerConfig:
+    """The tracker's parameters for the classes of a model. Raises ConfigError."""
+    try:
+        return stated.for_classes(config.object_classes)
+    except ValueError as error:
+        raise ConfigError(f"{file}: [{TRACKING}]: {error}") from None
+
+
 def needs_exported_file(engine: str, model: str) -> BevcliError:
     """The error for an engine that is to run a model by its name."""
     return BevcliError(
@@ -210,13 +219,14 @@ def _load_exported(options: ModelOptions) -> Model:
         raise BevcliError(f"`device={options.device}`: {file} runs on the CPU: leave out the option")
     network = load_exported(file, engine)
     found = network.metadata
+    stated = settings_of_table(found.contents, TRACKING, TrackerConfig, str(file))
     return Model(
         network,
         torch.device("cpu"),
         found.precision,
         None if found.untrained else file,
         bundled=found.bundled,
-        tracker=settings_of_table(found.contents, TRACKING, TrackerConfig, str(file)),
+        tracker=_tracker(stated, found.config, str(file)),
         engine=engine,
         file=file,
     )

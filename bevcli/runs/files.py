@@ -10,13 +10,16 @@ from typing import Any
 
 import numpy as np
 
+from bevcli.config import as_table
 from bevcli.errors import OutputError
 from bevcli.evaluation.export import CsvWriter
 from bevcli.evaluation.submission import SubmissionWriter
 from bevcli.frame import Frame, Prediction, Sequence
 from bevcli.geometry.boxes import attributes_by_speed
+from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Pose
 from bevcli.inference.load import Model
+from bevcli.model.config import ModelConfig
 from bevcli.recording.writer import LiveSink, Recording, RecordingState
 from bevcli.runs.folder import RunFolder
 from bevcli.runs.options import RunOptions
@@ -136,6 +139,7 @@ class RunFiles:
             "model": model.name,
             "untrained": model.untrained,
             "classes": list(model.config.classes),
+            **_class_settings(model.config),
             "range_m": model.config.bev_grid.nearest_side_m,
         }
         boxes_at, tracks_at = (None, None) if resume is None else (resume.predictions, resume.tracks)
@@ -170,7 +174,8 @@ class RunFiles:
             self._bev_frames.append(frame.stamp.index)
             self._add_bev(frame.stamp.index)
         self._recording.log(frame, prediction)
-        boxes = frame_boxes(frame, prediction, world=self._sequence.has_ego_motion)
+        classes = self._model.config.object_classes
+        boxes = frame_boxes(frame, prediction, world=self._sequence.has_ego_motion, classes=classes)
         if self._tracks is not None:
             instances = boxes.boxes.instances
             tracked = boxes if instances is None else replace(boxes, boxes=boxes.boxes[instances != ""])
@@ -236,7 +241,15 @@ class RunFiles:
         return tuple(path for path in (*paths, self._options.save_bev) if path is not None and path.exists())
 
 
-def frame_boxes(frame: Frame, prediction: Prediction, *, world: bool) -> FrameBoxes:
+def _class_settings(config: ModelConfig) -> dict[str, object]:
+    """The settings of a model's own classes, for the head of predictions.json; empty without any."""
+    settings = as_table(config)["class_settings"]
+    return {"class_settings": settings} if settings else {}
+
+
+def frame_boxes(
+    frame: Frame, prediction: Prediction, *, world: bool, classes: Mapping[str, ObjectClass] = NUSCENES_CLASSES
+) -> FrameBoxes:
     """A prediction as predictions.json holds it: all boxes, with attributes, in the world frame or the ego frame."""
     extras: dict[str, object] = {"skipped": True} if prediction.skipped else {}
     if prediction.not_finite:
@@ -244,7 +257,7 @@ def frame_boxes(frame: Frame, prediction: Prediction, *, world: bool) -> FrameBo
     if frame.sample_token is not None:
         extras["sample_token"] = frame.sample_token
     boxes = prediction.boxes_world if world else prediction.boxes_ego
-    boxes = replace(boxes, attributes=attributes_by_speed(boxes))
+    boxes = replace(boxes, attributes=attributes_by_speed(boxes, classes))
     return FrameBoxes(frame.stamp, frame.world_from_ego if world else None, boxes, extras)
 
 

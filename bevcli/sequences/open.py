@@ -4,10 +4,19 @@ from pathlib import Path
 from typing import Any
 
 from bevcli.frame import Sequence
+from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.options import defaults, gather
+from bevcli.sequences.files.class_names import ClassNames
 from bevcli.sequences.format import format_of, own_options
 from bevcli.sequences.options import SequenceOptions
-from bevcli.sequences.selection import WithoutGroundTruth, select_every, select_range, select_rate, select_scene
+from bevcli.sequences.selection import (
+    WithClassNames,
+    WithoutGroundTruth,
+    select_every,
+    select_range,
+    select_rate,
+    select_scene,
+)
 
 
 def open_sequence(path: str | Path, options: SequenceOptions | None = None, **changes: Any) -> Sequence:
@@ -25,7 +34,7 @@ def open_sequence(path: str | Path, options: SequenceOptions | None = None, **ch
     Args:
         path: the folder or file.
         options: the options of every format; None for the defaults.
-        changes: options as keywords, those of `SequenceOptions` and those of the path's format: `NativeOptions`,
+        changes: options as keywords, those of `SequenceOptions` and those of the path's format: `RigOptions`,
             `NuScenesOptions`, `BagOptions`, or the options of an installed format.
 
     Raises InputError if the path has no known format, a file is missing or invalid, the format does not have an option,
@@ -36,7 +45,9 @@ def open_sequence(path: str | Path, options: SequenceOptions | None = None, **ch
     chosen = format_of(path)
     own = own_options(path, chosen, changes)
     sequence = chosen.open(path, options, own)
-    if not options.ground_truth:
+    if options.ground_truth:
+        sequence = WithClassNames(sequence, ClassNames(options.class_map, options.classes or NUSCENES_CLASSES))
+    else:
         sequence = WithoutGroundTruth(sequence)
     if options.scene is not None:
         sequence = select_scene(sequence, options.scene)

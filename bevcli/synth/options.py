@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 from bevcli.errors import InputError
 from bevcli.options import option, option_of, options
+from bevcli.sequences.options import ClassOptions
 
 if TYPE_CHECKING:
     from bevcli.geometry.cameras import CameraRig
@@ -103,7 +104,7 @@ class DemoOptions:
 
 
 @options()
-class DriveOptions:
+class DriveOptions(ClassOptions):
     """Drives with ground truth: sequences, or rendered ones."""
 
     data: tuple[Path, ...] = option(

@@ -1,6 +1,6 @@
 """KITTI raw: tracklet_labels.xml, a list of tracks, as annotation tools read it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree
@@ -9,10 +9,11 @@ import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.evaluation.box_format import BoxFormat
-from bevcli.evaluation.export import KITTI_TYPES
+from bevcli.evaluation.export import kitti_type
 from bevcli.evaluation.formats.tracks import Place, tracks_of
 from bevcli.evaluation.options import ExportOptions
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array, wrap_angle
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 from bevcli.sequences.files.calibration_file import is_file_name
@@ -34,7 +35,8 @@ def _write(boxes: BoxesFile, target: Path, options: ExportOptions) -> str:
             raise InputError(f'scene "{scene:.60}": cannot be the name of a folder: rename it')
         tracks = tracks_of(frames)
         count += len(tracks)
-        root = tracklets([boxes.in_ego(frame) for frame in frames], tracks)
+        in_ego = [boxes.in_ego(frame) for frame in frames]
+        root = tracklets(in_ego, tracks, boxes.classes or NUSCENES_CLASSES)
         write_whole(target / scene / "tracklet_labels.xml", HEAD + ElementTree.tostring(root), parents=True)
     return f"{len(boxes.frames)} frames, {count} tracks"
 
@@ -42,13 +44,15 @@ def _write(boxes: BoxesFile, target: Path, options: ExportOptions) -> str:
 FORMAT = BoxFormat("kitti_raw", _write)
 
 
-def tracklets(frames: Sequence[Boxes3D], tracks: Sequence[Sequence[Place]]) -> ElementTree.Element:
+def tracklets(
+    frames: Sequence[Boxes3D], tracks: Sequence[Sequence[Place]], classes: Mapping[str, ObjectClass]
+) -> ElementTree.Element:
     """The XML of a scene's frames, which are numbered from 0. The frame of the lidar is the ego frame.
 
     A tracklet has one size, the median of its boxes', and a pose in every frame from its first to its last: between
     boxes it is interpolated.
 
-    frames: boxes in the ego frame.
+    frames: boxes in the ego frame. classes: the known ones, for their KITTI types.
     """
     root = ElementTree.Element("boost_serialization", signature="serialization::archive", version="9")
     listed = ElementTree.SubElement(root, "tracklets", class_id="0", tracking_level="0", version="0")
@@ -57,7 +61,7 @@ def tracklets(frames: Sequence[Boxes3D], tracks: Sequence[Sequence[Place]]) -> E
         item = ElementTree.SubElement(listed, "item", _marks(1, 1) if number == 0 else {})
         boxes = [frames[place.frame][[place.box]] for place in track]
         length, width, height = np.median([one.sizes_lwh[0] for one in boxes], axis=0).tolist()
-        kind = KITTI_TYPES.get(str(boxes[0].classes[0]), "Misc")
+        kind = kitti_type(str(boxes[0].classes[0]), classes)
         _values(item, {"objectType": kind, "h": height, "w": width, "l": length, "first_frame": track[0].frame})
         poses = [(place.frame, _pose(one)) for place, one in zip(track, boxes, strict=True)]
         _add_poses(item, _filled(poses), is_first=number == 0)

@@ -1,13 +1,15 @@
 """Frames and boxes as the fields of ROS 2 and Foxglove messages."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera
+from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array, Pose
-from bevcli.recording.colors import CLASS_COLORS, GROUND_TRUTH_COLOR, OTHER_COLOR
+from bevcli.recording.colors import GROUND_TRUTH_COLOR, OTHER_COLOR
 from bevcli.recording.foxglove.messages import DELETE_ALL
 
 Fields = dict[str, Any]
@@ -62,16 +64,19 @@ def camera_info(time_ns: int, frame: str, camera: Camera) -> Fields:
     }
 
 
-def scene_update(time_ns: int, frame: str, boxes: Boxes3D) -> Fields:
-    """foxglove_msgs/SceneUpdate that replaces all boxes of the topic. Boxes without scores are ground truth."""
-    entities = [_entity(time_ns, frame, boxes, place) for place in range(len(boxes))]
+def scene_update(time_ns: int, frame: str, boxes: Boxes3D, colors: Mapping[str, Color]) -> Fields:
+    """foxglove_msgs/SceneUpdate that replaces all boxes of the topic. Boxes without scores are ground truth.
+
+    colors: of the classes of predictions.
+    """
+    entities = [_entity(time_ns, frame, boxes, place, colors) for place in range(len(boxes))]
     return {"deletions": [{"timestamp": stamp(time_ns), "type": DELETE_ALL}], "entities": entities}
 
 
-def _entity(time_ns: int, frame: str, boxes: Boxes3D, place: int) -> Fields:
+def _entity(time_ns: int, frame: str, boxes: Boxes3D, place: int, colors: Mapping[str, Color]) -> Fields:
     name, score = str(boxes.classes[place]), None if boxes.scores is None else float(boxes.scores[place])
     identity = "" if boxes.instances is None else str(boxes.instances[place])
-    red, green, blue = GROUND_TRUTH_COLOR if score is None else CLASS_COLORS.get(name, OTHER_COLOR)
+    red, green, blue = GROUND_TRUTH_COLOR if score is None else colors.get(name, OTHER_COLOR)
     color = {"r": red / 255, "g": green / 255, "b": blue / 255, "a": 0.5}
     center, size, yaw = boxes.centers[place], boxes.sizes_lwh[place], float(boxes.yaws[place])
     turned = _wxyz([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])

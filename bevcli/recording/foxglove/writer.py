@@ -12,7 +12,9 @@ from bevcli.errors import BevcliError, InputError, OutputError
 from bevcli.frame import CameraImage, Frame, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
+from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import Pose
+from bevcli.recording.colors import class_colors
 from bevcli.recording.foxglove import scene
 from bevcli.sequences.files.boxes_file import BoxesFile, above_score, read_boxes
 from bevcli.sequences.options import WriteOptions
@@ -38,6 +40,8 @@ class McapWriter:
             raise OutputError(f"{path}: exists already: choose another file, or pass `force=True` to replace it")
         self.path, self._has_ego_motion = path, sequence.has_ego_motion
         self._boxes = None if options.boxes is None else _boxes_of(options.boxes, options.score, sequence, path)
+        known = None if self._boxes is None else self._boxes.classes
+        self._colors = class_colors((known or NUSCENES_CLASSES).values())
         frames = () if self._boxes is None else self._boxes.frames
         self._frames = {frame.stamp: frame for frame in frames}
         self._rig: CameraRig | None = None
@@ -80,7 +84,7 @@ class McapWriter:
         shown = {"/ground_truth": frame.ground_truth, "/predictions": self._predicted(frame)}
         for topic, boxes in shown.items():
             if boxes is not None:
-                fields = scene.scene_update(time_ns, fixed, boxes)
+                fields = scene.scene_update(time_ns, fixed, boxes, self._colors)
                 self._add(topic, "foxglove_msgs/SceneUpdate", time_ns, fields)
 
     def _write_rig(self, rig: CameraRig, time_ns: int) -> None:
