@@ -163,6 +163,10 @@ class Sequence(Protocol):
         """The image files and videos of the frame at a place; none where its images are in `input_files`."""
         return ()
 
+    def ground_truth_frame(self, place: int) -> Frame:
+        """The frame at a place for scoring: it needs no images. By default it has them, as from `load`."""
+        return self.load(place)
+
     def load(self, place: int) -> Frame:
         """The frame at a place (0 to len(stamps) - 1), with decoded images. Called in order, from one thread.
 

@@ -23,12 +23,13 @@ class BoxFormat:
 
     Attributes:
         target: name of the file or folder that is written next to the boxes by default.
-        write: writes boxes to a path, and returns what it wrote, such as "20 frames, 3 tracks". Raises InputError for
-            boxes that the format cannot hold, and OutputError.
+        write: writes boxes to a path with the options of the export, given the file that the boxes are from, and
+            returns what it wrote, such as "20 frames, 3 tracks". Raises InputError for boxes that the format cannot
+            hold, and OutputError.
     """
 
     target: str
-    write: Callable[[BoxesFile, Path, ExportOptions], str]
+    write: Callable[[BoxesFile, Path, ExportOptions, Path], str]
 
 
 def box_format(name: str) -> BoxFormat:

@@ -16,10 +16,13 @@ from bevcli.geometry.transforms import Pose, apply, rigid, rotation_about_z
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes
 from bevcli.sequences.files.class_names import ClassNames
 from bevcli.sequences.files.map_folder import MapFolder, open_maps
+from bevcli.sequences.format import formats
 from bevcli.sequences.nuscenes.cache import open_index
 from bevcli.sequences.nuscenes.choice import chosen_scenes, tables_of
 from bevcli.sequences.nuscenes.format import NuScenesOptions, is_nuscenes_root
 from bevcli.sequences.nuscenes.index import NuScenesIndex
+from bevcli.sequences.open import open_sequence
+from bevcli.sequences.options import SequenceOptions
 
 
 @dataclass(frozen=True)
@@ -61,14 +64,16 @@ def open_ground_truth(
     class_map: Mapping[str, str] | None = None,
     classes: Iterable[str] = NUSCENES_CLASSES,
 ) -> ScoredInput:
-    """Read a boxes file, the ground_truth.json in a sequence folder, or a nuScenes root.
+    """Read a boxes file, the ground_truth.json in a sequence folder, or a drive of another format.
 
     Maps are in ground_truth_map/ next to the file. options: the part of a nuScenes root. scene: selects frames of a
-    root or a boxes file. class_map: names of the ground truth -> classes. classes: those that are scored. Raises
+    drive or a boxes file. class_map: names of the ground truth -> classes. classes: those that are scored. Raises
     InputError where the ground truth is missing or wrong.
     """
     if path.is_dir() and is_nuscenes_root(path):
         return _open_nuscenes(path, options, scene, ClassNames(class_map, classes))
+    if path.is_dir() and any(one.annotated and one.recognises(path) for one in formats()):
+        return _open_drive(path, SequenceOptions(class_map or {}, scene=scene, classes=tuple(classes)))
     file = path / "ground_truth.json" if path.is_dir() else path
     boxes = read_boxes(file, class_map, classes)
     if scene is not None:
@@ -118,6 +123,21 @@ def _open_nuscenes(root: Path, options: NuScenesOptions, only: str | None, names
             frames.append(_nuscenes_frame(index, scene, sample, len(frames), tables, names))
             racks[frames[-1].extras["sample_token"]] = index.bicycle_racks(sample)
     return ScoredInput(BoxesFile("world", tuple(frames)), bicycle_racks=racks)
+
+
+def _open_drive(path: Path, options: SequenceOptions) -> ScoredInput:
+    drive = open_sequence(path, options)
+    frames = [drive.ground_truth_frame(place) for place in range(len(drive.stamps))]
+    found = [
+        FrameBoxes(
+            f.stamp, f.world_from_ego, f.ground_truth, {"sample_token": f.sample_token} if f.sample_token else {}
+        )
+        for f in frames
+        if f.ground_truth is not None
+    ]
+    if not found:
+        raise InputError(f"{path}: has no ground truth (expected for scoring): score another drive")
+    return ScoredInput(BoxesFile("world", tuple(found)))
 
 
 def _nuscenes_frame(

@@ -20,7 +20,10 @@ from bevcli.sequences.selection import (
 
 
 def open_sequence(path: str | Path, options: SequenceOptions | None = None, **changes: Any) -> Sequence:
-    """Open a drive: a native sequence folder (images or videos), a nuScenes dataset root, an MCAP file or a ROS 2 bag.
+    """Open a drive.
+
+    It is a native sequence folder (images or videos), a nuScenes dataset root, an MCAP file, a ROS 2 bag, or a drive of
+    another data set (docs/other-inputs.md).
 
         drive = open_sequence("my_drive")
         drive = open_sequence("drive.mcap", calibration="calibration.json")
@@ -35,7 +38,7 @@ def open_sequence(path: str | Path, options: SequenceOptions | None = None, **ch
         path: the folder or file.
         options: the options of every format; None for the defaults.
         changes: options as keywords, those of `SequenceOptions` and those of the path's format: `RigOptions`,
-            `NuScenesOptions`, `BagOptions`, or the options of an installed format.
+            `NuScenesOptions`, `BagOptions`, `Argoverse2Options` and so on, or the options of an installed format.
 
     Raises InputError if the path has no known format, a file is missing or invalid, the format does not have an option,
     or no frame is left; TypeError for an option that no format has.

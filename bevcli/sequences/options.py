@@ -112,6 +112,11 @@ class SequenceOptions(ClassOptions):
         if self.every is not None and self.every < 1:
             raise InputError(f"`every={self.every}`: expected an integer, 1 or more")
 
+    def refuse_static(self, path: Path) -> None:
+        """Raise InputError for `ego_motion="static"`. path: of an input that has its own ego-motion."""
+        if self.ego_motion == "static":
+            raise InputError(f'{path}: has its own ego-motion: remove `ego_motion="static"`')
+
     def for_model(self, config: ModelConfig, *, temporal: bool = True) -> SequenceOptions:
         """The options for a run of a model: its rate and classes, and ego-motion only where history needs it."""
         use = "optional" if self.ego_motion == "required" and not temporal else self.ego_motion

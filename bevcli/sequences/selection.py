@@ -30,6 +30,10 @@ class Selection(DerivedSequence):
         """Those of the frame at position `place` of the selection."""
         return self.sequence.image_files(self._indices[place])
 
+    def ground_truth_frame(self, place: int) -> Frame:
+        """The frame at position `place` of the selection, for scoring."""
+        return self.sequence.ground_truth_frame(self._indices[place])
+
     def load(self, place: int) -> Frame:
         """The frame at position `place` of the selection, with decoded images."""
         return self.sequence.load(self._indices[place])
@@ -58,9 +62,14 @@ class WithClassNames(DerivedSequence):
             counts[self._names[name]] += count
         return counts
 
+    def ground_truth_frame(self, place: int) -> Frame:
+        return self._renamed(self.sequence.ground_truth_frame(place))
+
     def load(self, place: int) -> Frame:
         """The frame at a place, with the names of known classes."""
-        frame = super().load(place)
+        return self._renamed(self.sequence.load(place))
+
+    def _renamed(self, frame: Frame) -> Frame:
         truth = frame.ground_truth
         return frame if truth is None else replace(frame, ground_truth=self._names.renamed(truth))
 

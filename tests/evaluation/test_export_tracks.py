@@ -180,4 +180,4 @@ def test_boxes_in_the_bev_frame_need_its_pose(tmp_path):
 
 
 def test_an_unknown_format_names_the_known_ones(predictions):
-    assert "--format dxf: unknown format (expected csv, kitti, " in str(export(predictions, "dxf").exception)
+    assert "--format dxf: unknown format (expected csv, json, kitti, " in str(export(predictions, "dxf").exception)

@@ -8,7 +8,7 @@ from bevcli.evaluation.options import ExportOptions
 from bevcli.sequences.files.boxes_file import BoxesFile
 
 
-def _write(boxes: BoxesFile, target: Path, options: ExportOptions) -> str:
+def _write(boxes: BoxesFile, target: Path, options: ExportOptions, source: Path) -> str:
     return f"{write_csv(boxes, target)} boxes"
 
 

@@ -25,7 +25,7 @@ UNSET = {"occlusion": -1, "occlusion_kf": 0, "truncation": -1, "amt_occlusion": 
 UNSET |= {"amt_border_l": -1, "amt_border_r": -1, "amt_border_kf": -1}
 
 
-def _write(boxes: BoxesFile, target: Path, options: ExportOptions) -> str:
+def _write(boxes: BoxesFile, target: Path, options: ExportOptions, source: Path) -> str:
     scenes: dict[str, list[FrameBoxes]] = {}
     for frame in boxes.frames:
         scenes.setdefault(frame.stamp.scene, []).append(frame)

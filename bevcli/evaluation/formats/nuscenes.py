@@ -8,12 +8,12 @@ from bevcli.evaluation.submission import write_submission
 from bevcli.sequences.files.boxes_file import BoxesFile
 
 
-def _write(boxes: BoxesFile, target: Path, options: ExportOptions) -> str:
+def _write(boxes: BoxesFile, target: Path, options: ExportOptions, source: Path) -> str:
     write_submission(boxes, target)
     return f"{len(boxes.frames)} samples"
 
 
-def _write_tracking(boxes: BoxesFile, target: Path, options: ExportOptions) -> str:
+def _write_tracking(boxes: BoxesFile, target: Path, options: ExportOptions, source: Path) -> str:
     write_submission(boxes, target, tracking=True)
     return f"{len(boxes.frames)} samples"
 

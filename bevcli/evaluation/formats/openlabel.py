@@ -22,7 +22,7 @@ NUMBERS = ("score", "track_score", "visibility")  # optional columns of boxes, b
 COLUMNS = {"score": "scores", "track_score": "track_scores", "visibility": "visibilities"}
 
 
-def _write(boxes: BoxesFile, target: Path, options: ExportOptions) -> str:
+def _write(boxes: BoxesFile, target: Path, options: ExportOptions, source: Path) -> str:
     content = openlabel(boxes)
     write_whole(target, json.dumps(content, allow_nan=False).encode())
     return f"{len(boxes.frames)} frames, {len(content['openlabel']['objects'])} objects"

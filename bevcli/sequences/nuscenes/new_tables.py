@@ -10,9 +10,10 @@ from bevcli.errors import InputError
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig, same_rig
 from bevcli.geometry.transforms import Pose
-from bevcli.sequences.nuscenes.build import LIDAR
+from bevcli.sequences.nuscenes.dialect import NUSCENES
 from bevcli.sequences.nuscenes.index import CLASS_OF_CATEGORY
 
+(LIDAR,) = NUSCENES.lidars  # its pose is that of the bev frame
 Row = dict[str, Any]
 # scene.json is the last: it makes a folder a nuScenes root.
 TABLES = (

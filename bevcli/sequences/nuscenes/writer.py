@@ -15,9 +15,8 @@ from bevcli.geometry.cameras import Camera
 from bevcli.geometry.ego_motion import Kinematics
 from bevcli.geometry.transforms import Pose
 from bevcli.sequences.files.calibration_file import is_file_name
-from bevcli.sequences.nuscenes.build import LIDAR
 from bevcli.sequences.nuscenes.format import versions_in
-from bevcli.sequences.nuscenes.new_tables import NewTables, Row
+from bevcli.sequences.nuscenes.new_tables import LIDAR, NewTables, Row
 from bevcli.sequences.options import WriteOptions
 from bevcli.writing import write_whole
 
