@@ -16,6 +16,7 @@ Group = Literal[
     "bevcli.label_formats",
     "bevcli.drive_writers",
     "bevcli.box_formats",
+    "bevcli.label_formats",
     "bevcli.engines",
     "bevcli.commands",
 ]

@@ -123,6 +123,11 @@ class SequenceOptions(ClassOptions):
         return replace(self, ego_motion=use, model_rate_hz=config.rate_hz, classes=config.classes)
 
 
+def _complete_format(incomplete: str) -> list[str]:
+    """The known formats of written drives that start with a text, for completion in a shell."""
+    return [name for name in entries("bevcli.drive_writers") if name.startswith(incomplete)]
+
+
 @options("Input")
 class LabelOptions:
     """Ground truth from a file of labels."""
@@ -139,11 +144,6 @@ class LabelOptions:
         help="Frames without a row in a CSV table of labels have no ground truth. By default they are labelled and "
         "empty.",
     )
-
-
-def _complete_format(incomplete: str) -> list[str]:
-    """The known formats of written drives that start with a text, for completion in a shell."""
-    return [name for name in entries("bevcli.drive_writers") if name.startswith(incomplete)]
 
 
 @options()
