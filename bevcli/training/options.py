@@ -1,8 +1,12 @@
 """TrainOptions: the options of a training."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Literal
 
-from bevcli.options import option, options
+from bevcli.options import option, options, parse_pairs
+
+Log = Literal["tensorboard"]
 
 
 @options()
@@ -24,6 +28,18 @@ class TrainOptions:
         "training table.",
         metavar="N",
         minimum=0,
+    )
+    changes: Mapping[str, str] = option(
+        default_factory=dict,
+        help="Change a setting of the training table, such as optimizer.learning_rate=1e-4. Repeatable.",
+        flag="--set",
+        metavar="KEY=VALUE",
+        parse=lambda texts: parse_pairs(texts, "KEY=VALUE, such as clips.batch=2"),
+        repeatable=True,
+    )
+    log: Log | None = option(
+        default=None,
+        help="Write the learning curves for TensorBoard too, into the folder tensorboard of the output folder.",
     )
     seed: int = option(default=0, help="Random seed.", minimum=0)
 

@@ -61,6 +61,18 @@ class ClipConfig:
         if self.in_turn < 1 or (self.in_turn > 1 and self.learn != "all"):
             raise ValueError('in_turn must be positive, and 1 unless learn is "all"')
 
+    @property
+    def updates(self) -> int:
+        """Updates of the weights in a step; fewer in one with shorter clips."""
+        return self.in_turn * (self.frames if self.learn == "all" else 1)
+
+    def __str__(self) -> str:
+        """A step in words."""
+        if self.learn == "last":
+            return f"a step is one update of the weights, on {self.batch} clips of {self.frames} frames"
+        drawn = f"{self.in_turn} batches of {self.batch} clips of {self.frames} frames"
+        return f"a step is {self.updates} updates of the weights: {drawn}, an update for each frame of a batch"
+
 
 @dataclass(frozen=True)
 class Clip:
