@@ -2,6 +2,7 @@
 
 import gc
 import os
+from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
 
@@ -54,6 +55,16 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
             return group_of(super()._split_scope(nodeid))
 
     return GroupScheduling(config, log)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_weights_of_the_user(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Weights that were downloaded on this machine, and its user's own names for weights, change no test."""
+    folder = tmp_path_factory.mktemp("user")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("BEVCLI_WEIGHTS_DIR", str(folder / "weights"))
+        patch.setenv("XDG_CONFIG_HOME", str(folder / "settings"))
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -29,7 +29,8 @@ def evaluate(
 ) -> None:
     """Score PREDICTIONS against GROUND_TRUTH with the nuScenes detection metrics, and maps with IoU if both have them.
 
-    Frames are matched by nuScenes' sample token, else by scene and timestamp, else by frame index.
+    Frames are matched by nuScenes' sample token, else by scene and timestamp, else by frame index. `bevcli validate`
+    runs a model on several drives and scores them together.
     """
     from bevcli.evaluation.evaluate import evaluate
 

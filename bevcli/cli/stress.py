@@ -38,6 +38,7 @@ def stress(
     The table has NDS and mAP by corruption and severity, and mRR, the share of the clean NDS that is left. Ctrl-C or
     SIGTERM end the test after the current frame; `--resume` goes on with it.
     """
+    from bevcli.cli.fetching import fetch_if_asked
     from bevcli.cli.progress import Progress
     from bevcli.cli.stop_signals import StopSignals
     from bevcli.errors import InputError
@@ -54,6 +55,7 @@ def stress(
     other = None if options.against is None else read_results(options.against)
     if bool(sequence) == (drive_options.rendered is not None):
         raise InputError("choose the drives: give either SEQUENCE folders or `rendered=SEEDS`, not both")
+    fetch_if_asked(model)
     loaded = load_model(options=model)
     if drive_options.rendered is None:
         chosen = source.for_model(loaded.config)

@@ -20,6 +20,7 @@ def train(
         str,
         typer.Option(
             autocompletion=complete_model,
+            metavar="NAME|FILE",
             help="A model name or a FILE.toml; required. Its training table holds the settings.",
             rich_help_panel="Model",
             show_default=False,

@@ -16,7 +16,7 @@ from bevcli.geometry.transforms import Array, apply, inverse, wrap_angle
 from bevcli.parsing.csv_cells import cell_of
 from bevcli.sequences.files.box_json import boxes_to_json
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
-from bevcli.sequences.files.calibration_file import read_calibration
+from bevcli.sequences.files.calibration_file import CALIBRATION, read_calibration
 from bevcli.sequences.files.incremental_json import GrowingFile
 from bevcli.writing import whole_file, write_whole
 
@@ -160,13 +160,24 @@ def _in_front_of_camera(corners: Array) -> Array:
     return np.concatenate([corners[corners[:, 2] >= NEAR_M], cut])
 
 
+def kitti_calibration(boxes: Path) -> Path:
+    """The calibration next to a boxes file, as a run and a sequence folder have it. Raises InputError without one."""
+    path = boxes.parent / CALIBRATION
+    if not path.is_file():
+        raise InputError(
+            f"`form=kitti` needs `calibration`: KITTI labels are in a camera frame, and there is no {path} "
+            "(a run writes it for a drive of one scene)"
+        )
+    return path
+
+
 def read_kitti_camera(calibration: Path, name: str | None) -> tuple[Camera, Array]:
     """The camera for the labels, and ego_from_bev (4, 4).
 
     calibration: calibration.json, or a folder that contains it. name: default CAM_FRONT, or else the camera that looks
     most directly ahead. Raises InputError where there is no such file or camera.
     """
-    path = calibration / "calibration.json" if calibration.is_dir() else calibration
+    path = calibration / CALIBRATION if calibration.is_dir() else calibration
     rig = read_calibration(path)
     if name is None:
         name = "CAM_FRONT" if "CAM_FRONT" in rig.names else min(rig.cameras, key=lambda camera: abs(camera.yaw)).name

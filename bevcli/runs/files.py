@@ -3,6 +3,7 @@
 import contextlib
 import hashlib
 import json
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from bevcli.config import as_table
-from bevcli.errors import OutputError
+from bevcli.errors import InputError, OutputError
 from bevcli.evaluation.export import CsvWriter
 from bevcli.evaluation.submission import SubmissionWriter
 from bevcli.frame import Frame, Prediction, Sequence
@@ -20,10 +21,12 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Pose
 from bevcli.inference.load import Model
 from bevcli.model.config import ModelConfig
+from bevcli.parsing.files import open_regular
 from bevcli.recording.writer import LiveSink, Recording, RecordingState
 from bevcli.runs.folder import RunFolder
 from bevcli.runs.options import RunOptions
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
+from bevcli.sequences.files.calibration_file import CALIBRATION, write_calibration
 from bevcli.sequences.files.incremental_json import partial_path
 from bevcli.sequences.files.json_fields import pose_to_json
 from bevcli.sequences.files.map_folder import map_path, write_map
@@ -52,19 +55,20 @@ class _Growing:
 
     def add(self, path: Path) -> None:
         """Hash one more file; a missing one has no bytes."""
-        with contextlib.suppress(OSError):
-            content = path.read_bytes()
-            self._size += len(content)
-            self._hash.update(content)
+        self._hash_from(path, 0, sys.maxsize)
 
     def up_to(self, path: Path, size: int) -> Kept:
         """What the file holds in its first `size` bytes; fewer if it is shorter."""
-        with contextlib.suppress(OSError), path.open("rb") as file:
-            file.seek(self._size)
+        self._hash_from(path, self._size, size)
+        return self.kept
+
+    def _hash_from(self, path: Path, start: int, size: int) -> None:
+        """Hash a regular file from a place on, until `size` bytes are hashed. A pipe or a device has no bytes."""
+        with contextlib.suppress(OSError, InputError), open_regular(path) as file:
+            file.seek(start)
             while self._size < size and (block := file.read(min(BLOCK, size - self._size))):
                 self._hash.update(block)
                 self._size += len(block)
-        return self.kept
 
     @property
     def kept(self) -> Kept:
@@ -151,6 +155,9 @@ class RunFiles:
                 self._tracks = self._stack.enter_context(CsvWriter(out / TRACKS, tracks_at))
             if resume is not None and resume.submission is not None:
                 self._open_submission(resume.submission)
+            if len({stamp.scene for stamp in sequence.stamps}) == 1:  # scenes may have rigs of their own
+                self._folder.add(out / CALIBRATION)
+                write_calibration(out / CALIBRATION, sequence.rig, sequence.facts)
             for note in sequence.notes if resume is None else ():
                 self._recording.event(note, "WARN")
             self._stack = self._stack.pop_all()
@@ -237,7 +244,7 @@ class RunFiles:
 
     def written(self) -> tuple[Path, ...]:
         """The files and folders that exist so far."""
-        paths = [self._out / name for name in (RECORDING, PREDICTIONS, TRACKS, SUBMISSION, SEGMENTATION)]
+        paths = [self._out / name for name in (RECORDING, PREDICTIONS, TRACKS, SUBMISSION, SEGMENTATION, CALIBRATION)]
         return tuple(path for path in (*paths, self._options.save_bev) if path is not None and path.exists())
 
 
@@ -286,6 +293,6 @@ def _save_bev(folder: Path, prediction: Prediction, model: Model) -> None:
         "untrained": model.untrained,
     }
     name = f"{prediction.stamp.index:06d}"
-    with whole_file(folder / f"{name}.npy", parents=True) as unfinished:
+    with whole_file(folder / f"{name}.npy", parents=True, regular=True) as unfinished:
         np.save(unfinished, features)
-    write_whole(folder / f"{name}.json", f"{json.dumps(facts, indent=1)}\n".encode())
+    write_whole(folder / f"{name}.json", f"{json.dumps(facts, indent=1)}\n".encode(), regular=True)

@@ -48,7 +48,7 @@ class RenderOptions:
         default=20, help="Number of frames.", metavar="N", flag="--count", old=("--frames",), minimum=1
     )
     rig: str | Path | CameraRig | None = option(
-        reads="path or name",
+        reads="path",
         default=None,
         help="The cameras, a calibration.json. Default: six cameras like nuScenes.",
         metavar="FILE",

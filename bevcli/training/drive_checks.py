@@ -34,9 +34,9 @@ def check_training_drives(
         return ()
     _check_lengths(drives, clip_frames)
     _check_ground_truth(drives)
-    notes = [*check_classes(drives, f"the {len(drives)} drives to train on", "trained on", config)]
+    notes = [*check_classes(drives, f"{_count(drives)} to train on", "trained on", config)]
     if held_out is not None:
-        notes += check_classes(held_out, f"the {len(held_out)} drives to score on", "scored", config)
+        notes += check_classes(held_out, f"{_count(held_out)} to score on", "scored", config)
     return tuple(notes)
 
 
@@ -45,7 +45,7 @@ def check_scored_drives(data: DriveOptions, drives: Drives, config: ModelConfig)
     if data.rendered is not None:
         _check_rendered_classes(data.class_map, config)
         return ()
-    return tuple(check_classes(drives, f"the {len(drives)} drives", "scored", config))
+    return tuple(check_classes(drives, _count(drives), "scored", config))
 
 
 def check_classes(drives: Drives, where: str, use: str, config: ModelConfig) -> Iterator[str]:
@@ -105,6 +105,10 @@ def _check_lengths(drives: Drives, clip_frames: int) -> None:
 def longest_scene(drive: Sequence) -> int:
     """The number of frames of the longest scene of a drive."""
     return max(map(len, scenes_of(drive.stamps)), default=0)
+
+
+def _count(drives: Drives) -> str:
+    return "the drive" if len(drives) == 1 else f"the {len(drives)} drives"
 
 
 def _too_short(drives: str, clip_frames: int, frames: int) -> InputError:

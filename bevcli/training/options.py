@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
+from bevcli.evaluation.options import MAX_RANGE_HELP
 from bevcli.options import option, options, parse_pairs
 
 Log = Literal["tensorboard"]
@@ -50,6 +51,7 @@ class ValidationOptions:
 
     rig: str | None = option(
         reads="path or name",
+        complete=lambda incomplete: ["random"],
         default=None,
         help="Cameras of the rendered drives: a calibration.json, scaled to the model's image size, or a random rig "
         "for each drive, from training.rigs of the model. Default: six cameras like nuScenes.",
@@ -57,7 +59,7 @@ class ValidationOptions:
     )
     max_range: float | None = option(
         default=None,
-        help="Ignore boxes beyond this distance. Default: the nearest side of the BEV grid.",
+        help=MAX_RANGE_HELP,
         metavar="METRES",
     )
     tracking: bool = option(default=False, help="Also run the tracker and score its tracks: AMOTA, identity switches.")

@@ -49,7 +49,7 @@ def test_its_weights_are_in_the_package_and_the_default() -> None:
 
 @pytest.mark.parametrize("name", ["tiny", "small", "base"])
 def test_other_models_do_not_run_without_weights(name: str) -> None:
-    with pytest.raises(WeightsError, match=f"model {name} has no weights: pass `weights=FILE`"):
+    with pytest.raises(WeightsError, match=f"model {name} has no weights: run `bevcli weights fetch {name}`"):
         load_model(name)
 
 

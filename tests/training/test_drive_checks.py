@@ -64,7 +64,7 @@ def test_a_note_a_set_names_dropped_boxes_with_counts(prepare: Callable[..., Tra
         "the 2 drives to train on: 6 boxes have other classes and are not trained on: car (6) (`class_map`"
     )
     assert absent == "the 2 drives to train on: no box has the class deer of the model mini"
-    assert scored.startswith("the 1 drives to score on: 3 boxes have other classes and are not scored: car (3)")
+    assert scored.startswith("the drive to score on: 3 boxes have other classes and are not scored: car (3)")
 
 
 def test_no_known_class_is_an_error(prepare: Callable[..., TrainingJob], tmp_path: Path) -> None:
@@ -111,7 +111,7 @@ def test_scored_drives_have_notes_too(fleet: Path) -> None:
     config = replace(load_config(fleet / "mini.toml"), classes=("car", "Rad"))
     data = DriveOptions(data=(fleet / "d000",))
     (dropped, _) = check_scored_drives(data, scored_drives(data, config), config)
-    assert dropped.startswith("the 1 drives: 3 boxes have other classes and are not scored: bicycle (3)")
+    assert dropped.startswith("the drive: 3 boxes have other classes and are not scored: bicycle (3)")
     with pytest.raises(InputError, match="has no class of the model"):
         check_scored_drives(data, scored_drives(data, config), replace(config, classes=("deer",)))
 

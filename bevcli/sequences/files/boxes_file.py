@@ -169,6 +169,14 @@ class BoxesWriter:
         self.file.close()
 
 
+def write_boxes(boxes: BoxesFile, path: Path) -> int:
+    """Write all frames of a file; return the number of boxes. Raises OutputError."""
+    with BoxesWriter(path, boxes.frame_of_reference, boxes.extras, boxes.ego_from_bev) as writer:
+        for frame in boxes.frames:
+            writer.write(frame)
+    return sum(len(frame.boxes) for frame in boxes.frames)
+
+
 def _load(path: Path) -> dict[str, Any]:
     missing = f'the file is missing (expected a boxes file, "format": "{FORMAT}")'
     content = read_entries(path, _TAIL, LARGEST_BYTES, missing=missing)

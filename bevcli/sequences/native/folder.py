@@ -10,6 +10,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
 from bevcli.geometry.transforms import Array, Pose, inverse
+from bevcli.parsing.files import is_there
 from bevcli.sequences.files.boxes_file import read_boxes
 from bevcli.sequences.files.calibration_file import read_rig_and_facts
 from bevcli.sequences.files.class_names import count_classes
@@ -89,7 +90,7 @@ class FolderSequence(Sequence):
 def _read_entries(path: Path, rig: CameraRig) -> tuple[tuple[FrameEntry, ...], tuple[str, ...]]:
     """The frames of frames.csv, or else those that are found, with a note."""
     table = path / "frames.csv"
-    if table.is_file():
+    if is_there(table):
         return read_frames_table(table, rig.names), ()
     entries, note = find_frames(path, rig.names)
     check_times(entries)
@@ -110,9 +111,9 @@ def _check_paths(folder: Path, entries: tuple[FrameEntry, ...]) -> None:
 
 def _read_motion(file: Path, use: EgoMotionUse) -> tuple[EgoMotion | None, tuple[str, ...]]:
     if use == "static":
-        unread = f" ({file.name} is not read)" if file.is_file() else ""
+        unread = f" ({file.name} is not read)" if is_there(file) else ""
         return None, (f"the vehicle is assumed to stand still{unread}",)
-    if file.is_file():
+    if is_there(file):
         return read_ego_motion(file), ()
     if use == "required":
         raise InputError(
@@ -154,7 +155,7 @@ class FolderGroundTruth:
 
     def __init__(self, folder: Path, *, is_read: bool = True) -> None:
         boxes_path, maps_path = folder / BOXES_FILE, folder / MAPS_FOLDER
-        has_boxes = is_read and existing(boxes_path).is_file()
+        has_boxes = is_read and is_there(existing(boxes_path))
         self._boxes = read_boxes(boxes_path) if has_boxes else None
         self.class_counts = count_classes(frame.boxes for frame in self._boxes.frames) if self._boxes else {}
         self._frames = {frame.stamp.index: frame for frame in self._boxes.frames} if self._boxes else {}

@@ -18,6 +18,7 @@ import numpy as np
 from bevcli.sequences.nuscenes.build import build_index
 from bevcli.sequences.nuscenes.dialect import NUSCENES, Dialect
 from bevcli.sequences.nuscenes.index import NuScenesIndex
+from bevcli.user_folders import user_cache
 
 FORMAT = 2  # version of the cached arrays; increase it when the index changes
 SMALLEST_BYTES = 64 << 20  # smaller tables are not cached, because reading them takes a second or two
@@ -40,11 +41,6 @@ def open_index(tables: Path, dialect: Dialect = NUSCENES) -> tuple[NuScenesIndex
     except OSError as error:
         return index, f"{folder}: the index cannot be cached ({error.strerror}); opening it again will be slow"
     return index, f"the index of the nuScenes tables is cached in {folder}"
-
-
-def user_cache() -> Path:
-    """The folder of all caches of bevcli, $XDG_CACHE_HOME/bevcli (default ~/.cache/bevcli)."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "bevcli"
 
 
 def _is_fresh(folder: Path, fingerprint: str) -> bool:
