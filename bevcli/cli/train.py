@@ -5,9 +5,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bevcli.cli.bridge import INPUT_OR_NAME, OldArgument, Part
+from bevcli.errors import InputError
 from bevcli.inference.options import ModelOptions, complete_model
+from bevcli.printing import say
 from bevcli.synth.options import DriveOptions
-from bevcli.training.options import TrainOptions
+from bevcli.training.options import ModelFileOptions, TrainOptions
 
 if TYPE_CHECKING:
     from bevcli.training.trainer import Trainer
@@ -31,6 +33,7 @@ def train(
     *,
     model_options: Annotated[ModelOptions, Part(only=("device",))],
     drives: Annotated[DriveOptions, Part(only=("data", "rendered", "split", "class_map"))],
+    file_options: ModelFileOptions,
     options: TrainOptions,
 ) -> None:
     """Train a model; write its weights, checkpoints and learning curves.
@@ -41,6 +44,8 @@ def train(
     a checkpoint after the current step; --resume continues from it, on a CPU with the same result. Run
     weights.safetensors with `bevcli run --weights`.
 
+    `bevcli train --init my.toml --data DIR …` writes a model file for these drives; then train with `--model my.toml`.
+
     `torchrun --nproc-per-node N -m bevcli train …` trains with N processes, one for each GPU or CPU core.
     """
     import torch
@@ -48,8 +53,17 @@ def train(
     from bevcli.cli.stop_signals import StopSignals
     from bevcli.inference.load import choose_device
     from bevcli.training.job import leave_process_group, prepare_training
+    from bevcli.training.model_file import write_model_file
     from bevcli.training.trainer import Trainer
 
+    if file_options.init is not None:
+        if model or options != TrainOptions():
+            raise InputError("`init` trains nothing: remove the model and the options of a training")
+        device = choose_device(model_options.device)
+        say(*write_model_file(file_options.init, drives, file_options.preset or "quick", device))
+        return
+    if file_options.preset is not None:
+        raise InputError("`preset` is for `init`: remove it")
     if not model:
         raise typer.BadParameter("is missing (expected a model name or a FILE.toml)", param_hint="--model")
     torch.manual_seed(options.seed)

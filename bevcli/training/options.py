@@ -8,6 +8,7 @@ from bevcli.evaluation.options import MAX_RANGE_HELP
 from bevcli.options import option, options, parse_pairs
 
 Log = Literal["tensorboard"]
+Preset = Literal["quick", "demo", "tiny", "base"]
 
 
 @options()
@@ -43,6 +44,23 @@ class TrainOptions:
         help="Write the learning curves for TensorBoard too, into the folder tensorboard of the output folder.",
     )
     seed: int = option(default=0, help="Random seed.", minimum=0)
+
+
+@options("Model")
+class ModelFileOptions:
+    """A new model file for a data set."""
+
+    init: Path | None = option(
+        default=None,
+        help="Do not train: write a model file for the drives, with their classes, cameras, frame rate, image size and "
+        "BEV range, and with the time and memory of a training on this machine.",
+        metavar="FILE.toml",
+    )
+    preset: Preset | None = option(
+        default=None,
+        help="The model that the file of `init` starts from. quick, the default, is the demo model on smaller images, "
+        "for a CPU.",
+    )
 
 
 @options()
