@@ -95,9 +95,11 @@ def _run(trainer: "Trainer") -> None:
         if missing > 0:
             progress.advance(missing)
 
-    with Progress(steps * updates, "updates", job.notes) as progress:
+    with Progress(steps * updates, "updates") as progress:
         counts = f"{len(job.drives)} to train on, {len(job.held_out)} to evaluate on"
         progress.message(f"{job.config.clips}; {steps} steps; drives: {counts}; output: {job.out}")
+        for note in job.notes:
+            progress.message(f"note: {note}")
         with StopSignals("step") as signals:
             trainer.run(
                 after_step,

@@ -1,6 +1,7 @@
 """Splits: the drives to train on, and those to score on. A file states them, or the last drives are held out."""
 
 import glob
+import json
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from bevcli.parsing.files import read_text
 from bevcli.synth.drives import Drives, FolderDrives, open_drives, split_drives
 from bevcli.synth.options import DriveOptions
 from bevcli.synth.rig import RigDistribution
+from bevcli.writing import write_whole
 
 KEYS = ("train", "validate")
 
@@ -36,8 +38,8 @@ def read_split(path: Path) -> Split:
         train = ["drives/2024-*"]
         validate = ["drives/2025-01", "drives/2025-02"]
 
-    Folders are relative to the file; * and ? stand for the folders that match, in the order of their names. Raises
-    InputError for another key, a list that leaves no drive, or a drive that is missing or stands there twice.
+    Folders are relative to the file; *, ? and [abc] stand for the folders that match, in the order of their names.
+    Raises InputError for another key, a list that leaves no drive, or a drive that is missing or stands there twice.
     """
     table = parse_toml(read_text(path, TOML_BYTES), path)
     if set(table) != set(KEYS):
@@ -48,6 +50,21 @@ def read_split(path: Path) -> Split:
     if twice:
         raise InputError(f"{path}: {twice[0]} stands there twice: a drive is trained on or scored on, once")
     return split
+
+
+def split_of(data: DriveOptions, held_out: int) -> Split | None:
+    """The folders to train on and to score on; None for rendered drives. Raises InputError as `read_split`."""
+    if data.split is not None:
+        return _only_split(data, data.split)
+    first = len(data.data) - held_out
+    return Split(data.data[:first], data.data[first:]) if data.rendered is None else None
+
+
+def write_split(path: Path, split: Split) -> None:
+    """Write a split file with absolute paths. Raises OutputError."""
+    for_glob = {key: [glob.escape(str(folder.resolve())) for folder in getattr(split, key)] for key in KEYS}
+    text = "".join(f"{key} = {json.dumps(folders, ensure_ascii=False)}\n" for key, folders in for_glob.items())
+    write_whole(path, text.encode())
 
 
 def training_drives(
@@ -84,7 +101,7 @@ def _folders(path: Path, key: str, names: object) -> tuple[Path, ...]:
         raise InputError(f'{path}: {key}: expected a list of folders, such as ["drives/a"], found {names!r:.60}')
     folders: list[Path] = []
     for name in names:
-        found = sorted(glob.glob(str(path.parent / name))) if set(name) & set("*?") else [str(path.parent / name)]
+        found = sorted(glob.glob(str(path.parent / name))) if set(name) & set("*?[") else [str(path.parent / name)]
         missing = [each for each in found if not Path(each).exists()]
         if missing or not found:
             raise InputError(f"{path}: {key}: {name}: there is no such folder")

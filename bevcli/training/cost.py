@@ -46,7 +46,9 @@ class Cost:
     def __str__(self) -> str:
         """The cost on one line."""
         steps, updates = self.config.steps, self.config.clips.updates
-        step = f"{self.update_s:.2g} s an update, {duration(self.step_s)} a step ({updates} updates)"
+        step = f"{self.update_s:.2g} s an update"
+        if updates > 1:
+            step += f", {duration(self.step_s)} a step of {updates}"
         whole = f"{duration(steps * self.step_s)} for {steps} steps without scoring"
         return f"{self.machine}: {step}, {whole}; memory {self.memory_bytes / 1e9:.1f} GB"
 

@@ -70,7 +70,7 @@ def check_classes(drives: Drives, where: str, use: str, config: ModelConfig) -> 
     absent = [name for name in config.classes if not counts[name]]
     if counts and all_counted and len(absent) == len(config.classes):
         named = ", ".join(f"{name} ({count})" for name, count in sorted(counts.items()))
-        raise _no_known_class(f"the ground truth of {where}", named, min(counts), config)
+        raise _no_known_class(f"the ground truth of {where}", named, counts.most_common(1)[0][0], config)
     yield from ClassNames(classes=config.classes).note(counts, where, use)
     if absent and all_counted:
         yield f"{where}: no box has the class {' or '.join(absent)} of the model {config.name}"

@@ -18,7 +18,7 @@ from bevcli.model.network import Network, build_network
 from bevcli.synth.drives import Drives, check_training_seeds
 from bevcli.synth.options import DriveOptions
 from bevcli.synth.rig import RigDistribution, rig_for_rendering
-from bevcli.synth.splits import training_drives
+from bevcli.synth.splits import split_of, training_drives, write_split
 from bevcli.training.augmentation import AugmentationConfig
 from bevcli.training.changes import with_changes
 from bevcli.training.drive_checks import check_training_drives
@@ -228,6 +228,9 @@ def prepare_training(
     if not options.resume:
         make_folder(out)
     group = join_process_group(device)
+    split = split_of(data, config.held_out)
+    if group.leads and split is not None and split.validate:
+        write_split(out / "split.toml", split)
     return TrainingJob(model, config, drives, evaluated, out, device, options.seed, group, notes, options.log)
 
 

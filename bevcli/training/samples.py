@@ -68,10 +68,15 @@ class ClipConfig:
 
     def __str__(self) -> str:
         """A step in words."""
+        clips = f"{_counted(self.batch, 'clip', 'clips')} of {_counted(self.frames, 'frame', 'frames')}"
         if self.learn == "last":
-            return f"a step is one update of the weights, on {self.batch} clips of {self.frames} frames"
-        drawn = f"{self.in_turn} batches of {self.batch} clips of {self.frames} frames"
-        return f"a step is {self.updates} updates of the weights: {drawn}, an update for each frame of a batch"
+            return f"a step is one update of the weights, on {clips}"
+        batches = f"{_counted(self.in_turn, 'batch', 'batches')} of {clips}"
+        return f"a step is {self.updates} updates of the weights, one for each frame of a batch: {batches}"
+
+
+def _counted(count: int, one: str, many: str) -> str:
+    return f"{count} {one if count == 1 else many}"
 
 
 @dataclass(frozen=True)

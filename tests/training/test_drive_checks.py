@@ -29,12 +29,11 @@ SETTINGS = {"clips.frames": "2", "clips.batch": "1", "held_out": "1", "steps": "
 
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four drives of three frames with a car and a bicycle each; mini.toml; split.toml."""
+    """Four drives of three frames with a car and a bicycle each, and mini.toml."""
     folder = tmp_path_factory.mktemp("fleet")
     write_fleet(folder, 4, truth=True)
     write_fleet(folder / "without", 2)
     (folder / "mini.toml").write_text(MINI_TOML)
-    (folder / "split.toml").write_text('train = ["d00[01]", "d00?"]\nvalidate = []\n')
     return folder
 
 
@@ -118,11 +117,12 @@ def test_scored_drives_have_notes_too(fleet: Path) -> None:
 
 def test_a_split_file_states_both_sets(fleet: Path, tmp_path: Path) -> None:
     file = fleet / "good.toml"
-    file.write_text('train = ["d00[0]", "d00?"]\nvalidate = ["d003"]\n'.replace('"d00[0]", "d00?"', '"d000", "d001"'))
+    file.write_text('train = ["d000", "d001"]\nvalidate = ["d003"]\n')
     options = TrainOptions(tmp_path / "out", changes=SETTINGS)
     job = prepare_training(str(fleet / "mini.toml"), CPU, DriveOptions(split=file), options)
     assert [job.drives.open(index).name for index in range(len(job.drives))] == ["d000", "d001"]
     assert [job.held_out.open(index).name for index in range(len(job.held_out))] == ["d003"]
+    assert read_split(job.out / "split.toml") == read_split(file)
     scored = scored_drives(DriveOptions(split=file), load_config(fleet / "mini.toml"))
     assert isinstance(scored, FolderDrives)
     assert [scored.open(index).name for index in range(len(scored))] == ["d003"]
@@ -130,6 +130,11 @@ def test_a_split_file_states_both_sets(fleet: Path, tmp_path: Path) -> None:
         scored_drives(DriveOptions(data=(fleet,), split=file), load_config(fleet / "mini.toml"))
     with pytest.raises(InputError, match="remove `held_out`, or `split`"):
         prepare_training("demo", CPU, DriveOptions(split=file), TrainOptions(tmp_path / "other", held_out=1))
+
+
+def test_a_training_states_its_drives(prepare: Callable[..., TrainingJob], fleet: Path) -> None:
+    split = read_split(prepare("d001", "d000", "d003").out / "split.toml")
+    assert (split.train, split.validate) == ((fleet / "d001", fleet / "d000"), (fleet / "d003",))
 
 
 def test_a_star_stands_for_folders_in_order(fleet: Path) -> None:
@@ -193,13 +198,14 @@ def test_the_command_says_what_a_step_is_and_counts_updates(fleet: Path, tmp_pat
         tmp_path, "train", "--model", fleet / "mini.toml", *drives, *settings, "--out", "out", "--log", "tensorboard"
     )
     assert done.returncode == 0, done.stderr
-    lines = [line for line in done.stderr.splitlines() if not line.startswith("note: ")]
+    lines = done.stderr.splitlines()
     assert lines[0] == (
-        "a step is 2 updates of the weights: 1 batches of 1 clips of 2 frames, an update for each frame of a batch; "
+        "a step is 2 updates of the weights, one for each frame of a batch: 1 batch of 1 clip of 2 frames; "
         "1 steps; drives: 1 to train on, 1 to evaluate on; output: out"
     )
-    assert lines[1].startswith("1/2 updates, ")
-    assert ", step 1, loss " in lines[1]
+    assert lines[1].startswith("note: the drive to train on: no box has the class truck or ")
+    assert lines[3].startswith("1/2 updates, ")
+    assert ", step 1, loss " in lines[3]
     assert (tmp_path / "out" / "weights.safetensors").stat().st_mode & 0o777 == (
         fleet / "mini.toml"
     ).stat().st_mode & 0o777

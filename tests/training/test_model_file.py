@@ -59,7 +59,7 @@ def test_the_file_trains_as_it_is_and_states_facts_and_cost(fleet: Path) -> None
         write_model_file(path, data, "quick", CPU)
 
 
-def test_a_slow_drive_keeps_its_frame_rate_and_a_fast_one_is_thinned() -> None:
+def test_a_slow_drive_keeps_its_rate_and_a_fast_one_is_thinned() -> None:
     for step_s, rate_hz, frames in ((1.0, 1.0, 4), (0.1, 2.0, 1)):
         facts = look_at([TrueDrive(4, step_s=step_s)], FRAME)
         table = model_table("m", "quick", facts)
