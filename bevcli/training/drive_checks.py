@@ -11,10 +11,11 @@ from bevcli.sequences.files.class_names import ClassNames
 from bevcli.sequences.selection import scenes_of
 from bevcli.synth.drives import FRAMES_PER_DRIVE, Drives
 from bevcli.synth.options import DriveOptions
+from bevcli.training.samples import ClipConfig
 
 
 def check_training_drives(
-    data: DriveOptions, drives: Drives, held_out: Drives | None, clip_frames: int, config: ModelConfig
+    data: DriveOptions, drives: Drives, held_out: Drives | None, clips: ClipConfig, config: ModelConfig
 ) -> tuple[str, ...]:
     """Notes about the drives of a training, each set once. Renders no drive.
 
@@ -22,18 +23,19 @@ def check_training_drives(
         data: the choice of the drives.
         drives: to train on.
         held_out: to score on; None for the same drives.
-        clip_frames: frames of a clip.
+        clips: the clips that are drawn.
         config: of the model.
 
-    Raises InputError where a drive has no ground truth or is shorter than a clip, and as `check_classes`.
+    Raises InputError where a frame to train on has no ground truth or a drive is shorter than a clip, and as
+    `check_classes`.
     """
     if data.rendered is not None:
-        if clip_frames > FRAMES_PER_DRIVE:
-            raise _too_short(f"rendered drives ({FRAMES_PER_DRIVE})", clip_frames, FRAMES_PER_DRIVE)
+        if clips.frames > FRAMES_PER_DRIVE:
+            raise _too_short(f"rendered drives ({FRAMES_PER_DRIVE})", clips.frames, FRAMES_PER_DRIVE)
         _check_rendered_classes(data.class_map, config)
         return ()
-    _check_lengths(drives, clip_frames)
-    _check_ground_truth(drives)
+    _check_lengths(drives, clips.frames)
+    _check_ground_truth(drives, clips)
     notes = [*check_classes(drives, f"{_count(drives)} to train on", "trained on", config)]
     if held_out is not None:
         notes += check_classes(held_out, f"{_count(held_out)} to score on", "scored", config)
@@ -83,13 +85,16 @@ def _check_rendered_classes(class_map: Mapping[str, str], config: ModelConfig) -
         raise _no_known_class("the ground truth of rendered drives", ", ".join(NUSCENES_CLASSES), "car", config)
 
 
-def _check_ground_truth(drives: Drives) -> None:
-    """Raise InputError for a drive without ground truth boxes. Looks at the last frame where they are not counted."""
-    for index in range(len(drives)):
-        drive = drives.open(index)
-        if not drive.class_counts and drive.ground_truth_frame(len(drive.stamps) - 1).ground_truth is None:
+def _check_ground_truth(drives: Drives, clips: ClipConfig) -> None:
+    """Raise InputError for a drive with a frame that may be trained on and has no ground truth boxes."""
+    first = clips.frames - 1 if clips.learn == "last" and clips.short_share == 0 else 0
+    for drive in map(drives.open, range(len(drives))):
+        places = [place for scene in scenes_of(drive.stamps) for place in scene[first:]]
+        missing = [place for place in places if drive.ground_truth_frame(place).ground_truth is None]
+        if missing:
             raise InputError(
-                f"{drive.name}: has no ground truth boxes: training needs ground_truth.json (bevcli convert writes it)"
+                f"{drive.name}: {len(missing)} of {len(places)} frames to train on have no ground truth boxes, the "
+                f"first is frame {drive.stamps[missing[0]].index}: add them to ground_truth.json, or remove the frames"
             )
 
 

@@ -221,7 +221,9 @@ def prepare_training(
     rigs = config.rigs if config.rigs.random_share > 0 else None
     drives, evaluated = training_drives(data, config.held_out, out / "drives", model_config, rigs)
     own = None if data.split is None and config.held_out == 0 else evaluated
-    notes = check_training_drives(data, drives, own, config.clips.frames, model_config)
+    notes = check_training_drives(data, drives, own, config.clips, model_config)
+    if data.rendered is not None and not (out / "drives").exists():
+        notes += ("each drive is rendered when it is first drawn, which takes seconds: the first step waits for some",)
     model = build_network(model_config)
     if options.weights is not None:
         load_weights(options.weights, model, resample=True)

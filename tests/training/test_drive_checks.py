@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from bevcli.synth.drives import FolderDrives
 from bevcli.synth.options import DriveOptions
 from bevcli.synth.splits import read_split, scored_drives
 from bevcli.training.changes import with_changes
-from bevcli.training.drive_checks import check_scored_drives
+from bevcli.training.drive_checks import check_scored_drives, check_training_drives
 from bevcli.training.job import TrainingConfig, TrainingJob, prepare_training
 from bevcli.training.options import TrainOptions
 from bevcli.training.samples import ClipConfig
@@ -78,7 +79,11 @@ def test_no_known_class_is_an_error(prepare: Callable[..., TrainingJob], tmp_pat
 @pytest.mark.parametrize(
     ("names", "changes", "message"),
     [
-        (("d000", "without/d000", "d001"), {}, "d000: has no ground truth boxes: training needs ground_truth.json"),
+        (
+            ("d000", "without/d000", "d001"),
+            {},
+            "d000: 3 of 3 frames to train on have no ground truth boxes, the first is frame 0",
+        ),
         (("d000", "d001", "d002"), {"clips.frames": "4"}, r"fewer frames than a clip, 4 .*: d000 \(3\), d001 \(3\)"),
         (("d000", "d001"), {"held_out": "2"}, "2 drives are too few with 2 of them held out"),
         (("d000", "nowhere", "d001"), {}, "nowhere: is missing"),
@@ -92,6 +97,16 @@ def test_refused_drives_leave_no_folder(
         prepare(*names, changes=changes)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_frame_without_ground_truth_is_named(fleet: Path, tmp_path: Path) -> None:
+    drive = shutil.copytree(fleet / "d000", tmp_path / "part")
+    truth = json.loads((drive / "ground_truth.json").read_text())
+    (drive / "ground_truth.json").write_text(json.dumps(truth | {"frames": truth["frames"][1:]}))
+    drives, config = FolderDrives([drive], load_config("tiny")), load_config("tiny")
+    with pytest.raises(InputError, match=r"part: 1 of 3 frames to train on have no ground truth boxes, .* frame 0"):
+        check_training_drives(DriveOptions(), drives, None, ClipConfig(frames=2), config)
+    assert check_training_drives(DriveOptions(), drives, None, ClipConfig(frames=2, short_share=0.0), config)
 
 
 def test_wrong_weights_leave_no_folder(fleet: Path, tmp_path: Path) -> None:
