@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bevcli.cli.bridge import INPUT_OR_NAME, OldArgument, Part
+from bevcli.cli.bridge import INPUT_OR_NAME, OldArgument, Part, print_note
 from bevcli.errors import InputError
 from bevcli.inference.options import ModelOptions, complete_model
 from bevcli.printing import say
@@ -95,11 +95,13 @@ def _run(trainer: "Trainer") -> None:
         if missing > 0:
             progress.advance(missing)
 
+    counts = f"{len(job.drives)} to train on, {len(job.held_out)} to evaluate on"
+    say(f"{job.config.clips}; {steps} steps; drives: {counts}; output: {job.out}", err=True)
+    for note in job.notes:
+        print_note(note)
+    if job.warm_start is not None:
+        say(job.warm_start.table())
     with Progress(steps * updates, "updates") as progress:
-        counts = f"{len(job.drives)} to train on, {len(job.held_out)} to evaluate on"
-        progress.message(f"{job.config.clips}; {steps} steps; drives: {counts}; output: {job.out}")
-        for note in job.notes:
-            progress.message(f"note: {note}")
         with StopSignals("step") as signals:
             trainer.run(
                 after_step,

@@ -10,7 +10,6 @@ import torch
 import torch.distributed
 from torch import Tensor, nn
 
-from bevcli.checkpoints import load_weights
 from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import InputError, OutputError
 from bevcli.geometry.cameras import CameraRig
@@ -26,6 +25,8 @@ from bevcli.training.frame_losses import LossConfigs
 from bevcli.training.options import Log, TrainOptions
 from bevcli.training.samples import ClipConfig
 from bevcli.training.tensorboard_log import require_tensorboard
+from bevcli.training.warm_start import WarmStart, warm_start
+from bevcli.weights.local import weights_file
 
 
 @dataclass(frozen=True)
@@ -184,6 +185,7 @@ class TrainingJob:
         group: the processes that train together.
         notes: about the drives, for the user.
         log: where the learning curves are written, besides the CSV files; None for nowhere.
+        warm_start: what the training starts from; None for random weights, or if it is resumed.
     """
 
     model: Network
@@ -196,6 +198,7 @@ class TrainingJob:
     group: ProcessGroup = field(default_factory=ProcessGroup)
     notes: tuple[str, ...] = ()
     log: Log | None = None
+    warm_start: WarmStart | None = None
 
 
 def prepare_training(
@@ -224,16 +227,16 @@ def prepare_training(
     notes = check_training_drives(data, drives, own, config.clips, model_config)
     if data.rendered is not None and not (out / "drives").exists():
         notes += ("each drive is rendered when it is first drawn, which takes seconds: the first step waits for some",)
-    model = build_network(model_config)
-    if options.weights is not None:
-        load_weights(options.weights, model, resample=True)
+    model, started = build_network(model_config), None
+    if options.weights is not None and not options.resume:
+        started = warm_start(weights_file(options.weights), model, model_name_or_file, lambda: drives.open(0).rig)
     if not options.resume:
         make_folder(out)
     group = join_process_group(device)
     split = split_of(data, config.held_out)
     if group.leads and split is not None and split.validate:
         write_split(out / "split.toml", split)
-    return TrainingJob(model, config, drives, evaluated, out, device, options.seed, group, notes, options.log)
+    return TrainingJob(model, config, drives, evaluated, out, device, options.seed, group, notes, options.log, started)
 
 
 def training_config(model_name_or_file: str, options: TrainOptions = TrainOptions()) -> TrainingConfig:
