@@ -13,16 +13,17 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError
-from bevcli.evaluation.export import write_csv
+from bevcli.evaluation.export import write_csv, write_kitti
 from bevcli.evaluation.formats.openlabel import openlabel
 from bevcli.frame import Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes, write_boxes
-from bevcli.sequences.labels import csv_table, label_format, openlabel as openlabel_reader
+from bevcli.sequences.labels import csv_table, kitti, label_format, openlabel as openlabel_reader
 from bevcli.sequences.labels.sequence import WithLabels
 from bevcli.sequences.native.writer import NativeWriter
+from bevcli.sequences.options import LabelOptions
 
-FORMATS = {"csv": csv_table.FORMAT, "openlabel": openlabel_reader.FORMAT}
+FORMATS = {"csv": csv_table.FORMAT, "kitti": kitti.FORMAT, "openlabel": openlabel_reader.FORMAT}
 HEAD = "frame,class,x,y,z,length,width,height,yaw"
 
 
@@ -104,7 +105,7 @@ def test_frames_without_a_row_are_empty_or_left_out(tmp_path: Path) -> None:
     drive, path = Drive(), tmp_path / "labels.csv"
     path.write_text(f"{HEAD}\n{drive.stamps[1].index},PKW,1,2,0,4,2,1,0\n")
     assert [len(WithLabels(drive, path).load(place).ground_truth) for place in range(3)] == [0, 1, 0]
-    labelled = WithLabels(drive, path, only_labelled=True)
+    labelled = WithLabels(drive, path, LabelOptions(only_labelled=True))
     assert [labelled.load(place).ground_truth is None for place in range(3)] == [True, False, True]
     assert any("1 frames with boxes: PKW (1); 3 frames without boxes have no" in note for note in labelled.notes)
     assert any("a column `instance` would give them" in note for note in labelled.notes)
@@ -143,7 +144,7 @@ def openlabel_text(cuboid: dict, timestamp: object = None) -> str:
 def test_openlabel_angles_turn_about_the_vertical(tmp_path: Path) -> None:
     path = tmp_path / "labels.json"
     path.write_text(openlabel_text({"name": "a", "val": [1, 2, 3, 0, 0, 0.7, 4, 2, 1], "coordinate_system": "ego"}))
-    (frame,) = label_format.read_labels(path).frames
+    (frame,) = label_format.read_labels(path, Drive().rig, LabelOptions()).frames
     np.testing.assert_allclose(frame.boxes.yaws, [0.7])
     assert (frame.boxes.classes.tolist(), frame.boxes.instances.tolist()) == (["PKW"], ["7"])
 
@@ -166,10 +167,51 @@ def test_wrong_openlabel_is_one_clear_line(text: str, message: str, tmp_path: Pa
     assert "\n" not in str(caught.value)
 
 
+def test_kitti_labels_that_bevcli_exports_are_read_again(tmp_path: Path) -> None:
+    drive = Drive()
+    given = boxes_of_drive(drive)
+    camera = drive.rig["CAM_FRONT"]
+    write_kitti(given, camera, drive.rig.ego_from_bev, tmp_path / "kitti")
+    labelled = WithLabels(drive, tmp_path / "kitti/label_2")
+    for place in range(2):  # later, the camera does not see both
+        found, frame = labelled.load(place).ground_truth, given.frames[place]
+        np.testing.assert_allclose(found.centers, frame.boxes.centers, atol=2e-3)
+        np.testing.assert_allclose(found.yaws, frame.boxes.yaws, atol=2e-3)
+        np.testing.assert_allclose(found.sizes_lwh, frame.boxes.sizes_lwh, atol=1e-3)
+
+
+def test_a_kitti_tracking_file_has_tracks(tmp_path: Path) -> None:
+    path = tmp_path / "0000.txt"
+    line = "Car 0 0 0 0 0 9 9 1.5 2 4 {} 1 20 0"
+    others = ["1 -1 DontCare -1 -1 -10 1 1 9 9 -1 -1 -1 -1000 -1000 -1000 -10", ""]
+    path.write_text("\n".join([*(f"{frame} 3 {line.format(0)}" for frame in range(3)), *others]))
+    labelled = WithLabels(Drive(), path)
+    assert [labelled.load(place).ground_truth.instances.tolist() for place in range(3)] == [["3"]] * 3
+    assert np.isfinite(labelled.load(1).ground_truth.velocities).all()
+    assert any("those that CAM_FRONT sees" in note for note in labelled.notes)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x 1 Car", "line 1: expected the index of a frame and a track"),
+        ("0 1 Car 0 0", "line 1: expected 15 or 16 words from the type on"),
+        ("0 1 Car 0 0 0 0 0 9 9 0 2 4 0 1 20 0", "sizes above 0"),
+        ("0 1 Car 0 0 0 0 0 9 9 1 2 4 nan 1 20 0", "finite numbers"),
+    ],
+)
+def test_wrong_kitti_labels_are_one_clear_line(text: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "0000.txt").write_text(text)
+    with pytest.raises(InputError, match=message):
+        WithLabels(Drive(), tmp_path / "0000.txt")
+    with pytest.raises(InputError, match="`labels_camera=roof`: is not in the rig"):
+        WithLabels(Drive(), tmp_path / "0000.txt", LabelOptions(labels_camera="roof"))
+
+
 def test_labels_of_another_kind_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "labels.txt").write_text("")
+    (tmp_path / "labels.xml").write_text("")
     with pytest.raises(InputError, match=r"is no file of labels \(expected a CSV table .* or an OpenLABEL file"):
-        WithLabels(Drive(), tmp_path / "labels.txt")
+        WithLabels(Drive(), tmp_path / "labels.xml")
 
 
 def test_convert_writes_the_labels_as_ground_truth(tmp_path: Path) -> None:

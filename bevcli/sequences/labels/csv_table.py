@@ -159,4 +159,6 @@ class _Table:
         return int(cell) if cell else None
 
 
-FORMAT = LabelFormat("a CSV table (.csv)", lambda path: path.suffix.lower() == ".csv", read_csv_labels)
+FORMAT = LabelFormat(
+    "a CSV table (.csv)", lambda path: path.suffix.lower() == ".csv", lambda path, rig, options: read_csv_labels(path)
+)

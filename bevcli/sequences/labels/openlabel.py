@@ -149,4 +149,8 @@ def _time_ns(where: str, stated: str | int | float | None) -> int | None:
         raise InputError(f'{where}: timestamp "{stated:.40}" is not a time such as 2026-01-31T12:00:00.5Z') from None
 
 
-FORMAT = LabelFormat("an OpenLABEL file (.json)", lambda path: path.suffix.lower() == ".json", read_openlabel)
+FORMAT = LabelFormat(
+    "an OpenLABEL file (.json)",
+    lambda path: path.suffix.lower() == ".json",
+    lambda path, rig, options: read_openlabel(path),
+)
