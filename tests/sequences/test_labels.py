@@ -125,6 +125,7 @@ def test_frames_without_a_row_are_empty_or_left_out(tmp_path: Path) -> None:
         (f"{HEAD}\n0,PKW", r'line 2: column x: expected a number, found ""'),
         (f"{HEAD}\n999,PKW,1,2,0,4,2,1,1", "the frame 999 is not in the drive .*are these the labels of this drive"),
         (f"{HEAD},frame_of_reference\n0,PKW,1,2,0,4,2,1,1,lidar", "frame_of_reference: expected world, ego or bev"),
+        (f"{HEAD}\n0,PKW,1,5,2,0,4,2,1,1", "line 2: has more cells than the 9 columns"),
         (f"{HEAD},x\n", "two columns have one name"),
     ],
 )
