@@ -28,6 +28,7 @@ LAYERS = (
     {"viewer"},
     {"inference"},
     {"rig"},
+    {"calibration"},
     {"runs"},
     {"synth", "batch"},
     {"training", "benchmark", "explain"},
