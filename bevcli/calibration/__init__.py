@@ -11,6 +11,7 @@ In the order of the work:
     solve                robust least squares
     heights              heights of the cameras, roughly, from the road
     road                 points of the road in both frames of a pair
+    levels               whether a camera has measured its height from a pavement
     measure              all of it in rounds
     observed             the part of the result that the drive shows, with its covariance
 
@@ -18,4 +19,6 @@ Outputs:
     estimates            what is said about each camera and the whole rig
     result               the corrected rig, and the files
     table                the text for the terminal
+    corrected_drive      the drive with the corrected rig
+    findings             what is found, for `bevcli project-debug`
 """

@@ -55,34 +55,33 @@ def calibrate(
     views = read_views(drive, chosen.pairs, after_step)
     matches = match_points(views)
     after_step()
-    if not len(matches.pair):
+    if not matches.same.any():
         raise InputError(
             f"{drive.name}: no points were found in both frames of a pair (expected {FEWEST_MATCHES} or more a "
             "camera): choose a part of the drive in which the images are sharp and show something"
         )
     measurement = measure(views, matches, chosen, after_step)
     found = observed(measurement)
-    cameras = tuple(
-        _estimate(index, drive, views, matches, measurement, found) for index in range(len(drive.rig.names))
-    )
-    rig = corrected_rig(drive.rig, cameras)
-    return CalibrationResult(drive.name, drive.rig, rig, cameras, _whole(found), len(views.pairs), drive.facts)
+    indices = range(len(views.rig.names))
+    cameras = tuple(_estimate(index, views, matches, measurement, found) for index in indices)
+    rig = corrected_rig(views.stated, cameras)
+    return CalibrationResult(drive.name, views.stated, rig, cameras, _whole(found), len(views.pairs), drive.facts)
 
 
 def _estimate(
-    index: int, drive: Sequence, views: Views, matches: PointMatches, measurement: Measurement, found: Observed
+    index: int, views: Views, matches: PointMatches, measurement: Measurement, found: Observed
 ) -> CameraEstimate:
     change, covariance = found.changes[index], found.covariances[index]
     deviations = np.sqrt(np.diag(covariance))
-    count = int((matches.camera == index).sum())
-    pairs = len(np.unique(matches.pair[matches.camera == index]))
+    mine = matches.same & (matches.camera == index)
+    count, pairs = int(mine.sum()), len(np.unique(matches.group[mine]))
     reason = _reason(count, pairs, np.degrees(deviations[:3]))
-    enlarged = drive.rig.cameras[index].width / views.rig.cameras[index].width
+    enlarged = views.stated.cameras[index].width / views.rig.cameras[index].width
     solution = measurement.solution.x
     before, after = (_residual_px(measurement, index, x) * enlarged for x in (0 * solution, solution))
     road = measurement.unknowns.groups[measurement.road.group, 1] == index
     return CameraEstimate(
-        camera=drive.rig.names[index],
+        camera=views.rig.names[index],
         verdict=Verdict.NOT_MEASURABLE if reason else _verdict(change[:6], deviations[:6]),
         reason=reason,
         rotation_deg=_yaw_pitch_roll(-np.degrees(change[:3])),
@@ -118,7 +117,7 @@ def _verdict(change: Array, deviations: Array) -> Verdict:
 
 def _residual_px(measurement: Measurement, index: int, x: Array) -> float:
     """The median residual of a camera's matched points, in pixels of the reduced image."""
-    mine = measurement.unknowns.groups[measurement.points.group, 1] == index
+    mine = (measurement.unknowns.groups[measurement.points.group, 1:] == index).all(-1)
     found = np.abs(values(measurement.unknowns, measurement.points, x)[mine])
     return float(np.median(found)) if found.size else 0.0
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.calibration.road import beside_way, sampled
-from bevcli.calibration.unknowns import GroupGeometry, Unknowns, geometry
+from bevcli.calibration.unknowns import GroupGeometry, Unknowns, geometry_at
 from bevcli.calibration.views import Views
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array
@@ -15,7 +15,7 @@ CORRECTIONS_M = np.arange(-0.6, 0.61, 0.03)
 DISTANCES, ANGLES_DEG = np.linspace(2.0, 8.0, 60), np.linspace(-35, 35, 100)  # of road points; in heights of the camera
 TILES, POINTS = (6, 10), (10, 10)  # of the road: each has a level of its own, such as that of the pavement
 LEAST_CORRELATION = 0.6
-LEAST_SHARPNESS = 0.15  # of a peak of the scores, as a share of the sharpest one's
+LEAST_SHARPNESS = 0.2  # of a peak of the scores, as a share of the sharpest one's
 LANE_M = 4.0  # farther beside the vehicle's way a tile counts less
 
 
@@ -26,12 +26,11 @@ def search_heights(views: Views, unknowns: Unknowns, x: Array) -> Array:
 
 
 def _best(views: Views, unknowns: Unknowns, x: Array, index: int) -> float:
-    groups = np.flatnonzero(unknowns.groups[:, 1] == index)
-    scores = np.zeros(len(CORRECTIONS_M))
-    if len(groups):
-        found = geometry(unknowns, x[unknowns.columns(groups)], groups)
-        for place, group in enumerate(groups):
-            scores += _scores(views, unknowns, found, place, int(group))
+    """The correction of a camera, by all its pairs of images."""
+    groups = [group for group in unknowns.within_camera if unknowns.groups[group, 1] == index]
+    found, scores = geometry_at(unknowns, x), np.zeros(len(CORRECTIONS_M))
+    for group in groups:
+        scores += _scores(views, unknowns, found, int(group))
     return float(CORRECTIONS_M[_lowest_level(scores)]) if scores.any() else 0.0
 
 
@@ -44,12 +43,12 @@ def _lowest_level(scores: Array) -> int:
     return int(np.flatnonzero(sharp >= LEAST_SHARPNESS * sharp.max())[-1]) if peak.any() else int(scores.argmax())
 
 
-def _scores(views: Views, unknowns: Unknowns, found: GroupGeometry, place: int, group: int) -> Array:
+def _scores(views: Views, unknowns: Unknowns, found: GroupGeometry, group: int) -> Array:
     """The score of each correction in a pair of images: tiles of the road that look alike vote for it."""
-    pair, index = unknowns.groups[group]
+    pair, index, _ = (int(each) for each in unknowns.groups[group])
     camera = views.rig.cameras[index]
-    images = [views.of[frame, int(index)].texture for frame in views.pairs[pair]]
-    pose, motion = found.ego_from_camera[place], found.ego_b_from_ego_a[place]
+    images = [view.texture for view in views.sides((pair, index, index))]
+    pose, motion = found.ego_from_camera_a[group], found.ego_b_from_ego_a[group]
     points = _grid(pose)
     moved = points @ motion[:3, :3].T + motion[:3, 3]
     alike = []

@@ -23,18 +23,20 @@ _Features = tuple[Array, NDArray[np.float32]]  # pixels (F, 2) and descriptors (
 
 @dataclass(frozen=True)
 class PointMatches:
-    """M matches of all cameras and pairs.
+    """M matches of all pairs.
 
     Attributes:
-        pair: (M,) index of the pair.
-        camera: (M,) index of the camera.
+        group: (M,) index of the group in `Views.groups`, in order.
+        same: (M,) whether both images are of the same camera.
+        camera: (M,) index of the camera of the first image.
         pixels_a: (M, 2) in the reduced image of the first frame.
         pixels_b: (M, 2) in that of the second frame.
         rays_a: (M, 3) unit directions in the camera frame.
         rays_b: (M, 3).
     """
 
-    pair: NDArray[np.int64]
+    group: NDArray[np.int64]
+    same: NDArray[np.bool_]
     camera: NDArray[np.int64]
     pixels_a: Array
     pixels_b: Array
@@ -43,25 +45,25 @@ class PointMatches:
 
 
 def match_points(views: Views) -> PointMatches:
-    """The matches of all pairs of views."""
+    """The matches of all groups of views."""
     with ThreadPoolExecutor() as threads:
         features = dict(zip(views.of, threads.map(lambda view: _features(view.pixels), views.of.values()), strict=True))
-        groups = views.groups()
 
-        def found(group: tuple[int, int]) -> tuple[Array, Array]:
-            pair, camera = group
-            a, b = (features[place, camera] for place in views.pairs[pair])
-            return _matched(a, b, views.rig.cameras[camera])
+        def found(group: tuple[int, int, int]) -> tuple[Array, Array]:
+            (a, b), (_, first, second) = views.pairs[group[0]], group
+            cameras = views.rig.cameras[first], views.rig.cameras[second]
+            return _matched(features[a, first], features[b, second], *cameras)
 
-        matched = list(threads.map(found, groups))
+        matched = list(threads.map(found, views.groups()))
     counts = [len(a) for a, _ in matched]
     pixels_a, pixels_b = (np.concatenate([each[side] for each in matched]) for side in (0, 1))
-    pair, camera = (np.repeat([group[side] for group in groups], counts) for side in (0, 1))
-    rays_a, rays_b = np.zeros((len(pair), 3)), np.zeros((len(pair), 3))
-    for index, each in enumerate(views.rig.cameras):
-        mine = camera == index
-        rays_a[mine], rays_b[mine] = each.rays(pixels_a[mine]), each.rays(pixels_b[mine])
-    return PointMatches(pair, camera, pixels_a, pixels_b, rays_a, rays_b)
+    _, first, second = (np.repeat(column, counts) for column in np.array(views.groups()).T)
+    rays_a, rays_b = np.zeros((len(first), 3)), np.zeros((len(first), 3))
+    for index, camera in enumerate(views.rig.cameras):
+        rays_a[first == index] = camera.rays(pixels_a[first == index])
+        rays_b[second == index] = camera.rays(pixels_b[second == index])
+    group = np.repeat(np.arange(len(counts)), counts)
+    return PointMatches(group, first == second, first, pixels_a, pixels_b, rays_a, rays_b)
 
 
 def _features(pixels: NDArray[np.uint8]) -> _Features:
@@ -72,28 +74,38 @@ def _features(pixels: NDArray[np.uint8]) -> _Features:
     return np.array([point.pt for point in points], dtype=np.float64), np.asarray(descriptors, dtype=np.float32)
 
 
-def _matched(a: _Features, b: _Features, camera: Camera) -> tuple[Array, Array]:
-    """Pixels (m, 2) and (m, 2) of the matches that one rigid motion explains."""
+def _matched(a: _Features, b: _Features, first: Camera, second: Camera) -> tuple[Array, Array]:
+    """Pixels (m, 2) and (m, 2) of the matches; those within one camera fit one rigid motion."""
     nothing = np.zeros((0, 2)), np.zeros((0, 2))
     if min(len(a[0]), len(b[0])) < FEWEST:
         return nothing
     nearest = cv2.BFMatcher().knnMatch(a[1], b[1], k=2)
-    kept = [best for best, second in nearest if best.distance < RATIO * second.distance]
-    pixels_a, pixels_b = a[0][[m.queryIdx for m in kept]], b[0][[m.trainIdx for m in kept]]
-    rays_a, rays_b = camera.rays(pixels_a), camera.rays(pixels_b)
-    with np.errstate(invalid="ignore"):
-        ahead = (rays_a[:, 2] > FLATTEST) & (rays_b[:, 2] > FLATTEST)
-    if ahead.sum() < FEWEST:
+    kept = [best for best, other in nearest if best.distance < RATIO * other.distance]
+    if len(kept) < FEWEST:
         return nothing
-    flat_a, flat_b = (rays[ahead, :2] / rays[ahead, 2:] for rays in (rays_a, rays_b))
+    pixels_a, pixels_b = a[0][[m.queryIdx for m in kept]], b[0][[m.trainIdx for m in kept]]
+    rays_a, rays_b = first.rays(pixels_a), second.rays(pixels_b)
+    with np.errstate(invalid="ignore"):
+        good = (rays_a[:, 2] > FLATTEST) & (rays_b[:, 2] > FLATTEST)
+    if first is second:
+        good[good] = _rigid(rays_a[good], rays_b[good], first)
+    quality = np.array([m.distance for m in kept])
+    chosen = np.flatnonzero(good)
+    chosen = chosen[_spread(pixels_a[chosen], quality[chosen], first)]
+    return pixels_a[chosen], pixels_b[chosen]
+
+
+def _rigid(rays_a: Array, rays_b: Array, camera: Camera) -> NDArray[np.bool_]:
+    """(m,) the matches that one rigid motion explains: all others move by themselves, or are wrong."""
+    nothing = np.zeros(len(rays_a), dtype=bool)
+    if len(rays_a) < FEWEST:
+        return nothing
+    flat_a, flat_b = (rays[:, :2] / rays[:, 2:] for rays in (rays_a, rays_b))
     threshold = INLIER_PX / camera.intrinsics[0, 0]
     _, inliers = cv2.findEssentialMat(flat_a, flat_b, np.eye(3), cv2.RANSAC, 0.999, threshold)
     if inliers is None or inliers.sum() < FEWEST:
         return nothing
-    rigid = np.flatnonzero(ahead)[inliers.ravel() > 0]
-    quality = np.array([m.distance for m in kept])[rigid]
-    rigid = rigid[_spread(pixels_a[rigid], quality, camera)]
-    return pixels_a[rigid], pixels_b[rigid]
+    return np.asarray(inliers.ravel() > 0)
 
 
 def _spread(pixels: Array, distance: Array, camera: Camera) -> NDArray[np.int64]:

@@ -6,20 +6,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from bevcli.calibration.heights import search_heights
+from bevcli.calibration.levels import level_corrections
 from bevcli.calibration.matches import PointMatches
 from bevcli.calibration.options import CalibrateOptions
 from bevcli.calibration.residuals import EpipolarResiduals, RoadResiduals, epipolar_residuals
 from bevcli.calibration.road import road_residuals
 from bevcli.calibration.solve import Solution, Term, solve, spread
-from bevcli.calibration.unknowns import OF_CAMERA, Unknowns
+from bevcli.calibration.unknowns import HEIGHT, OF_CAMERA, Unknowns
 from bevcli.calibration.views import Views
-from bevcli.geometry.transforms import Array
 
 SCALES_PX = (20.0, 5.0, 1.5, 0.7)  # of Cauchy's loss for points, one search after the other
 ROAD_SCALES_PX = (3.0, 1.0, 0.5)
-FLOWS_PX = (12.0, 4.0)  # largest distance of road points from where they are expected, round by round
+FLOWS_PX = (12.0, 8.0)  # largest distance of road points from where they are expected, round by round
 PARTS = 2 + 2 * len(FLOWS_PX)  # of the work, for progress
-HEIGHT = 5  # place of a camera's height among its unknowns
 
 
 @dataclass(frozen=True)
@@ -44,19 +43,23 @@ def measure(
 ) -> Measurement:
     """Measure all unknowns. progress: called PARTS times."""
     unknowns = Unknowns.of(views, options)
-    points = epipolar_residuals(views, matches, unknowns)
-    x: Array = np.zeros(len(unknowns.deviations))
+    points = epipolar_residuals(views, matches)
+    within, x = points.where(matches.same), np.zeros(len(unknowns.deviations))
     for scale in SCALES_PX:
-        x = solve(unknowns, [Term(points, scale)], x).x
+        x = solve(unknowns, [Term(within, scale)], x).x
     progress()
-    x[np.arange(unknowns.cameras) * OF_CAMERA + HEIGHT] += search_heights(views, unknowns, x)
+    heights = np.arange(unknowns.cameras) * OF_CAMERA + HEIGHT
+    x[heights] += search_heights(views, unknowns, x)
     progress()
+    ties = points.where(~matches.same)
     for most_px in FLOWS_PX:
         road = road_residuals(views, unknowns, x, most_px)
         progress()
         for scale in ROAD_SCALES_PX:
-            terms = [Term(each, max(s, spread(unknowns, each, x))) for each, s in ((points, 0.3), (road, scale))]
+            terms = [Term(each, max(s, spread(unknowns, each, x))) for each, s in ((within, 0.3), (road, scale))]
             solution = solve(unknowns, terms, x)
             x = solution.x
+        if most_px == FLOWS_PX[0]:
+            x[heights] += level_corrections(unknowns, ties, x)
         progress()
-    return Measurement(unknowns, solution, points, road)
+    return Measurement(unknowns, solution, within, road)

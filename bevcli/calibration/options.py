@@ -37,6 +37,16 @@ class CalibrateOptions:
     pairs: int = option(default=24, help="Use at most this many pairs of frames.", minimum=8)
 
 
+@options("Input")
+class CalibrateFirstOptions:
+    """Whether a drive is calibrated before it is used."""
+
+    calibrate: bool = option(
+        default=False,
+        help="Measure the calibration of the drive first, as `bevcli calibrate` does, and use the corrected one.",
+    )
+
+
 @options("Output")
 class CalibrateOutputOptions:
     """The output folder of `bevcli calibrate`."""

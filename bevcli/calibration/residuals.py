@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.calibration.matches import PointMatches
-from bevcli.calibration.unknowns import GroupGeometry, Indices, Unknowns, geometry
+from bevcli.calibration.unknowns import GroupGeometry, Indices, Unknowns, geometry, geometry_at
 from bevcli.calibration.views import Views
 from bevcli.geometry.transforms import Array
 
@@ -48,9 +48,14 @@ class EpipolarResiduals:
     rays_b: Array
     focal: Array
 
+    def where(self, kept: NDArray[np.bool_]) -> "EpipolarResiduals":
+        """Some of the points, by a mask (N,)."""
+        return EpipolarResiduals(*(getattr(self, field.name)[kept] for field in fields(self)))
+
     def of(self, geometry: GroupGeometry) -> Array:
         """(N, 1) pixels."""
-        turns, shifts = geometry.camera_b_from_camera_a
+        relative = geometry.camera_b_from_camera_a
+        turns, shifts = relative[:, :3, :3], relative[:, :3, 3]
         directions = shifts / np.maximum(np.linalg.norm(shifts, axis=-1, keepdims=True), SHORTEST)
         turned = np.einsum("nij,nj->ni", turns[self.group], self.rays_a)
         direction = directions[self.group]
@@ -90,7 +95,7 @@ class RoadResiduals:
 
 def rays_of_road_points(geometry: GroupGeometry, group: Indices, rays_a: Array) -> Array:
     """Unit directions (N, 3) in the second image of the points of the road that rays (N, 3) of the first one hit."""
-    pose, motion = geometry.ego_from_camera[group], geometry.ego_b_from_ego_a[group]
+    pose, motion = geometry.ego_from_camera_a[group], geometry.ego_b_from_ego_a[group]
     start, direction = pose[:, :3, 3], np.einsum("nij,nj->ni", pose[:, :3, :3], rays_a)
     normal = np.array([-geometry.slopes[0], -geometry.slopes[1], 1.0])
     down = direction @ normal
@@ -101,28 +106,21 @@ def rays_of_road_points(geometry: GroupGeometry, group: Indices, rays_a: Array) 
     return points / np.linalg.norm(points, axis=-1, keepdims=True)
 
 
-def epipolar_residuals(views: Views, matches: PointMatches, unknowns: Unknowns) -> EpipolarResiduals:
+def epipolar_residuals(views: Views, matches: PointMatches) -> EpipolarResiduals:
     """The residuals of matched points."""
-    group = unknowns.group_index[matches.pair, matches.camera]
     focal = np.array([camera.intrinsics[0, 0] for camera in views.rig.cameras])[matches.camera]
-    order = np.argsort(group, kind="stable")
-    return EpipolarResiduals(group[order], matches.rays_a[order], matches.rays_b[order], focal[order])
+    return EpipolarResiduals(matches.group, matches.rays_a, matches.rays_b, focal)
 
 
 def values(unknowns: Unknowns, residuals: Residuals, x: Array) -> Array:
     """(N, D) residuals at x."""
-    groups = np.arange(len(unknowns.groups))
-    return residuals.of(geometry(unknowns, x[unknowns.columns(groups)], groups))
+    return residuals.of(geometry_at(unknowns, x))
 
 
 def derivatives(unknowns: Unknowns, residuals: Residuals, x: Array) -> tuple[Array, Array]:
-    """Residuals (N, D), and their derivatives (N, D, 13) by the unknowns of their group."""
-    groups = np.arange(len(unknowns.groups))
-    local = x[unknowns.columns(groups)]
-    here = residuals.of(geometry(unknowns, local, groups))
-    columns = []
-    for column in range(local.shape[1]):
-        step = np.zeros(local.shape[1])
-        step[column] = STEP
-        columns.append((residuals.of(geometry(unknowns, local + step, groups)) - here) / STEP)
+    """Residuals (N, D), and their derivatives (N, D, 20) by the unknowns of their group, `Unknowns.columns`."""
+    local = x[unknowns.columns]
+    here = residuals.of(geometry(unknowns, local))
+    steps = STEP * np.eye(local.shape[1])
+    columns = [(residuals.of(geometry(unknowns, local + step)) - here) / STEP for step in steps]
     return here, np.stack(columns, axis=-1)

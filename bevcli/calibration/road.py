@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.calibration.residuals import RoadResiduals, rays_of_road_points
-from bevcli.calibration.unknowns import GroupGeometry, Unknowns, geometry
+from bevcli.calibration.unknowns import GroupGeometry, Unknowns, geometry_at
 from bevcli.calibration.views import Views
 from bevcli.geometry.cameras import OUTSIDE, Camera
 from bevcli.geometry.transforms import Array
@@ -46,8 +46,7 @@ class Warp:
 
 def road_residuals(views: Views, unknowns: Unknowns, x: Array, most_px: float) -> RoadResiduals:
     """Road points of all groups, at most `most_px` pixels from where the unknowns x (P,) expect them."""
-    groups = np.arange(len(unknowns.groups))
-    found = geometry(unknowns, x[unknowns.columns(groups)], groups)
+    groups, found = unknowns.within_camera, geometry_at(unknowns, x)
     with ThreadPoolExecutor() as threads:
         parts = list(threads.map(lambda group: _points_of(views, unknowns, found, int(group), most_px), groups))
     counts = [len(part[0]) for part in parts]
@@ -60,9 +59,9 @@ def _points_of(
 ) -> tuple[Array, Array, Array, Array]:
     """The fields of `RoadResiduals` after the first for the points of a group."""
     nothing = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2, 3)), np.zeros(0)
-    pair, index = unknowns.groups[group]
+    pair, index, _ = (int(each) for each in unknowns.groups[group])
     camera = views.rig.cameras[index]
-    first, second = (views.of[place, int(index)].texture for place in views.pairs[pair])
+    first, second = (view.texture for view in views.sides((pair, index, index)))
     warp = warp_of(camera, found, group)
     if warp is None:
         return nothing
@@ -78,7 +77,7 @@ def _points_of(
         return nothing
     target = _sample(warp.pixels, at + flow)
     rays_a, rays_b = camera.rays(at), camera.rays(target)
-    beside = beside_way(points_of_road(found.ego_from_camera[group], rays_a), found.ego_b_from_ego_a[group])
+    beside = beside_way(points_of_road(found.ego_from_camera_a[group], rays_a), found.ego_b_from_ego_a[group])
     return rays_a, rays_b, _weights(camera, first, warp, at, target), beside
 
 
@@ -87,7 +86,7 @@ def warp_of(camera: Camera, found: GroupGeometry, group: int) -> Warp | None:
     columns, rows = np.arange(0, camera.width + STRIDE, STRIDE), np.arange(0, camera.height + STRIDE, STRIDE)
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).astype(np.float64)
     rays = camera.rays(pixels.reshape(-1, 2))
-    pose, motion = found.ego_from_camera[group], found.ego_b_from_ego_a[group]
+    pose, motion = found.ego_from_camera_a[group], found.ego_b_from_ego_a[group]
     points = points_of_road(pose, rays)
     away = np.linalg.norm((points - pose[:3, 3])[:, :2], axis=-1)
     road = (away > NEAREST * pose[2, 3]) & (away < FARTHEST * pose[2, 3]) & (beside_way(points, motion) < WIDEST_M)

@@ -90,7 +90,7 @@ def _normal_equations(
     """
     size = len(unknowns.deviations)
     information, gradients = np.zeros((size, size)), np.zeros((len(unknowns.groups), size))
-    columns = unknowns.columns(np.arange(len(unknowns.groups)))
+    columns = unknowns.columns
     for term in terms:
         here, slopes = derivatives(unknowns, term.residuals, x)
         squares = (here**2).sum(-1) / term.scale**2
@@ -98,11 +98,13 @@ def _normal_equations(
         factor = _curvature(squares) if curvature else 1.0
         bounds = np.searchsorted(term.residuals.group, np.arange(len(columns) + 1))
         for group, (start, end) in enumerate(pairwise(bounds)):
+            if start == end:
+                continue
             part = slopes[start:end].reshape(-1, slopes.shape[-1])
             weighted = part * np.repeat(weights[start:end], here.shape[1])[:, None]
             places = columns[group]
-            information[np.ix_(places, places)] += factor * part.T @ weighted
-            gradients[group, places] += weighted.T @ here[start:end].ravel()
+            np.add.at(information, np.ix_(places, places), factor * part.T @ weighted)
+            np.add.at(gradients[group], places, weighted.T @ here[start:end].ravel())
     return information, gradients
 
 

@@ -47,6 +47,15 @@ def delay_text(estimate: CameraEstimate) -> str:
     return f"the images of {estimate.camera} were taken {size:.0f} ± {deviation:.0f} ms {word} than stated"
 
 
+def change_text(estimate: CameraEstimate) -> str:
+    """How far a camera is off, in words: "off by yaw +1.98° ± 0.05°, z +0.150 m ± 0.005 m", and so on."""
+    rotation = zip(("yaw", "pitch", "roll"), estimate.rotation_deg, estimate.rotation_deviation_deg, strict=True)
+    position = zip("xyz", estimate.position_m, estimate.position_deviation_m, strict=True)
+    parts = [f"{name} {value:+.2f}° ± {deviation:.2f}°" for name, value, deviation in rotation]
+    parts += [f"{name} {value:+.3f} m ± {deviation:.3f} m" for name, value, deviation in position if value]
+    return "off by " + ", ".join(parts)
+
+
 def _row(estimate: CameraEstimate) -> tuple[str, ...]:
     if estimate.verdict is Verdict.NOT_MEASURABLE:
         cells = ["–"] * 6

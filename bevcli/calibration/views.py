@@ -12,7 +12,7 @@ from bevcli.errors import InputError
 from bevcli.frame import Frame, Sequence
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, motion_during
-from bevcli.geometry.transforms import Array, inverse
+from bevcli.geometry.transforms import Array
 
 WIDTH = 1000  # pixels; larger images are reduced to it
 NEAREST_M, FARTHEST_M = 0.8, 12.0  # distance driven between the frames of a pair
@@ -47,24 +47,37 @@ class Views:
     """What a drive shows.
 
     Attributes:
-        rig: the stated rig, with cameras for the reduced images.
+        stated: the rig of the frames.
+        rig: the same with cameras for the reduced images.
         pairs: places of the frames of each pair.
         of: (place, camera index) -> view; missing images are left out.
     """
 
+    stated: CameraRig
     rig: CameraRig
     pairs: tuple[tuple[int, int], ...]
     of: dict[tuple[int, int], View]
 
-    def groups(self) -> list[tuple[int, int]]:
-        """(pair, camera) of each pair of views, both as indices."""
-        found = range(len(self.rig.cameras))
-        return [(k, c) for k, (a, b) in enumerate(self.pairs) for c in found if (a, c) in self.of and (b, c) in self.of]
+    def groups(self) -> list[tuple[int, int, int]]:
+        """(pair, camera of its first frame, camera of its second one): each camera with itself and its neighbours."""
+        cameras = [(each, each) for each in range(len(self.rig.cameras))] + self.neighbours()
+        return [
+            (pair, first, second)
+            for pair, (a, b) in enumerate(self.pairs)
+            for first, second in cameras
+            if (a, first) in self.of and (b, second) in self.of
+        ]
 
-    def motion(self, pair: int, camera: int) -> Array:
-        """(25, 4, 4) ego_b_from_ego_a of a pair, by the delay of the camera."""
-        a, b = (self.of[place, camera].poses for place in self.pairs[pair])
-        return inverse(b) @ a
+    def neighbours(self) -> list[tuple[int, int]]:
+        """Each camera with the next ones to the left and to the right."""
+        around = np.argsort([camera.yaw for camera in self.rig.cameras]).tolist()
+        pairs = {(a, b) for a, b in zip(around, around[1:] + around[:1], strict=True) if a != b}
+        return sorted(pairs | {(b, a) for a, b in pairs})
+
+    def sides(self, group: tuple[int, int, int]) -> tuple[View, View]:
+        """The two views of a group."""
+        (a, b), (_, first, second) = self.pairs[group[0]], group
+        return self.of[a, first], self.of[b, second]
 
 
 def read_views(drive: Sequence, most_pairs: int, progress: Callable[[], None] = lambda: None) -> Views:
@@ -79,11 +92,12 @@ def read_views(drive: Sequence, most_pairs: int, progress: Callable[[], None] = 
             f"{drive.name}: the vehicle moves between {len(pairs)} pairs of frames by {NEAREST_M:g} to {FARTHEST_M:g} "
             f"m (expected {FEWEST_PAIRS} or more): choose more frames, or a part of the drive in which it moves"
         )
-    rig = replace(drive.rig, cameras=tuple(map(_reduced, drive.rig.cameras)))
     views: dict[tuple[int, int], View] = {}
     places = sorted({place for pair in pairs for place in pair})
     for done, place in enumerate(places, 1):
         frame = drive.load(place)
+        if done == 1:
+            stated, rig = frame.rig, replace(frame.rig, cameras=tuple(map(_reduced, frame.rig.cameras)))
         for index, camera in enumerate(rig.cameras):
             view = _view(frame, camera, drive.ego_motion)
             if view is not None:
@@ -92,7 +106,7 @@ def read_views(drive: Sequence, most_pairs: int, progress: Callable[[], None] = 
             progress()
     if not views:
         raise InputError(f"{drive.name}: no image shows anything (expected images with contrast, not black ones)")
-    return Views(rig, tuple(pairs), views)
+    return Views(stated, rig, tuple(pairs), views)
 
 
 def _check(drive: Sequence) -> None:

@@ -11,6 +11,7 @@ from planted import BlackImages, WrongRig, angle_deg, distance_m, wrong_rig
 from typer.testing import CliRunner
 
 import bevcli
+from bevcli.calibration.corrected_drive import CorrectedDrive
 from bevcli.calibration.estimates import Verdict
 from bevcli.cli import bridge
 from bevcli.cli.calibrate import calibrate
@@ -150,3 +151,9 @@ def test_few_frames_are_refused_in_one_line():
     done = typed(str(STREET), "--frames", "0:2")
     assert isinstance(done.exception, InputError)
     assert "moves between 0 pairs" in str(done.exception)
+
+
+def test_a_corrected_drive_has_the_corrected_rig_in_its_frames(street, result):
+    drive = CorrectedDrive(WrongRig(street[0], street[2]), result)
+    assert drive.rig is result.rig
+    assert drive.load(0).rig is result.rig
