@@ -60,9 +60,12 @@ def calibrate(
             f"{drive.name}: no points were found in both frames of a pair (expected {FEWEST_MATCHES} or more a "
             "camera): choose a part of the drive in which the images are sharp and show something"
         )
-    measurement = measure(views, matches, chosen, after_step)
-    found = observed(measurement)
-    indices = range(len(views.rig.names))
+    return judge(drive, views, matches, measure(views, matches, chosen, after_step))
+
+
+def judge(drive: Sequence, views: Views, matches: PointMatches, measurement: Measurement) -> CalibrationResult:
+    """The result of a measurement: what is observed, with a verdict for each camera."""
+    found, indices = observed(measurement), range(len(views.rig.names))
     cameras = tuple(_estimate(index, views, matches, measurement, found) for index in indices)
     rig = corrected_rig(views.stated, cameras)
     return CalibrationResult(drive.name, views.stated, rig, cameras, _whole(found), len(views.pairs), drive.facts)

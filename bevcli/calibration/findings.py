@@ -1,7 +1,9 @@
 """What a calibration from motion finds, as findings for `bevcli project-debug`."""
 
+from collections.abc import Iterable
+
 from bevcli.calibration.calibrate import calibrate
-from bevcli.calibration.estimates import CameraEstimate
+from bevcli.calibration.estimates import CameraEstimate, Verdict
 from bevcli.calibration.table import change_text, delay_text
 from bevcli.errors import InputError
 from bevcli.findings import Finding
@@ -16,8 +18,17 @@ def motion_findings(drive: Sequence) -> tuple[Finding, ...]:
         result = calibrate(drive, pairs=SHORT_PAIRS)
     except InputError as error:
         return (Finding("motion-not-measured", "info", None, f"the drive does not show its calibration: {error}"),)
-    found = [_off(each) for each in result.corrected]
-    found += [_late(each) for each in result.cameras if delay_text(each)]
+    return findings_of(result.cameras)
+
+
+def findings_of(cameras: Iterable[CameraEstimate]) -> tuple[Finding, ...]:
+    """A finding for each camera that is corrected, and for each whose capture times are off."""
+    found = []
+    for each in cameras:
+        if each.verdict is Verdict.CORRECTED:
+            found.append(_off(each))
+        if delay_text(each):
+            found.append(_late(each))
     return tuple(found)
 
 

@@ -46,6 +46,8 @@ def project_debug(
     given = {name: value for name, value in format_options.items() if value}
     check = check_calibration(calibration, options.sequence, options.frame, allow_outside=source.allow_outside, **given)
     if options.motion and not check.errors:
+        if options.sequence is not None:
+            given["calibration"] = calibration
         check = _with_motion(check, options.sequence or calibration, source.allow_outside, given)
     written = check.write(options.out or Path("runs") / f"{check.name}-project-debug")
     if as_json:

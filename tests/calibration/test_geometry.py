@@ -118,7 +118,7 @@ def test_a_delay_moves_the_vehicle(drive):
     assert np.allclose(geometry_at(unknowns, x).ego_b_from_ego_a[0], expected, atol=1e-3)
 
 
-def test_points_beside_the_way_of_a_turn_are_measured_from_its_arc():
+def test_points_beside_a_turn_are_measured_from_its_arc():
     radius = 20.0
     angle = 0.2
     later = rigid((radius * np.sin(angle), radius * (1 - np.cos(angle)), 0), rotation_about_z(angle))
