@@ -18,6 +18,8 @@ In the order of the work:
 Outputs:
     estimates            what is said about each camera and the whole rig
     result               the corrected rig, and the files
+    evidence             the images and matches behind it
+    drawings             calibration.png
     table                the text for the terminal
     corrected_drive      the drive with the corrected rig
     findings             what is found, for `bevcli project-debug`

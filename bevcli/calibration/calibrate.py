@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from bevcli.calibration.estimates import CameraEstimate, RigEstimate, Verdict
+from bevcli.calibration.evidence import Evidence
 from bevcli.calibration.matches import PointMatches, match_points
 from bevcli.calibration.measure import PARTS, Measurement, measure
 from bevcli.calibration.observed import Observed, observed
@@ -68,7 +69,10 @@ def judge(drive: Sequence, views: Views, matches: PointMatches, measurement: Mea
     found, indices = observed(measurement), range(len(views.rig.names))
     cameras = tuple(_estimate(index, views, matches, measurement, found) for index in indices)
     rig = corrected_rig(views.stated, cameras)
-    return CalibrationResult(drive.name, views.stated, rig, cameras, _whole(found), len(views.pairs), drive.facts)
+    evidence = Evidence(views, matches, measurement)
+    return CalibrationResult(
+        drive.name, views.stated, rig, cameras, _whole(found), len(views.pairs), drive.facts, evidence
+    )
 
 
 def _estimate(

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bevcli.calibration.estimates import CameraEstimate, RigEstimate, Verdict
+from bevcli.calibration.evidence import Evidence
 from bevcli.calibration.table import rig_text, table
 from bevcli.calibration.unknowns import moved
 from bevcli.frame import DriveFacts
@@ -28,6 +29,7 @@ class CalibrationResult:
         whole: what is said about the whole rig.
         pairs: number of frame pairs that were used.
         facts: of the drive, for calibration.json.
+        evidence: what it was measured from.
     """
 
     name: str
@@ -37,6 +39,7 @@ class CalibrationResult:
     whole: RigEstimate
     pairs: int
     facts: DriveFacts
+    evidence: Evidence
 
     def __getitem__(self, camera: str) -> CameraEstimate:
         return next(each for each in self.cameras if each.camera == camera)
@@ -62,13 +65,16 @@ class CalibrationResult:
         return json.dumps(content, indent=1, ensure_ascii=False)
 
     def write(self, folder: Path | str) -> list[Path]:
-        """Write calibration.json (the corrected rig) and report.json into a folder. Returns their paths.
+        """Write calibration.json (the corrected rig), report.json and calibration.png. Returns their paths.
 
         The folder is made where it is missing; existing files are overwritten. Raises OutputError.
         """
+        from bevcli.calibration.drawings import write_sheet  # only the sheet needs matplotlib
+
         folder = Path(folder)
-        paths = [folder / "calibration.json", folder / "report.json"]
+        paths = [folder / name for name in ("calibration.json", "report.json", "calibration.png")]
         write_whole(paths[1], f"{self.to_json()}\n".encode(), parents=True)
+        write_sheet(paths[2], self.evidence, self.cameras)
         write_calibration(paths[0], self.rig, self.facts)
         return paths
 
