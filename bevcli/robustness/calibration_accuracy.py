@@ -19,8 +19,9 @@ from bevcli.calibration.matches import match_points
 from bevcli.calibration.measure import measure
 from bevcli.calibration.options import CalibrateOptions
 from bevcli.calibration.result import CalibrationResult
+from bevcli.calibration.table import delay_text
 from bevcli.calibration.views import Views, read_views
-from bevcli.frame import Sequence
+from bevcli.frame import DerivedSequence, Frame, Sequence
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Array
 from bevcli.printing import say
@@ -70,6 +71,40 @@ def errors_of_drive(drive: Sequence, levels: list[int], seeds: list[int]) -> Ite
             result = judge(drive, noisy, matches, measure(noisy, matches, options))
             for right, estimate in zip(views.stated.cameras, result.cameras, strict=True):
                 yield _error(drive.name, level, seed, right, result, estimate)
+
+
+class WrongTimes(DerivedSequence):
+    """A drive with ego-motion in which one camera states capture times that are too late by a constant."""
+
+    def __init__(self, sequence: Sequence, camera: str, late_ms: float) -> None:
+        super().__init__(sequence)
+        self._camera, self._late_ns = camera, round(late_ms * 1e6)
+
+    def load(self, place: int) -> Frame:
+        """The frame at a place, with the wrong time and the vehicle's pose at that time."""
+        frame, name, motion = self.sequence.load(place), self._camera, self.ego_motion
+        if name not in frame.images or motion is None:
+            return frame
+        time = frame.images[name].timestamp_ns + self._late_ns
+        pose = motion.pose_at(min(max(time, motion.first_ns), motion.last_ns))
+        images = {**frame.images, name: replace(frame.images[name], timestamp_ns=time)}
+        return replace(frame, images=images, world_from_ego_at={**frame.world_from_ego_at, name: pose})
+
+
+def delays_of_drive(drive: Sequence, delays_ms: list[float]) -> Iterator[str]:
+    """One line for each camera and delay: the delay that is found, and its deviation."""
+    options = CalibrateOptions()
+    views = read_views(drive, options.pairs)
+    matches = match_points(views)
+    for index, late_ms in enumerate(delays_ms):
+        camera = views.rig.names[index % len(views.rig.names)]
+        late = read_views(WrongTimes(drive, camera, late_ms), options.pairs)
+        found = judge(drive, late, matches, measure(late, matches, options))[camera]
+        turned = np.degrees(np.linalg.norm(found.change[:3]))
+        yield (
+            f"{drive.name} {camera}: planted {-late_ms:+.0f} ms, found {found.delay_ms:+.1f} ± "
+            f"{found.delay_deviation_ms:.1f} ms, rotation changed by {turned:.2f}°; {delay_text(found) or 'not told'}"
+        )
 
 
 def _with_noise(drive: Sequence, views: Views, level: int, seed: int) -> Views:
@@ -137,9 +172,16 @@ def main() -> None:
     parser.add_argument("drives", nargs="+", type=Path)
     parser.add_argument("--levels", default="1,2,3,4")
     parser.add_argument("--seeds", default="0")
+    parser.add_argument("--delays-ms", default="", help="instead: wrong capture times of one camera after the other")
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     levels, seeds = ([int(number) for number in text.split(",")] for text in (given.levels, given.seeds))
+    if given.delays_ms:
+        for path in given.drives:
+            drive = open_sequence(path, ground_truth=False)
+            for line in delays_of_drive(drive, [float(number) for number in given.delays_ms.split(",")]):
+                say(line)
+        return
     errors: list[CameraError] = []
     for path in given.drives:
         errors += errors_of_drive(open_sequence(path, ground_truth=False), levels, seeds)
