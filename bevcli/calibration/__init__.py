@@ -20,6 +20,7 @@ Outputs:
     result               the corrected rig, and the files
     evidence             the images and matches behind it
     drawings             calibration.png
+    calibration_recording     recording.rrd
     table                the text for the terminal
     corrected_drive      the drive with the corrected rig
     findings             what is found, for `bevcli project-debug`

@@ -10,7 +10,7 @@ from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 
 from bevcli.calibration.estimates import CameraEstimate, Verdict
-from bevcli.calibration.evidence import Evidence, ShownMatches
+from bevcli.calibration.evidence import Evidence, ShownMatches, epipolar_piece
 from bevcli.calibration.table import change_text
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array
@@ -20,8 +20,6 @@ from bevcli.rig.overlay import GROUND, HORIZON, ground_lines, visible_runs
 
 ROW_INCHES, WIDTH_INCHES = 2.9, 15.0
 POINT, LINE = (255, 120, 90), (110, 200, 255)  # RGB
-DEPTHS_M = np.geomspace(0.7, 300, 400)  # along the ray of a point
-PIECE_PX = 30.0  # length of the shown piece of an epipolar line to each side
 COLORS = {Verdict.FINE: "#7fd6a0", Verdict.CORRECTED: "#ffd640", Verdict.NOT_MEASURABLE: "#ff8080"}
 HEADINGS = (
     "stated: matched points (red), their epipolar lines (blue)",
@@ -63,21 +61,9 @@ def _draw_image(axes: Axes, grey: Pixels | None, camera: Camera, matches: ShownM
     _lines(canvas, ground_lines(camera), GROUND, 1)
     _lines(canvas, visible_runs(horizon(camera)), HORIZON, 2)
     for point, ray in zip(matches.pixels_b, matches.rays_a, strict=True):
-        _lines(canvas, _epipolar_piece(camera, matches.camera_b_from_camera_a, ray, point), LINE, 2)
+        _lines(canvas, epipolar_piece(camera, matches.camera_b_from_camera_a, ray, point), LINE, 2)
         cv2.circle(canvas, (round(point[0]), round(point[1])), 4, POINT, -1, cv2.LINE_AA)
     axes.imshow(canvas)
-
-
-def _epipolar_piece(camera: Camera, camera_b_from_camera_a: Array, ray: Array, point: Array) -> list[Array]:
-    """The part of a ray's image that is nearest to a point, as lines (P, 2) in pixels."""
-    points = DEPTHS_M[:, None] * ray @ camera_b_from_camera_a[:3, :3].T + camera_b_from_camera_a[:3, 3]
-    pixels = camera.project(points)[0]
-    distance = np.linalg.norm(pixels - point, axis=-1)
-    if not np.isfinite(distance).any():
-        return []
-    nearest = pixels[np.nanargmin(distance)]
-    near = np.linalg.norm(pixels - nearest, axis=-1) < PIECE_PX
-    return visible_runs(np.where(near[:, None], pixels, np.nan))
 
 
 def _lines(canvas: NDArray[np.uint8], lines: list[Array], color: tuple[int, int, int], thickness: int) -> None:

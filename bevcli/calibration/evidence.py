@@ -12,8 +12,11 @@ from bevcli.calibration.unknowns import geometry_at
 from bevcli.calibration.views import Views
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array
+from bevcli.rig.overlay import visible_runs
 
 MOST_SHOWN = 60  # matches of a camera
+DEPTHS_M = np.geomspace(0.7, 300, 400)  # along the ray of a point
+PIECE_PX = 30.0  # length of the shown piece of an epipolar line to each side
 
 
 @dataclass(frozen=True)
@@ -72,3 +75,15 @@ class Evidence:
             if counts[group]:
                 best[int(groups[group, 1])] = int(group)
         return best
+
+
+def epipolar_piece(camera: Camera, camera_b_from_camera_a: Array, ray: Array, point: Array) -> list[Array]:
+    """The part of a ray's image that is nearest to a point, as lines (P, 2) in pixels."""
+    points = DEPTHS_M[:, None] * ray @ camera_b_from_camera_a[:3, :3].T + camera_b_from_camera_a[:3, 3]
+    pixels = camera.project(points)[0]
+    distance = np.linalg.norm(pixels - point, axis=-1)
+    if not np.isfinite(distance).any():
+        return []
+    nearest = pixels[np.nanargmin(distance)]
+    near = np.linalg.norm(pixels - nearest, axis=-1) < PIECE_PX
+    return visible_runs(np.where(near[:, None], pixels, np.nan))

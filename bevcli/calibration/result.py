@@ -65,16 +65,19 @@ class CalibrationResult:
         return json.dumps(content, indent=1, ensure_ascii=False)
 
     def write(self, folder: Path | str) -> list[Path]:
-        """Write calibration.json (the corrected rig), report.json and calibration.png. Returns their paths.
+        """Write calibration.json (the corrected rig), report.json, calibration.png and recording.rrd into a folder.
 
-        The folder is made where it is missing; existing files are overwritten. Raises OutputError.
+        Returns their paths. The folder is made where it is missing; existing files are overwritten. Raises OutputError.
         """
-        from bevcli.calibration.drawings import write_sheet  # only the sheet needs matplotlib
+        # Only writing draws: matplotlib and rerun take a second to load.
+        from bevcli.calibration.calibration_recording import write_calibration_recording
+        from bevcli.calibration.drawings import write_sheet
 
         folder = Path(folder)
-        paths = [folder / name for name in ("calibration.json", "report.json", "calibration.png")]
+        paths = [folder / name for name in ("calibration.json", "report.json", "calibration.png", "recording.rrd")]
         write_whole(paths[1], f"{self.to_json()}\n".encode(), parents=True)
         write_sheet(paths[2], self.evidence, self.cameras)
+        write_calibration_recording(paths[3], self.evidence, self.text())
         write_calibration(paths[0], self.rig, self.facts)
         return paths
 

@@ -142,6 +142,7 @@ def test_the_command_writes_a_calibration(tmp_path):
         "calibration.json",
         "report.json",
         "calibration.png",
+        "recording.rrd",
     }
 
 
