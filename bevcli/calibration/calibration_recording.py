@@ -89,8 +89,8 @@ def _blueprint(rig: CameraRig) -> rrb.Blueprint:
     rows = [rrb.Horizontal(*(_camera_view(rig[name]) for name in row)) for row in camera_rows(rig)]
     layout = rrb.Vertical(*rows[:1], middle, *rows[1:])
     return rrb.Blueprint(
-        layout, rrb.TimePanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"), rrb.BlueprintPanel(state="collapsed"),
-        auto_views=False, auto_layout=False,
+        layout, rrb.TimePanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"), auto_views=False, auto_layout=False,
     )  # fmt: skip
 
 

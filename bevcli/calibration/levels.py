@@ -5,47 +5,81 @@ other. Where these contradict the road, one of the cameras sees another surface.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
-from bevcli.calibration.residuals import EpipolarResiduals, values
-from bevcli.calibration.unknowns import HEIGHT, OF_CAMERA, Unknowns
+from bevcli.calibration.residuals import EpipolarResiduals, RoadResiduals, values
+from bevcli.calibration.unknowns import HEIGHT, OF_CAMERA, Indices, Unknowns
 from bevcli.geometry.transforms import Array
 
-STEPS_M = np.arange(-0.6, 0.61, 0.02)
+STARTS_M = np.arange(-0.45, 0.46, 0.15)  # of a camera's height, about the present one
 LEAST_STEP_M = 0.08  # smaller steps are no kerb
 MOST_PX = 60.0  # residual of a point that may fit after a step
+SCALES_PX = (6.0, 3.0, 1.5, 1.0, 1.0)  # of Cauchy's loss, step by step
 FITS_PX = 1.0
 LEAST_GAIN, LEAST_SHARE = 10, 0.3  # points that fit after a step and did not before: number, and share of those before
+WAY_M, FEWEST_ON_WAY = 2.0, 60  # distance from the vehicle's way that is road for sure; points there
+FEWEST_TIES, LEAST_TIED = 60, 0.04  # shared points that fit: number, and share of all, which wrong matches do not reach
+DIFFERENCE_M = 1e-5  # for derivatives
 
 
 def level_corrections(unknowns: Unknowns, ties: EpipolarResiduals, x: Array) -> Array:
-    """(C,) corrections of the heights in x (P,), metres, of cameras on another level than their neighbours; 0 for most.
+    """(P,) corrections of x (P,): of the positions of cameras on another level than their neighbours; 0 for most.
 
     ties: points that two cameras share.
     """
     ties = ties.where(np.abs(values(unknowns, ties, x)[:, 0]) < MOST_PX)
-    corrections = np.zeros(unknowns.cameras)
-    for _ in range(2 * unknowns.cameras):  # the largest contradiction first: it may be the cause of others
-        found = [_step(unknowns, ties, x, corrections, camera) for camera in range(unknowns.cameras)]
-        gain, step, camera = max((*each, camera) for camera, each in enumerate(found))
+    corrected = x.copy()
+    for _ in range(unknowns.cameras):  # the largest contradiction first: it may be the cause of others
+        found = [_best(unknowns, ties, corrected, camera) for camera in range(unknowns.cameras)]
+        gain, camera = max((each[0], camera) for camera, each in enumerate(found))
         if gain <= 0:
             break
-        corrections[camera] += step
-    return corrections
+        corrected = found[camera][1]
+    return corrected - x
 
 
-def _step(
-    unknowns: Unknowns, ties: EpipolarResiduals, x: Array, corrections: Array, camera: int
-) -> tuple[float, float]:
-    """How many more points fit after the best step of a camera's height, beyond what chance may do; and the step."""
+def sees_road(unknowns: Unknowns, road: RoadResiduals, ties: EpipolarResiduals, x: Array) -> NDArray[np.bool_]:
+    """(C,) the cameras that have measured their height from the road, and not from a pavement.
+
+    They see the road right where the vehicle drives, or many of the points that they share with a neighbour fit.
+    """
+    fits = np.linalg.norm(values(unknowns, road, x), axis=-1) < FITS_PX
+    on_way = unknowns.groups[road.group[fits & (road.beside_m < WAY_M)], 1]
+    seen = np.bincount(on_way, minlength=unknowns.cameras) >= FEWEST_ON_WAY
+    tied = []
+    for camera in range(unknowns.cameras):
+        mine = ties.where((unknowns.groups[ties.group, 1:] == camera).any(-1))
+        tied.append(_fitting(unknowns, mine, x) >= max(FEWEST_TIES, LEAST_TIED * len(mine.group)))
+    return seen | np.array(tied)
+
+
+def _best(unknowns: Unknowns, ties: EpipolarResiduals, x: Array, camera: int) -> tuple[float, Array]:
+    """How many more points fit with a camera on another level, beyond what chance may do; and x with it there."""
     mine = ties.where((unknowns.groups[ties.group, 1:] == camera).any(-1))
-    heights = np.arange(unknowns.cameras) * OF_CAMERA + HEIGHT
-    fitting = []
-    for step in STEPS_M:
-        moved = x.copy()
-        moved[heights] += corrections
-        moved[heights[camera]] += step
-        fitting.append(int((np.abs(values(unknowns, mine, moved)) < FITS_PX).sum()))
-    best, stay = int(np.argmax(fitting)), fitting[int(np.abs(STEPS_M).argmin())]
-    if abs(STEPS_M[best]) < LEAST_STEP_M:
-        return 0.0, 0.0
-    return fitting[best] - (1 + LEAST_SHARE) * stay - LEAST_GAIN, float(STEPS_M[best])
+    columns = OF_CAMERA * camera + np.arange(HEIGHT - 2, HEIGHT + 1)
+    before = _fitting(unknowns, mine, x)
+    best, gain = x, 0.0
+    for start in STARTS_M:
+        moved = _positioned(unknowns, mine, x + start * (np.arange(len(x)) == columns[-1]), columns)
+        more = _fitting(unknowns, mine, moved) - (1 + LEAST_SHARE) * before - LEAST_GAIN
+        if more > gain and abs(moved[columns[-1]] - x[columns[-1]]) >= LEAST_STEP_M:
+            best, gain = moved, more
+    return gain, best
+
+
+def _fitting(unknowns: Unknowns, ties: EpipolarResiduals, x: Array) -> int:
+    return int((np.abs(values(unknowns, ties, x)) < FITS_PX).sum())
+
+
+def _positioned(unknowns: Unknowns, ties: EpipolarResiduals, x: Array, columns: Indices) -> Array:
+    """x with the position of a camera, its unknowns at `columns`, where the points that it shares fit best."""
+    x, prior = x.copy(), np.diag(1 / unknowns.deviations[columns] ** 2)
+    if not len(ties.group):
+        return x
+    for scale in SCALES_PX:
+        here = values(unknowns, ties, x)[:, 0]
+        steps = [x + DIFFERENCE_M * (np.arange(len(x)) == column) for column in columns]
+        slopes = np.stack([(values(unknowns, ties, each)[:, 0] - here) / DIFFERENCE_M for each in steps], axis=-1)
+        weighted = slopes / (scale**2 + here**2)[:, None]
+        x[columns] -= np.linalg.solve(weighted.T @ slopes + prior, weighted.T @ here + prior @ x[columns])
+    return x

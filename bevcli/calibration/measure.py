@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bevcli.calibration.heights import search_heights
-from bevcli.calibration.levels import level_corrections
+from bevcli.calibration.levels import level_corrections, sees_road
 from bevcli.calibration.matches import PointMatches
 from bevcli.calibration.options import CalibrateOptions
 from bevcli.calibration.residuals import EpipolarResiduals, RoadResiduals, epipolar_residuals
@@ -60,6 +60,9 @@ def measure(
             solution = solve(unknowns, terms, x)
             x = solution.x
         if most_px == FLOWS_PX[0]:
-            x[heights] += level_corrections(unknowns, ties, x)
+            x = x + level_corrections(unknowns, ties, x)
         progress()
+    certain = road.where(sees_road(unknowns, road, ties, x)[unknowns.groups[road.group, 1]])
+    if len(certain.group) < len(road.group):
+        road, solution = certain, solve(unknowns, [terms[0], Term(certain, terms[1].scale)], x)
     return Measurement(unknowns, solution, within, road)

@@ -9,7 +9,9 @@ from bevcli.calibration.unknowns import OF_CAMERA, OF_RIG
 from bevcli.geometry.transforms import Array
 
 LEAST_INFORMATION = 3.0  # of a direction, in that of the stated value: the deviation is then halved at least
-FINEST = np.array([np.radians(0.01)] * 3 + [0.001] * 3 + [0.001])  # errors of lens and images: radians, metres, seconds
+FINEST = np.array(
+    [np.radians(0.015)] * 3 + [0.001] * 3 + [0.001]
+)  # errors of lens and images: radians, metres, seconds
 
 
 @dataclass(frozen=True)

@@ -156,7 +156,8 @@ def _reduced(camera: Camera) -> Camera:
     """The camera of the reduced image. Its pixel (0, 0) is the centre of a larger pixel, so that coordinates shift."""
     if camera.width <= WIDTH:
         return camera
-    scaled = camera.scaled(WIDTH / camera.width)
+    size = (WIDTH, round(camera.height * WIDTH / camera.width))
+    scaled = camera.scaled(size[0] / camera.width, size[1] / camera.height)
     scaled.intrinsics[:2, 2] += (np.array([scaled.width / camera.width, scaled.height / camera.height]) - 1) / 2
     return scaled
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
+from command_line import MINI_TOML, command
 from memory_drive import MemorySequence
 from planted import BlackImages, WrongRig, angle_deg, distance_m, wrong_rig
 from typer.testing import CliRunner
@@ -16,7 +17,7 @@ from bevcli.calibration.estimates import Verdict
 from bevcli.cli import bridge
 from bevcli.cli.calibrate import calibrate
 from bevcli.errors import InputError, OutputError
-from bevcli.sequences.files.calibration_file import read_calibration
+from bevcli.sequences.files.calibration_file import read_calibration, write_calibration
 
 STREET = Path(__file__).parents[2] / "samples/street"
 TURNED, LOW = "CAM_FRONT", "CAM_BACK_LEFT"
@@ -162,3 +163,17 @@ def test_a_corrected_drive_has_the_corrected_rig_in_its_frames(street, result):
     drive = CorrectedDrive(WrongRig(street[0], street[2]), result)
     assert drive.rig is result.rig
     assert drive.load(0).rig is result.rig
+
+
+@pytest.mark.slow
+def test_a_run_measures_first_and_says_what_it_corrects(tmp_path):
+    right = bevcli.open_sequence(STREET).rig
+    write_calibration(tmp_path / "wrong.json", wrong_rig(right, TURNED, (1, -2, 0), (0, 0, 0)))
+    model = tmp_path / "mini.toml"
+    model.write_text(MINI_TOML)
+    done = command(
+        tmp_path, "run", STREET, "--calibration", "wrong.json", "--calibrate", "--model", model, "--untrained",
+        "--frames", "5:15", "--out", "run",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert f"calibration: {TURNED} is corrected: off by yaw +" in done.stderr

@@ -107,7 +107,7 @@ def test_a_camera_on_the_level_of_a_pavement_is_put_right(drive):
     x = np.zeros(len(unknowns.deviations))
     x[OF_CAMERA + HEIGHT] = -0.14  # camera B, seen from a kerb
     found = level_corrections(unknowns, residuals.where(groups[:, 1] != groups[:, 2]), x)
-    assert found[0] + 0.14 - found[1] == pytest.approx(0, abs=0.021)
+    assert found[HEIGHT] + 0.14 - found[OF_CAMERA + HEIGHT] == pytest.approx(0, abs=0.02)
 
 
 def test_a_delay_moves_the_vehicle(drive):
