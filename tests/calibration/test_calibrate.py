@@ -17,10 +17,11 @@ from bevcli.calibration.estimates import Verdict
 from bevcli.cli import bridge
 from bevcli.cli.calibrate import calibrate
 from bevcli.errors import InputError, OutputError
+from bevcli.robustness.calibration_accuracy import WrongTimes
 from bevcli.sequences.files.calibration_file import read_calibration, write_calibration
 
 STREET = Path(__file__).parents[2] / "samples/street"
-TURNED, LOW = "CAM_FRONT", "CAM_BACK_LEFT"
+TURNED, LOW = "CAM_FRONT", "CAM_BACK"
 
 
 def two_cameras(rig):
@@ -177,3 +178,11 @@ def test_a_run_measures_first_and_says_what_it_corrects(tmp_path):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert f"calibration: {TURNED} is corrected: off by yaw +" in done.stderr
+
+
+@pytest.mark.slow
+def test_wrong_capture_times_are_found():
+    drive = bevcli.open_sequence(STREET, ground_truth=False)
+    found = bevcli.calibrate(WrongTimes(drive, TURNED, late_ms=100))
+    assert found[TURNED].delay_ms == pytest.approx(-100, abs=15)
+    assert angle_deg(drive.rig, found.rig, TURNED) < 0.3
