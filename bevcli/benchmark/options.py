@@ -15,6 +15,7 @@ class BenchOptions:
         reads="path or name",
         default="tiny",
         help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, uniad-track-map, a FILE.toml or a FILE.onnx.",
+        metavar="NAME|FILE",
         complete=complete_model,
     )
     frames: int = option(

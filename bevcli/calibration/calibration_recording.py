@@ -29,7 +29,7 @@ def write_calibration_recording(path: Path, evidence: Evidence, table: str) -> N
             stream.save(unfinished, default_blueprint=_blueprint(rig))
         except RuntimeError as error:
             raise OutputError(f"{path}: the recording cannot be written ({error})") from error
-        log_static.log_scene(stream, rig, ())
+        log_static.log_scene(stream, rig, {})
         text = rr.TextDocument(f"```\n{table}\n```", media_type="text/markdown")
         stream.log(TABLE, text, static=True)
         for index in range(len(rig.cameras)):

@@ -23,8 +23,7 @@ def demo(options: DemoOptions) -> None:
 
     drive, results = options.out / "drive", OutputOptions(options.out / "results", options.force)
     render(drive, RenderOptions(options.seed, options.frames, resolution=RESOLUTION, force=options.force))
-    run(
-        drive, ModelOptions(), RunOptions(), RecordingOptions(), SequenceOptions(), CalibrateFirstOptions(), results, {}
-    )
+    as_stated = CalibrateFirstOptions()
+    run(drive, ModelOptions(), RunOptions(), RecordingOptions(), SequenceOptions(), as_stated, results, {})
     if options.view:
         viz(options.out / "results/recording.rrd", ViewOptions())

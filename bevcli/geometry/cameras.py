@@ -34,6 +34,14 @@ class Distortion:
     coefficients: tuple[float, ...]
 
 
+def brown_conrady(coefficients: ArrayLike) -> Distortion | None:
+    """The lens with the coefficients k1 k2 p1 p2 k3 k4 k5 k6, or None if all are 0."""
+    values = np.asarray(coefficients, dtype=np.float64)
+    if not values.any():
+        return None
+    return Distortion("brown_conrady", tuple(values.tolist() if values[5:].any() else values[:5].tolist()))
+
+
 @dataclass(frozen=True)
 class Camera:
     """A pinhole camera with optional lens distortion.
@@ -164,6 +172,20 @@ class CameraRig:
 
     def __getitem__(self, name: str) -> "Camera":
         return next(camera for camera in self.cameras if camera.name == name)
+
+
+def same_rig(one: CameraRig, other: CameraRig) -> bool:
+    """True if all names and numbers of two rigs are equal."""
+    return (
+        one.names == other.names
+        and np.array_equal(one.ego_from_bev, other.ego_from_bev)
+        and all(
+            (a.width, a.height, a.distortion) == (b.width, b.height, b.distortion)
+            and np.array_equal(a.intrinsics, b.intrinsics)
+            and np.array_equal(a.ego_from_camera, b.ego_from_camera)
+            for a, b in zip(one.cameras, other.cameras, strict=True)
+        )
+    )
 
 
 def default_ego_from_bev() -> Array:

@@ -9,12 +9,13 @@ from bevcli.registry import entries
 
 
 def complete_model(incomplete: str) -> list[str]:
-    """The known models that start with a text, for completion in a shell."""
+    """The known models and weights that start with a text, for completion in a shell."""
     # Not of bevcli.config, which loads PyTorch: completion must be quick.
+    from bevcli.weights.sources import read_sources
+
     files = [file.name for file in resources.files("bevcli").joinpath("configs").iterdir()]
-    return sorted(
-        file.removesuffix(".toml") for file in files if file.endswith(".toml") and file.startswith(incomplete)
-    )
+    names = {file.removesuffix(".toml") for file in files if file.endswith(".toml")} | read_sources().keys()
+    return sorted(name for name in names if name.startswith(incomplete))
 
 
 def complete_engine(incomplete: str) -> list[str]:
@@ -29,14 +30,22 @@ class ModelOptions:
     model: str | Path | None = option(
         reads="path or name",
         default=None,
-        help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, uniad-track-map, demo, a FILE.toml or a FILE.onnx of "
-        "`bevcli export-onnx`. Default: the model that WEIGHTS fit, else demo.",
+        help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, uniad-track-map, demo, a name of `bevcli weights "
+        "list`, a FILE.toml or a FILE.onnx of `bevcli export-onnx`. Default: the model that WEIGHTS fit, else demo.",
+        metavar="NAME|FILE",
         complete=complete_model,
     )
     weights: Path | None = option(
         reads="path",
         default=None,
-        help="An official .pth file or a .safetensors file. Default: the weights in the package (demo).",
+        help="An official .pth file or a .safetensors file. Default: the weights in the package (demo), or those that "
+        "`bevcli weights fetch` has downloaded.",
+    )
+    fetch: bool = option(default=False, help="Download the weights of MODEL if they are not there yet.")
+    weights_dir: Path | None = option(
+        default=None,
+        help="Folder of downloaded weights. Default: $BEVCLI_WEIGHTS_DIR, else ~/.cache/bevcli/weights.",
+        metavar="DIR",
     )
     untrained: bool = option(default=False, help="Use random weights; all outputs are labelled UNTRAINED.")
     device: str = option(

@@ -13,12 +13,13 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from bevcli.errors import OutputError, WaitError
-from bevcli.frame import Frame, FrameStamp, Prediction, Sequence
+from bevcli.frame import DriveFacts, Frame, FrameStamp, Prediction
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid
 from bevcli.recording import entities, log_bev, log_boxes, log_cameras, log_static
 from bevcli.recording.blueprint import LayoutFacts, recording_blueprint
-from bevcli.recording.colors import EGO_COLOR
+from bevcli.recording.colors import EGO_COLOR, class_colors
 from bevcli.recording.log_bev import BevColors, BevImages
 from bevcli.recording.log_cameras import PosedCamera, VideoImages
 from bevcli.recording.log_tracks import TrackHistory, TrackLog
@@ -55,6 +56,19 @@ class RecordedModel(Protocol):
     @property
     def bundled(self) -> bool:
         """True for the weights of the package. Titles and events say so where the drive is not a rendered one."""
+
+
+class RecordedDrive(Protocol):
+    """The facts about a drive that go into a recording: those of a `Sequence`, or of a `Session`."""
+
+    name: str
+    rig: CameraRig
+    has_ego_motion: bool
+    facts: DriveFacts
+
+    @property
+    def stamps(self) -> tuple[FrameStamp, ...]:
+        """The frames that are known in advance; their rate is written."""
 
 
 class LiveSink(Protocol):
@@ -103,7 +117,7 @@ class Recording:
 
     Args:
         path: the .rrd file to write; an existing one is replaced.
-        sequence: the rig and the name are taken from it.
+        sequence: the drive, or a `Session`; the rig and the name are taken from it.
         model: the class names, the name and whether it is trained are taken from it.
         options: how much is written; the defaults of RecordingOptions if None.
         live: a viewer that follows the recording; None for no viewer.
@@ -115,7 +129,7 @@ class Recording:
     def __init__(
         self,
         path: str | Path,
-        sequence: Sequence,
+        sequence: RecordedDrive,
         model: RecordedModel,
         options: RecordingOptions | None = None,
         live: LiveSink | None = None,
@@ -124,11 +138,14 @@ class Recording:
         self.path, self.rig, self.untrained = Path(path), sequence.rig, model.untrained
         self.title = f"{sequence.name} · {model.config.name}"
         self.note = weights_note(model, sequence)
-        self.class_names = tuple(model.config.classes)
+        self.classes = class_colors(model.config.object_classes.values())
         self._config, self._geo_origin = model.config, sequence.facts.geo_origin
         self._rate_hz, self._has_ego_motion = frame_rate_hz(sequence.stamps), sequence.has_ego_motion
         self.options = RecordingOptions() if options is None else options
         recording_id = str(uuid.uuid4()) if resume is None else resume.recording_id
+        # rerun keeps two threads and some MB of every stream that nobody uses any more, until this call. It may wait for
+        # a sink that hangs.
+        threading.Thread(target=rr.bindings.flush_and_cleanup_orphaned_recordings, daemon=True).start()
         self._stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
         self._recording_id, self._resume = recording_id, resume
         self._file: RrdFile | None = None
@@ -138,7 +155,7 @@ class Recording:
         self._frames = 0
         self._early_events: list[tuple[str, str]] = []  # logged before the first frame
         self._pillars: Array | None = None
-        self._tracks = TrackLog(self._stream, self.class_names)
+        self._tracks = TrackLog(self._stream, self.classes)
         self._video = VideoImages(self._stream) if self.options.images == "av1" else None
         self._bev_images: BevImages[tuple[FrameStamp, Prediction]] | None = None
         if self.options.bev != "none" and self.options.shows_internals:
@@ -148,7 +165,7 @@ class Recording:
         mesh, grid = self.options.vehicle_mesh, self._config.bev_grid
         vehicle = None if mesh is None else load_vehicle(mesh)
         map_classes = self._config.map_classes if self.options.shows_internals else ()
-        legend = log_static.legend_entries(self.class_names, map_classes)
+        legend = log_static.legend_entries(self.classes, map_classes)
         facts = LayoutFacts(
             note=self.note,
             probes=bool(self.options.probes),
@@ -164,7 +181,7 @@ class Recording:
         self._connect(self._file, recording_blueprint(self.rig, follows))
         if self._live is not None:
             self._live.open(self.path)
-        log_static.log_scene(self._stream, self.rig, self.class_names, vehicle, grid)
+        log_static.log_scene(self._stream, self.rig, self.classes, vehicle, grid)
         self._log_about(map_classes)
         log_static.log_legend(self._stream, legend)
         if self._resume is not None:
@@ -182,7 +199,8 @@ class Recording:
             untrained=self.untrained,
             note=self.note,
             score=self.options.score,
-            class_names=list(self.class_names),
+            class_names=list(self.classes),
+            class_colors=[f"#{bytes(color).hex()}" for color in self.classes.values()],
             camera_names=list(self.rig.names),
             **of_map,
         )
@@ -235,7 +253,7 @@ class Recording:
         cameras = self._log_cameras(frame)
         self._log_boxes(frame, prediction, cameras)
         if self._last is None:
-            log_static.log_curve_names(self._stream, prediction.stage_seconds, self.class_names)
+            log_static.log_curve_names(self._stream, prediction.stage_seconds, self.classes)
         self._stream.log(entities.STAGE_CURVES, rr.Scalars(list(prediction.stage_seconds.values())))
         self._log_frame_events(frame, prediction)
         if self.options.shows_internals:
@@ -334,9 +352,9 @@ class Recording:
             found = np.ones(len(truth), dtype=bool)
             if not self.untrained:  # random boxes match nothing: a scene all in red would be useless
                 marks = log_boxes.false_and_duplicate(shown, truth)
-                found = marks.found | log_boxes.other_classes(truth, self.class_names)
+                found = marks.found | log_boxes.other_classes(truth, self.classes)
             self._log_ground_truth(truth, found, world_from_bev, cameras)
-        stream, names = self._stream, self.class_names
+        stream, names = self._stream, self.classes
         ego_xy = self._moved_to_origin(prediction.world_from_ego.matrix)[:2, 3]
         log_boxes.log_boxes_3d(stream, in_world, marks, names, ego_xy)
         log_boxes.log_boxes_bev(stream, shown, marks, names)
@@ -353,7 +371,7 @@ class Recording:
         self, truth: Boxes3D, found: np.ndarray, world_from_bev: Array, cameras: PosedCameras
     ) -> None:
         in_world = truth.transformed(world_from_bev)
-        colors = log_boxes.ground_truth_colors(found, log_boxes.other_classes(truth, self.class_names))
+        colors = log_boxes.ground_truth_colors(found, log_boxes.other_classes(truth, self.classes))
         log_boxes.log_ground_truth_3d(self._stream, in_world, found, colors)
         log_boxes.log_ground_truth_bev(self._stream, truth, found, colors)
         for posed in cameras:
@@ -416,7 +434,7 @@ def _transform(parent_from_entity: Array) -> rr.Transform3D:
     return rr.Transform3D(translation=parent_from_entity[:3, 3], mat3x3=parent_from_entity[:3, :3])
 
 
-def weights_note(model: RecordedModel, sequence: Sequence) -> str:
+def weights_note(model: RecordedModel, sequence: RecordedDrive) -> str:
     """A note on the weights for the titles of the views, "" for none: a key of WARNINGS."""
     if model.untrained:
         return UNTRAINED

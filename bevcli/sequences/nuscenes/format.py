@@ -5,6 +5,7 @@ from pathlib import Path
 from bevcli.options import option, options
 from bevcli.sequences.format import Format
 from bevcli.sequences.options import FormatOptions
+from bevcli.sequences.output import OutputFormat
 
 
 @options("Input")
@@ -43,5 +44,8 @@ FORMAT = Format(
     recognises=is_nuscenes_root,
     opener="bevcli.sequences.nuscenes.sequence:NuScenesSequence",
     options=NuScenesOptions,
+    annotated=True,
     precedence=20,
 )
+
+OUTPUT = OutputFormat("a nuScenes root", "bevcli.sequences.nuscenes.writer:NuScenesWriter")
