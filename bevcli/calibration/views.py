@@ -14,7 +14,7 @@ from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, motion_during
 from bevcli.geometry.transforms import Array
 
-WIDTH = 1000  # pixels; larger images are reduced to it
+WIDTH, MOST_ENLARGED = 1000, 2  # pixels: all images are brought to this width; largest factor
 NEAREST_M, FARTHEST_M = 0.8, 12.0  # distance driven between the frames of a pair
 MOST_FRAMES = 120  # that are read where the poses of the drive are known only with its images
 FEWEST_PAIRS = 6  # a measurement from fewer would be sure of an error of the poses
@@ -154,9 +154,8 @@ def _choose_pairs(found: tuple[list[int], Array], most: int) -> list[tuple[int, 
 
 def _reduced(camera: Camera) -> Camera:
     """The camera of the reduced image. Its pixel (0, 0) is the centre of a larger pixel, so that coordinates shift."""
-    if camera.width <= WIDTH:
-        return camera
-    size = (WIDTH, round(camera.height * WIDTH / camera.width))
+    width = min(WIDTH, MOST_ENLARGED * camera.width)
+    size = (width, round(camera.height * width / camera.width))
     scaled = camera.scaled(size[0] / camera.width, size[1] / camera.height)
     scaled.intrinsics[:2, 2] += (np.array([scaled.width / camera.width, scaled.height / camera.height]) - 1) / 2
     return scaled
@@ -167,8 +166,9 @@ def _view(frame: Frame, camera: Camera, motion: EgoMotion | None) -> View | None
     if image is None:
         return None
     size = (camera.width, camera.height)
+    filtering = cv2.INTER_AREA if camera.width < image.pixels_bgr.shape[1] else cv2.INTER_CUBIC
     grey = cv2.cvtColor(image.pixels_bgr, cv2.COLOR_BGR2GRAY)
-    pixels = cv2.resize(grey, size, interpolation=cv2.INTER_AREA) if grey.shape[::-1] != size else grey
+    pixels = cv2.resize(grey, size, interpolation=filtering) if grey.shape[::-1] != size else grey
     if pixels.std() < DARKEST:
         return None
     poses = _poses(frame, camera.name, motion)
