@@ -143,8 +143,8 @@ class Recording:
         self._rate_hz, self._has_ego_motion = frame_rate_hz(sequence.stamps), sequence.has_ego_motion
         self.options = RecordingOptions() if options is None else options
         recording_id = str(uuid.uuid4()) if resume is None else resume.recording_id
-        # rerun keeps two threads and some MB of every stream that nobody uses any more, until this call. It may wait for
-        # a sink that hangs.
+        # rerun keeps two threads and some MB of every stream that nobody uses any more, until this call. It may wait
+        # for a sink that hangs.
         threading.Thread(target=rr.bindings.flush_and_cleanup_orphaned_recordings, daemon=True).start()
         self._stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
         self._recording_id, self._resume = recording_id, resume
