@@ -71,6 +71,39 @@ class BevMap:
 
 
 @dataclass(frozen=True)
+class MapLines:
+    """N lines of the map, such as lane dividers, in one frame of reference: bev, ego or world.
+
+    Attributes:
+        points: N lines (P, 2) of x and y, metres; P may differ.
+        classes: (N,) class names.
+        scores: (N,) confidence, 0 to 1. Optional.
+    """
+
+    points: tuple[Array, ...]
+    classes: NDArray[np.str_]
+    scores: Array | None = None
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Planned paths of the vehicle, one for each command of the driver, in the bev frame.
+
+    Attributes:
+        commands: names of the C commands.
+        paths: (C, T, 2) x and y of the origin of the bev frame, metres.
+        times_s: (T,) seconds from the frame's time.
+    """
+
+    commands: tuple[str, ...]
+    paths: Array
+    times_s: Array
+
+
+@dataclass(frozen=True)
 class FrameStamp:
     """The identity and the time of a frame.
 

@@ -14,7 +14,7 @@ class BenchOptions:
     model: str = option(
         reads="path or name",
         default="tiny",
-        help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, uniad-track-map, a FILE.toml or a FILE.onnx.",
+        help=f"{', '.join(complete_model(''))}, a FILE.toml or a FILE.onnx.",
         complete=complete_model,
     )
     frames: int = option(

@@ -9,7 +9,7 @@ from bevcli.registry import entries
 
 
 def complete_model(incomplete: str) -> list[str]:
-    """The known models that start with a text, for completion in a shell."""
+    """The known models that start with a text, for help and for completion in a shell."""
     # Not of bevcli.config, which loads PyTorch: completion must be quick.
     files = [file.name for file in resources.files("bevcli").joinpath("configs").iterdir()]
     return sorted(
@@ -29,8 +29,8 @@ class ModelOptions:
     model: str | Path | None = option(
         reads="path or name",
         default=None,
-        help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, uniad-track-map, demo, a FILE.toml or a FILE.onnx of "
-        "`bevcli export-onnx`. Default: the model that WEIGHTS fit, else demo.",
+        help=f"{', '.join(complete_model(''))}, a FILE.toml or a FILE.onnx of `bevcli export-onnx`. Default: the model "
+        "that WEIGHTS fit, else demo.",
         complete=complete_model,
     )
     weights: Path | None = option(

@@ -1,4 +1,4 @@
-"""Models: BEVFormer, BEVFormerV2 and UniAD in plain PyTorch, one folder a model, one block of the papers a file.
+"""Models in plain PyTorch, one folder a model, one block of the papers a file.
 
 A model is a subclass of `TemporalModel` (`temporal_model.py`). A package registers it by an entry point, and a TOML
 file names it by `architecture`:
