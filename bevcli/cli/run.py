@@ -38,7 +38,8 @@ def run(
     """Run BEVFormer on SEQUENCE, frame by frame, and write boxes and a recording.
 
     The output folder gets recording.rrd (open it with `bevcli viz`), predictions.json (all boxes of all frames),
-    tracks.csv (one row a box with its track), summary.json and, for models that predict a map, segmentation/.
+    tracks.csv (one row a box with its track), summary.json and, for models that predict a map, segmentation/. A model
+    that predicts lines of the map or plans a path adds map_lines.json and plan.csv.
     Ctrl-C or SIGTERM finish the current frame; a second one ends the program at once.
     """
     from bevcli.cli.progress import Progress

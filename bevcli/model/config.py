@@ -1,9 +1,10 @@
 """The configuration that every model has: images, BEV grid, and the parts that models share."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any, ClassVar, Literal
 
-from bevcli.frame import MAP_CLASSES
+from bevcli.frame import MAP_CLASSES, FrameResult
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.decoder import DecoderConfig
 from bevcli.model.deformable_attention import LevelShapes
@@ -217,6 +218,11 @@ class ModelConfig:
     def map_classes(self) -> tuple[str, ...]:
         """The classes of the map that the model predicts, in the order of their bits; empty without a map."""
         return tuple(MAP_CLASSES) if "segmentation" in self.heads else ()
+
+    @property
+    def results(self) -> Mapping[type[FrameResult], tuple[str, ...]]:
+        """Types of the model's further results, with their names: classes of the lines, commands of the plan."""
+        return {}
 
     @property
     def past_frames(self) -> int:

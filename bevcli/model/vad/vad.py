@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bevcli.errors import BevcliError, ConfigError
-from bevcli.frame import MapLines, Plan
+from bevcli.frame import FrameResult, MapLines, Plan
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
 from bevcli.model.bevformer.bevformer import BEVFormer
@@ -48,6 +48,10 @@ class VADConfig(ModelConfig):
             raise ValueError(f"channels is {self.channels}; it must be a multiple of the attention_heads")
         if not self.commands or len(set(self.commands)) < len(self.commands):
             raise ValueError("commands must name at least one command, and none twice")
+
+    @property
+    def results(self) -> Mapping[type[FrameResult], tuple[str, ...]]:
+        return {MapLines: self.line_decoder.classes, Plan: self.commands}
 
     def check_training(self, clip_frames: int) -> None:
         raise ConfigError(f"{self.name}: a VAD cannot be trained; expected a BEVFormer, such as tiny, small or base")
@@ -109,6 +113,10 @@ class VAD(BEVFormer):
     def decode_boxes(self, outputs: ModelOutputs) -> Boxes3D:
         assert isinstance(outputs, VADOutputs)
         return decode_futures(outputs, self.config)
+
+    def decode_results(self, outputs: ModelOutputs) -> tuple[FrameResult, ...]:
+        assert isinstance(outputs, VADOutputs)
+        return decode_lines(outputs, self.config), decode_plan(outputs, self.config)
 
     def exchange_parts(self) -> None:
         """See `TemporalModel`: the queries of objects and of lines attend to each other before they see the frame."""
