@@ -31,6 +31,7 @@ def evaluate(
 
     Frames are matched by nuScenes' sample token, else by scene and timestamp, else by frame index.
     """
+    from bevcli.evaluation.driving import DRIVING
     from bevcli.evaluation.evaluate import evaluate
 
     scores = evaluate(
@@ -39,6 +40,7 @@ def evaluate(
         options.max_range,
         options.count_missing,
         tracking=options.tracking,
+        driving=[name for name in DRIVING if getattr(options, name)],
         scene=source.scene,
         **format_options,
     )

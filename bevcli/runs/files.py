@@ -145,6 +145,9 @@ class RunFiles:
             "classes": list(model.config.classes),
             "range_m": model.config.bev_grid.nearest_side_m,
         }
+        if model.config.results:
+            grid = model.config.bev_grid
+            extras |= {"x_range_m": list(grid.x_range_m), "y_range_m": list(grid.y_range_m)}
         boxes_at, tracks_at = (None, None) if resume is None else (resume.predictions, resume.tracks)
         boxes = BoxesWriter(out / PREDICTIONS, self._reference, extras, resume_at=boxes_at)
         with self._stack:  # closes what is open if the next one cannot be opened
@@ -266,6 +269,8 @@ def frame_boxes(frame: Frame, prediction: Prediction, *, world: bool) -> FrameBo
     extras: dict[str, object] = {"skipped": True} if prediction.skipped else {}
     if prediction.not_finite:
         extras["not_finite"] = prediction.not_finite
+    if prediction.results:
+        extras["ego_from_bev"] = pose_to_json(Pose.from_matrix(prediction.ego_from_bev))
     if frame.sample_token is not None:
         extras["sample_token"] = frame.sample_token
     boxes = prediction.boxes_world if world else prediction.boxes_ego
