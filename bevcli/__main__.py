@@ -1,28 +1,31 @@
 """`bevcli`, and `python -m bevcli`."""
 
+import atexit
 import os
-import signal
-from types import FrameType
+import sys
 
-INTERRUPTED = 130  # exit code
+from bevcli.cli.stop_signals import EndSignals
 
 
 def main() -> None:
-    """The program. Ctrl-C ends it without a traceback, also while it imports packages."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a background job ignores it
-        signal.signal(signal.SIGINT, _interrupt)
+    """The program. Ctrl-C and SIGTERM end it without a traceback, also while it imports packages."""
+    _open_streams()
+    signals = EndSignals()
+    signals.start()
+    atexit.register(signals.stop)  # Python waits for threads before this
     from bevcli.cli.main import run_app
 
     run_app()
 
 
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt, but end the process at once during an import: packages turn it into other errors."""
-    while frame is not None:
-        if frame.f_code.co_filename.startswith("<frozen importlib"):
-            os._exit(INTERRUPTED)
-        frame = frame.f_back
-    raise KeyboardInterrupt
+def _open_streams() -> None:
+    """Make closed streams of the program, as of `>&-`, /dev/null: the next file would take their place."""
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(descriptor)
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, "w", closefd=False))  # noqa: SIM115, open until the program ends
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from bevcli.model.official_keys import from_official, is_official
 from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.parsing.pickles import Placeholder
 from bevcli.parsing.pth import StoredTensor, read_pth, read_safetensors
-from bevcli.writing import check_output, whole_file
+from bevcli.writing import check_output, write_whole
 
 # The types of numbers that weights may have, and the end of the only keys whose numbers are integers.
 FLOATS = (torch.float32, torch.float16, torch.bfloat16, torch.float64)
@@ -124,8 +124,7 @@ def convert(source: Path, destination: Path) -> Checkpoint:
         raise WeightsError(f"{destination}: expected a file name that ends in .safetensors")
     tensors = {key: tensor.contiguous() for key, tensor in checkpoint.state.items()}
     check_output(destination, source)
-    with whole_file(destination) as unfinished:
-        safetensors.torch.save_file(tensors, unfinished, {**checkpoint.facts, "model": checkpoint.models[0]})
+    write_whole(destination, safetensors.torch.save(tensors, {**checkpoint.facts, "model": checkpoint.models[0]}))
     return read_checkpoint(destination)
 
 

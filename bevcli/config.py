@@ -128,6 +128,8 @@ def _dataclass(table: dict[str, Any], kind: type[T], file: str, prefix: str) -> 
 def _value(value: Any, kind: Any, file: str, key: str) -> Any:
     if dataclasses.is_dataclass(kind) and isinstance(value, dict):
         return _dataclass(value, typing.cast(type, kind), file, f"{key}.")
+    if typing.get_origin(kind) is Mapping and isinstance(value, dict):
+        return {name: _value(each, typing.get_args(kind)[1], file, f"{key}.{name}") for name, each in value.items()}
     try:
         if _is_finite(value):
             return msgspec.convert(value, kind)

@@ -194,9 +194,18 @@ class Sequence(Protocol):
         """The files that a resumed run needs unchanged, such as tables and bags; image files are not among them."""
         return ()
 
+    @property
+    def class_counts(self) -> Mapping[str, int]:
+        """Number of ground-truth boxes of the drive by class, where they are in one table; else empty."""
+        return {}
+
     def image_files(self, place: int) -> tuple[Path, ...]:
         """The image files and videos of the frame at a place; none where its images are in `input_files`."""
         return ()
+
+    def ground_truth_frame(self, place: int) -> Frame:
+        """The frame at a place for scoring: it needs no images. By default it has them, as from `load`."""
+        return self.load(place)
 
     def load(self, place: int) -> Frame:
         """The frame at a place (0 to len(stamps) - 1), with decoded images. Called in order, from one thread.
@@ -218,6 +227,10 @@ class DerivedSequence(Sequence):
     @property
     def input_files(self) -> tuple[Path, ...]:
         return self.sequence.input_files
+
+    @property
+    def class_counts(self) -> Mapping[str, int]:
+        return self.sequence.class_counts
 
     def image_files(self, place: int) -> tuple[Path, ...]:
         return self.sequence.image_files(place)

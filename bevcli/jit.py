@@ -15,9 +15,16 @@ from typing import Any
 
 import numba
 
+from bevcli.errors import BevcliError
+
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """`numba.njit(cache=True, **options)`, with a temporary cache or none where numba finds no place for it."""
+    """`numba.njit(cache=True, **options)`, with a temporary cache or none where numba finds no place for it.
+
+    Raises BevcliError if numba's compiler is switched off.
+    """
+    if getattr(numba.config, "DISABLE_JIT"):  # noqa: B009, an attribute that numba makes at run time
+        raise BevcliError("NUMBA_DISABLE_JIT is set: unset it, because the functions here run compiled only")
 
     def compiled(function: Callable[..., Any]) -> Any:
         for is_cached in (lambda: True, _temporary_cache):

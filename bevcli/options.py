@@ -20,7 +20,7 @@ from dataclasses import MISSING, Field
 from pathlib import Path
 from typing import Any, Literal, TypeVar, dataclass_transform, get_type_hints
 
-Reads = Literal["path", "path or name"]
+Reads = Literal["path", "path or name", "path or pattern"]
 _Class = TypeVar("_Class", bound=type[Any])
 _Options = TypeVar("_Options")
 
@@ -40,8 +40,9 @@ class Option:
         repeatable: whether the flag may be given several times; `parse` then takes the list of texts.
         flag_value: value that the flag alone stands for, such as "static" for --static. None for a flag with a value.
         complete: the values that complete a text in a shell.
-        reads: "path" for a file or folder that is read, "path or name" where a name without suffix, such as that of a
-            model, may stand for it. The command line refuses a missing one before anything slow is imported.
+        reads: "path" for a file or folder that is read, "path or name" where a name without suffix may stand for
+            it, one of `complete` if that is given; "path or pattern" where a glob pattern may. The command line refuses
+            a missing one before anything slow is imported.
         hidden: whether only Python has the option.
         old: earlier spellings, which work for one more release, with a note; `--help` does not show them.
         retired: what to use in place of an option that works for one more release, with this note; "" for others.

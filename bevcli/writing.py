@@ -11,7 +11,7 @@ from bevcli.errors import OutputError
 
 
 @contextmanager
-def whole_file(path: Path, *, parents: bool = False, shared: bool = False) -> Iterator[Path]:
+def whole_file(path: Path, *, parents: bool = False, shared: bool = False, regular: bool = False) -> Iterator[Path]:
     """A path to write to, in the folder of `path`.
 
         with whole_file(out) as unfinished:
@@ -21,13 +21,14 @@ def whole_file(path: Path, *, parents: bool = False, shared: bool = False) -> It
     stays as it was. A device or a pipe, and what is in /dev, is written directly.
 
     parents: make the folders that are missing. shared: several processes may write the file at the same time. Else
-    its unfinished name is always the same, so that killed processes leave one such file at most.
+    its unfinished name is always the same, so that killed processes leave one such file at most. regular: the file
+    takes the place of a pipe too: a pipe that somebody has put there would be waited for.
     Raises OutputError where the file cannot be written; every OSError of the block counts as this.
     """
     mark = uuid.uuid4().hex[:8] if shared else f"{zlib.crc32(os.fsencode(path.name)):08x}"
     unfinished = path.with_name(f".unfinished-{mark}{path.suffix}")
     try:
-        if path.is_relative_to("/dev") or (path.exists() and not path.is_file()):
+        if not regular and (path.is_relative_to("/dev") or (path.exists() and not path.is_file())):
             yield path
             return
         if parents:
@@ -42,9 +43,11 @@ def whole_file(path: Path, *, parents: bool = False, shared: bool = False) -> It
             unfinished.unlink()
 
 
-def write_whole(path: Path, content: bytes, *, parents: bool = False, shared: bool = False) -> None:
+def write_whole(
+    path: Path, content: bytes, *, parents: bool = False, shared: bool = False, regular: bool = False
+) -> None:
     """Write a file, so that readers see the old or the new contents; see `whole_file`."""
-    with whole_file(path, parents=parents, shared=shared) as unfinished:
+    with whole_file(path, parents=parents, shared=shared, regular=regular) as unfinished:
         unfinished.write_bytes(content)
 
 

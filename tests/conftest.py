@@ -2,6 +2,7 @@
 
 import gc
 import os
+from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 import torch
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.geometry.boxes import CLASSES
+from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.bevformer_v2.bev_fusion import BevFusionConfig
 from bevcli.model.bevformer_v2.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config
@@ -56,6 +57,16 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
     return GroupScheduling(config, log)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def no_weights_of_the_user(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Weights that were downloaded on this machine, and its user's own names for weights, change no test."""
+    folder = tmp_path_factory.mktemp("user")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("BEVCLI_WEIGHTS_DIR", str(folder / "weights"))
+        patch.setenv("XDG_CONFIG_HOME", str(folder / "settings"))
+        yield
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """The folder of real frames and reference numbers; skips the test where there is none."""
@@ -76,7 +87,7 @@ def mini_config() -> ModelConfig:
     """A BEVFormer with all its parts, so small that a step takes milliseconds."""
     return ModelConfig(
         name="mini",
-        classes=CLASSES,
+        classes=tuple(NUSCENES_CLASSES),
         cameras=tuple(NUSCENES_YAWS_DEG),
         image=ImageConfig(size=(160, 90), mean=(123.0, 116.0, 103.0), std=(58.0, 57.0, 57.0), color_order="rgb"),
         bev_grid=BevGrid(rows=12, columns=10, x_range_m=(-25, 25), y_range_m=(-30, 30)),

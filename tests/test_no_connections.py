@@ -1,17 +1,22 @@
 """bevcli opens no connection of its own, and the viewer's telemetry is off."""
 
+import ast
 import sys
 from pathlib import Path
 
+import pytest
+from command_line import command
 from forks import FORKS, run_in_fork
 
-SAMPLE = Path(__file__).parents[1] / "samples" / "street"
+ROOT = Path(__file__).parents[1]
+SAMPLE = ROOT / "samples" / "street"
 CONNECTIONS = ("socket.connect", "socket.getaddrinfo", "socket.sendto", "socket.bind")
 
 
 def watch() -> None:
     def report(event, arguments):
-        if event in CONNECTIONS:
+        # Connections of libcurl cause no events; it is imported for a download only.
+        if event in CONNECTIONS or (event == "import" and arguments[0] == "pycurl"):
             print("CONNECTION", event, arguments, file=sys.stderr)
 
     sys.addaudithook(report)
@@ -25,6 +30,44 @@ def test_a_run_opens_no_connection(tmp_path):
     texts = (tmp_path / "texts").read_text()
     assert process.exitcode == 0, texts
     assert "CONNECTION" not in texts
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("weights", "list"), "github.com"),
+        (("weights", "list", "--json"), "github.com"),
+        (("run", SAMPLE, "--model", "tiny"), "run `bevcli weights fetch tiny`, which downloads them"),
+        (("batch", SAMPLE, "--model", "tiny-fp16", "--out", "out"), "run `bevcli weights fetch tiny-fp16`"),
+        (("explain", SAMPLE, "--model", "small"), "run `bevcli weights fetch small`"),
+        (("reproduce", "tiny", "--data", SAMPLE), "is not a nuScenes root"),
+    ],
+    ids=lambda value: " ".join(map(str, value[:2])) if isinstance(value, tuple) else "",
+)
+def test_weights_are_never_fetched_without_being_asked(arguments, said, tmp_path, monkeypatch):
+    """In place of libcurl there is nothing that could be imported."""
+    monkeypatch.setitem(sys.modules, "pycurl", None)
+    monkeypatch.setenv("BEVCLI_WEIGHTS_DIR", str(tmp_path))
+    done = command(tmp_path, *arguments)
+    assert said in done.stdout + done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_only_a_download_uses_libcurl_and_http():
+    """And only `fetch_weights` downloads, which is called where `fetch` was given, or by a command that is for it."""
+    users: dict[str, set[str]] = {}
+    for path in (ROOT / "bevcli").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [each.name for each in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom) and node.module:
+                names = [node.module, *(f"{node.module}.{each.name}" for each in node.names)]
+            for name in names:
+                users.setdefault(name, set()).add(path.relative_to(ROOT / "bevcli").as_posix())
+    assert users["pycurl"] == {"weights/download.py"}
+    assert users["bevcli.weights.download.download"] == {"weights/fetch.py"}
+    assert users["bevcli.weights.fetch.fetch_weights"] == {"inference/load.py", "cli/fetching.py"}
+    assert users["urllib.request"] == {"viewer/web.py"}  # which asks the viewer on this machine
+    assert not {"requests", "httpx", "aiohttp", "http.client", "urllib3"} & users.keys()
 
 
 def test_the_viewer_starts_without_telemetry():

@@ -18,9 +18,10 @@ from pathlib import Path
 from bevcli.batch.storage import RemoteFolder, Storage, StoredFile, expand, is_url, open_storage
 from bevcli.errors import BevcliError, InputError
 from bevcli.parsing.files import MIB, read_text
-from bevcli.sequences.nuscenes.cache import open_index, user_cache
+from bevcli.sequences.nuscenes.cache import open_index
 from bevcli.sequences.nuscenes.choice import choose_version, chosen_scenes, keyframes, sweep_frames, tables_of
 from bevcli.sequences.nuscenes.format import NuScenesOptions, is_nuscenes_root
+from bevcli.user_folders import user_cache
 
 LISTING_THREADS = 32  # listing a folder in an object store is waiting
 LONGEST_NAME = 80

@@ -20,6 +20,7 @@ from bevcli.runs.options import RunOptions
 from bevcli.sequences.format import check_options, format_of, option_classes
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import FormatOptions, SequenceOptions
+from bevcli.weights.cache import weights_folder
 
 RESULTS, FAILED, ATTEMPTS = "drives", "failed", ".bevcli/attempts"  # folders of a batch
 SCORE_BINS = 20  # of the histogram of a drive's scores, from 0 to 1
@@ -100,6 +101,12 @@ def all_own_options(values: Mapping[str, Any]) -> tuple[FormatOptions, ...]:
     return tuple(
         gather(kind, None, {name: given[name] for name in defaults(kind) if name in given}) for kind in option_classes()
     )
+
+
+def with_absolute_paths(model: ModelOptions) -> ModelOptions:
+    """The options for workers in other folders: they take the downloaded weights of this process, and fetch none."""
+    weights = None if model.weights is None else model.weights.absolute()
+    return replace(model, weights=weights, weights_dir=weights_folder(model.weights_dir).absolute(), fetch=False)
 
 
 def _fact(value: object) -> str:

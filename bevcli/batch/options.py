@@ -78,6 +78,23 @@ class BatchOptions:
     )
 
 
+@options("Input")
+class ReproduceOptions:
+    """The part of nuScenes on which a model is scored, and the folder of the batch."""
+
+    data: Path = option(reads="path", help="The nuScenes root.", metavar="DIR")
+    version: str | None = option(
+        default=None, help="Dataset version, such as v1.0-trainval. Default: the only one present."
+    )
+    split: str = option(default="val", help="Split that is scored: val, or mini_val of v1.0-mini.")
+    out: Path | None = option(
+        default=None, help="Folder of the batch. Default: runs/reproduce-NAME-SPLIT.", panel="Output"
+    )
+    resume: bool = option(
+        default=False, help="Go on in the output folder: scenes that are done are not run again.", panel="Output"
+    )
+
+
 @options()
 class FindLikeOptions:
     """A frame of a batch, and how many similar ones are listed."""

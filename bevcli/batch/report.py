@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 from bevcli._version import __version__
 from bevcli.batch.job import RESULTS, SCORE_BINS, Record
 from bevcli.duration import duration
-from bevcli.geometry.boxes import CLASSES
 from bevcli.inference.load import Model
 
 WORST = 10  # drives in the table of the worst ones
@@ -69,7 +68,7 @@ def write_report(records: Sequence[Record], metrics: dict[str, Any] | None, mode
         f'<p class="soft">model {escape(model.name)}, bevcli {__version__}</p>{untrained}',
         _cards(done, failed, metrics),
         _distributions(done),
-        _classes(done),
+        _classes(done, model.config.classes),
         _worst(done),
         _errors(failed),
     ]
@@ -106,11 +105,11 @@ def _distributions(done: Sequence[Record]) -> str:
     return f'<h2>Distributions over drives</h2><div class="charts">{charts}</div>'
 
 
-def _classes(done: Sequence[Record]) -> str:
+def _classes(done: Sequence[Record], classes: Sequence[str]) -> str:
     counts: Counter[str] = Counter()
     for record in done:
         counts.update(record["boxes_by_class"])
-    names = [*CLASSES, *sorted(counts.keys() - set(CLASSES))]
+    names = [*classes, *sorted(counts.keys() - set(classes))]
     rows = [(escape(name), f"{counts[name]:,}") for name in names]
     return f"<h2>Boxes by class</h2>{_table(('class', 'boxes'), rows, (1,), 'narrow')}"
 

@@ -5,7 +5,7 @@ import csv
 import io
 import json
 from collections import Counter
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -22,11 +22,13 @@ from bevcli.batch.storage import LocalFolder, Storage, open_storage
 from bevcli.batch.worker import MATCHES, StoppedError, Worker
 from bevcli.errors import OutputError
 from bevcli.evaluation.config import ERRORS, DetectionConfig
+from bevcli.evaluation.evaluate import OWN_CLASSES
 from bevcli.evaluation.joint import DriveMatches, score_jointly
 from bevcli.evaluation.scores_report import scores_to_dict
 from bevcli.frame import MAP_CLASSES
-from bevcli.geometry.boxes import CLASSES
+from bevcli.geometry.object_classes import are_nuscenes
 from bevcli.inference.load import Model
+from bevcli.model.config import ModelConfig
 from bevcli.parsing.csv_cells import cell_of
 from bevcli.runs.folder import folder_lock
 from bevcli.runs.state import load_state
@@ -34,13 +36,14 @@ from bevcli.runs.state import load_state
 PARQUET, CSV, METRICS, REPORT = "batch.parquet", "batch.csv", "metrics.json", "report.html"
 DESCRIPTION = "batch.json"  # says that a folder is a batch
 
+_CLASSES = "boxes_CLASS"  # stands for a column of each class
 _COUNTS = ("attempts", "frames", "boxes", "tracks", "dropped_images", "skipped_frames", "not_finite_frames")
-COLUMNS: dict[str, pa.DataType] = {
+_COLUMNS: dict[str, pa.DataType] = {
     **dict.fromkeys(("drive", "source", "scene", "result", "error"), pa.string()),
     **dict.fromkeys(_COUNTS, pa.int64()),
     **dict.fromkeys(("seconds", "frames_per_second", "fetch_seconds"), pa.float64()),
     "output_bytes": pa.int64(),
-    **{f"boxes_{name}": pa.int64() for name in CLASSES},
+    _CLASSES: pa.int64(),
     **dict.fromkeys(("mean_ap", "nd_score", *ERRORS, *(f"iou_{name}" for name in MAP_CLASSES)), pa.float64()),
     "ground_truth_boxes": pa.int64(),
     "not_scored": pa.string(),
@@ -197,8 +200,9 @@ def _known_records(out: Storage, drives: Sequence[Drive], job_hash: str, retry_f
 
 
 def _write_tables(out: Storage, records: Sequence[Record], model: Model) -> tuple[str, ...]:
-    metrics = joint_metrics(out, records, model.config.bev_grid.nearest_side_m)
-    files = {PARQUET: to_parquet(records), CSV: to_csv(records)}
+    metrics = joint_metrics(out, records, model.config)
+    classes = model.config.classes
+    files = {PARQUET: to_parquet(records, classes), CSV: to_csv(records, classes)}
     if metrics is not None:
         files[METRICS] = (json.dumps(metrics, indent=1) + "\n").encode()
     files[REPORT] = write_report(records, metrics, model).encode()
@@ -207,48 +211,62 @@ def _write_tables(out: Storage, records: Sequence[Record], model: Model) -> tupl
     return tuple(f"{out.where}/{name}" for name in files)
 
 
-def row(record: Record) -> dict[str, Any]:
+def columns(classes: Iterable[str]) -> dict[str, pa.DataType]:
+    """The columns of the tables and their types. classes: of the model, a column each."""
+    of_classes = {f"boxes_{name}": pa.int64() for name in classes}
+    made: dict[str, pa.DataType] = {}
+    for name, kind in _COLUMNS.items():
+        made |= of_classes if name == _CLASSES else {name: kind}
+    return made
+
+
+def row(record: Record, names: Iterable[str]) -> dict[str, Any]:
     """The columns of a drive; None for what is not known, such as metrics without ground truth."""
     boxes = record.get("boxes_by_class")
     flat = {**(record.get("scores") or {}), **record}
-    if boxes is not None:
-        flat |= {f"boxes_{name}": boxes.get(name, 0) for name in CLASSES}
-    return {name: flat.get(name) for name in COLUMNS}
+    counts = {} if boxes is None else {name: boxes.get(name.removeprefix("boxes_"), 0) for name in names}
+    return {name: counts.get(name) if name.startswith("boxes_") else flat.get(name) for name in names}
 
 
-def to_parquet(records: Sequence[Record]) -> bytes:
-    """batch.parquet: one row per drive, in the order of the records."""
-    table = pa.Table.from_pylist([row(record) for record in records], schema=pa.schema(list(COLUMNS.items())))
+def to_parquet(records: Sequence[Record], classes: Iterable[str]) -> bytes:
+    """batch.parquet: one row per drive, in the order of the records. classes: of the model."""
+    schema = columns(classes)
+    table = pa.Table.from_pylist([row(record, schema) for record in records], schema=pa.schema(list(schema.items())))
     buffer = io.BytesIO()
     pq.write_table(table, buffer)
     return buffer.getvalue()
 
 
-def to_csv(records: Sequence[Record]) -> bytes:
+def to_csv(records: Sequence[Record], classes: Iterable[str]) -> bytes:
     """batch.csv: the same columns; an empty field for what is not known."""
+    names = columns(classes)
     text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    writer = csv.DictWriter(text, names, lineterminator="\n")
     writer.writeheader()
     for record in records:
-        writer.writerow({name: cell_of(cell) if isinstance(cell, str) else cell for name, cell in row(record).items()})
+        cells = row(record, names).items()
+        writer.writerow({name: cell_of(cell) if isinstance(cell, str) else cell for name, cell in cells})
     return text.getvalue().encode()
 
 
-def joint_metrics(out: Storage, records: Sequence[Record], range_m: float) -> dict[str, Any] | None:
+def joint_metrics(out: Storage, records: Sequence[Record], model: ModelConfig) -> dict[str, Any] | None:
     """The scores over all frames of all drives with ground truth, with the keys of `bevcli eval --json`, or None.
 
-    Boxes of all drives are scored together: the result is not a mean of the drives' scores. range_m: distance beyond
-    which nothing was scored. Raises InputError where the matches of a drive cannot be read.
+    Boxes of all drives are scored together: the result is not a mean of the drives' scores. Nothing was scored beyond
+    the model's BEV grid. Raises InputError where the matches of a drive cannot be read.
     """
     scored = [record for record in records if record.get("scores")]
     if not scored:
         return None
     with ThreadPoolExecutor(READING_THREADS) as pool:
         matches = list(pool.map(lambda record: _read_matches(out, record), scored))
-    config = DetectionConfig().cut_at(range_m)
+    range_m = model.bev_grid.nearest_side_m
+    config = DetectionConfig.of(model.object_classes).cut_at(range_m)
     detection, segmentation = score_jointly(matches, config)
-    notes = (f"{len(scored)} drives are scored together; nothing beyond {range_m:g} m is scored",)
-    return {"drives": len(scored), **scores_to_dict(detection, config, segmentation, notes)}
+    notes = [f"{len(scored)} drives are scored together; nothing beyond {range_m:g} m is scored"]
+    if not are_nuscenes(model.object_classes):
+        notes.append(OWN_CLASSES)
+    return {"drives": len(scored), **scores_to_dict(detection, config, segmentation, tuple(notes))}
 
 
 def _read_matches(out: Storage, record: Record) -> DriveMatches:

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import shlex
 import shutil
 import tempfile
 import time
@@ -25,11 +26,13 @@ from bevcli.evaluation.evaluate import Scores, evaluate
 from bevcli.evaluation.joint import DriveMatches
 from bevcli.frame import Frame, Prediction
 from bevcli.inference.load import Model
+from bevcli.parsing.files import is_there
+from bevcli.rig.check_drive import CheckedDrive
 from bevcli.runs.folder import SUMMARY
 from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.runs.state import save_state
 from bevcli.runs.summary import RunSummary
-from bevcli.sequences.native.format import NativeOptions
+from bevcli.sequences.format import format_of
 from bevcli.sequences.nuscenes.format import NuScenesOptions
 
 MATCHES = "matches.safetensors"  # in the folder of a drive's results: for the joint metrics
@@ -93,7 +96,7 @@ class Worker:
             path = _fetched(drive, job, inputs)
             fetched = time.perf_counter()
             try:
-                sequence = job.open(path, drive.scene)
+                sequence = CheckedDrive(job.open(path, drive.scene), shlex.quote(drive.source))
                 histogram = np.zeros(SCORE_BINS, dtype=np.int64)  # of the boxes that are shown
                 pooling = FramePooling(f"{self._model.name}, {self._model.weights_hash}") if job.embed else None
 
@@ -141,10 +144,11 @@ class Worker:
 
     def _score(self, drive: Drive, path: Path, aside: Path) -> tuple[Scores | None, str]:
         """The scores of a drive's predictions, or None and why there are none; "" without ground truth."""
-        if not self._job.evaluate or not (drive.scene or (path / "ground_truth.json").is_file()):
+        chosen = format_of(path)
+        if not self._job.evaluate or not (chosen.annotated or is_there(path / "ground_truth.json")):
             return None, ""
         version = self._job.own_of(NuScenesOptions).version if drive.scene else None
-        class_map = self._job.own_of(NativeOptions).class_map
+        class_map = self._job.source.class_map
         range_m = self._model.config.bev_grid.nearest_side_m
         try:
             scores = evaluate(aside, path, range_m, scene=drive.scene, version=version, class_map=class_map)

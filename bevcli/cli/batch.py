@@ -2,18 +2,24 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from bevcli.batch.options import BatchOptions, Workers
-from bevcli.cli.bridge import Part
+from bevcli.cli.bridge import INPUT_OR_PATTERN, Part
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import RunOptions
 from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
+
+if TYPE_CHECKING:
+    from bevcli.batch.drives import Drive
+    from bevcli.batch.job import Job
+    from bevcli.batch.run_batch import BatchSummary
+    from bevcli.inference.load import Model
 
 PANEL = "Run"
 SOME_FAILED = 3  # exit code
@@ -27,6 +33,7 @@ def batch(
             "or URLs such as s3://bucket/fleet/*.",
             show_default=False,
         ),
+        INPUT_OR_PATTERN,
     ] = None,
     *,
     options: BatchOptions,
@@ -47,38 +54,70 @@ def batch(
     error, and the others go on. Exit code 3: some drives failed. See docs/fleet.md.
     """
     from bevcli.batch.drives import find_drives, read_list
-    from bevcli.batch.job import Job, all_own_options
-    from bevcli.batch.run_batch import run_batch
+    from bevcli.batch.job import Job, all_own_options, with_absolute_paths
     from bevcli.batch.storage import is_url
-    from bevcli.batch.worker import use_threads
-    from bevcli.cli.progress import Progress
-    from bevcli.cli.stop_signals import StopSignals
-    from bevcli.inference.load import choose_device
+    from bevcli.cli.fetching import fetch_if_asked
     from bevcli.sequences.nuscenes.format import NuScenesOptions
 
     texts = [*(drives or ()), *(read_list(options.listed) if options.listed else ())]
     if options.retry_failed and not options.resume:
         raise typer.BadParameter("is for --resume", param_hint="--retry-failed")
-    alone = workers.in_this_process
-    if alone and workers.gpus == 0 and model.device == "auto":
-        model = replace(model, device="cpu")
     job = Job(
         options.out if is_url(options.out) else str(Path(options.out.removeprefix("file://")).absolute()),
-        replace(model, weights=None if model.weights is None else model.weights.absolute()),
+        with_absolute_paths(model),
         run=replace(run_options, recording=recording),
         embed=options.embed,
         evaluate=options.evaluate,
         retries=workers.retries,
     )
-    if alone and workers.threads is not None:
-        use_threads(workers.threads)
-    if workers.address is None:
-        choose_device(model.device)
-    # Loaded here, so that a mistake in the model ends the batch at once. Its hash is needed; only one worker runs it.
-    loaded = job.load_model(model.device if alone else "cpu")
+    fetch_if_asked(model)
+    loaded = load_for_batch(job, workers)
     found, notes = find_drives(texts, NuScenesOptions(format_options["version"], format_options.pop("split")))
     source = source.for_model(loaded.config, temporal=run_options.temporal)
     job = replace(job, source=source, own=all_own_options(format_options))
+    summary = run_with_progress(
+        job, loaded, found, notes, workers, resume=options.resume, retry_failed=options.retry_failed
+    )
+    say(summary.table())
+    if summary.failed:
+        say("some drives failed; `--resume --retry-failed` runs them again", err=True)
+        raise typer.Exit(SOME_FAILED)
+
+
+def load_for_batch(job: "Job", workers: Workers) -> "Model":
+    """The model, loaded before the batch, so that a mistake in it ends the command at once. Raises BevcliError.
+
+    The batch needs its hash; only a worker in this process runs it.
+    """
+    from bevcli.batch.worker import use_threads
+    from bevcli.inference.load import choose_device
+
+    alone, device = workers.in_this_process, job.model.device
+    if alone and workers.threads is not None:
+        use_threads(workers.threads)
+    if alone and workers.gpus == 0 and device == "auto":
+        device = "cpu"
+    if workers.address is None:
+        choose_device(device)
+    return job.load_model(device if alone else "cpu")
+
+
+def run_with_progress(
+    job: "Job",
+    model: "Model",
+    drives: "list[Drive]",
+    notes: tuple[str, ...],
+    workers: Workers,
+    *,
+    resume: bool,
+    retry_failed: bool = False,
+) -> "BatchSummary":
+    """Run a batch with its progress on stderr. A stopped one ends the command with the exit code of the signal."""
+    from bevcli.batch.run_batch import run_batch
+    from bevcli.cli.progress import Progress
+    from bevcli.cli.stop_signals import StopSignals
+
+    alone = workers.in_this_process
     if alone and workers.count is None:
         notes = (*notes, "Ray is not installed: one worker (pip install 'bevcli[ray]' for several)")
 
@@ -89,22 +128,20 @@ def batch(
             progress.message(f"warning: {row['drive']}: {row['input_errors']}")
         progress.advance()
 
-    with Progress(len(found), "drives", notes) as progress, StopSignals("frame", at_once=not alone) as signals:
+    with Progress(len(drives), "drives", notes) as progress, StopSignals("frame", at_once=not alone) as signals:
         summary = run_batch(
             job,
-            loaded,
-            found,
+            model,
+            drives,
             None if alone else workers,
-            resume=options.resume,
-            retry_failed=options.retry_failed,
+            resume=resume,
+            retry_failed=retry_failed,
             skipped=progress.skip,
             after_drive=show,
             should_stop=signals.received,
         )
-    say(summary.table())
     if summary.stopped:
+        say(summary.table())
         say("stopped; `--resume` goes on with the drives that are left", err=True)
         raise typer.Exit(signals.exit_code)
-    if summary.failed:
-        say("some drives failed; `--resume --retry-failed` runs them again", err=True)
-        raise typer.Exit(SOME_FAILED)
+    return summary

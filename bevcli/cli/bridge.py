@@ -3,6 +3,8 @@
 import ast
 import copy
 import dataclasses
+import difflib
+import glob
 import os
 import re
 import types
@@ -11,7 +13,7 @@ from contextvars import ContextVar
 from dataclasses import MISSING, Field, dataclass
 from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import typer
 
@@ -24,7 +26,9 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instea
 # In an annotation of an argument, see `Option.reads`.
 INPUT: Reads = "path"
 INPUT_OR_NAME: Reads = "path or name"
+INPUT_OR_PATTERN: Reads = "path or pattern"
 
+_METAVARS = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
 _ARGUMENT = re.compile(r"`([a-z]\w*)(?:=([^`]*))?`")
 
 
@@ -64,7 +68,7 @@ class _Old:
         kind, info, *_ = get_args(self.option.annotation)
         if self.spelling:
             info = copy.copy(info)
-            info.param_decls, info.hidden = (self.spelling,), True
+            info.default, info.param_decls, info.hidden = ..., (self.spelling,), True  # default has a spelling
         else:
             info = typer.Argument(hidden=True, metavar=f"[{self.option.name.upper()}]")
         kind, default = (bool, False) if kind is bool else (kind | None, None)
@@ -84,6 +88,34 @@ class _Old:
 
 
 @dataclass(frozen=True)
+class _Read:
+    """What is read. label: for messages. reads: see `Option`. names: those that may stand for a path."""
+
+    label: str
+    reads: Reads
+    names: Callable[[str], Iterable[str]] | None = None
+
+    def require(self, text: str) -> None:
+        """Raise InputError for a path that does not exist, a pattern without matches, or an unknown name."""
+        if "://" in text or _exists(Path(text)):
+            return
+        if self.reads == "path or name" and not Path(text).suffix and os.sep not in text:
+            self._require_name(text)
+        elif self.reads == "path or pattern" and glob.has_magic(text):
+            if next(glob.iglob(text), None) is None:
+                raise InputError(f"{text}: nothing matches this pattern (expected drives)")
+        else:
+            raise InputError(f"{text}: there is no such file or folder")
+
+    def _require_name(self, text: str) -> None:
+        known = None if self.names is None else list(self.names(""))
+        if known is not None and text not in known:
+            near = difflib.get_close_matches(text, known, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(known)}, or a file"
+            raise InputError(f"{self.label} {text}: is unknown: {hint}")
+
+
+@dataclass(frozen=True)
 class _Flag:
     """An option of a command. kind: type of the field. default: `Parameter.empty` for a required one."""
 
@@ -97,6 +129,12 @@ class _Flag:
     def yes(self) -> str:
         """Spelling without that of the opposite."""
         return flag_of(self.field).split()[0].partition("/")[0]
+
+    @property
+    def read(self) -> _Read | None:
+        """What it names that is read, if anything."""
+        reads = self.option.reads
+        return None if reads is None else _Read(self.yes, reads, self.option.complete)
 
     def parameter(self, flags: Mapping[str, "_Flag"]) -> Parameter:
         """The parameter of a function, as typer reads it. flags: for the help text."""
@@ -150,7 +188,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     arguments: list[str] = []
     flags: dict[str, _Flag] = {}
     makers: dict[str, tuple[Callable[..., Any], list[str]]] = {}
-    inputs: dict[str, Reads] = {}
+    inputs: dict[str, _Read] = {}
     hints = get_type_hints(function, include_extras=True)
     for parameter in signature(function).parameters.values():
         hint = hints[parameter.name]
@@ -160,15 +198,16 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             marks = get_args(hint)[1:]  # of an Annotated
             if OldArgument in marks:
                 arguments.append(parameter.name)
-            for mark in (INPUT, INPUT_OR_NAME):
+            for mark in (INPUT, INPUT_OR_NAME, INPUT_OR_PATTERN):
                 if mark in marks:
-                    inputs[parameter.name] = mark
+                    names = getattr(marks[0], "autocompletion", None)
+                    inputs[parameter.name] = _Read(f"--{parameter.name}", mark, names)
             continue
         for name in found.keys() & flags.keys():  # one of them is of another package
             raise BevcliError(f"command {function.__name__}: two options are named {name}: rename one")
         makers[parameter.name] = make, list(found)
         flags |= found
-        inputs |= {name: flag.option.reads for name, flag in found.items() if flag.option.reads is not None}
+        inputs |= {name: flag.read for name, flag in found.items() if flag.read is not None}
         parts += found.values()
 
     def called(**given: Any) -> None:
@@ -176,7 +215,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         try:
             for each in old:
                 each.move(given)
-            paths = [(given[name], reads) for name, reads in inputs.items()]
+            paths = [(given[name], read) for name, read in inputs.items()]
             for parameter, (make, names) in makers.items():
                 values = {name: flags[name].value(given.pop(name)) for name in names}
                 given[parameter] = make(**{name: value for name, value in values.items() if value is not MISSING})
@@ -193,18 +232,17 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     spelled = [(each, text) for each in parameters if each.name in flags for text in flags[each.name].option.old]
     old = [_Old(each, flags[each.name].yes, text) for each, text in spelled]
     old += [_Old(each, f"--{each.name}") for each in parameters if each.name in arguments]
-    called.__signature__ = Signature([*parameters, *(each.parameter for each in old)])  # type: ignore[attr-defined]
+    made = [*parameters, *(each.parameter for each in old)]
+    called.__signature__ = Signature([_with_metavar(each) for each in made])  # type: ignore[attr-defined]
     return called
 
 
-def _require_inputs(given: Iterable[tuple[Any, Reads]]) -> None:
-    """Raise InputError for a path that does not exist, before anything is imported that takes seconds."""
-    for values, reads in given:
+def _require_inputs(given: Iterable[tuple[Any, _Read]]) -> None:
+    """Raise InputError for what does not exist, before anything is imported that takes seconds."""
+    for values, read in given:
         for value in values if isinstance(values, list | tuple) else [values]:
-            text = "" if value is None else str(value)
-            is_name = "://" in text or (reads == "path or name" and not Path(text).suffix and os.sep not in text)
-            if text and not is_name and not _exists(Path(text)):
-                raise InputError(f"{text}: there is no such file or folder")
+            if value is not None and str(value):
+                read.require(str(value))
 
 
 def _exists(path: Path) -> bool:
@@ -275,6 +313,26 @@ def _flags_of(hint: Any) -> tuple[Callable[..., Any] | None, dict[str, _Flag]]:
                 found.setdefault(field.name, flag)
     assert set(part.only) <= found.keys(), f"{hint}: {part.only}"
     return (dict if part.classes else hint), found
+
+
+def _with_metavar(parameter: Parameter) -> Parameter:
+    """The parameter with a name for its value in `--help`: that of an argument, else PATH, TEXT or the choices."""
+    whole: Any
+    whole, *marks = get_args(parameter.annotation) if get_origin(parameter.annotation) is Annotated else [None]
+    info = next((each for each in marks if isinstance(each, typer.models.ParameterInfo)), None)
+    if info is None or info.metavar is not None:
+        return parameter
+    kinds = [each for each in get_args(whole) if each is not type(None)] if get_origin(whole) is not Literal else []
+    kind = kinds[0] if kinds else whole
+    kind = get_args(kind)[0] if get_origin(kind) is list else kind
+    if kind is bool:
+        return parameter
+    info = copy.copy(info)
+    if isinstance(info, typer.models.ArgumentInfo):
+        info.metavar = parameter.name.upper()
+    else:
+        info.metavar = "|".join(get_args(kind)) or _METAVARS.get(kind)
+    return parameter.replace(annotation=Annotated[whole, info])
 
 
 def _plain(hint: Any) -> Any:

@@ -24,7 +24,7 @@ def convert(
         INPUT,
     ],
     out: Annotated[Path, typer.Argument(metavar="OUT_SEQUENCE", help="The native sequence folder to write.")],
-    options: Annotated[SequenceOptions, Part(only=("strict", "scene", "ground_truth", "allow_outside"))],
+    options: Annotated[SequenceOptions, Part(only=("strict", "scene", "ground_truth", "allow_outside", "class_map"))],
     format_options: Annotated[dict[str, Any], Part(classes=option_classes)],
     written: WriteOptions,
 ) -> None:

@@ -22,14 +22,15 @@ def evaluate(
     ground_truth: Annotated[
         Path, typer.Argument(help="ground_truth.json, a sequence folder that contains one, or a nuScenes root."), INPUT
     ],
-    source: Annotated[SequenceOptions, Part(only=("scene",))],
-    format_options: Annotated[dict[str, Any], Part(only=("version", "split", "class_map"), classes=option_classes)],
+    source: Annotated[SequenceOptions, Part(only=("scene", "class_map"))],
+    format_options: Annotated[dict[str, Any], Part(only=("version", "split"), classes=option_classes)],
     options: EvaluationOptions,
     as_json: Json = False,
 ) -> None:
     """Score PREDICTIONS against GROUND_TRUTH with the nuScenes detection metrics, and maps with IoU if both have them.
 
-    Frames are matched by nuScenes' sample token, else by scene and timestamp, else by frame index.
+    Frames are matched by nuScenes' sample token, else by scene and timestamp, else by frame index. `bevcli validate`
+    runs a model on several drives and scores them together.
     """
     from bevcli.evaluation.driving import DRIVING
     from bevcli.evaluation.evaluate import evaluate
@@ -42,6 +43,7 @@ def evaluate(
         tracking=options.tracking,
         driving=[name for name in DRIVING if getattr(options, name)],
         scene=source.scene,
+        class_map=source.class_map,
         **format_options,
     )
     say(json.dumps(scores.to_dict(), indent=1) if as_json else scores.table())

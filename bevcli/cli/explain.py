@@ -29,7 +29,7 @@ def explain(
     self-attention, encoder layers, recurrence, object decoder, box code, segmentation, and an overview.
     docs/bevformer.md explains the steps with these figures.
     """
-    from bevcli.explain.figures import write_figures
+    from bevcli.explain.figures import check_figures, write_figures
     from bevcli.explain.trace import trace
     from bevcli.inference.load import load_model
     from bevcli.sequences.open import open_sequence
@@ -37,11 +37,13 @@ def explain(
     loaded = load_model(options=model)
     loaded.require_parts("bevcli explain")
     drive = open_sequence(sequence, source, rate_hz=loaded.config.rate_hz)
+    out = options.out or Path("runs") / f"{drive.name}-{loaded.name}-explained"
+    check_figures(out, force=options.force)
     place = options.place([stamp.index for stamp in drive.stamps])
     traced = trace(loaded.network, loaded.device, drive, place, options.cell)
     if loaded.untrained:
         say("note: the weights are UNTRAINED (random): the figures only show how data flows", err=True)
     x, y = traced.cell_center
     say(f"frame {traced.frame.stamp.index}, BEV cell at x {x:.2f} m, y {y:.2f} m (bev frame)")
-    for figure in write_figures(traced, options.out, options.image_format, untrained=loaded.untrained):
+    for figure in write_figures(traced, out, options.image_format, untrained=loaded.untrained):
         say(f"{figure.step}: left out, {figure.left_out}" if figure.path is None else str(figure.path))

@@ -19,6 +19,7 @@ def export_onnx(
         str | None,
         typer.Option(
             autocompletion=complete_model,
+            metavar="NAME|FILE",
             help="tiny, small, base, demo, v2-t1-base, v2-t1, v2-t2, v2-t8, or a FILE.toml. Default: the model that "
             "WEIGHTS fit, else demo.",
             rich_help_panel="Model",

@@ -27,14 +27,21 @@ class PlainCommand(TyperCommand):
         """The help text, printable."""
         return printable(super().get_help(ctx))
 
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        """The options and the arguments, without hidden ones."""
+        shown = [each for each in self.get_params(ctx) if not getattr(each, "hidden", False)]
+        return ["[OPTIONS]", *(piece.strip("{}") for each in shown for piece in each.get_usage_pieces(ctx))]
+
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the arguments, then the options by panels, last those without one."""
         panels: dict[str, list[tuple[str, str]]] = {"Arguments": []}
         for each in self.get_params(ctx):
-            panel = "Arguments" if each.param_type_name == "argument" else getattr(each, "rich_help_panel", None)
+            is_argument = each.param_type_name == "argument"
+            panel = "Arguments" if is_argument else getattr(each, "rich_help_panel", None)
             row = each.get_help_record(ctx)
             if row is not None:
-                panels.setdefault(panel or "Options", []).append(row)
+                name = each.metavar if is_argument and each.metavar else row[0]
+                panels.setdefault(panel or "Options", []).append((name, row[1]))
         panels["Options"] = panels.pop("Options", [])
         _write(panels, formatter)
 

@@ -15,6 +15,7 @@ import typer
 from bevcli._version import __version__
 from bevcli.cli.bridge import command
 from bevcli.cli.help_text import GROUP, PlainCommand, PlainGroup
+from bevcli.cli.system_errors import system_error
 from bevcli.errors import BevcliError, WaitError
 from bevcli.inference.cpu_settings import THREAD_SETTINGS, keep_freed_memory
 from bevcli.printing import one_line, say
@@ -111,3 +112,9 @@ def run_app() -> None:
         say(f"error: {one_line(where + str(error.strerror or error))}", err=True)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more at its end
         sys.exit(1)
+    except Exception as error:
+        message = system_error(error)
+        if message is None:
+            raise
+        say(f"error: {message}", err=True)
+        os._exit(1)  # what Python does at its end needs memory too

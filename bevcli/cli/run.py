@@ -38,20 +38,23 @@ def run(
     """Run BEVFormer on SEQUENCE, frame by frame, and write boxes and a recording.
 
     The output folder gets recording.rrd (open it with `bevcli viz`), predictions.json (all boxes of all frames),
-    tracks.csv (one row a box with its track), summary.json and, for models that predict a map, segmentation/. A model
-    that predicts lines of the map or plans a path adds map_lines.json and plan.csv.
+    tracks.csv (one row a box with its track), summary.json, for models that predict a map segmentation/, and for a
+    drive of one scene calibration.json (the rig). A model that predicts lines of the map or plans a path adds
+    map_lines.json and plan.csv.
     Ctrl-C or SIGTERM finish the current frame; a second one ends the program at once.
     """
+    from bevcli.cli.fetching import fetch_if_asked
     from bevcli.cli.progress import Progress
     from bevcli.cli.stop_signals import StopSignals
     from bevcli.inference.load import load_model
-    from bevcli.rig.check_drive import input_errors
+    from bevcli.rig.check_drive import CheckedDrive
     from bevcli.runs.run_into_folder import run_into_folder
     from bevcli.sequences.open import open_sequence
 
+    fetch_if_asked(model)
     loaded = load_model(options=model)
     reading = source.for_model(loaded.config, temporal=run_options.temporal)
-    drive = open_sequence(sequence, reading, **format_options)
+    drive = CheckedDrive(open_sequence(sequence, reading, **format_options), shlex.quote(str(sequence)))
     out = output.out or Path("runs") / f"{drive.name}-{loaded.name}"
     view = None
     if output.live:
@@ -64,7 +67,7 @@ def run(
             progress.message(f"warning: {warning}")
         progress.advance()
 
-    notes = [*input_errors(drive, shlex.quote(str(sequence))), *_run_notes(loaded, drive, live=output.live)]
+    notes = [*drive.input_errors, *_run_notes(loaded, drive, live=output.live)]
     with Progress(len(drive.stamps), "frames", notes) as progress, StopSignals("frame") as signals:
         summary = run_into_folder(
             loaded,

@@ -1,16 +1,93 @@
-"""StopSignals: Ctrl-C and SIGTERM end a long command after the current piece of work."""
+"""Ctrl-C and SIGTERM: `EndSignals` ends every command, `StopSignals` a long one after the current piece of work."""
 
 import os
 import signal
 import socket
 import threading
+import time
+from collections.abc import Iterable
+from contextlib import suppress
 from types import FrameType
+from typing import Self
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+CLEANUP_S = 10.0
+ONE_SIGNAL_S = 0.05  # `timeout` of GNU sends each signal twice
 
 
-class StopSignals:
-    """`with StopSignals("frame") as signals:`; the command asks `signals.received()` and ends. A second one kills it.
+class _Signals:
+    """Handles signals within a `with` block. A second one ends the process, also where a library stays in one call.
+
+    limit_s: time from the first signal to the end of the process; None without a limit.
+    """
+
+    limit_s: float | None = None
+
+    def __init__(self) -> None:
+        self._number = 0
+        self._before: dict[signal.Signals, object] = {}
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def start(self) -> None:
+        """Handle signals from now on."""
+        if threading.current_thread() is threading.main_thread():  # Python allows handlers there only
+            self._before = {number: signal.signal(number, self._receive) for number in self._handled()}
+            reader, self._writer = socket.socketpair()
+            self._writer.setblocking(False)
+            self._fd_before = signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
+            self._thread = threading.Thread(target=_end_at_second, args=(reader, self.limit_s), daemon=True)
+            self._thread.start()
+
+    def __exit__(self, *error: object) -> None:
+        self.stop()
+
+    def stop(self) -> None:
+        """Handle them as before `start`."""
+        for number, handler in self._before.items():
+            signal.signal(number, handler)  # type: ignore[arg-type]
+        if threading.current_thread() is threading.main_thread():
+            signal.set_wakeup_fd(self._fd_before)
+            self._writer.close()  # ends the thread
+            self._thread.join(1.0)
+
+    def _handled(self) -> Iterable[signal.Signals]:
+        return SIGNALS
+
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        if not self._number:
+            self._number = number
+            self._react(number, frame)
+
+    def _react(self, number: int, frame: FrameType | None) -> None:
+        raise NotImplementedError
+
+
+class EndSignals(_Signals):
+    """`EndSignals().start()` before a command: a signal raises KeyboardInterrupt or SystemExit.
+
+    So the command deletes its partial files. It has 10 s for this and for its end, or until the second signal.
+    """
+
+    limit_s = CLEANUP_S
+
+    def _handled(self) -> Iterable[signal.Signals]:
+        """A job in the background ignores SIGINT, and keeps to that."""
+        unchanged = (signal.default_int_handler, signal.SIG_DFL)
+        return [number for number in SIGNALS if signal.getsignal(number) in unchanged]
+
+    def _react(self, number: int, frame: FrameType | None) -> None:
+        while frame is not None:
+            if frame.f_code.co_filename.startswith("<frozen importlib"):  # packages turn it into other errors
+                os._exit(128 + number)
+            frame = frame.f_back
+        raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(128 + number)
+
+
+class StopSignals(_Signals):
+    """`with StopSignals("frame") as signals:`; the command asks `signals.received()` and ends.
 
     Args:
         work: the piece of work that is finished first, for the message.
@@ -18,25 +95,8 @@ class StopSignals:
     """
 
     def __init__(self, work: str, *, at_once: bool = False) -> None:
+        super().__init__()
         self._work, self._at_once = work, at_once
-        self._number = 0
-        self._before: dict[signal.Signals, object] = {}
-
-    def __enter__(self) -> "StopSignals":
-        if threading.current_thread() is threading.main_thread():  # Python allows handlers there only
-            self._before = {number: signal.signal(number, self._receive) for number in SIGNALS}
-            reader, self._writer = socket.socketpair()
-            self._writer.setblocking(False)
-            self._fd_before = signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
-            threading.Thread(target=_end_at_second, args=(reader,), daemon=True).start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)  # type: ignore[arg-type]
-        if self._before:
-            signal.set_wakeup_fd(self._fd_before)
-            self._writer.close()  # ends the thread
 
     def received(self) -> bool:
         """True once a signal has come."""
@@ -47,20 +107,25 @@ class StopSignals:
         """130 after Ctrl-C, 143 after SIGTERM."""
         return 128 + self._number
 
-    def _receive(self, number: int, frame: FrameType | None) -> None:
-        self._number = number
-        for each in SIGNALS:
-            signal.signal(each, signal.SIG_DFL)
+    def _react(self, number: int, frame: FrameType | None) -> None:
         if self._at_once:
             raise KeyboardInterrupt
-        os.write(2, f"\nstopping after this {self._work}; once more to stop at once\n".encode())
+        with suppress(OSError):  # the terminal may be gone
+            os.write(2, f"\nstopping after this {self._work}; once more to stop at once\n".encode())
 
 
-def _end_at_second(numbers: socket.socket) -> None:
-    """Ends the process at the second signal. Python calls `_receive` only when a long call in C returns."""
-    received = 0
+def _end_at_second(numbers: socket.socket, limit_s: float | None) -> None:
+    """Ends the process at the second signal. Python calls a handler only when a long call in C returns."""
+    first, since = 0, 0.0
     with numbers:
-        while number := numbers.recv(1):
-            received += number[0] in SIGNALS
-            if received == 2:
-                os._exit(128 + number[0])
+        try:
+            while number := int.from_bytes(numbers.recv(1)):
+                is_same = number == first and time.monotonic() - since < ONE_SIGNAL_S
+                if number not in SIGNALS or is_same:
+                    continue
+                if first:
+                    os._exit(128 + number)
+                first, since = number, time.monotonic()
+                numbers.settimeout(limit_s)
+        except TimeoutError:
+            os._exit(128 + first)

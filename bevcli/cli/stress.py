@@ -26,8 +26,8 @@ def stress(
     *,
     model: Annotated[ModelOptions, Part(without=("untrained",))],
     options: StressOptions,
-    source: Annotated[SequenceOptions, Part(only=("frames", "scene"))],
-    format_options: Annotated[dict[str, Any], Part(only=("version", "split", "class_map"), classes=option_classes)],
+    source: Annotated[SequenceOptions, Part(only=("frames", "scene", "class_map"))],
+    format_options: Annotated[dict[str, Any], Part(only=("version", "split"), classes=option_classes)],
     drive_options: Annotated[DriveOptions, Part(only=("rendered", "cache"))],
     output: StressOutputOptions,
     as_json: Json = False,
@@ -38,6 +38,7 @@ def stress(
     The table has NDS and mAP by corruption and severity, and mRR, the share of the clean NDS that is left. Ctrl-C or
     SIGTERM end the test after the current frame; `--resume` goes on with it.
     """
+    from bevcli.cli.fetching import fetch_if_asked
     from bevcli.cli.progress import Progress
     from bevcli.cli.stop_signals import StopSignals
     from bevcli.errors import InputError
@@ -54,12 +55,14 @@ def stress(
     other = None if options.against is None else read_results(options.against)
     if bool(sequence) == (drive_options.rendered is not None):
         raise InputError("choose the drives: give either SEQUENCE folders or `rendered=SEEDS`, not both")
+    fetch_if_asked(model)
     loaded = load_model(options=model)
     if drive_options.rendered is None:
         chosen = source.for_model(loaded.config)
         drives = [open_sequence(path, chosen, **format_options) for path in sequence or ()]
     else:
-        rendered = open_drives((), drive_options.rendered, drive_options.cache, loaded.config)
+        seeds, cache = drive_options.rendered, drive_options.cache
+        rendered = open_drives((), seeds, cache, loaded.config, class_map=source.class_map)
         drives = [rendered.open(index) for index in range(len(rendered))]
         if source.frames is not None:
             drives = [select_range(drive, source.frames) for drive in drives]

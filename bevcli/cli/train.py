@@ -17,6 +17,7 @@ def train(
         str,
         typer.Option(
             autocompletion=complete_model,
+            metavar="NAME|FILE",
             help="A model name or a FILE.toml; required. Its training table holds the settings.",
             rich_help_panel="Model",
             show_default=False,
@@ -26,7 +27,7 @@ def train(
     ] = "",
     *,
     model_options: Annotated[ModelOptions, Part(only=("device",))],
-    drives: Annotated[DriveOptions, Part(only=("data", "rendered"))],
+    drives: Annotated[DriveOptions, Part(only=("data", "rendered", "class_map"))],
     options: TrainOptions,
 ) -> None:
     """Train a model; write its weights, checkpoints and learning curves.

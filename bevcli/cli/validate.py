@@ -20,6 +20,7 @@ def validate(
         str | None,
         typer.Option(
             autocompletion=complete_model,
+            metavar="NAME|FILE",
             help="A model name, a FILE.toml or a FILE.onnx. Default: the model that WEIGHTS fit, else demo.",
             rich_help_panel="Model",
         ),
@@ -35,8 +36,8 @@ def validate(
 ) -> None:
     """Score a model on drives with ground truth, all drives together.
 
-    Each drive is run as by `bevcli run` and scored as by `bevcli eval`. `bevcli train` never uses rendered drives with
-    seeds of 1000000 and above: keep them for this.
+    Each drive is run as by `bevcli run` and scored as by `bevcli eval`, which scores the files of a run that is done.
+    `bevcli train` never uses rendered drives with seeds of 1000000 and above: keep them for this.
     """
     from bevcli.cli.progress import Progress
     from bevcli.inference.load import load_model
@@ -47,7 +48,8 @@ def validate(
 
     loaded = load_model(model, options=model_options)
     rig = None if options.rig is None else rig_for_drives(options.rig, model or loaded.name)
-    drives = open_drives(drive_options.data, drive_options.rendered, drive_options.cache, loaded.config, rig)
+    data = drive_options
+    drives = open_drives(data.data, data.rendered, data.cache, loaded.config, rig, data.class_map)
     runner = Runner(loaded.prepared, loaded.device, StepOptions(loaded.precision, run_options.temporal))
     with Progress(count_frames(drives), "frames") as progress:
         scores = validate_model(

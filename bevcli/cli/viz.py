@@ -1,4 +1,4 @@
-"""`bevcli viz`: shows a recording, or writes an image, a video, its boxes or a summary of it."""
+"""`bevcli viz`: shows a recording, or writes an image, a video or a summary of it."""
 
 from pathlib import Path
 from typing import Annotated
@@ -16,9 +16,9 @@ def viz(
     recording: Annotated[Path, typer.Argument(help="A recording (.rrd), or the output folder of `bevcli run`."), INPUT],
     options: ViewOptions,
 ) -> None:
-    """Show a recording in the viewer, or write an image, a video, its boxes or a summary.
+    """Show a recording in the viewer, or write an image, a video or a summary.
 
-    The viewer opens if none of --summary, --screenshot, --video and --export is given: in a window if there is a
+    The viewer opens if none of --summary, --screenshot and --video is given: in a window if there is a
     display, else in the browser at an address that only this machine can reach. Ctrl-C closes it.
     """
     from bevcli.viewer.recording_file import open_recording, recording_in

@@ -1,4 +1,4 @@
-"""`bevcli weights`: inspects and converts weights files, and lists the parts of a model."""
+"""`bevcli weights`: lists and downloads published weights, inspects and converts files, lists the parts of a model."""
 
 import json
 from dataclasses import asdict
@@ -7,19 +7,68 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bevcli.cli.bridge import INPUT, Json, Part, command
+from bevcli.cli.bridge import INPUT, INPUT_OR_NAME, Json, Part, command
 from bevcli.cli.help_text import PlainCommand
 from bevcli.engines.options import FileOptions
+from bevcli.inference.options import ModelOptions, complete_model
 from bevcli.printing import say
 
 if TYPE_CHECKING:
     from bevcli.checkpoints import Checkpoint
     from bevcli.model.parts import ModelPart
+    from bevcli.weights.cache import NamedWeights
 
 PANEL = "Train"
 weights_app = typer.Typer(
-    help="Inspect and convert weights files.", no_args_is_help=True, add_completion=False, rich_markup_mode=None
+    help="List, download, inspect and convert weights.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
 )
+
+
+@weights_app.command(name="list", cls=PlainCommand)
+@command
+def list_weights(options: Annotated[ModelOptions, Part(only=("weights_dir",))], as_json: Json = False) -> None:
+    """List published weights by name.
+
+    Each has the scores that are published for it (nuScenes validation split, in per cent), its size, its licence, and
+    where it lies on this machine or is published. Connects to no other machine.
+    """
+    from bevcli.weights.cache import all_weights
+    from bevcli.weights.sources import own_table
+
+    found = list(all_weights(options.weights_dir))
+    if as_json:
+        say(json.dumps([_named_as_data(each) for each in found], indent=1))
+        return
+    say(_named_as_text(found))
+    say(f"\nthe weights of demo are in the package; your own names go into {own_table()}")
+
+
+@weights_app.command(cls=PlainCommand)
+@command
+def fetch(
+    name: Annotated[str, typer.Argument(help="A name of `bevcli weights list`.")],
+    options: Annotated[ModelOptions, Part(only=("weights_dir",))],
+    force: Annotated[bool, typer.Option("--force", help="Download a file once more that is there.")] = False,
+) -> None:
+    """Download weights by NAME, for `--model NAME`.
+
+    A cut download goes on where it ended. The file is checked: its hash if that is known, else its size and the keys
+    and shapes of the model. A first download's hash is printed and remembered, and every later one must have it.
+    """
+    from bevcli.cli.fetching import fetch_with_bar
+    from bevcli.weights.cache import named_weights
+
+    found = fetch_with_bar(named_weights(name, options.weights_dir), force=force)
+    rows = [
+        ("weights", f"{found.path} ({found.known.bytes:,} bytes)"),
+        ("sha256", found.known.sha256),
+        ("checked", f"keys, shapes and size; of the hash: {found.checked}"),
+        ("next", f"bevcli run SEQUENCE --model {name}"),
+    ]
+    say("\n".join(f"{title:<8} {text}" for title, text in rows))
 
 
 @weights_app.command(cls=PlainCommand)
@@ -33,7 +82,10 @@ def inspect(
         typer.Option(
             help="List the parts of this model, such as tiny, base or v2-t2, or a FILE.toml; FILE must fit it.",
             show_default=False,
+            autocompletion=complete_model,
+            metavar="NAME|FILE",
         ),
+        INPUT_OR_NAME,
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -80,6 +132,33 @@ def convert(
     from bevcli.checkpoints import convert as convert_file
 
     say(_as_text(convert_file(source, options.target(destination))))
+
+
+def _named_as_data(weights: "NamedWeights") -> dict[str, object]:
+    here = weights.here
+    return {
+        "name": weights.name,
+        "model": weights.model,
+        "published": dict(weights.source.published),
+        "bytes": weights.size,
+        "licence": weights.source.licence,
+        "file": None if here is None else str(here),
+        "source": weights.source.url or weights.source.source,
+        "page": weights.source.page,
+    }
+
+
+def _named_as_text(found: "list[NamedWeights]") -> str:
+    rows = [("name", "model", "published", "size", "licence", "file or source")]
+    for each in found:
+        scores = ", ".join(f"{name} {100 * value:.1f}" for name, value in list(each.source.published.items())[:2])
+        size = "unknown" if each.size is None else f"{each.size / 1e6:.1f} MB"
+        source = each.source.url or each.source.source or f"by hand: {each.source.page}"
+        place = source if each.here is None else f"here: {each.here}"
+        rows.append((each.name, each.model, scores, size, each.source.licence, place))
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    cells = [[text.ljust(width) for text, width in zip(row, widths, strict=True)] for row in rows]
+    return "\n".join("  ".join(row).rstrip() for row in cells)
 
 
 def _as_data(checkpoint: "Checkpoint") -> dict[str, object]:

@@ -1,27 +1,15 @@
 """Parameters of the detection score (nuScenes' detection_cvpr_2019) and of the tracking score (tracking_nips_2019)."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Self
 
 from bevcli.errors import ConfigError
-from bevcli.geometry.boxes import CLASSES
-
-# Distance from the ego vehicle up to which a class is scored, metres (detection_cvpr_2019).
-CLASS_RANGES_M = {
-    "car": 50.0, "truck": 50.0, "construction_vehicle": 50.0, "bus": 50.0, "trailer": 50.0,
-    "barrier": 30.0, "motorcycle": 40.0, "bicycle": 40.0, "pedestrian": 40.0, "traffic_cone": 30.0,
-}  # fmt: skip
-assert set(CLASS_RANGES_M) == set(CLASSES)
+from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 
 # The devkit's names of the five true-positive errors, in m, 1 - IoU, radians, m/s, 1 - accuracy.
 ERRORS = ("trans_err", "scale_err", "orient_err", "vel_err", "attr_err")
-# Errors that are not defined for a class: a cone has no heading, and both never move.
-UNDEFINED_ERRORS = {
-    "traffic_cone": ("orient_err", "vel_err", "attr_err"),
-    "barrier": ("vel_err", "attr_err"),
-}
 
 
 @dataclass(frozen=True)
@@ -50,6 +38,7 @@ class DetectionConfig(ClassRanges):
     """Parameters of the detection score; the defaults are the devkit's.
 
     Attributes:
+        classes: the classes that are scored, by name.
         distances_m: matching distances of the centres on the ground, metres; one AP each.
         error_distance_m: the matching distance for true-positive errors and recall, metres.
         min_recall: precision at lower recall is ignored, 0 to 1.
@@ -59,7 +48,8 @@ class DetectionConfig(ClassRanges):
         visibility_bins: for the table by visibility, lower end included; the last bin includes 1.
     """
 
-    class_ranges_m: Mapping[str, float] = field(default_factory=lambda: dict(CLASS_RANGES_M))
+    class_ranges_m: Mapping[str, float] = field(default_factory=lambda: _ranges_m(NUSCENES_CLASSES.values()))
+    classes: Mapping[str, ObjectClass] = field(default_factory=lambda: NUSCENES_CLASSES)
     distances_m: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
     error_distance_m: float = 2.0
     min_recall: float = 0.1
@@ -68,16 +58,15 @@ class DetectionConfig(ClassRanges):
     range_bins_m: tuple[tuple[float, float], ...] = ((0, 10), (10, 20), (20, 30), (30, 40), (40, 50))
     visibility_bins: tuple[tuple[float, float], ...] = ((0.0, 0.4), (0.4, 0.6), (0.6, 0.8), (0.8, 1.0))
 
+    @classmethod
+    def of(cls, classes: Mapping[str, ObjectClass]) -> Self:
+        """The score of these classes, each within its range."""
+        return cls(_ranges_m(classes.values()), classes)
+
     def cut_at(self, max_range_m: float) -> Self:
         """The same score with all class ranges and bins cut at max_range_m. Raises ConfigError as `ClassRanges`."""
         bins = tuple((low, min(high, max_range_m)) for low, high in self.range_bins_m if low < max_range_m)
         return replace(super().cut_at(max_range_m), range_bins_m=bins)
-
-
-# The seven tracking classes, with the distance from the ego vehicle up to which each is scored, in metres.
-TRACKING_RANGES_M = {
-    "bicycle": 40.0, "bus": 50.0, "car": 50.0, "motorcycle": 40.0, "pedestrian": 40.0, "trailer": 50.0, "truck": 50.0,
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -93,10 +82,24 @@ class TrackingConfig(ClassRanges):
             lost when it is matched in less than, this share of its frames.
     """
 
-    class_ranges_m: Mapping[str, float] = field(default_factory=lambda: dict(TRACKING_RANGES_M))
+    class_ranges_m: Mapping[str, float] = field(default_factory=lambda: _tracked_ranges_m(NUSCENES_CLASSES))
     match_distance_m: float = 2.0
     recall_levels: int = 40
     min_recall: float = 0.1
     frame_period_s: float = 0.5
     mostly_tracked: float = 0.8
     mostly_lost: float = 0.2
+
+    @classmethod
+    def of(cls, classes: Mapping[str, ObjectClass]) -> Self:
+        """The metrics of those of these classes that are tracked, each within its range."""
+        return cls(_tracked_ranges_m(classes))
+
+
+def _ranges_m(classes: Iterable[ObjectClass]) -> dict[str, float]:
+    return {one.name: one.range_m for one in classes}
+
+
+def _tracked_ranges_m(classes: Mapping[str, ObjectClass]) -> dict[str, float]:
+    """The ranges of the tracked classes, in the order of their names, as the devkit has them."""
+    return _ranges_m(classes[name] for name in sorted(classes) if classes[name].tracked)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bevcli.evaluation.config import ERRORS, UNDEFINED_ERRORS, DetectionConfig
+from bevcli.evaluation.config import ERRORS, DetectionConfig
 from bevcli.evaluation.detection_scores import (
     ClassScores,
     DetectionScores,
@@ -91,9 +91,10 @@ def _score_class(part: ClassMatches, config: DetectionConfig, unmeasured: tuple[
     row = config.distances_m.index(config.error_distance_m)
     hits = np.flatnonzero(part.counts[row] & (part.matched[row] >= 0))
     truths = part.ground_truth.boxes[part.matched[row][hits]]
-    errors = _true_positive_errors(part.name, truths, part.predictions.boxes[hits])
+    one = config.classes[part.name]
+    errors = _true_positive_errors(truths, part.predictions.boxes[hits], symmetric=one.symmetric)
     curve = curves[config.error_distance_m]
-    undefined = {*UNDEFINED_ERRORS.get(part.name, ()), *unmeasured}
+    undefined = {*one.undefined_errors, *unmeasured}
     return ClassScores(
         ground_truth_count=truth_count,
         prediction_count=int(part.counts[row].sum()),
@@ -107,19 +108,19 @@ def _score_class(part: ClassMatches, config: DetectionConfig, unmeasured: tuple[
     )
 
 
-def _true_positive_errors(class_name: str, truth: Boxes3D, found: Boxes3D) -> dict[str, Array]:
+def _true_positive_errors(truth: Boxes3D, found: Boxes3D, *, symmetric: bool) -> dict[str, Array]:
     """The five errors of M matched pairs of one class, each (M,), by the devkit's names.
 
     trans_err: distance of the centres on the ground, metres.
     scale_err: 1 - IoU of the boxes with the same centre and heading.
-    orient_err: angle between the headings, radians; front and back of a barrier are the same.
+    orient_err: angle between the headings, radians; with symmetric, front and back are the same.
     vel_err: m/s; NaN where ground truth has no velocity.
     attr_err: 0 for the right attribute, 1 for a wrong one; NaN where ground truth has none.
     """
     offsets = found.centers[:, :2] - truth.centers[:, :2]
     intersection = np.minimum(truth.sizes_lwh, found.sizes_lwh).prod(axis=1)
     union = truth.sizes_lwh.prod(axis=1) + found.sizes_lwh.prod(axis=1) - intersection
-    half_turns = 2 if class_name == "barrier" else 1
+    half_turns = 2 if symmetric else 1
     turn = wrap_angle(half_turns * (truth.yaws - found.yaws)) / half_turns
     assert truth.attributes is not None
     assert found.attributes is not None

@@ -18,10 +18,15 @@ from bevcli.evaluation.scores_report import finite, scores_table, scores_to_dict
 from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmentation
 from bevcli.evaluation.tracking.scoring import TrackingScores, evaluate_tracking
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
-from bevcli.sequences.files.class_names import count_other_classes, other_classes_note
+from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass, are_nuscenes
+from bevcli.sequences.files.class_names import ClassNames, count_classes
 from bevcli.sequences.nuscenes.format import NuScenesOptions
 
 Config = TypeVar("Config", bound=ClassRanges)
+OWN_CLASSES = (
+    "the classes are not nuScenes' ten: the formulas are nuScenes', with the classes and ranges of the model, and the "
+    "numbers are not comparable to nuScenes'"
+)
 
 
 @dataclass(frozen=True)
@@ -87,8 +92,8 @@ def evaluate(
     Args:
         predictions: a predictions.json, the folder of a run, or a nuScenes submission (results_nusc.json).
         ground_truth: a ground_truth.json, a sequence folder that contains one, or a nuScenes root.
-        max_range: distance from the ego vehicle beyond which nothing is scored, metres. Default: nuScenes' range of
-            each class, cut where the model's BEV grid ends if the predictions state it; no limit where no frame has an
+        max_range: distance from the ego vehicle beyond which nothing is scored, metres. Default: the range of each
+            class, cut where the model's BEV grid ends if the predictions state it; no limit where no frame has an
             ego pose, as in the devkit.
         count_missing: whether ground-truth frames without a prediction count as missed; they are left out by default.
         tracking: whether to score tracks, too: AMOTA and the metrics that come with it. Predictions and ground truth
@@ -97,7 +102,7 @@ def evaluate(
         scene: score only this scene of the ground truth.
         version: of a nuScenes root, such as "v1.0-mini".
         split: of a nuScenes root, such as "val".
-        class_map: class names in the files -> the ten classes, such as {"Lorry": "truck"}.
+        class_map: class names in the files -> the classes of the model, such as {"Lorry": "truck"}.
 
     Returns:
         The scores. Predictions without attributes get them from class and speed.
@@ -107,19 +112,24 @@ def evaluate(
             identities, or one of them lacks what `driving` asks for.
         ConfigError: max_range is not positive.
     """
-    truth = open_ground_truth(Path(ground_truth), NuScenesOptions(version, split), scene, class_map)
     found = open_predictions(Path(predictions), class_map)
+    classes = found.boxes.classes or NUSCENES_CLASSES
+    truth = open_ground_truth(Path(ground_truth), NuScenesOptions(version, split), scene, class_map, classes)
     pairs = pair_frames(found.boxes, truth.boxes, count_missing=count_missing)
     pairs = without_cycles_in_racks(pairs, truth.bicycle_racks)
-    model_range = _model_range_m(found, pairs) if max_range is None else None
+    model_range = _model_range_m(found, pairs, classes) if max_range is None else None
     limit = max_range if model_range is None else model_range
-    config = _config(DetectionConfig(), pairs, limit)
-    detection = evaluate_detections(_with_attributes(pairs.predictions), pairs.ground_truth, config, pairs.ego_xy)
+    config = _config(DetectionConfig.of(classes), pairs, limit)
+    predicted = _with_attributes(pairs.predictions, classes)
+    detection = evaluate_detections(predicted, pairs.ground_truth, config, pairs.ego_xy)
     segmentation, map_notes = _score_maps(found, truth, pairs)
-    tracks, track_notes = _score_tracks(pairs, _config(TrackingConfig(), pairs, limit)) if tracking else (None, [])
+    tracked = _config(TrackingConfig.of(classes), pairs, limit)
+    tracks, track_notes = _score_tracks(pairs, tracked) if tracking else (None, [])
     limits = _range_notes(max_range, model_range, pairs)
+    of_classes = [] if are_nuscenes(classes) else [OWN_CLASSES]
+    of_classes += _other_class_notes(pairs, classes)
     drives = evaluate_driving(driving, (Path(predictions), Path(ground_truth)), found, truth, pairs)
-    notes = (*pairs.notes, *map_notes, *_other_class_notes(pairs), *limits, *_detection_notes(detection), *track_notes)
+    notes = (*pairs.notes, *map_notes, *of_classes, *limits, *_detection_notes(detection), *track_notes)
     return Scores(pairs, config, detection, segmentation, tracks, (*notes, *drives.notes), drives)
 
 
@@ -160,10 +170,10 @@ def _score_tracks(pairs: FramePairs, config: TrackingConfig) -> tuple[TrackingSc
     return scores, notes
 
 
-def _with_attributes(frames: Sequence[Boxes3D]) -> Sequence[Boxes3D]:
+def _with_attributes(frames: Sequence[Boxes3D], classes: Mapping[str, ObjectClass]) -> Sequence[Boxes3D]:
     if any(boxes.attributes is not None for boxes in frames):
         return frames
-    return [replace(boxes, attributes=attributes_by_speed(boxes)) for boxes in frames]
+    return [replace(boxes, attributes=attributes_by_speed(boxes, classes)) for boxes in frames]
 
 
 def _score_maps(
@@ -192,21 +202,19 @@ def _score_maps(
     return evaluate_segmentation(maps, classes), notes
 
 
-def _model_range_m(predictions: ScoredInput, pairs: FramePairs) -> float | None:
+def _model_range_m(predictions: ScoredInput, pairs: FramePairs, classes: Mapping[str, ObjectClass]) -> float | None:
     """Distance to the end of the model's BEV grid, metres; None if unknown, not applicable, or beyond all ranges."""
     stated = predictions.boxes.extras.get("range_m")
-    farthest = max(DetectionConfig().class_ranges_m.values())
+    farthest = max(one.range_m for one in classes.values())
     if not pairs.ego_pose_known or not isinstance(stated, (int, float)) or not 0 < stated < farthest:
         return None
     return float(stated)
 
 
-def _other_class_notes(pairs: FramePairs) -> Iterator[str]:
+def _other_class_notes(pairs: FramePairs, classes: Mapping[str, ObjectClass]) -> Iterator[str]:
     """Name the classes on each side that are not scored."""
     for side, frames in (("the ground truth", pairs.ground_truth), ("the predictions", pairs.predictions)):
-        others = count_other_classes(frames)
-        if others:
-            yield other_classes_note(others, side)
+        yield from ClassNames(classes=classes).note(count_classes(frames), side)
 
 
 def _detection_notes(detection: DetectionScores) -> Iterator[str]:

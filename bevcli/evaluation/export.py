@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
@@ -12,11 +12,12 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
 from bevcli.geometry.cameras import Camera
+from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array, apply, inverse, wrap_angle
 from bevcli.parsing.csv_cells import cell_of
 from bevcli.sequences.files.box_json import boxes_to_json
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
-from bevcli.sequences.files.calibration_file import read_calibration
+from bevcli.sequences.files.calibration_file import CALIBRATION, read_calibration
 from bevcli.sequences.files.incremental_json import GrowingFile
 from bevcli.writing import whole_file, write_whole
 
@@ -79,12 +80,6 @@ def _rows(frame: FrameBoxes, frame_of_reference: str) -> Iterator[dict[str, Any]
         }
 
 
-# KITTI's types where it has the class; names in its style for the others.
-KITTI_TYPES = {
-    "car": "Car", "truck": "Truck", "construction_vehicle": "ConstructionVehicle", "bus": "Bus",
-    "trailer": "Trailer", "barrier": "Barrier", "motorcycle": "Motorcycle", "bicycle": "Cyclist",
-    "pedestrian": "Pedestrian", "traffic_cone": "TrafficCone",
-}  # fmt: skip
 OCCLUSION_UNKNOWN = 3
 NEAR_M = 0.1  # box edges are clipped at this depth
 
@@ -99,9 +94,9 @@ def write_kitti(boxes: BoxesFile, camera: Camera, ego_from_bev: Array, folder: P
     numbers = [frame.stamp.index for frame in boxes.frames]
     if len(set(numbers)) < len(numbers):
         raise InputError("frame indices repeat (KITTI's files are named by them): export each scene separately")
-    count = 0
+    count, classes = 0, boxes.classes or NUSCENES_CLASSES
     for frame in boxes.frames:
-        lines = kitti_labels(_in_ego(frame, boxes.frame_of_reference, ego_from_bev), camera)
+        lines = kitti_labels(_in_ego(frame, boxes.frame_of_reference, ego_from_bev), camera, classes)
         name = f"{frame.stamp.index:06d}.txt"
         write_whole(folder / "label_2" / name, "".join(f"{line}\n" for line in lines).encode(), parents=True)
         write_whole(folder / "calib" / name, _calibration(camera, ego_from_bev).encode(), parents=True)
@@ -109,7 +104,9 @@ def write_kitti(boxes: BoxesFile, camera: Camera, ego_from_bev: Array, folder: P
     return count
 
 
-def kitti_labels(boxes_ego: Boxes3D, camera: Camera) -> list[str]:
+def kitti_labels(
+    boxes_ego: Boxes3D, camera: Camera, classes: Mapping[str, ObjectClass] = NUSCENES_CLASSES
+) -> list[str]:
     """One line for each box that the camera sees, in the order of the boxes.
 
     The fields: type, truncated 0 to 1, occluded (3: unknown), alpha, 2D box (left, top, right, bottom) in pixels,
@@ -130,11 +127,16 @@ def kitti_labels(boxes_ego: Boxes3D, camera: Camera) -> list[str]:
         rectangle, truncated = seen
         length, width, height = boxes_ego.sizes_lwh[place]
         numbers = [alphas[place], *rectangle, height, width, length, *locations[place], rotations_y[place]]
-        kind = KITTI_TYPES.get(str(boxes_ego.classes[place]), "Misc")
+        kind = _kitti_type(classes.get(str(boxes_ego.classes[place])))
         label = f"{kind} {truncated:.2f} {OCCLUSION_UNKNOWN} "
         score = "" if boxes_ego.scores is None else f" {boxes_ego.scores[place]:.4f}"
         lines.append(label + " ".join(f"{number:.3f}" for number in numbers) + score)
     return lines
+
+
+def _kitti_type(one: ObjectClass | None) -> str:
+    """A class's type in a label file, whose columns are parted by spaces."""
+    return "Misc" if one is None else "_".join((one.kitti or one.name).split())
 
 
 def _image_box(corners: Array, camera: Camera) -> tuple[Array, float] | None:
@@ -159,13 +161,24 @@ def _in_front_of_camera(corners: Array) -> Array:
     return np.concatenate([corners[corners[:, 2] >= NEAR_M], cut])
 
 
+def kitti_calibration(boxes: Path) -> Path:
+    """The calibration next to a boxes file, as a run and a sequence folder have it. Raises InputError without one."""
+    path = boxes.parent / CALIBRATION
+    if not path.is_file():
+        raise InputError(
+            f"`form=kitti` needs `calibration`: KITTI labels are in a camera frame, and there is no {path} "
+            "(a run writes it for a drive of one scene)"
+        )
+    return path
+
+
 def read_kitti_camera(calibration: Path, name: str | None) -> tuple[Camera, Array]:
     """The camera for the labels, and ego_from_bev (4, 4).
 
     calibration: calibration.json, or a folder that contains it. name: default CAM_FRONT, or else the camera that looks
     most directly ahead. Raises InputError where there is no such file or camera.
     """
-    path = calibration / "calibration.json" if calibration.is_dir() else calibration
+    path = calibration / CALIBRATION if calibration.is_dir() else calibration
     rig = read_calibration(path)
     if name is None:
         name = "CAM_FRONT" if "CAM_FRONT" in rig.names else min(rig.cameras, key=lambda camera: abs(camera.yaw)).name

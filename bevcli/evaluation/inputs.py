@@ -1,6 +1,6 @@
 """Reads predictions and ground truth from files, folders or a nuScenes root."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -11,14 +11,18 @@ from bevcli.evaluation.pairing import FramePairs
 from bevcli.evaluation.submission import is_submission, read_submission
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import Pose, apply, rigid, rotation_about_z
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes
 from bevcli.sequences.files.class_names import ClassNames
 from bevcli.sequences.files.map_folder import MapFolder, open_maps
+from bevcli.sequences.format import formats
 from bevcli.sequences.nuscenes.cache import open_index
 from bevcli.sequences.nuscenes.choice import chosen_scenes, tables_of
 from bevcli.sequences.nuscenes.format import NuScenesOptions, is_nuscenes_root
 from bevcli.sequences.nuscenes.index import NuScenesIndex
+from bevcli.sequences.open import open_sequence
+from bevcli.sequences.options import SequenceOptions
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,7 @@ def open_predictions(path: Path, class_map: Mapping[str, str] | None = None) -> 
     missing or wrong, or boxes have no scores.
     """
     file = path / "predictions.json" if path.is_dir() else path
-    boxes = read_submission(file) if is_submission(file) else read_boxes(file, ClassNames(class_map))
+    boxes = read_submission(file) if is_submission(file) else read_boxes(file, class_map)
     for frame in boxes.frames:
         if len(frame.boxes) and frame.boxes.scores is None:
             raise InputError(
@@ -58,17 +62,20 @@ def open_ground_truth(
     options: NuScenesOptions = NuScenesOptions(),
     scene: str | None = None,
     class_map: Mapping[str, str] | None = None,
+    classes: Iterable[str] = NUSCENES_CLASSES,
 ) -> ScoredInput:
-    """Read a boxes file, the ground_truth.json in a sequence folder, or a nuScenes root.
+    """Read a boxes file, the ground_truth.json in a sequence folder, or a drive of another format.
 
     Maps are in ground_truth_map/ next to the file. options: the part of a nuScenes root. scene: selects frames of a
-    root or a boxes file. class_map: names in a boxes file -> the ten classes. Raises InputError where the ground truth
-    is missing or wrong.
+    drive or a boxes file. class_map: names of the ground truth -> classes. classes: those that are scored. Raises
+    InputError where the ground truth is missing or wrong.
     """
     if path.is_dir() and is_nuscenes_root(path):
-        return _open_nuscenes(path, options, scene)
+        return _open_nuscenes(path, options, scene, ClassNames(class_map, classes))
+    if path.is_dir() and any(one.annotated and one.recognises(path) for one in formats()):
+        return _open_drive(path, SequenceOptions(class_map or {}, scene=scene, classes=tuple(classes)))
     file = path / "ground_truth.json" if path.is_dir() else path
-    boxes = read_boxes(file, ClassNames(class_map))
+    boxes = read_boxes(file, class_map, classes)
     if scene is not None:
         kept = tuple(frame for frame in boxes.frames if frame.stamp.scene == scene)
         if not kept:
@@ -106,19 +113,36 @@ def _maps_next_to(file: Path, name: str) -> MapFolder | None:
     return open_maps(folder) if folder.is_dir() else None
 
 
-def _open_nuscenes(root: Path, options: NuScenesOptions, only: str | None) -> ScoredInput:
+def _open_nuscenes(root: Path, options: NuScenesOptions, only: str | None, names: ClassNames) -> ScoredInput:
     tables = tables_of(root, options.version)
     index, _ = open_index(tables)
     frames: list[FrameBoxes] = []
     racks = {}
     for scene in chosen_scenes(index, tables, options.split, only):
         for sample in range(*index.scenes.first_sample[scene : scene + 2]):
-            frames.append(_nuscenes_frame(index, scene, sample, len(frames), tables))
+            frames.append(_nuscenes_frame(index, scene, sample, len(frames), tables, names))
             racks[frames[-1].extras["sample_token"]] = index.bicycle_racks(sample)
     return ScoredInput(BoxesFile("world", tuple(frames)), bicycle_racks=racks)
 
 
-def _nuscenes_frame(index: NuScenesIndex, scene: int, sample: int, number: int, tables: Path) -> FrameBoxes:
+def _open_drive(path: Path, options: SequenceOptions) -> ScoredInput:
+    drive = open_sequence(path, options)
+    frames = [drive.ground_truth_frame(place) for place in range(len(drive.stamps))]
+    found = [
+        FrameBoxes(
+            f.stamp, f.world_from_ego, f.ground_truth, {"sample_token": f.sample_token} if f.sample_token else {}
+        )
+        for f in frames
+        if f.ground_truth is not None
+    ]
+    if not found:
+        raise InputError(f"{path}: has no ground truth (expected for scoring): score another drive")
+    return ScoredInput(BoxesFile("world", tuple(found)))
+
+
+def _nuscenes_frame(
+    index: NuScenesIndex, scene: int, sample: int, number: int, tables: Path, names: ClassNames
+) -> FrameBoxes:
     boxes = index.ground_truth(sample)
     if boxes is None:
         raise InputError(f"{tables}: has no annotations (expected for scoring): choose another split than test")
@@ -126,6 +150,6 @@ def _nuscenes_frame(index: NuScenesIndex, scene: int, sample: int, number: int, 
     return FrameBoxes(
         FrameStamp(number, str(index.scenes.names[scene]), int(samples.times_us[sample]) * 1000),
         Pose(np.array(samples.translations[sample]), np.array(samples.quaternions[sample])),
-        boxes,
+        names.renamed(boxes),
         {"sample_token": samples.tokens[sample].decode()},
     )

@@ -5,6 +5,12 @@ from typing import Literal
 
 from bevcli.options import option, options
 
+# Of every command that scores boxes.
+MAX_RANGE_HELP = (
+    "Score nothing beyond this distance from the ego vehicle, nor beyond nuScenes' range of the class. Default: where "
+    "the model's BEV grid ends."
+)
+
 
 @options()
 class EvaluationOptions:
@@ -17,7 +23,7 @@ class EvaluationOptions:
     )
     max_range: float | None = option(
         default=None,
-        help="Cut nuScenes' class ranges at this distance from the ego vehicle. Default: the model's range.",
+        help=MAX_RANGE_HELP,
         metavar="METRES",
     )
     count_missing: bool = option(default=False, help="Count ground-truth frames without a prediction as missed.")
@@ -37,18 +43,20 @@ class EvaluationOptions:
 class ExportOptions:
     """The format of exported boxes and what it needs."""
 
-    form: Literal["csv", "kitti", "nuscenes", "nuscenes-tracking"] = option(
-        help="csv: one table. kitti: label_2 and calib. nuscenes: results_nusc.json. nuscenes-tracking: "
-        "tracking_nusc.json.",
+    form: Literal["csv", "json", "kitti", "nuscenes", "nuscenes-tracking"] = option(
+        help="csv: one table. json: a boxes file, as predictions.json. kitti: label_2 and calib. "
+        "nuscenes: results_nusc.json. nuscenes-tracking: tracking_nusc.json.",
         flag="--format",
     )
     out: Path | None = option(
         default=None,
-        help="Default: boxes.csv, kitti, results_nusc.json or tracking_nusc.json next to PREDICTIONS.",
+        help="Default: boxes.csv, boxes.json, kitti, results_nusc.json or tracking_nusc.json next to PREDICTIONS.",
     )
     score: float = option(default=0.0, help="Leave out boxes scored below this.", minimum=0, maximum=1)
     calibration: Path | None = option(
-        reads="path", default=None, help="kitti: calibration.json, or the sequence folder that contains it."
+        reads="path",
+        default=None,
+        help="kitti: calibration.json, or the sequence folder that contains it. Default: the one next to PREDICTIONS.",
     )
     camera: str | None = option(
         default=None, help="kitti: the camera. Default: CAM_FRONT, else the one that looks most directly ahead."

@@ -1,7 +1,8 @@
 """Plots of detection scores: precision and recall, errors by range, misses and false positives from above."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from itertools import cycle
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,12 +21,10 @@ from bevcli.evaluation.pairing import FramePairs
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.writing import whole_file
 
-# Colours of classes on a white background.
-PLOT_COLORS = {
-    "car": "#1f77b4", "truck": "#ff7f0e", "construction_vehicle": "#bcbd22", "bus": "#9467bd", "trailer": "#8c564b",
-    "barrier": "#7f7f7f", "motorcycle": "#d62728", "bicycle": "#2ca02c", "pedestrian": "#e377c2",
-    "traffic_cone": "#17becf",
-}  # fmt: skip
+# Colours of classes on a white background, in the order of the classes; the eleventh has the first again.
+_PLOT_COLORS = (
+    "#1f77b4", "#ff7f0e", "#bcbd22", "#9467bd", "#8c564b", "#7f7f7f", "#d62728", "#2ca02c", "#e377c2", "#17becf",
+)  # fmt: skip
 _GRID_COLOR = "#e6e6e6"
 _DISTANCE_COLORS = ("#b8c9e8", "#7d9fd3", "#3f6fb5", "#173e7a")  # from the shortest matching distance to the longest
 _ERROR_TITLES = {
@@ -53,14 +52,21 @@ def save_figures(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
     return [folder / name for name in figures]
 
 
+def plot_colors(classes: Iterable[str]) -> dict[str, str]:
+    """A colour for each class, by its place among the classes."""
+    return dict(zip(classes, cycle(_PLOT_COLORS), strict=False))
+
+
 def draw_precision_recall(detection: DetectionScores) -> Figure:
     """One panel a class, with one curve for each matching distance."""
     table = detection.overall
     subtitle = f"mAP {table.mean_ap:.3f}, one curve for each matching distance"
     figure = titled_figure((15, 7), "Precision and recall by class", subtitle)
-    panels = figure.subplots(2, (len(table.classes) + 1) // 2, sharex=True, sharey=True)
+    panels = figure.subplots(2, (len(table.classes) + 1) // 2, sharex=True, sharey=True, squeeze=False)
     for axes, (name, scores) in zip(panels.flat, table.classes.items(), strict=False):
         _draw_precision_recall(axes, name, scores)
+    if len(table.classes) % 2:
+        panels[-1, -1].set_axis_off()
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="upper right", ncols=len(labels), frameon=False, title="matching distance")
     for axes in panels[-1]:
@@ -78,9 +84,9 @@ def draw_errors_by_range(detection: DetectionScores) -> Figure:
     panels = figure.subplots(2, 3, sharex=True)
     middles = [(part.low_m + part.high_m) / 2 for part in bins]
     for axes, error in zip(panels.flat, (None, *ERRORS), strict=True):
-        for name in detection.overall.classes:
+        for name, color in plot_colors(detection.overall.classes).items():
             values = [_value(part.table.classes.get(name), error) for part in bins]
-            axes.plot(middles, values, color=PLOT_COLORS[name], linewidth=1, marker=".", label=name, alpha=0.8)
+            axes.plot(middles, values, color=color, linewidth=1, marker=".", label=name, alpha=0.8)
         means = [part.table.mean_ap if error is None else part.table.errors[error] for part in bins]
         axes.plot(middles, means, color="black", linewidth=2.5, marker="o", label="mean")
         axes.set_title("AP" if error is None else _ERROR_TITLES[error], fontsize=11)
@@ -165,8 +171,9 @@ def _best_outcome(matches: ClassMatches, row: int) -> _Outcome:
 
 
 def _legend(missed: Mapping[str, ScoredBoxes], false: Mapping[str, ScoredBoxes]) -> list[Line2D]:
+    colors = plot_colors(missed)
     dots = [
-        Line2D([], [], color=PLOT_COLORS[name], marker="o", ls="", label=f"{name} {len(part)} / {len(false[name])}")
+        Line2D([], [], color=colors[name], marker="o", ls="", label=f"{name} {len(part)} / {len(false[name])}")
         for name, part in missed.items()
     ]
     outlines = ((_FOUND, "found"), (_MISSED, "missed"), (_FALSE, "false positive"))
@@ -191,12 +198,12 @@ def _worst_frames(outcomes: list[_Outcome]) -> list[int]:
 def _draw_dots(
     axes: Axes, title: str, parts: Mapping[str, ScoredBoxes], reference_from_ego: Array, radius: float
 ) -> None:
-    centers_ego, colors = [np.zeros((0, 3))], []
+    centers_ego, colors, of_class = [np.zeros((0, 3))], [], plot_colors(parts)
     for name, part in parts.items():
         ego_from_reference = inverse(reference_from_ego)[part.frames]
         turned = np.einsum("nij,nj->ni", ego_from_reference[:, :3, :3], part.boxes.centers)
         centers_ego.append(turned + ego_from_reference[:, :3, 3])
-        colors += [PLOT_COLORS[name]] * len(part)
+        colors += [of_class[name]] * len(part)
     points = _in_plot(np.concatenate(centers_ego))
     # A random subset in random order, so that no class hides another.
     shown = np.random.default_rng(0).permutation(len(points))[:MAX_DOTS]

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.evaluation.config import TRACKING_RANGES_M
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
+from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import rotation_from_quaternion, yaw_of_rotation
 from bevcli.parsing.files import open_regular
 from bevcli.sequences.files.box_json import boxes_from_json
@@ -18,6 +18,7 @@ from bevcli.sequences.files.boxes_file import LARGEST_BYTES, BoxesFile, FrameBox
 from bevcli.sequences.files.incremental_json import IncrementalJson, existing, read_entries
 
 MAX_BOXES = 500  # per sample, by the rules of the benchmark; the best by score are kept
+TRACKED = tuple(name for name, one in NUSCENES_CLASSES.items() if one.tracked)
 META = {"use_camera": True, "use_lidar": False, "use_radar": False, "use_map": False, "use_external": False}
 _TAIL = "}}"
 _PEEK_BYTES = 2048  # the kind of a file can be read from its beginning
@@ -68,7 +69,7 @@ def tracking_submission_boxes(boxes: Boxes3D, sample_token: str) -> list[dict[st
     """
     if boxes.instances is None or boxes.track_scores is None:
         return []
-    tracked = boxes[(boxes.instances != "") & np.isin(boxes.classes, tuple(TRACKING_RANGES_M))]
+    tracked = boxes[(boxes.instances != "") & np.isin(boxes.classes, TRACKED)]
     assert tracked.instances is not None
     assert tracked.track_scores is not None
     best = np.argsort(-tracked.track_scores, kind="stable")[:MAX_BOXES]

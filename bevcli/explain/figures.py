@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -161,13 +161,23 @@ class FigureFile:
     left_out: str = ""
 
 
+def check_figures(folder: Path, *, force: bool) -> None:
+    """Raises OutputError where a folder holds figures already and may not lose them. force: it may."""
+    found = [] if force else [path for step in FIGURES for path in _figures_of(step, folder) if path.exists()]
+    if found:
+        raise OutputError(
+            f"{found[0]}: exists already; pass `force=True` to replace the figures of the folder, or `out=DIR`"
+        )
+
+
 def write_figures(
     trace: Trace, folder: Path, image_format: ImageFormat = "png", *, untrained: bool = False
 ) -> Iterator[FigureFile]:
     """Writes `bevformer-STEP.png` (or .jpg) per step into a folder, which is created; yields each file when written.
 
     untrained: whether the weights are random; then every figure is labelled UNTRAINED.
-    Files of the same name are overwritten. Raises OutputError when the folder or a file cannot be written.
+    Figures that the folder holds are replaced, also those of the other format.
+    Raises OutputError when the folder or a file cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -175,15 +185,22 @@ def write_figures(
         raise OutputError(f"{folder}: the folder for the figures cannot be made: {error.strerror}") from error
     for step, draw in FIGURES.items():
         reason = reason_to_leave_out(step, trace)
+        path = folder / f"bevformer-{step}.{image_format}"
+        for earlier in _figures_of(step, folder):
+            if reason or earlier != path:
+                earlier.unlink(missing_ok=True)
         if reason:
             yield FigureFile(step, None, reason)
             continue
-        path = folder / f"bevformer-{step}.{image_format}"
         figure = draw(trace)
         if untrained:
             figure.text(0.985, 0.985, "UNTRAINED", color=ACCENT, fontsize=17, fontweight="bold", ha="right", va="top")
         _save(figure, path, image_format)
         yield FigureFile(step, path)
+
+
+def _figures_of(step: str, folder: Path) -> tuple[Path, ...]:
+    return tuple(folder / f"bevformer-{step}.{ending}" for ending in get_args(ImageFormat))
 
 
 def reason_to_leave_out(step: str, trace: Trace) -> str:

@@ -28,9 +28,8 @@ class ExplainOptions:
         parse=parse_position,
     )
     image_format: ImageFormat = option(default="png", help="File format of the figures.", flag="--format")
-    out: Path = option(
-        default=Path("explained"), help="Folder for the figures; files of the same name are overwritten."
-    )
+    out: Path | None = option(default=None, help="Folder for the figures. Default: runs/SEQUENCE-MODEL-explained.")
+    force: bool = option(default=False, help="Replace the figures of an earlier call in the folder.")
 
     def place(self, indices: list[int]) -> int:
         """The place of the frame among the frames that the model takes. indices: of those. Raises InputError."""

@@ -1,19 +1,14 @@
 """Oriented 3D boxes in one frame of reference, with class, score, velocity and further optional columns."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array, apply
-
-# The ten detection classes of nuScenes, in the order of the published models' class scores.
-CLASSES = (
-    "car", "truck", "construction_vehicle", "bus", "trailer",
-    "barrier", "motorcycle", "bicycle", "pedestrian", "traffic_cone",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -150,20 +145,13 @@ BOX_EDGES = (
 )  # fmt: skip
 
 MOVING_MPS = 0.2  # a faster box counts as moving
-# Attribute of a moving and of a standing box. A standing bus is "stopped", not "parked", as in the original code.
-_MOVING_AND_STILL = {
-    **dict.fromkeys(("car", "truck", "construction_vehicle", "trailer"), ("vehicle.moving", "vehicle.parked")),
-    "bus": ("vehicle.moving", "vehicle.stopped"),
-    **dict.fromkeys(("motorcycle", "bicycle"), ("cycle.with_rider", "cycle.without_rider")),
-    "pedestrian": ("pedestrian.moving", "pedestrian.standing"),
-}
 
 
-def attributes_by_speed(boxes: Boxes3D) -> NDArray[np.str_]:
+def attributes_by_speed(boxes: Boxes3D, classes: Mapping[str, ObjectClass] = NUSCENES_CLASSES) -> NDArray[np.str_]:
     """(N,) nuScenes attribute names from class and speed, as the original BEVFormer assigns them.
 
     Classes without attributes get "". A box with unknown velocity counts as standing.
     """
     moving = np.linalg.norm(boxes.velocities, axis=1) > MOVING_MPS
-    choices = [_MOVING_AND_STILL.get(str(name), ("", "")) for name in boxes.classes]
+    choices = [classes[name].attributes if name in classes else ("", "") for name in boxes.classes.tolist()]
     return np.array([pair[0 if fast else 1] for pair, fast in zip(choices, moving, strict=True)], dtype=np.str_)

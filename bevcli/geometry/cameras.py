@@ -30,6 +30,14 @@ class Distortion:
     coefficients: tuple[float, ...]
 
 
+def brown_conrady(coefficients: ArrayLike) -> Distortion | None:
+    """The lens with the coefficients k1 k2 p1 p2 k3 k4 k5 k6, or None if all are 0."""
+    values = np.asarray(coefficients, dtype=np.float64)
+    if not values.any():
+        return None
+    return Distortion("brown_conrady", tuple(values.tolist() if values[5:].any() else values[:5].tolist()))
+
+
 @dataclass(frozen=True)
 class Camera:
     """A pinhole camera with optional lens distortion.

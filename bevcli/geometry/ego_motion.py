@@ -1,6 +1,7 @@
 """The vehicle's poses and kinematics over time, with interpolation between the stored times."""
 
 from dataclasses import dataclass, field, fields, replace
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,6 +99,25 @@ class EgoMotion:
         if row == len(times) - 1:
             return row, 0.0
         return row, (clipped - int(times[row])) / (int(times[row + 1]) - int(times[row]))
+
+
+# Times (T,) in ns, translations (T, 3) in metres in the world frame, and quaternions (T, 4) of world_from_ego.
+PoseTable: TypeAlias = tuple[NDArray[np.int64], Array, Array]
+
+
+def motion_of_keyframes(keyframes: PoseTable, others: PoseTable) -> EgoMotion:
+    """The poses at the times of keyframes, which increase, and at other times in any order.
+
+    Kinematics are derived from the keyframes only: differentiating poses a few milliseconds apart amplifies noise.
+    """
+    key_times = keyframes[0]
+    rough = EgoMotion(*keyframes, *derive_kinematics(*keyframes))
+    # Of equal times the first is kept, so that keyframes take precedence.
+    times, first = np.unique(np.concatenate([key_times, others[0]]), return_index=True)
+    translations, quaternions = (np.concatenate([keyframes[k], others[k]])[first] for k in (1, 2))
+    derived = [rough.kinematics_at(int(time)) for time in np.clip(times, key_times[0], key_times[-1])]
+    kinematics = zip(*(vars(one).values() for one in derived), strict=True)
+    return EgoMotion(times, translations, quaternions, *map(np.stack, kinematics))
 
 
 def derive_kinematics(

@@ -3,6 +3,7 @@
 import copy
 import hashlib
 import re
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -14,7 +15,7 @@ import torch
 from bevcli.checkpoints import bundled_weights, load_weights, read_checkpoint
 from bevcli.config import TRACKING, as_table, known_models, load_config, load_table, settings_of_table
 from bevcli.engines.exported import SUFFIX, load_exported
-from bevcli.errors import BevcliError, WeightsError
+from bevcli.errors import BevcliError, ConfigError, WeightsError
 from bevcli.geometry.cameras import CameraRig
 from bevcli.inference.options import ModelOptions
 from bevcli.inference.preprocess import image_for_rig
@@ -24,6 +25,8 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.prepare import Precision, prepare_for_inference
 from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.options import gather
+from bevcli.weights.cache import NamedWeights, find_weights, weights_folder
+from bevcli.weights.fetch import by_hand, fetch_weights
 
 DEFAULT_MODEL = "demo"
 UNTRAINED_SEED = 0  # two untrained runs of one drive agree
@@ -134,18 +137,19 @@ def load_model(
         model = bevcli.load_model("tiny", weights="bevformer_tiny_epoch_24.pth", device="cuda")
 
     Args:
-        model: a known model, one of `bevcli.config.known_models()` such as "tiny" or "demo", a FILE.toml, or an
-            exported FILE.onnx, which holds its weights and runs on the CPU in the precision of the file. None takes the
-            model that the weights fit, or "demo" where there are no weights.
+        model: a known model, one of `bevcli.config.known_models()` such as "tiny" or "demo", a name of the table of
+            weights ("tiny-fp16"), a FILE.toml, or an exported FILE.onnx, which holds its weights and runs on the CPU in
+            the precision of the file. None takes the model that the weights fit, or "demo" where there are no weights.
         weights: an official .pth as published, or a .safetensors. None takes the weights of the package, which only
-            "demo" has.
+            "demo" has, or downloaded ones.
         options: a model with its options; `model` and `weights` replace its own where they are given.
         changes: the other options of `ModelOptions` as keywords: `device` ("auto", "cpu", "cuda", "cuda:1", "mps" or a
-            torch.device), `precision`, `untrained` and `engine`.
+            torch.device), `precision`, `untrained`, `engine`, `fetch` (download missing weights) and `weights_dir`.
 
     Raises:
         ConfigError: the model's TOML file is missing or wrong.
-        WeightsError: there are no weights, they do not fit, or both weights and `untrained` are given.
+        WeightsError: there are no weights, they do not fit or cannot be downloaded, or both weights and `untrained` are
+            given.
         BevcliError: the device is not there, the engine is not installed, or an option does not apply to the model.
     """
     given = {name: value for name, value in (("model", model), ("weights", weights)) if value is not None}
@@ -162,14 +166,17 @@ def _load_network(options: ModelOptions) -> Model:
         raise WeightsError(f"`weights={weights}` and `untrained` exclude each other: pass one of them")
     if name is None:
         name = DEFAULT_MODEL if weights is None else _model_of(weights)
-    config, tracker = load_config(name), load_table(name, TRACKING, TrackerConfig)
-    bundled = bundled_weights(str(name)) if weights is None and not untrained else None
+    named = find_weights(str(name), options.weights_dir)
+    config_name = name if named is None else named.model
+    config = load_config(config_name)
+    tracker = _tracker(load_table(config_name, TRACKING, TrackerConfig), config, str(name))
+    if named is not None:
+        config = replace(config, name=named.name)
+    wanted = weights is None and not untrained
+    bundled = bundled_weights(str(name)) if wanted else None
     file = weights or bundled
-    if file is None and not untrained:
-        raise WeightsError(
-            f"model {config.name} has no weights: pass `weights=FILE` (the official .pth or a .safetensors), "
-            "or `untrained=True` to try the program with random weights"
-        )
+    if file is None and wanted:
+        file = _named_file(config.name, named, options)
     target = choose_device(options.device)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(UNTRAINED_SEED)
@@ -186,6 +193,37 @@ def _load_network(options: ModelOptions) -> Model:
         not_read=() if loaded is None else loaded.not_read,
         facts={} if loaded is None else loaded.facts,
     )
+
+
+def _named_file(model: str, named: NamedWeights | None, options: ModelOptions) -> Path:
+    """The downloaded weights of a model. Raises WeightsError where there are none."""
+    if named is not None and named.file is not None:
+        if named.here is not None:
+            return named.here
+        if options.fetch:
+            return fetch_weights(named).path
+        how = f"run {_fetch_command(named.name, options)}, which downloads them"
+    elif named is not None:
+        how = f"they {by_hand(named)}"
+    else:
+        how = "pass `weights=FILE` (the official .pth or a .safetensors)"
+    raise WeightsError(
+        f"model {model} has no weights: {how}, or pass `untrained=True` to try the program with random weights"
+    )
+
+
+def _fetch_command(name: str, options: ModelOptions) -> str:
+    if options.weights_dir in (None, weights_folder().absolute()):
+        return f"`bevcli weights fetch {name}`"
+    return f"`bevcli weights fetch {name} --weights-dir {shlex.quote(str(options.weights_dir))}`"
+
+
+def _tracker(stated: TrackerConfig, config: ModelConfig, file: str) -> TrackerConfig:
+    """The tracker's parameters for the classes of a model. Raises ConfigError."""
+    try:
+        return stated.for_classes(config.object_classes)
+    except ValueError as error:
+        raise ConfigError(f"{file}: [{TRACKING}]: {error}") from None
 
 
 def needs_exported_file(engine: str, model: str) -> BevcliError:
@@ -210,13 +248,14 @@ def _load_exported(options: ModelOptions) -> Model:
         raise BevcliError(f"`device={options.device}`: {file} runs on the CPU: leave out the option")
     network = load_exported(file, engine)
     found = network.metadata
+    stated = settings_of_table(found.contents, TRACKING, TrackerConfig, str(file))
     return Model(
         network,
         torch.device("cpu"),
         found.precision,
         None if found.untrained else file,
         bundled=found.bundled,
-        tracker=settings_of_table(found.contents, TRACKING, TrackerConfig, str(file)),
+        tracker=_tracker(stated, found.config, str(file)),
         engine=engine,
         file=file,
     )

@@ -8,13 +8,18 @@ from bevcli.options import option, options
 from bevcli.registry import entries
 
 
-def complete_model(incomplete: str) -> list[str]:
-    """The known models that start with a text, for help and for completion in a shell."""
-    # Not of bevcli.config, which loads PyTorch: completion must be quick.
+def model_names() -> list[str]:
+    """The known models."""
+    # Not of bevcli.config, which loads PyTorch: help and completion must be quick.
     files = [file.name for file in resources.files("bevcli").joinpath("configs").iterdir()]
-    return sorted(
-        file.removesuffix(".toml") for file in files if file.endswith(".toml") and file.startswith(incomplete)
-    )
+    return sorted(file.removesuffix(".toml") for file in files if file.endswith(".toml"))
+
+
+def complete_model(incomplete: str) -> list[str]:
+    """The known models and weights that start with a text, for completion in a shell."""
+    from bevcli.weights.sources import read_sources
+
+    return sorted(name for name in {*model_names(), *read_sources()} if name.startswith(incomplete))
 
 
 def complete_engine(incomplete: str) -> list[str]:
@@ -29,14 +34,22 @@ class ModelOptions:
     model: str | Path | None = option(
         reads="path or name",
         default=None,
-        help=f"{', '.join(complete_model(''))}, a FILE.toml or a FILE.onnx of `bevcli export-onnx`. Default: the model "
-        "that WEIGHTS fit, else demo.",
+        help=f"{', '.join(model_names())}, a name of `bevcli weights list`, a FILE.toml or a FILE.onnx of `bevcli "
+        "export-onnx`. Default: the model that WEIGHTS fit, else demo.",
+        metavar="NAME|FILE",
         complete=complete_model,
     )
     weights: Path | None = option(
         reads="path",
         default=None,
-        help="An official .pth file or a .safetensors file. Default: the weights in the package (demo).",
+        help="An official .pth file or a .safetensors file. Default: the weights in the package (demo), or those that "
+        "`bevcli weights fetch` has downloaded.",
+    )
+    fetch: bool = option(default=False, help="Download the weights of MODEL if they are not there yet.")
+    weights_dir: Path | None = option(
+        default=None,
+        help="Folder of downloaded weights. Default: $BEVCLI_WEIGHTS_DIR, else ~/.cache/bevcli/weights.",
+        metavar="DIR",
     )
     untrained: bool = option(default=False, help="Use random weights; all outputs are labelled UNTRAINED.")
     device: str = option(

@@ -5,7 +5,7 @@ the tracks move to the frame's time, and the boxes, highest score first, each ta
 within the class's gate. Added here: two score thresholds, scores of tracks, and the suppression of duplicates.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -14,37 +14,10 @@ from numpy.typing import NDArray
 
 from bevcli.frame import Frame, FrameStamp, Prediction
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array
 
-
-@dataclass(frozen=True)
-class Gates:
-    """The largest distance, by class, between a box and the place where its track is expected, metres.
-
-    Attributes:
-        other: for classes that are not listed.
-    """
-
-    car: float = 3.0
-    truck: float = 3.0
-    construction_vehicle: float = 4.0
-    bus: float = 5.0
-    trailer: float = 4.0
-    barrier: float = 1.0
-    motorcycle: float = 4.0
-    bicycle: float = 2.5
-    pedestrian: float = 2.0
-    traffic_cone: float = 1.0
-    other: float = 4.0
-
-    def __post_init__(self) -> None:
-        for gate in fields(self):
-            if not getattr(self, gate.name) > 0:
-                raise ValueError(f"gates_m.{gate.name} must be above 0 m, found {getattr(self, gate.name):g}")
-
-    def of(self, classes: NDArray[np.str_]) -> Array:
-        """(N,) the gates of boxes of these classes (N,), metres."""
-        return np.array([getattr(self, str(name), self.other) for name in classes], dtype=np.float64)
+OTHER = "other"  # the gate of classes that have none
 
 
 @dataclass(frozen=True)
@@ -60,7 +33,7 @@ class TrackerConfig:
         duplicate_widths: a box is a duplicate when the centre of a better box of its class is closer than this many
             widths of the better box. 0: no box is a duplicate.
         use_velocity: whether tracks move with the predicted velocity; if not, they stay where their last box is.
-        gates_m: the largest distance of a match, by class.
+        gates_m: the largest distance of a match, by class, "other" for other classes. Default: `ObjectClass.gate_m`.
     """
 
     birth_score: float = 0.2
@@ -69,7 +42,7 @@ class TrackerConfig:
     coast_s: float = 1.5
     duplicate_widths: float = 1.0
     use_velocity: bool = True
-    gates_m: Gates = field(default_factory=Gates)
+    gates_m: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not 0 <= self.keep_score <= self.birth_score <= 1:
@@ -82,6 +55,22 @@ class TrackerConfig:
                 "confirm_frames must be at least 1, coast_s and duplicate_widths must not be negative; found "
                 f"{self.confirm_frames}, {self.coast_s:g} and {self.duplicate_widths:g}"
             )
+        for name, gate in self.gates_m.items():
+            if not gate > 0:
+                raise ValueError(f"gates_m.{name} must be above 0 m, found {gate:g}")
+
+    def for_classes(self, classes: Mapping[str, ObjectClass]) -> "TrackerConfig":
+        """The parameters with a gate for each of a model's classes. Raises ValueError for a gate of no class."""
+        unknown = self.gates_m.keys() - {OTHER, *classes, *NUSCENES_CLASSES}
+        if unknown:
+            raise ValueError(f'gates_m.{min(unknown)}: the model has no class "{min(unknown)}"')
+        return replace(self, gates_m={name: one.gate_m for name, one in classes.items()} | dict(self.gates_m))
+
+    def gates_of(self, classes: NDArray[np.str_]) -> Array:
+        """(N,) the gates of boxes of these classes (N,), metres."""
+        gates = {name: one.gate_m for name, one in NUSCENES_CLASSES.items()} | dict(self.gates_m)
+        other = gates.get(OTHER, ObjectClass.gate_m)
+        return np.array([gates.get(name, other) for name in classes.tolist()], dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -237,7 +226,7 @@ def _match(
         places = places + np.nan_to_num(tracks.velocities) * seconds[:, None]
     away = np.linalg.norm(boxes.centers[usable, None, :2] - places, axis=-1)  # (M, T)
     away[boxes.classes[usable, None] != tracks.classes] = np.inf
-    away[away > config.gates_m.of(boxes.classes[usable])[:, None]] = np.inf
+    away[away > config.gates_of(boxes.classes[usable])[:, None]] = np.inf
     for box, distances in zip(usable, away, strict=True):
         nearest = int(np.argmin(distances))
         if np.isfinite(distances[nearest]):

@@ -6,6 +6,7 @@ from typing import Any, ClassVar, Literal
 
 from bevcli.frame import MAP_CLASSES, FrameResult
 from bevcli.geometry.bev_grid import BevGrid
+from bevcli.geometry.object_classes import ClassSettings, ObjectClass, object_classes
 from bevcli.model.decoder import DecoderConfig
 from bevcli.model.deformable_attention import LevelShapes
 from bevcli.model.ego_motion import EgoMotionConfig
@@ -135,6 +136,7 @@ class ModelConfig:
         trains_with_gaps: a training clip leaves out one of its earlier frames, as published for BEVFormer.
         name: of the model.
         classes: of the objects, in the order of the class logits.
+        class_settings: settings of classes by name, where they differ from the defaults.
         cameras: names of the camera embeddings, in their order.
         image: how images become the network's input.
         bev_grid: the cells of the BEV map and their pillars.
@@ -175,6 +177,7 @@ class ModelConfig:
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     decoder: DecoderConfig = field(default_factory=DecoderConfig)
     segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
+    class_settings: Mapping[str, ClassSettings] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         _check_numbers(self)
@@ -183,8 +186,9 @@ class ModelConfig:
             raise ValueError("bev_grid needs at least one row, column and pillar point")
         if any(start >= end for start, end in (grid.x_range_m, grid.y_range_m, grid.z_range_m)):
             raise ValueError("bev_grid: each range goes from a smaller to a larger number")
-        if not (self.classes and self.cameras) or min(self.channels, self.rate_hz, self.max_gap_s) <= 0:
-            raise ValueError("classes and cameras must not be empty, channels, rate_hz and max_gap_s must be positive")
+        object_classes(self.classes, self.class_settings)
+        if not self.cameras or min(self.channels, self.rate_hz, self.max_gap_s) <= 0:
+            raise ValueError("cameras must not be empty, channels, rate_hz and max_gap_s must be positive")
         if "detection" not in self.heads or len(set(self.heads)) < len(self.heads):
             raise ValueError('heads must name "detection", and no head twice')
         divisors = [2, self.encoder.attention_heads, self.decoder.attention_heads]
@@ -199,6 +203,11 @@ class ModelConfig:
                 f"neck.levels is {levels}; expected at least the number of backbone.output_stages, "
                 f"at most image_tokens.level_embeddings"
             )
+
+    @property
+    def object_classes(self) -> dict[str, ObjectClass]:
+        """The classes by name, in the order of the class logits."""
+        return object_classes(self.classes, self.class_settings)
 
     @property
     def encoder_levels(self) -> int:

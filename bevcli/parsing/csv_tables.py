@@ -41,7 +41,7 @@ class CsvRow:
         """The cell as a finite number. Raises InputError if it is not one."""
         text = self.cells[column]
         try:
-            value = float(text)
+            value = float(text if text.isascii() and "_" not in text else "")  # Python also takes 1_000 and ١
         except ValueError:
             raise self.error(column, f'expected a number, found "{text:.40}"') from None
         if not abs(value) < LARGEST_NUMBER:
@@ -70,6 +70,9 @@ def read_csv(path: Path, required: Iterable[str], optional: Iterable[str] = ()) 
         raise InputError(f"{path}: the file is empty (expected a header with {', '.join(required)})")
     columns = tuple(name_of(cell.strip()) for cell in lines[0][1])
     _check_columns(path, columns, required, tuple(optional))
+    for line, cells in lines:
+        if any("\0" in cell for cell in cells):
+            raise InputError(f"{path}: line {line}: has a null byte (expected text; the file may be damaged)")
     rows = tuple(_row(path, columns, line, cells) for line, cells in lines[1:])
     if not rows:
         raise InputError(f"{path}: the table has no rows below the header (expected at least one)")

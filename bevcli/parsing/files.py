@@ -10,6 +10,11 @@ from bevcli.errors import BevcliError, InputError
 MIB = 1 << 20
 
 
+def is_there(path: Path) -> bool:
+    """True if a file that may be missing is there. It may be a pipe or a broken link, which is an error when read."""
+    return os.path.lexists(path)
+
+
 def read_bytes(
     path: Path, largest: int, *, missing: str = "the file is missing", error: type[BevcliError] = InputError
 ) -> bytes:

@@ -8,21 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Color = tuple[int, int, int]
+from bevcli.geometry.object_classes import Color, ObjectClass
 
-# No class is red: red means a miss or a false positive.
-CLASS_COLORS: dict[str, Color] = {
-    "car": (255, 158, 44),
-    "truck": (186, 222, 92),
-    "construction_vehicle": (205, 155, 110),
-    "bus": (240, 108, 190),
-    "trailer": (110, 190, 120),
-    "barrier": (150, 160, 175),
-    "motorcycle": (178, 130, 255),
-    "bicycle": (96, 165, 255),
-    "pedestrian": (70, 222, 190),
-    "traffic_cone": (245, 222, 90),
-}
 GROUND_TRUTH_COLOR: Color = (235, 238, 245)
 OTHER_COLOR: Color = (128, 132, 140)  # ground truth of a class that is not among the model's
 MISSED_COLOR: Color = (255, 45, 85)
@@ -57,10 +44,13 @@ LINE_COLORS: dict[str, Color] = {
 OTHER_LINE_COLORS: tuple[Color, ...] = ((120, 170, 255), (255, 170, 120), (160, 235, 225), (235, 150, 205))
 
 
-def class_color(name: str, index: int) -> Color:
-    """The colour of a class. A class that is not in CLASS_COLORS gets one by its index among the model's classes."""
-    if name in CLASS_COLORS:
-        return CLASS_COLORS[name]
+def class_colors(classes: Iterable[ObjectClass]) -> dict[str, Color]:
+    """The colours of a model's classes, in their order. A class without a colour takes one by its index."""
+    return {one.name: one.color or index_color(index) for index, one in enumerate(classes)}
+
+
+def index_color(index: int) -> Color:
+    """A bright colour; neighbouring indices differ much."""
     red, green, blue = colorsys.hsv_to_rgb((0.11 + index * 0.618034) % 1.0, 0.65, 1.0)
     return round(red * 255), round(green * 255), round(blue * 255)
 

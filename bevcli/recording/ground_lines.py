@@ -9,7 +9,7 @@ import numpy as np
 from bevcli.frame import FrameResult, Ground, MapLines, Plan
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
-from bevcli.recording.colors import EGO_COLOR, line_colors
+from bevcli.recording.colors import EGO_COLOR, Color, line_colors
 from bevcli.recording.log_boxes import box_colors
 
 FUTURES = "futures"
@@ -37,7 +37,7 @@ class GroundLines:
     width: float = 1.0
 
 
-def future_lines(boxes: Boxes3D, class_names: Sequence[str]) -> GroundLines:
+def future_lines(boxes: Boxes3D, classes: Mapping[str, Color]) -> GroundLines:
     """The futures of boxes in the recording's world: colours by class, opaque by score of the mode, faded in time."""
     if boxes.futures is None or not len(boxes):
         return GroundLines(FUTURES)
@@ -49,7 +49,7 @@ def future_lines(boxes: Boxes3D, class_names: Sequence[str]) -> GroundLines:
     modes = np.ones(boxes.futures.shape[:2]) if boxes.future_scores is None else boxes.future_scores
     share = modes / np.maximum(modes.max(1, keepdims=True), 1e-9)  # (N, M)
     fading = np.linspace(1, 0.25, boxes.futures.shape[2])
-    strips, colors, of_class = [], [], box_colors(boxes, class_names)
+    strips, colors, of_class = [], [], box_colors(boxes, classes)
     for box, mode, step in np.ndindex(*boxes.futures.shape[:3]):
         piece = steps[box, mode, step : step + 2]
         if np.isfinite(piece).all():

@@ -1,6 +1,6 @@
 """Writes boxes into a recording: in the 3D scene, in the BEV view, on the street map; finds misses and duplicates."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.matching import descending_scores, gather, match_greedily
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.geometry.boxes import CLASSES, Boxes3D
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.geographic import GeoOrigin
 from bevcli.geometry.transforms import Array
 from bevcli.recording import entities
@@ -24,7 +24,7 @@ from bevcli.recording.colors import (
     MISSED_COLOR,
     OTHER_COLOR,
     Color,
-    class_color,
+    index_color,
 )
 
 MATCH_DISTANCE_M = DetectionConfig().error_distance_m
@@ -104,21 +104,20 @@ MOVING_M_S = 0.5  # slower objects get no velocity arrow
 THIN, THICK = rr.Radius.ui_points(0.8), rr.Radius.ui_points(1.6)
 
 
-def box_colors(boxes: Boxes3D, class_names: Sequence[str]) -> np.ndarray:
+def box_colors(boxes: Boxes3D, classes: Mapping[str, Color]) -> np.ndarray:
     """(N, 3) uint8 RGB: the colour of each box's class."""
-    indices = {name: index for index, name in enumerate(class_names)}
-    colors = {name: class_color(name, indices.get(name, len(indices))) for name in np.unique(boxes.classes)}
-    return np.array([colors[name] for name in boxes.classes], dtype=np.uint8).reshape(-1, 3)
+    other = index_color(len(classes))
+    return np.array([classes.get(name, other) for name in boxes.classes.tolist()], dtype=np.uint8).reshape(-1, 3)
 
 
 def log_boxes_3d(
-    stream: rr.RecordingStream, boxes: Boxes3D, marks: Marks, class_names: Sequence[str], ego_xy: Array
+    stream: rr.RecordingStream, boxes: Boxes3D, marks: Marks, classes: Mapping[str, Color], ego_xy: Array
 ) -> None:
     """Writes predicted boxes into the scene: boxes, velocity arrows, marks of false positives and duplicates.
 
     boxes: in the recording's world. ego_xy: (2,) the vehicle's position; the boxes nearest to it get labels.
     """
-    ids = [1 + list(class_names).index(name) if name in class_names else 0 for name in boxes.classes]
+    ids = [1 + list(classes).index(name) if name in classes else 0 for name in boxes.classes.tolist()]
     labels = labels_in_scene(boxes, ego_xy)
     archetype = rr.Boxes3D(**_shape(boxes), class_ids=ids, labels=labels, show_labels=True, radii=THICK)
     track = {} if boxes.instances is None else {"track": pa.array(boxes.instances.tolist(), pa.utf8())}
@@ -131,16 +130,16 @@ def log_boxes_3d(
     )
     stream.log(entities.BOXES, archetype, facts)
     moving = boxes[np.linalg.norm(boxes.velocities, axis=-1) > MOVING_M_S]
-    vectors, colors = np.column_stack([moving.velocities, np.zeros(len(moving))]), box_colors(moving, class_names)
+    vectors, colors = np.column_stack([moving.velocities, np.zeros(len(moving))]), box_colors(moving, classes)
     arrows = rr.Arrows3D(vectors=vectors, origins=moving.centers, colors=colors, radii=rr.Radius.ui_points(1.2))
     stream.log(entities.VELOCITY, arrows)
     for entity, strips, color in zip((entities.FALSE_BOXES, entities.DUPLICATES), *_marks(boxes, marks), strict=True):
         stream.log(entity, rr.LineStrips3D(strips, colors=color, radii=THICK))
 
 
-def other_classes(truth: Boxes3D, class_names: Sequence[str]) -> np.ndarray:
-    """(M,) bool, ground-truth boxes of classes that neither nuScenes nor the model has: they are never missed."""
-    return ~np.isin(truth.classes, (*CLASSES, *class_names))
+def other_classes(truth: Boxes3D, classes: Mapping[str, Color]) -> np.ndarray:
+    """(M,) bool, ground-truth boxes of classes that the model does not have: they are never missed."""
+    return ~np.isin(truth.classes, list(classes))
 
 
 def ground_truth_colors(found: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -163,9 +162,9 @@ def log_ground_truth_3d(stream: rr.RecordingStream, truth: Boxes3D, found: np.nd
         stream.log(entity, archetype, rr.AnyValues(name=_names(truth[chosen])))
 
 
-def log_boxes_bev(stream: rr.RecordingStream, boxes: Boxes3D, marks: Marks, class_names: Sequence[str]) -> None:
+def log_boxes_bev(stream: rr.RecordingStream, boxes: Boxes3D, marks: Marks, classes: Mapping[str, Color]) -> None:
     """Writes predicted boxes (in the bev frame) into the BEV view."""
-    colors = box_colors(boxes, class_names)
+    colors = box_colors(boxes, classes)
     doubled = np.concatenate([colors, colors])
     stream.log(entities.BEV_BOXES, rr.LineStrips2D(footprints(boxes), colors=doubled, radii=THICK, draw_order=30))
     moving = np.linalg.norm(boxes.velocities, axis=-1) > MOVING_M_S
@@ -230,7 +229,9 @@ def log_ego_on_map(stream: rr.RecordingStream, origin: GeoOrigin, here: Array, b
         stream.log(entities.MAP_ROUTE, line)
 
 
-def log_boxes_on_map(stream: rr.RecordingStream, origin: GeoOrigin, boxes: Boxes3D, class_names: Sequence[str]) -> None:
+def log_boxes_on_map(
+    stream: rr.RecordingStream, origin: GeoOrigin, boxes: Boxes3D, classes: Mapping[str, Color]
+) -> None:
     """Writes the centres of boxes, in the sequence's world frame, in the colours of their classes."""
-    places, colors = origin.latitude_longitude(boxes.centers), box_colors(boxes, class_names) if len(boxes) else None
+    places, colors = origin.latitude_longitude(boxes.centers), box_colors(boxes, classes) if len(boxes) else None
     stream.log(entities.MAP_BOXES, rr.GeoPoints(lat_lon=places, radii=rr.Radius.ui_points(4.0), colors=colors))

@@ -1,6 +1,6 @@
 """Writes one camera of a frame into a recording: pose, image, and the overlays of the image."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -13,7 +13,7 @@ from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.recording import entities
 from bevcli.recording.box_lines import ImageLines, box_labels, labels_2d, labels_in_image, lines_in_image
-from bevcli.recording.colors import colormap
+from bevcli.recording.colors import Color, colormap
 from bevcli.recording.log_boxes import box_colors
 from bevcli.recording.video_images import Av1Encoder
 
@@ -84,11 +84,11 @@ class VideoImages:
 
 
 def log_boxes_in_image(
-    stream: rr.RecordingStream, posed: PosedCamera, boxes: Boxes3D, class_names: Sequence[str]
+    stream: rr.RecordingStream, posed: PosedCamera, boxes: Boxes3D, classes: Mapping[str, Color]
 ) -> None:
     """Draws predicted boxes (in the recording's world) into the image: lines and labels."""
     name = posed.name
-    colors = box_colors(boxes, class_names)
+    colors = box_colors(boxes, classes)
     lines = lines_in_image(boxes, posed.camera, posed.camera_from_world)
     stream.log(entities.overlay(name, "boxes"), _strips(lines, colors, 1.0, draw_order=30))
     texts = box_labels(boxes)

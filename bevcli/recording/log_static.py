@@ -1,6 +1,6 @@
 """Writes the static parts of a recording: rig, vehicle, range rings, pillars, colours, legend, the page "About"."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import rerun as rr
@@ -19,7 +19,6 @@ from bevcli.recording.colors import (
     RING_COLOR,
     STAGE_COLORS,
     Color,
-    class_color,
     colormap,
     line_colors,
     map_colors,
@@ -53,7 +52,7 @@ HOW_TO_READ = """\
 def log_scene(
     stream: rr.RecordingStream,
     rig: CameraRig,
-    class_names: Sequence[str],
+    classes: Mapping[str, Color],
     vehicle: VehicleMesh | None = None,
     grid: BevGrid | None = None,
 ) -> None:
@@ -63,7 +62,7 @@ def log_scene(
     larger; None draws rings up to 50 m.
     """
     stream.log(entities.WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    infos = [rr.AnnotationInfo(id=i + 1, label=n, color=class_color(n, i)) for i, n in enumerate(class_names)]
+    infos = [rr.AnnotationInfo(id=i + 1, label=n, color=color) for i, (n, color) in enumerate(classes.items())]
     stream.log("/", rr.AnnotationContext([rr.AnnotationInfo(id=0, label="other"), *infos]), static=True)
     for camera in rig.cameras:
         _log_pinhole(stream, camera)
@@ -81,13 +80,12 @@ def about_text(title: str, rig: CameraRig, options: RecordingOptions, *, untrain
     return f"# {title}\n\n{warning}{facts}\n{HOW_TO_READ}"
 
 
-def log_curve_names(stream: rr.RecordingStream, stages: Iterable[str], class_names: Sequence[str]) -> None:
+def log_curve_names(stream: rr.RecordingStream, stages: Iterable[str], classes: Mapping[str, Color]) -> None:
     """Writes names and colours of the curves: seconds per stage, boxes per class, speed."""
     stages = list(stages)
     colors = [STAGE_COLORS[i % len(STAGE_COLORS)] for i in range(len(stages))]
     stream.log(entities.STAGE_CURVES, rr.SeriesLines(names=stages, colors=colors), static=True)
-    colors = [class_color(name, i) for i, name in enumerate(class_names)]
-    stream.log(entities.BOX_CURVES, rr.SeriesLines(names=list(class_names), colors=colors), static=True)
+    stream.log(entities.BOX_CURVES, rr.SeriesLines(names=list(classes), colors=list(classes.values())), static=True)
     stream.log(entities.SPEED_CURVE, rr.SeriesLines(names="km/h", colors=EGO_COLOR), static=True)
 
 
@@ -181,7 +179,7 @@ TEXT_COLOR: Color = (225, 228, 235)
 
 
 def legend_entries(
-    class_names: Sequence[str],
+    classes: Mapping[str, Color],
     map_classes: Sequence[str] = (),
     line_classes: Sequence[str] = (),
     *,
@@ -190,16 +188,16 @@ def legend_entries(
     """The texts and colours of the legend.
 
     Args:
-        class_names: of the objects.
+        classes: of the objects, with their colours.
         map_classes: of the model's map; empty without one.
         line_classes: of the model's lines of the map; empty without these.
         plans: whether the model plans paths.
     """
-    classes = [(name.replace("_", " "), class_color(name, index)) for index, name in enumerate(class_names)]
+    of_classes = [(name.replace("_", " "), color) for name, color in classes.items()]
     states = [("ground truth", GROUND_TRUTH_COLOR), ("missed, false", MISSED_COLOR), ("duplicate", DUPLICATE_COLOR)]
     maps = [(f"map: {name.replace('_', ' ')}", color) for name, color in map_colors(map_classes).items()]
     lines = [(f"line: {name.replace('_', ' ')}", color) for name, color in line_colors(line_classes).items()]
-    return [*classes, *states, *maps, *lines, *([("planned path", EGO_COLOR)] if plans else [])]
+    return [*of_classes, *states, *maps, *lines, *([("planned path", EGO_COLOR)] if plans else [])]
 
 
 def legend_size(entries: int) -> tuple[float, float]:

@@ -1,6 +1,6 @@
 """Writes tracks into a recording: each has an entity of its own with its past, its footprint and the next second."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
 
@@ -11,6 +11,7 @@ from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, apply
 from bevcli.recording import entities
+from bevcli.recording.colors import Color
 from bevcli.recording.log_boxes import THIN, box_colors, line_strips
 
 PAST_S = 5.0  # length of a trail
@@ -69,8 +70,8 @@ def track_names(boxes: Boxes3D) -> list[str]:
 class TrackLog:
     """Writes the tracks of each frame, and clears the entities of tracks without a box."""
 
-    def __init__(self, stream: rr.RecordingStream, class_names: Sequence[str]) -> None:
-        self._stream, self._class_names = stream, class_names
+    def __init__(self, stream: rr.RecordingStream, classes: Mapping[str, Color]) -> None:
+        self._stream, self._classes = stream, classes
         self._history = TrackHistory()
 
     def state(self) -> TrackHistory:
@@ -86,7 +87,7 @@ class TrackLog:
         if boxes.instances is None:
             return
         self._history.add(boxes, stamp)
-        ahead, outlines, colors = _ahead(boxes), _footprints(boxes), box_colors(boxes, self._class_names)
+        ahead, outlines, colors = _ahead(boxes), _footprints(boxes), box_colors(boxes, self._classes)
         shown: set[str] = set()
         flat, flat_colors = [], []
         for i, name in enumerate(track_names(boxes)):

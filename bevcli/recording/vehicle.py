@@ -1,19 +1,15 @@
 """The ego vehicle as a mesh: a plain car by default, or a mesh file."""
 
-import io
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array
-from bevcli.parsing.files import MIB, read_bytes
-from bevcli.printing import reason_of
 from bevcli.recording.colors import EGO_COLOR, Color
+from bevcli.recording.mesh_file import read_mesh
 
 BODY_LWH = (4.6, 1.86, 0.75)
 REAR_AXLE_TO_MIDDLE = 1.35  # metres ahead; the ego frame's origin is on the ground under the rear axle
@@ -22,15 +18,7 @@ GLASS: Color = (32, 40, 52)
 RUBBER: Color = (20, 22, 26)
 OUTLINE = np.array([[3.65, -0.93], [3.65, 0.93], [-0.95, 0.93], [-0.95, -0.93], [3.65, -0.93]])  # in ego, from above
 FRONT_ARROW = np.array([[2.2, -0.8], [3.3, 0.0], [2.2, 0.8]])
-SMOOTH_BELOW_RAD = np.radians(40.0)  # faces that meet at a smaller angle are shaded as one curved surface
-LARGEST_BYTES = 64 * MIB  # of the file, and of each that it names
-LARGEST_TEXT_BYTES = 16 * MIB  # of a format of text, of which trimesh makes sixty times as much
-TEXT_FORMATS = (".obj", ".off")
-FORMATS = (".glb", ".gltf", ".ply", ".obj", ".stl", ".off")  # no archives, whose contents may have any size
 LONGEST_M = 50.0  # a longer mesh is not in metres
-Part = tuple[Array, Array, NDArray[np.int64], NDArray[np.uint8]]  # vertices, normals, faces, colours
-GLTF_FILES = (".glb", ".gltf")
-EGO_FROM_GLTF = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # glTF: y up, z forward, x left
 
 
 @dataclass(frozen=True)
@@ -61,78 +49,17 @@ def load_vehicle(path: Path) -> VehicleMesh:
 
     Materials, textures and buffers that the file names are read only in its own folder.
 
-    Raises InputError where trimesh cannot read the file, and where it has no triangles or is longer than 50 m.
+    Raises InputError where trimesh cannot read the file within 1 GiB and 20 s, and where it has no triangles or is
+    longer than 50 m.
     """
-    corners, normals, faces, colors = zip(*_read_parts(path), strict=True)
-    starts = np.cumsum([0, *map(len, corners[:-1])])
-    vertices = np.concatenate(corners)
+    vertices, normals, faces, colors = read_mesh(path)
     low, high = vertices.min(0), vertices.max(0)
     if not np.isfinite(vertices).all() or not (high - low).max() <= LONGEST_M:
         size = " x ".join(f"{length:.4g}" for length in high - low)
         raise InputError(
             f"{path}: the vehicle's size is {size} m (expected at most {LONGEST_M:g} m; scale it to metres)"
         )
-    shifted = np.concatenate([part + start for part, start in zip(faces, starts, strict=True)])
-    return VehicleMesh(vertices, np.concatenate(normals), shifted, np.concatenate(colors), _top_view(low, high))
-
-
-def _read_parts(path: Path) -> list[Part]:
-    """The triangle meshes of a file in the ego frame. Raises InputError."""
-    import trimesh  # only here: it takes half a second to load
-
-    suffix = path.suffix.lower()
-    if suffix not in FORMATS:
-        raise InputError(f"{path}: is not a mesh file (expected a name that ends in {', '.join(FORMATS)})")
-    content = read_bytes(path, LARGEST_TEXT_BYTES if suffix in TEXT_FORMATS else LARGEST_BYTES)
-    try:
-        scene = trimesh.load_scene(io.BytesIO(content), file_type=suffix[1:], resolver=_Siblings(path.parent))
-        if suffix in GLTF_FILES:
-            scene.apply_transform(EGO_FROM_GLTF)
-        parts = [_part(mesh) for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
-    except Exception as error:  # each of trimesh's many readers raises errors of its own
-        reason = reason_of(error)
-        raise InputError(
-            f"{path}: trimesh cannot read this mesh file ({reason}); try .glb, .ply, .obj or .stl"
-        ) from error
-    if not parts:
-        raise InputError(f"{path}: the file has no triangles (expected a triangle mesh of the vehicle)")
-    return parts
-
-
-class _Siblings(Mapping[str, bytes]):
-    """The regular files of a folder by name, as trimesh asks for them: nothing outside of it, and no pipes."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder.resolve()
-
-    def __getitem__(self, name: str) -> bytes:
-        path = (self.folder / name).resolve()
-        if not path.is_relative_to(self.folder):
-            raise InputError(f"{name}: is outside of the mesh file's folder")
-        return read_bytes(path, LARGEST_BYTES)
-
-    def __iter__(self) -> Iterator[str]:
-        return (path.name for path in self.folder.iterdir())
-
-    def __len__(self) -> int:
-        return sum(1 for _ in self)
-
-
-def _part(mesh: Any) -> Part:
-    """Vertices, normals, faces and colours of a trimesh.Trimesh, with sharp edges."""
-    import trimesh
-
-    visual = mesh.visual
-    if visual.kind == "face":
-        mesh.unmerge_vertices()  # no vertex may be shared by faces of different colours
-        visual = mesh.visual
-    if visual.kind == "texture":
-        visual = visual.to_color()  # of each vertex; one colour for all of them where there is no texture image
-    colors = visual.vertex_colors if visual.defined else (*EGO_COLOR, 255)
-    mesh.visual = trimesh.visual.ColorVisuals(vertex_colors=np.broadcast_to(colors, (len(mesh.vertices), 4)))
-    mesh = trimesh.graph.smooth_shade(mesh, angle=SMOOTH_BELOW_RAD, facet_minarea=None)
-    colors = np.array(mesh.visual.vertex_colors, dtype=np.uint8)[:, :3]
-    return np.array(mesh.vertices), np.array(mesh.vertex_normals), np.array(mesh.faces), colors
+    return VehicleMesh(vertices, normals, faces, colors, _top_view(low, high))
 
 
 def _top_view(low: Array, high: Array) -> tuple[Array, ...]:

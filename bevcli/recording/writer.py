@@ -18,7 +18,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid
 from bevcli.recording import entities, log_bev, log_boxes, log_cameras, log_static
 from bevcli.recording.blueprint import LayoutFacts, recording_blueprint
-from bevcli.recording.colors import EGO_COLOR
+from bevcli.recording.colors import EGO_COLOR, class_colors
 from bevcli.recording.ground_lines import future_lines, result_lines
 from bevcli.recording.log_bev import BevColors, BevImages
 from bevcli.recording.log_cameras import PosedCamera, VideoImages
@@ -126,7 +126,7 @@ class Recording:
         self.path, self.rig, self.untrained = Path(path), sequence.rig, model.untrained
         self.title = f"{sequence.name} · {model.config.name}"
         self.note = weights_note(model, sequence)
-        self.class_names = tuple(model.config.classes)
+        self.classes = class_colors(model.config.object_classes.values())
         self._config, self._geo_origin = model.config, sequence.facts.geo_origin
         self._rate_hz, self._has_ego_motion = frame_rate_hz(sequence.stamps), sequence.has_ego_motion
         self.options = RecordingOptions() if options is None else options
@@ -140,7 +140,7 @@ class Recording:
         self._frames = 0
         self._early_events: list[tuple[str, str]] = []  # logged before the first frame
         self._pillars: Array | None = None
-        self._tracks = TrackLog(self._stream, self.class_names)
+        self._tracks = TrackLog(self._stream, self.classes)
         self._video = VideoImages(self._stream) if self.options.images == "av1" else None
         self._bev_images: BevImages[tuple[FrameStamp, Prediction]] | None = None
         if self.options.bev != "none" and self.options.shows_internals:
@@ -152,7 +152,7 @@ class Recording:
         map_classes = self._config.map_classes if self.options.shows_internals else ()
         results = self._config.results
         lines = results.get(MapLines, ())
-        legend = log_static.legend_entries(self.class_names, map_classes, lines, plans=Plan in results)
+        legend = log_static.legend_entries(self.classes, map_classes, lines, plans=Plan in results)
         facts = LayoutFacts(
             note=self.note,
             probes=bool(self.options.probes),
@@ -168,7 +168,7 @@ class Recording:
         self._connect(self._file, recording_blueprint(self.rig, follows))
         if self._live is not None:
             self._live.open(self.path)
-        log_static.log_scene(self._stream, self.rig, self.class_names, vehicle, grid)
+        log_static.log_scene(self._stream, self.rig, self.classes, vehicle, grid)
         self._log_about(map_classes)
         log_static.log_legend(self._stream, legend)
         if self._resume is not None:
@@ -188,7 +188,8 @@ class Recording:
             untrained=self.untrained,
             note=self.note,
             score=self.options.score,
-            class_names=list(self.class_names),
+            class_names=list(self.classes),
+            class_colors=[f"#{bytes(color).hex()}" for color in self.classes.values()],
             camera_names=list(self.rig.names),
             **of_map,
         )
@@ -242,7 +243,7 @@ class Recording:
         self._log_boxes(frame, prediction, cameras)
         self._log_results(prediction, cameras)
         if self._last is None:
-            log_static.log_curve_names(self._stream, prediction.stage_seconds, self.class_names)
+            log_static.log_curve_names(self._stream, prediction.stage_seconds, self.classes)
         self._stream.log(entities.STAGE_CURVES, rr.Scalars(list(prediction.stage_seconds.values())))
         self._log_frame_events(frame, prediction)
         if self.options.shows_internals:
@@ -341,9 +342,9 @@ class Recording:
             found = np.ones(len(truth), dtype=bool)
             if not self.untrained:  # random boxes match nothing: a scene all in red would be useless
                 marks = log_boxes.false_and_duplicate(shown, truth)
-                found = marks.found | log_boxes.other_classes(truth, self.class_names)
+                found = marks.found | log_boxes.other_classes(truth, self.classes)
             self._log_ground_truth(truth, found, world_from_bev, cameras)
-        stream, names = self._stream, self.class_names
+        stream, names = self._stream, self.classes
         ego_xy = self._moved_to_origin(prediction.world_from_ego.matrix)[:2, 3]
         log_boxes.log_boxes_3d(stream, in_world, marks, names, ego_xy)
         log_boxes.log_boxes_bev(stream, shown, marks, names)
@@ -365,14 +366,14 @@ class Recording:
         ground = replace(prediction.ground, world_from_ego=moved)
         shown = prediction.boxes.scored(score).transformed(world_from_bev)
         of_results = result_lines(prediction.results, ground, self._config.results, score)
-        for lines in (*of_results, future_lines(shown, self.class_names)):
+        for lines in (*of_results, future_lines(shown, self.classes)):
             log_ground_lines(self._stream, lines, world_from_bev, cameras)
 
     def _log_ground_truth(
         self, truth: Boxes3D, found: np.ndarray, world_from_bev: Array, cameras: PosedCameras
     ) -> None:
         in_world = truth.transformed(world_from_bev)
-        colors = log_boxes.ground_truth_colors(found, log_boxes.other_classes(truth, self.class_names))
+        colors = log_boxes.ground_truth_colors(found, log_boxes.other_classes(truth, self.classes))
         log_boxes.log_ground_truth_3d(self._stream, in_world, found, colors)
         log_boxes.log_ground_truth_bev(self._stream, truth, found, colors)
         for posed in cameras:

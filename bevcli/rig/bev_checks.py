@@ -23,7 +23,7 @@ def check_bev_frame(ego_from_bev: Array) -> tuple[Finding, ...]:
     if unit != 1:
         found, expected = f"{np.linalg.norm(ego_from_bev[:3, 3]):.0f} m from the ego origin", "about (0.94, 0, 1.84) m"
         message = f'the translation of "ego_from_bev" is in {"millimetres" if unit == 1000 else "centimetres"}'
-        return (_error("translation-unit", message, found, expected, f"divide it by {unit:g}"),)
+        return (_error("translation-unit", message, found, expected, f"divide the translation by {unit:g}"),)
     if _is_plausible(ego_from_bev):
         return _warnings(ego_from_bev)
     return (_mistake(ego_from_bev) or _defect(ego_from_bev),)

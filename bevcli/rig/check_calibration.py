@@ -13,10 +13,11 @@ from bevcli.errors import InputError
 from bevcli.findings import Finding, errors_of
 from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.cameras import CameraRig
+from bevcli.parsing.files import is_there
 from bevcli.rig.coverage import Coverage
 from bevcli.rig.rig_report import RigReport, check_rig, report_text, with_findings
 from bevcli.rig.sequence_checks import check_camera_times, check_scenes
-from bevcli.sequences.files.calibration_file import draft_calibration
+from bevcli.sequences.files.calibration_file import CALIBRATION, draft_calibration
 from bevcli.sequences.native.folder import FolderSequence
 from bevcli.sequences.native.tables import read_frames_table
 from bevcli.sequences.open import open_sequence
@@ -24,7 +25,6 @@ from bevcli.sequences.options import SequenceOptions
 from bevcli.sequences.ros.format import is_ros_bag
 from bevcli.writing import write_whole
 
-CALIBRATION = "calibration.json"
 _Found = tuple[tuple[Finding, ...], Mapping[str, NDArray[np.uint8]]]  # findings, and images by camera
 
 
@@ -153,7 +153,7 @@ def _read_folder(folder: Path, rig: CameraRig, frame: int, allow_outside: bool) 
             return tuple(findings), {}
     if sequence.ego_motion is not None:
         findings += check_scenes(sequence.ego_motion, sequence.stamps)
-    if (folder / "frames.csv").is_file():
+    if is_there(folder / "frames.csv"):
         findings += _check_times(folder / "frames.csv", rig)
     index = _checked_index(sequence.stamps, frame, folder)
     try:

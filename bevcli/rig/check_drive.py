@@ -1,13 +1,25 @@
-"""`input_errors`: the cheap checks of a drive before a run."""
+"""`CheckedDrive` and `input_errors`: the cheap checks of a drive before a run."""
 
 import numpy as np
 
 from bevcli.findings import errors_of
-from bevcli.frame import Sequence
+from bevcli.frame import DerivedSequence, Sequence
 from bevcli.rig.rig_report import rig_errors
 from bevcli.rig.sequence_checks import check_scenes
 
 CHECKED_POSES = 5000  # of a longer drive, every second, third, … pose is checked
+
+
+class CheckedDrive(DerivedSequence):
+    """A drive that was checked once. source: see `input_errors`.
+
+    Attributes:
+        input_errors: one line for each mistake.
+    """
+
+    def __init__(self, drive: Sequence, source: str = "SEQUENCE") -> None:
+        super().__init__(drive)
+        self.input_errors = input_errors(drive, source)
 
 
 def input_errors(drive: Sequence, source: str = "SEQUENCE") -> tuple[str, ...]:

@@ -16,10 +16,11 @@ class CheckOptions:
         reads="path", default=None, help="A sequence folder whose images and ego-motion belong to the calibration."
     )
     frame: int = option(default=0, help="Index of the frame whose images are drawn on.", minimum=0)
-    out: Path | None = option(default=None, help="The output folder. Default: runs/<name>-project-debug.")
+    out: Path | None = option(default=None, help="The output folder. Default: runs/NAME-project-debug.")
     model: str = option(
         reads="path or name",
         default="demo",
         help="Compare the rig with those that this model's weights were trained on: a model name or a FILE.toml.",
+        metavar="NAME|FILE",
         complete=complete_model,
     )

@@ -323,5 +323,5 @@ def _unit_finding(camera: Camera, unit: float) -> Finding:
     return Finding(
         "translation-unit", "error", camera.name, f"the translation is in {name}",
         f"{np.linalg.norm(translation):.0f} m from the ego origin", f"metres, at most {MAX_DISTANCE_M:g}",
-        f"divide it by {unit:g}",
+        f"divide the translation by {unit:g}",
     )  # fmt: skip

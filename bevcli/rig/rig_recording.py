@@ -44,7 +44,7 @@ def write_rig_recording(path: Path, rig: CameraRig, report: RigReport, images: M
             stream.save(unfinished, default_blueprint=_blueprint(rig))
         except RuntimeError as error:
             raise OutputError(f"{path}: the recording cannot be written ({error})") from error
-        log_static.log_scene(stream, rig, ())
+        log_static.log_scene(stream, rig, {})
         _log_scene(stream, rig, report.coverage)
         for camera in rig.cameras:
             _log_camera(stream, camera, rig.ego_from_bev, images.get(camera.name))

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Literal
 
+from bevcli.evaluation.options import MAX_RANGE_HELP
 from bevcli.options import option, options
 
 LostImage = Literal["black", "missing"]
@@ -23,7 +24,7 @@ class StressOptions:
     )
     max_range_m: float | None = option(
         default=None,
-        help="Ignore boxes beyond this distance. Default: the nearest side of the BEV grid.",
+        help=MAX_RANGE_HELP,
         flag="--max-range",
         metavar="METRES",
     )

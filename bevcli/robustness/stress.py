@@ -146,7 +146,7 @@ class _Test:
 
     def __post_init__(self) -> None:
         self.range_m = self.options.max_range_m or self.model.config.bev_grid.nearest_side_m
-        self.metrics = DetectionConfig().cut_at(self.range_m)
+        self.metrics = DetectionConfig.of(self.model.config.object_classes).cut_at(self.range_m)
 
     def header(self) -> dict[str, Any]:
         """A description of the test for stress.json. It names no folders, so that the file is the same everywhere."""
@@ -210,7 +210,7 @@ class _Test:
         steps = self.runner.run(sequence, range(len(sequence.stamps)), Preprocessor(model.config))
         for frame, prediction, _ in steps:
             if frame.ground_truth is not None:
-                yield boxes_ego(frame, frame.ground_truth, prediction)
+                yield boxes_ego(frame, frame.ground_truth, prediction, self.metrics.classes)
             self.after_frame()
             if self.should_stop():
                 raise _Stopped

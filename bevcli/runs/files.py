@@ -3,6 +3,7 @@
 import contextlib
 import hashlib
 import json
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,18 +11,23 @@ from typing import Any
 
 import numpy as np
 
-from bevcli.errors import OutputError
+from bevcli.config import as_table
+from bevcli.errors import InputError, OutputError
 from bevcli.evaluation.export import CsvWriter
 from bevcli.evaluation.submission import SubmissionWriter
 from bevcli.frame import Frame, Prediction, Sequence
 from bevcli.geometry.boxes import attributes_by_speed
+from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Pose
 from bevcli.inference.load import Model
+from bevcli.model.config import ModelConfig
+from bevcli.parsing.files import open_regular
 from bevcli.recording.writer import LiveSink, Recording, RecordingState
 from bevcli.runs.folder import RunFolder
 from bevcli.runs.options import RunOptions
 from bevcli.runs.result_files import RESULT_WRITERS, ResultWriter
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
+from bevcli.sequences.files.calibration_file import CALIBRATION, write_calibration
 from bevcli.sequences.files.incremental_json import partial_path
 from bevcli.sequences.files.json_fields import pose_to_json
 from bevcli.sequences.files.map_folder import map_path, write_map
@@ -50,19 +56,20 @@ class _Growing:
 
     def add(self, path: Path) -> None:
         """Hash one more file; a missing one has no bytes."""
-        with contextlib.suppress(OSError):
-            content = path.read_bytes()
-            self._size += len(content)
-            self._hash.update(content)
+        self._hash_from(path, 0, sys.maxsize)
 
     def up_to(self, path: Path, size: int) -> Kept:
         """What the file holds in its first `size` bytes; fewer if it is shorter."""
-        with contextlib.suppress(OSError), path.open("rb") as file:
-            file.seek(self._size)
+        self._hash_from(path, self._size, size)
+        return self.kept
+
+    def _hash_from(self, path: Path, start: int, size: int) -> None:
+        """Hash a regular file from a place on, until `size` bytes are hashed. A pipe or a device has no bytes."""
+        with contextlib.suppress(OSError, InputError), open_regular(path) as file:
+            file.seek(start)
             while self._size < size and (block := file.read(min(BLOCK, size - self._size))):
                 self._hash.update(block)
                 self._size += len(block)
-        return self.kept
 
     @property
     def kept(self) -> Kept:
@@ -143,6 +150,7 @@ class RunFiles:
             "model": model.name,
             "untrained": model.untrained,
             "classes": list(model.config.classes),
+            **_class_settings(model.config),
             "range_m": model.config.bev_grid.nearest_side_m,
         }
         if model.config.results:
@@ -158,6 +166,9 @@ class RunFiles:
             self._open_results(extras)
             if resume is not None and resume.submission is not None:
                 self._open_submission(resume.submission)
+            if len({stamp.scene for stamp in sequence.stamps}) == 1:  # scenes may have rigs of their own
+                self._folder.add(out / CALIBRATION)
+                write_calibration(out / CALIBRATION, sequence.rig, sequence.facts)
             for note in sequence.notes if resume is None else ():
                 self._recording.event(note, "WARN")
             self._stack = self._stack.pop_all()
@@ -181,7 +192,8 @@ class RunFiles:
             self._bev_frames.append(frame.stamp.index)
             self._add_bev(frame.stamp.index)
         self._recording.log(frame, prediction)
-        boxes = frame_boxes(frame, prediction, world=self._sequence.has_ego_motion)
+        classes = self._model.config.object_classes
+        boxes = frame_boxes(frame, prediction, world=self._sequence.has_ego_motion, classes=classes)
         if self._tracks is not None:
             instances = boxes.boxes.instances
             tracked = boxes if instances is None else replace(boxes, boxes=boxes.boxes[instances != ""])
@@ -259,12 +271,20 @@ class RunFiles:
 
     def written(self) -> tuple[Path, ...]:
         """The files and folders that exist so far."""
-        paths = [self._out / name for name in (RECORDING, PREDICTIONS, TRACKS, SUBMISSION, SEGMENTATION)]
+        paths = [self._out / name for name in (RECORDING, PREDICTIONS, TRACKS, SUBMISSION, SEGMENTATION, CALIBRATION)]
         paths += [self._out / writer.name for writer in self._results.values()]
         return tuple(path for path in (*paths, self._options.save_bev) if path is not None and path.exists())
 
 
-def frame_boxes(frame: Frame, prediction: Prediction, *, world: bool) -> FrameBoxes:
+def _class_settings(config: ModelConfig) -> dict[str, object]:
+    """The settings of a model's own classes, for the head of predictions.json; empty without any."""
+    settings = as_table(config)["class_settings"]
+    return {"class_settings": settings} if settings else {}
+
+
+def frame_boxes(
+    frame: Frame, prediction: Prediction, *, world: bool, classes: Mapping[str, ObjectClass] = NUSCENES_CLASSES
+) -> FrameBoxes:
     """A prediction as predictions.json holds it: all boxes, with attributes, in the world frame or the ego frame."""
     extras: dict[str, object] = {"skipped": True} if prediction.skipped else {}
     if prediction.not_finite:
@@ -274,7 +294,7 @@ def frame_boxes(frame: Frame, prediction: Prediction, *, world: bool) -> FrameBo
     if frame.sample_token is not None:
         extras["sample_token"] = frame.sample_token
     boxes = prediction.boxes_world if world else prediction.boxes_ego
-    boxes = replace(boxes, attributes=attributes_by_speed(boxes))
+    boxes = replace(boxes, attributes=attributes_by_speed(boxes, classes))
     return FrameBoxes(frame.stamp, frame.world_from_ego if world else None, boxes, extras)
 
 
@@ -303,6 +323,6 @@ def _save_bev(folder: Path, prediction: Prediction, model: Model) -> None:
         "untrained": model.untrained,
     }
     name = f"{prediction.stamp.index:06d}"
-    with whole_file(folder / f"{name}.npy", parents=True) as unfinished:
+    with whole_file(folder / f"{name}.npy", parents=True, regular=True) as unfinished:
         np.save(unfinished, features)
-    write_whole(folder / f"{name}.json", f"{json.dumps(facts, indent=1)}\n".encode())
+    write_whole(folder / f"{name}.json", f"{json.dumps(facts, indent=1)}\n".encode(), regular=True)

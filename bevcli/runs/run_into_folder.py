@@ -15,6 +15,7 @@ from bevcli.inference.run import RunnerState, run_steps
 from bevcli.inference.runner import StepOptions
 from bevcli.model.temporal_model import model_class
 from bevcli.recording.writer import LiveSink
+from bevcli.rig.check_drive import CheckedDrive
 from bevcli.runs.files import RunFiles
 from bevcli.runs.folder import SUMMARY, RunFolder
 from bevcli.runs.options import RunOptions
@@ -74,7 +75,8 @@ def run_into_folder(
             folder.remove_written()
             state = RunState(facts, None, Counts())
             save_state(folder.state_path, state)
-        summary = RunSummary(model, sequence, options, state.counts)
+        checked = sequence if isinstance(sequence, CheckedDrive) else CheckedDrive(sequence)
+        summary = RunSummary(model, checked, options, state.counts)
         folder.add(out / SUMMARY)
         files = RunFiles(folder, sequence, model, options, live, state.files, done=state.frames)
         began_at = state.frames

@@ -180,6 +180,8 @@ def _image_facts(sequence: Sequence) -> str:
             found.update(f"{path.name} {facts.st_size} {facts.st_mtime_ns}\n".encode(errors="surrogateescape"))
         except OSError as error:
             found.update(f"{path.name} {error.errno}\n".encode(errors="surrogateescape"))
+        except ValueError:  # a null byte in the name
+            found.update(b"no name\n")
     return f"{len(paths)}, {short_hash(found.hexdigest())}"
 
 
@@ -191,7 +193,7 @@ def short_hash(hexdigest: str) -> str:
 def save_state(path: Path, state: object) -> None:
     """Write a state. The file is replaced at once, so that it is whole at every moment. Raises OutputError."""
     tensors = _tensors_of(state)
-    write_whole(path, save(tensors, {"format": FORMAT, "sha256": _hash(tensors)}))
+    write_whole(path, save(tensors, {"format": FORMAT, "sha256": _hash(tensors)}), regular=True)
 
 
 def load_state(path: Path, kind: type[Loaded]) -> Loaded:

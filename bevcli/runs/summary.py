@@ -9,9 +9,9 @@ from pathlib import Path
 
 from bevcli._version import __version__
 from bevcli.duration import duration
-from bevcli.frame import Frame, Prediction, Sequence
+from bevcli.frame import Frame, Prediction
 from bevcli.inference.load import Model
-from bevcli.rig.check_drive import input_errors
+from bevcli.rig.check_drive import CheckedDrive
 from bevcli.runs.folder import SUMMARY
 from bevcli.runs.options import RunOptions
 from bevcli.writing import write_whole
@@ -91,13 +91,13 @@ class RunSummary:
     Attributes:
         files: that the run wrote.
         counts: so far.
-        input_errors: one line for each, see `bevcli.rig.check_drive`.
+        input_errors: of the drive, one line for each, see `bevcli.rig.check_drive`.
     """
 
-    def __init__(self, model: Model, sequence: Sequence, options: RunOptions, counts: Counts) -> None:
+    def __init__(self, model: Model, sequence: CheckedDrive, options: RunOptions, counts: Counts) -> None:
         self.files: tuple[Path, ...] = ()
         self._model, self._sequence, self._options, self.counts = model, sequence, options, counts
-        self.input_errors = input_errors(sequence)
+        self.input_errors = sequence.input_errors
 
     def add(self, frame: Frame, prediction: Prediction, recording_s: float, whole_s: float) -> None:
         """Count a frame. recording_s: spent on writing. whole_s: since the frame before was done."""
@@ -168,7 +168,7 @@ class RunSummary:
         """Write summary.json into a folder. files: that the run wrote. Raises OutputError."""
         path = folder / SUMMARY
         self.files = (*files, path)
-        write_whole(path, (json.dumps(self.to_dict(), indent=1) + "\n").encode())
+        write_whole(path, (json.dumps(self.to_dict(), indent=1) + "\n").encode(), regular=True)
 
     def table(self) -> str:
         """The summary as a few aligned lines."""

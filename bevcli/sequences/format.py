@@ -31,6 +31,7 @@ class Format:
             imported when it is needed. `open_sequence` itself selects the scene and the frames, and takes away the
             ground truth. Raises InputError.
         options: the dataclass of its own options.
+        annotated: whether its drives may have ground truth that opening them reads, so that `bevcli eval` takes them.
         precedence: the format with the highest one is taken where several recognise a path. A format that needs little
             to recognise a path has a low one.
     """
@@ -40,6 +41,7 @@ class Format:
     recognises: Callable[[Path], bool]
     opener: str | Callable[[Path, SequenceOptions, Any], Sequence]
     options: type[FormatOptions] = FormatOptions
+    annotated: bool = False
     precedence: int = 0
 
     def open(self, path: Path, common: SequenceOptions, own: FormatOptions) -> Sequence:
@@ -73,6 +75,7 @@ def option_classes() -> list[type[FormatOptions]]:
 def format_of(path: Path) -> Format:
     """The format of a path. Raises InputError if it is missing, or has no known format or two."""
     known, broken = _loaded()
+    known = tuple(sorted(known, key=lambda one: one.precedence))  # in messages, the most general one comes first
     if not path.exists():
         raise InputError(f"{path}: is missing (expected {_either([one.name for one in known])})")
     matching = [one for one in known if one.recognises(path)]

@@ -4,14 +4,26 @@ from pathlib import Path
 from typing import Any
 
 from bevcli.frame import Sequence
+from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.options import defaults, gather
+from bevcli.sequences.files.class_names import ClassNames
 from bevcli.sequences.format import format_of, own_options
 from bevcli.sequences.options import SequenceOptions
-from bevcli.sequences.selection import WithoutGroundTruth, select_every, select_range, select_rate, select_scene
+from bevcli.sequences.selection import (
+    WithClassNames,
+    WithoutGroundTruth,
+    select_every,
+    select_range,
+    select_rate,
+    select_scene,
+)
 
 
 def open_sequence(path: str | Path, options: SequenceOptions | None = None, **changes: Any) -> Sequence:
-    """Open a drive: a native sequence folder (images or videos), a nuScenes dataset root, an MCAP file or a ROS 2 bag.
+    """Open a drive.
+
+    It is a native sequence folder (images or videos), a nuScenes dataset root, an MCAP file, a ROS 2 bag, or a drive of
+    another data set (docs/other-inputs.md).
 
         drive = open_sequence("my_drive")
         drive = open_sequence("drive.mcap", calibration="calibration.json")
@@ -25,8 +37,8 @@ def open_sequence(path: str | Path, options: SequenceOptions | None = None, **ch
     Args:
         path: the folder or file.
         options: the options of every format; None for the defaults.
-        changes: options as keywords, those of `SequenceOptions` and those of the path's format: `NativeOptions`,
-            `NuScenesOptions`, `BagOptions`, or the options of an installed format.
+        changes: options as keywords, those of `SequenceOptions` and those of the path's format: `RigOptions`,
+            `NuScenesOptions`, `BagOptions`, `Argoverse2Options` and so on, or the options of an installed format.
 
     Raises InputError if the path has no known format, a file is missing or invalid, the format does not have an option,
     or no frame is left; TypeError for an option that no format has.
@@ -36,7 +48,9 @@ def open_sequence(path: str | Path, options: SequenceOptions | None = None, **ch
     chosen = format_of(path)
     own = own_options(path, chosen, changes)
     sequence = chosen.open(path, options, own)
-    if not options.ground_truth:
+    if options.ground_truth:
+        sequence = WithClassNames(sequence, ClassNames(options.class_map, options.classes or NUSCENES_CLASSES))
+    else:
         sequence = WithoutGroundTruth(sequence)
     if options.scene is not None:
         sequence = select_scene(sequence, options.scene)

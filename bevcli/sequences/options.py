@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from bevcli.errors import InputError
-from bevcli.options import option, options
+from bevcli.options import option, options, parse_pairs
 
 if TYPE_CHECKING:
     from bevcli.geometry.cameras import CameraRig
@@ -40,8 +41,33 @@ def parse_rate(text: str) -> float | Literal["all"]:
     return rate_hz
 
 
+def parse_class_map(texts: list[str]) -> dict[str, str]:
+    """A class map from texts NAME=CLASS and names of TOML files. Raises ValueError, InputError for a file."""
+    from bevcli.sequences.files.class_names import read_class_map
+
+    files = [text for text in texts if text.endswith(".toml") and "=" not in text]
+    pairs = parse_pairs([text for text in texts if text not in files], "NAME=CLASS or FILE.toml")
+    merged: dict[str, str] = {}
+    for file in files:
+        merged |= read_class_map(Path(file))
+    return merged | pairs
+
+
 @options("Input")
-class SequenceOptions:
+class ClassOptions:
+    """The class names of ground truth."""
+
+    class_map: Mapping[str, str] = option(
+        default_factory=dict,
+        help="Rename a class of the ground truth to one of the model's, such as Lorry=truck. Repeatable.",
+        metavar="NAME=CLASS|FILE.toml",
+        parse=parse_class_map,
+        repeatable=True,
+    )
+
+
+@options("Input")
+class SequenceOptions(ClassOptions):
     """The options of every input format: which frames, and how strictly they are read."""
 
     frames: slice | None = option(
@@ -73,6 +99,9 @@ class SequenceOptions:
     model_rate_hz: float | None = option(
         default=None, help="Frame rate of a model, used without `rate_hz` and `every`.", hidden=True
     )
+    classes: tuple[str, ...] | None = option(
+        default=None, help="The classes of a model. Default: nuScenes' ten.", hidden=True
+    )
 
     def __post_init__(self) -> None:
         if self.rate_hz is not None and self.every is not None:
@@ -82,10 +111,15 @@ class SequenceOptions:
         if self.every is not None and self.every < 1:
             raise InputError(f"`every={self.every}`: expected an integer, 1 or more")
 
+    def refuse_static(self, path: Path) -> None:
+        """Raise InputError for `ego_motion="static"`. path: of an input that has its own ego-motion."""
+        if self.ego_motion == "static":
+            raise InputError(f'{path}: has its own ego-motion: remove `ego_motion="static"`')
+
     def for_model(self, config: ModelConfig, *, temporal: bool = True) -> SequenceOptions:
-        """The options for a run of a model: at its rate, and with ego-motion required only where history needs it."""
+        """The options for a run of a model: its rate and classes, and ego-motion only where history needs it."""
         use = "optional" if self.ego_motion == "required" and not temporal else self.ego_motion
-        return replace(self, ego_motion=use, model_rate_hz=config.rate_hz)
+        return replace(self, ego_motion=use, model_rate_hz=config.rate_hz, classes=config.classes)
 
 
 @options()

@@ -1,6 +1,7 @@
 """A part of a sequence as a sequence: one scene, a range of frames, or a lower frame rate."""
 
-from collections.abc import Iterator, Sequence as Indices
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence as Indices
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -9,6 +10,7 @@ import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.frame import DerivedSequence, Frame, FrameStamp, Sequence
+from bevcli.sequences.files.class_names import ClassNames
 
 # A scene counts as having the wanted rate if the ratio of its rate to it is in this range: keyframe times jitter.
 SLOWEST_RATIO, FASTEST_RATIO = 0.75, 1.5
@@ -28,6 +30,10 @@ class Selection(DerivedSequence):
         """Those of the frame at position `place` of the selection."""
         return self.sequence.image_files(self._indices[place])
 
+    def ground_truth_frame(self, place: int) -> Frame:
+        """The frame at position `place` of the selection, for scoring."""
+        return self.sequence.ground_truth_frame(self._indices[place])
+
     def load(self, place: int) -> Frame:
         """The frame at position `place` of the selection, with decoded images."""
         return self.sequence.load(self._indices[place])
@@ -39,6 +45,33 @@ class WithoutGroundTruth(DerivedSequence):
     def load(self, place: int) -> Frame:
         """The frame at a place, without boxes and map."""
         return replace(super().load(place), ground_truth=None, ground_truth_map=None)
+
+
+class WithClassNames(DerivedSequence):
+    """A sequence whose ground truth has the names of known classes; a note names boxes of other classes."""
+
+    def __init__(self, sequence: Sequence, names: ClassNames) -> None:
+        super().__init__(sequence)
+        self._names = names
+        self.notes = (*sequence.notes, *names.note(sequence.class_counts, f"{sequence.name}: the ground truth"))
+
+    @property
+    def class_counts(self) -> Mapping[str, int]:
+        counts: Counter[str] = Counter()
+        for name, count in self.sequence.class_counts.items():
+            counts[self._names[name]] += count
+        return counts
+
+    def ground_truth_frame(self, place: int) -> Frame:
+        return self._renamed(self.sequence.ground_truth_frame(place))
+
+    def load(self, place: int) -> Frame:
+        """The frame at a place, with the names of known classes."""
+        return self._renamed(self.sequence.load(place))
+
+    def _renamed(self, frame: Frame) -> Frame:
+        truth = frame.ground_truth
+        return frame if truth is None else replace(frame, ground_truth=self._names.renamed(truth))
 
 
 def select(sequence: Sequence, indices: Indices[int], notes: tuple[str, ...] = ()) -> Sequence:

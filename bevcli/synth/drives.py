@@ -4,7 +4,7 @@ import hashlib
 import os
 import shutil
 import threading
-from collections.abc import Sequence as Items
+from collections.abc import Mapping, Sequence as Items
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
@@ -15,6 +15,7 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.inference.preprocess import image_for_rig, network_scale, rig_enlargement
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.sequences.open import open_sequence
+from bevcli.sequences.options import SequenceOptions
 from bevcli.synth.assets.catalog import Assets
 from bevcli.synth.drive import RenderedDrive
 from bevcli.synth.export import export_drive
@@ -49,9 +50,9 @@ class FolderDrives:
 
     input_shapes: tuple[InputShape, ...] | None = None
 
-    def __init__(self, folders: Items[Path], rate_hz: float) -> None:
+    def __init__(self, folders: Items[Path], config: ModelConfig, class_map: Mapping[str, str] | None = None) -> None:
         self._folders = tuple(folders)
-        self._rate_hz = rate_hz
+        self._options = SequenceOptions(class_map or {}, rate_hz=config.rate_hz, classes=config.classes)
         self._of_thread = threading.local()  # a Sequence must be read from one thread
 
     def __len__(self) -> int:
@@ -61,7 +62,7 @@ class FolderDrives:
         """The drive at an index, thinned to the model's frame rate. Raises InputError."""
         opened: dict[int, Sequence] = vars(self._of_thread).setdefault("opened", {})
         if index not in opened:
-            opened[index] = open_sequence(self._folders[index], rate_hz=self._rate_hz)
+            opened[index] = open_sequence(self._folders[index], self._options)
         return opened[index]
 
 
@@ -76,7 +77,12 @@ class RenderedDrives(FolderDrives):
     """
 
     def __init__(
-        self, seeds: Items[int], cache: Path, config: ModelConfig, rig: CameraRig | RigDistribution | None = None
+        self,
+        seeds: Items[int],
+        cache: Path,
+        config: ModelConfig,
+        rig: CameraRig | RigDistribution | None = None,
+        class_map: Mapping[str, str] | None = None,
     ) -> None:
         image, (width, height) = config.image, config.image.size
         name = f"{width}x{height}"
@@ -88,7 +94,7 @@ class RenderedDrives(FolderDrives):
             found = nuscenes_like_rig(width, height) if rig is None else _fitting(rig, image)
             self._rigs = [DrawnRig(found)] * len(seeds)
             name += "" if rig is None else f"-rig-{_digest(found)}"
-        super().__init__([cache / name / f"{seed:06d}" for seed in seeds], config.rate_hz)
+        super().__init__([cache / name / f"{seed:06d}" for seed in seeds], config, class_map)
         self.input_shapes = _if_different(tuple(_input_shape(drawn.rig, image) for drawn in self._rigs))
         self._seeds, self._config = tuple(seeds), config
         self._rendering = threading.Lock()
@@ -174,6 +180,7 @@ def open_drives(
     cache: Path,
     config: ModelConfig,
     rig: CameraRig | RigDistribution | None = None,
+    class_map: Mapping[str, str] | None = None,
 ) -> Drives:
     """The drives in folders, or those rendered from seeds.
 
@@ -182,13 +189,16 @@ def open_drives(
         seeds: of rendered drives; None if folders are given.
         cache: the folder that keeps rendered drives.
         rig: of rendered drives, or the distribution of their rigs; None for the default rig.
+        class_map: names of the ground truth -> classes of the model.
 
     Raises:
         InputError: both or neither are given.
     """
     if bool(folders) == (seeds is not None):
         raise InputError("choose the drives: give either `data=DIR` (repeatable) or `rendered=SEEDS`, not both")
-    return FolderDrives(folders, config.rate_hz) if seeds is None else RenderedDrives(seeds, cache, config, rig)
+    if seeds is None:
+        return FolderDrives(folders, config, class_map)
+    return RenderedDrives(seeds, cache, config, rig, class_map)
 
 
 def check_training_seeds(seeds: Items[int]) -> None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 from bevcli.errors import InputError
 from bevcli.options import option, option_of, options
+from bevcli.sequences.options import ClassOptions
 
 if TYPE_CHECKING:
     from bevcli.geometry.cameras import CameraRig
@@ -47,7 +48,7 @@ class RenderOptions:
         default=20, help="Number of frames.", metavar="N", flag="--count", old=("--frames",), minimum=1
     )
     rig: str | Path | CameraRig | None = option(
-        reads="path or name",
+        reads="path",
         default=None,
         help="The cameras, a calibration.json. Default: six cameras like nuScenes.",
         metavar="FILE",
@@ -103,7 +104,7 @@ class DemoOptions:
 
 
 @options()
-class DriveOptions:
+class DriveOptions(ClassOptions):
     """Drives with ground truth: sequences, or rendered ones."""
 
     data: tuple[Path, ...] = option(

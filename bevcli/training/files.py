@@ -20,7 +20,7 @@ from bevcli.inference.training_rigs import weights_facts
 from bevcli.model.network import Network
 from bevcli.parsing.files import MIB, read_text
 from bevcli.parsing.pth import read_pth
-from bevcli.writing import whole_file
+from bevcli.writing import whole_file, write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -89,8 +89,7 @@ def save_weights(path: Path, model: Network, dtype: torch.dtype) -> None:
         key: (tensor.to(dtype) if tensor.is_floating_point() else tensor).contiguous().cpu()
         for key, tensor in model.state_dict().items()
     }
-    with whole_file(path) as unfinished:
-        safetensors.torch.save_file(state, unfinished, weights_facts(model.config))
+    write_whole(path, safetensors.torch.save(state, weights_facts(model.config)))
 
 
 class LearningCurve:

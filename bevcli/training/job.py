@@ -208,7 +208,7 @@ def prepare_training(
     out = options.out or Path("runs") / f"train-{model_config.name}"
     check_training_seeds(data.rendered or ())
     rigs = config.rigs if config.rigs.random_share > 0 else None
-    drives = open_drives(data.data, data.rendered, out / "drives", model_config, rigs)
+    drives = open_drives(data.data, data.rendered, out / "drives", model_config, rigs, data.class_map)
     drives, evaluated = split_drives(drives, config.held_out)
     prepare_folder(out, resume=options.resume)
     model = build_network(model_config)

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from bevcli.evaluation.options import MAX_RANGE_HELP
 from bevcli.options import option, options
 
 
@@ -34,6 +35,7 @@ class ValidationOptions:
 
     rig: str | None = option(
         reads="path or name",
+        complete=lambda incomplete: ["random"],
         default=None,
         help="Cameras of the rendered drives: a calibration.json, scaled to the model's image size, or a random rig "
         "for each drive, from training.rigs of the model. Default: six cameras like nuScenes.",
@@ -41,7 +43,7 @@ class ValidationOptions:
     )
     max_range: float | None = option(
         default=None,
-        help="Ignore boxes beyond this distance. Default: the nearest side of the BEV grid.",
+        help=MAX_RANGE_HELP,
         metavar="METRES",
     )
     tracking: bool = option(default=False, help="Also run the tracker and score its tracks: AMOTA, identity switches.")

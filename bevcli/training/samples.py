@@ -210,7 +210,8 @@ def _targets(frames: list[Frame], config: ModelConfig) -> Targets:
     if "segmentation" not in config.heads:
         return Targets(detection, perspective, ())
     maps = [frame.ground_truth_map for frame in frames]
-    segmentation = (segmentation_targets(*pair, config.bev_grid) for pair in zip(boxes, maps, strict=True))
+    grid, classes = config.bev_grid, config.object_classes
+    segmentation = (segmentation_targets(*pair, grid, classes) for pair in zip(boxes, maps, strict=True))
     return Targets(detection, perspective, tuple(segmentation))
 
 

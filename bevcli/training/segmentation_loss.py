@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,8 +14,8 @@ from bevcli.errors import InputError
 from bevcli.frame import BevMap
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.model.segmentation import STUFF_CLASSES, SegmentationOutputs
-from bevcli.synth.render.ground import VEHICLE_CLASSES
 from bevcli.training.detection_loss import focal_cost, focal_loss, has_points, hungarian_matching
 
 # A cell belongs to a class that covers at least this share of it. Lines are thinner than a cell: their share is lower.
@@ -44,13 +44,19 @@ class SegmentationTargets:
         return SegmentationTargets(stuff, self.things.to(device), self.locations.to(device))
 
 
-def segmentation_targets(boxes: Boxes3D, bev_map: BevMap | None, grid: BevGrid) -> SegmentationTargets:
+def segmentation_targets(
+    boxes: Boxes3D,
+    bev_map: BevMap | None,
+    grid: BevGrid,
+    classes: Mapping[str, ObjectClass] = NUSCENES_CLASSES,
+) -> SegmentationTargets:
     """Masks on the BEV grid. Raises InputError if the map does not cover the grid, or has none of STUFF_CLASSES.
 
     Args:
         boxes: the frame's ground truth boxes, bev frame.
     """
-    vehicles = boxes[np.isin(boxes.classes, VEHICLE_CLASSES) & has_points(boxes)]
+    names = [name for name, one in classes.items() if one.vehicle]
+    vehicles = boxes[np.isin(boxes.classes, names) & has_points(boxes)]
     vehicles = vehicles[(grid.cell_of(vehicles.centers[:, :2]) >= 0).all(-1)]
     stuff = None if bev_map is None else torch.from_numpy(_stuff(bev_map, grid)).float()
     footprints, locations = (torch.from_numpy(make(vehicles, grid)).float() for make in (_footprints, _locations))

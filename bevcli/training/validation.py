@@ -1,7 +1,7 @@
 """Scores of a model over several drives: each is run as by `bevcli run`, and all are scored as by `bevcli eval`."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import Any
@@ -16,6 +16,7 @@ from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmenta
 from bevcli.evaluation.tracking.scoring import TrackingScores, evaluate_tracking
 from bevcli.frame import MAP_CLASSES, Frame, Prediction
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
+from bevcli.geometry.object_classes import ObjectClass
 from bevcli.geometry.transforms import inverse
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner
@@ -108,7 +109,8 @@ def validate(
         each_drive: score each drive alone too.
     """
     range_m = runner.config.bev_grid.nearest_side_m if max_range_m is None else max_range_m
-    config = DetectionConfig().cut_at(range_m)
+    classes = runner.config.object_classes
+    config = DetectionConfig.of(classes).cut_at(range_m)
     predictions: list[Boxes3D] = []
     truths: list[Boxes3D] = []
     maps = []
@@ -124,7 +126,7 @@ def validate(
             if frame.ground_truth is not None:
                 if tracker is not None:
                     tracks.append((index, frame, prediction.boxes_world, frame.ground_truth))
-                predicted, truth = boxes_ego(frame, frame.ground_truth, prediction)
+                predicted, truth = boxes_ego(frame, frame.ground_truth, prediction, classes)
                 predictions.append(predicted)
                 truths.append(truth)
             if prediction.segmentation is not None and frame.ground_truth_map is not None:
@@ -138,7 +140,7 @@ def validate(
         config,
         evaluate_detections(predictions, truths, config),
         evaluate_segmentation(maps) if maps else None,
-        None if tracker is None else _score_tracks(tracks, TrackingConfig().cut_at(range_m)),
+        None if tracker is None else _score_tracks(tracks, TrackingConfig.of(classes).cut_at(range_m)),
         tuple(of_drives),
     )
 
@@ -154,10 +156,12 @@ def drives_table(drives: Sequence[DriveScores]) -> str:
     return "\n".join(lines)
 
 
-def boxes_ego(frame: Frame, ground_truth: Boxes3D, prediction: Prediction) -> tuple[Boxes3D, Boxes3D]:
+def boxes_ego(
+    frame: Frame, ground_truth: Boxes3D, prediction: Prediction, classes: Mapping[str, ObjectClass]
+) -> tuple[Boxes3D, Boxes3D]:
     """Predicted and ground truth boxes in the ego frame. The model has no attributes: they follow from the speed."""
     predicted = prediction.boxes_ego
-    predicted = replace(predicted, attributes=attributes_by_speed(predicted))
+    predicted = replace(predicted, attributes=attributes_by_speed(predicted, classes))
     return predicted, ground_truth.transformed(inverse(frame.world_from_ego.matrix))
 
 

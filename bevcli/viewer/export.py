@@ -1,38 +1,34 @@
-"""Exports the boxes of a recording: as a table (.csv), or as a boxes file that `bevcli eval` reads (.json)."""
+"""The boxes of a recording, and their export: a table (.csv), or a boxes file that `bevcli eval` reads (.json)."""
 
-import csv
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from bevcli.errors import InputError
+from bevcli.evaluation.export import write_csv
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
-from bevcli.parsing.csv_cells import cell_of
 from bevcli.recording import entities
-from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, write_boxes
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
-from bevcli.writing import whole_file
 
-COLUMNS = (
-    "frame", "scene", "timestamp_ns", "class", "score", "x", "y", "z", "length", "width", "height", "yaw",
-    "velocity_x", "velocity_y", "instance",
-)  # fmt: skip
+
+def read_recording(recording: Path) -> BoxesFile:
+    """The shown boxes of all frames, in the world frame."""
+    return BoxesFile("world", tuple(recorded_boxes(frame) for frame in RecordingReader(recording).frames()))
 
 
 def export_boxes(recording: Path, path: Path) -> tuple[int, int]:
-    """Writes the shown boxes, in the world frame, metres and radians; returns the number of frames and of boxes.
+    """Write the shown boxes, in the world frame, metres and radians; return the number of frames and of boxes.
 
     Raises InputError if the path does not end in .csv or .json, OutputError if the file cannot be written.
     """
-    writers = {".csv": _write_csv, ".json": _write_json}
+    writers = {".csv": write_csv, ".json": write_boxes}
     if path.suffix.lower() not in writers:
         raise InputError(f"{path}: the file must end in .csv or .json")
-    frames = [recorded_boxes(frame) for frame in RecordingReader(recording).frames()]
-    writers[path.suffix.lower()](path, frames)
-    return len(frames), sum(len(frame.boxes) for frame in frames)
+    boxes = read_recording(recording)
+    return len(boxes.frames), writers[path.suffix.lower()](boxes, path)
 
 
 def recorded_boxes(frame: RecordedFrame) -> FrameBoxes:
@@ -55,27 +51,3 @@ def recorded_boxes(frame: RecordedFrame) -> FrameBoxes:
     world_from_ego = pose[0].reshape(4, 4).copy() if len(pose) else np.eye(4)
     world_from_ego[:3, 3] += origin
     return FrameBoxes(stamp, Pose.from_matrix(world_from_ego), boxes)
-
-
-def _write_csv(path: Path, frames: list[FrameBoxes]) -> None:
-    with whole_file(path) as unfinished, unfinished.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(COLUMNS)
-        for frame in frames:
-            writer.writerows(_rows(frame))
-
-
-def _rows(frame: FrameBoxes) -> Iterator[list[object]]:
-    stamp, boxes = frame.stamp, frame.boxes
-    assert boxes.scores is not None
-    for i, score in enumerate(boxes.scores):
-        numbers = (score, *boxes.centers[i], *boxes.sizes_lwh[i], boxes.yaws[i], *boxes.velocities[i])
-        instance = "" if boxes.instances is None else cell_of(boxes.instances[i])
-        rounded = (f"{number:.4f}" for number in numbers)
-        yield [stamp.index, cell_of(stamp.scene), stamp.timestamp_ns, cell_of(boxes.classes[i]), *rounded, instance]
-
-
-def _write_json(path: Path, frames: list[FrameBoxes]) -> None:
-    with BoxesWriter(path, "world") as writer:
-        for frame in frames:
-            writer.write(frame)

@@ -53,5 +53,8 @@ class ViewOptions:
         metavar="OUT.mp4|.webm",
     )
     export: Path | None = option(
-        default=None, help="Write the shown boxes in the world frame.", metavar="BOXES.csv|.json"
+        default=None,
+        help="Write the shown boxes in the world frame.",
+        metavar="BOXES.csv|.json",
+        retired="bevcli export RECORDING.rrd writes the boxes",
     )

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import struct
 import subprocess
-import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Literal
 
 import rerun as rr
 
 from bevcli.errors import BevcliError, InputError, OutputError
+from bevcli.parsing.own_process import run_program, run_python
 from bevcli.viewer.native import viewer_binary, viewer_environment
 from bevcli.writing import whole_file
 
@@ -25,11 +26,7 @@ if TYPE_CHECKING:
 CHECK = """
 import sys, warnings
 from rerun.chunk import RrdReader
-try:
-    import resource
-    resource.setrlimit(resource.RLIMIT_DATA, (int(sys.argv[2]), int(sys.argv[2])))
-except (ImportError, ValueError, OSError):
-    pass
+limit_memory()
 warnings.simplefilter("ignore")
 try:
     for chunk in RrdReader(sys.argv[1]).stream():
@@ -99,7 +96,7 @@ def recording_in(path: Path) -> Path:
 def _check(file: Path, path: Path) -> None:
     """Raises InputError, which names `path`, unless all of a file can be read."""
     memory = CHECK_MEMORY + 4 * file.stat().st_size
-    done = _run([sys.executable, "-c", CHECK, str(file), str(memory)], path)
+    done = _run(path, partial(run_python, CHECK, [file], memory))
     if done.returncode == 0 and CUT_SHORT in done.stderr:
         raise InputError(f"{path}: the recording cannot be read: it is damaged (rerun does not read all of it)")
     if done.returncode:
@@ -127,16 +124,16 @@ def restore_index(path: Path) -> bool:
 
 def _repair(path: Path, copy: Path) -> None:
     """Copies all messages of a recording that can be read. Raises InputError if this takes too long."""
-    _run([str(viewer_binary()), "rrd", "filter", "--continue-on-error", str(path), "-o", str(copy)], path)
+    command = [str(viewer_binary()), "rrd", "filter", "--continue-on-error", str(path), "-o", str(copy)]
+    _run(path, partial(run_program, command))
 
 
-def _run(command: list[str], path: Path) -> subprocess.CompletedProcess[bytes]:
+def _run(path: Path, run: Callable[..., subprocess.CompletedProcess[bytes]]) -> subprocess.CompletedProcess[bytes]:
+    """Run a process that reads a recording. run: takes its time limit and its environment."""
     seconds = SECONDS + path.stat().st_size / BYTES_PER_SECOND
     environment = {**viewer_environment(), **CHECK_ENVIRONMENT, "RUST_BACKTRACE": "0"}
     try:
-        return subprocess.run(
-            command, stdin=subprocess.DEVNULL, capture_output=True, env=environment, check=False, timeout=seconds
-        )
+        return run(seconds=seconds, environment=environment)
     except subprocess.TimeoutExpired:
         raise InputError(f"{path}: the recording cannot be read within {seconds:.0f} s: it is damaged") from None
 

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.frame import MAP_CLASSES
+from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass, color_of_hex
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.images import decode_image
 from bevcli.recording import entities
 from bevcli.recording.blueprint import rows_of_largest_images
-from bevcli.recording.colors import Color, class_color, line_colors, map_colors
+from bevcli.recording.colors import Color, class_colors, line_colors, map_colors
 from bevcli.recording.ground_lines import KINDS
 from bevcli.recording.video_images import Av1Decoder, require_av
 from bevcli.viewer.recording_reader import RecordedFrame
@@ -233,11 +234,10 @@ def _draw_legend(canvas: Canvas, frame: RecordedFrame) -> None:
     if any(frame.values(entities.RUN, "untrained")):
         note = "UNTRAINED WEIGHTS: boxes are meaningless"
     draw_text(canvas, note, (CAMERAS_WIDTH - 480, 24), WARNING, 0.6)
-    names = frame.values(entities.RUN, "class_names")
     counts = Counter(frame.values(entities.BOXES, "name"))
-    for index, name in enumerate(names):
+    for index, (name, color) in enumerate(_class_colors(frame).items()):
         place = 16 + 250 * (index % 5), 60 + 32 * (index // 5)
-        _draw_entry(canvas, place, class_color(name, index), f"{name.replace('_', ' ')} {counts[name]}")
+        _draw_entry(canvas, place, color, f"{name.replace('_', ' ')} {counts[name]}")
     lines = line_colors(frame.values(entities.RUN, "line_classes"))
     for index, (name, color) in enumerate(lines.items()):
         _draw_entry(canvas, (16 + 250 * index, 60 + 32 * 2), color, f"line: {name.replace('_', ' ')}")
@@ -247,6 +247,14 @@ def _draw_legend(canvas: Canvas, frame: RecordedFrame) -> None:
         width = min(250, (CAMERAS_WIDTH - 16) // len(classes))
         for index, (name, color) in enumerate(map_colors(classes).items()):
             _draw_entry(canvas, (16 + width * index, 60 + 32 * 2), color, f"map: {name.replace('_', ' ')}")
+
+
+def _class_colors(frame: RecordedFrame) -> dict[str, Color]:
+    """The colours of the model's classes. Recordings of version 0.1.0 name the classes only."""
+    names, stated = (frame.values(entities.RUN, key) for key in ("class_names", "class_colors"))
+    if not stated:
+        return class_colors(NUSCENES_CLASSES.get(name, ObjectClass(name)) for name in names)
+    return dict(zip(names, map(color_of_hex, stated), strict=True))
 
 
 def _draw_entry(canvas: Canvas, place: tuple[int, int], color: Color, text: str) -> None:

@@ -71,7 +71,8 @@ def test_drives_have_bytes_of_single_runs_and_a_bad_one_is_a_row(batch, fleet, t
     for name in COMPARED:
         assert (results["d001"] / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()
     facts = json.loads((results["d001"] / "summary.json").read_text())
-    assert facts["files"] == [str(results["d001"] / name) for name in ("recording.rrd", *COMPARED, "summary.json")]
+    names = ("recording.rrd", *COMPARED, "calibration.json", "summary.json")
+    assert facts["files"] == [str(results["d001"] / name) for name in names]
     rows = pq.read_table(tmp_path / "out/batch.parquet").to_pylist()
     assert [row["drive"] for row in rows] == ["d000", "d001", "d002", "empty"]
     assert [row["frames"] for row in rows] == [3, 3, 3, None]

@@ -137,6 +137,7 @@ class RenamedOptions:
     ("arguments", "expected", "notes"),
     [
         ((), RenamedOptions(), []),
+        (("--count", "4", "--file", "a", "--all"), RenamedOptions(4, (Path("a"),), True), []),
         (("--frames", "3"), RenamedOptions(3), ["--frames is now --count; the old form ends with this release"]),
         (("--number", "5"), RenamedOptions(5), ["--number is now --count; the old form ends with this release"]),
         (

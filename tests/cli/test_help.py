@@ -29,6 +29,7 @@ def test_help_of_the_program_groups_all_commands_unbuilt(monkeypatch):
 def test_help_of_a_command_fits_80_columns(name):
     text = help_of(*name.split())
     assert max(map(len, text.splitlines())) <= 80
+    assert "<" not in text.replace("<=", "")  # typer's names of types
     assert "bool" not in text
     assert "\\" not in text
 

@@ -47,8 +47,8 @@ def test_static_takes_precedence_over_no_temporal(mini_model):
 
 
 def test_model_names_are_completed():
-    assert complete_model("") == list(known_models())
-    assert complete_model("ti") == ["tiny"]
+    assert complete_model("") == sorted({*known_models(), "tiny-fp16"})
+    assert complete_model("ti") == ["tiny", "tiny-fp16"]
 
 
 @pytest.mark.parametrize("name", ["cuda:", "gpu", "cuda:x"])

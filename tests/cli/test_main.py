@@ -74,7 +74,10 @@ def test_a_mistake_in_the_input_is_one_line_and_exits_1(arguments, message, tmp_
         ("project-debug", SAMPLE, "--sequence", "nope"),
         ("quantize", "nope", "--calibrate", SAMPLE),
         ("quantize", SAMPLE, "--calibrate", "nope"),
+        ("batch", "nope", "--out", "out"),
+        ("batch", "nope/*", "--out", "out"),
         ("render", "out", "--rig", "nope.json"),
+        ("render", "out", "--rig", "nope"),
         ("stress", "nope"),
         ("train", "nope.toml"),
         ("train", "demo", "--data", "nope"),
@@ -87,8 +90,27 @@ def test_a_mistake_in_the_input_is_one_line_and_exits_1(arguments, message, tmp_
 def test_a_missing_path_is_refused_before_slow_imports(arguments, monkeypatch):
     for name in [name for name in sys.modules if name.partition(".")[0] in HEAVY]:
         monkeypatch.delitem(sys.modules, name)
-    with pytest.raises(InputError, match=r"nope[.a-z]*: there is no such file or folder"):
+    with pytest.raises(InputError, match=r"nope[.a-z]*: there is no such file|nope/\*: nothing matches"):
         app([str(each) for each in arguments], standalone_mode=False)
+    assert [name for name in HEAVY if name in sys.modules] == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("run", SAMPLE, "--model", "tinny"), "--model tinny: is unknown: did you mean tiny?"),
+        (("train", "--model", "bas"), "--model bas: is unknown: did you mean base?"),
+        (("weights", "inspect", "--model", "x"), "--model x: is unknown: expected one of base, demo, "),
+        (("validate", "--rig", "randon"), "--rig randon: is unknown: did you mean random?"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, tuple) else "",
+)
+def test_an_unknown_name_is_refused_before_slow_imports(arguments, message, monkeypatch):
+    for name in [name for name in sys.modules if name.partition(".")[0] in HEAVY]:
+        monkeypatch.delitem(sys.modules, name)
+    with pytest.raises(InputError) as raised:
+        app([str(each) for each in arguments], standalone_mode=False)
+    assert str(raised.value).startswith(message)
     assert [name for name in HEAVY if name in sys.modules] == []
 
 

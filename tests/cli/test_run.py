@@ -43,9 +43,11 @@ def test_the_command_runs_the_sample_and_says_untrained(tmp_path):
         "recording.rrd",
         "predictions.json",
         "summary.json",
+        "calibration.json",
         "tracks.csv",
         ".bevcli",
     }
+    assert json.loads((out / "calibration.json").read_text()) == json.loads((SAMPLE / "calibration.json").read_text())
     boxes = read_boxes(out / "predictions.json")
     assert [len(frame.boxes) for frame in boxes.frames] == [10, 10]
     assert boxes.extras["untrained"] is True

@@ -57,6 +57,13 @@ def test_an_old_form_works_with_a_note(arguments, note, tmp_path):
     assert others[-1].startswith("error: ")
 
 
+def test_each_flag_belongs_to_one_parameter():
+    """A new spelling that is also the old one's gives a note to those who use it."""
+    for found in commands().values():
+        flags = [flag for each in found.params for flag in (*each.opts, *each.secondary_opts)]
+        assert len(flags) == len(set(flags)), found.name
+
+
 def test_train_asks_for_a_model(tmp_path):
     done = command(tmp_path, "train", "--rendered", "0:2")
     assert done.returncode == 2

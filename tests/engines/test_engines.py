@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import gc
 import json
+import os
 import shutil
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from forks import FORKS
 from typer.testing import CliRunner
 
 from bevcli.cli.main import app
+from bevcli.cli.stop_signals import EndSignals
 from bevcli.config import as_table, load_config
 from bevcli.engines.export_onnx import export_onnx
 from bevcli.engines.exported import load_exported
@@ -163,6 +167,50 @@ def test_a_node_that_fails_when_it_runs_is_one_line(small_file, tmp_path):
     with pytest.raises(WeightsError, match=r"fails\.onnx: fails when it runs") as caught:
         step_of_file(model, small_inputs())
     assert "\n" not in str(caught.value)
+
+
+@pytest.fixture(scope="module")
+def endless_file(small_file) -> Path:
+    """Its step has a loop of 2^62 trips, which ONNX Runtime never leaves by itself."""
+    make, kinds = onnx.helper, onnx.TensorProto
+    states = [make.make_tensor_value_info(*each) for each in (("trip", kinds.INT64, []), ("go", kinds.BOOL, []))]
+    value, total = (make.make_tensor_value_info(name, kinds.INT64, [1]) for name in ("value", "total"))
+    go_on = make.make_tensor_value_info("go_on", kinds.BOOL, [])
+    nodes = [make.make_node("Identity", ["go"], ["go_on"]), make.make_node("Add", ["value", "one"], ["total"])]
+    body = make.make_graph(nodes, "body", [*states, value], [go_on, total])
+    proto, name = onnx.load(small_file), "most_cameras_per_cell"
+    for node in proto.graph.node:
+        node.output[:] = ["before" if each == name else each for each in node.output]
+    proto.graph.node.append(make.make_node("Loop", ["trips", "", "before"], [name], body=body))
+    for each, shape, numbers in (("trips", [], [1 << 62]), ("one", [1], [1])):
+        proto.graph.initializer.append(make.make_tensor(each, kinds.INT64, shape, numbers))
+    file = small_file.with_name("endless.onnx")
+    onnx.save(proto, file)
+    return file
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_two_signals_end_an_endless_loop_of_a_file(endless_file, tmp_path, number):
+    process = FORKS.Process(target=run_for_ever, args=(endless_file, tmp_path / "ready"))
+    process.start()
+    end = time.monotonic() + 60
+    while not (tmp_path / "ready").exists():
+        assert process.is_alive()
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    for _ in range(2):
+        time.sleep(0.2)
+        os.kill(process.pid, number)
+    process.join(10)
+    assert process.exitcode == 128 + number
+
+
+def run_for_ever(file: Path, ready: Path) -> None:
+    """Run a file with the signals of the program, which every command has."""
+    EndSignals().start()
+    model = load_exported(file, "onnxruntime")
+    ready.touch()
+    step_of_file(model, small_inputs())
 
 
 def test_an_output_that_is_missing_or_misshapen_is_named(small_file, tmp_path):

@@ -184,9 +184,12 @@ def test_the_deployment_pages_program_finds_the_boxes_of_bevcli(demo_file, tmp_p
     program = page.split("```python\n")[1].split("```")[0]
     street = ROOT / "samples" / "street"
     done = subprocess.run(
-        [sys.executable, "-c", program, str(demo_file), str(street)], capture_output=True, text=True, check=False
+        [sys.executable, "-W", "error", "-c", program, str(demo_file), str(street)],
+        capture_output=True,
+        text=True,
+        check=False,
     )
-    assert done.returncode == 0, done.stderr
+    assert (done.returncode, done.stderr) == (0, "")
     model = load_model("demo", device="cpu")
     expected = [prediction.boxes for _, prediction in run(model, open_sequence(street))]
     lines = done.stdout.splitlines()

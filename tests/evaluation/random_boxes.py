@@ -6,20 +6,21 @@ from dataclasses import replace
 
 import numpy as np
 
-from bevcli.geometry.boxes import CLASSES, Boxes3D
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.object_classes import NUSCENES_CLASSES
 
 
 def random_truth(seed: int, frames: int = 6, per_class: int = 3) -> list[Boxes3D]:
     """Frames with boxes of every class, within 28 m of the origin, everything about them known."""
     rng = np.random.default_rng(seed)
-    count = per_class * len(CLASSES)
+    count = per_class * len(NUSCENES_CLASSES)
     return [
         Boxes3D(
             centers=np.concatenate([rng.uniform(-19, 19, (count, 2)), rng.normal(0, 0.5, (count, 1))], axis=1),
             sizes_lwh=rng.uniform(0.5, 5, (count, 3)),
             yaws=rng.uniform(-3, 3, count),
             velocities=rng.normal(0, 3, (count, 2)),
-            classes=np.repeat(CLASSES, per_class),
+            classes=np.repeat(tuple(NUSCENES_CLASSES), per_class),
             attributes=np.repeat(["vehicle.moving"], count),
             visibilities=rng.uniform(0, 1, count),
             num_points=rng.integers(1, 50, count),

@@ -164,6 +164,21 @@ def test_the_command_does_not_replace_its_input(tmp_path: Path) -> None:
     assert path.read_bytes() == before
 
 
+def test_kitti_takes_the_calibration_next_to_the_boxes(tmp_path: Path) -> None:
+    sample = Path(__file__).parents[2] / "samples/street"
+    shutil.copy(sample / "ground_truth.json", tmp_path)
+    arguments = ["export", str(tmp_path / "ground_truth.json"), "--format", "kitti"]
+    result = CliRunner().invoke(app, arguments)
+    assert isinstance(result.exception, InputError)
+    assert f"there is no {tmp_path / 'calibration.json'}" in str(result.exception)
+    shutil.copy(sample / "calibration.json", tmp_path)
+    for chosen in ([], ["--calibration", str(sample), "--out", str(tmp_path / "stated")]):
+        assert CliRunner().invoke(app, [*arguments, *chosen], catch_exceptions=False).exit_code == 0
+    names = sorted(path.relative_to(tmp_path / "kitti") for path in (tmp_path / "kitti").rglob("*.txt"))
+    assert len(names) == 40  # labels and calibrations of 20 frames
+    assert all((tmp_path / "kitti" / name).read_text() == (tmp_path / "stated" / name).read_text() for name in names)
+
+
 def test_a_table_that_does_not_fit_leaves_the_old_one(tmp_path: Path) -> None:
     boxes = read_boxes(Path(__file__).parents[2] / "samples/street/ground_truth.json")
     path, before = tmp_path / "boxes.csv", resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -14,7 +14,8 @@ import pytest
 from bevcli.errors import InputError
 from bevcli.evaluation.submission import SubmissionWriter, is_submission, read_submission, write_submission
 from bevcli.frame import FrameStamp
-from bevcli.geometry.boxes import CLASSES, Boxes3D, attributes_by_speed
+from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
+from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import Pose, yaw_of_quaternion
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 
@@ -37,7 +38,7 @@ def many_boxes(count: int, seed: int = 0) -> Boxes3D:
         sizes_lwh=rng.uniform(0.3, 8, (count, 3)),
         yaws=rng.uniform(-math.pi, math.pi, count),
         velocities=velocities,
-        classes=rng.choice(CLASSES, count),
+        classes=rng.choice(tuple(NUSCENES_CLASSES), count),
         scores=rng.uniform(0, 1, count),
     )
 
@@ -55,7 +56,7 @@ def assert_valid(submission: dict[str, Any], tokens: set[str]) -> None:
             for key, length in (("translation", 3), ("size", 3), ("rotation", 4), ("velocity", 2)):
                 assert len(box[key]) == length
                 assert all(type(number) is float and math.isfinite(number) for number in box[key])
-            assert box["detection_name"] in CLASSES
+            assert box["detection_name"] in NUSCENES_CLASSES
             assert type(box["detection_score"]) is float
             allowed = ALLOWED_ATTRIBUTES.get(box["detection_name"], VEHICLE_ATTRIBUTES)
             assert box["attribute_name"] in allowed

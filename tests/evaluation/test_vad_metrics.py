@@ -13,7 +13,8 @@ from bevcli.evaluation.map_lines import _Curve, evaluate_lines, similarity
 from bevcli.evaluation.motion import MIN_SCORE, evaluate_motion, match
 from bevcli.evaluation.planning import PlannedFrame, PlanScores, collisions, evaluate_plans, hits, occupancy
 from bevcli.frame import MapLines
-from bevcli.geometry.boxes import CLASSES, Boxes3D
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.object_classes import NUSCENES_CLASSES
 
 VEHICLES = range(14, 24)
 HUMANS = range(2, 9)
@@ -68,7 +69,7 @@ def boxes_of(side: dict[str, Any], offsets: np.ndarray) -> Boxes3D:
         rows[:, [4, 3, 5]],
         -rows[:, 6] - np.pi / 2,
         rows[:, 7:],
-        np.array(CLASSES)[side["labels"]],
+        np.array(list(NUSCENES_CLASSES))[side["labels"]],
         np.array(side["scores"]) if "scores" in side else None,
         futures=np.concatenate([seconds, places], axis=-1),
     )

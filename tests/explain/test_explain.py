@@ -10,10 +10,10 @@ import torch
 from command_line import command
 from memory_drive import MemorySequence, make_rig
 
-from bevcli.errors import InputError
+from bevcli.errors import InputError, OutputError
 from bevcli.explain import figures
 from bevcli.explain.drawing import project_bev
-from bevcli.explain.figures import FIGURES, write_figures
+from bevcli.explain.figures import FIGURES, check_figures, write_figures
 from bevcli.explain.head_figures import reference_points
 from bevcli.explain.trace import cell_at, trace
 from bevcli.inference.preprocess import Preprocessor
@@ -72,6 +72,28 @@ def test_a_figure_of_the_same_frame_has_the_same_bytes(mini_model, tmp_path, mon
         [_] = write_figures(trace(mini_model, CPU, MemorySequence(1), 0, None), tmp_path / name)
     one, other = (tmp_path / name / "bevformer-spatial-attention.png" for name in ("one", "other"))
     assert one.read_bytes() == other.read_bytes()
+
+
+def test_figures_are_replaced_only_when_asked(mini_model, tmp_path, monkeypatch):
+    draw_only(monkeypatch, "overview", "segmentation")  # the second one is left out
+    traced = trace(mini_model, CPU, MemorySequence(1), 0, None)
+    check_figures(tmp_path / "new", force=False)
+    for name in ("bevformer-segmentation.png", "bevformer-overview.jpg", "mine.png"):
+        (tmp_path / name).write_text("earlier")
+        with pytest.raises(OutputError, match="exists already; pass `force=True`"):
+            check_figures(tmp_path, force=False)
+    check_figures(tmp_path, force=True)
+    list(write_figures(traced, tmp_path))
+    assert {path.name for path in tmp_path.iterdir()} == {"bevformer-overview.png", "mine.png"}
+
+
+def test_the_command_refuses_a_folder_with_figures(tmp_path):
+    out = tmp_path / "runs/street-demo-explained"
+    out.mkdir(parents=True)
+    (out / "bevformer-overview.png").touch()
+    result = command(tmp_path, "explain", SAMPLE.absolute())
+    assert result.returncode == 1
+    assert "runs/street-demo-explained/bevformer-overview.png: exists already; pass --force" in result.stderr
 
 
 @pytest.mark.parametrize(

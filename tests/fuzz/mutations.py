@@ -60,7 +60,7 @@ def mutated(seed: bytes, changes: list[Edit]) -> bytes:
 
 def _changed(data: bytes, name: str, where: int, what: int) -> bytes:
     if name in TREE:
-        return _changed_tree(data, name, where, what)
+        return changed_tree(data, name, where, what)
     if name in TEXT:
         return _changed_text(data, name, where, what)
     place = where % (len(data) + 1)
@@ -93,7 +93,8 @@ def _changed_text(data: bytes, name: str, where: int, what: int) -> bytes:
     return data[: word.start()] + new + data[word.end() :]
 
 
-def _changed_tree(data: bytes, name: str, where: int, what: int) -> bytes:
+def changed_tree(data: bytes, name: str, where: int, what: int) -> bytes:
+    """A JSON document after one change of TREE; one that cannot be parsed stays as it is."""
     try:
         document = json.loads(data)
     except (ValueError, RecursionError):

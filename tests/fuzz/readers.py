@@ -133,6 +133,10 @@ def _nuscenes(folder: Path) -> None:
     _open(folder / "nuscenes")
 
 
+def _other(name: str) -> Callable[[Path], None]:
+    return lambda folder: _open(folder / name)
+
+
 def _bag(name: str) -> Callable[[Path], None]:
     return lambda folder: _open(folder / name)
 
@@ -189,6 +193,16 @@ READERS = {
     "checkpoint": Reader("checkpoint.pt", "bytes", _checkpoint),
     "learning curve": Reader("loss.csv", "text", _checkpoint),
     "vehicle mesh": Reader("vehicle.glb", "bytes", _vehicle),
+    **{
+        f"{name} {Path(file).stem}": Reader(f"{name}/{file}", kind, _other(name))
+        for name, file, kind in (
+            ("dgp", "scene_s.json", "json"),
+            ("dgp", "calibration/c.json", "json"),
+            ("argoverse2", "annotations.feather", "bytes"),
+            ("argoverse2", "calibration/intrinsics.feather", "bytes"),
+            ("t4", "annotation/calibrated_sensor.json", "json"),
+        )
+    },
     "CAN bus": Reader("nuscenes/can_bus/scene-0001_pose.json", "json", _nuscenes),
     **{
         f"nuScenes {name}": Reader(f"nuscenes/v1.0-mini/{name}.json", "json", _nuscenes)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections
 import datetime
 import json
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 
@@ -18,8 +19,10 @@ from bags import drive_messages, write_mcap, write_rosbag2
 from memory_drive import MemorySequence, make_rig
 from nuscenes_tables import Size, scene_name, write_tables
 from recorded_drive import record
+from written_formats import WRITTEN
 
 from bevcli.frame import FrameStamp
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
 from bevcli.model.bevformer.bevformer import BevHistory
 from bevcli.runs.state import RunState, save_state
@@ -31,6 +34,7 @@ from bevcli.training.files import save_checkpoint
 CAMERAS = ("CAM_FRONT", "CAM_BACK")
 SIZE = (64, 36)
 QUATERNIONS = {"CAM_FRONT": [0.5, -0.5, 0.5, -0.5], "CAM_BACK": [0.5, -0.5, -0.5, 0.5]}
+BOX = Boxes3D(np.ones((1, 3)), np.ones((1, 3)), np.zeros(1), np.full((1, 2), np.nan), np.array(["car"]))
 START_NS, STEP_NS, FRAMES = 1_000_000_000, 500_000_000, 2
 
 
@@ -42,6 +46,7 @@ def write_seeds(folder: Path) -> None:
     _weights(folder)
     record(folder / "recording.rrd", MemorySequence(1, make_rig({"CAM_FRONT": 0.0})))
     _nuscenes(folder / "nuscenes")
+    _other_formats(folder)
     _boxes(folder)
     _bags(folder)
     _runs(folder)
@@ -176,6 +181,14 @@ def _bags(folder: Path) -> None:
     messages = list(drive_messages(open_sequence(folder / "drive"), motion))
     write_mcap(folder / "bag.mcap", messages)
     write_rosbag2(folder / "rosbag2", messages, "sqlite3")
+
+
+def _other_formats(folder: Path) -> None:
+    drive = open_sequence(folder / "drive", ground_truth=False)
+    box = replace(BOX, instances=np.array(["1"]))
+    frames = [replace(drive.load(place), ground_truth=box) for place in range(FRAMES)]
+    for name, written in WRITTEN.items():
+        written.write(frames, folder / name)
 
 
 def _nuscenes(root: Path) -> None:

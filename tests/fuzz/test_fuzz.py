@@ -62,7 +62,7 @@ def test_a_broken_file_is_read_or_refused_in_one_line(name, seeds, worker):
             folder = Path(SAVE) / name.replace(" ", "_")
             folder.mkdir(parents=True, exist_ok=True)
             (folder / hashlib.sha256(data).hexdigest()[:16]).write_bytes(data)
-        outcome = worker.read(name, data)
+        outcome = worker.run(name, data)
         assert outcome == "read" or outcome.startswith("refused: "), outcome
 
     check()

@@ -1,7 +1,8 @@
-"""A process that reads broken files, with limits on time and memory; what it cannot survive ends only the process."""
+"""A process that runs fuzz cases, with limits on time and memory; what it cannot survive ends only the process."""
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
 import resource
@@ -10,8 +11,15 @@ import sys
 import tempfile
 import traceback
 import warnings
+from collections.abc import Callable
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
+from random import Random
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from readers import Reader
 
 SECONDS = 10.0
 MEMORY = 1 << 30  # bytes beyond what the libraries and the seed files take
@@ -19,23 +27,27 @@ START_SECONDS = 240.0
 
 
 class Worker:
-    """Reads broken files, one after the other, in another process, which is replaced where a file ends it.
+    """Runs cases, one after the other, in another process, which is replaced where a case ends it.
 
-    seeds: the folder of seed files; each process works in a copy.
+    seeds: the folder of seed files; each process works in a copy. group: of `groups.GROUPS`, run in
+    place of the readers.
     """
 
-    def __init__(self, seeds: Path) -> None:
-        self._seeds = seeds
+    def __init__(self, seeds: Path, group: str | None = None) -> None:
+        self._seeds, self._group = seeds, group
         self._process: multiprocessing.process.BaseProcess | None = None
         self._connection: Connection | None = None
 
-    def read(self, reader: str, data: bytes) -> str:
-        """What comes of a broken file: "read", "refused: …" (one BevcliError), or what went wrong."""
+    def run(self, name: str, case: bytes | int) -> str:
+        """What comes of a case: "read", "refused: …" (one BevcliError), or what went wrong.
+
+        name: of a reader, whose file then holds the bytes; or of a group, whose case has this number.
+        """
         if self._process is None or not self._process.is_alive():
             self._start()
         assert self._connection is not None
         try:
-            self._connection.send((reader, data))
+            self._connection.send((name, case))
             if self._connection.poll(SECONDS):
                 return self._connection.recv()
             answer = f"hang: more than {SECONDS:.0f} s"
@@ -55,7 +67,7 @@ class Worker:
         context = multiprocessing.get_context("spawn")
         self._connection, other = context.Pipe()
         os.environ.setdefault("MALLOC_ARENA_MAX", "2")
-        self._process = context.Process(target=_serve, args=(other, self._seeds, sys.path), daemon=True)
+        self._process = context.Process(target=_serve, args=(other, self._seeds, self._group, sys.path), daemon=True)
         self._process.start()
         other.close()
         if not self._connection.poll(START_SECONDS):
@@ -64,21 +76,28 @@ class Worker:
         assert answer == "ready", answer
 
 
-def _serve(connection: Connection, seeds: Path, path: list[str]) -> None:
+def _serve(connection: Connection, seeds: Path, group: str | None, path: list[str]) -> None:
     sys.path[:] = path
     from readers import READERS
 
     warnings.simplefilter("ignore")
+    logging.disable()
     with tempfile.TemporaryDirectory(prefix="bevcli-fuzz-") as folder:
-        own = Path(folder) / "files"
+        own, case = Path(folder) / "files", Path(folder) / "case"
         shutil.copytree(seeds, own)
         os.environ["XDG_CACHE_HOME"] = folder
         os.chdir(folder)
         with open(os.devnull, "w") as silent:  # FFmpeg and libpng complain there about every broken file
             os.dup2(silent.fileno(), 2)
         try:
-            for reader in READERS.values():
-                reader.read(own)
+            runs: dict[str, Callable[..., None]]
+            if group is not None:
+                runs = {group: _group_run(group, own, case)}
+                _outcome(partial(runs[group], 0), 0)  # makes what all cases share
+            else:
+                runs = {name: partial(_read, reader, own) for name, reader in READERS.items()}
+                for reader in READERS.values():
+                    reader.read(own)
         except BaseException:
             connection.send(traceback.format_exc())
             raise
@@ -87,26 +106,43 @@ def _serve(connection: Connection, seeds: Path, path: list[str]) -> None:
         base = _bytes_of("VmRSS")
         connection.send("ready")
         while True:
-            name, data = connection.recv()
+            name, given = connection.recv()
             Path("/proc/self/clear_refs").write_text("5")  # the peak is measured from now on
-            connection.send(_outcome(READERS[name], own, data, base))
+            connection.send(_outcome(partial(runs[name], given), base))
 
 
-def _outcome(reader, own: Path, data: bytes, base: int) -> str:
-    from bevcli.errors import BevcliError
-
+def _read(reader: Reader, own: Path, data: bytes) -> None:
+    """Reads the seed files with other contents of one of them."""
     file = own / reader.file
     whole = file.read_bytes()
     try:
         file.write_bytes(data)
         reader.read(own)
+    finally:
+        file.write_bytes(whole)
+
+
+def _group_run(name: str, own: Path, case: Path) -> Callable[[int], None]:
+    from groups import GROUPS
+
+    def run(number: int) -> None:
+        shutil.rmtree(case, ignore_errors=True)
+        case.mkdir()
+        GROUPS[name].run(own, case, Random(f"{name} {number}"))
+
+    return run
+
+
+def _outcome(run: Callable[[], None], base: int) -> str:
+    from bevcli.errors import BevcliError
+
+    try:
+        run()
         answer = "read"
     except BevcliError as error:
         answer = f"refused: {error}" if "\n" not in str(error) else f"several lines: {error}"
     except BaseException:
         answer = traceback.format_exc()
-    finally:
-        file.write_bytes(whole)
     grown = _bytes_of("VmHWM") - base
     return answer if grown <= MEMORY else f"memory: {grown >> 20} MiB more than before; {answer}"
 

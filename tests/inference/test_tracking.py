@@ -9,7 +9,7 @@ import pytest
 from bevcli.evaluation.tracking.scoring import evaluate_tracking
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.inference.tracking import Gates, TrackerConfig, step
+from bevcli.inference.tracking import TrackerConfig, step
 from bevcli.sequences.files.boxes_file import read_boxes
 
 STREET = Path(__file__).parents[2] / "samples" / "street" / "ground_truth.json"
@@ -131,13 +131,13 @@ def test_a_step_changes_neither_its_state_nor_the_boxes():
 
 
 def test_a_box_outside_the_gate_is_another_object():
-    config = TrackerConfig(gates_m=Gates(car=2.0))
+    config = TrackerConfig(gates_m={"car": 2.0})
     assert identities([box(0, 0), box(1.9, 0)], config=config) == [["0"], ["0"]]
     assert identities([box(0, 0), box(2.1, 0)], config=config) == [["0"], ["1"]]
 
 
 def test_gates_belong_to_classes():
-    config = TrackerConfig(gates_m=Gates(car=0.5, bus=3.0, other=1.0))
+    config = TrackerConfig(gates_m={"car": 0.5, "bus": 3.0, "other": 1.0})
     frames = [frame(*(box(10 * k, y, name=name) for k, name in enumerate(("car", "bus", "tram")))) for y in (0, 2)]
     assert identities(frames, config=config) == [["0", "1", "2"], ["3", "1", "4"]]
 
@@ -212,4 +212,4 @@ def test_parameters_that_make_no_sense_are_errors(wrong):
     with pytest.raises(ValueError):
         TrackerConfig(**wrong)
     with pytest.raises(ValueError, match=r"gates_m\.car must be above 0 m"):
-        Gates(car=0.0)
+        TrackerConfig(gates_m={"car": 0.0})

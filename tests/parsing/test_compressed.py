@@ -73,6 +73,21 @@ def test_a_computed_column_is_refused(tmp_path, table):
         SqliteFile(tmp_path / "a.db3")
 
 
+def test_names_and_messages_of_other_types_are_refused(tmp_path):
+    with sqlite3.connect(tmp_path / "a.db3", timeout=5) as database:
+        database.execute("CREATE TABLE topics (id, name, type, serialization_format)")
+        database.execute("CREATE TABLE messages (id, topic_id, timestamp, data)")
+        database.execute("INSERT INTO topics VALUES (1, '/a', 'std_msgs/msg/String', 'cdr')")
+        database.execute("INSERT INTO messages VALUES (1, 1, 5, 'text')")
+    with pytest.raises(InputError, match=r"/a: message 0 is broken \('text' is not bytes\)"):
+        SqliteFile(tmp_path / "a.db3").read("/a", 0)
+    with database:
+        database.execute("UPDATE topics SET name = x'2f61'")
+    database.close()
+    with pytest.raises(InputError, match="table topics: b'/a' is no text"):
+        SqliteFile(tmp_path / "a.db3")
+
+
 def test_a_virtual_table_is_refused(tmp_path):
     with sqlite3.connect(tmp_path / "a.db3", timeout=5) as database:
         database.execute("CREATE TABLE topics (id, name, type, serialization_format)")

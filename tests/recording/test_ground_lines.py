@@ -93,7 +93,7 @@ def test_the_commanded_path_is_a_ribbon(frames: list[RecordedFrame]) -> None:
 
 
 def test_futures_fade_with_time_and_with_the_score_of_the_mode() -> None:
-    lines = future_lines(with_futures()[:1], ["car"])
+    lines = future_lines(with_futures()[:1], {"car": (1, 2, 3)})
     assert len(lines.strips) == 4  # two modes of two steps
     np.testing.assert_allclose(lines.strips[0][:, :2], [[0, 12], [0, 14]])
     first, later, unlikely, _ = (color[3] for color in lines.colors)

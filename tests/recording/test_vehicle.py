@@ -13,8 +13,9 @@ from recorded_drive import record
 
 from bevcli.errors import InputError
 from bevcli.parsing.files import read_bytes
-from bevcli.recording import entities, vehicle
+from bevcli.recording import entities, mesh_file
 from bevcli.recording.colors import EGO_COLOR
+from bevcli.recording.mesh_file import read_parts
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.vehicle import default_vehicle, load_vehicle
 from bevcli.viewer.recording_reader import RecordingReader
@@ -126,14 +127,16 @@ TRIANGLE = "mtllib {}\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl paint\nf 1 2 3\n"
 
 @pytest.mark.parametrize("name", ["own.mtl", "pipe.mtl", "../secret.mtl", "missing.mtl"])
 def test_a_mesh_reads_only_regular_files_of_its_folder(tmp_path, monkeypatch, name):
+    """Read in this process, to see what is read."""
     folder, read = tmp_path / "mesh", []
     folder.mkdir()
     for path in (tmp_path / "secret.mtl", folder / "own.mtl"):
         path.write_text("newmtl paint\nKd 1 0 0\n")
     os.mkfifo(folder / "pipe.mtl")
     (folder / "car.obj").write_text(TRIANGLE.format(name))
-    monkeypatch.setattr(vehicle, "read_bytes", lambda path, most: read.append(path.name) or read_bytes(path, most))
-    assert load_vehicle(folder / "car.obj").faces.tolist() == [[0, 1, 2]]  # a part that is missing has no colour
+    monkeypatch.setattr(mesh_file, "read_bytes", lambda path, most: read.append(path.name) or read_bytes(path, most))
+    ((_, _, faces, _),) = read_parts(folder / "car.obj")  # a part that is missing has no colour
+    assert faces.tolist() == [[0, 1, 2]]
     assert ("secret.mtl" in read, "own.mtl" in read) == (False, name == "own.mtl")
 
 
@@ -143,6 +146,28 @@ def test_a_text_mesh_over_16_mib_is_refused_unread(tmp_path):
         file.truncate((16 << 20) + 1)
     with pytest.raises(InputError, match="at most 16 MiB"):
         load_vehicle(path)
+
+
+@pytest.mark.parametrize(
+    ("limit", "value", "message"),
+    [("MEMORY", 100 << 20, "takes more than 1 GiB of memory"), ("SECONDS", 0.05, "s to read")],
+)
+def test_a_mesh_that_takes_too_much_is_an_error_of_one_line(tmp_path, monkeypatch, limit, value, message):
+    path = tmp_path / "sphere.ply"
+    trimesh.creation.icosphere(subdivisions=7).export(path)  # 300,000 triangles
+    monkeypatch.setattr(mesh_file, limit, value)
+    with pytest.raises(InputError, match=message) as caught:
+        load_vehicle(path)
+    assert str(caught.value).startswith(str(path))
+
+
+def test_a_mesh_is_read_with_our_packages_not_the_folders(tmp_path, monkeypatch):
+    van().export(tmp_path / "van.ply")
+    for name in ("trimesh", "resource", "numpy"):
+        (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
+    monkeypatch.chdir(tmp_path)
+    load_vehicle(tmp_path / "van.ply")
+    assert not (tmp_path / "ran").exists()
 
 
 def test_a_mesh_in_millimetres_is_an_error(tmp_path):

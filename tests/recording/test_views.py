@@ -12,16 +12,17 @@ from bevcli.frame import MAP_CLASSES, MOST_MAP_CLASSES, BevMap, DriveFacts, clas
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.geometry.geographic import GeoOrigin
+from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.model.config import ModelConfig
 from bevcli.recording import entities
 from bevcli.recording.blueprint import TEXTS_SHARE, TITLE_HEIGHT, WINDOW, camera_row_shares
 from bevcli.recording.colors import (
     BACKGROUND,
-    CLASS_COLORS,
     GROUND_TRUTH_COLOR,
     MAP_COLORS,
     MISSED_COLOR,
     OTHER_MAP_COLORS,
+    class_colors,
     map_colors,
 )
 from bevcli.recording.log_static import legend_entries, ring_distances_m
@@ -47,7 +48,7 @@ COLORS_OF_MAPS = (*MAP_COLORS.values(), *OTHER_MAP_COLORS)
 @pytest.mark.parametrize("index", range(len(COLORS_OF_MAPS)))
 def test_a_map_colour_cannot_be_taken_for_a_box_or_another_class(index):
     color, others = COLORS_OF_MAPS[index], [*COLORS_OF_MAPS[:index], *COLORS_OF_MAPS[index + 1 :]]
-    of_boxes = [*CLASS_COLORS.values(), GROUND_TRUTH_COLOR, MISSED_COLOR]
+    of_boxes = [*class_colors(NUSCENES_CLASSES.values()).values(), GROUND_TRUTH_COLOR, MISSED_COLOR]
     nearest = min(np.linalg.norm(lab(color) - lab(other)) for other in of_boxes)
     assert nearest > 22  # 2 is the smallest difference that people see side by side
     assert min(np.linalg.norm(lab(color) - lab(other)) for other in others) > 12
@@ -65,10 +66,11 @@ def test_map_classes_of_any_name_have_different_colours():
 
 
 def test_the_legend_names_every_class_and_map_class():
-    names = [text for text, _ in legend_entries(TINY.classes, list(MAP_CLASSES))]
+    colors = class_colors(TINY.object_classes.values())
+    names = [text for text, _ in legend_entries(colors, list(MAP_CLASSES))]
     assert set(TINY.classes) <= {name.replace(" ", "_") for name in names}
     assert {f"map: {name.replace('_', ' ')}" for name in MAP_CLASSES} <= set(names)
-    assert not any(text.startswith("map") for text, _ in legend_entries(TINY.classes))
+    assert not any(text.startswith("map") for text, _ in legend_entries(colors))
 
 
 def test_the_legend_is_in_the_recording(tmp_path):

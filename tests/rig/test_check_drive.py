@@ -65,6 +65,8 @@ def test_the_command_names_the_error_before_the_run(spoilt, tmp_path):
     done = command(tmp_path, "run", str(drive), "--model", "mini.toml", "--untrained", "--frames", "0:1")
     assert done.returncode == 0, done.stderr
     (line,) = [line for line in done.stderr.splitlines() if "millimetres" in line]
+    assert "divide the translation by 1000" in line
     assert f"bevcli project-debug {drive}" in line
+    assert f"bevcli project-debug {drive}" in done.stdout  # of the summary
     (note,) = json.loads((tmp_path / "runs/drive-mini/summary.json").read_text())["notes"][:1]
     assert "millimetres" in note

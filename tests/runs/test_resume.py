@@ -311,6 +311,24 @@ def test_damaged_files_are_named_and_left_alone(model, interrupted):
         assert contents(interrupted) == kept
 
 
+def test_pipes_and_devices_in_place_of_files_are_not_waited_for(model, interrupted):
+    for replaced in (os.mkfifo, lambda path: path.symlink_to("/dev/zero")):
+        path = interrupted / "segmentation/000001.png"
+        path.unlink()
+        replaced(path)
+        with pytest.raises(OutputError, match=r"segmentation: `resume`: was changed or damaged"):
+            run_all(model, interrupted, resume=True)
+
+
+def test_a_pipe_that_appears_under_way_is_replaced(model, tmp_path):
+    summary, state = tmp_path / "out/summary.json", tmp_path / "state.safetensors"
+    run_all(model, tmp_path / "out", Drive(1), after_frame=lambda frame, prediction: os.mkfifo(summary))
+    assert summary.is_file()
+    os.mkfifo(state)
+    save_state(state, Counts())
+    assert load_state(state, Counts) == Counts()
+
+
 def test_changed_images_are_seen(model, tmp_path):
     class WithImages(Drive):
         def image_files(self, place):

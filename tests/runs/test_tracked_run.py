@@ -107,7 +107,7 @@ def test_the_models_file_holds_the_parameters(tmp_path):
     file = tmp_path / "mine.toml"
     file.write_text("[tracking]\nbirth_score = 0.5\n[tracking.gates_m]\ncar = 7\n")
     own = load_table(file, TRACKING, TrackerConfig)
-    assert own == replace(TrackerConfig(), birth_score=0.5, gates_m=replace(TrackerConfig().gates_m, car=7.0))
+    assert own == replace(TrackerConfig(), birth_score=0.5, gates_m={"car": 7.0})
     file.write_text("[tracking]\nbirth = 0.5\n")
     with pytest.raises(ConfigError, match=r'unknown key "tracking\.birth"; did you mean "birth_score"'):
         load_table(file, TRACKING, TrackerConfig)

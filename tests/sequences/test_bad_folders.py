@@ -1,6 +1,7 @@
 """A mistake in a native folder gives a message of one line that names the file and the camera, line or column."""
 
 import json
+import os
 import shutil
 
 import cv2
@@ -38,6 +39,22 @@ def test_missing_file(drive, file):
     line = message(drive)
     assert f"{drive / file}" in line
     assert "missing" in line
+
+
+@pytest.mark.parametrize("file", ["frames.csv", "ego_motion.csv", "ground_truth.json", "timing.toml"])
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("nowhere")], ids=["pipe", "link"])
+def test_an_optional_file_that_is_no_file_is_not_passed_over(drive, file, make):
+    """A drive is not read as if the file were missing."""
+    (drive / file).unlink(missing_ok=True)
+    if file == "timing.toml":
+        (drive / "frames.csv").unlink()
+    make(drive / file)
+    assert str(drive / file) in message(drive)
+
+
+def test_a_video_index_of_5000_digits_is_a_missing_image(edit):
+    frame = open_sequence(edit("frames.csv", "0.png", f"0.png#{'9' * 5000}")).load(0)
+    assert list(frame.dropped) == ["CAM_FRONT"]
 
 
 def test_missing_ego_motion_says_what_to_do(drive):
@@ -80,6 +97,9 @@ def test_broken_json(drive, content):
         ("ego_motion.csv", "qw,qx", "qx,qw2", ["ego_motion.csv", "qw", "missing"]),
         ("ego_motion.csv", "1000000000,10.0", "1000000000,nan", ["line 3", "column x", "finite", "nan"]),
         ("ego_motion.csv", "1000000000,10.0", "1000000000,ten", ["line 3", "column x", '"ten"']),
+        ("ego_motion.csv", "1000000000,10.0", "1000000000,1_0.0", ["line 3", "column x", "number", '"1_0.0"']),
+        ("ego_motion.csv", "1000000000,10.0", "1000000000,\u0661", ["line 3", "column x", "number"]),
+        ("frames.csv", ".png", "\0.png", ["frames.csv: line 2", "null byte"]),
         ("ego_motion.csv", "1000000000,10.0", "900000000,10.0", ["line 3", "timestamp_ns", "900000000"]),
         ("ego_motion.csv", "1000000000,10.0", "1000000000.0,10.0", ["line 3", "timestamp_ns", "integer"]),
         ("ego_motion.csv", "10.0,0,0,1,0,0,0", "10.0,0,0,0.99,0,0,0", ["line 3", "norm is 0.99"]),

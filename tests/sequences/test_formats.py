@@ -16,7 +16,7 @@ from bevcli.errors import BevcliError, InputError
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.options import option_of
 from bevcli.sequences.files.calibration_file import write_calibration
-from bevcli.sequences.format import format_of, format_options, formats, option_classes
+from bevcli.sequences.format import GROUP, format_of, format_options, formats, option_classes
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import RigOptions, SequenceOptions
 
@@ -141,7 +141,7 @@ def test_a_package_can_add_a_format(plug_in, strip, drive):
     assert [int(sequence.load(place).images["CAM_FRONT"].pixels_bgr[0, 0, 0]) for place in (0, 1)] == [20, 30]
     with pytest.raises(InputError, match=r"images.per.second"):
         open_sequence(drive, images_per_second=4)
-    with pytest.raises(InputError, match="a sequence folder, a nuScenes root, a ROS bag or a strip"):
+    with pytest.raises(InputError, match=r"a sequence folder, .*, a strip"):
         open_sequence(drive / "missing")
 
 
@@ -152,7 +152,7 @@ def test_a_broken_package_stops_only_what_needs_its_format(plug_in, strip, drive
         with pytest.raises(BevcliError, match=r"strips = strips:FORMAT cannot be imported.*a_package") as error:
             open_sequence(path, **options)
         assert "\n" not in str(error.value)
-    assert len(formats()) == len(option_classes()) == 3
+    assert len(formats()) == len(option_classes()) == len(registry.entries(GROUP)) - 1
 
 
 def test_recognising_a_path_imports_no_reader(tmp_path):

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bevcli.geometry.boxes import CLASSES
+from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.synth.assets.catalog import Assets, draw_body
 from bevcli.synth.assets.paint import linear
 
@@ -19,13 +19,13 @@ PLAUSIBLE = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", CLASSES)
+@pytest.mark.parametrize("name", NUSCENES_CLASSES)
 def test_there_are_enough_variants(assets: Assets, name: str):
     looks = {v.name.removesuffix("_standing") for v in assets.catalog.by_class[name]}
     assert len(looks) >= (6 if name in VEHICLES else 4)
 
 
-@pytest.mark.parametrize("name", CLASSES)
+@pytest.mark.parametrize("name", NUSCENES_CLASSES)
 def test_sizes_are_plausible(assets: Assets, name: str):
     low, high = np.array(PLAUSIBLE[name])
     for variant in assets.catalog.by_class[name]:
@@ -33,7 +33,7 @@ def test_sizes_are_plausible(assets: Assets, name: str):
         assert (variant.size_lwh < high).all(), variant.name
 
 
-@pytest.mark.parametrize("name", CLASSES)
+@pytest.mark.parametrize("name", NUSCENES_CLASSES)
 def test_mesh_fills_its_box_exactly(assets: Assets, name: str):
     rng = np.random.default_rng(3)
     for variant in assets.catalog.by_class[name]:
@@ -45,7 +45,7 @@ def test_mesh_fills_its_box_exactly(assets: Assets, name: str):
             np.testing.assert_allclose(points.max(0), low + body.size_lwh, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", CLASSES)
+@pytest.mark.parametrize("name", NUSCENES_CLASSES)
 def test_meshes_have_no_holes_and_no_inverted_faces(assets: Assets, name: str):
     """From every side, the faces that point to the viewer cover the same area as all faces."""
     for variant in assets.catalog.by_class[name]:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bevcli.geometry.boxes import CLASSES
+from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import inverse, wrap_angle
 from bevcli.synth.assets.catalog import Assets
 from bevcli.synth.drive import ANNOTATED_M, RenderedDrive, RenderedFrame
@@ -167,7 +167,7 @@ def test_boxes_are_near_unique_and_have_valid_visibilities(drive: RenderedDrive,
     boxes = frame.boxes
     origin = (frame.world_from_ego.matrix @ drive.rig.ego_from_bev)[:2, 3]
     assert np.hypot(*(boxes.centers[:, :2] - origin).T).max() < ANNOTATED_M
-    assert set(boxes.classes) <= set(CLASSES)
+    assert set(boxes.classes) <= set(NUSCENES_CLASSES)
     assert len(set(boxes.instances)) == len(boxes)
     assert ((boxes.visibilities >= 0) & (boxes.visibilities <= 1)).all()
     np.testing.assert_array_equal(boxes.num_points > 0, boxes.visibilities > 0)
@@ -207,7 +207,7 @@ def test_boxes_contain_their_pixels_with_lens_distortion(drive: RenderedDrive, f
 @pytest.mark.slow
 def test_drives_are_dense(assets: Assets):
     """Eight drives, every fourth frame: at least 15 boxes within 32 m, 15 % of them barely visible, all classes."""
-    counts, near, hidden, frames = dict.fromkeys(CLASSES, 0), 0, 0, 0
+    counts, near, hidden, frames = dict.fromkeys(NUSCENES_CLASSES, 0), 0, 0, 0
     for seed in range(200, 208):
         drive = RenderedDrive(seed, frames=20, rig=nuscenes_like_rig(200, 112), assets=assets)
         for index in range(0, 20, 4):

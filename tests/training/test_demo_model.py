@@ -49,7 +49,7 @@ def test_its_weights_are_in_the_package_and_the_default() -> None:
 
 @pytest.mark.parametrize("name", ["tiny", "small", "base"])
 def test_other_models_do_not_run_without_weights(name: str) -> None:
-    with pytest.raises(WeightsError, match=f"model {name} has no weights: pass `weights=FILE`"):
+    with pytest.raises(WeightsError, match=f"model {name} has no weights: run `bevcli weights fetch {name}`"):
         load_model(name)
 
 
@@ -69,7 +69,7 @@ def test_the_model_follows_from_the_weights() -> None:
 def test_it_finds_cars_and_road_in_the_sample_street() -> None:
     """Thresholds far below the model card's scores, but far above those of random weights."""
     model = load_model(device="cpu")
-    scores = validate(Runner(model.prepared, model.device), FolderDrives([STREET], 2.0), tracker=model.tracker)
+    scores = validate(Runner(model.prepared, model.device), FolderDrives([STREET], model.config), tracker=model.tracker)
     assert scores.detection.overall.classes["car"].mean_ap > 0.2
     assert scores.segmentation.iou["drivable_road"] > 0.6
     cars = scores.tracking.classes["car"].metrics

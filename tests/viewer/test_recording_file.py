@@ -2,6 +2,7 @@
 
 import sys
 import warnings
+from functools import partial
 
 import pytest
 from memory_drive import MemorySequence
@@ -9,6 +10,7 @@ from recorded_drive import NamedModel, predict, record
 from rerun.chunk import RrdReader
 
 from bevcli.errors import InputError
+from bevcli.parsing.own_process import run_python
 from bevcli.recording import entities, writer
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.writer import Recording
@@ -159,6 +161,6 @@ def test_a_message_of_unknown_kind_is_damage_not_the_end(recording, tmp_path, me
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems do not limit the memory of a process")
 def test_the_first_process_to_read_a_recording_has_one_gigabyte(recording):
     greedy = recording_file.CHECK.replace("try:\n    for", "bytearray(1200 << 20)\ntry:\n    for")
-    done = recording_file._run([sys.executable, "-c", greedy, str(recording), str(1 << 30)], recording)
+    done = recording_file._run(recording, partial(run_python, greedy, [recording], 1 << 30))
     assert done.returncode == 1
     assert b"MemoryError" in done.stderr

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError, OutputError
+from bevcli.evaluation.export import COLUMNS
 from bevcli.geometry.transforms import apply
 from bevcli.recording.options import RecordingOptions
 from bevcli.viewer import video
@@ -48,10 +49,15 @@ def test_the_summary_counts_frames_boxes_and_bytes(drive):
 
 def test_the_table_has_the_shown_boxes_in_the_world_frame(drive, tmp_path):
     frames, path = drive
-    viz(path, "--export", tmp_path / "boxes.csv")
+    note = viz(path, "--export", tmp_path / "old.csv")
+    assert note.startswith("note: --export ends with this release: bevcli export")
+    result = CliRunner().invoke(app, ["export", str(path), "--format", "csv", "--out", str(tmp_path / "boxes.csv")])
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "boxes.csv").read_bytes() == (tmp_path / "old.csv").read_bytes()
     with (tmp_path / "boxes.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 6
+    assert tuple(rows[0]) == COLUMNS  # those of boxes files
     cars = [row for row in rows if row["class"] == "car"]
     for frame, row in zip(frames, cars, strict=True):
         assert int(row["timestamp_ns"]) == frame.stamp.timestamp_ns
@@ -62,8 +68,11 @@ def test_the_table_has_the_shown_boxes_in_the_world_frame(drive, tmp_path):
 
 def test_the_boxes_file_has_the_shown_boxes(drive, tmp_path):
     frames, path = drive
-    viz(path, "--export", tmp_path / "boxes.json")
-    content = json.loads((tmp_path / "boxes.json").read_text())
+    for arguments in (("viz", str(path), "--export"), ("export", str(path), "--format", "json", "--out")):
+        result = CliRunner().invoke(app, [*arguments, str(tmp_path / f"{arguments[0]}.json")], catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+    content = json.loads((tmp_path / "export.json").read_text())
+    assert content == json.loads((tmp_path / "viz.json").read_text())
     assert (content["format"], content["frame_of_reference"]) == ("bevcli-boxes/1", "world")
     assert [frame["timestamp_ns"] for frame in content["frames"]] == [frame.stamp.timestamp_ns for frame in frames]
     assert [box["class"] for box in content["frames"][0]["boxes"]] == ["car", "pedestrian"]

@@ -4,15 +4,18 @@ A file is read as a whole and written frame by frame.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import msgspec
+
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.object_classes import NUSCENES_CLASSES, ClassSettings, ObjectClass, object_classes
 from bevcli.geometry.transforms import Pose
 from bevcli.parsing.documents import without_garbage_collection
 from bevcli.sequences.files.box_json import boxes_from_json, boxes_to_json
@@ -54,18 +57,23 @@ class BoxesFile:
         frames: the frames.
         ego_from_bev: pose of the bev frame, None if unknown.
         extras: further members of the file's JSON object, such as "model" or "untrained".
+        classes: the classes of the model that predicted the boxes; None where the file does not state them.
     """
 
     frame_of_reference: str
     frames: tuple[FrameBoxes, ...]
     ego_from_bev: Pose | None = None
     extras: Mapping[str, Any] = field(default_factory=dict)
+    classes: Mapping[str, ObjectClass] | None = None
 
 
-def read_boxes(path: Path, class_names: ClassNames | None = None) -> BoxesFile:
+def read_boxes(
+    path: Path, class_map: Mapping[str, str] | None = None, classes: Iterable[str] | None = None
+) -> BoxesFile:
     """Read a boxes file. Of a writer that was killed, the partial file (`incremental_json`) is read.
 
-    class_names: maps the classes. None: names are compared without case. Unknown names are kept.
+    Names are compared without case to the known classes, and unknown ones are kept. class_map: names of the file ->
+    known classes. classes: the known ones; by default those that the file states, as predictions do, or nuScenes' ten.
     Raises InputError if the file is missing, not JSON or of another format, or has a missing key, an invalid value,
     or two frames of a scene with the same time. The message names the file, the frame and the box.
     """
@@ -78,7 +86,8 @@ def read_boxes(path: Path, class_names: ClassNames | None = None) -> BoxesFile:
             )
         if not isinstance(content.get("frames"), list):
             raise InputError(f'{path}: "frames" is missing or not a list (expected one object per frame)')
-        rows, names = content["frames"], class_names or ClassNames()
+        stated = _stated_classes(content, path)
+        rows, names = content["frames"], ClassNames(class_map, classes or stated or NUSCENES_CLASSES)
         frames = tuple(_frame(path, place, row, frame_of_reference, names) for place, row in enumerate(rows))
     _check_unique(path, frames)
     ego_from_bev = content.get("ego_from_bev")
@@ -87,7 +96,20 @@ def read_boxes(path: Path, class_names: ClassNames | None = None) -> BoxesFile:
         frames,
         None if ego_from_bev is None else pose_from_json(ego_from_bev, "ego_from_bev", str(path)),
         _others(content, _FILE_KEYS),
+        stated,
     )
+
+
+def _stated_classes(content: Mapping[str, Any], path: Path) -> dict[str, ObjectClass] | None:
+    """The classes in "classes" and "class_settings" of a boxes file; None without them. Raises InputError."""
+    if "classes" not in content:
+        return None
+    try:
+        names = msgspec.convert(content["classes"], tuple[str, ...])
+        settings = msgspec.convert(content.get("class_settings", {}), dict[str, ClassSettings])
+        return object_classes(names, settings)
+    except ValueError as error:
+        raise InputError(f'{path}: "classes" or "class_settings" is wrong: {error}') from None
 
 
 def above_score(boxes: BoxesFile, score: float) -> BoxesFile:
@@ -145,6 +167,14 @@ class BoxesWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.file.close()
+
+
+def write_boxes(boxes: BoxesFile, path: Path) -> int:
+    """Write all frames of a file; return the number of boxes. Raises OutputError."""
+    with BoxesWriter(path, boxes.frame_of_reference, boxes.extras, boxes.ego_from_bev) as writer:
+        for frame in boxes.frames:
+            writer.write(frame)
+    return sum(len(frame.boxes) for frame in boxes.frames)
 
 
 def _load(path: Path) -> dict[str, Any]:

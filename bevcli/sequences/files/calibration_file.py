@@ -19,7 +19,7 @@ from bevcli.printing import one_line
 from bevcli.sequences.files.json_fields import LONGEST_VALUE, Report, parse_numbers, parse_transform, transform_to_json
 from bevcli.writing import write_whole
 
-FORMAT = "bevcli-calibration/1"
+FORMAT, CALIBRATION = "bevcli-calibration/1", "calibration.json"
 LARGEST_BYTES = 4 << 20
 KEYS = ("width", "height", "intrinsics", "distortion", "ego_from_camera")
 LARGEST_SIZE = 16384  # pixels of a side
@@ -153,8 +153,8 @@ def _facts_to_json(facts: DriveFacts) -> dict[str, Any]:
 
 def _camera_to_json(camera: Camera) -> dict[str, Any]:
     entry: dict[str, Any] = {
-        "width": camera.width,
-        "height": camera.height,
+        "width": int(camera.width),  # a reader of another package may have NumPy's
+        "height": int(camera.height),
         "intrinsics": camera.intrinsics.tolist(),
         "ego_from_camera": transform_to_json(camera.ego_from_camera),
     }

@@ -69,9 +69,9 @@ def write_map(folder: Path, frame: int, bev_map: BevMap) -> None:
     other classes.
     """
     if not (folder / LEGEND).exists():
-        write_whole(folder / LEGEND, f"{json.dumps(_legend(bev_map), indent=1)}\n".encode(), parents=True)
+        write_whole(folder / LEGEND, f"{json.dumps(_legend(bev_map), indent=1)}\n".encode(), parents=True, regular=True)
     _check_legend(open_maps(folder), bev_map)
-    write_whole(map_path(folder, frame), cv2.imencode(".png", bev_map.cells)[1].tobytes())
+    write_whole(map_path(folder, frame), cv2.imencode(".png", bev_map.cells)[1].tobytes(), regular=True)
 
 
 def _check_legend(folder: MapFolder, bev_map: BevMap) -> None:

@@ -9,16 +9,16 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
 from bevcli.geometry.transforms import Array, Pose, inverse
+from bevcli.parsing.files import is_there
 from bevcli.sequences.files.boxes_file import read_boxes
 from bevcli.sequences.files.calibration_file import read_rig_and_facts
-from bevcli.sequences.files.class_names import ClassNames, count_other_classes, other_classes_note
+from bevcli.sequences.files.class_names import count_classes
 from bevcli.sequences.files.incremental_json import existing
 from bevcli.sequences.files.map_folder import open_maps
 from bevcli.sequences.images import FrameEntry, ImageReader, ImageSource, read_frame
-from bevcli.sequences.native.format import NativeOptions
 from bevcli.sequences.native.tables import check_times, read_ego_motion, read_frames_table
 from bevcli.sequences.native.unlisted_frames import find_frames
-from bevcli.sequences.options import EgoMotionUse, SequenceOptions
+from bevcli.sequences.options import EgoMotionUse, RigOptions, SequenceOptions
 
 BOXES_FILE = "ground_truth.json"
 MAPS_FOLDER = "ground_truth_map"
@@ -35,7 +35,7 @@ class FolderSequence(Sequence):
         self,
         path: Path,
         common: SequenceOptions = SequenceOptions(),
-        own: NativeOptions = NativeOptions(),
+        own: RigOptions = RigOptions(),
         rig: CameraRig | None = None,
     ) -> None:
         if not path.is_dir():
@@ -55,9 +55,13 @@ class FolderSequence(Sequence):
             advice = "set start_ns in timing.toml" if notes else "add ego-motion, or remove the frame"
             _check_coverage(file, self.ego_motion, self._entries, advice)
         self.has_ego_motion = self.ego_motion is not None
-        self._truth = FolderGroundTruth(path, own.class_map, is_read=common.ground_truth)
-        self.notes = (*rig_notes(self.rig), *notes, *motion_notes, *self._truth.notes)
+        self._truth = FolderGroundTruth(path, is_read=common.ground_truth)
+        self.notes = (*rig_notes(self.rig), *notes, *motion_notes)
         self._images = ImageReader(strict=common.strict, inside=None if common.allow_outside else path)
+
+    @property
+    def class_counts(self) -> Mapping[str, int]:
+        return self._truth.class_counts
 
     @property
     def input_files(self) -> tuple[Path, ...]:
@@ -80,7 +84,7 @@ class FolderSequence(Sequence):
 def _read_entries(path: Path, rig: CameraRig) -> tuple[tuple[FrameEntry, ...], tuple[str, ...]]:
     """The frames of frames.csv, or else those that are found, with a note."""
     table = path / "frames.csv"
-    if table.is_file():
+    if is_there(table):
         return read_frames_table(table, rig.names), ()
     entries, note = find_frames(path, rig.names)
     check_times(entries)
@@ -101,9 +105,9 @@ def _check_paths(folder: Path, entries: tuple[FrameEntry, ...]) -> None:
 
 def _read_motion(file: Path, use: EgoMotionUse) -> tuple[EgoMotion | None, tuple[str, ...]]:
     if use == "static":
-        unread = f" ({file.name} is not read)" if file.is_file() else ""
+        unread = f" ({file.name} is not read)" if is_there(file) else ""
         return None, (f"the vehicle is assumed to stand still{unread}",)
-    if file.is_file():
+    if is_there(file):
         return read_ego_motion(file), ()
     if use == "required":
         raise InputError(
@@ -137,18 +141,17 @@ def rig_notes(rig: CameraRig, source: str = "calibration.json") -> tuple[str, ..
 class FolderGroundTruth:
     """ground_truth.json, read at once, and ground_truth_map/, read frame by frame. Either may be missing.
 
-    class_map: class names in the file -> known classes, see `ClassNames`. is_read: whether they are read at all.
+    is_read: whether they are read at all.
 
     Attributes:
-        notes: names the classes that are not scored.
+        class_counts: number of boxes by class.
     """
 
-    def __init__(self, folder: Path, class_map: Mapping[str, str], *, is_read: bool = True) -> None:
+    def __init__(self, folder: Path, *, is_read: bool = True) -> None:
         boxes_path, maps_path = folder / BOXES_FILE, folder / MAPS_FOLDER
-        has_boxes = is_read and existing(boxes_path).is_file()
-        self._boxes = read_boxes(boxes_path, ClassNames(class_map)) if has_boxes else None
-        others = count_other_classes(frame.boxes for frame in self._boxes.frames) if self._boxes else None
-        self.notes = (other_classes_note(others, str(boxes_path)),) if others else ()
+        has_boxes = is_read and is_there(existing(boxes_path))
+        self._boxes = read_boxes(boxes_path) if has_boxes else None
+        self.class_counts = count_classes(frame.boxes for frame in self._boxes.frames) if self._boxes else {}
         self._frames = {frame.stamp.index: frame for frame in self._boxes.frames} if self._boxes else {}
         self._maps = open_maps(maps_path) if is_read and maps_path.is_dir() else None
 

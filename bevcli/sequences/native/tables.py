@@ -17,7 +17,7 @@ from bevcli.parsing.csv_tables import CsvRow, CsvTable, read_csv
 from bevcli.sequences.images import FrameEntry, ImageSource
 from bevcli.writing import whole_file
 
-VIDEO_CELL = re.compile(r"(?P<path>.+)#(?P<index>\d+)")
+VIDEO_CELL = re.compile(r"(?P<path>.+)#(?P<index>[0-9]{1,9})")
 NO_IMAGE = "no image in frames.csv"
 TRANSLATION = ("x", "y", "z")
 QUATERNION = ("qw", "qx", "qy", "qz")

@@ -18,7 +18,7 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
-from bevcli.parsing.files import read_text
+from bevcli.parsing.files import is_there, read_text
 from bevcli.sequences.images import IMAGE_SUFFIXES, VIDEO_SUFFIXES, FrameEntry, ImageSource
 from bevcli.sequences.video import VideoFacts, video_facts
 
@@ -61,7 +61,7 @@ def read_timing(folder: Path, cameras: tuple[str, ...]) -> Timing:
     Raises InputError for broken TOML, an unknown key or camera, or an invalid value.
     """
     path = folder / FILE_NAME
-    if not path.is_file():
+    if not is_there(path):
         return Timing()
     stated = parse_toml(read_text(path, TOML_BYTES), path)
     _check_keys(path, "", stated, ("start_ns", "rate_hz", "cameras"))
@@ -186,7 +186,7 @@ def _from_videos(folder: Path, cameras: tuple[str, ...], timing: Timing) -> tupl
             else:
                 sources[name] = source
         entries.append(FrameEntry(FrameStamp(place, "", time), sources, dropped, f"{paths[leading]}#{place}"))
-    has_timing = (folder / FILE_NAME).is_file()
+    has_timing = is_there(folder / FILE_NAME)
     stated = f"times from {FILE_NAME}" if has_timing else f"starting at time 0 (set start_ns in {FILE_NAME})"
     note = f"frames.csv is missing: found {len(entries)} frames from {leading}, {rates[leading]:g} per second"
     return tuple(entries), f"{note}, {stated}"

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.documents import without_garbage_collection
+from bevcli.sequences.nuscenes.dialect import NUSCENES, Dialect
 from bevcli.sequences.nuscenes.index import Annotations, Images, Ints, NuScenesIndex, Samples, Scenes, Sensors
 from bevcli.sequences.nuscenes.json_tables import (
     Row,
@@ -25,9 +26,7 @@ from bevcli.sequences.nuscenes.json_tables import (
     tokens,
     vectors,
 )
-
-LIDAR = "LIDAR_TOP"  # the published models predict in the frame of this sensor
-MAX_GAP_S = 1.5  # longest time between two annotations of an object from which a velocity is derived
+from bevcli.sequences.tracks import velocities_between
 
 
 @dataclass(frozen=True)
@@ -46,18 +45,18 @@ class _SensorData:
         return replace(self, **{name: values[rows] for name, values in vars(self).items()})
 
 
-def build_index(tables: Path) -> NuScenesIndex:
+def build_index(tables: Path, dialect: Dialect = NUSCENES) -> NuScenesIndex:
     """Read the folder with one version's tables. Raises InputError if one is missing, invalid or inconsistent."""
     with without_garbage_collection():
         sensor_tokens, sensors = _read_sensors(tables)
         names, sample_tokens, sample_times, sample_scenes = _read_samples(tables)
-        data = _read_sensor_data(tables, sample_tokens, sensor_tokens, sensors)
+        data = _read_sensor_data(tables, sample_tokens, sensor_tokens, sensors, dialect)
         translations, quaternions = _read_poses(tables, data.poses)
-        lidar = sensors.channels[data.sensors] == LIDAR
-        lidar_rows = _lidar_of_samples(tables, data.samples, np.flatnonzero(lidar), len(sample_tokens), sample_tokens)
+        lidar = np.isin(sensors.channels[data.sensors], dialect.lidars)
+        lidar_rows = _lidar_of_samples(tables, data.samples, np.flatnonzero(lidar), sample_tokens, dialect)
         image_rows = np.flatnonzero(~lidar)
         image_rows = image_rows[np.lexsort((data.times_us[image_rows], sample_scenes[data.samples[image_rows]]))]
-        annotations, first_annotation = read_annotations(tables, sample_tokens, sample_times)
+        annotations, first_annotation = read_annotations(tables, sample_tokens, sample_times, dialect)
     images = data[image_rows]
     return NuScenesIndex(
         Scenes(names, _starts(sample_scenes, len(names)), _starts(sample_scenes[images.samples], len(names))),
@@ -96,6 +95,7 @@ def _read_sensors(tables: Path) -> tuple[NDArray[np.bytes_], Sensors]:
         vectors(rows, "translation", path, 3),
         quaternions(rows, "rotation", path),
         np.array([_intrinsics(row, path) for row in rows], dtype=np.float64).reshape(-1, 3, 3),
+        np.array([_distortion(row, path) for row in rows], dtype=np.float64).reshape(-1, 8),
     )
     return tokens(rows, "token", path), sensors
 
@@ -109,6 +109,15 @@ def _intrinsics(row: Row, path: Path) -> Array:
     if array is None or not min(array[0, 0], array[1, 1]) > 0:
         raise InputError(f'{path}: "camera_intrinsic": expected a camera matrix of 3x3 numbers, or []')
     return array
+
+
+def _distortion(row: Row, path: Path) -> Array:
+    """(8,) Brown-Conrady coefficients. nuScenes has none; T4 adds the column."""
+    value = row.get("camera_distortion") or []
+    array = array_of(value, (len(value),)) if type(value) is list and len(value) in (0, 4, 5, 8) else None
+    if array is None:
+        raise InputError(f'{path}: "camera_distortion": expected 0, 4, 5 or 8 numbers: k1 k2 p1 p2 [k3 [k4 k5 k6]]')
+    return np.pad(array, (0, 8 - len(array)))
 
 
 def _read_samples(tables: Path) -> tuple[NDArray[np.str_], NDArray[np.bytes_], Ints, Ints]:
@@ -125,10 +134,14 @@ def _read_samples(tables: Path) -> tuple[NDArray[np.str_], NDArray[np.bytes_], I
 
 
 def _read_sensor_data(
-    tables: Path, sample_tokens: NDArray[np.bytes_], sensor_tokens: NDArray[np.bytes_], sensors: Sensors
+    tables: Path,
+    sample_tokens: NDArray[np.bytes_],
+    sensor_tokens: NDArray[np.bytes_],
+    sensors: Sensors,
+    dialect: Dialect,
 ) -> _SensorData:
     path = tables / "sample_data.json"
-    lidars = {token.decode() for token in sensor_tokens[sensors.channels == LIDAR]}
+    lidars = {token.decode() for token in sensor_tokens[np.isin(sensors.channels, dialect.lidars)]}
     cameras = {token.decode() for token in sensor_tokens[np.isfinite(sensors.intrinsics).all((1, 2))]}
     parts = []
     for batch in read_batches(path):
@@ -136,7 +149,7 @@ def _read_sensor_data(
         needed = [
             row
             for row, owner, key in zip(batch, owners, keys, strict=True)
-            if owner in cameras or (key and owner in lidars)
+            if (owner in cameras and row.get("is_valid") is not False) or (key and owner in lidars)
         ]
         if needed:
             parts.append(_sensor_data_of(needed, path, sample_tokens, sensor_tokens))
@@ -178,14 +191,16 @@ def _read_poses(tables: Path, wanted: NDArray[np.bytes_]) -> tuple[Array, Array]
 
 
 def _lidar_of_samples(
-    tables: Path, samples: Ints, lidar_rows: Ints, count: int, sample_tokens: NDArray[np.bytes_]
+    tables: Path, samples: Ints, lidar_rows: Ints, sample_tokens: NDArray[np.bytes_], dialect: Dialect
 ) -> Ints:
-    """(N,) the row of each sample's LIDAR_TOP keyframe."""
-    rows = np.full(count, -1, dtype=np.int64)
+    """(N,) the row of each sample's lidar keyframe."""
+    rows = np.full(len(sample_tokens), -1, dtype=np.int64)
     rows[samples[lidar_rows]] = lidar_rows
     if (rows < 0).any():
         token = sample_tokens[rows < 0][0].decode()
-        raise InputError(f'{tables / "sample_data.json"}: sample "{token}" has no keyframe of {LIDAR}')
+        raise InputError(
+            f'{tables / "sample_data.json"}: sample "{token}" has no keyframe of {" or ".join(dialect.lidars)}'
+        )
     return rows
 
 
@@ -195,7 +210,7 @@ def _starts(sorted_owners: Ints, count: int) -> Ints:
 
 
 def read_annotations(
-    tables: Path, sample_tokens: NDArray[np.bytes_], sample_times_us: Ints
+    tables: Path, sample_tokens: NDArray[np.bytes_], sample_times_us: Ints, dialect: Dialect
 ) -> tuple[Annotations, Ints]:
     """The annotations ordered by sample, and the row of each sample's first annotation (N + 1,).
 
@@ -205,7 +220,7 @@ def read_annotations(
     Raises InputError if the tables are inconsistent.
     """
     path = tables / "sample_annotation.json"
-    names = _Names(tables)
+    names = _Names(tables, dialect)
     parts = [_columns(batch, path, names) for batch in (read_batches(path) if path.is_file() else [[]])]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     samples = places_of(columns.pop("samples"), sample_tokens, tables / "sample.json")
@@ -221,7 +236,7 @@ def read_annotations(
 class _Names:
     """The names behind the tokens in an annotation."""
 
-    def __init__(self, tables: Path) -> None:
+    def __init__(self, tables: Path, dialect: Dialect) -> None:
         categories = _texts(tables / "category.json", "name")
         path = tables / "instance.json"
         instances = _optional_rows(path)
@@ -230,9 +245,11 @@ class _Names:
             if token not in categories:
                 raise InputError(f'{path}: category "{token}" is missing in category.json')
         self.category = {token: categories[owner].encode() for token, owner in zip(own, owners, strict=True)}
-        self.attribute = {token: name.encode() for token, name in _texts(tables / "attribute.json", "name").items()}
+        attributes = _texts(tables / "attribute.json", "name") if dialect.has_attributes else {}
+        self.attribute = {token: name.encode() for token, name in attributes.items()}
         self.visibility = {
-            token: _middle(level, tables) for token, level in _texts(tables / "visibility.json", "level").items()
+            token: dialect.visibilities.get(level) or _middle(level, tables)
+            for token, level in _texts(tables / "visibility.json", "level").items()
         }
 
 
@@ -283,16 +300,9 @@ def _velocities(
     times_us: Ints,
     path: Path,
 ) -> Array:
-    """(A, 3) m/s in the world frame, NaN if unknown: central differences, one-sided for first and last annotations.
-
-    As in the official devkit, a velocity is known if each time gap is at most 1.5 s on average.
-    """
+    """(A, 3) m/s in the world frame, NaN if unknown, see `velocities_between`."""
     first, last = np.arange(len(own)), np.arange(len(own))
     has_earlier, has_later = earlier != b"", later != b""
     first[has_earlier] = places_of(earlier[has_earlier], own, path)
     last[has_later] = places_of(later[has_later], own, path)
-    seconds = (times_us[last] - times_us[first]) * 1e-6
-    longest = MAX_GAP_S * np.where(has_earlier & has_later, 2, 1)
-    known = (has_earlier | has_later) & (seconds > 0) & (seconds <= longest)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(known[:, None], (centers[last] - centers[first]) / seconds[:, None], np.nan)
+    return velocities_between(centers, (times_us - times_us[:1]).astype(np.float64) * 1e-6, first, last)

@@ -16,34 +16,31 @@ from typing import Any, get_type_hints
 import numpy as np
 
 from bevcli.sequences.nuscenes.build import build_index
+from bevcli.sequences.nuscenes.dialect import NUSCENES, Dialect
 from bevcli.sequences.nuscenes.index import NuScenesIndex
+from bevcli.user_folders import user_cache
 
-FORMAT = 1  # version of the cached arrays; increase it when the index changes
+FORMAT = 2  # version of the cached arrays; increase it when the index changes
 SMALLEST_BYTES = 64 << 20  # smaller tables are not cached, because reading them takes a second or two
 FINGERPRINT = "fingerprint.json"
 
 
-def open_index(tables: Path) -> tuple[NuScenesIndex, str]:
+def open_index(tables: Path, dialect: Dialect = NUSCENES) -> tuple[NuScenesIndex, str]:
     """The index of a folder with tables, from the cache if it is up to date, and a note for the user or ""."""
     if sum(path.stat().st_size for path in tables.glob("*.json")) < SMALLEST_BYTES:
-        return build_index(tables), ""
+        return build_index(tables, dialect), ""
     name = hashlib.sha256(str(tables.resolve()).encode()).hexdigest()[:16]
     folder = user_cache() / "nuscenes" / f"{tables.name}-{name}"
     facts = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in sorted(tables.glob("*.json"))]
     fingerprint = json.dumps({"format": FORMAT, "tables": facts})
     if _is_fresh(folder, fingerprint):
         return _load(folder), ""
-    index = build_index(tables)
+    index = build_index(tables, dialect)
     try:
         _save(index, folder, fingerprint)
     except OSError as error:
         return index, f"{folder}: the index cannot be cached ({error.strerror}); opening it again will be slow"
     return index, f"the index of the nuScenes tables is cached in {folder}"
-
-
-def user_cache() -> Path:
-    """The folder of all caches of bevcli, $XDG_CACHE_HOME/bevcli (default ~/.cache/bevcli)."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "bevcli"
 
 
 def _is_fresh(folder: Path, fingerprint: str) -> bool:

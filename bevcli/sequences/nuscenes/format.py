@@ -43,5 +43,6 @@ FORMAT = Format(
     recognises=is_nuscenes_root,
     opener="bevcli.sequences.nuscenes.sequence:NuScenesSequence",
     options=NuScenesOptions,
+    annotated=True,
     precedence=20,
 )

@@ -1,5 +1,6 @@
 """The contents of nuScenes' tables that bevcli needs, as arrays ordered by scene and time."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,12 +55,14 @@ class Sensors:
         translations: (K, 3) of ego_from_sensor, metres.
         quaternions: (K, 4) of ego_from_sensor, w, x, y, z.
         intrinsics: (K, 3, 3) pixels; NaN for other sensors than cameras.
+        distortions: (K, 8) Brown-Conrady coefficients k1 k2 p1 p2 k3 k4 k5 k6; 0 without distortion.
     """
 
     channels: NDArray[np.str_]
     translations: Array
     quaternions: Array
     intrinsics: Array
+    distortions: Array
 
 
 @dataclass(frozen=True)
@@ -145,12 +148,17 @@ class NuScenesIndex:
     images: Images
     annotations: Annotations
 
-    def ground_truth(self, sample: int) -> Boxes3D | None:
-        """A sample's boxes of the ten classes in the world frame; None in a version without annotations."""
+    def ground_truth(
+        self, sample: int, class_of: Callable[[str], str | None] = CLASS_OF_CATEGORY.get
+    ) -> Boxes3D | None:
+        """A sample's boxes in the world frame; None in a version without annotations.
+
+        class_of: a category -> its class, None for a category that is left out.
+        """
         if not len(self.annotations.categories):
             return None
         rows = self._annotations_of(sample)
-        classes = [CLASS_OF_CATEGORY.get(name.decode()) for name in self.annotations.categories[rows]]
+        classes = [class_of(name.decode()) for name in self.annotations.categories[rows]]
         kept = np.array([name is not None for name in classes], dtype=bool)
         return self._boxes(rows[kept], [name for name in classes if name])
 

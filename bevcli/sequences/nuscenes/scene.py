@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.geometry.cameras import Camera, CameraRig
-from bevcli.geometry.ego_motion import EgoMotion, Kinematics, derive_kinematics
+from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady
+from bevcli.geometry.ego_motion import EgoMotion, Kinematics, motion_of_keyframes
 from bevcli.geometry.transforms import Array, Pose
 from bevcli.sequences.files.calibration_file import LARGEST_SIZE, is_camera_name
+from bevcli.sequences.nuscenes.dialect import Dialect
 from bevcli.sequences.nuscenes.index import NuScenesIndex
 from bevcli.sequences.nuscenes.json_tables import integers, read_rows, vectors
 
@@ -60,14 +61,14 @@ class SceneFacts:
         return self.can_bus.kinematics_at(timestamp_ns // 1000)
 
 
-def read_scene_facts(index: NuScenesIndex, root: Path, scene: int) -> SceneFacts:
+def read_scene_facts(index: NuScenesIndex, root: Path, dialect: Dialect, scene: int) -> SceneFacts:
     """The facts of a scene, given by its row in the index. Raises InputError."""
-    rig, sensor_names = scene_rig(index, scene)
+    rig, sensor_names = scene_rig(index, dialect, scene)
     can_bus = read_can_bus(root, str(index.scenes.names[scene]))
     return SceneFacts(rig, sensor_names, scene_motion(index, scene), can_bus)
 
 
-def scene_rig(index: NuScenesIndex, scene: int) -> tuple[CameraRig, dict[int, str]]:
+def scene_rig(index: NuScenesIndex, dialect: Dialect, scene: int) -> tuple[CameraRig, dict[int, str]]:
     """The rig of a scene, and the camera name of each of its calibrated sensors."""
     first, last = index.scenes.first_image[scene : scene + 2]
     sensors, rows = np.unique(index.images.sensors[first:last], return_index=True)
@@ -76,29 +77,20 @@ def scene_rig(index: NuScenesIndex, scene: int) -> tuple[CameraRig, dict[int, st
     names = {int(sensor): str(index.sensors.channels[sensor]) for sensor in sensors}
     if len({camera.name for camera in cameras}) < len(cameras):
         raise InputError(f"scene {index.scenes.names[scene]}: a camera changes its calibration within the scene")
+    if dialect.ego_from_bev is not None:
+        return CameraRig(tuple(cameras), dialect.ego_from_bev, ego_from_bev_assumed=True), names
     lidar = int(index.samples.lidars[index.scenes.first_sample[scene]])
     return CameraRig(tuple(cameras), _sensor_pose(index, lidar).matrix), names
 
 
 def scene_motion(index: NuScenesIndex, scene: int) -> EgoMotion:
-    """A scene's poses at the times of its keyframes and images.
-
-    Kinematics are derived from the keyframes only: differentiating poses a few milliseconds apart amplifies noise.
-    """
+    """A scene's poses at the times of its keyframes and images, see `motion_of_keyframes`."""
     samples, images = index.samples, index.images
     keys = slice(*index.scenes.first_sample[scene : scene + 2])
     rows = slice(*index.scenes.first_image[scene : scene + 2])
-    key_times = samples.times_us[keys] * 1000
-    keyframes = (samples.translations[keys], samples.quaternions[keys])
-    rough = EgoMotion(key_times, *keyframes, *derive_kinematics(key_times, *keyframes))
-    # Of equal times the first is kept, so that keyframes take precedence.
-    times, first = np.unique(np.concatenate([key_times, images.times_us[rows] * 1000]), return_index=True)
-    translations = np.concatenate([keyframes[0], images.translations[rows]])[first]
-    quaternions = np.concatenate([keyframes[1], images.quaternions[rows]])[first]
-    inside = np.clip(times, key_times[0], key_times[-1])
-    derived = [rough.kinematics_at(int(time)) for time in inside]
-    return EgoMotion(
-        times, translations, quaternions, *map(np.stack, zip(*(vars(k).values() for k in derived), strict=True))
+    return motion_of_keyframes(
+        (samples.times_us[keys] * 1000, samples.translations[keys], samples.quaternions[keys]),
+        (images.times_us[rows] * 1000, images.translations[rows], images.quaternions[rows]),
     )
 
 
@@ -123,7 +115,8 @@ def _camera(index: NuScenesIndex, sensor: int, image: int) -> Camera:
         raise InputError(
             f'camera "{name:.60}": expected a name without a slash and an image size, found {width}x{height}'
         )
-    return Camera(name, width, height, np.array(index.sensors.intrinsics[sensor]), _sensor_pose(index, sensor).matrix)
+    intrinsics, lens = np.array(index.sensors.intrinsics[sensor]), brown_conrady(index.sensors.distortions[sensor])
+    return Camera(name, width, height, intrinsics, _sensor_pose(index, sensor).matrix, lens)
 
 
 def _sensor_pose(index: NuScenesIndex, sensor: int) -> Pose:

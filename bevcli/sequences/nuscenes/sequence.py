@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from bevcli.errors import InputError
 from bevcli.frame import Frame, FrameStamp, Sequence
 from bevcli.geometry.transforms import Pose
 from bevcli.sequences.images import ImageReader, ImageSource
 from bevcli.sequences.nuscenes.cache import open_index
 from bevcli.sequences.nuscenes.choice import chosen_scenes, keyframes, sweep_frames, tables_of
+from bevcli.sequences.nuscenes.dialect import NUSCENES, Dialect
 from bevcli.sequences.nuscenes.format import NuScenesOptions
 from bevcli.sequences.nuscenes.index import Images, Ints, Samples
 from bevcli.sequences.nuscenes.scene import read_scene_facts, scene_rig
@@ -29,31 +29,42 @@ class _FrameEntry:
     rows: Ints
 
 
-class NuScenesSequence(Sequence):
-    """Frames of a nuScenes root, scene after scene, numbered from 0: keyframes, and sweeps if they are chosen.
+class TableSequence(Sequence):
+    """Frames of a folder with nuScenes' tables, scene after scene, numbered from 0.
 
-    The bev frame is the scene's LIDAR_TOP frame. The world frame is that of nuScenes' map.
+    Args:
+        root: the folder that file names are relative to.
+        tables: the folder with the tables.
+        common: the options of every format.
+        dialect: the points in which the tables differ from nuScenes' own.
+        split: only the scenes of this split. None: all.
+        sweeps: whether images between the keyframes make frames too.
+
     Raises InputError if a table is missing or invalid, or the choice contains no scene.
     """
 
     has_ego_motion = True
 
     def __init__(
-        self, root: Path, common: SequenceOptions = SequenceOptions(), own: NuScenesOptions = NuScenesOptions()
+        self,
+        root: Path,
+        tables: Path,
+        common: SequenceOptions,
+        dialect: Dialect,
+        *,
+        split: str | None = None,
+        sweeps: bool = False,
     ) -> None:
-        if common.ego_motion == "static":
-            raise InputError(f'{root}: a nuScenes root has its own ego-motion: remove `ego_motion="static"`')
-        self.root = root
-        self.tables = tables_of(root, own.version)
-        self.index, note = open_index(self.tables)
-        scenes = chosen_scenes(self.index, self.tables, own.split, common.scene)
-        self.name = common.scene or own.split or self.tables.name
-        self.rig = scene_rig(self.index, scenes[0])[0]
-        self._frames = tuple(self._find_frames(scenes, own.sweeps))
+        common.refuse_static(root)
+        self.root, self.tables, self.dialect = root, tables, dialect
+        self.index, note = open_index(tables, dialect)
+        self.scenes = chosen_scenes(self.index, tables, split, common.scene)
+        self.rig = scene_rig(self.index, dialect, self.scenes[0])[0]
+        self._frames = tuple(self._find_frames(self.scenes, sweeps))
         self.stamps = tuple(entry.stamp for entry in self._frames)
         self._images = ImageReader(strict=common.strict, inside=None if common.allow_outside else root)
-        self._facts = lru_cache(maxsize=2)(partial(read_scene_facts, self.index, root))
-        self.notes = tuple(text for text in (note, self._can_bus_note(scenes)) if text)
+        self._facts = lru_cache(maxsize=2)(partial(read_scene_facts, self.index, root, dialect))
+        self.notes = (note,) if note else ()
 
     @property
     def input_files(self) -> tuple[Path, ...]:
@@ -63,12 +74,17 @@ class NuScenesSequence(Sequence):
     def image_files(self, place: int) -> tuple[Path, ...]:
         return tuple(self._source(int(row)).path for row in self._frames[place].rows)
 
+    def ground_truth_frame(self, place: int) -> Frame:
+        return self._frame(self._frames[place], with_images=False)
+
     def load(self, place: int) -> Frame:
-        entry = self._frames[place]
+        return self._frame(self._frames[place], with_images=True)
+
+    def _frame(self, entry: _FrameEntry, *, with_images: bool) -> Frame:
         facts = self._facts(entry.scene)
         rows = {facts.sensor_names[int(self.index.images.sensors[row])]: int(row) for row in entry.rows}
         dropped = {name: "no image in sample_data.json" for name in facts.rig.names if name not in rows}
-        sources = {name: self._source(rows[name]) for name in facts.rig.names if name in rows}
+        sources = {name: self._source(rows[name]) for name in facts.rig.names if name in rows and with_images}
         images, dropped = self._images.read(sources, facts.rig, dropped)
         sample, index = entry.sample, self.index
         pose = facts.motion.pose_at(entry.stamp.timestamp_ns) if sample is None else _pose_of(index.samples, sample)
@@ -80,7 +96,7 @@ class NuScenesSequence(Sequence):
             world_from_ego_at={n: _pose_of(index.images, rows[n]) if n in rows else pose for n in facts.rig.names},
             kinematics=facts.kinematics_at(entry.stamp.timestamp_ns),
             dropped=dropped,
-            ground_truth=None if sample is None else index.ground_truth(sample),
+            ground_truth=None if sample is None else index.ground_truth(sample, self.dialect.class_of),
             sample_token=None if sample is None else index.samples.tokens[sample].decode(),
         )
 
@@ -97,8 +113,25 @@ class NuScenesSequence(Sequence):
         images = self.index.images
         return ImageSource(self.root / images.files[row].decode(), int(images.times_us[row]) * 1000)
 
-    def _can_bus_note(self, scenes: Iterable[int]) -> str:
-        names = [str(self.index.scenes.names[scene]) for scene in scenes]
+
+class NuScenesSequence(TableSequence):
+    """Frames of a nuScenes root: keyframes, and sweeps if they are chosen.
+
+    The bev frame is the scene's LIDAR_TOP frame. The world frame is that of nuScenes' map.
+    Raises InputError as `TableSequence`.
+    """
+
+    def __init__(
+        self, root: Path, common: SequenceOptions = SequenceOptions(), own: NuScenesOptions = NuScenesOptions()
+    ) -> None:
+        tables = tables_of(root, own.version)
+        super().__init__(root, tables, common, NUSCENES, split=own.split, sweeps=own.sweeps)
+        self.name = common.scene or own.split or tables.name
+        note = self._can_bus_note()
+        self.notes = (*self.notes, note) if note else self.notes
+
+    def _can_bus_note(self) -> str:
+        names = [str(self.index.scenes.names[scene]) for scene in self.scenes]
         without = [name for name in names if not (self.root / "can_bus" / f"{name}_pose.json").is_file()]
         if not without:
             return ""

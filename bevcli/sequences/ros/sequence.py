@@ -13,6 +13,7 @@ from bevcli.frame import DriveFacts, Frame, FrameStamp, Sequence
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
 from bevcli.geometry.transforms import Array, rigid
+from bevcli.parsing.files import is_there
 from bevcli.sequences.files.calibration_file import read_rig_and_facts
 from bevcli.sequences.images import FrameEntry, ImageReader, Source, read_frame
 from bevcli.sequences.native.folder import rig_notes
@@ -96,11 +97,11 @@ def _files_beside(
 ) -> tuple[CameraRig | None, DriveFacts, Path | None, list[str]]:
     """Rig, facts, ego-motion file and notes: those of files beside the bag, where no others are given."""
     calibration, notes = folder / CALIBRATION_FILE, []
-    found, facts = read_rig_and_facts(calibration) if calibration.is_file() else (None, DriveFacts())
+    found, facts = read_rig_and_facts(calibration) if is_there(calibration) else (None, DriveFacts())
     if rig is None and found is not None:
         notes.append(f"{calibration} is used in place of the calibration in the bag")
     file = own.ego_motion_file
-    if file is None and common.ego_motion != "static" and (folder / EGO_MOTION_FILE).is_file():
+    if file is None and common.ego_motion != "static" and is_there(folder / EGO_MOTION_FILE):
         file = folder / EGO_MOTION_FILE
         notes.append(f"{file} is used in place of the poses in the bag")
     return found if rig is None else rig, facts, file, notes

@@ -227,6 +227,8 @@ class SqliteFile:
             self._database.execute("PRAGMA locking_mode = EXCLUSIVE")
             self._check_tables()
             rows = self._database.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
+            if wrong := [cell for row in rows for cell in row[1:] if not isinstance(cell, str)]:
+                raise sqlite3.DatabaseError(f"table topics: {wrong[0]!r:.50} is no text (expected names and types)")
             definitions = self._definitions()
         except sqlite3.Error as error:
             raise InputError(f"{path}: cannot be read as a rosbag2 database ({error})") from None
@@ -245,7 +247,10 @@ class SqliteFile:
         """The bytes of message `index` of a topic. Raises InputError if they are broken."""
         row = int(self._references_of(topic)[index, 1])
         try:
-            return self._database.execute("SELECT data FROM messages WHERE id = ?", (row,)).fetchone()[0]
+            found = self._database.execute("SELECT data FROM messages WHERE id = ?", (row,)).fetchone()[0]
+            if not isinstance(found, bytes):
+                raise TypeError(f"{found!r:.50} is not bytes")
+            return found
         except (sqlite3.Error, TypeError) as error:
             raise InputError(f"{self.path}: {topic}: message {index} is broken ({error})") from None
 

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bevcli.frame import MAP_CLASSES, BevMap
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.object_classes import VEHICLE_CLASSES
 from bevcli.geometry.transforms import Array, apply
 from bevcli.synth.assets.paint import linear
 from bevcli.synth.world.ground_plan import ASPHALT, GroundPiece
@@ -84,7 +85,6 @@ def roughness() -> NDArray[np.float32]:
 
 
 BOUNDARY_M = 0.5  # width of lane boundaries in the map; wider than their paint, so that no cell misses them
-VEHICLE_CLASSES = ("car", "truck", "construction_vehicle", "bus", "trailer", "motorcycle", "bicycle")
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,161 @@
+"""Classes of objects: how each is scored, tracked, drawn and exported. A model names its own; nuScenes has ten."""
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+Color = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class ObjectClass:
+    """One class of objects.
+
+    Attributes:
+        name: of the class.
+        range_m: distance from the ego vehicle on the ground below which objects are scored, metres.
+        gate_m: largest distance between a box and the place where its track is expected, metres.
+        tracked: whether tracks of the class are scored.
+        attributes: nuScenes attribute of a moving and of a standing object; "" for a class without attributes.
+        undefined_errors: errors of the nuScenes score that the class does not have, by the devkit's names.
+        symmetric: whether front and back of an object are the same.
+        vehicle: whether its objects are drawn into the map layer "vehicle".
+        kitti: type in KITTI's label files; "" for the name.
+        color: RGB, 0 to 255; None for one by the index among the model's classes.
+    """
+
+    name: str
+    range_m: float = 50.0
+    gate_m: float = 4.0
+    tracked: bool = True
+    attributes: tuple[str, str] = ("", "")
+    undefined_errors: tuple[str, ...] = ("attr_err",)
+    symmetric: bool = False
+    vehicle: bool = False
+    kitti: str = ""
+    color: Color | None = None
+
+
+def _vehicle(
+    name: str, kitti: str, gate_m: float, color: Color, still: str = "vehicle.parked", *, tracked: bool = True
+) -> ObjectClass:
+    attributes = ("vehicle.moving", still)
+    return ObjectClass(name, 50.0, gate_m, tracked, attributes, (), vehicle=True, kitti=kitti, color=color)
+
+
+def _cycle(name: str, kitti: str, gate_m: float, color: Color) -> ObjectClass:
+    attributes = ("cycle.with_rider", "cycle.without_rider")
+    return ObjectClass(name, 40.0, gate_m, True, attributes, (), vehicle=True, kitti=kitti, color=color)
+
+
+def _static(name: str, kitti: str, color: Color, *undefined_errors: str) -> ObjectClass:
+    symmetric = "orient_err" not in undefined_errors
+    return ObjectClass(name, 30.0, 1.0, False, ("", ""), undefined_errors, symmetric, kitti=kitti, color=color)
+
+
+_WALKING = ("pedestrian.moving", "pedestrian.standing")
+
+# The ten detection classes of nuScenes, in the order of the published models' class scores. Ranges, tracked classes and
+# undefined errors are those of its devkit (detection_cvpr_2019, tracking_nips_2019). A standing bus is "stopped", not
+# "parked", as in the original BEVFormer. No class is red: red marks a miss or a false positive.
+NUSCENES_CLASSES: Mapping[str, ObjectClass] = {
+    each.name: each
+    for each in (
+        _vehicle("car", "Car", 3.0, (255, 158, 44)),
+        _vehicle("truck", "Truck", 3.0, (186, 222, 92)),
+        _vehicle("construction_vehicle", "ConstructionVehicle", 4.0, (205, 155, 110), tracked=False),
+        _vehicle("bus", "Bus", 5.0, (240, 108, 190), "vehicle.stopped"),
+        _vehicle("trailer", "Trailer", 4.0, (110, 190, 120)),
+        _static("barrier", "Barrier", (150, 160, 175), "vel_err", "attr_err"),
+        _cycle("motorcycle", "Motorcycle", 4.0, (178, 130, 255)),
+        _cycle("bicycle", "Cyclist", 2.5, (96, 165, 255)),
+        ObjectClass("pedestrian", 40.0, 2.0, True, _WALKING, (), kitti="Pedestrian", color=(70, 222, 190)),
+        _static("traffic_cone", "TrafficCone", (245, 222, 90), "orient_err", "vel_err", "attr_err"),
+    )
+}
+VEHICLE_CLASSES = tuple(name for name, each in NUSCENES_CLASSES.items() if each.vehicle)
+
+
+@dataclass(frozen=True)
+class ClassSettings:
+    """The table [class_settings.NAME] of a model's TOML file: settings of one class.
+
+    A setting that is left out is that of the class `like`; without `like`, that of the nuScenes class of the same name,
+    or else the default of `ObjectClass`.
+
+    Attributes:
+        like: one of nuScenes' ten classes.
+        range_m, gate_m, tracked, attributes, kitti: see `ObjectClass`.
+        color: such as "#ff9e2c".
+    """
+
+    like: str = ""
+    range_m: float | None = None
+    gate_m: float | None = None
+    tracked: bool | None = None
+    attributes: tuple[str, str] | None = None
+    kitti: str | None = None
+    color: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.like and self.like not in NUSCENES_CLASSES:
+            raise ValueError(f'like is "{self.like:.40}" (expected one of {", ".join(NUSCENES_CLASSES)})')
+        if any(value is not None and not value > 0 for value in (self.range_m, self.gate_m)):
+            raise ValueError("range_m and gate_m must be above 0")
+        if self.color is not None and not re.fullmatch(r"#[0-9a-fA-F]{6}", self.color):
+            raise ValueError(f'color is "{self.color:.40}" (expected red, green and blue such as "#ff9e2c")')
+
+    def resolve(self, name: str) -> ObjectClass:
+        """The class of this name with these settings."""
+        base = NUSCENES_CLASSES.get(self.like or name, ObjectClass(name))
+        own = ("range_m", "gate_m", "tracked", "attributes", "kitti")
+        given: dict[str, Any] = {key: getattr(self, key) for key in own if getattr(self, key) is not None}
+        if self.attributes is not None:
+            given["undefined_errors"] = () if any(self.attributes) else (*base.undefined_errors, "attr_err")
+        if self.color is not None:
+            given["color"] = color_of_hex(self.color)
+        return replace(base, name=name, **given)
+
+
+def color_of_hex(text: str) -> Color:
+    """The colour of a text such as "#ff9e2c"."""
+    red, green, blue = bytes.fromhex(text[1:])
+    return red, green, blue
+
+
+def object_classes(names: Iterable[str], settings: Mapping[str, ClassSettings]) -> dict[str, ObjectClass]:
+    """Classes by name, in the order of the names. Raises ValueError for no or a repeated name, or settings of no class.
+
+    Classes that are drawn like the same nuScenes class have its colour only once: the others take one by their index.
+    """
+    given = tuple(names)
+    if not given:
+        raise ValueError("classes is empty (expected at least one name)")
+    for name in given:
+        if not (name.strip() == name and 0 < len(name) <= 100 and name.isprintable()):
+            raise ValueError(f"classes: {name!r:.60} is not a name (expected up to 100 printable characters)")
+        if given.count(name) > 1:
+            raise ValueError(f'classes: "{name}" stands there twice')
+    unknown = settings.keys() - set(given)
+    if unknown:
+        raise ValueError(f'class_settings: "{min(unknown)}" is not among the classes ({", ".join(given)})')
+    made: dict[str, ObjectClass] = {}
+    for name in given:
+        one = settings.get(name, ClassSettings()).resolve(name)
+        taken = any(other.color == one.color for other in made.values())
+        stated = name in settings and settings[name].color is not None
+        made[name] = replace(one, color=None) if taken and not stated else one
+    return made
+
+
+def are_nuscenes(classes: Mapping[str, ObjectClass]) -> bool:
+    """True for the ten classes with nuScenes' own settings: scores are then comparable to nuScenes'."""
+    return {name: _scoring(one) for name, one in classes.items()} == {
+        name: _scoring(one) for name, one in NUSCENES_CLASSES.items()
+    }
+
+
+def _scoring(one: ObjectClass) -> ObjectClass:
+    """The class without what changes no score."""
+    return replace(one, color=None, kitti="", gate_m=1.0)

@@ -1,0 +1,132 @@
+"""Reads the triangles of a mesh file with trimesh, in a process of its own with limits of memory and time."""
+
+import io
+import subprocess
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.errors import InputError
+from bevcli.geometry.transforms import Array
+from bevcli.parsing.files import MIB, read_bytes
+from bevcli.parsing.own_process import run_python
+from bevcli.printing import reason_of
+from bevcli.recording.colors import EGO_COLOR
+
+SMOOTH_BELOW_RAD = np.radians(40.0)  # faces that meet at a smaller angle are shaded as one curved surface
+LARGEST_BYTES = 64 * MIB  # of the file, and of each that it names
+LARGEST_TEXT_BYTES = 16 * MIB  # of a format of text, of which trimesh makes sixty times as much
+TEXT_FORMATS = (".obj", ".off")
+FORMATS = (".glb", ".gltf", ".ply", ".obj", ".stl", ".off")  # no archives, whose contents may have any size
+Part = tuple[Array, Array, NDArray[np.int64], NDArray[np.uint8]]  # vertices, normals, faces, colours
+GLTF_FILES = (".glb", ".gltf")
+EGO_FROM_GLTF = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # glTF: y up, z forward, x left
+MEMORY, SECONDS = 1024 * MIB, 20.0  # limits of the process
+READ = """
+import sys, trimesh
+from bevcli.recording.mesh_file import write_parts
+limit_memory()
+sys.exit(write_parts(sys.argv[1]))
+"""
+TOO_LARGE = 3  # exit code
+
+
+def read_mesh(path: Path) -> Part:
+    """All triangles of a mesh file in the ego frame: vertices (V, 3) in metres, normals, faces (F, 3), colours.
+
+    Raises InputError where trimesh cannot read the file within 1 GiB and 20 s, and where it has no triangles.
+    """
+    if path.suffix.lower() not in FORMATS:
+        raise InputError(f"{path}: is not a mesh file (expected a name that ends in {', '.join(FORMATS)})")
+    try:
+        done = run_python(READ, [path], MEMORY, SECONDS)
+    except subprocess.TimeoutExpired:
+        raise InputError(f"{path}: takes more than {SECONDS:.0f} s to read (expected fewer triangles)") from None
+    if done.returncode == 0:
+        file = io.BytesIO(done.stdout)
+        vertices, normals, faces, colors = (np.load(file, allow_pickle=False) for _ in range(4))
+        return vertices, normals, faces, colors
+    lines = done.stderr.decode(errors="replace").strip().splitlines()
+    if done.returncode == 1 and lines:
+        raise InputError(lines[-1])
+    what = "takes more than 1 GiB of memory" if done.returncode == TOO_LARGE else "ends trimesh, which reads it"
+    raise InputError(f"{path}: {what} (expected a mesh of fewer triangles)")
+
+
+def write_parts(path: str) -> str | int | None:
+    """Write the arrays of a mesh file to stdout, for `read_mesh`. Returns what `sys.exit` takes."""
+    import sys
+
+    try:
+        corners, normals, faces, colors = zip(*read_parts(Path(path)), strict=True)
+        starts = np.cumsum([0, *map(len, corners[:-1])])
+        shifted = np.concatenate([part + start for part, start in zip(faces, starts, strict=True)])
+        for array in (np.concatenate(corners), np.concatenate(normals), shifted, np.concatenate(colors)):
+            np.save(sys.stdout.buffer, array)
+    except InputError as error:
+        return str(error)
+    except MemoryError:
+        return TOO_LARGE
+    return None
+
+
+def read_parts(path: Path) -> list[Part]:
+    """The triangle meshes of a file in the ego frame, read in this process. Raises InputError, MemoryError."""
+    import trimesh  # only here: it takes half a second to load
+
+    suffix = path.suffix.lower()
+    content = read_bytes(path, LARGEST_TEXT_BYTES if suffix in TEXT_FORMATS else LARGEST_BYTES)
+    try:
+        scene = trimesh.load_scene(io.BytesIO(content), file_type=suffix[1:], resolver=_Siblings(path.parent))
+        if suffix in GLTF_FILES:
+            scene.apply_transform(EGO_FROM_GLTF)
+        parts = [_part(mesh) for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
+    except MemoryError:
+        raise
+    except Exception as error:  # each of trimesh's many readers raises errors of its own
+        reason = reason_of(error)
+        raise InputError(
+            f"{path}: trimesh cannot read this mesh file ({reason}); try .glb, .ply, .obj or .stl"
+        ) from error
+    if not parts:
+        raise InputError(f"{path}: the file has no triangles (expected a triangle mesh of the vehicle)")
+    return parts
+
+
+class _Siblings(Mapping[str, bytes]):
+    """The regular files of a folder by name, as trimesh asks for them: nothing outside of it, and no pipes."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder.resolve()
+
+    def __getitem__(self, name: str) -> bytes:
+        path = (self.folder / name).resolve()
+        if not path.is_relative_to(self.folder):
+            raise InputError(f"{name}: is outside of the mesh file's folder")
+        return read_bytes(path, LARGEST_BYTES)
+
+    def __iter__(self) -> Iterator[str]:
+        return (path.name for path in self.folder.iterdir())
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+
+def _part(mesh: Any) -> Part:
+    """Vertices, normals, faces and colours of a trimesh.Trimesh, with sharp edges."""
+    import trimesh
+
+    visual = mesh.visual
+    if visual.kind == "face":
+        mesh.unmerge_vertices()  # no vertex may be shared by faces of different colours
+        visual = mesh.visual
+    if visual.kind == "texture":
+        visual = visual.to_color()  # of each vertex; one colour for all of them where there is no texture image
+    colors = visual.vertex_colors if visual.defined else (*EGO_COLOR, 255)
+    mesh.visual = trimesh.visual.ColorVisuals(vertex_colors=np.broadcast_to(colors, (len(mesh.vertices), 4)))
+    mesh = trimesh.graph.smooth_shade(mesh, angle=SMOOTH_BELOW_RAD, facet_minarea=None)
+    colors = np.array(mesh.visual.vertex_colors, dtype=np.uint8)[:, :3]
+    return np.array(mesh.vertices), np.array(mesh.vertex_normals), np.array(mesh.faces), colors

@@ -1,0 +1,143 @@
+"""An Argoverse 2 log as a Sequence."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.errors import InputError
+from bevcli.frame import Frame, FrameStamp, Sequence
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.cameras import CameraRig
+from bevcli.geometry.ego_motion import EgoMotion
+from bevcli.geometry.transforms import rotation_from_quaternion, yaw_of_rotation
+from bevcli.parsing.documents import LARGEST_INTEGER
+from bevcli.sequences.argoverse2.classes import CLASS_OF_CATEGORY
+from bevcli.sequences.argoverse2.feather import QUATERNION, TRANSLATION, FeatherTable
+from bevcli.sequences.argoverse2.format import Argoverse2Options
+from bevcli.sequences.argoverse2.rig import read_motion, read_rig
+from bevcli.sequences.files.class_names import ClassNames, count_classes
+from bevcli.sequences.images import FrameEntry, ImageReader, ImageSource, read_frame
+from bevcli.sequences.native.folder import rig_notes
+from bevcli.sequences.options import SequenceOptions
+from bevcli.sequences.tracks import with_track_velocities
+
+NEAR_NS = 26_000_000  # half the time between two images of a camera, which has 20 per second, and some jitter
+SIZE = ("length_m", "width_m", "height_m")
+ANNOTATIONS = "annotations.feather"
+Times = NDArray[np.int64]
+
+
+class Argoverse2Sequence(Sequence):
+    """A log of the Argoverse 2 sensor dataset: a frame for each time that has boxes, 10 per second.
+
+    A log without boxes has a frame for each image of the front camera. Each camera contributes its nearest image.
+    The ego frame is below Argoverse's, on the ground. The world frame is that of the city. Raises InputError.
+    """
+
+    has_ego_motion = True
+
+    def __init__(
+        self, path: Path, common: SequenceOptions = SequenceOptions(), own: Argoverse2Options = Argoverse2Options()
+    ) -> None:
+        common.refuse_static(path)
+        self.path, self.name = path, path.resolve().name
+        self.rig = read_rig(path / "calibration", own)
+        self.ego_motion = read_motion(path / "city_SE3_egovehicle.feather", own.axle_height_m)
+        images = {name: _image_times(path / "sensors/cameras" / name) for name in self.rig.names}
+        annotated = (path / ANNOTATIONS).exists()
+        names = ClassNames.of_format(CLASS_OF_CATEGORY, common.class_map)
+        truth = _read_annotations(path / ANNOTATIONS, self.ego_motion, own, names) if annotated else {}
+        self._entries, notes = _entries(path, self.rig, images, np.array(sorted(truth), dtype=np.int64))
+        self.stamps = tuple(entry.stamp for entry in self._entries)
+        self._truth = truth if common.ground_truth else {}
+        self.notes = (*rig_notes(self.rig, "an Argoverse 2 log"), *notes)
+        self._images = ImageReader(strict=common.strict, inside=None if common.allow_outside else path)
+
+    @property
+    def input_files(self) -> tuple[Path, ...]:
+        """The tables."""
+        return tuple(sorted((*self.path.glob("*.feather"), *self.path.glob("calibration/*.feather"))))
+
+    @property
+    def class_counts(self) -> Mapping[str, int]:
+        return count_classes(self._truth.values())
+
+    def image_files(self, place: int) -> tuple[Path, ...]:
+        sources = self._entries[place].sources.values()
+        return tuple(source.path for source in sources if isinstance(source, ImageSource))
+
+    def ground_truth_frame(self, place: int) -> Frame:
+        entry = self._entries[place]
+        return self._frame(FrameEntry(entry.stamp, {}, {}, entry.origin))
+
+    def load(self, place: int) -> Frame:
+        return self._frame(self._entries[place])
+
+    def _frame(self, entry: FrameEntry) -> Frame:
+        truth = self._truth.get(entry.stamp.timestamp_ns)
+        return read_frame(entry, self.rig, self._images, self.ego_motion, truth)
+
+
+def _image_times(folder: Path) -> Times:
+    """(N,) ns, increasing, of the images TIMESTAMP.jpg in a camera's folder; none without the folder."""
+    names = [file.stem for file in folder.glob("*.jpg")] if folder.is_dir() else []
+    times = [int(name) for name in names if name.isascii() and name.isdecimal() and len(name) <= 19]
+    return np.array(sorted(time for time in times if time <= LARGEST_INTEGER), dtype=np.int64)
+
+
+def _read_annotations(path: Path, motion: EgoMotion, own: Argoverse2Options, names: ClassNames) -> dict[int, Boxes3D]:
+    """The boxes in the city frame by time in ns. Raises InputError."""
+    columns = ("timestamp_ns", "track_uuid", "category", *SIZE, *QUATERNION, *TRANSLATION, "num_interior_pts")
+    table = FeatherTable(path, columns)
+    translations, quaternions = table.poses()
+    boxes = Boxes3D(
+        translations + [0, 0, own.axle_height_m],
+        table.numbers(SIZE),
+        np.array([yaw_of_rotation(rotation_from_quaternion(q)) for q in quaternions], dtype=np.float64),
+        np.full((len(table), 2), np.nan),
+        np.array([names[name] for name in table.texts("category")], dtype=np.str_),
+        instances=np.array(table.texts("track_uuid"), dtype=np.str_),
+        num_points=table.integers("num_interior_pts"),
+    )
+    times = table.integers("timestamp_ns")
+    frames = np.unique(times)
+    try:
+        in_city = [boxes[times == time].transformed(motion.pose_at(int(time)).matrix) for time in frames]
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return dict(zip(frames.tolist(), with_track_velocities(in_city, frames.tolist()), strict=True))
+
+
+def _entries(
+    path: Path, rig: CameraRig, images: Mapping[str, Times], annotated: Times
+) -> tuple[tuple[FrameEntry, ...], tuple[str, ...]]:
+    """The frames that have an image, and notes. Raises InputError if there are none."""
+    leading = next((times for times in images.values() if len(times)), None)
+    if leading is None:
+        raise InputError(
+            f"{path / 'sensors/cameras'}: has no images (expected {rig.names[0]}/TIMESTAMP_NS.jpg and others)"
+        )
+    times = annotated if len(annotated) else leading
+    found = [_sources(path / "sensors/cameras", images, int(time)) for time in times]
+    kept = [(index, sources) for index, sources in enumerate(found) if sources]
+    if not kept:
+        raise InputError(f"{path}: no image is within {NEAR_NS / 1e6:.0f} ms of a time that has boxes in {ANNOTATIONS}")
+    entries = []
+    for index, sources in kept:
+        reason = f"has no image within {NEAR_NS / 1e6:.0f} ms of the frame"
+        dropped = {name: reason for name in rig.names if name not in sources}
+        entries.append(FrameEntry(FrameStamp(index, "", int(times[index])), sources, dropped, str(path)))
+    note = f"{len(times) - len(kept)} of {len(times)} frames have no image and are left out"
+    return tuple(entries), (note,) if len(kept) < len(times) else ()
+
+
+def _sources(folder: Path, images: Mapping[str, Times], time: int) -> dict[str, ImageSource]:
+    """The image of each camera that is nearest to a time in ns."""
+    found = {}
+    for name, times in images.items():
+        nearest = int(times[np.abs(times - time).argmin()]) if len(times) else None
+        if nearest is not None and abs(nearest - time) <= NEAR_NS:
+            found[name] = ImageSource(folder / name / f"{nearest}.jpg", nearest)
+    return found

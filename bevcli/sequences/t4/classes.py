@@ -1,0 +1,33 @@
+"""The class names of T4 datasets. docs/other-inputs.md says what is lost."""
+
+# Older datasets have the longer names. Names are compared without case; others stay as they are, and are not scored.
+CLASS_OF_CATEGORY = {
+    "vehicle.car": "car",
+    "police_car": "car",
+    "vehicle.police": "car",
+    "vehicle.emergency (ambulance & police)": "car",
+    "ambulance": "truck",
+    "vehicle.ambulance": "truck",
+    "fire_truck": "truck",
+    "vehicle.fire": "truck",
+    "vehicle.truck": "truck",
+    "forklift": "construction_vehicle",
+    "vehicle.construction": "construction_vehicle",
+    "vehicle.bus": "bus",
+    "vehicle.bus (bendy & rigid)": "bus",
+    "vehicle.trailer": "trailer",
+    "semi_trailer": "trailer",
+    "motorbike": "motorcycle",
+    "vehicle.motorbike": "motorcycle",
+    "vehicle.motorcycle": "motorcycle",
+    "vehicle.bicycle": "bicycle",
+    "construction_worker": "pedestrian",
+    "police_officer": "pedestrian",
+    "pedestrian.adult": "pedestrian",
+    "pedestrian.child": "pedestrian",
+    "pedestrian.construction_worker": "pedestrian",
+    "pedestrian.police_officer": "pedestrian",
+    "movable_object.barrier": "barrier",
+    "movable_object.trafficcone": "traffic_cone",
+    "movable_object.traffic_cone": "traffic_cone",
+}

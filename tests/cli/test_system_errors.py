@@ -1,0 +1,82 @@
+"""What the system lacks or refuses is one line: memory, a package, an output stream, a disk."""
+
+import os
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from command_line import command
+
+from bevcli.checkpoints import convert
+from bevcli.cli import main
+from bevcli.errors import OutputError
+
+PROGRAM = [sys.executable, "-m", "bevcli"]
+
+
+@pytest.mark.parametrize("streams", [">&-", "<&-", ">&- 2>&-", "<&- >&- 2>&-"])
+def test_closed_streams_are_null_devices(streams):
+    """Else the next file that the program opens becomes its stdout."""
+    done = subprocess.run(["sh", "-c", f'"$@" --version {streams}', "sh", *PROGRAM], capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        RuntimeError("can't start new thread"),
+        ImportError("libarrow.so.2600: failed to map segment from shared object"),
+        RuntimeError("[enforce fail at alloc_cpu.cpp:117] DefaultCPUAllocator: can't allocate memory"),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_a_lack_of_memory_is_one_line(error, tmp_path, monkeypatch):
+    def fail():
+        raise error
+
+    monkeypatch.setattr(main, "app", fail)
+    monkeypatch.setattr(os, "_exit", sys.exit)
+    done = command(tmp_path, "run")
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: the system gives no more memory or threads: ")
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_a_package_that_cannot_be_imported_is_one_line(tmp_path):
+    environment = {**os.environ, "NUMBA_NUM_THREADS": "0"}
+    run = [*PROGRAM, "render", "out", "--count", "1"]
+    done = subprocess.run(run, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: the package numba cannot be imported: ")
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_other_errors_are_bugs_and_have_tracebacks(tmp_path, monkeypatch):
+    def fail():
+        raise KeyError("x")
+
+    monkeypatch.setattr(main, "app", fail)
+    with pytest.raises(KeyError):
+        command(tmp_path, "run")
+
+
+def test_weights_on_a_full_disk_are_one_line(tmp_path):
+    demo = Path(main.__file__).parents[1] / "weights/demo.safetensors"
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))
+    try:
+        with pytest.raises(OutputError, match=r"out\.safetensors: cannot be written"):
+            convert(demo, tmp_path / "out.safetensors")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_numba_without_its_compiler_is_one_line():
+    code = "import bevcli.model.kernels.bilinear"
+    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    assert done.stderr.splitlines()[-1].startswith("bevcli.errors.BevcliError: NUMBA_DISABLE_JIT is set")

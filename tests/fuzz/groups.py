@@ -1,0 +1,41 @@
+"""Groups of semantic fuzz cases: files that are well formed, or whole, and wrong in what they say.
+
+A case is a number. `Group.run` derives everything from it, in a folder that is empty before: it makes the case from the
+seeds, and does what a user's command would do. It fails by any exception but a BevcliError; an assertion says that a
+command succeeded with damaged output. The worker adds the limits on time and memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from random import Random
+
+from file_cases import batch_record, mesh, onnx_file, sqlite_schema
+from run_cases import exchanged_input, exchanged_under_way, false_state, resumed_after_damage
+
+
+@dataclass(frozen=True)
+class Group:
+    """A group of cases.
+
+    Attributes:
+        run: (folder of the seeds, empty folder, source of all choices) -> nothing.
+        cases: in `make fuzz`.
+    """
+
+    run: Callable[[Path, Path, Random], None]
+    cases: int
+
+
+GROUPS = {
+    "output damaged between kill and resume": Group(resumed_after_damage, 1000),
+    "input exchanged between kill and resume": Group(exchanged_input, 800),
+    "input or output exchanged under way": Group(exchanged_under_way, 300),
+    "state with right hash and wrong content": Group(false_state, 600),
+    "ONNX": Group(onnx_file, 600),
+    "mesh with siblings": Group(mesh, 1000),
+    "batch record": Group(batch_record, 1000),
+    "SQLite schema": Group(sqlite_schema, 700),
+}
