@@ -30,6 +30,9 @@ def class_bits(names: Iterable[str]) -> dict[str, int]:
 # The map classes of rendered drives and of the segmentation head.
 MAP_CLASSES = class_bits(["drivable_road", "lane_boundary", "pedestrian_crossing", "vehicle"])
 
+# The classes of the true lines of rendered drives, which are those of VAD.
+LINE_CLASSES = ("divider", "ped_crossing", "boundary")
+
 
 @dataclass(frozen=True)
 class CameraImage:
@@ -139,6 +142,7 @@ class Frame:
         dropped: camera -> why its image is missing.
         ground_truth: boxes in the world frame.
         ground_truth_map: a map in the bev frame.
+        ground_truth_lines: lines of the map in the bev frame, of LINE_CLASSES.
         sample_token: nuScenes' name of the frame.
     """
 
@@ -151,6 +155,7 @@ class Frame:
     dropped: Mapping[str, str] = field(default_factory=dict)
     ground_truth: Boxes3D | None = None
     ground_truth_map: BevMap | None = None
+    ground_truth_lines: "MapLines | None" = None
     sample_token: str | None = None
 
 

@@ -20,12 +20,11 @@ from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.files.json_fields import pose_from_json
-from bevcli.sequences.files.lines_file import LinesFile, read_lines
-from bevcli.sequences.files.plan_file import read_plans
+from bevcli.sequences.files.lines_file import TRUE_LINES, LinesFile, LinesWriter, read_lines
+from bevcli.sequences.files.plan_file import PlanWriter, read_plans
 
 Scored = Literal["map", "motion", "plan"]
 DRIVING: tuple[Scored, ...] = ("map", "motion", "plan")
-LINES, TRUE_LINES, PLAN = "map_lines.json", "ground_truth_lines.json", "plan.csv"
 TURN_M = 2.0  # a path that ends further to a side is one to the right or left, as in nuScenes' labels for VAD
 
 
@@ -49,13 +48,15 @@ def evaluate_driving(
     folders = tuple(path if path.is_dir() else path.parent for path in files)
     scores = DrivingScores()
     if "map" in asked:
-        scores = replace(scores, lines=_lines(read_lines(folders[0] / LINES), _true_lines(folders[1]), pairs))
+        scores = replace(
+            scores, lines=_lines(read_lines(folders[0] / LinesWriter.name), _true_lines(folders[1]), pairs)
+        )
     if "motion" in asked:
         _require_world(pairs, "motion")
         scores = replace(scores, motion=_motion(found, truth, pairs))
     if "plan" in asked:
         _require_world(pairs, "plan")
-        plan, notes = _plan(folders[0] / PLAN, found, truth, pairs)
+        plan, notes = _plan(folders[0] / PlanWriter.name, found, truth, pairs)
         scores = replace(scores, plan=plan, notes=notes)
     return scores
 
@@ -68,7 +69,7 @@ def _require_world(pairs: FramePairs, option: str) -> None:
 def _true_lines(folder: Path) -> LinesFile:
     file = folder / TRUE_LINES
     if not file.exists():
-        raise InputError(f"{file}: `map`: the file is missing (expected true lines of the map)")
+        raise InputError(f"{file}: `map`: the file is missing (expected true lines, as `bevcli render` writes them)")
     return read_lines(file)
 
 

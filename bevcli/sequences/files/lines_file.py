@@ -13,6 +13,7 @@ from bevcli.frame import FrameStamp, Ground, MapLines
 from bevcli.sequences.files.incremental_json import IncrementalJson, read_entries
 
 FORMAT = "bevcli-map-lines/1"
+TRUE_LINES = "ground_truth_lines.json"  # of a drive
 LARGEST_BYTES = 4 << 30
 DECIMALS = 3  # millimetres
 _TAIL = "]}"
