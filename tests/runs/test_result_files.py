@@ -18,9 +18,10 @@ from bevcli.inference.commands import Commands, read_commands
 from bevcli.inference.load import Model
 from bevcli.inference.run import run
 from bevcli.model.config import ModelConfig
+from bevcli.model.vad.config import VADConfig
 from bevcli.model.vad.line_decoder import LineDecoderConfig
 from bevcli.model.vad.motion_head import MotionConfig
-from bevcli.model.vad.vad import VAD, VADConfig
+from bevcli.model.vad.vad import VAD
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import RunOptions
 from bevcli.runs.run_into_folder import run_into_folder

@@ -1,77 +1,24 @@
 """VAD (Jiang et al. 2023): BEVFormer's BEV map and objects, lines of the map, futures of objects, a planned path."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from typing import ClassVar, NoReturn
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from bevcli.errors import BevcliError, ConfigError
-from bevcli.frame import FrameResult, MapLines, Plan
+from bevcli.frame import FrameResult
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.transforms import Array
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.model.box_coding import best_queries, decode
 from bevcli.model.config import ModelConfig
 from bevcli.model.network import STAGES, ConstantSelfAttention
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.step import ModelOutputs
-from bevcli.model.vad.line_decoder import LineDecoder, LineDecoderConfig, LineEncoder, LineOutputs
-from bevcli.model.vad.motion_head import MapTokens, MotionConfig, MotionHead, MotionOutputs, line_positions
+from bevcli.model.vad.config import VADConfig
+from bevcli.model.vad.decoding import VADOutputs, decode_futures, decode_lines, decode_plan
+from bevcli.model.vad.export import VADForm
+from bevcli.model.vad.line_decoder import LineDecoder, LineEncoder, LineOutputs
+from bevcli.model.vad.motion_head import MapTokens, MotionHead, line_positions
 from bevcli.model.vad.official_keys import NAMES, UNUSED
 from bevcli.model.vad.planner import Planner
-
-
-@dataclass(frozen=True, kw_only=True)
-class VADConfig(ModelConfig):
-    """A whole VAD.
-
-    Attributes:
-        commands: of the driver, in the order of the planned paths.
-        line_decoder: the map decoder.
-        motion: the motion head and the planner.
-    """
-
-    architecture: ClassVar[str] = "VAD"
-
-    commands: tuple[str, ...] = ("right", "left", "straight")
-    line_decoder: LineDecoderConfig = field(default_factory=LineDecoderConfig)
-    motion: MotionConfig = field(default_factory=MotionConfig)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.heads != ("detection",) or self.decoder.training_groups != 1:
-            raise ValueError('heads must be ["detection"] and decoder.training_groups 1: VAD has heads of its own')
-        if self.channels % self.line_decoder.attention_heads or self.channels % self.motion.attention_heads:
-            raise ValueError(f"channels is {self.channels}; it must be a multiple of the attention_heads")
-        if not self.commands or len(set(self.commands)) < len(self.commands):
-            raise ValueError("commands must name at least one command, and none twice")
-
-    @property
-    def results(self) -> Mapping[type[FrameResult], tuple[str, ...]]:
-        return {MapLines: self.line_decoder.classes, Plan: self.commands}
-
-    def check_training(self, clip_frames: int) -> None:
-        raise ConfigError(f"{self.name}: a VAD cannot be trained; expected a BEVFormer, such as tiny, small or base")
-
-
-@dataclass(frozen=True, kw_only=True)
-class VADOutputs(ModelOutputs):
-    """The outputs of one step.
-
-    Attributes:
-        lines: of the map.
-        motion: the futures of the object queries.
-        plan: (B, commands, T, 2) movement of the vehicle in each step along x and y of the bev frame, metres.
-    """
-
-    stays_on_device: ClassVar[bool] = True
-
-    lines: LineOutputs
-    motion: MotionOutputs
-    plan: Tensor
 
 
 class VAD(BEVFormer):
@@ -130,10 +77,8 @@ class VAD(BEVFormer):
         return bev
 
     @classmethod
-    def export_form(cls, config: ModelConfig, cameras: int) -> NoReturn:
-        raise BevcliError(
-            f"{config.name}: a VAD cannot be exported (expected a BEVFormer or a BEVFormerV2, such as tiny)"
-        )
+    def export_form(cls, config: ModelConfig, cameras: int) -> VADForm:
+        return VADForm(config, cameras)
 
     @classmethod
     def without_training_parts(cls, state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
@@ -150,37 +95,3 @@ class VAD(BEVFormer):
         yield "planner: vehicle to objects", "planner.agent_attention", "planner.agent_position"
         yield "planner: vehicle to lines", "planner.line_attention", "planner.line_position"
         yield "planner: paths", "planner"
-
-
-def decode_futures(outputs: VADOutputs, config: VADConfig) -> Boxes3D:
-    """The boxes of `bevcli.model.box_coding.decode`, with futures: the places of each object's centre in each mode."""
-    boxes, queries = decode(outputs, config)[0], best_queries(outputs, config)[0][0]
-    offsets = outputs.motion.offsets[0, queries].double().cpu().numpy()  # (K, M, T, 2)
-    places = boxes.centers[:, None, None, :2] + offsets.cumsum(2)
-    seconds = np.broadcast_to(step_times(config)[:, None], (*places.shape[:3], 1))
-    scores = outputs.motion.mode_logits[0, queries].sigmoid().double().cpu().numpy()
-    return replace(boxes, futures=np.concatenate([seconds, places], axis=-1), future_scores=scores)
-
-
-def decode_lines(outputs: VADOutputs, config: VADConfig) -> MapLines:
-    """The line_decoder.max_lines lines with the best scores, by falling score, bev frame.
-
-    A query gives one line for each of its classes that is among the best scores.
-    """
-    decoder, grid = config.line_decoder, config.bev_grid
-    scores = outputs.lines.class_logits[-1, 0].sigmoid().flatten()  # (N · classes,)
-    best, index = scores.topk(min(decoder.max_lines, len(scores)))
-    points = outputs.lines.points[-1, 0, index // len(decoder.classes)].double().cpu().numpy()  # (K, P, 2)
-    (x0, x1), (y0, y1) = grid.x_range_m, grid.y_range_m
-    classes = np.asarray(decoder.classes)[(index % len(decoder.classes)).cpu().numpy()]
-    return MapLines(tuple(points * (x1 - x0, y1 - y0) + (x0, y0)), classes, best.double().cpu().numpy())
-
-
-def decode_plan(outputs: VADOutputs, config: VADConfig) -> Plan:
-    """The planned paths, bev frame."""
-    return Plan(config.commands, outputs.plan[0].double().cpu().numpy().cumsum(1), step_times(config))
-
-
-def step_times(config: VADConfig) -> Array:
-    """(T,) seconds from the frame's time to the end of each step."""
-    return config.motion.step_s * np.arange(1.0, config.motion.steps + 1)
