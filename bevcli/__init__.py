@@ -29,14 +29,17 @@ if TYPE_CHECKING:
         Sequence as Sequence,
     )
     from bevcli.geometry.boxes import Boxes3D as Boxes3D
-    from bevcli.geometry.cameras import Camera as Camera, CameraRig as CameraRig
+    from bevcli.geometry.cameras import Camera as Camera, CameraRig as CameraRig, Distortion as Distortion
+    from bevcli.geometry.ego_motion import Kinematics as Kinematics
     from bevcli.geometry.transforms import Pose as Pose
     from bevcli.inference.load import Model as Model, load_model as load_model
     from bevcli.inference.run import run as run
+    from bevcli.inference.session import Session as Session
     from bevcli.recording.options import RecordingOptions as RecordingOptions
     from bevcli.recording.writer import Recording as Recording
     from bevcli.rig.check_calibration import check_calibration as check_calibration
     from bevcli.runs.run_into_folder import RunOptions as RunOptions, run_into_folder as run_into_folder
+    from bevcli.sequences.files.calibration_file import read_calibration as read_calibration
     from bevcli.sequences.open import open_sequence as open_sequence
     from bevcli.synth.export import render as render
     from bevcli.viewer.recording_file import show as show
@@ -47,14 +50,17 @@ _NAMES = {
     "bevcli.evaluation.evaluate": "evaluate",
     "bevcli.frame": "BevMap CameraImage Frame FrameStamp MAP_CLASSES Prediction Sequence",
     "bevcli.geometry.boxes": "Boxes3D",
-    "bevcli.geometry.cameras": "Camera CameraRig",
+    "bevcli.geometry.cameras": "Camera CameraRig Distortion",
+    "bevcli.geometry.ego_motion": "Kinematics",
     "bevcli.geometry.transforms": "Pose",
     "bevcli.inference.load": "Model load_model",
     "bevcli.inference.run": "run",
+    "bevcli.inference.session": "Session",
     "bevcli.recording.options": "RecordingOptions",
     "bevcli.recording.writer": "Recording",
     "bevcli.rig.check_calibration": "check_calibration",
     "bevcli.runs.run_into_folder": "RunOptions run_into_folder",
+    "bevcli.sequences.files.calibration_file": "read_calibration",
     "bevcli.sequences.open": "open_sequence",
     "bevcli.synth.export": "render",
     "bevcli.viewer.recording_file": "show",

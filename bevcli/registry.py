@@ -10,7 +10,15 @@ from typing import Any, Literal
 
 from bevcli.errors import BevcliError
 
-Group = Literal["bevcli.models", "bevcli.sequences", "bevcli.engines", "bevcli.commands"]
+Group = Literal[
+    "bevcli.models",
+    "bevcli.sequences",
+    "bevcli.drive_writers",
+    "bevcli.box_formats",
+    "bevcli.label_formats",
+    "bevcli.engines",
+    "bevcli.commands",
+]
 
 
 @cache

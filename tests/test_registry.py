@@ -1,6 +1,7 @@
 """The registry: bevcli's own entries can be imported, and what is wrong with another package's is one clear line."""
 
 from importlib.metadata import EntryPoint
+from typing import get_args
 
 import pytest
 
@@ -26,7 +27,7 @@ def installed(monkeypatch):
     registry.load.cache_clear()
 
 
-@pytest.mark.parametrize("group", ["bevcli.models", "bevcli.sequences", "bevcli.engines", "bevcli.commands"])
+@pytest.mark.parametrize("group", get_args(registry.Group))
 def test_own_entries_are_found_in_the_order_of_names(group):
     names = list(registry.entries(group))
     assert names == sorted(names)

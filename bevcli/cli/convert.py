@@ -1,4 +1,4 @@
-"""`bevcli convert`: writes any input as a native sequence folder."""
+"""`bevcli convert`: writes any input as a drive of another format."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +9,7 @@ import typer
 from bevcli.cli.bridge import INPUT, Part
 from bevcli.printing import say
 from bevcli.sequences.format import option_classes
-from bevcli.sequences.options import SequenceOptions, WriteOptions
+from bevcli.sequences.options import LabelOptions, SequenceOptions, WriteOptions
 
 PANEL = "Start"
 
@@ -23,27 +23,31 @@ def convert(
         ),
         INPUT,
     ],
-    out: Annotated[Path, typer.Argument(metavar="OUT_SEQUENCE", help="The native sequence folder to write.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="The folder or file to write.")],
     options: Annotated[SequenceOptions, Part(only=("strict", "scene", "ground_truth", "allow_outside", "class_map"))],
+    labels: LabelOptions,
     format_options: Annotated[dict[str, Any], Part(classes=option_classes)],
     written: WriteOptions,
 ) -> None:
-    """Write any input as a native sequence folder.
+    """Write any input as a native sequence folder, or as a drive of another format.
 
     Image files are copied byte for byte; images of a video become PNG. Ego-motion and ground truth are kept.
     """
     from bevcli.cli.progress import Progress
     from bevcli.errors import OutputError
-    from bevcli.sequences.native.writer import NativeWriter
+    from bevcli.sequences.labels.sequence import WithLabels
     from bevcli.sequences.open import open_sequence
+    from bevcli.sequences.output import open_writer
 
     if out.resolve() == source.resolve() or out.resolve() in source.resolve().parents:
-        raise OutputError(f"{out}: contains the input: choose another folder")
+        raise OutputError(f"{out}: contains the input: choose another path")
     sequence = open_sequence(source, replace(options, ego_motion="optional"), **format_options)
+    if labels.labels is not None:
+        sequence = WithLabels(sequence, labels.labels, only_labelled=labels.only_labelled)
     count = len(sequence.stamps)
     gaps = 0
     with (
-        NativeWriter(out, with_ego_motion=sequence.has_ego_motion, force=written.force, facts=sequence.facts) as writer,
+        open_writer(out, sequence, written) as writer,
         Progress(count, "frames", sequence.notes) as progress,
     ):
         for place in range(count):

@@ -13,13 +13,6 @@ if TYPE_CHECKING:
     from bevcli.sequences.files.boxes_file import BoxesFile
 
 PANEL = "Score"
-NAMES = {
-    "csv": "boxes.csv",
-    "json": "boxes.json",
-    "kitti": "kitti",
-    "nuscenes": "results_nusc.json",
-    "nuscenes-tracking": "tracking_nusc.json",
-}
 
 
 def export(
@@ -30,31 +23,21 @@ def export(
     ],
     options: ExportOptions,
 ) -> None:
-    """Write boxes as a table, as a boxes file, as KITTI labels of one camera, or as a nuScenes submission.
+    """Write boxes as a table, a boxes file, KITTI labels, a nuScenes submission, or tracks for annotation tools.
 
     KITTI labels are the boxes that one camera sees, in the camera frame. Of a recording, the shown boxes are written:
     those above the score of the run.
     """
-    from bevcli.evaluation.export import kitti_calibration, read_kitti_camera, write_csv, write_kitti
-    from bevcli.evaluation.submission import write_submission
-    from bevcli.sequences.files.boxes_file import above_score, write_boxes
+    from bevcli.evaluation.box_format import box_format
+    from bevcli.sequences.files.boxes_file import above_score
     from bevcli.writing import check_output
 
+    chosen = box_format(options.form)
     file = predictions / "predictions.json" if predictions.is_dir() else predictions
-    form, target = options.form, options.out or file.parent / NAMES[options.form]
+    target = options.out or file.parent / chosen.target
     check_output(target, file)
     boxes = above_score(_read(file), options.score)
-    if form in ("csv", "json"):
-        count = write_csv(boxes, target) if form == "csv" else write_boxes(boxes, target)
-        say(f"{target}: {count} boxes")
-    elif form in ("nuscenes", "nuscenes-tracking"):
-        write_submission(boxes, target, tracking=form == "nuscenes-tracking")
-        say(f"{target}: {len(boxes.frames)} samples")
-    else:
-        calibration = options.calibration or kitti_calibration(file)
-        chosen, ego_from_bev = read_kitti_camera(calibration, options.camera)
-        labels = write_kitti(boxes, chosen, ego_from_bev, target)
-        say(f"{target}: {len(boxes.frames)} frames, {labels} labels of {chosen.name}")
+    say(f"{target}: {chosen.write(boxes, target, options, file)}")
 
 
 def _read(file: Path) -> "BoxesFile":

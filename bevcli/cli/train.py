@@ -6,6 +6,7 @@ import typer
 
 from bevcli.cli.bridge import INPUT_OR_NAME, OldArgument, Part
 from bevcli.inference.options import ModelOptions, complete_model
+from bevcli.printing import say
 from bevcli.synth.options import DriveOptions
 from bevcli.training.options import TrainOptions
 
@@ -56,6 +57,8 @@ def train(
             trainer.run(stop=signals.received)
         leave_process_group(job.group)
         return
+    if job.warm_start is not None:
+        say(job.warm_start.table())
     with Progress(job.config.steps - trainer.done, "steps") as progress:
         progress.message(
             f"drives: {len(job.drives)} to train on, {len(job.held_out)} to evaluate on; output: {job.out}"

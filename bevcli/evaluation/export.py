@@ -127,15 +127,16 @@ def kitti_labels(
         rectangle, truncated = seen
         length, width, height = boxes_ego.sizes_lwh[place]
         numbers = [alphas[place], *rectangle, height, width, length, *locations[place], rotations_y[place]]
-        kind = _kitti_type(classes.get(str(boxes_ego.classes[place])))
+        kind = kitti_type(str(boxes_ego.classes[place]), classes)
         label = f"{kind} {truncated:.2f} {OCCLUSION_UNKNOWN} "
         score = "" if boxes_ego.scores is None else f" {boxes_ego.scores[place]:.4f}"
         lines.append(label + " ".join(f"{number:.3f}" for number in numbers) + score)
     return lines
 
 
-def _kitti_type(one: ObjectClass | None) -> str:
-    """A class's type in a label file, whose columns are parted by spaces."""
+def kitti_type(name: str, classes: Mapping[str, ObjectClass]) -> str:
+    """A class's type in KITTI's files, whose columns are parted by spaces; "Misc" for a class that is not known."""
+    one = classes.get(name)
     return "Misc" if one is None else "_".join((one.kitti or one.name).split())
 
 

@@ -1,9 +1,9 @@
 """The options of scoring and of the export of boxes."""
 
 from pathlib import Path
-from typing import Literal
 
 from bevcli.options import option, options
+from bevcli.registry import entries
 
 # Of every command that scores boxes.
 MAX_RANGE_HELP = (
@@ -39,18 +39,26 @@ class EvaluationOptions:
     )
 
 
+def _complete_format(incomplete: str) -> list[str]:
+    """The known formats of exported boxes that start with a text, for completion in a shell."""
+    return [name for name in entries("bevcli.box_formats") if name.startswith(incomplete)]
+
+
 @options()
 class ExportOptions:
     """The format of exported boxes and what it needs."""
 
-    form: Literal["csv", "json", "kitti", "nuscenes", "nuscenes-tracking"] = option(
+    form: str = option(
         help="csv: one table. json: a boxes file, as predictions.json. kitti: label_2 and calib. "
-        "nuscenes: results_nusc.json. nuscenes-tracking: tracking_nusc.json.",
+        "nuscenes: results_nusc.json. nuscenes-tracking: tracking_nusc.json. openlabel: ASAM OpenLABEL, with tracks. "
+        "kitti-raw: tracklet_labels.xml, with tracks. Or "
+        "the format of an installed package.",
         flag="--format",
+        metavar="NAME",
+        complete=_complete_format,
     )
     out: Path | None = option(
-        default=None,
-        help="Default: boxes.csv, boxes.json, kitti, results_nusc.json or tracking_nusc.json next to PREDICTIONS.",
+        default=None, help="Default: a name that depends on the format, such as boxes.csv, next to PREDICTIONS."
     )
     score: float = option(default=0.0, help="Leave out boxes scored below this.", minimum=0, maximum=1)
     calibration: Path | None = option(

@@ -181,7 +181,7 @@ def _load_network(options: ModelOptions) -> Model:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(UNTRAINED_SEED)
         network = build_model(config)
-    loaded = None if file is None else load_weights(file, network)
+    loaded = None if file is None else load_weights(file, network, str(name))
     return Model(
         network.eval(),
         target,

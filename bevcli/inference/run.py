@@ -1,6 +1,6 @@
 """The loop over a sequence: `run` yields predictions."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence as Items
 from dataclasses import dataclass, replace
 
 from bevcli.frame import Frame, Prediction, Sequence
@@ -9,6 +9,7 @@ from bevcli.inference.load import Model
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import BevState, Runner, StepOptions
 from bevcli.inference.tracking import TrackerState, track as track_boxes, without_identities
+from bevcli.model.step import PreparedFrame
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,35 @@ class RunnerState:
 
     bev: BevState | None = None
     tracks: TrackerState | None = None
+
+
+class Steps:
+    """From prepared frames to boxes with identities, step by step. The state is an argument and a result.
+
+    Attributes:
+        runner: steps the model.
+        prepare: makes a frame the input of `step`; may be called in another thread.
+    """
+
+    def __init__(
+        self, model: Model, options: StepOptions, cameras: Mapping[str, str] | None = None, *, track: bool = True
+    ) -> None:
+        """See `run` for the arguments."""
+        self.runner = Runner(model.prepared, model.device, options)
+        self.prepare = self.runner.preparation(Preprocessor(model.config, cameras))
+        self._tracker, self._track = model.tracker, track
+
+    def step(
+        self, state: RunnerState, prepared: PreparedFrame, upcoming: Items[PreparedFrame] = ()
+    ) -> tuple[RunnerState, Prediction]:
+        """The state and the prediction after one frame. upcoming: see `Runner.step`."""
+        bev, prediction = self.runner.step(state.bev, prepared, upcoming)
+        tracks = state.tracks
+        if not self._track:
+            prediction = replace(prediction, boxes=without_identities(prediction.boxes))
+        elif not self.runner.tracks:
+            ((_, prediction, tracks),) = track_boxes(self._tracker, [(prepared.frame, prediction)], tracks)
+        return RunnerState(bev, tracks), prediction
 
 
 def run(
@@ -83,13 +113,8 @@ def run_steps(
     state: RunnerState = RunnerState(),
 ) -> Iterator[tuple[Frame, Prediction, RunnerState]]:
     """The frames from the place `start` on, with what the next frame needs."""
-    runner = Runner(model.prepared, model.device, options)
+    steps = Steps(model, options, cameras, track=track)
     places = range(start, len(sequence.stamps))
-    tracks = state.tracks
-    for frame, prediction, bev in runner.run(sequence, places, Preprocessor(model.config, cameras), state.bev):
-        tracked = prediction
-        if not track:
-            tracked = replace(prediction, boxes=without_identities(prediction.boxes))
-        elif not runner.tracks:
-            ((_, tracked, tracks),) = track_boxes(model.tracker, [(frame, prediction)], tracks)
-        yield frame, tracked, RunnerState(bev, tracks)
+    for prepared, upcoming in steps.runner.frames(sequence, places, steps.prepare):
+        state, prediction = steps.step(state, prepared, upcoming)
+        yield prepared.frame, prediction, state

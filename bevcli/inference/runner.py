@@ -2,7 +2,7 @@
 
 import contextlib
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence as Items
+from collections.abc import Callable, Iterable, Iterator, Sequence as Items
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import Literal
@@ -118,15 +118,24 @@ class Runner:
 
         A model that looks ahead sees the later ones of these places.
         """
-        upload_images = ImageUploader(self.device)
-
-        def prepare(place: int) -> PreparedFrame:
-            return upload_images(preprocessor(sequence.load(place)))
-
-        ahead = self.config.later_frames if self.options.temporal else 0
-        for prepared, upcoming in with_upcoming(read_ahead(prepare, places), ahead):
+        for prepared, upcoming in self.frames(sequence, places, self.preparation(preprocessor)):
             state, prediction = self.step(state, prepared, upcoming)
             yield prepared.frame, prediction, state
+
+    def frames(
+        self, sequence: Sequence, places: Items[int], prepare: Callable[[Frame], PreparedFrame]
+    ) -> Iterator[tuple[PreparedFrame, tuple[PreparedFrame, ...]]]:
+        """Each frame at these places, read and prepared in advance, with the later ones that the model looks ahead to.
+
+        prepare: of `preparation`.
+        """
+        ahead = self.config.later_frames if self.options.temporal else 0
+        return with_upcoming(read_ahead(lambda place: prepare(sequence.load(place)), places), ahead)
+
+    def preparation(self, preprocessor: Preprocessor) -> Callable[[Frame], PreparedFrame]:
+        """The function from a frame to the input of `step`, its images on the device. To call before the first step."""
+        upload_images = ImageUploader(self.device)
+        return lambda frame: upload_images(preprocessor(frame))
 
     @property
     def tracks(self) -> bool:

@@ -1,5 +1,6 @@
 """A drive's rig next to the rigs that a model's weights were trained on."""
 
+import json
 from collections.abc import Iterator, Mapping
 
 import numpy as np
@@ -18,11 +19,13 @@ def rig_notes(rig: CameraRig, config: ModelConfig) -> tuple[str, ...]:
 
 
 def weights_facts(config: ModelConfig) -> dict[str, str]:
-    """The metadata of a weights file: the model, and the frame and the rigs that the weights expect."""
+    """The metadata of a weights file: the model, its classes and cameras, and the frame and rigs that it expects."""
     x0, x1 = config.bev_grid.x_range_m
     frame = config.bev_frame
     facts = {
         "model": config.name,
+        "classes": json.dumps(config.classes, ensure_ascii=False),
+        "cameras": json.dumps(config.cameras, ensure_ascii=False),
         "bev_frame": f"level, {frame.height_m:g} m above the ground" if frame.level else "as in the drive",
         "range_m": f"{x0:g} to {x1:g}",
     }
@@ -36,14 +39,23 @@ def weights_facts(config: ModelConfig) -> dict[str, str]:
 
 
 def facts_notes(facts: Mapping[str, str], config: ModelConfig) -> Iterator[str]:
-    """A warning where the model's file contradicts the bev frame that the weights file states."""
-    expected = weights_facts(config)["bev_frame"]
+    """Warnings where the model's file contradicts the bev frame or the classes that the weights file states."""
+    own = weights_facts(config)
+    if facts.get("classes", own["classes"]) != own["classes"]:
+        names = (_plain(facts["classes"]), _plain(own["classes"]))
+        yield "the weights were trained for the classes {}, but the model's file names {}".format(*names)
+    expected = own["bev_frame"]
     stated = facts.get("bev_frame", expected)
     if stated != expected:
         yield (
             f'the weights were trained with a bev frame "{stated}", but the model\'s file gives them one "{expected}": '
             "set [bev_frame] in the model's file"
         )
+
+
+def _plain(names: str) -> str:
+    """The names of a JSON list, for a sentence."""
+    return names.strip("[]").replace('"', "")
 
 
 def _cameras_note(rig: CameraRig, config: ModelConfig) -> Iterator[str]:

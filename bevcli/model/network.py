@@ -22,7 +22,7 @@ from bevcli.model.step import ClipInputs, ModelOutputs
 from bevcli.model.temporal_model import TemporalModel, build_model
 
 STAGES = {name: name for name in ("backbone", "neck", "encoder", "decoder", "segmentation_head")}
-CALIBRATION_EMBEDDING = "calibration_embedding."
+CAMERA_EMBEDDING = "image_tokens.camera_embedding"  # the key of the tensor that has a row for each camera
 
 
 class Network(TemporalModel):
@@ -96,13 +96,14 @@ class Network(TemporalModel):
         """
         raise NotImplementedError
 
-    def resampled(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """A state dict for fine-tuning, from one of a model with another BEV grid or without calibration embedding.
-
-        BEV queries are interpolated. A calibration embedding that is missing keeps its initial weights: no change.
-        """
-        added = {key: value for key, value in self.state_dict().items() if key.startswith(CALIBRATION_EMBEDDING)}
-        return added | dict(self.bev_queries.resampled(state, "bev_queries."))
+    @property
+    def class_keys(self) -> tuple[str, ...]:
+        """Keys of the tensors that have a row for each class."""
+        layers = [
+            f"detection_head.class_branches.{branch}.{[*modules.named_children()][-1][0]}"
+            for branch, modules in self.detection_head.class_branches.named_children()
+        ]
+        return tuple(f"{layer}.{kind}" for layer in layers for kind in ("weight", "bias"))
 
     @classmethod
     def part_names(cls, config: ModelConfig) -> Iterator[tuple[str, ...]]:

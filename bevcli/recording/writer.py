@@ -13,8 +13,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from bevcli.errors import OutputError, WaitError
-from bevcli.frame import Frame, FrameStamp, MapLines, Plan, Prediction, Sequence
+from bevcli.frame import DriveFacts, Frame, FrameStamp, MapLines, Plan, Prediction
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid
 from bevcli.recording import entities, log_bev, log_boxes, log_cameras, log_static
 from bevcli.recording.blueprint import LayoutFacts, recording_blueprint
@@ -57,6 +58,19 @@ class RecordedModel(Protocol):
     @property
     def bundled(self) -> bool:
         """True for the weights of the package. Titles and events say so where the drive is not a rendered one."""
+
+
+class RecordedDrive(Protocol):
+    """The facts about a drive that go into a recording: those of a `Sequence`, or of a `Session`."""
+
+    name: str
+    rig: CameraRig
+    has_ego_motion: bool
+    facts: DriveFacts
+
+    @property
+    def stamps(self) -> tuple[FrameStamp, ...]:
+        """The frames that are known in advance; their rate is written."""
 
 
 class LiveSink(Protocol):
@@ -105,7 +119,7 @@ class Recording:
 
     Args:
         path: the .rrd file to write; an existing one is replaced.
-        sequence: the rig and the name are taken from it.
+        sequence: the drive, or a `Session`; the rig and the name are taken from it.
         model: the class names, the name and whether it is trained are taken from it.
         options: how much is written; the defaults of RecordingOptions if None.
         live: a viewer that follows the recording; None for no viewer.
@@ -117,7 +131,7 @@ class Recording:
     def __init__(
         self,
         path: str | Path,
-        sequence: Sequence,
+        sequence: RecordedDrive,
         model: RecordedModel,
         options: RecordingOptions | None = None,
         live: LiveSink | None = None,
@@ -131,6 +145,9 @@ class Recording:
         self._rate_hz, self._has_ego_motion = frame_rate_hz(sequence.stamps), sequence.has_ego_motion
         self.options = RecordingOptions() if options is None else options
         recording_id = str(uuid.uuid4()) if resume is None else resume.recording_id
+        # rerun keeps two threads and some MB of every stream that nobody uses any more, until this call. It may wait
+        # for a sink that hangs.
+        threading.Thread(target=rr.bindings.flush_and_cleanup_orphaned_recordings, daemon=True).start()
         self._stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
         self._recording_id, self._resume = recording_id, resume
         self._file: RrdFile | None = None
@@ -436,7 +453,7 @@ def _transform(parent_from_entity: Array) -> rr.Transform3D:
     return rr.Transform3D(translation=parent_from_entity[:3, 3], mat3x3=parent_from_entity[:3, :3])
 
 
-def weights_note(model: RecordedModel, sequence: Sequence) -> str:
+def weights_note(model: RecordedModel, sequence: RecordedDrive) -> str:
     """A note on the weights for the titles of the views, "" for none: a key of WARNINGS."""
     if model.untrained:
         return UNTRAINED

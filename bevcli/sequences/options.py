@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 from bevcli.errors import InputError
 from bevcli.options import option, options, parse_pairs
+from bevcli.registry import entries
 
 if TYPE_CHECKING:
     from bevcli.geometry.cameras import CameraRig
@@ -122,11 +123,48 @@ class SequenceOptions(ClassOptions):
         return replace(self, ego_motion=use, model_rate_hz=config.rate_hz, classes=config.classes)
 
 
+def _complete_format(incomplete: str) -> list[str]:
+    """The known formats of written drives that start with a text, for completion in a shell."""
+    return [name for name in entries("bevcli.drive_writers") if name.startswith(incomplete)]
+
+
+@options("Input")
+class LabelOptions:
+    """Ground truth from a file of labels."""
+
+    labels: Path | None = option(
+        reads="path",
+        default=None,
+        help="Ground truth in place of that of INPUT: a CSV table with the columns of `bevcli export --format csv`, or "
+        "an OpenLABEL file.",
+        metavar="FILE",
+    )
+    only_labelled: bool = option(
+        default=False,
+        help="Frames without a row in a CSV table of labels have no ground truth. By default they are labelled and "
+        "empty.",
+    )
+
+
 @options()
 class WriteOptions:
-    """The options of a native folder that is written."""
+    """The options of a drive that is written."""
 
-    force: bool = option(default=False, help="Overwrite an existing sequence in OUT_SEQUENCE.")
+    form: str = option(
+        default="native",
+        help="native: a sequence folder. nuscenes: a nuScenes root. mcap: one file for Foxglove and ROS 2, with boxes. "
+        "Or the format of an installed package.",
+        flag="--format",
+        metavar="NAME",
+        complete=_complete_format,
+    )
+    force: bool = option(default=False, help="Overwrite an existing drive in OUT.")
+    boxes: Path | None = option(
+        reads="path", default=None, help="mcap: also write the boxes of this run (a folder or predictions.json)."
+    )
+    score: float = option(
+        default=0.25, help="mcap: leave out boxes of the run scored below this.", minimum=0, maximum=1
+    )
 
 
 @options("Input")

@@ -10,7 +10,6 @@ import torch
 import torch.distributed
 from torch import Tensor, nn
 
-from bevcli.checkpoints import load_weights
 from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import OutputError
 from bevcli.geometry.cameras import CameraRig
@@ -22,6 +21,8 @@ from bevcli.training.augmentation import AugmentationConfig
 from bevcli.training.frame_losses import LossConfigs
 from bevcli.training.options import TrainOptions
 from bevcli.training.samples import ClipConfig
+from bevcli.training.warm_start import WarmStart, warm_start
+from bevcli.weights.local import weights_file
 
 
 @dataclass(frozen=True)
@@ -178,6 +179,7 @@ class TrainingJob:
         device: device to train on.
         seed: determines all random draws, together with the step and the rank of the process.
         group: the processes that train together.
+        warm_start: what the training starts from; None for random weights, or if it is resumed.
     """
 
     model: Network
@@ -188,6 +190,7 @@ class TrainingJob:
     device: torch.device
     seed: int = 0
     group: ProcessGroup = field(default_factory=ProcessGroup)
+    warm_start: WarmStart | None = None
 
 
 def prepare_training(
@@ -211,10 +214,11 @@ def prepare_training(
     drives = open_drives(data.data, data.rendered, out / "drives", model_config, rigs, data.class_map)
     drives, evaluated = split_drives(drives, config.held_out)
     prepare_folder(out, resume=options.resume)
-    model = build_network(model_config)
-    if options.weights is not None:
-        load_weights(options.weights, model, resample=True)
-    return TrainingJob(model, config, drives, evaluated, out, device, options.seed, join_process_group(device))
+    model, started = build_network(model_config), None
+    if options.weights is not None and not options.resume:
+        started = warm_start(weights_file(options.weights), model, model_name_or_file, lambda: drives.open(0).rig)
+    group = join_process_group(device)
+    return TrainingJob(model, config, drives, evaluated, out, device, options.seed, group, started)
 
 
 def rig_for_drives(choice: str, model: str) -> CameraRig | RigDistribution:

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from bevcli.evaluation.options import MAX_RANGE_HELP
+from bevcli.inference.options import complete_model
 from bevcli.options import option, options
 
 
@@ -16,7 +17,12 @@ class TrainOptions:
     )
     resume: bool = option(default=False, help="Resume from the checkpoint in the output folder.")
     weights: Path | None = option(
-        reads="path", default=None, help="Start from these weights (fine-tuning) instead of random ones."
+        reads="path or name",
+        default=None,
+        help="Start from these weights (fine-tuning) instead of random ones: a file, or a model's name. The model may "
+        "have other classes, cameras and BEV cells; a table lists what is loaded.",
+        metavar="FILE|NAME",
+        complete=complete_model,
     )
     steps: int | None = option(default=None, help="Number of steps. Default: as in the training table.", minimum=1)
     held_out: int | None = option(

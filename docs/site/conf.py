@@ -33,7 +33,7 @@ SECTIONS = {
     "Train": ["docs/training", "docs/model-card"],
     "Deploy": ["docs/deploy", "docs/speed", "docs/fleet"],
     "Understand": ["docs/bevformer", "docs/vad", "docs/glossary"],
-    "Python and extensions": ["docs/python", "docs/extend", "docs/reference"],
+    "Python and extensions": ["docs/python", "docs/live", "docs/extend", "docs/reference"],
     "Project": ["CONTRIBUTING", "SECURITY", "CHANGELOG", "docs/history"],
 }
 

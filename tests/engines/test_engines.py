@@ -95,7 +95,7 @@ def test_ctrl_c_reaches_python_after_openvino_models_are_gone(small_file):
 def test_a_file_tells_its_model_and_that_its_weights_are_random(small_file):
     model = load_model(small_file)
     assert model.config == _model().config
-    assert model.tracker == TrackerConfig(birth_score=0.5)
+    assert model.tracker == TrackerConfig(birth_score=0.5).for_classes(model.config.object_classes)
     assert model.untrained
     assert model.prepared is model.network
 

@@ -14,7 +14,6 @@ from bevcli.parsing.csv_cells import cell_of, name_of
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 from bevcli.sequences.native.writer import NativeWriter
 from bevcli.sequences.open import open_sequence
-from bevcli.viewer import export
 
 SIGNS = ("=", "+", "-", "@", "\t", "\r")
 
@@ -38,13 +37,12 @@ def test_scene_and_camera_come_back_from_frames_csv(tmp_path):
     assert {stamp.scene for stamp in again.stamps} == {"-1+1"}
 
 
-@pytest.mark.parametrize("write", [write_csv, lambda boxes, path: export._write_csv(path, list(boxes.frames))])
-def test_boxes_of_odd_names_are_no_formulas(tmp_path, write):
+def test_boxes_of_odd_names_are_no_formulas(tmp_path):
     boxes = boxes_ahead()
     boxes = replace(boxes, instances=boxes.classes.astype("<U20"))
     boxes.instances[:] = "@SUM(1)"
     frame = FrameBoxes(FrameStamp(0, "=1+1", 5), Pose.identity(), boxes)
-    write(BoxesFile("world", (frame,)), tmp_path / "boxes.csv")
+    write_csv(BoxesFile("world", (frame,)), tmp_path / "boxes.csv")
     for row in csv.DictReader((tmp_path / "boxes.csv").open()):
         assert row["scene"] == "'=1+1"
         assert row["instance"] == "'@SUM(1)"

@@ -1,5 +1,6 @@
 """What a recording holds, read back from the file."""
 
+import gc
 import subprocess
 import sys
 from dataclasses import replace
@@ -243,3 +244,18 @@ with Recording({str(tmp_path / "r.rrd")!r}, drive, NamedModel()) as r:
     frames = list(RecordingReader(tmp_path / "r.rrd").frames())
     assert [frame.index for frame in frames] == [0, 1, 2]
     assert all(frame.values(entities.BOXES, "name") == ["car", "pedestrian"] for frame in frames)
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="threads are counted on Linux")
+def test_the_threads_of_earlier_recordings_end(tmp_path):
+    def streams() -> int:
+        names = [task / "comm" for task in Path("/proc/self/task").iterdir()]
+        return sum("RecordingStream" in name.read_text() for name in names if name.exists())
+
+    counts = []
+    for number in range(4):
+        record(tmp_path / f"{number}.rrd", MemorySequence(1))
+        gc.collect()
+        counts.append(streams())
+    # rerun itself keeps the stream of each blueprint.
+    assert counts[-1] - counts[0] <= len(counts)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bevcli.geometry.cameras import CameraRig
+from bevcli.geometry.transforms import wrap_angle
 from bevcli.sequences.native.folder import FolderSequence
 from bevcli.sequences.native.writer import NativeWriter
 from bevcli.sequences.open import open_sequence
@@ -38,7 +39,7 @@ def assert_same_frames(one, other, *, same_bytes: bool) -> None:
             np.testing.assert_allclose(getattr(a.kinematics, quantity), getattr(b.kinematics, quantity), atol=1e-12)
         np.testing.assert_allclose(a.ground_truth.centers, b.ground_truth.centers, atol=1e-9)
         np.testing.assert_allclose(a.ground_truth.sizes_lwh, b.ground_truth.sizes_lwh, atol=1e-9)
-        np.testing.assert_allclose(a.ground_truth.yaws, b.ground_truth.yaws, atol=1e-9)
+        np.testing.assert_allclose(wrap_angle(a.ground_truth.yaws - b.ground_truth.yaws), 0, atol=1e-9)
         assert a.ground_truth.classes.tolist() == b.ground_truth.classes.tolist()
 
 

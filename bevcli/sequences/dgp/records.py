@@ -12,7 +12,7 @@ from bevcli.errors import InputError
 from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_ego_from_bev
 from bevcli.geometry.transforms import Array, Pose
 from bevcli.parsing.documents import LARGEST_INTEGER, read_json
-from bevcli.sequences.files.calibration_file import LARGEST_SIZE, is_camera_name
+from bevcli.sequences.files.calibration_file import LARGEST_SIZE, is_file_name
 
 LARGEST_NUMBER = 1e12  # metres or pixels
 SHORTEST_QUATERNION = 1e-3
@@ -145,7 +145,7 @@ class Calibration:
     def _camera(self, name: str, size: tuple[int, int]) -> Camera:
         lens = self.lenses[name]
         fx, fy, cx, cy = lens.numbers(PINHOLE)
-        if not (is_camera_name(name) and 0 < min(size) <= max(size) <= LARGEST_SIZE and min(fx, fy) > 0):
+        if not (is_file_name(name) and 0 < min(size) <= max(size) <= LARGEST_SIZE and min(fx, fy) > 0):
             raise InputError(
                 f"{lens.where}: camera {name:.60}: expected an image size and focal lengths above 0, "
                 f"found {size[0]}x{size[1]}, {fx:g}, {fy:g}"

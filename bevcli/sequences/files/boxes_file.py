@@ -16,7 +16,7 @@ from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ClassSettings, ObjectClass, object_classes
-from bevcli.geometry.transforms import Pose
+from bevcli.geometry.transforms import Pose, inverse
 from bevcli.parsing.documents import without_garbage_collection
 from bevcli.sequences.files.box_json import boxes_from_json, boxes_to_json
 from bevcli.sequences.files.class_names import ClassNames
@@ -65,6 +65,17 @@ class BoxesFile:
     ego_from_bev: Pose | None = None
     extras: Mapping[str, Any] = field(default_factory=dict)
     classes: Mapping[str, ObjectClass] | None = None
+
+    def in_ego(self, frame: FrameBoxes) -> Boxes3D:
+        """The boxes of one of the frames in the ego frame. Raises InputError if the file lacks the bev frame's pose."""
+        if self.frame_of_reference == "ego":
+            return frame.boxes
+        if self.frame_of_reference == "world":
+            assert frame.world_from_ego is not None  # read_boxes requires it
+            return frame.boxes.transformed(inverse(frame.world_from_ego.matrix))
+        if self.ego_from_bev is None:
+            raise InputError('the boxes are in the bev frame, and their file does not state "ego_from_bev": add it')
+        return frame.boxes.transformed(self.ego_from_bev.matrix)
 
 
 def read_boxes(

@@ -42,9 +42,9 @@ class RigDraft:
     facts: DriveFacts = field(default_factory=DriveFacts)
 
 
-def read_calibration(path: Path) -> CameraRig:
+def read_calibration(path: str | Path) -> CameraRig:
     """The rig in calibration.json. Raises InputError with the first mistake in the file."""
-    return read_rig_and_facts(path)[0]
+    return read_rig_and_facts(Path(path))[0]
 
 
 def read_rig_and_facts(path: Path) -> tuple[CameraRig, DriveFacts]:
@@ -175,7 +175,7 @@ def _lines(value: Any, indent: str = "") -> str:
 
 def parse_camera(name: str, value: object, report: Report) -> Camera | None:
     """The camera, or None if a field is invalid. All fields are read, so that all mistakes are reported."""
-    if not is_camera_name(name):
+    if not is_file_name(name):
         expected = "up to 100 letters, digits and signs, no slash"
         report.error("camera-name", one_line(name, LONGEST_VALUE), "is not the name of a camera", expected=expected)
         return None
@@ -193,8 +193,8 @@ def parse_camera(name: str, value: object, report: Report) -> Camera | None:
     return Camera(name, width, height, intrinsics, ego_from_camera, distortion)
 
 
-def is_camera_name(name: str) -> bool:
-    """True for a name that a camera may have: it becomes the name of a folder when images are written."""
+def is_file_name(name: str) -> bool:
+    """True for a name that a camera or a scene may have: it becomes that of a file or folder."""
     return 0 < len(name) <= 100 and name.isprintable() and not set(name) & {"/", "\\"} and name.strip(". ") != ""
 
 

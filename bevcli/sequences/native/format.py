@@ -4,6 +4,7 @@ from pathlib import Path
 
 from bevcli.sequences.format import Format
 from bevcli.sequences.options import RigOptions
+from bevcli.sequences.output import OutputFormat
 
 # Any of these makes a folder a native sequence, so that an incomplete one gets an error that names the missing file.
 MARKERS = ("calibration.json", "frames.csv", "ego_motion.csv", "images", "videos")
@@ -22,3 +23,5 @@ FORMAT = Format(
     options=RigOptions,
     precedence=-10,
 )
+
+OUTPUT = OutputFormat("a sequence folder", "bevcli.sequences.native.writer:write_native")

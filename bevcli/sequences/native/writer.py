@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 
 from bevcli.errors import InputError, OutputError
-from bevcli.frame import LINE_CLASSES, CameraImage, DriveFacts, Frame, Ground, MapLines
-from bevcli.geometry.cameras import CameraRig
+from bevcli.frame import LINE_CLASSES, CameraImage, DriveFacts, Frame, Ground, MapLines, Sequence
+from bevcli.geometry.cameras import CameraRig, same_rig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
 from bevcli.geometry.transforms import Pose
 from bevcli.parsing.csv_cells import cell_of
@@ -24,11 +24,18 @@ from bevcli.sequences.files.lines_file import TRUE_LINES, LinesWriter
 from bevcli.sequences.files.map_folder import write_map
 from bevcli.sequences.native.folder import BOXES_FILE, MAPS_FOLDER
 from bevcli.sequences.native.tables import write_ego_motion
+from bevcli.sequences.options import WriteOptions
 from bevcli.writing import write_whole
 
 # The files that the writer creates and `force` removes. Other files in the folder are kept.
 PARTS = ("calibration.json", "frames.csv", "ego_motion.csv", "images", BOXES_FILE, MAPS_FOLDER, TRUE_LINES)
 SUFFIXES = {"image/jpeg": ".jpg", "image/png": ".png"}
+
+
+def write_native(folder: Path, sequence: Sequence, options: WriteOptions) -> "NativeWriter":
+    """The writer of a sequence as a native folder; see `OutputFormat`."""
+    with_ego_motion = sequence.has_ego_motion
+    return NativeWriter(folder, with_ego_motion=with_ego_motion, force=options.force, facts=sequence.facts)
 
 
 class NativeWriter:
@@ -160,20 +167,6 @@ class NativeWriter:
             self._open.callback(self._lines.close)
         pose = frame.world_from_ego if self._with_ego_motion else None
         self._lines.write(Ground(frame.stamp, frame.rig.ego_from_bev, pose), lines)
-
-
-def same_rig(one: CameraRig, other: CameraRig) -> bool:
-    """True if all names and numbers of two rigs are equal."""
-    return (
-        one.names == other.names
-        and np.array_equal(one.ego_from_bev, other.ego_from_bev)
-        and all(
-            (a.width, a.height, a.distortion) == (b.width, b.height, b.distortion)
-            and np.array_equal(a.intrinsics, b.intrinsics)
-            and np.array_equal(a.ego_from_camera, b.ego_from_camera)
-            for a, b in zip(one.cameras, other.cameras, strict=True)
-        )
-    )
 
 
 def _make_room(folder: Path, force: bool) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 from bevcli.options import option, options
 from bevcli.sequences.format import Format
 from bevcli.sequences.options import FormatOptions
+from bevcli.sequences.output import OutputFormat
 
 
 @options("Input")
@@ -46,3 +47,5 @@ FORMAT = Format(
     annotated=True,
     precedence=20,
 )
+
+OUTPUT = OutputFormat("a nuScenes root", "bevcli.sequences.nuscenes.writer:NuScenesWriter")

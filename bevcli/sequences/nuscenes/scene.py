@@ -11,7 +11,7 @@ from bevcli.errors import InputError
 from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics, motion_of_keyframes
 from bevcli.geometry.transforms import Array, Pose
-from bevcli.sequences.files.calibration_file import LARGEST_SIZE, is_camera_name
+from bevcli.sequences.files.calibration_file import LARGEST_SIZE, is_file_name
 from bevcli.sequences.nuscenes.dialect import Dialect
 from bevcli.sequences.nuscenes.index import NuScenesIndex
 from bevcli.sequences.nuscenes.json_tables import integers, read_rows, vectors
@@ -111,7 +111,7 @@ def read_can_bus(root: Path, scene: str) -> CanBus | None:
 def _camera(index: NuScenesIndex, sensor: int, image: int) -> Camera:
     width, height = (int(value) for value in index.images.sizes[image])
     name = str(index.sensors.channels[sensor])
-    if not is_camera_name(name) or not 0 < min(width, height) <= max(width, height) <= LARGEST_SIZE:
+    if not is_file_name(name) or not 0 < min(width, height) <= max(width, height) <= LARGEST_SIZE:
         raise InputError(
             f'camera "{name:.60}": expected a name without a slash and an image size, found {width}x{height}'
         )

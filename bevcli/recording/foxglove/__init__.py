@@ -1,0 +1,1 @@
+"""Drives and boxes as an MCAP file for Foxglove and ROS 2."""

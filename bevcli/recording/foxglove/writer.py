@@ -1,0 +1,149 @@
+"""Writes a drive as an MCAP file of ROS 2 messages, with boxes as Foxglove scenes."""
+
+import importlib.util
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import cv2
+
+from bevcli.errors import BevcliError, InputError, OutputError
+from bevcli.frame import CameraImage, Frame, Sequence
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.cameras import CameraRig
+from bevcli.geometry.object_classes import NUSCENES_CLASSES
+from bevcli.geometry.transforms import Pose
+from bevcli.recording.colors import class_colors
+from bevcli.recording.foxglove import scene
+from bevcli.sequences.files.boxes_file import BoxesFile, above_score, read_boxes
+from bevcli.sequences.options import WriteOptions
+from bevcli.writing import check_output, whole_file
+
+WORLD, EGO, BEV = "map", "base_link", "bev"
+FORMATS = {"image/jpeg": "jpeg", "image/png": "png"}
+
+
+class McapWriter:
+    """Writes an MCAP file frame by frame; it gets its name when it is whole.
+
+    Topics: /CAMERA/image/compressed, /CAMERA/camera_info, /tf_static (cameras and the bev frame in base_link), /tf and
+    /odom (base_link in map), /ground_truth and, with `boxes`, /predictions. The bytes of JPEG and PNG files are kept;
+    other images become PNG.
+    """
+
+    def __init__(self, path: Path, sequence: Sequence, options: WriteOptions) -> None:
+        """See `OutputFormat`."""
+        if not all(importlib.util.find_spec(name) for name in ("mcap", "rosbags")):
+            raise BevcliError('`form="mcap"`: needs mcap and rosbags: pip install "bevcli[ros]"')
+        if path.exists() and not options.force:
+            raise OutputError(f"{path}: exists already: choose another file, or pass `force=True` to replace it")
+        self.path, self._has_ego_motion = path, sequence.has_ego_motion
+        self._boxes = None if options.boxes is None else _boxes_of(options.boxes, options.score, sequence, path)
+        known = None if self._boxes is None else self._boxes.classes
+        self._colors = class_colors((known or NUSCENES_CLASSES).values())
+        frames = () if self._boxes is None else self._boxes.frames
+        self._frames = {frame.stamp: frame for frame in frames}
+        self._rig: CameraRig | None = None
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+        self._open = ExitStack()
+
+    def __enter__(self) -> Self:
+        from mcap.writer import Writer
+
+        from bevcli.recording.foxglove.messages import Messages
+
+        self._messages = Messages()
+        file = self._open.enter_context(whole_file(self.path, parents=True))
+        self._writer = Writer(self._open.enter_context(file.open("wb")))
+        self._writer.start(profile="ros2", library="bevcli")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is not None:
+            self._open.__exit__(kind, error, trace)
+            return
+        with self._open:
+            if self._rig is None:
+                raise OutputError(f"{self.path}: no frame was written (expected at least one)")
+            self._writer.finish()
+
+    def write(self, frame: Frame) -> None:
+        """Write a frame: its poses, images, calibrations and boxes."""
+        time_ns = frame.stamp.timestamp_ns
+        if frame.rig is not self._rig:
+            self._write_rig(frame.rig, time_ns)
+        if self._has_ego_motion:
+            self._write_poses(frame)
+        for name, image in frame.images.items():
+            self._write_image(frame, name, image)
+        fixed = WORLD if self._has_ego_motion else EGO
+        shown = {"/ground_truth": frame.ground_truth, "/predictions": self._predicted(frame)}
+        for topic, boxes in shown.items():
+            if boxes is not None:
+                fields = scene.scene_update(time_ns, fixed, boxes, self._colors)
+                self._add(topic, "foxglove_msgs/SceneUpdate", time_ns, fields)
+
+    def _write_rig(self, rig: CameraRig, time_ns: int) -> None:
+        poses = {_optical(camera.name): camera.ego_from_camera for camera in rig.cameras} | {BEV: rig.ego_from_bev}
+        transforms = [scene.transform(time_ns, EGO, name, Pose.from_matrix(pose)) for name, pose in poses.items()]
+        self._add("/tf_static", "tf2_msgs/TFMessage", time_ns, {"transforms": transforms})
+        self._rig = rig
+
+    def _write_poses(self, frame: Frame) -> None:
+        """The vehicle's poses at the times of the frame and its images; those at one time are written once."""
+        motion = frame.kinematics
+        poses = {image.timestamp_ns: frame.world_from_ego_at[name] for name, image in frame.images.items()}
+        poses[frame.stamp.timestamp_ns] = frame.world_from_ego
+        for time_ns, pose in sorted(poses.items()):
+            moved = scene.transform(time_ns, WORLD, EGO, pose)
+            self._add("/tf", "tf2_msgs/TFMessage", time_ns, {"transforms": [moved]})
+            fields = scene.odometry(time_ns, WORLD, EGO, pose, motion.velocity, motion.angular_rate)
+            self._add("/odom", "nav_msgs/Odometry", time_ns, fields)
+
+    def _write_image(self, frame: Frame, name: str, image: CameraImage) -> None:
+        time_ns, encoded, kind = image.timestamp_ns, image.encoded, FORMATS.get(image.media_type or "")
+        if encoded is None or kind is None:
+            encoded, kind = cv2.imencode(".png", image.pixels_bgr)[1].tobytes(), "png"
+        head = scene.header(time_ns, _optical(name))
+        fields = {"header": head, "format": kind, "data": encoded}
+        self._add(f"/{name}/image/compressed", "sensor_msgs/CompressedImage", time_ns, fields)
+        info = scene.camera_info(time_ns, _optical(name), frame.rig[name])
+        self._add(f"/{name}/camera_info", "sensor_msgs/CameraInfo", time_ns, info)
+
+    def _predicted(self, frame: Frame) -> Boxes3D | None:
+        """The run's boxes of a frame, in the frame of the scene; none where the run does not have the frame."""
+        if self._boxes is None:
+            return None
+        found = self._frames.get(frame.stamp)
+        if found is None:
+            return Boxes3D.empty()
+        in_ego = self._boxes.in_ego(found)
+        return in_ego.transformed(frame.world_from_ego.matrix) if self._has_ego_motion else in_ego
+
+    def _add(self, topic: str, kind: str, time_ns: int, fields: scene.Fields) -> None:
+        if kind not in self._schemas:
+            text = self._messages.definition(kind).encode()
+            self._schemas[kind] = self._writer.register_schema(kind.replace("/", "/msg/"), "ros2msg", text)
+        if topic not in self._channels:
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind])
+        data = self._messages.encode(kind, fields)
+        self._writer.add_message(self._channels[topic], log_time=time_ns, publish_time=time_ns, data=data)
+
+
+def _boxes_of(run: Path, score: float, sequence: Sequence, out: Path) -> BoxesFile:
+    """The boxes of a run of a sequence, with at least this score."""
+    file = run / "predictions.json" if run.is_dir() else run
+    check_output(out, file)
+    boxes = above_score(read_boxes(file), score)
+    if not {frame.stamp for frame in boxes.frames} & set(sequence.stamps):
+        raise InputError(f"{file}: has none of the frames of {sequence.name}: convert the drive that the run is of")
+    return boxes
+
+
+def _optical(camera: str) -> str:
+    """The name of a camera's optical frame."""
+    return f"{camera}_optical"

@@ -1,0 +1,148 @@
+"""A session: frames from memory give what a run over the same frames gives, and what it refuses."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from memory_drive import MemorySequence, WithoutImages, make_rig
+
+import bevcli
+from bevcli.errors import InputError
+from bevcli.frame import StartReason
+from bevcli.geometry.ego_motion import GRAVITY
+from bevcli.geometry.transforms import rigid, rotation_about_z
+from bevcli.recording import entities
+from bevcli.viewer.recording_reader import RecordingReader
+
+COLUMNS = ("centers", "sizes_lwh", "yaws", "velocities", "scores", "track_scores", "duplicates")
+
+
+@pytest.fixture(scope="module")
+def model(mini_model):
+    return bevcli.Model(mini_model)
+
+
+def step(session, frame, **changes):
+    """A step with all that a frame holds."""
+    images = {name: image.pixels_bgr for name, image in frame.images.items()}
+    given = {
+        "images": images,
+        "world_from_ego": frame.world_from_ego,
+        "timestamp_ns": frame.stamp.timestamp_ns,
+        "world_from_ego_at": frame.world_from_ego_at,
+        "kinematics": frame.kinematics,
+    }
+    return session.step(**given | changes)
+
+
+def assert_same(one, other):
+    for name in COLUMNS:
+        assert np.asarray(getattr(one.boxes, name)).tobytes() == np.asarray(getattr(other.boxes, name)).tobytes(), name
+    assert list(one.boxes.classes) == list(other.boxes.classes)
+    assert one.skipped or list(one.boxes.instances) == list(other.boxes.instances)
+    assert (one.bev is None and other.bev is None) or one.bev.equal(other.bev)
+    assert (one.started_anew, one.skipped) == (other.started_anew, other.skipped)
+
+
+@pytest.mark.parametrize("temporal", [True, False])
+def test_a_session_equals_a_run_to_the_byte(model, temporal):
+    drive = WithoutImages({1: ("CAM_BACK",), 3: "all"}, count=5)
+    session = bevcli.Session(model, drive.rig, temporal=temporal)
+    for frame, expected in bevcli.run(model, drive, temporal=temporal):
+        assert_same(step(session, frame), expected)
+
+
+@pytest.mark.slow
+def test_a_session_equals_a_run_on_the_sample_drive():
+    model, drive = bevcli.load_model("demo"), bevcli.open_sequence("samples/street", frames=slice(0, 2))
+    session = bevcli.Session(model, drive.rig)
+    for frame, expected in bevcli.run(model, drive):
+        found = step(session, frame)
+        assert_same(found, expected)
+        assert found.segmentation.cells.tobytes() == expected.segmentation.cells.tobytes()
+
+
+def test_rgb_images_are_those_of_the_other_order(model):
+    drive = MemorySequence(1)
+    frame, expected = next(bevcli.run(model, drive))
+    images = {name: image.pixels_bgr[..., ::-1] for name, image in frame.images.items()}
+    assert_same(step(bevcli.Session(model, drive.rig, color_order="rgb"), frame, images=images), expected)
+
+
+def test_a_gap_begins_anew_and_a_reset_too(model):
+    frame, session = MemorySequence(1).load(0), bevcli.Session(model, make_rig())
+    times = [0, 500_000_000, 10_000_000_000]
+    begun = [step(session, frame, timestamp_ns=time).started_anew for time in times]
+    assert [None if one is None else one.reason for one in begun] == [StartReason.FIRST_FRAME, None, StartReason.GAP]
+    session.reset()
+    again = step(session, frame, timestamp_ns=0)
+    assert again.started_anew.reason is StartReason.FIRST_FRAME
+    assert (again.stamp.index, again.stamp.scene) == (3, "2")
+
+
+def test_frames_out_of_order_change_nothing(model):
+    drive = MemorySequence(3)
+    session = bevcli.Session(model, drive.rig)
+    expected = [prediction for _, prediction in bevcli.run(model, drive)]
+    for place in range(3):
+        assert_same(step(session, drive.load(place)), expected[place])
+        with pytest.raises(InputError, match=r"is not later than the frame before .*reset\(\)"):
+            step(session, drive.load(place))
+
+
+WRONG_IMAGES = [
+    ({"CAM_LEFT": np.zeros((180, 320, 3), np.uint8)}, "camera CAM_LEFT is not in the rig"),
+    ({"CAM_FRONT": np.zeros((90, 160, 3), np.uint8)}, r"expected uint8 of shape \(180, 320, 3\).*\(90, 160, 3\)"),
+    ({"CAM_FRONT": np.zeros((180, 320, 3), np.float32)}, "found float32"),
+    ({"CAM_FRONT": None}, "found NoneType"),
+]
+
+
+@pytest.mark.parametrize(("images", "message"), WRONG_IMAGES)
+def test_other_images_are_refused(model, images, message):
+    with pytest.raises(InputError, match=message):
+        step(bevcli.Session(model, make_rig()), MemorySequence(1).load(0), images=images)
+
+
+@pytest.mark.parametrize("pose", [np.eye(3), np.diag([1, 1, 2, 1]), np.diag([1, 1, -1, 1]), np.full((4, 4), np.nan)])
+def test_poses_that_are_not_rigid_are_refused(model, pose):
+    with pytest.raises(InputError, match=r"`world_from_ego`: (expected a Pose|is not a rigid transform)"):
+        step(bevcli.Session(model, make_rig()), MemorySequence(1).load(0), world_from_ego=pose)
+
+
+def test_a_session_that_cannot_be_is_refused(model, window_model):
+    rig = make_rig()
+    with pytest.raises(InputError, match='`color_order=yuv`: expected "bgr" or "rgb"'):
+        bevcli.Session(model, rig, color_order="yuv")
+    with pytest.raises(InputError, match="found CAM_FRONT, CAM_FRONT"):
+        bevcli.Session(model, replace(rig, cameras=rig.cameras[:1] * 2))
+    with pytest.raises(InputError, match="model mini uses 1 later frames"):
+        bevcli.Session(bevcli.Model(window_model(-1, 0, 1)), rig)
+
+
+@pytest.mark.parametrize("rate_hz", [2, 30])
+def test_motion_is_derived_from_the_poses(model, rate_hz):
+    """A circle at constant speed: 6 m/s, 0.3 rad/s."""
+    session = bevcli.Session(model, make_rig())
+    for k in range(1 + 6 * rate_hz // 5):
+        yaw = 0.3 * k / rate_hz
+        pose = rigid((20 * np.sin(yaw), 20 * (1 - np.cos(yaw)), 0), rotation_about_z(yaw))
+        session.step({}, pose, 10**18 + round(k / rate_hz * 1e9))
+    motion = session.frame.kinematics
+    np.testing.assert_allclose(motion.velocity, [6, 0, 0], atol=0.5)
+    np.testing.assert_allclose(motion.angular_rate, [0, 0, 0.3], atol=0.01)
+    np.testing.assert_allclose(motion.acceleration, [0, 1.8, GRAVITY], atol=0.3)
+
+
+def test_a_recording_follows_a_session(model, tmp_path: Path):
+    drive = MemorySequence(2)
+    session = bevcli.Session(model, drive.rig, name="car 7")
+    with bevcli.Recording(tmp_path / "live.rrd", session, model) as recording:
+        for place in range(2):
+            prediction = step(session, drive.load(place))
+            recording.log(session.frame, prediction)
+    recorded = list(RecordingReader(tmp_path / "live.rrd").frames())
+    assert [frame.index for frame in recorded] == [0, 1]
+    for name in session.rig.names:
+        assert recorded[1].has(entities.image(name), "EncodedImage:blob")
