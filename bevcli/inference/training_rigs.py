@@ -1,7 +1,9 @@
 """A drive's rig next to the rigs that a model's weights were trained on."""
 
 import json
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +18,21 @@ _BEV_TILT_DEG = 4.0  # published weights were trained with nuScenes' LIDAR_TOP, 
 def rig_notes(rig: CameraRig, config: ModelConfig) -> tuple[str, ...]:
     """Warnings where a rig lies outside the training distribution, at most two: the cameras, and the bev frame."""
     return (*_cameras_note(rig, config), *_bev_frame_note(rig, config))
+
+
+def rigs_of(rigs: Iterable[CameraRig]) -> dict[str, Any]:
+    """The table [training_rigs] of a model that is trained on some rigs."""
+    rigs = [rig for rig in rigs if rig.cameras]
+    cameras = [camera for rig in rigs for camera in rig.cameras]
+    counts = [len(rig.cameras) for rig in rigs]
+    fovs = [_fov_deg(camera) for camera in cameras]
+    heights = [float(camera.ego_from_camera[2, 3]) for camera in cameras]
+    return {
+        "cameras": [min(counts), max(counts)],
+        "fov_deg": [float(math.floor(min(fovs))), float(math.ceil(max(fovs)))],
+        "height_m": [round(min(heights), 2), round(max(heights), 2)],
+        "tilt_deg": round(max(map(_tilt_deg, cameras)), 1),
+    }
 
 
 def weights_facts(config: ModelConfig) -> dict[str, str]:

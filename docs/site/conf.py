@@ -34,7 +34,7 @@ SECTIONS = {
     "Deploy": ["docs/deploy", "docs/speed", "docs/fleet"],
     "Understand": ["docs/bevformer", "docs/vad", "docs/glossary"],
     "Python and extensions": ["docs/python", "docs/live", "docs/extend", "docs/reference"],
-    "Project": ["CONTRIBUTING", "SECURITY", "CHANGELOG", "docs/history"],
+    "Project": ["CONTRIBUTING", "SECURITY", "docs/hardening", "CHANGELOG", "docs/history"],
 }
 
 project = "bevcli"
