@@ -10,7 +10,7 @@ from bevcli.errors import BevcliError
 from bevcli.model.bev_queries import BevQueries
 from bevcli.model.calibration_embedding import CalibrationEmbedding
 from bevcli.model.config import ModelConfig
-from bevcli.model.decoder import Decoder, DecoderLayer, DetectionHead
+from bevcli.model.decoder import Decoder, DecoderLayer, DetectionHead, ObjectQueries
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.encoder import Encoder
 from bevcli.model.fpn import FPN
@@ -75,7 +75,8 @@ class Network(TemporalModel):
 
     def exchange_parts(self) -> None:
         """See `TemporalModel`: the object queries attend to each other before they look at the frame."""
-        self.decoder.layers[0].self_attention = ConstantSelfAttention(self.decoder)
+        first = self.decoder.layers[0]
+        first.self_attention = ConstantSelfAttention(first, self.decoder.object_queries(batch=1))
 
     def remember(self, clip: ClipInputs, place: int, memory: Any) -> Any:
         """The memory after a frame of training clips that is history only; called without gradient.
@@ -155,12 +156,11 @@ class ConstantSelfAttention(nn.Module):
 
     attended: Tensor
 
-    def __init__(self, decoder: Decoder) -> None:
+    def __init__(self, first: nn.Module, queries: ObjectQueries) -> None:
+        """first: a DecoderLayer. queries: those that enter it in every frame, for a batch of one."""
         super().__init__()
-        first = decoder.layers[0]
         assert isinstance(first, DecoderLayer)
         with torch.no_grad():
-            queries = decoder.object_queries(batch=1)
             key = queries.content + queries.position
             attended, _ = first.self_attention(key, key, queries.content, need_weights=False)
         self.register_buffer("attended", attended, persistent=False)  # (1, Q, C)
