@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from bevcli._version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from bevcli.calibration.calibrate import calibrate as calibrate
     from bevcli.errors import BevcliError as BevcliError
     from bevcli.evaluation.evaluate import evaluate as evaluate
     from bevcli.frame import (
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
 
 # The public names by the modules that define them.
 _NAMES = {
+    "bevcli.calibration.calibrate": "calibrate",
     "bevcli.errors": "BevcliError",
     "bevcli.evaluation.evaluate": "evaluate",
     "bevcli.frame": "BevMap CameraImage Frame FrameStamp MAP_CLASSES Prediction Sequence",

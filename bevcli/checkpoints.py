@@ -1,7 +1,7 @@
 """Weights files: reads the official .pth and our .safetensors into the state dict of our model."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache, cached_property
 from importlib import resources
 from pathlib import Path
@@ -13,7 +13,6 @@ from torch import Tensor
 from bevcli.config import known_models, load_config
 from bevcli.errors import WeightsError
 from bevcli.model.config import ModelConfig
-from bevcli.model.network import Network
 from bevcli.model.official_keys import from_official, is_official
 from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.parsing.pickles import Placeholder
@@ -46,8 +45,14 @@ class KeyReport:
 
     def describe(self) -> str:
         """All differing keys, on one line."""
-        parts = [("missing", self.missing), ("unexpected", self.unexpected), ("misshapen", self.misshapen)]
-        return "; ".join(f"{len(keys)} {name}: {', '.join(keys)}" for name, keys in parts if keys)
+        return "; ".join(f"{len(keys)} {name}: {', '.join(keys)}" for name, keys in self._parts() if keys)
+
+    def summary(self) -> str:
+        """The first differing key of each kind, on one line."""
+        return "; ".join(f"{len(keys)} {name}, such as {keys[0]}" for name, keys in self._parts() if keys)
+
+    def _parts(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
+        return ("missing", self.missing), ("unexpected", self.unexpected), ("misshapen", self.misshapen)
 
 
 @dataclass(frozen=True)
@@ -81,35 +86,37 @@ class Checkpoint:
         return sum(tensor.numel() for tensor in self.state.values())
 
 
-def load_weights(path: Path, model: TemporalModel, *, resample: bool = False) -> Checkpoint:
+def load_weights(path: Path, model: TemporalModel, model_file: str = "") -> Checkpoint:
     """Loads a weights file into a model, in place. Keys and shapes must be exactly those of the model.
 
     Args:
         path: an official .pth or a .safetensors.
         model: unchanged where the file does not fit.
-        resample: for fine-tuning: BEV queries of a grid with another number of cells are interpolated, and a
-            calibration embedding that the file lacks keeps the model's initial weights, which change nothing.
+        model_file: name or TOML file of the model, for the message; by default the model's name.
 
     Raises WeightsError that names the known model that the file fits, or else every key that differs.
     """
     checkpoint = read_checkpoint(path)
-    if resample:
-        assert isinstance(model, Network)
-        checkpoint = replace(checkpoint, state=model.resampled(checkpoint.state))
-    require_fit(checkpoint, model.config.name, model.state_dict())
+    require_fit(checkpoint, model_file or model.config.name, model.state_dict())
     model.load_state_dict(dict(checkpoint.state))
     return checkpoint
 
 
 def require_fit(checkpoint: Checkpoint, model: str, expected: Mapping[str, Tensor]) -> None:
-    """Raises WeightsError where a weights file does not fit a model. expected: the model's state dict."""
+    """Raises WeightsError where a weights file does not fit a model.
+
+    model: its name or TOML file. expected: its state dict.
+    """
     report = compare(checkpoint.state, expected)
     if report.fits:
         return
+    differences = report.describe()
     if checkpoint.models:
-        others = " or ".join(checkpoint.models)
-        raise WeightsError(f"{checkpoint.path}: expected weights of model {model}, found those of {others}")
-    raise WeightsError(f"{checkpoint.path}: does not fit model {model} nor any known one; {report.describe()}")
+        differences = f"it holds weights of {' or '.join(checkpoint.models)}; {report.summary()}"
+    raise WeightsError(
+        f"{checkpoint.path}: does not fit model {model}: {differences}; `bevcli train` starts from whatever fits "
+        f"(`--model {model} --weights {checkpoint.path}`)"
+    )
 
 
 def convert(source: Path, destination: Path) -> Checkpoint:

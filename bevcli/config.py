@@ -40,7 +40,7 @@ def load_config(name_or_path: str | Path) -> ModelConfig:
 
     Raises ConfigError where there is none, or where its contents are wrong.
     """
-    return config_of_table(*_read_model(str(name_or_path)))
+    return config_of_table(*read_model_file(str(name_or_path)))
 
 
 def config_of_table(table: dict[str, Any], file: str) -> ModelConfig:
@@ -63,7 +63,7 @@ def load_table(name_or_path: str | Path, table: str, kind: type[T]) -> T:
 
     Raises ConfigError where there is no such file, or where its contents are wrong.
     """
-    contents, file = _read_model(str(name_or_path))
+    contents, file = read_model_file(str(name_or_path))
     return settings_of_table(contents, table, kind, file)
 
 
@@ -90,8 +90,11 @@ def _plain(settings: Any) -> dict[str, Any]:
     return {key: _plain(each) if isinstance(each, dict) else each for key, each in table.items() if each is not None}
 
 
-def _read_model(name: str) -> tuple[dict[str, Any], str]:
-    """Contents and name of the TOML file of a known model, or of a file whose name ends in .toml."""
+def read_model_file(name: str) -> tuple[dict[str, Any], str]:
+    """Contents and name of the TOML file of a known model, or of a file whose name ends in .toml.
+
+    Raises ConfigError where there is no such file, or where it is no TOML.
+    """
     known = ", ".join(known_models())
     if name.endswith(".toml"):
         path, file = Path(name), name

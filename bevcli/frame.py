@@ -14,7 +14,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
 from bevcli.geometry.geographic import GeoOrigin
-from bevcli.geometry.transforms import Array, Pose
+from bevcli.geometry.transforms import Array, Pose, apply
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -29,6 +29,9 @@ def class_bits(names: Iterable[str]) -> dict[str, int]:
 
 # The map classes of rendered drives and of the segmentation head.
 MAP_CLASSES = class_bits(["drivable_road", "lane_boundary", "pedestrian_crossing", "vehicle"])
+
+# The classes of the true lines of rendered drives, which are those of VAD.
+LINE_CLASSES = ("divider", "ped_crossing", "boundary")
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,46 @@ class BevMap:
 
 
 @dataclass(frozen=True)
+class MapLines:
+    """N lines of the map, such as lane dividers.
+
+    Attributes:
+        points: N lines of x and y in the bev frame (P, 2), or of points on the ground in the ego or world frame (P, 3),
+            metres; P may differ.
+        classes: (N,) class names.
+        scores: (N,) confidence, 0 to 1. Optional.
+    """
+
+    points: tuple[Array, ...]
+    classes: NDArray[np.str_]
+    scores: Array | None = None
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Planned paths of the vehicle, one for each command of the driver.
+
+    Attributes:
+        commands: names of the C commands.
+        paths: (C, T, 2) x and y in the bev frame, or (C, T, 3) points on the ground in the ego or world frame, metres:
+            future places of the origin of the bev frame.
+        times_s: (T,) seconds from the frame's time.
+        command: the one that was given, "" for none.
+    """
+
+    commands: tuple[str, ...]
+    paths: Array
+    times_s: Array
+    command: str = ""
+
+
+FrameResult = MapLines | Plan  # further results of a model, which files and recordings take by their type
+
+
+@dataclass(frozen=True)
 class FrameStamp:
     """The identity and the time of a frame.
 
@@ -99,6 +142,7 @@ class Frame:
         dropped: camera -> why its image is missing.
         ground_truth: boxes in the world frame.
         ground_truth_map: a map in the bev frame.
+        ground_truth_lines: lines of the map in the bev frame, of LINE_CLASSES.
         sample_token: nuScenes' name of the frame.
     """
 
@@ -111,6 +155,7 @@ class Frame:
     dropped: Mapping[str, str] = field(default_factory=dict)
     ground_truth: Boxes3D | None = None
     ground_truth_map: BevMap | None = None
+    ground_truth_lines: "MapLines | None" = None
     sample_token: str | None = None
 
 
@@ -239,6 +284,30 @@ class AttentionView:
     probes: tuple[Probe, ...] = ()
 
 
+@dataclass(frozen=True)
+class Ground:
+    """The ground at a frame's time, z = 0 of the ego frame, below places of the bev frame.
+
+    Attributes:
+        stamp: of the frame.
+        ego_from_bev: (4, 4).
+        world_from_ego: the vehicle's pose; None if unknown, or where points are to be in the ego frame.
+    """
+
+    stamp: FrameStamp
+    ego_from_bev: Array
+    world_from_ego: Pose | None
+
+    def points(self, places: Array) -> Array:
+        """Points (..., 3) on the ground in the world frame, or the ego frame without pose.
+
+        places: (..., 2) x and y in the bev frame, metres.
+        """
+        below = np.full((*places.shape[:-1], 1), -self.ego_from_bev[2, 3])
+        in_ego = apply(self.ego_from_bev, np.concatenate([places, below], axis=-1)) * (1, 1, 0)
+        return in_ego if self.world_from_ego is None else apply(self.world_from_ego.matrix, in_ego)
+
+
 class StartReason(Enum):
     """A reason to step without history."""
 
@@ -285,6 +354,7 @@ class Prediction:
         segmentation: the map of the segmentation head, None without one.
         attention: what the attentions sampled, where this was asked for.
         stage_seconds: stage of the pipeline -> seconds, in the order of execution.
+        results: further results of the model, each of another type.
     """
 
     stamp: FrameStamp
@@ -300,6 +370,12 @@ class Prediction:
     segmentation: BevMap | None = None
     attention: AttentionView | None = None
     stage_seconds: Mapping[str, float] = field(default_factory=dict)
+    results: tuple[FrameResult, ...] = ()
+
+    @property
+    def ground(self) -> "Ground":
+        """The ground below the bev frame."""
+        return Ground(self.stamp, self.ego_from_bev, self.world_from_ego)
 
     @property
     def boxes_ego(self) -> Boxes3D:

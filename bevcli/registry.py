@@ -15,6 +15,7 @@ Group = Literal[
     "bevcli.sequences",
     "bevcli.drive_writers",
     "bevcli.box_formats",
+    "bevcli.label_formats",
     "bevcli.engines",
     "bevcli.commands",
 ]

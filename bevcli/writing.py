@@ -35,13 +35,23 @@ def whole_file(path: Path, *, parents: bool = False, shared: bool = False, regul
         if parents:
             path.parent.mkdir(parents=True, exist_ok=True)
         unfinished.unlink(missing_ok=True)  # it may be a link
+        mode = _mode_of_new_files(unfinished)
         yield unfinished
+        unfinished.chmod(mode)  # some libraries, such as safetensors, write files that only their owner can read
         os.replace(unfinished, path)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from None
     finally:
         with suppress(OSError):
             unfinished.unlink()
+
+
+def _mode_of_new_files(path: Path) -> int:
+    """The mode that the umask gives to a file of this name, which does not exist before or after."""
+    path.touch(exist_ok=False)
+    mode = path.stat().st_mode & 0o777
+    path.unlink()
+    return mode
 
 
 def write_whole(

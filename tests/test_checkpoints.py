@@ -30,9 +30,11 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.official_keys import from_official
 from bevcli.model.parts import model_parts
 from bevcli.model.temporal_model import build_model
+from bevcli.training.warm_start import warm_start
 
 sys.path.insert(0, str(Path(__file__).parent / "model"))
 
+from memory_drive import make_rig
 from small_model import small_model
 
 KEYS = json.loads((Path(__file__).parent / "data" / "golden_keys.json").read_text())
@@ -113,7 +115,7 @@ def test_keys_of_uniad_files_without_effect_are_left_out(version_1_0: bool, left
 
 def test_other_differences_of_v2_files_are_refused(tmp_path: Path) -> None:
     path = official_v2("v2-t2", tmp_path, level_embeds=(5, 256))
-    with pytest.raises(WeightsError, match=r"does not fit model v2-t2 .*1 misshapen: image_tokens\.level_embedding"):
+    with pytest.raises(WeightsError, match=r"does not fit model v2-t2: .*1 misshapen: image_tokens\.level_embedding"):
         require_fit(read_checkpoint(path), "v2-t2", expected_state(load_config("v2-t2")))
 
 
@@ -182,7 +184,7 @@ def test_weights_of_another_grid_are_resampled_on_request(tmp_path: Path) -> Non
     finer = small_model(seed=2, bev_grid=grid)
     with pytest.raises(WeightsError, match="3 misshapen"):
         load_weights(path, finer)
-    load_weights(path, finer, resample=True)
+    warm_start(path, finer, "finer.toml", make_rig)
     cells = finer.bev_queries.embedding.data.reshape(12, 16, -1)
     # A linear gradient over the grid stays linear, except in the outermost half cells.
     torch.testing.assert_close(cells[1:-1, 3, 0], ((torch.arange(12) + 0.5) / 12)[1:-1])
@@ -219,7 +221,7 @@ def test_every_missing_unexpected_and_misshapen_key_is_listed(tmp_path: Path) ->
 
 
 def test_the_error_for_weights_of_another_model_names_that_model(official_tiny: Path) -> None:
-    with pytest.raises(WeightsError, match="expected weights of model small-for-tests, found those of tiny"):
+    with pytest.raises(WeightsError, match="does not fit model small-for-tests: it holds weights of tiny; "):
         load_weights(official_tiny, small_model())
 
 
@@ -325,7 +327,7 @@ def test_weights_inspect_gives_file_and_parts_as_json(official_tiny: Path) -> No
 def test_weights_inspect_needs_a_file_that_fits_the_model(official_tiny: Path) -> None:
     answer = CliRunner().invoke(app, ["weights", "inspect", str(official_tiny), "--model", "base"])
     assert isinstance(answer.exception, WeightsError)
-    assert "expected weights of model base, found those of tiny" in str(answer.exception)
+    assert "does not fit model base: it holds weights of tiny; " in str(answer.exception)
     assert CliRunner().invoke(app, ["weights", "inspect"]).exit_code == 2
 
 

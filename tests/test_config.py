@@ -193,7 +193,7 @@ def test_the_architecture_of_a_file_is_named(tmp_path: Path) -> None:
     for wrong, message in [
         (
             ('"BEVFormerV2"', '"BEVFormerV3"'),
-            '"architecture" must be "BEVFormer" or "BEVFormerV2" or "UniAD", but is \'BEVFormerV3\'',
+            '"BEVFormerV2" or "UniAD" or "VAD", but is \'BEVFormerV3\'',
         ),
         (("frames = [-1, 0]", ""), '"frames" is missing; expected a list, each element'),
         (("frames = [-1, 0]", "frames = [-2, -1]"), "frames must be ascending, and hold 0, the current frame"),

@@ -29,6 +29,7 @@ LAYERS = (
     {"viewer"},
     {"inference"},
     {"rig"},
+    {"calibration"},
     {"runs"},
     {"synth", "batch"},
     {"training", "benchmark", "explain"},

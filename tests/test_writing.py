@@ -15,6 +15,16 @@ def test_a_written_file_has_its_name_and_leaves_nothing_else(tmp_path):
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["file.txt"]
 
 
+def test_the_umask_gives_the_mode_of_a_file(tmp_path):
+    before = os.umask(0o027)
+    try:
+        with whole_file(tmp_path / "file") as unfinished:
+            unfinished.touch(mode=0o600)
+    finally:
+        os.umask(before)
+    assert (tmp_path / "file").stat().st_mode & 0o777 == 0o640
+
+
 @pytest.mark.parametrize(("failure", "raised"), [(OSError(28, "disk full"), OutputError), (ValueError(), ValueError)])
 def test_after_an_error_the_old_file_is_there(tmp_path, failure, raised):
     def fail(path):

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Literal
 
-from bevcli.inference.options import complete_model
+from bevcli.inference.options import complete_model, model_names
 from bevcli.options import option, options
 
 
@@ -14,7 +14,7 @@ class BenchOptions:
     model: str = option(
         reads="path or name",
         default="tiny",
-        help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, uniad-track-map, a FILE.toml or a FILE.onnx.",
+        help=f"{', '.join(model_names())}, a FILE.toml or a FILE.onnx.",
         metavar="NAME|FILE",
         complete=complete_model,
     )

@@ -9,7 +9,7 @@ import typer
 from bevcli.cli.bridge import INPUT, Part
 from bevcli.printing import say
 from bevcli.sequences.format import option_classes
-from bevcli.sequences.options import SequenceOptions, WriteOptions
+from bevcli.sequences.options import LabelOptions, SequenceOptions, WriteOptions
 
 PANEL = "Start"
 
@@ -25,6 +25,7 @@ def convert(
     ],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="The folder or file to write.")],
     options: Annotated[SequenceOptions, Part(only=("strict", "scene", "ground_truth", "allow_outside", "class_map"))],
+    labels: LabelOptions,
     format_options: Annotated[dict[str, Any], Part(classes=option_classes)],
     written: WriteOptions,
 ) -> None:
@@ -34,12 +35,15 @@ def convert(
     """
     from bevcli.cli.progress import Progress
     from bevcli.errors import OutputError
+    from bevcli.sequences.labels.sequence import WithLabels
     from bevcli.sequences.open import open_sequence
     from bevcli.sequences.output import open_writer
 
     if out.resolve() == source.resolve() or out.resolve() in source.resolve().parents:
         raise OutputError(f"{out}: contains the input: choose another path")
     sequence = open_sequence(source, replace(options, ego_motion="optional"), **format_options)
+    if labels.labels is not None:
+        sequence = WithLabels(sequence, labels.labels, only_labelled=labels.only_labelled)
     count = len(sequence.stamps)
     gaps = 0
     with (

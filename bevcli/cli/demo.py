@@ -1,5 +1,6 @@
 """`bevcli demo`: render a short drive, run the model on it and open the viewer; needs no other data."""
 
+from bevcli.calibration.options import CalibrateFirstOptions
 from bevcli.inference.options import ModelOptions
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import OutputOptions, RunOptions
@@ -22,6 +23,7 @@ def demo(options: DemoOptions) -> None:
 
     drive, results = options.out / "drive", OutputOptions(options.out / "results", options.force)
     render(drive, RenderOptions(options.seed, options.frames, resolution=RESOLUTION, force=options.force))
-    run(drive, ModelOptions(), RunOptions(), RecordingOptions(), SequenceOptions(), results, {})
+    as_stated = CalibrateFirstOptions()
+    run(drive, ModelOptions(), RunOptions(), RecordingOptions(), SequenceOptions(), as_stated, results, {})
     if options.view:
         viz(options.out / "results/recording.rrd", ViewOptions())

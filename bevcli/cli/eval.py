@@ -32,6 +32,7 @@ def evaluate(
     Frames are matched by nuScenes' sample token, else by scene and timestamp, else by frame index. `bevcli validate`
     runs a model on several drives and scores them together.
     """
+    from bevcli.evaluation.driving import DRIVING
     from bevcli.evaluation.evaluate import evaluate
 
     scores = evaluate(
@@ -40,6 +41,7 @@ def evaluate(
         options.max_range,
         options.count_missing,
         tracking=options.tracking,
+        driving=[name for name in DRIVING if getattr(options, name)],
         scene=source.scene,
         class_map=source.class_map,
         **format_options,

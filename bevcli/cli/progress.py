@@ -21,7 +21,8 @@ LONGEST_SILENCE_S = 30.0  # between two lines on a pipe, if units are done meanw
 class Progress:
     """Shows the work done, the rate and the time left.
 
-    Use it as `with Progress(total, "frames") as progress: ... progress.advance()`.
+    Use it as `with Progress(total, "frames") as progress: ... progress.advance()`. Its attribute `detail` is a text
+    after them, such as "loss 1.2".
 
     Args:
         total: the amount of work, in units.
@@ -34,6 +35,7 @@ class Progress:
         self.total, self.unit, self._notes = total, unit, dict.fromkeys(notes)
         self.stream = sys.stderr if stream is None else stream
         self.done = 0
+        self.detail = ""
         self.skipped = 0
         self.started = self._printed = time.perf_counter()
         self._bar: rich.progress.Progress | None = None
@@ -79,7 +81,8 @@ class Progress:
             return f"{self.done}/{self.total} {self.unit}"
         each = max(time.perf_counter() - self.started, 1e-9) / (self.done - self.skipped)
         pace = f"{1 / each:.2f} per second" if each <= SLOW_S else f"{each:.1f} s each"
-        return f"{self.done}/{self.total} {self.unit}, {pace}, {duration((self.total - self.done) * each)} left"
+        left = f"{duration((self.total - self.done) * each)} left"
+        return ", ".join(filter(None, (f"{self.done}/{self.total} {self.unit}", pace, left, self.detail)))
 
     def _line_is_due(self, count: int) -> bool:
         step = max(1, self.total // LINES_ON_A_PIPE)

@@ -1,8 +1,9 @@
 """`bevcli project-debug`: find mistakes in a calibration."""
 
 import textwrap
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -11,6 +12,9 @@ from bevcli.printing import say
 from bevcli.rig.options import CheckOptions
 from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
+
+if TYPE_CHECKING:
+    from bevcli.rig.check_calibration import CalibrationCheck
 
 PANEL = "Look"
 ERRORS_FOUND = 3
@@ -27,7 +31,8 @@ def project_debug(
 ) -> None:
     """Find mistakes in a calibration.
 
-    Checks the camera poses and lenses, the bev frame and, with a sequence, its ego-motion and timestamps. Writes
+    Checks the camera poses and lenses, the bev frame and, with a sequence, its ego-motion, its timestamps, and whether
+    the images fit how the vehicle moves (the short form of `bevcli calibrate`). Writes
     cameras.png (pillars, ground grid and horizon in each image), coverage.png (how many cameras see each BEV cell),
     recording.rrd (for bevcli viz) and findings.json. Existing files are overwritten.
 
@@ -40,6 +45,10 @@ def project_debug(
 
     given = {name: value for name, value in format_options.items() if value}
     check = check_calibration(calibration, options.sequence, options.frame, allow_outside=source.allow_outside, **given)
+    if options.motion and not check.errors:
+        if options.sequence is not None:
+            given["calibration"] = calibration
+        check = _with_motion(check, options.sequence or calibration, source.allow_outside, given)
     written = check.write(options.out or Path("runs") / f"{check.name}-project-debug")
     if as_json:
         say(check.to_json())
@@ -51,3 +60,19 @@ def project_debug(
         say(as_flags(check.text()), "", *notes, "Written: " + ", ".join(map(str, written)))
     if check.errors:
         raise typer.Exit(ERRORS_FOUND)
+
+
+def _with_motion(
+    check: "CalibrationCheck", path: Path, allow_outside: bool, given: dict[str, Any]
+) -> "CalibrationCheck":
+    """The check with the findings of a calibration from motion, where `path` is a drive with ego-motion."""
+    from bevcli.calibration.findings import motion_findings
+    from bevcli.errors import InputError
+    from bevcli.rig.rig_report import with_findings
+    from bevcli.sequences.open import open_sequence
+
+    try:
+        drive = open_sequence(path, ground_truth=False, allow_outside=allow_outside, **given)
+    except InputError:  # a calibration alone, or a drive without ego-motion: the check has said so
+        return check
+    return replace(check, report=with_findings(check.report, motion_findings(drive)))

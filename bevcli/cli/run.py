@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from bevcli.calibration.options import CalibrateFirstOptions
 from bevcli.cli.bridge import INPUT, Part, as_flags
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
@@ -32,6 +33,7 @@ def run(
     run_options: RunOptions,
     recording: RecordingOptions,
     source: SequenceOptions,
+    first: CalibrateFirstOptions,
     output: OutputOptions,
     format_options: Annotated[dict[str, Any], Part(classes=option_classes)],
 ) -> None:
@@ -39,7 +41,8 @@ def run(
 
     The output folder gets recording.rrd (open it with `bevcli viz`), predictions.json (all boxes of all frames),
     tracks.csv (one row a box with its track), summary.json, for models that predict a map segmentation/, and for a
-    drive of one scene calibration.json (the rig).
+    drive of one scene calibration.json (the rig). A model that predicts lines of the map or plans a path adds
+    map_lines.json and plan.csv.
     Ctrl-C or SIGTERM finish the current frame; a second one ends the program at once.
     """
     from bevcli.cli.fetching import fetch_if_asked
@@ -53,7 +56,10 @@ def run(
     fetch_if_asked(model)
     loaded = load_model(options=model)
     reading = source.for_model(loaded.config, temporal=run_options.temporal)
-    drive = CheckedDrive(open_sequence(sequence, reading, **format_options), shlex.quote(str(sequence)))
+    drive = open_sequence(sequence, reading, **format_options)
+    if first.calibrate:
+        drive = _calibrated(drive)
+    drive = CheckedDrive(drive, shlex.quote(str(sequence)))
     out = output.out or Path("runs") / f"{drive.name}-{loaded.name}"
     view = None
     if output.live:
@@ -85,6 +91,21 @@ def run(
         say(f"stopped; `--resume` goes on with frame {summary.frames + 1} of {len(drive.stamps)}", err=True)
         raise typer.Exit(signals.exit_code)
     say(f"next     bevcli viz {shlex.quote(str(out))}")
+
+
+def _calibrated(drive: "Sequence") -> "Sequence":
+    """The drive with the rig that it shows; what is corrected is printed."""
+    from bevcli.calibration.calibrate import STEPS, calibrate
+    from bevcli.calibration.corrected_drive import CorrectedDrive
+    from bevcli.calibration.table import change_text
+    from bevcli.cli.progress import Progress
+
+    with Progress(STEPS, "steps of the calibration") as progress:
+        result = calibrate(drive, after_step=progress.advance)
+    for each in result.cameras:
+        reason = change_text(each) if each in result.corrected else each.reason
+        say(f"calibration: {each.camera} is {each.verdict.value}" + (f": {reason}" if reason else ""), err=True)
+    return CorrectedDrive(drive, result)
 
 
 def _run_notes(model: "Model", drive: "Sequence", *, live: bool = False) -> list[str]:

@@ -42,16 +42,19 @@ def validate(
     from bevcli.cli.progress import Progress
     from bevcli.inference.load import load_model
     from bevcli.inference.runner import Runner, StepOptions
-    from bevcli.synth.drives import count_frames, open_drives
+    from bevcli.synth.drives import count_frames
+    from bevcli.synth.splits import scored_drives
+    from bevcli.training.drive_checks import check_scored_drives
     from bevcli.training.job import rig_for_drives
     from bevcli.training.validation import validate as validate_model
 
     loaded = load_model(model, options=model_options)
     rig = None if options.rig is None else rig_for_drives(options.rig, model or loaded.name)
     data = drive_options
-    drives = open_drives(data.data, data.rendered, data.cache, loaded.config, rig, data.class_map)
+    drives = scored_drives(data, loaded.config, rig)
+    notes = check_scored_drives(data, drives, loaded.config)
     runner = Runner(loaded.prepared, loaded.device, StepOptions(loaded.precision, run_options.temporal))
-    with Progress(count_frames(drives), "frames") as progress:
+    with Progress(count_frames(drives), "frames", notes) as progress:
         scores = validate_model(
             runner,
             drives,

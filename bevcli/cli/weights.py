@@ -110,7 +110,7 @@ def inspect(
     if model is not None:
         config = load_config(model)
         if checkpoint is not None:
-            require_fit(checkpoint, config.name, expected_state(config))
+            require_fit(checkpoint, model, expected_state(config))
         parts = model_parts(config)
         data |= {"model": config.name, "model_parameters": sum(part.parameters for part in parts)}
         data["parts"] = [asdict(part) for part in parts]

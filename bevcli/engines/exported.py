@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -12,6 +12,8 @@ from torch import Tensor
 from bevcli.config import config_of_table
 from bevcli.engines.engine import Engine
 from bevcli.errors import WeightsError
+from bevcli.frame import FrameResult
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.config import ModelConfig
 from bevcli.model.segmentation import SegmentationOutputs
 from bevcli.model.step import ModelOutputs, PreparedFrame
@@ -76,6 +78,8 @@ class ExportedOutputs(ModelOutputs):
         found: every output of the file by name.
     """
 
+    stays_on_device: ClassVar[bool] = True  # it is on the CPU
+
     found: Mapping[str, Tensor] = field(default_factory=dict)
 
 
@@ -124,6 +128,14 @@ class ExportedModel(TemporalModel):
             )
         outputs: ExportedOutputs = self(self.form.feed(prepared, memory))
         return outputs, self.form.memory(prepared, memory, outputs.found)
+
+    def decode_boxes(self, outputs: ModelOutputs) -> Boxes3D:
+        assert isinstance(outputs, ExportedOutputs)
+        return self.form.decode_boxes(self.form.model_outputs(outputs, outputs.found))
+
+    def decode_results(self, outputs: ModelOutputs) -> tuple[FrameResult, ...]:
+        assert isinstance(outputs, ExportedOutputs)
+        return self.form.decode_results(self.form.model_outputs(outputs, outputs.found))
 
     def forward(self, feed: Mapping[str, Tensor]) -> ExportedOutputs:
         """The outputs of the file. feed: its inputs by name, see `ExportForm.feed`.

@@ -1,7 +1,7 @@
 """`evaluate`: read predictions and ground truth, match their frames, and score boxes and maps."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
@@ -10,9 +10,11 @@ from typing import Any, TypeVar
 from bevcli.evaluation.config import ClassRanges, DetectionConfig, TrackingConfig
 from bevcli.evaluation.detection import evaluate_detections
 from bevcli.evaluation.detection_scores import DetectionScores
+from bevcli.evaluation.driving import DrivingScores, Scored, evaluate_driving
+from bevcli.evaluation.driving_report import driving_tables, driving_to_dict
 from bevcli.evaluation.inputs import ScoredInput, open_ground_truth, open_predictions, without_cycles_in_racks
 from bevcli.evaluation.pairing import FramePairs, pair_frames
-from bevcli.evaluation.scores_report import scores_table, scores_to_dict
+from bevcli.evaluation.scores_report import finite, scores_table, scores_to_dict
 from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmentation
 from bevcli.evaluation.tracking.scoring import TrackingScores, evaluate_tracking
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
@@ -37,6 +39,7 @@ class Scores:
         detection: the scores of the boxes.
         segmentation: the scores of the maps; None where predictions or ground truth have none.
         tracking: the scores of the tracks; None if they were not asked for.
+        driving: the scores of lines of the map, forecasts and planned paths that were asked for.
         notes: what was assumed or left out, one line each.
     """
 
@@ -46,15 +49,18 @@ class Scores:
     segmentation: SegmentationScores | None
     tracking: TrackingScores | None
     notes: tuple[str, ...]
+    driving: DrivingScores = field(default_factory=DrivingScores)
 
     def to_dict(self) -> dict[str, Any]:
         """All scores as a dict for JSON, with the devkit's key names; undefined numbers are None."""
-        return scores_to_dict(self.detection, self.config, self.segmentation, self.notes, self.tracking)
+        scores = scores_to_dict(self.detection, self.config, self.segmentation, self.notes, self.tracking)
+        return scores | finite(driving_to_dict(self.driving))
 
     def table(self) -> str:
         """The scores as text for a terminal."""
         frames = f"{self.detection.frame_count} frames, matched by {self.pairs.matched_by}"
-        return f"{frames}\n\n{scores_table(self.detection, self.segmentation, self.tracking)}"
+        parts = [frames, scores_table(self.detection, self.segmentation, self.tracking), *driving_tables(self.driving)]
+        return "\n\n".join(parts)
 
     def write_plots(self, folder: Path | str) -> list[Path]:
         """Write plots as PNG files into a folder, made where it is missing; return their paths. Raises OutputError."""
@@ -75,6 +81,7 @@ def evaluate(
     count_missing: bool = False,
     *,
     tracking: bool = False,
+    driving: Sequence[Scored] = (),
     scene: str | None = None,
     version: str | None = None,
     split: str | None = None,
@@ -91,6 +98,7 @@ def evaluate(
         count_missing: whether ground-truth frames without a prediction count as missed; they are left out by default.
         tracking: whether to score tracks, too: AMOTA and the metrics that come with it. Predictions and ground truth
             need identities ("instance").
+        driving: what else to score: "map" (lines), "motion" (forecasts) and "plan" (planned paths).
         scene: score only this scene of the ground truth.
         version: of a nuScenes root, such as "v1.0-mini".
         split: of a nuScenes root, such as "val".
@@ -100,8 +108,8 @@ def evaluate(
         The scores. Predictions without attributes get them from class and speed.
 
     Raises:
-        InputError: a file is missing or wrong, the two have no frame in common, or `tracking` and one of them has no
-            identities.
+        InputError: a file is missing or wrong, the two have no frame in common, `tracking` and one of them has no
+            identities, or one of them lacks what `driving` asks for.
         ConfigError: max_range is not positive.
     """
     found = open_predictions(Path(predictions), class_map)
@@ -120,8 +128,9 @@ def evaluate(
     limits = _range_notes(max_range, model_range, pairs)
     of_classes = [] if are_nuscenes(classes) else [OWN_CLASSES]
     of_classes += _other_class_notes(pairs, classes)
+    drives = evaluate_driving(driving, (Path(predictions), Path(ground_truth)), found, truth, pairs)
     notes = (*pairs.notes, *map_notes, *of_classes, *limits, *_detection_notes(detection), *track_notes)
-    return Scores(pairs, config, detection, segmentation, tracks, notes)
+    return Scores(pairs, config, detection, segmentation, tracks, (*notes, *drives.notes), drives)
 
 
 def _range_notes(max_range: float | None, model_range: float | None, pairs: FramePairs) -> Iterator[str]:

@@ -3,6 +3,7 @@
 import csv
 import io
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -66,7 +67,7 @@ def write_csv(boxes: BoxesFile, path: Path) -> int:
 
 def _rows(frame: FrameBoxes, frame_of_reference: str) -> Iterator[dict[str, Any]]:
     stamp = frame.stamp
-    for box in boxes_to_json(frame.boxes):
+    for box in boxes_to_json(replace(frame.boxes, futures=None)):  # a cell has one number
         center, size, velocity = box.pop("center"), box.pop("size_lwh"), box.pop("velocity")
         yield {
             "frame": stamp.index,

@@ -13,7 +13,8 @@ from bevcli.evaluation.config import DetectionConfig
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
 
-# Value of an optional column in frames that do not have it.
+_NOT_MATCHED = ("futures", "future_scores")  # scored on their own
+# Value of any other optional column in frames that do not have it.
 _UNKNOWN = {
     "scores": np.float64(np.nan),
     "attributes": np.str_(""),
@@ -55,7 +56,9 @@ def gather(frames: Sequence[Boxes3D], ego_xy: Array) -> ScoredBoxes:
     indices = np.repeat(np.arange(len(frames)), [len(boxes) for boxes in frames])
     filled = [boxes for boxes in frames if len(boxes)] or [Boxes3D.empty()]
     columns: dict[str, Any] = {
-        column.name: np.concatenate([_column(boxes, column.name) for boxes in filled]) for column in fields(Boxes3D)
+        column.name: np.concatenate([_column(boxes, column.name) for boxes in filled])
+        for column in fields(Boxes3D)
+        if column.name not in _NOT_MATCHED
     }
     boxes = Boxes3D(**columns)
     ranges = np.linalg.norm(boxes.centers[:, :2] - ego_xy[indices], axis=1)

@@ -30,6 +30,13 @@ class EvaluationOptions:
     tracking: bool = option(
         default=False, help="Also score tracks: AMOTA, identity switches and the other tracking metrics."
     )
+    map: bool = option(default=False, help="Also score lines of the map: AP by Chamfer distance of 0.5, 1 and 1.5 m.")
+    motion: bool = option(default=False, help="Also score forecasts: EPA, minADE, minFDE and miss rate.")
+    plan: bool = option(
+        default=False,
+        help="Also score planned paths: distance to the driven path and collisions, up to 1, 2 and 3 s as VAD states "
+        "them, and at 1, 2 and 3 s as UniAD does.",
+    )
 
 
 def _complete_format(incomplete: str) -> list[str]:

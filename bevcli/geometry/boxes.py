@@ -30,6 +30,9 @@ class Boxes3D:
         duplicates: (N,) whether a better box describes the same object. Optional.
         visibilities: (N,) visible fraction, 0 to 1; NaN if unknown. Optional.
         num_points: (N,) number of lidar and radar points; boxes with 0 are not scored, -1 if unknown. Optional.
+        futures: (N, M, T, 3) M possible futures in T steps: seconds from the boxes' time, then x and y of the centre,
+            metres; NaN if unknown. Optional.
+        future_scores: (N, M) score of each future, 0 to 1. Optional.
     """
 
     centers: Array
@@ -44,6 +47,8 @@ class Boxes3D:
     duplicates: NDArray[np.bool_] | None = None
     visibilities: Array | None = None
     num_points: NDArray[np.int64] | None = None
+    futures: Array | None = None
+    future_scores: Array | None = None
 
     def __len__(self) -> int:
         return len(self.centers)
@@ -89,7 +94,14 @@ class Boxes3D:
             centers=apply(matrix, self.centers),
             yaws=np.arctan2(turned[:, 1], turned[:, 0]),
             velocities=velocities[:, :2],
+            futures=None if self.futures is None else self._moved_futures(matrix, self.futures),
         )
+
+    def _moved_futures(self, matrix: Array, futures: Array) -> Array:
+        """Futures (N, M, T, 3) in another frame. An object keeps its height."""
+        heights = np.broadcast_to(self.centers[:, None, None, 2:], (*futures.shape[:3], 1))
+        moved = apply(matrix, np.concatenate([futures[..., 1:], heights], axis=-1))
+        return np.concatenate([futures[..., :1], moved[..., :2]], axis=-1)
 
     def corners(self) -> Array:
         """(N, 8, 3) corners, metres: bottom four counter-clockwise from front left, then the top four likewise."""
@@ -110,6 +122,7 @@ class Boxes3D:
 
         The columns are class, score, x, y, z, length, width, height, yaw, vx, vy, attribute, instance, track_score,
         duplicate, visibility and num_points, without the optional ones that are None.
+        Futures are left out.
         """
         numbers = ("x", "y", "z", "length", "width", "height", "yaw", "vx", "vy")
         columns = {

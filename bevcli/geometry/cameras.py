@@ -14,6 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 from bevcli.geometry.transforms import Array, apply, inverse, rigid, rotation_about_z, yaw_of_rotation
 
 NEAR_M = 1e-5  # a point with a smaller depth, or behind the camera, has no pixel
+WIDEST_ANGLE = np.radians(120)  # off the optical axis, of a ray of a fisheye
+ANGLES = 20_000  # of the table that inverts a fisheye's projection
+REFINEMENTS = 15  # fixed-point steps that invert a lens distortion
+LARGEST_RAY_ERROR = 1e-5  # of a normalised coordinate
 OUTSIDE = -1e4  # pixel coordinate outside any image, in place of NaN, which cv2.remap does not accept
 
 
@@ -115,6 +119,19 @@ class Camera:
         p = np.asarray(pixels, dtype=np.float64)
         rays = np.concatenate([p, np.ones((*p.shape[:-1], 1))], axis=-1) @ np.linalg.inv(self.intrinsics).T
         return self.project(rays)[0]
+
+    def rays(self, pixels: ArrayLike) -> Array:
+        """Pixels (..., 2) -> unit directions (..., 3) in the camera frame, with the lens distortion undone.
+
+        Of a fisheye they may lead backwards. NaN beyond `WIDEST_ANGLE`, and where the lens model is not valid.
+        """
+        p = np.asarray(pixels, dtype=np.float64)
+        bent = (p - self.intrinsics[:2, 2]) @ np.linalg.inv(self.intrinsics[:2, :2]).T
+        if self.distortion is not None and self.distortion.model == "kannala_brandt":
+            return _kannala_brandt_directions(bent, self.distortion.coefficients)
+        flat = bent if self.distortion is None else _undistorted(bent, self.distortion)
+        directions = np.concatenate([flat, np.ones((*p.shape[:-1], 1))], axis=-1)
+        return directions / np.linalg.norm(directions, axis=-1, keepdims=True)
 
     def undistort(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The image (H, W, 3) that a pinhole camera with the same intrinsics would have taken.
@@ -220,6 +237,31 @@ def _distort_brown_conrady(xy: Array, coefficients: tuple[float, ...]) -> Array:
     bent_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
     with np.errstate(invalid="ignore"):
         return np.where((slope > 0)[..., None], np.stack([bent_x, bent_y], axis=-1), np.nan)
+
+
+def _undistorted(bent: Array, distortion: Distortion) -> Array:
+    """Distorted coordinates (..., 2) -> normalised pinhole coordinates (..., 2); NaN where no ray is found.
+
+    OpenCV's solution alone is off by some pixels at strong distortion, so it is refined.
+    """
+    found = cv2.undistortPoints(bent.reshape(-1, 1, 2), np.eye(3), np.array(distortion.coefficients))
+    rays = np.asarray(found, dtype=np.float64).reshape(bent.shape)
+    for _ in range(REFINEMENTS):
+        rays = rays + (bent - distort(rays, distortion))
+    error = np.abs(distort(rays, distortion) - bent).max(-1, keepdims=True)
+    return np.where(error < LARGEST_RAY_ERROR, rays, np.nan)
+
+
+def _kannala_brandt_directions(bent: Array, coefficients: tuple[float, ...]) -> Array:
+    """Distorted coordinates (..., 2) of a fisheye -> unit directions (..., 3)."""
+    angles = np.linspace(0, WIDEST_ANGLE, ANGLES)
+    radii = angles + sum(k * angles ** (2 * i + 3) for i, k in enumerate(coefficients))
+    falls = np.flatnonzero(np.diff(radii) <= 0)
+    end = int(falls[0]) + 1 if len(falls) else ANGLES
+    radius = np.linalg.norm(bent, axis=-1)
+    angle = np.interp(radius, radii[:end], angles[:end], right=np.nan)
+    side = np.sin(angle) / np.where(radius > 0, radius, 1.0)
+    return np.concatenate([bent * side[..., None], np.cos(angle)[..., None]], axis=-1)
 
 
 TRANSLATION_M = 0.05  # standard deviation per level and axis

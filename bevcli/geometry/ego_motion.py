@@ -3,11 +3,12 @@
 from dataclasses import dataclass, field, fields, replace
 from typing import TypeAlias
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.geometry.transforms import Array, Pose, interpolate, rotation_from_quaternion
+from bevcli.geometry.transforms import Array, Pose, interpolate, rigid, rotation_from_quaternion
 
 GRAVITY = 9.81  # m/s², the reading of an accelerometer at rest along z
 TOLERANCE_NS = 50_000_000  # a time this far outside the stored range is accepted and gets the nearest pose
@@ -26,6 +27,13 @@ class Kinematics:
     acceleration: Array
     angular_rate: Array
     velocity: Array
+
+
+def motion_during(seconds: float, kinematics: Kinematics) -> Array:
+    """(4, 4) ego_from_later_ego: the motion at constant velocity and angular rate. seconds: may be negative."""
+    turn, _ = cv2.Rodrigues(seconds * kinematics.angular_rate)
+    half_turn, _ = cv2.Rodrigues(seconds / 2 * kinematics.angular_rate)
+    return rigid(half_turn @ (seconds * np.asarray(kinematics.velocity)), turn)
 
 
 @dataclass(frozen=True)

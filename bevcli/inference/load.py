@@ -137,10 +137,9 @@ def load_model(
         model = bevcli.load_model("tiny", weights="bevformer_tiny_epoch_24.pth", device="cuda")
 
     Args:
-        model: a known model ("tiny", "small", "base", "v2-t1-base", "v2-t1", "v2-t2", "v2-t8", "uniad-track-map",
-            "demo"), a name of the table of weights ("tiny-fp16"), a FILE.toml, or an exported FILE.onnx, which holds
-            its weights and runs on the CPU in the precision of the file. None takes the model that the weights fit,
-            or "demo" where there are no weights.
+        model: a known model, one of `bevcli.config.known_models()` such as "tiny" or "demo", a name of the table of
+            weights ("tiny-fp16"), a FILE.toml, or an exported FILE.onnx, which holds its weights and runs on the CPU in
+            the precision of the file. None takes the model that the weights fit, or "demo" where there are no weights.
         weights: an official .pth as published, or a .safetensors. None takes the weights of the package, which only
             "demo" has, or downloaded ones.
         options: a model with its options; `model` and `weights` replace its own where they are given.
@@ -182,7 +181,7 @@ def _load_network(options: ModelOptions) -> Model:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(UNTRAINED_SEED)
         network = build_model(config)
-    loaded = None if file is None else load_weights(file, network)
+    loaded = None if file is None else load_weights(file, network, str(name))
     return Model(
         network.eval(),
         target,

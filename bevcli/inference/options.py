@@ -8,14 +8,18 @@ from bevcli.options import option, options
 from bevcli.registry import entries
 
 
+def model_names() -> list[str]:
+    """The known models."""
+    # Not of bevcli.config, which loads PyTorch: help and completion must be quick.
+    files = [file.name for file in resources.files("bevcli").joinpath("configs").iterdir()]
+    return sorted(file.removesuffix(".toml") for file in files if file.endswith(".toml"))
+
+
 def complete_model(incomplete: str) -> list[str]:
     """The known models and weights that start with a text, for completion in a shell."""
-    # Not of bevcli.config, which loads PyTorch: completion must be quick.
     from bevcli.weights.sources import read_sources
 
-    files = [file.name for file in resources.files("bevcli").joinpath("configs").iterdir()]
-    names = {file.removesuffix(".toml") for file in files if file.endswith(".toml")} | read_sources().keys()
-    return sorted(name for name in names if name.startswith(incomplete))
+    return sorted(name for name in {*model_names(), *read_sources()} if name.startswith(incomplete))
 
 
 def complete_engine(incomplete: str) -> list[str]:
@@ -30,8 +34,8 @@ class ModelOptions:
     model: str | Path | None = option(
         reads="path or name",
         default=None,
-        help="tiny, small, base, v2-t1-base, v2-t1, v2-t2, v2-t8, uniad-track-map, demo, a name of `bevcli weights "
-        "list`, a FILE.toml or a FILE.onnx of `bevcli export-onnx`. Default: the model that WEIGHTS fit, else demo.",
+        help=f"{', '.join(model_names())}, a name of `bevcli weights list`, a FILE.toml or a FILE.onnx of `bevcli "
+        "export-onnx`. Default: the model that WEIGHTS fit, else demo.",
         metavar="NAME|FILE",
         complete=complete_model,
     )

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence as Items
 from dataclasses import dataclass, replace
 
 from bevcli.frame import Frame, Prediction, Sequence
+from bevcli.inference.commands import read_commands
 from bevcli.inference.load import Model
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import BevState, Runner, StepOptions
@@ -62,6 +63,7 @@ def run(
     attention: bool = False,
     probes: tuple[tuple[float, float], ...] = (),
     cameras: Mapping[str, str] | None = None,
+    command: str | None = None,
 ) -> Iterator[tuple[Frame, Prediction]]:
     """Runs a model over a sequence, frame by frame; the BEV map of a frame is the history of the next.
 
@@ -81,14 +83,21 @@ def run(
             `attention`.
         cameras: camera of the rig -> camera of the model whose embedding it takes. Default: the camera of the same
             name, else the one with the nearest viewing direction.
+        command: of the driver, which chooses one of the planned paths, such as "straight"; or a FILE.json.
 
     Raises:
-        InputError: a frame cannot be read, a probe lies outside the BEV grid, a camera is unknown, or the attention
-            of an exported file is asked for.
+        InputError: a frame cannot be read, a probe lies outside the BEV grid, a camera or a command is unknown, or the
+            attention of an exported file is asked for.
     """
     if attention or probes:
         model.require_parts("attention and probes")
-    asked = StepOptions(model.precision, temporal, ask_attention=attention or bool(probes), probes=tuple(probes))
+    asked = StepOptions(
+        model.precision,
+        temporal,
+        ask_attention=attention or bool(probes),
+        probes=tuple(probes),
+        commands=read_commands(command, model.config),
+    )
     steps = run_steps(model, sequence, asked, cameras, track=track)
     return ((frame, prediction) for frame, prediction, _ in steps)
 

@@ -3,7 +3,7 @@
 import contextlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence as Items
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import Literal
 
@@ -14,6 +14,7 @@ from bevcli.frame import AttentionView, BevMap, Frame, FrameStamp, NewStart, Pre
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.inference.attention import AttentionProbe, attention_view, probe_cells
 from bevcli.inference.background import read_ahead
+from bevcli.inference.commands import Commands
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.stage_clock import StageClock
 from bevcli.inference.tracking import without_identities
@@ -45,12 +46,14 @@ class StepOptions:
         temporal: whether history is used.
         ask_attention: whether predictions carry an AttentionView; those of an exported file never do.
         probes: x, y in metres, bev frame: the cells whose sampling points the AttentionView shows.
+        commands: of the driver, for a model that plans.
     """
 
     precision: Precision | Literal["int8"] = "fp32"
     temporal: bool = True
     ask_attention: bool = False
     probes: tuple[tuple[float, float], ...] = ()
+    commands: Commands = field(default_factory=Commands)
 
 
 class Runner:
@@ -99,11 +102,13 @@ class Runner:
             if self.config.has_tracks and not self.tracks:
                 boxes = without_identities(boxes)
             self.clock.mark("box_decoding")
+            results = self.options.commands.given_to(self.model.decode_results(found), frame.stamp.index)
             segmentation = self.model.decode_map(found)
             if segmentation is not None:
                 self.clock.mark("map_merging")
         view = None if probe is None else attention_view(probe, prepared, self.config)
         prediction = self._prediction(prepared, started_anew, boxes, outputs.bev[0], view, segmentation)
+        prediction = replace(prediction, results=results)
         return BevState(memory, frame.stamp), prediction
 
     def run(

@@ -1,6 +1,9 @@
 """A drive's rig next to the rigs that a model's weights were trained on."""
 
-from collections.abc import Iterator, Mapping
+import json
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -17,12 +20,29 @@ def rig_notes(rig: CameraRig, config: ModelConfig) -> tuple[str, ...]:
     return (*_cameras_note(rig, config), *_bev_frame_note(rig, config))
 
 
+def rigs_of(rigs: Iterable[CameraRig]) -> dict[str, Any]:
+    """The table [training_rigs] of a model that is trained on some rigs."""
+    rigs = [rig for rig in rigs if rig.cameras]
+    cameras = [camera for rig in rigs for camera in rig.cameras]
+    counts = [len(rig.cameras) for rig in rigs]
+    fovs = [_fov_deg(camera) for camera in cameras]
+    heights = [float(camera.ego_from_camera[2, 3]) for camera in cameras]
+    return {
+        "cameras": [min(counts), max(counts)],
+        "fov_deg": [float(math.floor(min(fovs))), float(math.ceil(max(fovs)))],
+        "height_m": [round(min(heights), 2), round(max(heights), 2)],
+        "tilt_deg": round(max(map(_tilt_deg, cameras)), 1),
+    }
+
+
 def weights_facts(config: ModelConfig) -> dict[str, str]:
-    """The metadata of a weights file: the model, and the frame and the rigs that the weights expect."""
+    """The metadata of a weights file: the model, its classes and cameras, and the frame and rigs that it expects."""
     x0, x1 = config.bev_grid.x_range_m
     frame = config.bev_frame
     facts = {
         "model": config.name,
+        "classes": json.dumps(config.classes, ensure_ascii=False),
+        "cameras": json.dumps(config.cameras, ensure_ascii=False),
         "bev_frame": f"level, {frame.height_m:g} m above the ground" if frame.level else "as in the drive",
         "range_m": f"{x0:g} to {x1:g}",
     }
@@ -36,14 +56,23 @@ def weights_facts(config: ModelConfig) -> dict[str, str]:
 
 
 def facts_notes(facts: Mapping[str, str], config: ModelConfig) -> Iterator[str]:
-    """A warning where the model's file contradicts the bev frame that the weights file states."""
-    expected = weights_facts(config)["bev_frame"]
+    """Warnings where the model's file contradicts the bev frame or the classes that the weights file states."""
+    own = weights_facts(config)
+    if facts.get("classes", own["classes"]) != own["classes"]:
+        names = (_plain(facts["classes"]), _plain(own["classes"]))
+        yield "the weights were trained for the classes {}, but the model's file names {}".format(*names)
+    expected = own["bev_frame"]
     stated = facts.get("bev_frame", expected)
     if stated != expected:
         yield (
             f'the weights were trained with a bev frame "{stated}", but the model\'s file gives them one "{expected}": '
             "set [bev_frame] in the model's file"
         )
+
+
+def _plain(names: str) -> str:
+    """The names of a JSON list, for a sentence."""
+    return names.strip("[]").replace('"', "")
 
 
 def _cameras_note(rig: CameraRig, config: ModelConfig) -> Iterator[str]:

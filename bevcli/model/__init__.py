@@ -1,4 +1,4 @@
-"""Models: BEVFormer, BEVFormerV2 and UniAD in plain PyTorch, one folder a model, one block of the papers a file.
+"""Models in plain PyTorch, one folder a model, one block of the papers a file.
 
 A model is a subclass of `TemporalModel` (`temporal_model.py`). A package registers it by an entry point, and a TOML
 file names it by `architecture`:
@@ -13,6 +13,7 @@ It has:
     restarted       the part of a memory that is kept where the history starts anew; by default nothing
     decode_boxes    boxes from the outputs; by default from class logits and box codes, as BEVFormer's
     decode_map      a map from the outputs; by default that of the segmentation head
+    decode_results  further results, such as lines of the map and a planned path; by default none
 
 and, where it wants them: `exchange_parts` (for `prepare_for_inference`), `export_form`, `official_names` and
 `without_training_parts` (of a released weights file), `part_names`, `stages`. The configuration says what the model

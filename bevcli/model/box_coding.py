@@ -5,6 +5,7 @@ from -y: yaw = -angle - pi/2, with yaw counter-clockwise from +x.
 """
 
 import numpy as np
+from torch import Tensor
 
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, wrap_angle
@@ -20,15 +21,21 @@ def decode(outputs: ModelOutputs, config: ModelConfig) -> list[Boxes3D]:
     the best scores.
     """
     classes = np.asarray(config.classes)
-    scores = outputs.class_logits[-1].detach().float().sigmoid().flatten(1)  # (B, Q · classes)
-    best, index = scores.topk(min(config.decoder.max_boxes, scores.shape[1]))
-    query, label = index // len(classes), index % len(classes)
+    query, label, best = best_queries(outputs, config)
     last_codes = outputs.box_codes[-1].detach()
     codes = last_codes.gather(1, query[..., None].expand(-1, -1, last_codes.shape[-1]))
     return [
         boxes_of_codes(code.double().cpu().numpy(), classes[names.cpu().numpy()], score.double().cpu().numpy())
         for code, names, score in zip(codes, label, best, strict=True)
     ]
+
+
+def best_queries(outputs: ModelOutputs, config: ModelConfig) -> tuple[Tensor, Tensor, Tensor]:
+    """Query, class index and score, each (B, K), of the boxes with the K best scores, by falling score."""
+    classes = len(config.classes)
+    scores = outputs.class_logits[-1].detach().float().sigmoid().flatten(1)  # (B, Q · classes)
+    best, index = scores.topk(min(config.decoder.max_boxes, scores.shape[1]))
+    return index // classes, index % classes, best
 
 
 def encode(boxes: Boxes3D) -> Array:

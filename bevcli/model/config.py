@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any, ClassVar, Literal
 
-from bevcli.frame import MAP_CLASSES
+from bevcli.frame import MAP_CLASSES, FrameResult
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.object_classes import ClassSettings, ObjectClass, object_classes
 from bevcli.model.decoder import DecoderConfig
@@ -227,6 +227,11 @@ class ModelConfig:
     def map_classes(self) -> tuple[str, ...]:
         """The classes of the map that the model predicts, in the order of their bits; empty without a map."""
         return tuple(MAP_CLASSES) if "segmentation" in self.heads else ()
+
+    @property
+    def results(self) -> Mapping[type[FrameResult], tuple[str, ...]]:
+        """Types of the model's further results, with their names: classes of the lines, commands of the plan."""
+        return {}
 
     @property
     def past_frames(self) -> int:

@@ -157,7 +157,7 @@ class DetectionHead(nn.Module):
 
     def __init__(self, layers: int, channels: int, classes: int, grid: BevGrid) -> None:
         super().__init__()
-        self.class_branches = nn.ModuleList(_class_branch(channels, classes) for _ in range(layers))
+        self.class_branches = nn.ModuleList(class_branch(channels, classes) for _ in range(layers))
         self.box_branches = nn.ModuleList(branch(channels, 3, BOX_CODE_SIZE) for _ in range(layers))
         ranges = torch.tensor([grid.x_range_m, grid.y_range_m, grid.z_range_m])
         self.register_buffer("range_start", ranges[:, 0], persistent=False)
@@ -189,7 +189,8 @@ def inverse_sigmoid(x: Tensor) -> Tensor:
     return torch.log(x.clamp(min=1e-5) / (1 - x).clamp(min=1e-5))
 
 
-def _class_branch(channels: int, classes: int) -> nn.Sequential:
+def class_branch(channels: int, classes: int) -> nn.Sequential:
+    """Linear layers with norm and ReLU between them: (..., C) -> logits (..., classes)."""
     hidden = [(nn.Linear(channels, channels), nn.LayerNorm(channels), nn.ReLU()) for _ in range(2)]
     last = nn.Linear(channels, classes)
     nn.init.constant_(last.bias, -math.log(99))  # prior of the focal loss: untrained, every class scores 0.01

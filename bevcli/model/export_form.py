@@ -7,9 +7,12 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from bevcli.frame import FrameResult
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.model.box_coding import decode
 from bevcli.model.config import ModelConfig
 from bevcli.model.segmentation import STUFF_CLASSES
-from bevcli.model.step import ModelInputs, PreparedFrame
+from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,7 @@ class ExportForm:
 
     def outputs(self, *, decode: bool) -> tuple[Port, ...]:
         """The outputs, in the order of the results of the step's `forward`. decode: with boxes."""
-        return (*_output_ports(self.config), *(_box_ports(self.config) if decode else ()))
+        return (*_output_ports(self.config), *(box_ports(self.config) if decode else ()))
 
     def facts(self) -> dict[str, Any]:
         """Further metadata of the file."""
@@ -59,6 +62,18 @@ class ExportForm:
     def feed(self, prepared: PreparedFrame, memory: Any) -> dict[str, Tensor]:
         """The inputs of one frame by name. memory: after the frame before; None where the history starts anew."""
         raise NotImplementedError
+
+    def model_outputs(self, outputs: ModelOutputs, found: Mapping[str, Tensor]) -> ModelOutputs:
+        """The outputs as the model's own decoders take them. found: all outputs of the file by name."""
+        return outputs
+
+    def decode_boxes(self, outputs: ModelOutputs) -> Boxes3D:
+        """As `TemporalModel.decode_boxes`, of `model_outputs`."""
+        return decode(outputs, self.config)[0]
+
+    def decode_results(self, outputs: ModelOutputs) -> tuple[FrameResult, ...]:
+        """As `TemporalModel.decode_results`, of `model_outputs`."""
+        return ()
 
     def memory(self, prepared: PreparedFrame, memory: Any, found: Mapping[str, Tensor]) -> Any:
         """The memory after a frame. memory: before it. found: the file's outputs by name."""
@@ -134,7 +149,8 @@ def _output_ports(config: ModelConfig) -> Iterator[Port]:
         )
 
 
-def _box_ports(config: ModelConfig) -> Iterator[Port]:
+def box_ports(config: ModelConfig) -> Iterator[Port]:
+    """The boxes that a file may have, decoded."""
     count = min(config.decoder.max_boxes, config.decoder.queries * len(config.classes))
     yield Port(
         "boxes",

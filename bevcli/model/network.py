@@ -10,7 +10,7 @@ from bevcli.errors import BevcliError
 from bevcli.model.bev_queries import BevQueries
 from bevcli.model.calibration_embedding import CalibrationEmbedding
 from bevcli.model.config import ModelConfig
-from bevcli.model.decoder import Decoder, DecoderLayer, DetectionHead
+from bevcli.model.decoder import Decoder, DecoderLayer, DetectionHead, ObjectQueries
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.encoder import Encoder
 from bevcli.model.fpn import FPN
@@ -22,7 +22,7 @@ from bevcli.model.step import ClipInputs, ModelOutputs
 from bevcli.model.temporal_model import TemporalModel, build_model
 
 STAGES = {name: name for name in ("backbone", "neck", "encoder", "decoder", "segmentation_head")}
-CALIBRATION_EMBEDDING = "calibration_embedding."
+CAMERA_EMBEDDING = "image_tokens.camera_embedding"  # the key of the tensor that has a row for each camera
 
 
 class Network(TemporalModel):
@@ -75,7 +75,8 @@ class Network(TemporalModel):
 
     def exchange_parts(self) -> None:
         """See `TemporalModel`: the object queries attend to each other before they look at the frame."""
-        self.decoder.layers[0].self_attention = ConstantSelfAttention(self.decoder)
+        first = self.decoder.layers[0]
+        first.self_attention = ConstantSelfAttention(first, self.decoder.object_queries(batch=1))
 
     def remember(self, clip: ClipInputs, place: int, memory: Any) -> Any:
         """The memory after a frame of training clips that is history only; called without gradient.
@@ -95,13 +96,14 @@ class Network(TemporalModel):
         """
         raise NotImplementedError
 
-    def resampled(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """A state dict for fine-tuning, from one of a model with another BEV grid or without calibration embedding.
-
-        BEV queries are interpolated. A calibration embedding that is missing keeps its initial weights: no change.
-        """
-        added = {key: value for key, value in self.state_dict().items() if key.startswith(CALIBRATION_EMBEDDING)}
-        return added | dict(self.bev_queries.resampled(state, "bev_queries."))
+    @property
+    def class_keys(self) -> tuple[str, ...]:
+        """Keys of the tensors that have a row for each class."""
+        layers = [
+            f"detection_head.class_branches.{branch}.{[*modules.named_children()][-1][0]}"
+            for branch, modules in self.detection_head.class_branches.named_children()
+        ]
+        return tuple(f"{layer}.{kind}" for layer in layers for kind in ("weight", "bias"))
 
     @classmethod
     def part_names(cls, config: ModelConfig) -> Iterator[tuple[str, ...]]:
@@ -154,12 +156,11 @@ class ConstantSelfAttention(nn.Module):
 
     attended: Tensor
 
-    def __init__(self, decoder: Decoder) -> None:
+    def __init__(self, first: nn.Module, queries: ObjectQueries) -> None:
+        """first: a DecoderLayer. queries: those that enter it in every frame, for a batch of one."""
         super().__init__()
-        first = decoder.layers[0]
         assert isinstance(first, DecoderLayer)
         with torch.no_grad():
-            queries = decoder.object_queries(batch=1)
             key = queries.content + queries.position
             attended, _ = first.self_attention(key, key, queries.content, need_weights=False)
         self.register_buffer("attended", attended, persistent=False)  # (1, Q, C)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.errors import WeightsError
-from bevcli.frame import BevMap
+from bevcli.frame import BevMap, FrameResult
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.encoder import SpatialCrossAttention
 from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms
@@ -99,6 +99,9 @@ class PreparedModel(TemporalModel):
 
     def decode_map(self, outputs: ModelOutputs) -> BevMap | None:
         return self.network.decode_map(outputs)
+
+    def decode_results(self, outputs: ModelOutputs) -> tuple[FrameResult, ...]:
+        return self.network.decode_results(outputs)
 
     @property
     def observed(self) -> nn.Module:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.errors import BevcliError
-from bevcli.frame import BevMap, FrameStamp
+from bevcli.frame import BevMap, FrameResult, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
 from bevcli.model.box_coding import decode
@@ -77,6 +77,10 @@ class TemporalModel(nn.Module):
             return None
         grid = self.config.bev_grid
         return decode_maps(outputs.segmentation, self.config.segmentation, grid)[0].bev_map(grid)
+
+    def decode_results(self, outputs: ModelOutputs) -> tuple[FrameResult, ...]:
+        """The further results, of the types of `ModelConfig.results`."""
+        return ()
 
     @property
     def device(self) -> torch.device:

@@ -12,6 +12,7 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.cameras import CameraRig
 from bevcli.recording import entities
 from bevcli.recording.colors import BACKGROUND
+from bevcli.recording.ground_lines import KINDS
 from bevcli.recording.log_static import legend_size
 
 SIDEWAYS = np.pi / 2 + 1e-6  # a camera that looks exactly sideways belongs to the front row
@@ -124,7 +125,7 @@ def camera_row_shares(rig: CameraRig) -> list[float]:
 
 
 def _scene(rig: CameraRig, titled: str, facts: LayoutFacts) -> rrb.Spatial3DView:
-    drawn_in_images = ("boxes", "ground_truth", "pillars", "probes")
+    drawn_in_images = ("boxes", "ground_truth", "pillars", "probes", *KINDS)
     excluded = [f"- /{entities.overlay(name, kind)}/**" for name in rig.names for kind in drawn_in_images]
     hidden = [entities.PILLARS, *([entities.BEV_ON_GROUND] if facts.segmentation else [])]
     return rrb.Spatial3DView(

@@ -38,7 +38,12 @@ def lines_in_image(boxes: Boxes3D, camera: Camera, camera_from_boxes: Array) -> 
     corners = apply(camera_from_boxes, boxes.corners())  # (N, 8, 3)
     edges = corners[:, _EDGES]  # (N, 14, 2, 3)
     owners = np.repeat(np.arange(len(boxes)), len(_EDGES))
-    ends, kept = clip_near(edges.reshape(-1, 2, 3))
+    return cut_to_image(edges.reshape(-1, 2, 3), owners, camera)
+
+
+def cut_to_image(ends: Array, owners: NDArray[np.int64], camera: Camera) -> ImageLines:
+    """The parts inside the image of lines (M, 2, 3) in the camera frame, with their owners (M,)."""
+    ends, kept = clip_near(ends)
     ends, owners = ends[kept], owners[kept]
     if camera.distortion is not None:
         ends, owners = _cut(ends), np.repeat(owners, PIECES_PER_EDGE)

@@ -69,6 +69,18 @@ def track(class_name: str, identity: str) -> str:
     return f"{TRACKS}/{class_name}_{identity}"
 
 
+def ground_lines(kind: str) -> str:
+    """The entity of lines on the ground in the scene, such as "world/map_lines"."""
+    return f"{WORLD}/{kind}"
+
+
+def bev_ground_lines(kind: str) -> str:
+    """The entity of lines on the ground in the BEV view, such as "bev/map_lines"."""
+    return f"{BEV}/{kind}"
+
+
 def overlay(name: str, kind: str) -> str:
-    """The entity of an image overlay. kind: "boxes", "boxes/labels", "ground_truth", "pillars" or "probes"."""
+    """The entity of an image overlay. kind: "boxes", "boxes/labels", "ground_truth", "pillars", "probes",
+    or one of `bevcli.recording.ground_lines.KINDS`.
+    """
     return f"{camera(name)}/{kind}"

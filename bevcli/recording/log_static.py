@@ -20,6 +20,7 @@ from bevcli.recording.colors import (
     STAGE_COLORS,
     Color,
     colormap,
+    line_colors,
     map_colors,
 )
 from bevcli.recording.options import RecordingOptions
@@ -38,6 +39,9 @@ HOW_TO_READ = """\
 - **Duplicates**, a second box on an object, have one grey diagonal.
 - **Tracks** have a number in their label and a trail: the last 5 s, and, fainter, the next second at the predicted
   velocity. Each is an entity below `world/tracks`; select it there or by a click on its trail.
+- **Lines on the ground**, of a model that has them: lines of the map in the colours of the legend; the futures of each
+  box in its colour, fainter with time and for modes with lower scores; planned paths, that of the given command as a
+  ribbon.
 - **The ground** shows the segmentation, if the model has one. For the BEV features click the eyes next to `bev_map` and
   `segmentation`, below `ego` in the left panel.
 - **Pillars** are the 3D reference points of the BEV cells, coloured by height from blue to red. They are hidden at
@@ -174,12 +178,26 @@ COLUMN_WIDTH, ROW_HEIGHT = 9.0, 1.0  # in the units of the view
 TEXT_COLOR: Color = (225, 228, 235)
 
 
-def legend_entries(classes: Mapping[str, Color], map_classes: Sequence[str] = ()) -> list[tuple[str, Color]]:
-    """The texts and colours of the legend. map_classes: of the model's map; empty without one."""
+def legend_entries(
+    classes: Mapping[str, Color],
+    map_classes: Sequence[str] = (),
+    line_classes: Sequence[str] = (),
+    *,
+    plans: bool = False,
+) -> list[tuple[str, Color]]:
+    """The texts and colours of the legend.
+
+    Args:
+        classes: of the objects, with their colours.
+        map_classes: of the model's map; empty without one.
+        line_classes: of the model's lines of the map; empty without these.
+        plans: whether the model plans paths.
+    """
     of_classes = [(name.replace("_", " "), color) for name, color in classes.items()]
     states = [("ground truth", GROUND_TRUTH_COLOR), ("missed, false", MISSED_COLOR), ("duplicate", DUPLICATE_COLOR)]
     maps = [(f"map: {name.replace('_', ' ')}", color) for name, color in map_colors(map_classes).items()]
-    return [*of_classes, *states, *maps]
+    lines = [(f"line: {name.replace('_', ' ')}", color) for name, color in line_colors(line_classes).items()]
+    return [*of_classes, *states, *maps, *lines, *([("planned path", EGO_COLOR)] if plans else [])]
 
 
 def legend_size(entries: int) -> tuple[float, float]:

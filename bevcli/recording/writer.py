@@ -13,15 +13,17 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from bevcli.errors import OutputError, WaitError
-from bevcli.frame import DriveFacts, Frame, FrameStamp, Prediction
+from bevcli.frame import DriveFacts, Frame, FrameStamp, MapLines, Plan, Prediction
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid
 from bevcli.recording import entities, log_bev, log_boxes, log_cameras, log_static
 from bevcli.recording.blueprint import LayoutFacts, recording_blueprint
 from bevcli.recording.colors import EGO_COLOR, class_colors
+from bevcli.recording.ground_lines import future_lines, result_lines
 from bevcli.recording.log_bev import BevColors, BevImages
 from bevcli.recording.log_cameras import PosedCamera, VideoImages
+from bevcli.recording.log_ground import log_ground_lines
 from bevcli.recording.log_tracks import TrackHistory, TrackLog
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.rrd_file import RrdFile
@@ -165,7 +167,9 @@ class Recording:
         mesh, grid = self.options.vehicle_mesh, self._config.bev_grid
         vehicle = None if mesh is None else load_vehicle(mesh)
         map_classes = self._config.map_classes if self.options.shows_internals else ()
-        legend = log_static.legend_entries(self.classes, map_classes)
+        results = self._config.results
+        lines = results.get(MapLines, ())
+        legend = log_static.legend_entries(self.classes, map_classes, lines, plans=Plan in results)
         facts = LayoutFacts(
             note=self.note,
             probes=bool(self.options.probes),
@@ -194,6 +198,8 @@ class Recording:
     def _log_about(self, map_classes: tuple[str, ...]) -> None:
         """Writes the page "About", and the facts of the run that readers of the file need."""
         of_map: dict[str, Any] = {"map_classes": list(map_classes)} if map_classes else {}
+        if lines := self._config.results.get(MapLines):
+            of_map["line_classes"] = list(lines)
         facts = rr.AnyValues(
             title=self.title,
             untrained=self.untrained,
@@ -252,6 +258,7 @@ class Recording:
         self._log_ego(frame)
         cameras = self._log_cameras(frame)
         self._log_boxes(frame, prediction, cameras)
+        self._log_results(prediction, cameras)
         if self._last is None:
             log_static.log_curve_names(self._stream, prediction.stage_seconds, self.classes)
         self._stream.log(entities.STAGE_CURVES, rr.Scalars(list(prediction.stage_seconds.values())))
@@ -366,6 +373,18 @@ class Recording:
             log_cameras.log_boxes_in_image(stream, posed, in_world, names)
         counts = [float((shown.classes == name).sum()) for name in names]
         stream.log(entities.BOX_CURVES, rr.Scalars(counts))
+
+    def _log_results(self, prediction: Prediction, cameras: PosedCameras) -> None:
+        """Writes lines of the map, futures and planned paths of a model that has further results."""
+        if not self._config.results:
+            return
+        world_from_bev, score = self._world_from_bev(prediction), self.options.score
+        moved = Pose.from_matrix(self._moved_to_origin(prediction.world_from_ego.matrix))
+        ground = replace(prediction.ground, world_from_ego=moved)
+        shown = prediction.boxes.scored(score).transformed(world_from_bev)
+        of_results = result_lines(prediction.results, ground, self._config.results, score)
+        for lines in (*of_results, future_lines(shown, self.classes)):
+            log_ground_lines(self._stream, lines, world_from_bev, cameras)
 
     def _log_ground_truth(
         self, truth: Boxes3D, found: np.ndarray, world_from_bev: Array, cameras: PosedCameras

@@ -107,12 +107,12 @@ def _log_camera(stream: rr.RecordingStream, camera: Camera, ego_from_bev: Array,
         "horizon": (visible_runs(horizon(camera)), HORIZON, 1.0),
     }
     for kind, (strips, color, width) in lines.items():
-        inside = [strip for line in strips for strip in _clipped(line, camera)]
+        inside = [strip for line in strips for strip in clipped(line, camera)]
         archetype = rr.LineStrips2D(inside, colors=color, radii=rr.Radius.ui_points(width), draw_order=20)
         stream.log(entities.overlay(camera.name, kind), archetype, static=True)
 
 
-def _clipped(line: Array, camera: Camera) -> list[Array]:
+def clipped(line: Array, camera: Camera) -> list[Array]:
     """The parts of a line (P, 2) inside the image. The viewer does not clip lines."""
     size = np.array([camera.width, camera.height])
     inside = ((line >= 0) & (line <= size)).all(axis=-1, keepdims=True)

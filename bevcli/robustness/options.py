@@ -19,6 +19,10 @@ class StressOptions:
         default="black",
         help="What the model gets for a lost image: a black image, as in RoboBEV, or none.",
     )
+    calibrate: bool = option(
+        default=False,
+        help="Measure the calibration of each drive first, as `bevcli calibrate` does, and use the corrected one.",
+    )
     temporal: bool = option(
         default=True, help="Use the frames before (and after).", panel="Model", flag="--temporal/--no-temporal"
     )

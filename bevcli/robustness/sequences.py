@@ -7,14 +7,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
-import cv2
 import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.frame import CameraImage, DerivedSequence, Frame, FrameStamp, Sequence
 from bevcli.geometry.cameras import Camera, CameraRig, camera_pose_noise
-from bevcli.geometry.ego_motion import Kinematics
-from bevcli.geometry.transforms import Array, Pose, inverse, rigid
+from bevcli.geometry.ego_motion import Kinematics, motion_during
+from bevcli.geometry.transforms import Pose, inverse
 from bevcli.robustness.corruptions import ImageCorruption, Level, Pixels
 from bevcli.robustness.options import LostImage
 from bevcli.sequences.selection import scenes_of, select
@@ -245,10 +244,3 @@ class EgoMotionLost(ChangedSequence):
                 break
             place -= 1
         return place
-
-
-def motion_during(seconds: float, kinematics: Kinematics) -> Array:
-    """(4, 4) ego_from_later_ego: the motion at constant velocity and angular rate. seconds: may be negative."""
-    turn, _ = cv2.Rodrigues(seconds * kinematics.angular_rate)
-    half_turn, _ = cv2.Rodrigues(seconds / 2 * kinematics.angular_rate)
-    return rigid(half_turn @ (seconds * np.asarray(kinematics.velocity)), turn)

@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from bevcli.calibration.calibrate import calibrate
+from bevcli.calibration.corrected_drive import CorrectedDrive
 from bevcli.errors import InputError, OutputError
 from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import evaluate_detections
@@ -194,7 +196,7 @@ class _Test:
             return load_state(path, SceneBoxes)
         scene, frames = self.scenes[place], list[tuple[Boxes3D, Boxes3D]]()
         for part in condition.sequences(scene, self.options.seed, self.options.lost_images):
-            frames += self._run_sequence(part)
+            frames += self._run_sequence(_calibrated(part) if self.options.calibrate else part)
         if not frames:
             raise InputError(f"{scene.name}: has no ground truth (expected boxes to score against)")
         boxes = SceneBoxes(*zip(*frames, strict=True))
@@ -214,6 +216,14 @@ class _Test:
             self.after_frame()
             if self.should_stop():
                 raise _Stopped
+
+
+def _calibrated(sequence: Sequence) -> Sequence:
+    """The sequence with the rig that it shows; itself where it shows none."""
+    try:
+        return CorrectedDrive(sequence, calibrate(sequence))
+    except InputError:
+        return sequence
 
 
 def _place_of(scores: ConditionScores) -> int:

@@ -25,6 +25,7 @@ from bevcli.parsing.files import open_regular
 from bevcli.recording.writer import LiveSink, Recording, RecordingState
 from bevcli.runs.folder import RunFolder
 from bevcli.runs.options import RunOptions
+from bevcli.runs.result_files import RESULT_WRITERS, ResultWriter
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.calibration_file import CALIBRATION, write_calibration
 from bevcli.sequences.files.incremental_json import partial_path
@@ -85,6 +86,7 @@ class FilesState:
         predictions: bytes of predictions.json.
         tracks: bytes of tracks.csv, None without one.
         submission: bytes of results_nusc.json, None without one.
+        results: name -> bytes of the files of further results.
         kept: what each file holds, by its name; the files of single frames by the name of their folder.
         map_frames: indices of the frames that have a map.
         bev_frames: indices of the frames that have BEV features.
@@ -94,6 +96,7 @@ class FilesState:
     predictions: int
     tracks: int | None
     submission: int | None
+    results: Mapping[str, int]
     kept: Mapping[str, Kept]
     map_frames: tuple[int, ...]
     bev_frames: tuple[int, ...]
@@ -102,11 +105,12 @@ class FilesState:
     def sizes(self) -> dict[str, int | None]:
         """Bytes of each file that grows, None for one that does not exist."""
         sizes = self.recording.size, self.predictions, self.tracks, self.submission
-        return dict(zip((RECORDING, PREDICTIONS, TRACKS, SUBMISSION), sizes, strict=True))
+        return dict(zip((RECORDING, PREDICTIONS, TRACKS, SUBMISSION), sizes, strict=True)) | dict(self.results)
 
 
 class RunFiles:
-    """`with RunFiles(…) as files: files.write(frame, prediction)`: recording, boxes, tracks, maps and BEV features."""
+    """`with RunFiles(…) as files: files.write(frame, prediction)`: recording, boxes, tracks, maps, BEV features
+    and further results."""
 
     def __init__(
         self,
@@ -127,7 +131,10 @@ class RunFiles:
         self._tracks: CsvWriter | None = None
         self._reference = "world" if sequence.has_ego_motion else "ego"
         self._is_complete = done == len(sequence.stamps)
-        self._growing = {name: _Growing() for name in (RECORDING, PREDICTIONS, TRACKS, SUBMISSION, SEGMENTATION, BEV)}
+        self._results: dict[type, ResultWriter] = {}
+        names = [RESULT_WRITERS[kind].name for kind in model.config.results]
+        names += [RECORDING, PREDICTIONS, TRACKS, SUBMISSION, SEGMENTATION, BEV]
+        self._growing = {name: _Growing() for name in names}
         self._map_frames = [] if resume is None else list(resume.map_frames)
         self._bev_frames = [] if resume is None else list(resume.bev_frames)
         if resume is not None:
@@ -146,6 +153,9 @@ class RunFiles:
             **_class_settings(model.config),
             "range_m": model.config.bev_grid.nearest_side_m,
         }
+        if model.config.results:
+            grid = model.config.bev_grid
+            extras |= {"x_range_m": list(grid.x_range_m), "y_range_m": list(grid.y_range_m)}
         boxes_at, tracks_at = (None, None) if resume is None else (resume.predictions, resume.tracks)
         boxes = BoxesWriter(out / PREDICTIONS, self._reference, extras, resume_at=boxes_at)
         with self._stack:  # closes what is open if the next one cannot be opened
@@ -153,6 +163,7 @@ class RunFiles:
             self._boxes = self._stack.enter_context(boxes)
             if self._options.track:
                 self._tracks = self._stack.enter_context(CsvWriter(out / TRACKS, tracks_at))
+            self._open_results(extras)
             if resume is not None and resume.submission is not None:
                 self._open_submission(resume.submission)
             if len({stamp.scene for stamp in sequence.stamps}) == 1:  # scenes may have rigs of their own
@@ -189,6 +200,9 @@ class RunFiles:
             self._tracks.write(tracked, self._reference)
         if frame.sample_token is not None:
             (self._submission or self._open_submission()).write(boxes)
+        ground = prediction.ground if self._sequence.has_ego_motion else replace(prediction.ground, world_from_ego=None)
+        for kind, writer in self._results.items():
+            writer.write(ground, next((result for result in prediction.results if isinstance(result, kind)), None))
         self._boxes.write(boxes)  # last: a frame in predictions.json is in the other files too
         self._check_that_files_exist()
         self._is_complete = frame.stamp == self._sequence.stamps[-1]
@@ -200,7 +214,8 @@ class RunFiles:
             return None
         tracks, submission = (None if file is None else file.file.size for file in (self._tracks, self._submission))
         frames = tuple(self._map_frames), tuple(self._bev_frames)
-        state = FilesState(recording, self._boxes.file.size, tracks, submission, {}, *frames)
+        results = {writer.name: writer.file.size for writer in self._results.values()}
+        state = FilesState(recording, self._boxes.file.size, tracks, submission, results, {}, *frames)
         return replace(state, kept=dict(self._kept(state)))
 
     def _kept(self, state: FilesState) -> Iterator[tuple[str, Kept]]:
@@ -232,19 +247,32 @@ class RunFiles:
         for ending in ("npy", "json"):
             self._growing[BEV].add(self._options.save_bev / f"{index:06d}.{ending}")
 
+    def _open_results(self, extras: Mapping[str, Any]) -> None:
+        """Open the file of each type of further results that the model has."""
+        for kind, names in self._model.config.results.items():
+            write = RESULT_WRITERS[kind]
+            self._folder.add(self._out / write.name)
+            resume_at = None if self._resume is None else self._resume.results[write.name]
+            of_file = {**extras, "classes": list(names)}
+            writer = write(self._out / write.name, self._reference, of_file, resume_at)
+            self._stack.callback(writer.close)
+            self._results[kind] = writer
+
     def _open_submission(self, resume_at: int | None = None) -> SubmissionWriter:
         self._folder.add(self._out / SUBMISSION)
         self._submission = self._stack.enter_context(SubmissionWriter(self._out / SUBMISSION, resume_at))
         return self._submission
 
     def _check_that_files_exist(self) -> None:
-        deleted = self._recording.is_deleted() or self._boxes.file.is_deleted()
-        if deleted or (self._tracks is not None and self._tracks.file.is_deleted()):
+        deleted = [self._recording.is_deleted(), self._boxes.file.is_deleted()]
+        deleted += [writer.file.is_deleted() for writer in self._results.values()]
+        if any(deleted) or (self._tracks is not None and self._tracks.file.is_deleted()):
             raise OutputError(f"{self._out}: the files of this run were deleted while it was writing them")
 
     def written(self) -> tuple[Path, ...]:
         """The files and folders that exist so far."""
         paths = [self._out / name for name in (RECORDING, PREDICTIONS, TRACKS, SUBMISSION, SEGMENTATION, CALIBRATION)]
+        paths += [self._out / writer.name for writer in self._results.values()]
         return tuple(path for path in (*paths, self._options.save_bev) if path is not None and path.exists())
 
 
@@ -261,6 +289,8 @@ def frame_boxes(
     extras: dict[str, object] = {"skipped": True} if prediction.skipped else {}
     if prediction.not_finite:
         extras["not_finite"] = prediction.not_finite
+    if prediction.results:
+        extras["ego_from_bev"] = pose_to_json(Pose.from_matrix(prediction.ego_from_bev))
     if frame.sample_token is not None:
         extras["sample_token"] = frame.sample_token
     boxes = prediction.boxes_world if world else prediction.boxes_ego

@@ -28,6 +28,12 @@ class RunOptions:
         parse=partial(parse_pairs, expected="NAME=MODEL_CAMERA"),
         repeatable=True,
     )
+    command: str | None = option(
+        default=None,
+        help="Command of the driver, which marks one of the planned paths of a model that plans: straight, left or "
+        "right, or a file with a command by frame index. Default: none is marked.",
+        metavar="NAME|FILE.json",
+    )
     recording: RecordingOptions = field(default_factory=RecordingOptions)
     save_bev: Path | None = option(
         default=None,

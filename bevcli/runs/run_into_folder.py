@@ -9,6 +9,7 @@ from typing import Any
 from bevcli.errors import BevcliError, OutputError
 from bevcli.frame import Frame, Prediction, Sequence
 from bevcli.inference.background import write_behind
+from bevcli.inference.commands import Commands, read_commands
 from bevcli.inference.load import Model
 from bevcli.inference.run import RunnerState, run_steps
 from bevcli.inference.runner import StepOptions
@@ -62,10 +63,11 @@ def run_into_folder(
     options = RunOptions() if options is None else options
     if options.recording.probes:
         model.require_parts("`probes`")
+    commands = read_commands(options.command, model.config)
     if force and resume:
         raise OutputError("`force` and `resume` exclude each other: pass one of them")
     with RunFolder(out, force=force, resume=resume) as folder:
-        facts = run_facts(model, sequence, options)
+        facts = run_facts(model, sequence, options) | {"commands": str(commands.since)}
         state = _state_to_resume(folder, facts, model_class(model.config).memory_type) if resume else None
         if state is not None and state.files is not None:
             resumed(state.frames)
@@ -79,7 +81,7 @@ def run_into_folder(
         files = RunFiles(folder, sequence, model, options, live, state.files, done=state.frames)
         began_at = state.frames
         try:
-            _run_from(state, model, sequence, options, folder, files, summary, after_frame, should_stop)
+            _run_from(state, model, sequence, options, commands, folder, files, summary, after_frame, should_stop)
         except BaseException as error:
             with contextlib.suppress(OutputError):  # the first error is the one to report
                 summary.write(out, files.written())
@@ -106,6 +108,7 @@ def _run_from(
     model: Model,
     sequence: Sequence,
     options: RunOptions,
+    commands: Commands,
     folder: RunFolder,
     files: RunFiles,
     summary: RunSummary,
@@ -115,7 +118,13 @@ def _run_from(
     """Run the frames after a state, write them, and save the state."""
     recording = options.recording
     asks = recording.shows_internals
-    asked = StepOptions(model.precision, options.temporal, ask_attention=asks, probes=tuple(recording.probes))
+    asked = StepOptions(
+        model.precision,
+        options.temporal,
+        ask_attention=asks,
+        probes=tuple(recording.probes),
+        commands=commands,
+    )
     saver = StateSaver(folder.state_path)
     start, runner, is_whole = state.frames, state.runner, True
 

@@ -128,6 +128,24 @@ def _complete_format(incomplete: str) -> list[str]:
     return [name for name in entries("bevcli.drive_writers") if name.startswith(incomplete)]
 
 
+@options("Input")
+class LabelOptions:
+    """Ground truth from a file of labels."""
+
+    labels: Path | None = option(
+        reads="path",
+        default=None,
+        help="Ground truth in place of that of INPUT: a CSV table with the columns of `bevcli export --format csv`, or "
+        "an OpenLABEL file.",
+        metavar="FILE",
+    )
+    only_labelled: bool = option(
+        default=False,
+        help="Frames without a row in a CSV table of labels have no ground truth. By default they are labelled and "
+        "empty.",
+    )
+
+
 @options()
 class WriteOptions:
     """The options of a drive that is written."""

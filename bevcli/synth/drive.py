@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.frame import BevMap, FrameStamp
+from bevcli.frame import BevMap, FrameStamp, MapLines
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion
@@ -16,6 +16,7 @@ from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid, rotat
 from bevcli.synth.assets.catalog import Assets, Body
 from bevcli.synth.assets.triangles import TriangleSoup
 from bevcli.synth.render.ground import GroundTexture, MapWindow, draw_map, paint_ground
+from bevcli.synth.render.line_truth import true_lines
 from bevcli.synth.render.rasteriser import ShadowMap
 from bevcli.synth.render.renderer import RenderedView, WorldSnapshot, render_view
 from bevcli.synth.rig import nuscenes_like_rig
@@ -53,6 +54,7 @@ class RenderedFrame:
         camera_timestamps_ns: camera name to the time of its image.
         boxes: ground truth boxes in the world frame, with attributes, instances, visibilities and numbers of pixels.
         bev_map: ground truth map.
+        lines: true lines of the map, bev frame.
     """
 
     stamp: FrameStamp
@@ -62,6 +64,7 @@ class RenderedFrame:
     camera_timestamps_ns: Mapping[str, int]
     boxes: Boxes3D
     bev_map: BevMap
+    lines: MapLines
 
     @property
     def images(self) -> dict[str, NDArray[np.uint8]]:
@@ -180,7 +183,7 @@ class RenderedDrive:
         bev_map = draw_map(pieces, boxes, bev_from_world, self.map_window)
         poses = {name: self.world_from_ego(time_s + delay) for name, delay in delays.items()}
         times = {name: stamp.timestamp_ns + round(delay * 1e9) for name, delay in delays.items()}
-        return RenderedFrame(stamp, views, pose, poses, times, boxes, bev_map)
+        return RenderedFrame(stamp, views, pose, poses, times, boxes, bev_map, true_lines(pieces, bev_from_world))
 
     def _render_views(
         self, names: list[str], states: list[ActorState], world_from_ego: Pose, time_s: float, here: Array

@@ -195,7 +195,7 @@ def open_drives(
         InputError: both or neither are given.
     """
     if bool(folders) == (seeds is not None):
-        raise InputError("choose the drives: give either `data=DIR` (repeatable) or `rendered=SEEDS`, not both")
+        raise InputError("choose the drives: give either `data=DIR` (repeatable), `rendered=SEEDS` or `split=FILE`")
     if seeds is None:
         return FolderDrives(folders, config, class_map)
     return RenderedDrives(seeds, cache, config, rig, class_map)

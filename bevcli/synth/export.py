@@ -104,6 +104,7 @@ def export_drive(
                     rendered.stamp, drive.rig, images, rendered.world_from_ego,
                     rendered.world_from_ego_at, kinematics,
                     ground_truth=_rounded(rendered.boxes), ground_truth_map=rendered.bev_map,
+                    ground_truth_lines=rendered.lines,
                 )
             )  # fmt: skip
             if progress is not None:

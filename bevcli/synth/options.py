@@ -120,4 +120,10 @@ class DriveOptions(ClassOptions):
         metavar="SEEDS",
         parse=parse_seeds,
     )
+    split: Path | None = option(
+        reads="path",
+        default=None,
+        help="Use the drives of a TOML file with two lists of folders instead: train and validate.",
+        metavar="FILE.toml",
+    )
     cache: Path = option(default=Path("runs/drives"), help="Folder that keeps rendered drives.", metavar="DIR")

@@ -10,18 +10,23 @@ import torch
 import torch.distributed
 from torch import Tensor, nn
 
-from bevcli.checkpoints import load_weights
 from bevcli.config import TRAINING, load_config, load_table
-from bevcli.errors import OutputError
+from bevcli.errors import InputError, OutputError
 from bevcli.geometry.cameras import CameraRig
 from bevcli.model.network import Network, build_network
-from bevcli.synth.drives import Drives, check_training_seeds, open_drives, split_drives
+from bevcli.synth.drives import Drives, check_training_seeds
 from bevcli.synth.options import DriveOptions
 from bevcli.synth.rig import RigDistribution, rig_for_rendering
+from bevcli.synth.splits import split_of, training_drives, write_split
 from bevcli.training.augmentation import AugmentationConfig
+from bevcli.training.changes import with_changes
+from bevcli.training.drive_checks import check_training_drives
 from bevcli.training.frame_losses import LossConfigs
-from bevcli.training.options import TrainOptions
+from bevcli.training.options import Log, TrainOptions
 from bevcli.training.samples import ClipConfig
+from bevcli.training.tensorboard_log import require_tensorboard
+from bevcli.training.warm_start import WarmStart, warm_start
+from bevcli.weights.local import weights_file
 
 
 @dataclass(frozen=True)
@@ -178,6 +183,9 @@ class TrainingJob:
         device: device to train on.
         seed: determines all random draws, together with the step and the rank of the process.
         group: the processes that train together.
+        notes: about the drives, for the user.
+        log: where the learning curves are written, besides the CSV files; None for nowhere.
+        warm_start: what the training starts from; None for random weights, or if it is resumed.
     """
 
     model: Network
@@ -188,6 +196,9 @@ class TrainingJob:
     device: torch.device
     seed: int = 0
     group: ProcessGroup = field(default_factory=ProcessGroup)
+    notes: tuple[str, ...] = ()
+    log: Log | None = None
+    warm_start: WarmStart | None = None
 
 
 def prepare_training(
@@ -198,23 +209,42 @@ def prepare_training(
     Initial weights are drawn from PyTorch's global generator: call torch.manual_seed before to reproduce them.
     data: the drives; rendered ones are kept in the output folder.
 
-    Raises BevcliError where a file, the choice of drives, or the output folder is wrong.
+    Raises BevcliError where a file, the choice of drives, or the output folder is wrong; nothing is written then.
     """
     model_config = load_config(model_name_or_file)
+    config = training_config(model_name_or_file, options)
+    model_config.check_training(config.clips.frames)
+    out = options.out or Path("runs") / f"train-{model_config.name}"
+    check_folder(out, resume=options.resume)
+    if options.log is not None:
+        require_tensorboard()
+    check_training_seeds(data.rendered or ())
+    if data.split is not None and options.held_out is not None:
+        raise InputError(f"{data.split}: states the drives to score on: remove `held_out`, or `split`")
+    rigs = config.rigs if config.rigs.random_share > 0 else None
+    drives, evaluated = training_drives(data, config.held_out, out / "drives", model_config, rigs)
+    own = None if data.split is None and config.held_out == 0 else evaluated
+    notes = check_training_drives(data, drives, own, config.clips, model_config)
+    if data.rendered is not None and not (out / "drives").exists():
+        notes += ("each drive is rendered when it is first drawn, which takes seconds: the first step waits for some",)
+    model, started = build_network(model_config), None
+    if options.weights is not None and not options.resume:
+        started = warm_start(weights_file(options.weights), model, model_name_or_file, lambda: drives.open(0).rig)
+    if not options.resume:
+        make_folder(out)
+    group = join_process_group(device)
+    split = split_of(data, config.held_out)
+    if group.leads and split is not None and split.validate:
+        write_split(out / "split.toml", split)
+    return TrainingJob(model, config, drives, evaluated, out, device, options.seed, group, notes, options.log, started)
+
+
+def training_config(model_name_or_file: str, options: TrainOptions = TrainOptions()) -> TrainingConfig:
+    """The [training] table of a model's file with the changes of the options. Raises ConfigError."""
     config = load_table(model_name_or_file, TRAINING, TrainingConfig)
     held_out = config.held_out if options.held_out is None else options.held_out
     config = replace(config, steps=options.steps or config.steps, held_out=held_out)
-    model_config.check_training(config.clips.frames)
-    out = options.out or Path("runs") / f"train-{model_config.name}"
-    check_training_seeds(data.rendered or ())
-    rigs = config.rigs if config.rigs.random_share > 0 else None
-    drives = open_drives(data.data, data.rendered, out / "drives", model_config, rigs, data.class_map)
-    drives, evaluated = split_drives(drives, config.held_out)
-    prepare_folder(out, resume=options.resume)
-    model = build_network(model_config)
-    if options.weights is not None:
-        load_weights(options.weights, model, resample=True)
-    return TrainingJob(model, config, drives, evaluated, out, device, options.seed, join_process_group(device))
+    return with_changes(config, options.changes)
 
 
 def rig_for_drives(choice: str, model: str) -> CameraRig | RigDistribution:
@@ -227,12 +257,16 @@ def rig_for_drives(choice: str, model: str) -> CameraRig | RigDistribution:
     return rig_for_rendering(choice, None)
 
 
-def prepare_folder(out: Path, *, resume: bool) -> None:
-    """Makes the output folder. Raises OutputError if it holds a training that is not to be resumed."""
+def check_folder(out: Path, *, resume: bool) -> None:
+    """Raises OutputError if an output folder holds a training that is not to be resumed."""
     if (out / CHECKPOINT).exists() and not resume:
         raise OutputError(
             f"{out}: already holds a training; pass `resume=True` to continue it, or `out=DIR` for a new one"
         )
+
+
+def make_folder(out: Path) -> None:
+    """Makes the output folder. Raises OutputError if this is not possible."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -1,9 +1,15 @@
 """TrainOptions: the options of a training."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Literal
 
 from bevcli.evaluation.options import MAX_RANGE_HELP
-from bevcli.options import option, options
+from bevcli.inference.options import complete_model
+from bevcli.options import option, options, parse_pairs
+
+Log = Literal["tensorboard"]
+Preset = Literal["quick", "demo", "tiny", "base"]
 
 
 @options()
@@ -16,7 +22,12 @@ class TrainOptions:
     )
     resume: bool = option(default=False, help="Resume from the checkpoint in the output folder.")
     weights: Path | None = option(
-        reads="path", default=None, help="Start from these weights (fine-tuning) instead of random ones."
+        reads="path or name",
+        default=None,
+        help="Start from these weights (fine-tuning) instead of random ones: a file, or a model's name. The model may "
+        "have other classes, cameras and BEV cells; a table lists what is loaded.",
+        metavar="FILE|NAME",
+        complete=complete_model,
     )
     steps: int | None = option(default=None, help="Number of steps. Default: as in the training table.", minimum=1)
     held_out: int | None = option(
@@ -26,7 +37,36 @@ class TrainOptions:
         metavar="N",
         minimum=0,
     )
+    changes: Mapping[str, str] = option(
+        default_factory=dict,
+        help="Change a setting of the training table, such as optimizer.learning_rate=1e-4. Repeatable.",
+        flag="--set",
+        metavar="KEY=VALUE",
+        parse=lambda texts: parse_pairs(texts, "KEY=VALUE, such as clips.batch=2"),
+        repeatable=True,
+    )
+    log: Log | None = option(
+        default=None,
+        help="Write the learning curves for TensorBoard too, into the folder tensorboard of the output folder.",
+    )
     seed: int = option(default=0, help="Random seed.", minimum=0)
+
+
+@options("Model")
+class ModelFileOptions:
+    """A new model file for a data set."""
+
+    init: Path | None = option(
+        default=None,
+        help="Do not train: write a model file for the drives, with their classes, cameras, frame rate, image size and "
+        "BEV range, and with the time and memory of a training on this machine.",
+        metavar="FILE.toml",
+    )
+    preset: Preset | None = option(
+        default=None,
+        help="The model that the file of `init` starts from. quick, the default, is the demo model on smaller images, "
+        "for a CPU.",
+    )
 
 
 @options()

@@ -61,6 +61,23 @@ class ClipConfig:
         if self.in_turn < 1 or (self.in_turn > 1 and self.learn != "all"):
             raise ValueError('in_turn must be positive, and 1 unless learn is "all"')
 
+    @property
+    def updates(self) -> int:
+        """Updates of the weights in a step; fewer in one with shorter clips."""
+        return self.in_turn * (self.frames if self.learn == "all" else 1)
+
+    def __str__(self) -> str:
+        """A step in words."""
+        clips = f"{_counted(self.batch, 'clip', 'clips')} of {_counted(self.frames, 'frame', 'frames')}"
+        if self.learn == "last":
+            return f"a step is one update of the weights, on {clips}"
+        batches = f"{_counted(self.in_turn, 'batch', 'batches')} of {clips}"
+        return f"a step is {self.updates} updates of the weights, one for each frame of a batch: {batches}"
+
+
+def _counted(count: int, one: str, many: str) -> str:
+    return f"{count} {one if count == 1 else many}"
+
 
 @dataclass(frozen=True)
 class Clip:

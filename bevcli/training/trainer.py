@@ -24,6 +24,7 @@ from bevcli.training.files import LearningCurve, draw_learning_curves, load_chec
 from bevcli.training.frame_losses import FrameLosses
 from bevcli.training.job import CHECKPOINT, OptimizerConfig, TrainingJob
 from bevcli.training.samples import Batch, draw_clips, load_batch
+from bevcli.training.tensorboard_log import TensorBoardLog
 from bevcli.training.validation import Validation, validate
 
 T = TypeVar("T")
@@ -159,12 +160,14 @@ class Trainer:
         if job.group.leads:
             self._loss_curve = LearningCurve(job.out / "loss.csv", self.done)
             self._validation_curve = LearningCurve(job.out / "validation.csv", self.done)
+        self._log = TensorBoardLog(job.out / "tensorboard", self.done) if job.log and job.group.leads else None
 
     def run(
         self,
         after_step: Callable[[], None] = lambda: None,
         after_validation: Callable[[int, Validation], None] = lambda step, scores: None,
         stop: Callable[[], bool] = lambda: False,
+        after_update: Callable[[float], None] = lambda loss: None,
     ) -> None:
         """Runs the remaining steps and leaves the model in evaluation mode. Raises BevcliError if a loss is not finite.
 
@@ -172,16 +175,18 @@ class Trainer:
             after_step: called by the leader after each step.
             after_validation: called by the leader with the number of steps done and the scores.
             stop: asked after each step; if it is true, a checkpoint is written and the training ends early.
+            after_update: called after each update of the weights, with the loss.
         """
         config = self.job.config
         remaining = range(self.done, config.steps)
         for batches in read_ahead(self._load, remaining, depth=config.loaders, threads=config.loaders):
-            row = self._step(batches)
+            row = self._step(batches, after_update)
             trim_memory()
             self.done += 1
             last, stopped = self.done == config.steps, stop()
             if self.job.group.leads:
                 self._loss_curve.add(self.done, row)
+                self._add_to_log("training", row)
                 if self.done % config.evaluate_every == 0 or last:
                     after_validation(self.done, self._validate())
                 if self.done % config.checkpoint_every == 0 or last or stopped:
@@ -211,7 +216,7 @@ class Trainer:
             batches.append(load_batch(job.drives, clips, model, augmentation, random, learn_all=learn_all))
         return batches
 
-    def _step(self, batches: list[Batch]) -> dict[str, float]:
+    def _step(self, batches: list[Batch], after_update: Callable[[float], None]) -> dict[str, float]:
         """One step, with an update of the weights for each frame trained on. Returns the means for loss.csv."""
         job, config = self.job, self.job.config
         rate = config.optimizer.learning_rate_at(self.done, config.steps)
@@ -221,7 +226,10 @@ class Trainer:
         with torch.random.fork_rng(gpus), self._losses.watching(job.model), frozen:
             torch.manual_seed(int(np.random.SeedSequence(self._seeds(self.done)).generate_state(1)[0]))  # for dropout
             clips = [self._clip_losses(batch.to(job.device)) for batch in batches]
-            rows = [self._update(losses) for losses in alternated(clips)]
+            rows = []
+            for losses in alternated(clips):
+                rows.append(self._update(losses))
+                after_update(rows[-1]["loss"])
         job.group.average_statistics(self.trained)
         means = {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}
         norm = means.pop("gradient norm")
@@ -264,10 +272,15 @@ class Trainer:
         runner = Runner(model, job.device, options)
         scores = validate(runner, job.held_out if len(job.held_out) else job.drives)
         self._validation_curve.add(self.done, scores.row())
+        self._add_to_log("validation", scores.row())
         dtype = torch.float16 if job.config.weights_dtype == "float16" else torch.float32
         save_weights(job.out / "weights.safetensors", model, dtype)
         draw_learning_curves(self._loss_curve, self._validation_curve, job.out / "curves.png")
         return scores
+
+    def _add_to_log(self, group: str, row: Mapping[str, float]) -> None:
+        if self._log is not None:
+            self._log.add(self.done, group, row)
 
 
 def alternated(iterators: Sequence[Iterator[T]]) -> Iterator[T]:

@@ -14,7 +14,8 @@ from bevcli.geometry.transforms import Array
 from bevcli.parsing.images import decode_image
 from bevcli.recording import entities
 from bevcli.recording.blueprint import rows_of_largest_images
-from bevcli.recording.colors import Color, class_colors, map_colors
+from bevcli.recording.colors import Color, class_colors, line_colors, map_colors
+from bevcli.recording.ground_lines import KINDS
 from bevcli.recording.video_images import Av1Decoder, require_av
 from bevcli.viewer.recording_reader import RecordedFrame
 
@@ -184,7 +185,8 @@ def _draw_camera(canvas: Canvas, frame: RecordedFrame, tile: Tile, image: Canvas
         return points * scale
 
     boxes = entities.overlay(tile.camera, "boxes")
-    draw_strips(canvas, frame, entities.overlay(tile.camera, "ground_truth"), to_canvas)
+    for kind in (*KINDS, "ground_truth"):
+        draw_strips(canvas, frame, entities.overlay(tile.camera, kind), to_canvas)
     draw_strips(canvas, frame, boxes, to_canvas)
     draw_labels(canvas, frame, f"{boxes}/labels", to_canvas, 0.36)
     cv2.rectangle(canvas, (0, 0), (10 * len(tile.camera) + 12, 22), BACKGROUND, -1)
@@ -204,6 +206,8 @@ def _draw_bev(canvas: Canvas, frame: RecordedFrame) -> None:
         _draw_placed(canvas, frame, entities.BEV_SEGMENTATION, segmentation, to_canvas)
     draw_strips(canvas, frame, entities.BEV_RINGS, to_canvas)
     draw_labels(canvas, frame, f"{entities.BEV_RINGS}/labels", to_canvas, 0.35)
+    for kind in KINDS:
+        draw_strips(canvas, frame, entities.bev_ground_lines(kind), to_canvas)
     for entity in BELOW_BOXES:
         draw_strips(canvas, frame, entity, to_canvas)
     draw_strips(canvas, frame, entities.BEV_BOXES, to_canvas, 2)
@@ -234,6 +238,9 @@ def _draw_legend(canvas: Canvas, frame: RecordedFrame) -> None:
     for index, (name, color) in enumerate(_class_colors(frame).items()):
         place = 16 + 250 * (index % 5), 60 + 32 * (index // 5)
         _draw_entry(canvas, place, color, f"{name.replace('_', ' ')} {counts[name]}")
+    lines = line_colors(frame.values(entities.RUN, "line_classes"))
+    for index, (name, color) in enumerate(lines.items()):
+        _draw_entry(canvas, (16 + 250 * index, 60 + 32 * 2), color, f"line: {name.replace('_', ' ')}")
     if frame.has(entities.BEV_SEGMENTATION, "Image:buffer"):
         # Recordings of version 0.1.0 do not name their classes, which are those of the segmentation head.
         classes = frame.values(entities.RUN, "map_classes") or list(MAP_CLASSES)

@@ -32,9 +32,9 @@ SECTIONS = {
     "Score": ["docs/scoring", "docs/robustness"],
     "Train": ["docs/training", "docs/model-card"],
     "Deploy": ["docs/deploy", "docs/speed", "docs/fleet"],
-    "Understand": ["docs/bevformer", "docs/glossary"],
+    "Understand": ["docs/bevformer", "docs/vad", "docs/glossary"],
     "Python and extensions": ["docs/python", "docs/live", "docs/extend", "docs/reference"],
-    "Project": ["CONTRIBUTING", "SECURITY", "CHANGELOG", "docs/history"],
+    "Project": ["CONTRIBUTING", "SECURITY", "docs/hardening", "CHANGELOG", "docs/history"],
 }
 
 project = "bevcli"

@@ -8,15 +8,17 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
-from memory_drive import MemorySequence, make_camera
+from memory_drive import MemorySequence, make_camera, make_rig
 from small_model import HEIGHT, WIDTH, small_config, small_inputs, small_model
 
 from bevcli.checkpoints import compare, load_weights
+from bevcli.errors import WeightsError
 from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.transforms import apply, inverse
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.calibration_embedding import ray_features
 from bevcli.model.image_tokens import ImageTokensConfig
+from bevcli.training.warm_start import warm_start
 
 WITH_RAYS = ImageTokensConfig(level_embeddings=3, calibration_embedding=True)
 
@@ -59,7 +61,9 @@ def test_weights_without_the_embedding_start_a_training_only(tmp_path: Path):
     model = BEVFormer(small_config(image_tokens=WITH_RAYS))
     missing = compare(small_model().state_dict(), model.state_dict()).missing
     assert len(missing) == 6
-    load_weights(path, model, resample=True)
+    with pytest.raises(WeightsError, match="6 missing"):
+        load_weights(path, model)
+    warm_start(path, model, "small", make_rig)
     assert not model.calibration_embedding.layers[-1].weight.any()
 
 

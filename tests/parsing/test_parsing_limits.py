@@ -6,9 +6,9 @@ import time
 import pytest
 
 from bevcli.errors import ConfigError, InputError
+from bevcli.parsing.csv_tables import read_csv
 from bevcli.parsing.documents import parse_json, parse_toml, read_json, read_yaml
 from bevcli.parsing.files import read_bytes
-from bevcli.sequences.native.tables import read_csv
 
 
 def refused(function, *arguments, error=InputError, **options):

@@ -3,8 +3,10 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 from healthy_rigs import HEALTHY, copy_of
+from memory_drive import MemorySequence
 from mistakes import (
     BEV_MISTAKES,
     FIELD_MISTAKES,
@@ -21,6 +23,8 @@ from mistakes import (
 from test_project_debug import calibration, write_drive, write_motion
 
 import bevcli
+from bevcli.calibration.estimates import CameraEstimate, Verdict
+from bevcli.calibration.findings import findings_of, motion_findings
 from bevcli.rig.check_calibration import check_calibration
 from bevcli.rig.sequence_checks import check_ego_motion
 
@@ -90,9 +94,19 @@ def sequence_codes(folder):
     return motion.union(*({f.code for f in check_calibration(path).findings} for path in (late, missing, refused)))
 
 
+def motion_codes():
+    """Findings about what the drive itself shows."""
+    late = CameraEstimate(
+        "CAM_FRONT", Verdict.CORRECTED, "", (2, 0, 0), (0.1, 0.1, 0.1), (0, 0, 0), (0.1, 0.1, 0.1), 100, 5,
+        500, 500, 9, 1, np.zeros(6), np.eye(6),
+    )  # fmt: skip
+    return {finding.code for finding in (*findings_of([late]), *motion_findings(MemorySequence(count=1)))}
+
+
 @pytest.fixture(scope="module")
 def occurring(tmp_path_factory):
-    return rig_codes(tmp_path_factory.mktemp("rigs")) | sequence_codes(tmp_path_factory.mktemp("sequences"))
+    rigs, sequences = (tmp_path_factory.mktemp(name) for name in ("rigs", "sequences"))
+    return rig_codes(rigs) | sequence_codes(sequences) | motion_codes()
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ import pytest
 
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import wrap_angle
+from bevcli.sequences.files.class_names import count_classes
 from bevcli.sequences.native.folder import FolderSequence
 from bevcli.sequences.native.writer import NativeWriter
 from bevcli.sequences.open import open_sequence
@@ -64,6 +65,15 @@ def test_nuscenes_root_gives_the_same_frames(real_drive, nuscenes_root):
     assert sequence.has_ego_motion
     assert [stamp.scene for stamp in sequence.stamps] == ["scene-0103"] * 4
     assert_same_frames(open_sequence(real_drive), sequence, same_bytes=True)
+
+
+@pytest.mark.parametrize("kind", ["real_drive", "nuscenes_root"])
+def test_boxes_are_counted_as_they_are_read_without_images(kind, request):
+    drive = open_sequence(request.getfixturevalue(kind))
+    frames = [drive.ground_truth_frame(place) for place in range(len(drive.stamps))]
+    assert drive.class_counts == count_classes(frame.ground_truth for frame in frames)
+    assert drive.class_counts
+    assert not any(frame.images for frame in frames)
 
 
 def test_keyframes_have_their_sample_tokens(nuscenes_root):

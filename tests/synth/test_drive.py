@@ -163,6 +163,25 @@ def test_map_agrees_with_the_boxes(drive: RenderedDrive, frame: RenderedFrame):
             assert cell & 1
 
 
+def test_true_lines_agree_with_the_map(frame: RenderedFrame):
+    """Dividers lie on lane boundaries, road boundaries at the edge of the road, all inside the area."""
+    bev_map = frame.bev_map
+    (rows, columns), (x0, x1), (y0, y1) = bev_map.cells.shape, bev_map.x_range_m, bev_map.y_range_m
+    kernel = np.ones((3, 3), np.uint8)
+    road = bev_map.layer("drivable_road").astype(np.uint8)
+    layers = {
+        "divider": cv2.dilate(bev_map.layer("lane_boundary").astype(np.uint8), kernel),
+        "boundary": cv2.dilate(road, kernel) & (1 - cv2.erode(road, kernel)),
+        "ped_crossing": cv2.dilate(bev_map.layer("pedestrian_crossing").astype(np.uint8), kernel),
+    }
+    assert set(frame.lines.classes) >= {"divider", "boundary"}
+    for name, points in zip(frame.lines.classes, frame.lines.points, strict=True):
+        assert (np.abs(points) <= (15.001, 30.001)).all()
+        column = ((points[:, 0] - x0) / (x1 - x0) * columns).astype(int)
+        row = ((y1 - points[:, 1]) / (y1 - y0) * rows).astype(int)
+        assert layers[str(name)][row, column].mean() > 0.9, name
+
+
 def test_boxes_are_near_unique_and_have_valid_visibilities(drive: RenderedDrive, frame: RenderedFrame):
     boxes = frame.boxes
     origin = (frame.world_from_ego.matrix @ drive.rig.ego_from_bev)[:2, 3]

@@ -9,7 +9,10 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError, OutputError
+from bevcli.frame import LINE_CLASSES
+from bevcli.geometry.transforms import apply
 from bevcli.sequences.files.calibration_file import write_calibration
+from bevcli.sequences.files.lines_file import TRUE_LINES, read_lines
 from bevcli.sequences.open import open_sequence
 from bevcli.synth.assets.catalog import Assets
 from bevcli.synth.drive import RenderedDrive
@@ -42,6 +45,18 @@ def test_reading_the_folder_gives_the_rendered_frames(written: tuple[RenderedDri
     np.testing.assert_array_equal(read.ground_truth.num_points, rendered.boxes.num_points)
     np.testing.assert_array_equal(read.ground_truth_map.cells, rendered.bev_map.cells)
     np.testing.assert_allclose(read.world_from_ego.matrix, rendered.world_from_ego.matrix, atol=1e-9)
+
+
+def test_true_lines_are_written_in_the_world_frame(written: tuple[RenderedDrive, Path]):
+    drive, folder = written
+    lines = read_lines(folder / TRUE_LINES)
+    assert (lines.frame_of_reference, lines.classes, len(lines.frames)) == ("world", LINE_CLASSES, 2)
+    rendered = drive.frame(1)
+    world_from_bev = rendered.world_from_ego.matrix @ drive.rig.ego_from_bev
+    assert len(lines.frames[1].lines) == len(rendered.lines) > 3
+    for found, expected in zip(lines.frames[1].lines.points, rendered.lines.points, strict=True):
+        at = apply(world_from_bev, np.pad(expected, ((0, 0), (0, 1))))
+        np.testing.assert_allclose(found[:, :2], at[:, :2], atol=0.05)  # the bev frame is 1.84 m above the ground
 
 
 def test_ego_motion_has_50_hz(written: tuple[RenderedDrive, Path]):

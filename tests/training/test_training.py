@@ -22,7 +22,7 @@ from bevcli.synth.options import DriveOptions, parse_seeds
 from bevcli.training.augmentation import AugmentationConfig
 from bevcli.training.files import save_checkpoint
 from bevcli.training.frame_losses import DenseLossConfig
-from bevcli.training.job import OptimizerConfig, TrainingConfig, TrainingJob, prepare_folder, prepare_training
+from bevcli.training.job import OptimizerConfig, TrainingConfig, TrainingJob, check_folder, prepare_training
 from bevcli.training.options import TrainOptions
 from bevcli.training.perspective_loss import PerspectiveLossConfig
 from bevcli.training.samples import ClipConfig
@@ -340,11 +340,10 @@ def test_seeds_reserved_for_evaluation_are_rejected(tmp_path: Path) -> None:
 
 
 def test_a_training_is_not_overwritten(tmp_path: Path) -> None:
-    prepare_folder(tmp_path / "new", resume=False)
-    (tmp_path / "new" / "checkpoint.pt").write_bytes(b"")
-    prepare_folder(tmp_path / "new", resume=True)
+    (tmp_path / "checkpoint.pt").write_bytes(b"")
+    check_folder(tmp_path, resume=True)
     with pytest.raises(OutputError, match="pass `resume=True` to continue it"):
-        prepare_folder(tmp_path / "new", resume=False)
+        check_folder(tmp_path, resume=False)
 
 
 @pytest.mark.slow

@@ -11,11 +11,12 @@ from bevcli.errors import InputError
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
 from bevcli.sequences.files.class_names import ClassNames
+from bevcli.sequences.files.future_json import add_futures, futures_from_json
 
 KEYS = frozenset(
     (
         "class", "center", "size_lwh", "yaw", "velocity", "score", "attribute", "instance", "track_score", "duplicate",
-        "visibility", "num_points",
+        "visibility", "num_points", "futures", "future_times_s", "future_scores",
     )
 )  # fmt: skip
 # Keys of optional columns: type, value where a box has none, and a text for messages.
@@ -53,6 +54,7 @@ def boxes_from_json(objects: Any, where: str, class_names: ClassNames = _OWN_NAM
         duplicates=_plain(objects, "duplicate", where),
         visibilities=_shares(objects, "visibility", where),
         num_points=_plain(objects, "num_points", where),
+        **futures_from_json(objects, where),
     )
     for key, column in (("center", boxes.centers), ("size_lwh", boxes.sizes_lwh), ("yaw", boxes.yaws)):
         _require(np.isfinite(column), column, f"{where}: box", key, "finite numbers")
@@ -88,6 +90,7 @@ def boxes_to_json(boxes: Boxes3D) -> list[dict[str, Any]]:
             for box, value in zip(objects, column.tolist(), strict=True):
                 if known(value):
                     box[key] = value
+    add_futures(objects, boxes)
     return objects
 
 

@@ -64,14 +64,17 @@ class ClassNames:
         """Number of boxes by class, for classes that are not among the known ones. counts: of the file's names."""
         return {name: count for name, count in counts.items() if self[name] not in self.known}
 
-    def note(self, counts: Mapping[str, int], where: str) -> tuple[str, ...]:
-        """A note about boxes whose class is not known, if there are any. where: the file or the side that has them."""
+    def note(self, counts: Mapping[str, int], where: str, use: str = "scored") -> tuple[str, ...]:
+        """A note about boxes whose class is not known, if there are any.
+
+        where: the file or the side that has them. use: what is not done with them.
+        """
         others = self.others(counts)
         if not others:
             return ()
         named = ", ".join(f"{name} ({count})" for name, count in sorted(others.items()))
         return (
-            f"{where}: {sum(others.values())} boxes have other classes and are not scored: {named} "
+            f"{where}: {sum(others.values())} boxes have other classes and are not {use}: {named} "
             f'(`class_map` "{min(others)}={self.known[0]}" renames a class)',
         )
 

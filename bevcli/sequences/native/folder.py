@@ -1,6 +1,7 @@
 """The native sequence folder as a Sequence."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from bevcli.errors import InputError
@@ -72,8 +73,13 @@ class FolderSequence(Sequence):
         sources = self._entries[place].sources.values()
         return tuple(source.path for source in sources if isinstance(source, ImageSource))
 
+    def ground_truth_frame(self, place: int) -> Frame:
+        return self._frame(replace(self._entries[place], sources={}))
+
     def load(self, place: int) -> Frame:
-        entry = self._entries[place]
+        return self._frame(self._entries[place])
+
+    def _frame(self, entry: FrameEntry) -> Frame:
         stamp = entry.stamp
         pose = self.ego_motion.pose_at(stamp.timestamp_ns) if self.ego_motion else None
         boxes = self._truth.boxes(stamp.index, pose, self.rig.ego_from_bev)

@@ -1,10 +1,8 @@
 """frames.csv and ego_motion.csv: strict CSV, with error messages that name line and column."""
 
 import csv
-import io
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -15,14 +13,10 @@ from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
 from bevcli.geometry.transforms import Array
-from bevcli.parsing.csv_cells import name_of
-from bevcli.parsing.documents import LARGEST_INTEGER
-from bevcli.parsing.files import read_text
+from bevcli.parsing.csv_tables import CsvRow, CsvTable, read_csv
 from bevcli.sequences.images import FrameEntry, ImageSource
 from bevcli.writing import whole_file
 
-LARGEST_BYTES = 256 << 20
-LARGEST_NUMBER = 1e12  # in SI units, far beyond any position or motion of a vehicle
 VIDEO_CELL = re.compile(r"(?P<path>.+)#(?P<index>[0-9]{1,9})")
 NO_IMAGE = "no image in frames.csv"
 TRANSLATION = ("x", "y", "z")
@@ -31,103 +25,6 @@ ACCELERATION = ("ax", "ay", "az")
 ANGULAR_RATE = ("wx", "wy", "wz")
 VELOCITY = ("vx", "vy", "vz")
 NORM_TOLERANCE = 1e-3  # largest deviation of a quaternion's norm from 1
-
-
-@dataclass(frozen=True)
-class CsvRow:
-    """One row of a CSV file. line: in the file, from 1. cells: text by column, without surrounding spaces."""
-
-    path: Path
-    line: int
-    cells: dict[str, str]
-
-    def error(self, column: str, what: str) -> InputError:
-        """The error to raise for a mistake in this row."""
-        return InputError(f"{self.path}: line {self.line}, column {column}: {what}")
-
-    def integer(self, column: str) -> int:
-        """The cell as an integer of any size. Raises InputError if it is not one."""
-        text = self.cells[column]
-        digits = text.removeprefix("-")
-        if not (digits.isascii() and digits.isdigit()):
-            raise self.error(column, f'expected an integer, found "{text:.40}": remove decimal point and exponent')
-        if len(digits) > 19 or int(digits) > LARGEST_INTEGER:
-            raise self.error(column, f'the integer "{text:.24}" is too large (expected at most 62 bits)')
-        return int(text)
-
-    def number(self, column: str) -> float:
-        """The cell as a finite number. Raises InputError if it is not one."""
-        text = self.cells[column]
-        try:
-            value = float(text if text.isascii() and "_" not in text else "")  # Python also takes 1_000 and ١
-        except ValueError:
-            raise self.error(column, f'expected a number, found "{text:.40}"') from None
-        if not abs(value) < LARGEST_NUMBER:
-            raise self.error(column, f'expected a finite number, found "{text:.24}": correct or remove the row')
-        return value
-
-
-@dataclass(frozen=True)
-class CsvTable:
-    """A file's header and its rows in order."""
-
-    path: Path
-    columns: tuple[str, ...]
-    rows: tuple[CsvRow, ...]
-
-
-def read_csv(path: Path, required: Iterable[str], optional: Iterable[str] = ()) -> CsvTable:
-    """Read a CSV file with a header (UTF-8, separated by commas).
-
-    Raises InputError if the file cannot be read, a required column is missing, a column is unknown or repeated, a row
-    has another number of cells than the header, or there are no rows.
-    """
-    required = tuple(required)
-    lines = _lines(path)
-    if not lines:
-        raise InputError(f"{path}: the file is empty (expected a header with {', '.join(required)})")
-    columns = tuple(name_of(cell.strip()) for cell in lines[0][1])
-    _check_columns(path, columns, required, tuple(optional))
-    for line, cells in lines:
-        if any("\0" in cell for cell in cells):
-            raise InputError(f"{path}: line {line}: has a null byte (expected text; the file may be damaged)")
-    rows = tuple(_row(path, columns, line, cells) for line, cells in lines[1:])
-    if not rows:
-        raise InputError(f"{path}: the table has no rows below the header (expected at least one)")
-    return CsvTable(path, columns, rows)
-
-
-def _lines(path: Path) -> list[tuple[int, list[str]]]:
-    """Line number and cells of every line that is not blank."""
-    text = read_text(path, LARGEST_BYTES).removeprefix("\ufeff")
-    try:
-        reader = csv.reader(io.StringIO(text, newline=""))
-        return [(reader.line_num, cells) for cells in reader if cells]
-    except csv.Error as error:
-        raise InputError(f"{path}: cannot be read as CSV ({error})") from None
-
-
-def _check_columns(path: Path, columns: tuple[str, ...], required: tuple[str, ...], optional: tuple[str, ...]) -> None:
-    missing = [name for name in required if name not in columns]
-    if missing and len(columns) == 1:
-        for character, name in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
-            if character in columns[0]:
-                raise InputError(f"{path}: the columns are separated by {name} (expected commas): save it with commas")
-    if missing:
-        raise InputError(f'{path}: column "{missing[0]}" is missing (found: {", ".join(columns)})')
-    known = {*required, *optional}
-    unknown = [name for name in columns if name not in known]
-    if unknown:
-        raise InputError(f'{path}: unknown column "{unknown[0]}" (known: {", ".join((*required, *optional))})')
-    twice = [name for name in columns if columns.count(name) > 1]
-    if twice:
-        raise InputError(f'{path}: column "{twice[0]}" appears twice in the header')
-
-
-def _row(path: Path, columns: tuple[str, ...], line: int, cells: list[str]) -> CsvRow:
-    if len(cells) != len(columns):
-        raise InputError(f"{path}: line {line} has {len(cells)} cells (expected {len(columns)}, as in the header)")
-    return CsvRow(path, line, {name: name_of(cell.strip()) for name, cell in zip(columns, cells, strict=True)})
 
 
 def read_frames_table(path: Path, cameras: Sequence[str]) -> tuple[FrameEntry, ...]:

@@ -12,13 +12,14 @@ import cv2
 import numpy as np
 
 from bevcli.errors import InputError, OutputError
-from bevcli.frame import CameraImage, DriveFacts, Frame, Sequence
+from bevcli.frame import LINE_CLASSES, CameraImage, DriveFacts, Frame, Ground, MapLines, Sequence
 from bevcli.geometry.cameras import CameraRig, same_rig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
 from bevcli.geometry.transforms import Pose
 from bevcli.parsing.csv_cells import cell_of
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.calibration_file import write_calibration
+from bevcli.sequences.files.lines_file import TRUE_LINES, LinesWriter
 from bevcli.sequences.files.map_folder import write_map
 from bevcli.sequences.native.folder import BOXES_FILE, MAPS_FOLDER
 from bevcli.sequences.native.tables import write_ego_motion
@@ -26,7 +27,7 @@ from bevcli.sequences.options import WriteOptions
 from bevcli.writing import remove_parts, whole_folder, write_whole
 
 # The files that the writer creates and `force` removes. Other files in the folder are kept.
-PARTS = ("calibration.json", "frames.csv", "ego_motion.csv", "images", BOXES_FILE, MAPS_FOLDER)
+PARTS = ("calibration.json", "frames.csv", "ego_motion.csv", "images", BOXES_FILE, MAPS_FOLDER, TRUE_LINES)
 SUFFIXES = {"image/jpeg": ".jpg", "image/png": ".png"}
 
 
@@ -62,6 +63,7 @@ class NativeWriter:
         self._motion: dict[int, tuple[Pose, Kinematics]] = {}
         self._scenes: dict[str, tuple[int, int]] = {}  # first and last time of each scene, ns
         self._boxes: BoxesWriter | None = None
+        self._lines: LinesWriter | None = None
         self._open = ExitStack()
         self._open.enter_context(whole_folder(folder, PARTS))
         self._open.push(self._finish)  # once the files below are closed
@@ -82,6 +84,9 @@ class NativeWriter:
             self._write_boxes(frame)
         if frame.ground_truth_map is not None:
             write_map(self.folder / MAPS_FOLDER, frame.stamp.index, frame.ground_truth_map)
+
+        if frame.ground_truth_lines is not None:
+            self._write_lines(frame, frame.ground_truth_lines)
 
     def __enter__(self) -> Self:
         return self
@@ -156,6 +161,14 @@ class NativeWriter:
         pose = frame.world_from_ego if self._with_ego_motion else None
         extras = {"sample_token": frame.sample_token} if frame.sample_token else {}
         self._boxes.write(FrameBoxes(frame.stamp, pose, frame.ground_truth, extras))
+
+    def _write_lines(self, frame: Frame, lines: MapLines) -> None:
+        if self._lines is None:
+            frame_of_reference = "world" if self._with_ego_motion else "ego"
+            self._lines = LinesWriter(self.folder / TRUE_LINES, frame_of_reference, {"classes": list(LINE_CLASSES)})
+            self._open.callback(self._lines.close)
+        pose = frame.world_from_ego if self._with_ego_motion else None
+        self._lines.write(Ground(frame.stamp, frame.rig.ego_from_bev, pose), lines)
 
 
 def _make_room(folder: Path, force: bool) -> None:

@@ -1,6 +1,7 @@
 """A nuScenes dataset root as a Sequence."""
 
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -70,6 +71,19 @@ class TableSequence(Sequence):
     def input_files(self) -> tuple[Path, ...]:
         """The tables. A run can be resumed only if they are the same."""
         return tuple(sorted(self.tables.glob("*.json")))
+
+    @property
+    def class_counts(self) -> Mapping[str, int]:
+        first, categories = self.index.samples.first_annotation, self.index.annotations.categories
+        found: Counter[bytes] = Counter()
+        for sample in (entry.sample for entry in self._frames if len(categories)):
+            if sample is not None:
+                found.update(categories[first[sample] : first[sample + 1]].tolist())
+        counts: Counter[str] = Counter()
+        for category, count in found.items():
+            name = self.dialect.class_of(category.decode())
+            counts.update({name: count} if name else {})
+        return counts
 
     def image_files(self, place: int) -> tuple[Path, ...]:
         return tuple(self._source(int(row)).path for row in self._frames[place].rows)

@@ -1,7 +1,5 @@
 """A T4 dataset as a Sequence."""
 
-from collections import Counter
-from collections.abc import Mapping
 from pathlib import Path
 
 from bevcli.geometry.cameras import default_ego_from_bev
@@ -34,8 +32,3 @@ class T4Sequence(TableSequence):
         super().__init__(path, path / "annotation", common, dialect)
         self.name = path.resolve().name
         self.notes = (*self.notes, *rig_notes(self.rig, "a T4 dataset"))
-
-    @property
-    def class_counts(self) -> Mapping[str, int]:
-        names = (self.dialect.class_of(name.decode()) for name in self.index.annotations.categories)
-        return Counter(name for name in names if name)

@@ -1,0 +1,153 @@
+"""`calibrate`: a drive -> how far its calibration is off, from what its images show between two frames."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from bevcli.calibration.estimates import CameraEstimate, RigEstimate, Verdict
+from bevcli.calibration.evidence import Evidence
+from bevcli.calibration.matches import PointMatches, match_points
+from bevcli.calibration.measure import PARTS, Measurement, measure
+from bevcli.calibration.observed import Observed, observed
+from bevcli.calibration.options import CalibrateOptions
+from bevcli.calibration.residuals import values
+from bevcli.calibration.result import CalibrationResult, corrected_rig
+from bevcli.calibration.views import FEWEST_PAIRS, READING_STEPS, Views, read_views
+from bevcli.errors import InputError
+from bevcli.frame import Sequence
+from bevcli.geometry.transforms import Array
+from bevcli.options import gather
+
+FEWEST_MATCHES = 100  # of a camera
+WIDEST_DEG = 0.5  # deviation of a rotation that counts as measured
+FINE = np.array([np.radians(0.2)] * 3 + [0.03, 0.03, 0.015])  # changes that are not worth a correction,
+FINE_DEVIATIONS = 3.0  # or less than this many standard deviations
+STEPS = READING_STEPS + 1 + PARTS  # of the work, for progress
+
+
+def calibrate(
+    drive: Sequence,
+    options: CalibrateOptions | None = None,
+    *,
+    after_step: Callable[[], None] = lambda: None,
+    **changes: Any,
+) -> CalibrationResult:
+    """Measure the calibration of a drive from its own images and ego-motion.
+
+        result = calibrate(open_sequence("my_drive"))
+        print(result.text())
+        result.write("rig")
+
+    What the images show between two frames must fit how the vehicle moved. Matched points tell the rotation of each
+    camera, and its position where the drive turns; the flat road tells its height, pitch and roll. All are estimated
+    together, about the stated values. What the drive does not show stays as it is stated.
+
+    Args:
+        drive: of `open_sequence`, one scene with ego-motion.
+        options: see `CalibrateOptions`.
+        after_step: called STEPS times, after each part of the work.
+        changes: options as keywords.
+
+    Raises InputError where the drive does not show how its cameras move: no ego-motion, too few frames, a vehicle that
+    stands, black images, or several scenes.
+    """
+    chosen = gather(CalibrateOptions, options, changes)
+    views = read_views(drive, chosen.pairs, after_step)
+    matches = match_points(views)
+    after_step()
+    if not matches.same.any():
+        raise InputError(
+            f"{drive.name}: no points were found in both frames of a pair (expected {FEWEST_MATCHES} or more a "
+            "camera): choose a part of the drive in which the images are sharp and show something"
+        )
+    return judge(drive, views, matches, measure(views, matches, chosen, after_step))
+
+
+def judge(drive: Sequence, views: Views, matches: PointMatches, measurement: Measurement) -> CalibrationResult:
+    """The result of a measurement: what is observed, with a verdict for each camera."""
+    found, indices = observed(measurement), range(len(views.rig.names))
+    cameras = tuple(_estimate(index, views, matches, measurement, found) for index in indices)
+    rig = corrected_rig(views.stated, cameras)
+    evidence = Evidence(views, matches, measurement)
+    return CalibrationResult(
+        drive.name, views.stated, rig, cameras, _whole(found), len(views.pairs), drive.facts, evidence
+    )
+
+
+def _estimate(
+    index: int, views: Views, matches: PointMatches, measurement: Measurement, found: Observed
+) -> CameraEstimate:
+    change, covariance = found.changes[index], found.covariances[index]
+    deviations = np.sqrt(np.diag(covariance))
+    mine = matches.same & (matches.camera == index)
+    count, pairs = int(mine.sum()), len(np.unique(matches.group[mine]))
+    reason = _reason(count, pairs, np.degrees(deviations[:3]))
+    enlarged = views.stated.cameras[index].width / views.rig.cameras[index].width
+    solution = measurement.solution.x
+    before, after = (_residual_px(measurement, index, x) * enlarged for x in (0 * solution, solution))
+    road = measurement.unknowns.groups[measurement.road.group, 1] == index
+    return CameraEstimate(
+        camera=views.rig.names[index],
+        verdict=Verdict.NOT_MEASURABLE if reason else _verdict(change[:6], deviations[:6]),
+        reason=reason,
+        rotation_deg=_yaw_pitch_roll(-np.degrees(change[:3])),
+        rotation_deviation_deg=_yaw_pitch_roll(np.degrees(deviations[:3]) * [1, -1, 1]),
+        position_m=_triple(-change[3:6]),
+        position_deviation_m=_triple(deviations[3:6]),
+        delay_ms=1000 * float(change[6]),
+        delay_deviation_ms=1000 * float(deviations[6]),
+        matches=count,
+        road_points=int(road.sum()),
+        before_px=before,
+        after_px=after,
+        change=change[:6],
+        covariance=covariance[:6, :6],
+    )
+
+
+def _reason(matches: int, pairs: int, deviations_deg: Array) -> str:
+    """Why a camera is not measurable; "" where it is."""
+    if matches < FEWEST_MATCHES:
+        return f"{matches} matches"
+    if pairs < FEWEST_PAIRS:
+        return f"matches in {pairs} frame pairs"
+    if deviations_deg.max() > WIDEST_DEG:
+        return f"the drive shows its rotation to ±{deviations_deg.max():.1f}° only"
+    return ""
+
+
+def _verdict(change: Array, deviations: Array) -> Verdict:
+    is_fine = np.abs(change) <= np.maximum(FINE, FINE_DEVIATIONS * deviations)
+    return Verdict.FINE if is_fine.all() else Verdict.CORRECTED
+
+
+def _residual_px(measurement: Measurement, index: int, x: Array) -> float:
+    """The median residual of a camera's matched points, in pixels of the reduced image."""
+    mine = (measurement.unknowns.groups[measurement.points.group, 1:] == index).all(-1)
+    found = np.abs(values(measurement.unknowns, measurement.points, x)[mine])
+    return float(np.median(found)) if found.size else 0.0
+
+
+def _yaw_pitch_roll(turn: Array) -> tuple[float, float, float]:
+    """Small turns (3,) about right, down and forward axes of a camera as yaw (to the left), pitch (up) and roll."""
+    return -float(turn[1]), float(turn[0]), float(turn[2])
+
+
+def _triple(values: Array) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
+def _whole(found: Observed) -> RigEstimate:
+    scale, along, across = (float(value) for value in found.rig)
+    deviations = [float(value) for value in found.rig_deviations]
+    tilts = (float(np.degrees(along)), float(np.degrees(across)))
+    return RigEstimate(
+        scale,
+        deviations[0],
+        -found.height_m,
+        found.height_deviation_m,
+        tilts,
+        (float(np.degrees(deviations[1])), float(np.degrees(deviations[2]))),
+    )

@@ -1,0 +1,98 @@
+"""recording.rrd of a calibration from motion: frame 0 shows the stated calibration, frame 1 the measured one."""
+
+from pathlib import Path
+
+import cv2
+import rerun as rr
+import rerun.blueprint as rrb
+
+from bevcli.calibration.drawings import LINE, POINT
+from bevcli.calibration.evidence import Evidence, epipolar_piece
+from bevcli.errors import OutputError
+from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.recording import entities, log_static
+from bevcli.recording.blueprint import camera_rows, flat_view
+from bevcli.recording.colors import BACKGROUND
+from bevcli.rig.mounting import horizon
+from bevcli.rig.overlay import GROUND, HORIZON, ground_lines, visible_runs
+from bevcli.rig.rig_recording import JPEG_QUALITY, clipped
+from bevcli.writing import whole_file
+
+TABLE = "calibration"
+
+
+def write_calibration_recording(path: Path, evidence: Evidence, table: str) -> None:
+    """Write the recording. table: the text of the result. Raises OutputError."""
+    rig = evidence.views.rig
+    with whole_file(path) as unfinished, rr.RecordingStream("bevcli-calibrate") as stream:
+        try:
+            stream.save(unfinished, default_blueprint=_blueprint(rig))
+        except RuntimeError as error:
+            raise OutputError(f"{path}: the recording cannot be written ({error})") from error
+        log_static.log_scene(stream, rig, {})
+        text = rr.TextDocument(f"```\n{table}\n```", media_type="text/markdown")
+        stream.log(TABLE, text, static=True)
+        for index in range(len(rig.cameras)):
+            _log_image(stream, evidence, index)
+        for step in (0, 1):
+            stream.set_time(entities.FRAME_TIMELINE, sequence=step)
+            for index in range(len(rig.cameras)):
+                _log_camera(stream, evidence, index, measured=step == 1)
+
+
+def _log_image(stream: rr.RecordingStream, evidence: Evidence, index: int) -> None:
+    """What both calibrations share: the image and its matched points."""
+    name, pixels = evidence.views.rig.names[index], evidence.image(index)
+    if pixels is None:
+        return
+    encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+    stream.log(entities.image(name), rr.EncodedImage(contents=encoded, media_type="image/jpeg"), static=True)
+    points = evidence.matches(index, measured=True).pixels_b
+    dots = rr.Points2D(points, colors=POINT, radii=rr.Radius.ui_points(2.5), draw_order=30)
+    stream.log(entities.overlay(name, "matches"), dots, static=True)
+
+
+def _log_camera(stream: rr.RecordingStream, evidence: Evidence, index: int, *, measured: bool) -> None:
+    """Pose, epipolar lines, ground grid and horizon by one of the two calibrations."""
+    camera, matches = evidence.camera(index, measured=measured), evidence.matches(index, measured=measured)
+    pose = rr.Transform3D(translation=camera.ego_from_camera[:3, 3], mat3x3=camera.ego_from_camera[:3, :3])
+    stream.log(entities.camera(camera.name), pose)
+    motion = matches.camera_b_from_camera_a
+    pieces = [
+        piece
+        for ray, point in zip(matches.rays_a, matches.pixels_b, strict=True)
+        for piece in epipolar_piece(camera, motion, ray, point)
+    ]
+    lines = {
+        "epipolar_lines": (pieces, LINE, 1.2),
+        "ground_grid": (ground_lines(camera), GROUND, 0.6),
+        "horizon": (visible_runs(horizon(camera)), HORIZON, 1.0),
+    }
+    for kind, (strips, color, width) in lines.items():
+        inside = [strip for line in strips for strip in clipped(line, camera)]
+        archetype = rr.LineStrips2D(inside, colors=color, radii=rr.Radius.ui_points(width), draw_order=20)
+        stream.log(entities.overlay(camera.name, kind), archetype)
+
+
+def _blueprint(rig: CameraRig) -> rrb.Blueprint:
+    kinds = ("matches", "epipolar_lines", "ground_grid", "horizon")
+    excluded = [f"- /{entities.overlay(name, kind)}/**" for name in rig.names for kind in kinds]
+    scene = rrb.Spatial3DView(
+        origin=entities.EGO,
+        contents=[f"/{entities.WORLD}/**", *excluded],
+        name="The rig",
+        background=list(BACKGROUND),
+        line_grid=False,
+        eye_controls=rrb.EyeControls3D(position=(-5.5, 0.0, 4.5), look_target=(0.9, 0.0, 0.8), eye_up=(0, 0, 1)),
+    )
+    middle = rrb.Horizontal(scene, rrb.TextDocumentView(origin=TABLE, name="Calibration"), column_shares=[2, 5])
+    rows = [rrb.Horizontal(*(_camera_view(rig[name]) for name in row)) for row in camera_rows(rig)]
+    layout = rrb.Vertical(*rows[:1], middle, *rows[1:])
+    return rrb.Blueprint(
+        layout, rrb.TimePanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"), auto_views=False, auto_layout=False,
+    )  # fmt: skip
+
+
+def _camera_view(camera: Camera) -> rrb.Spatial2DView:
+    return flat_view(entities.camera(camera.name), camera.name, (0, camera.width), (0, camera.height))

@@ -1,0 +1,126 @@
+"""What is measured against what the unknowns predict: matched points, and points of the road."""
+
+from dataclasses import dataclass, fields
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.calibration.matches import PointMatches
+from bevcli.calibration.unknowns import GroupGeometry, Indices, Unknowns, geometry, geometry_at
+from bevcli.calibration.views import Views
+from bevcli.geometry.transforms import Array
+
+STEP = 1e-6  # of an unknown, for derivatives
+SHORTEST = 1e-9
+
+
+class Residuals(Protocol):
+    """Measured points of groups, sorted by group.
+
+    Attributes:
+        group: (N,) the group of each.
+    """
+
+    @property
+    def group(self) -> Indices: ...
+
+    def of(self, geometry: GroupGeometry) -> Array:
+        """(N, D) residuals in pixels of the reduced images, for the geometry of all groups."""
+        ...
+
+
+@dataclass(frozen=True)
+class EpipolarResiduals:
+    """The distance of matched points from each other's epipolar lines: the angle between ray and epipolar plane.
+
+    This is Sampson's distance for rays, so that it holds for fisheyes too.
+
+    Attributes:
+        group: (N,).
+        rays_a: (N, 3) unit directions in the camera frame of the first image.
+        rays_b: (N, 3) in that of the second one.
+        focal: (N,) pixels.
+    """
+
+    group: Indices
+    rays_a: Array
+    rays_b: Array
+    focal: Array
+
+    def where(self, kept: NDArray[np.bool_]) -> "EpipolarResiduals":
+        """Some of the points, by a mask (N,)."""
+        return EpipolarResiduals(*(getattr(self, field.name)[kept] for field in fields(self)))
+
+    def of(self, geometry: GroupGeometry) -> Array:
+        """(N, 1) pixels."""
+        relative = geometry.camera_b_from_camera_a
+        turns, shifts = relative[:, :3, :3], relative[:, :3, 3]
+        directions = shifts / np.maximum(np.linalg.norm(shifts, axis=-1, keepdims=True), SHORTEST)
+        turned = np.einsum("nij,nj->ni", turns[self.group], self.rays_a)
+        direction = directions[self.group]
+        normal_a, normal_b = np.cross(direction, turned), np.cross(direction, self.rays_b)
+        length = np.sqrt((normal_a**2).sum(-1) + (normal_b**2).sum(-1))
+        return (self.focal * (self.rays_b * normal_a).sum(-1) / np.maximum(length, SHORTEST))[:, None]
+
+
+@dataclass(frozen=True)
+class RoadResiduals:
+    """The distance of road points from where they would be on a flat road.
+
+    Attributes:
+        group: (N,).
+        rays_a: (N, 3) unit directions in the camera frame of the first image.
+        rays_b: (N, 3) of the same points, found in the second image.
+        weights: (N, 2, 3) from an error of a ray in the second image to pixels of the first one, less where the image
+            shows no contrast along an axis.
+        beside_m: (N,) distance of the points from the way of the vehicle.
+    """
+
+    group: Indices
+    rays_a: Array
+    rays_b: Array
+    weights: Array
+    beside_m: Array
+
+    def where(self, kept: NDArray[np.bool_]) -> "RoadResiduals":
+        """Some of the points, by a mask (N,)."""
+        return RoadResiduals(*(getattr(self, field.name)[kept] for field in fields(self)))
+
+    def of(self, geometry: GroupGeometry) -> Array:
+        """(N, 2) pixels."""
+        ahead = rays_of_road_points(geometry, self.group, self.rays_a)
+        return np.einsum("nij,nj->ni", self.weights, ahead - self.rays_b)
+
+
+def rays_of_road_points(geometry: GroupGeometry, group: Indices, rays_a: Array) -> Array:
+    """Unit directions (N, 3) in the second image of the points of the road that rays (N, 3) of the first one hit."""
+    pose, motion = geometry.ego_from_camera_a[group], geometry.ego_b_from_ego_a[group]
+    start, direction = pose[:, :3, 3], np.einsum("nij,nj->ni", pose[:, :3, :3], rays_a)
+    normal = np.array([-geometry.slopes[0], -geometry.slopes[1], 1.0])
+    down = direction @ normal
+    depth = -(start @ normal) / np.where(down < -SHORTEST, down, -SHORTEST)
+    points = start + depth[:, None] * direction
+    points = np.einsum("nij,nj->ni", motion[:, :3, :3], points) + motion[:, :3, 3] - start
+    points = np.einsum("nji,nj->ni", pose[:, :3, :3], points)
+    return points / np.linalg.norm(points, axis=-1, keepdims=True)
+
+
+def epipolar_residuals(views: Views, matches: PointMatches) -> EpipolarResiduals:
+    """The residuals of matched points."""
+    focal = np.array([camera.intrinsics[0, 0] for camera in views.rig.cameras])[matches.camera]
+    return EpipolarResiduals(matches.group, matches.rays_a, matches.rays_b, focal)
+
+
+def values(unknowns: Unknowns, residuals: Residuals, x: Array) -> Array:
+    """(N, D) residuals at x."""
+    return residuals.of(geometry_at(unknowns, x))
+
+
+def derivatives(unknowns: Unknowns, residuals: Residuals, x: Array) -> tuple[Array, Array]:
+    """Residuals (N, D), and their derivatives (N, D, 20) by the unknowns of their group, `Unknowns.columns`."""
+    local = x[unknowns.columns]
+    here = residuals.of(geometry(unknowns, local))
+    steps = STEP * np.eye(local.shape[1])
+    columns = [(residuals.of(geometry(unknowns, local + step)) - here) / STEP for step in steps]
+    return here, np.stack(columns, axis=-1)

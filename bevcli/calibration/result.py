@@ -1,0 +1,98 @@
+"""CalibrationResult: the estimates, the corrected rig, and the files."""
+
+import json
+from collections.abc import Sequence as Items
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from bevcli.calibration.estimates import CameraEstimate, RigEstimate, Verdict
+from bevcli.calibration.evidence import Evidence
+from bevcli.calibration.table import rig_text, table
+from bevcli.calibration.unknowns import moved
+from bevcli.frame import DriveFacts
+from bevcli.geometry.cameras import CameraRig
+from bevcli.sequences.files.calibration_file import write_calibration
+from bevcli.writing import write_whole
+
+
+@dataclass(frozen=True)
+class CalibrationResult:
+    """The result of `calibrate`.
+
+    Attributes:
+        name: of the drive.
+        stated: the rig of the drive.
+        rig: the corrected rig; cameras that are fine or not measurable are as stated.
+        cameras: the estimates, in the rig's order.
+        whole: what is said about the whole rig.
+        pairs: number of frame pairs that were used.
+        facts: of the drive, for calibration.json.
+        evidence: what it was measured from.
+    """
+
+    name: str
+    stated: CameraRig
+    rig: CameraRig
+    cameras: tuple[CameraEstimate, ...]
+    whole: RigEstimate
+    pairs: int
+    facts: DriveFacts
+    evidence: Evidence
+
+    def __getitem__(self, camera: str) -> CameraEstimate:
+        return next(each for each in self.cameras if each.camera == camera)
+
+    @property
+    def corrected(self) -> tuple[CameraEstimate, ...]:
+        """The cameras whose calibration is corrected."""
+        return tuple(each for each in self.cameras if each.verdict is Verdict.CORRECTED)
+
+    def text(self) -> str:
+        """One row a camera, and lines about the whole rig, for a terminal."""
+        pairs = f"{self.name}: {self.pairs} frame pairs; off by: stated minus measured, ± standard deviation"
+        return "\n".join([table(self.cameras), "", pairs, rig_text(self.whole, self.cameras)])
+
+    def to_json(self) -> str:
+        """The content of report.json."""
+        content = {
+            "drive": self.name,
+            "pairs": self.pairs,
+            "cameras": {each.camera: each.to_dict() for each in self.cameras},
+            "rig": asdict(self.whole),
+        }
+        return json.dumps(content, indent=1, ensure_ascii=False)
+
+    def write(self, folder: Path | str) -> list[Path]:
+        """Write calibration.json (the corrected rig), report.json, calibration.png and recording.rrd into a folder.
+
+        Returns their paths. The folder is made where it is missing; existing files are overwritten. Raises OutputError.
+        """
+        # Only writing draws: matplotlib and rerun take a second to load.
+        from bevcli.calibration.calibration_recording import write_calibration_recording
+        from bevcli.calibration.drawings import write_sheet
+
+        folder = Path(folder)
+        paths = [folder / name for name in ("calibration.json", "report.json", "calibration.png", "recording.rrd")]
+        write_whole(paths[1], f"{self.to_json()}\n".encode(), parents=True)
+        write_sheet(paths[2], self.evidence, self.cameras)
+        write_calibration_recording(paths[3], self.evidence, self.text())
+        write_calibration(paths[0], self.rig, self.facts)
+        return paths
+
+
+def corrected_rig(rig: CameraRig, cameras: Items[CameraEstimate]) -> CameraRig:
+    """The rig with the changes of the cameras whose verdict is "corrected"."""
+    poses = moved(
+        np.stack([camera.ego_from_camera for camera in rig.cameras]),
+        np.stack([each.change * (each.verdict is Verdict.CORRECTED) for each in cameras]),
+    )
+    kept = [each.verdict is not Verdict.CORRECTED for each in cameras]
+    return replace(
+        rig,
+        cameras=tuple(
+            camera if keep else replace(camera, ego_from_camera=pose)
+            for camera, pose, keep in zip(rig.cameras, poses, kept, strict=True)
+        ),
+    )

@@ -1,0 +1,172 @@
+"""Points of the road in both frames of a pair: the second image is warped onto the first as a flat road would be seen.
+
+What is left between the two images is measured by optical flow. It tells the height of a camera, and its pitch and roll
+over the road.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bevcli.calibration.residuals import RoadResiduals, rays_of_road_points
+from bevcli.calibration.unknowns import GroupGeometry, Unknowns, geometry_at
+from bevcli.calibration.views import Views
+from bevcli.geometry.cameras import OUTSIDE, Camera
+from bevcli.geometry.transforms import Array
+
+NEAREST, FARTHEST = 1.3, 9.0  # road points, from the camera, in heights of the camera
+WIDEST_M = 10.0  # from the way of the vehicle: farther aside are pavements
+STRIDE = 8  # pixels between the points at which the warping is computed; between them it is interpolated
+SPACING = 16  # pixels between the points whose flow is measured
+WINDOW = 21  # pixels
+MOST_BACK_PX = 0.5  # between a point and the flow there and back
+FEWEST = 12  # points of a pair of images; fewer are not used
+FULL_CONTRAST = 30.0  # mean squared gradient per pixel of a window, grey levels², from which a point counts fully
+
+
+AXES = np.eye(2)
+
+
+@dataclass(frozen=True)
+class Warp:
+    """The map from the first image of a pair to the second, over a flat road.
+
+    Attributes:
+        pixels: (h, w, 2) float32, in the second image; far outside where there is no road to compare.
+        inside: (h, w) the pixels of the first image with road.
+    """
+
+    pixels: NDArray[np.float32]
+    inside: NDArray[np.bool_]
+
+
+def road_residuals(views: Views, unknowns: Unknowns, x: Array, most_px: float) -> RoadResiduals:
+    """Road points of all groups, at most `most_px` pixels from where the unknowns x (P,) expect them."""
+    groups, found = unknowns.within_camera, geometry_at(unknowns, x)
+    with ThreadPoolExecutor() as threads:
+        parts = list(threads.map(lambda group: _points_of(views, unknowns, found, int(group), most_px), groups))
+    counts = [len(part[0]) for part in parts]
+    columns = (np.concatenate([part[side] for part in parts]) for side in range(4))
+    return RoadResiduals(np.repeat(groups, counts), *columns)
+
+
+def _points_of(
+    views: Views, unknowns: Unknowns, found: GroupGeometry, group: int, most_px: float
+) -> tuple[Array, Array, Array, Array]:
+    """The fields of `RoadResiduals` after the first for the points of a group."""
+    nothing = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2, 3)), np.zeros(0)
+    pair, index, _ = (int(each) for each in unknowns.groups[group])
+    camera = views.rig.cameras[index]
+    first, second = (view.texture for view in views.sides((pair, index, index)))
+    warp = warp_of(camera, found, group)
+    if warp is None:
+        return nothing
+    warped = sampled(second, warp.pixels)
+    inside = cv2.erode(warp.inside.astype(np.uint8), np.ones((WINDOW, WINDOW)))
+    at = np.argwhere(inside[::SPACING, ::SPACING] > 0)[:, ::-1].astype(np.float32) * SPACING
+    if len(at) < FEWEST:
+        return nothing
+    flow, kept = _flow(first, warped, at)
+    kept &= np.linalg.norm(flow, axis=-1) < most_px
+    at, flow = at[kept], flow[kept]
+    if len(at) < FEWEST:
+        return nothing
+    target = _sample(warp.pixels, at + flow)
+    rays_a, rays_b = camera.rays(at), camera.rays(target)
+    beside = beside_way(points_of_road(found.ego_from_camera_a[group], rays_a), found.ego_b_from_ego_a[group])
+    return rays_a, rays_b, _weights(camera, first, warp, at, target), beside
+
+
+def warp_of(camera: Camera, found: GroupGeometry, group: int) -> Warp | None:
+    """The map of a group; None where the two images share no road."""
+    columns, rows = np.arange(0, camera.width + STRIDE, STRIDE), np.arange(0, camera.height + STRIDE, STRIDE)
+    pixels = np.stack(np.meshgrid(columns, rows), axis=-1).astype(np.float64)
+    rays = camera.rays(pixels.reshape(-1, 2))
+    pose, motion = found.ego_from_camera_a[group], found.ego_b_from_ego_a[group]
+    points = points_of_road(pose, rays)
+    away = np.linalg.norm((points - pose[:3, 3])[:, :2], axis=-1)
+    road = (away > NEAREST * pose[2, 3]) & (away < FARTHEST * pose[2, 3]) & (beside_way(points, motion) < WIDEST_M)
+    ahead = rays_of_road_points(found, np.full(len(rays), group), np.nan_to_num(rays, nan=-1.0))
+    target, in_front = camera.project(ahead)
+    road &= camera.contains(target, in_front)
+    shape = pixels.shape[:2]
+    if road.sum() < 4:
+        return None
+    near = np.nan_to_num(target, nan=OUTSIDE).reshape(*shape, 2).astype(np.float32)
+    size = (columns[-1] + STRIDE, rows[-1] + STRIDE)
+    matrix = np.array([[1 / STRIDE, 0, 0], [0, 1 / STRIDE, 0]])
+    whole = cv2.warpAffine(near, matrix, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    inside = cv2.warpAffine(
+        road.reshape(shape).astype(np.float32), matrix, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    )
+    cut = np.s_[: camera.height, : camera.width]
+    return Warp(np.ascontiguousarray(whole[cut]), inside[cut] > 0.999)
+
+
+def points_of_road(pose: Array, rays: Array) -> Array:
+    """Points (n, 3) of the plane z = 0 that rays (n, 3) of a camera with a pose (4, 4) hit; NaN above the horizon."""
+    directions = rays @ pose[:3, :3].T
+    with np.errstate(invalid="ignore", divide="ignore"):
+        depth = np.where(directions[:, 2] < -1e-3, pose[2, 3] / -directions[:, 2], np.nan)
+    return np.asarray(pose[:3, 3] + depth[:, None] * directions)
+
+
+def beside_way(points: Array, motion: Array) -> Array:
+    """(n,) distance of points (n, 3) of the ego frame from the way of the vehicle, an arc through both positions."""
+    ahead = np.linalg.inv(motion)[:2, 3]
+    if np.hypot(*ahead) < 1e-6:
+        return np.abs(points[:, 1])
+    bend = 2 * ahead[1] / (ahead @ ahead)  # of the circle that is tangent to x
+    if abs(bend) < 1e-4:
+        return np.abs(points[:, 1])
+    return np.abs(np.hypot(points[:, 0], points[:, 1] - 1 / bend) - abs(1 / bend))
+
+
+def _flow(
+    first: NDArray[np.uint8], warped: NDArray[np.uint8], at: NDArray[np.float32]
+) -> tuple[Array, NDArray[np.bool_]]:
+    """The flow (n, 2) from the first image at points (n, 2), and whether it is believed."""
+    start, size, levels = at[:, None], (WINDOW, WINDOW), 2
+    there, found, _ = cv2.calcOpticalFlowPyrLK(first, warped, start, start.copy(), winSize=size, maxLevel=levels)
+    back, again, _ = cv2.calcOpticalFlowPyrLK(warped, first, there, start.copy(), winSize=size, maxLevel=levels)
+    returned = np.linalg.norm((back - start)[:, 0], axis=-1) < MOST_BACK_PX
+    flow = np.asarray(there - start, dtype=np.float64)[:, 0]
+    return flow, (found.ravel() > 0) & (again.ravel() > 0) & returned
+
+
+def sampled(image: NDArray[Any], pixels: NDArray[Any]) -> NDArray[Any]:
+    """Values (h, w) or (h, w, D) of an image or a field at pixels (h, w, 2)."""
+    x, y = (np.ascontiguousarray(pixels[..., axis], dtype=np.float32) for axis in (0, 1))
+    return cv2.remap(image, x, y, cv2.INTER_LINEAR)
+
+
+def _sample(field: NDArray[np.float32], at: NDArray[Any]) -> Array:
+    """Values (n, 2) of a field (h, w, 2) at pixels (n, 2)."""
+    return sampled(field, at[:, None])[:, 0].astype(np.float64)
+
+
+def _weights(camera: Camera, first: NDArray[np.uint8], warp: Warp, at: NDArray[Any], target: Array) -> Array:
+    """(n, 2, 3) from an error of a ray in the second image to pixels of the first, weighted by the contrast there."""
+    stretch = (
+        np.stack([_sample(warp.pixels, at + 2 * axis) - _sample(warp.pixels, at - 2 * axis) for axis in AXES], -1) / 4
+    )
+    back = np.linalg.pinv(np.nan_to_num(stretch))  # (n, 2, 2), pixels of the first image by those of the second
+    along = np.stack([(camera.rays(target + axis) - camera.rays(target - axis)) / 2 for axis in AXES], -1)
+    across = np.linalg.pinv(np.nan_to_num(along))  # (n, 2, 3), pixels of the second image by its rays
+    return _contrast(first, at) @ back @ across
+
+
+def _contrast(image: NDArray[np.uint8], at: NDArray[Any]) -> Array:
+    """(n, 2, 2) symmetric, 0 to 1 along each axis of the contrast around pixels (n, 2)."""
+    dx, dy = (cv2.Sobel(image, cv2.CV_32F, *order, ksize=3, scale=1 / 8) for order in ((1, 0), (0, 1)))
+    products = np.stack([dx * dx, dx * dy, dy * dy], axis=-1)
+    mean = cv2.boxFilter(products, -1, (WINDOW, WINDOW))
+    columns, rows = np.rint(at).astype(int).T
+    xx, xy, yy = mean[rows, columns].astype(np.float64).T
+    size, axes = np.linalg.eigh(np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -2))
+    share = np.sqrt(np.clip(size / FULL_CONTRAST, 0, 1))
+    return np.einsum("nij,nj,nkj->nik", axes, share, axes)

@@ -1,0 +1,113 @@
+"""Robust least squares over the unknowns, and the covariance of the result.
+
+The unknowns are few (about a hundred) and the residuals many (tens of thousands), so the normal equations are formed
+group by group. They are the information matrix, which says what is observed.
+"""
+
+from collections.abc import Sequence as Items
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from bevcli.calibration.residuals import Residuals, derivatives, values
+from bevcli.calibration.unknowns import Unknowns
+from bevcli.geometry.transforms import Array
+
+STEPS = 25
+SMALLEST_STEP = 1e-3  # of the deviations before the measurement; a smaller step ends the search
+DAMPING = (1e-4, 1e8)  # at the start, and where the search ends without success
+DEVIATION = 1.4826  # standard deviation by the median of absolute values
+LEAST_CURVATURE = 0.1  # where most residuals are outliers
+SMALLEST_PX = 0.05  # a smaller spread of residuals is not believed
+
+
+@dataclass(frozen=True)
+class Term:
+    """Residuals with their spread, pixels: Cauchy's loss treats those far beyond it as outliers."""
+
+    residuals: Residuals
+    scale: float
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The unknowns that fit best.
+
+    Attributes:
+        x: (P,) their values.
+        information: (P, P) of the measurements alone.
+        scatter: (P, P) sum over the groups of the products of their gradients, which measures how well they agree.
+    """
+
+    x: Array
+    information: Array
+    scatter: Array
+
+
+def solve(unknowns: Unknowns, terms: Items[Term], x: Array) -> Solution:
+    """Levenberg and Marquardt's search from x (P,) with Cauchy's loss."""
+    prior = 1 / unknowns.deviations**2
+    damping, cost = DAMPING[0], _cost(unknowns, terms, x, prior)
+    for _ in range(STEPS):
+        information, gradients = _normal_equations(unknowns, terms, x)
+        matrix, gradient = information + np.diag(prior), gradients.sum(0) + prior * x
+        while damping < DAMPING[1]:
+            step = -np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), gradient)
+            reached = _cost(unknowns, terms, x + step, prior)
+            if reached <= cost:
+                break
+            damping *= 10
+        else:
+            break
+        x, cost, damping = x + step, reached, max(damping / 10, 1e-9)
+        if np.abs(step / unknowns.deviations).max() < SMALLEST_STEP:
+            break
+    information, gradients = _normal_equations(unknowns, terms, x, curvature=True)
+    return Solution(x, information, gradients.T @ gradients)
+
+
+def spread(unknowns: Unknowns, residuals: Residuals, x: Array) -> float:
+    """The standard deviation of the residuals at x, pixels, outliers left out."""
+    found = np.abs(values(unknowns, residuals, x))
+    return max(DEVIATION * float(np.median(found)), SMALLEST_PX) if found.size else 1.0
+
+
+def _cost(unknowns: Unknowns, terms: Items[Term], x: Array, prior: Array) -> float:
+    cost = float((prior * x**2).sum())
+    for term in terms:
+        squares = (values(unknowns, term.residuals, x) ** 2).sum(-1) / term.scale**2
+        cost += float(np.log1p(squares).sum())
+    return cost
+
+
+def _normal_equations(
+    unknowns: Unknowns, terms: Items[Term], x: Array, *, curvature: bool = False
+) -> tuple[Array, Array]:
+    """The information (P, P), and the gradient of each group (G, P).
+
+    curvature: scale the information of a term by the mean curvature of its loss, as the covariance needs it.
+    """
+    size = len(unknowns.deviations)
+    information, gradients = np.zeros((size, size)), np.zeros((len(unknowns.groups), size))
+    columns = unknowns.columns
+    for term in terms:
+        here, slopes = derivatives(unknowns, term.residuals, x)
+        squares = (here**2).sum(-1) / term.scale**2
+        weights = 1 / (1 + squares) / term.scale**2
+        factor = _curvature(squares) if curvature else 1.0
+        bounds = np.searchsorted(term.residuals.group, np.arange(len(columns) + 1))
+        for group, (start, end) in enumerate(pairwise(bounds)):
+            if start == end:
+                continue
+            part = slopes[start:end].reshape(-1, slopes.shape[-1])
+            weighted = part * np.repeat(weights[start:end], here.shape[1])[:, None]
+            places = columns[group]
+            np.add.at(information, np.ix_(places, places), factor * part.T @ weighted)
+            np.add.at(gradients[group], places, weighted.T @ here[start:end].ravel())
+    return information, gradients
+
+
+def _curvature(squares: Array) -> float:
+    """The mean curvature of Cauchy's loss as a share of the mean weight, for squared residuals (N,) in its scale."""
+    return max(float(np.sum((1 - squares) / (1 + squares) ** 2) / np.sum(1 / (1 + squares))), LEAST_CURVATURE)

@@ -1,0 +1,48 @@
+"""`bevcli calibrate`: measure the calibration of a drive from its own images and ego-motion."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from bevcli.calibration.options import CalibrateOptions, CalibrateOutputOptions
+from bevcli.cli.bridge import INPUT, Json, Part, as_flags
+from bevcli.printing import say
+from bevcli.sequences.format import option_classes
+from bevcli.sequences.options import SequenceOptions
+
+PANEL = "Look"
+
+
+def calibrate(
+    sequence: Annotated[
+        Path,
+        typer.Argument(help="Sequence folder (images or videos), nuScenes root, .mcap file or rosbag2 folder."),
+        INPUT,
+    ],
+    options: CalibrateOptions,
+    source: Annotated[SequenceOptions, Part(only=("frames", "scene", "rate_hz", "every", "allow_outside"))],
+    format_options: Annotated[dict[str, Any], Part(classes=option_classes)],
+    output: CalibrateOutputOptions,
+    as_json: Json = False,
+) -> None:
+    """Measure the calibration of a drive from its own images and ego-motion.
+
+    Prints one row a camera: how far its stated rotation and position are off, with standard deviations, and a verdict:
+    fine, corrected, or not measurable. Writes calibration.json with the corrected rig, report.json with all numbers,
+    calibration.png and recording.rrd, which show the cameras before and after. Nothing in SEQUENCE is changed.
+    `bevcli run SEQUENCE --calibration FILE` uses the corrected rig.
+    """
+    from bevcli.calibration.calibrate import STEPS, calibrate as measure
+    from bevcli.cli.progress import Progress
+    from bevcli.sequences.open import open_sequence
+    from bevcli.writing import check_output
+
+    drive = open_sequence(sequence, source, ground_truth=False, **format_options)
+    out = output.out or Path("runs") / f"{drive.name}-calibrate"
+    check_output(out / "calibration.json", sequence / "calibration.json")
+    with Progress(STEPS, "steps", drive.notes) as progress:
+        result = measure(drive, options, after_step=progress.advance)
+    written = result.write(out)
+    say(result.to_json() if as_json else as_flags(result.text()))
+    say("Written: " + ", ".join(map(str, written)), err=as_json)

@@ -1,0 +1,53 @@
+"""Commands of the driver, such as "straight": each chooses one of the paths that a model plans."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from bevcli.errors import InputError
+from bevcli.frame import FrameResult, Plan
+from bevcli.model.config import ModelConfig
+from bevcli.parsing.documents import read_json
+
+
+@dataclass(frozen=True)
+class Commands:
+    """Commands over a drive. A command stays until the next one.
+
+    Attributes:
+        since: index of a frame and the command from it on, by rising index.
+    """
+
+    since: tuple[tuple[int, str], ...] = ()
+
+    def at(self, frame: int) -> str:
+        """The command at a frame, "" for none."""
+        return next((command for first, command in reversed(self.since) if first <= frame), "")
+
+    def given_to(self, results: tuple[FrameResult, ...], frame: int) -> tuple[FrameResult, ...]:
+        """The results, plans with the command at a frame."""
+        return tuple(replace(r, command=self.at(frame)) if isinstance(r, Plan) else r for r in results)
+
+
+def read_commands(command: str | None, config: ModelConfig) -> Commands:
+    """The commands of the option `command`: one name, or a JSON file {"0": "straight", "40": "left"} by frame index.
+
+    None: no command. Raises InputError for a model that does not plan, an unknown command, or a wrong file.
+    """
+    if command is None:
+        return Commands()
+    known = config.results.get(Plan, ())
+    if not known:
+        raise InputError(f"`command={command}`: {config.name} plans no path: leave out the option")
+    expected = f"expected {', '.join(known)}"
+    if command in known:
+        return Commands(((0, command),))
+    path = Path(command)
+    if path.suffix != ".json":
+        raise InputError(f"`command={command}`: is unknown ({expected} or a FILE.json)")
+    found = read_json(path)
+    if not isinstance(found, dict) or not found:
+        raise InputError(f'{path}: is not a file of commands (expected {{"0": "{known[0]}"}}, by frame index)')
+    for frame, name in found.items():
+        if not (frame.isascii() and frame.isdigit() and len(frame) < 10) or name not in known:
+            raise InputError(f'{path}: "{frame}": {name!r:.40}: is no command ({expected}, by frame index)')
+    return Commands(tuple(sorted((int(frame), name) for frame, name in found.items())))

@@ -1,0 +1,141 @@
+"""The motion head of VAD: each object attends to all objects and to the lines around it; its futures come of that."""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from bevcli.model.decoder import branch, class_branch
+from bevcli.model.vad.attention_layer import AttentionLayer
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """The motion head and the planner.
+
+    Attributes:
+        modes: M, number of futures of an object.
+        steps: T, number of steps of a future and of a planned path.
+        step_s: seconds of a step.
+        attention_heads: heads of the four attentions.
+        feed_forward_width: channels between the two linear layers of the feed-forward networks.
+        dropout: probability, 0 to below 1.
+        min_line_score: objects attend to lines with a higher score.
+        max_line_distance: objects attend to lines up to this distance, in shares of the range of the BEV grid.
+    """
+
+    modes: int = 6
+    steps: int = 6
+    step_s: float = 0.5
+    attention_heads: int = 8
+    feed_forward_width: int = 512
+    dropout: float = 0.1
+    min_line_score: float = 0.5
+    max_line_distance: float = 0.2
+
+    def __post_init__(self) -> None:
+        counts = (self.modes, self.steps, self.attention_heads, self.feed_forward_width)
+        if min(counts) < 1 or self.step_s <= 0 or not 0 <= self.dropout < 1:
+            raise ValueError("modes, steps, step_s, heads and width must be positive, dropout from 0 to below 1")
+
+    def attention(self, channels: int) -> AttentionLayer:
+        """An attention layer with these settings."""
+        return AttentionLayer(channels, self.attention_heads, self.feed_forward_width, self.dropout)
+
+
+@dataclass(frozen=True)
+class MapTokens:
+    """The N lines as motion head and planner see them.
+
+    Attributes:
+        features: (B, N, C), one vector a line.
+        positions: (B, N, 2), one point of each line, 0 to 1 over the range: see `line_positions`.
+        scores: (B, N), of the best class, 0 to 1.
+    """
+
+    features: Tensor
+    positions: Tensor
+    scores: Tensor
+
+
+@dataclass(frozen=True)
+class MotionOutputs:
+    """The futures of Q objects.
+
+    Attributes:
+        offsets: (B, Q, M, T, 2) movement in each step along x and y of the bev frame, metres.
+        mode_logits: (B, Q, M).
+        features: (B, Q, C), one vector an object, for the planner.
+    """
+
+    offsets: Tensor
+    mode_logits: Tensor
+    features: Tensor
+
+
+class MotionHead(nn.Module):
+    """M futures of each object. Modes of all objects attend to each other, then to the lines near their object."""
+
+    def __init__(self, config: MotionConfig, channels: int) -> None:
+        super().__init__()
+        self.config = config
+        self.mode_queries = nn.Parameter(torch.randn(config.modes, channels))
+        self.agent_attention = config.attention(channels)
+        self.agent_position = nn.Linear(2, channels)
+        self.line_attention = config.attention(channels)
+        self.line_position = nn.Linear(2, channels)
+        self.trajectory_branch = branch(2 * channels, 3, 2 * config.steps)
+        self.mode_branch = class_branch(2 * channels, 1)
+        self.agent_fusion = nn.Sequential(
+            nn.Linear(2 * config.modes * channels, channels),
+            nn.LayerNorm(channels),
+            nn.ReLU(),
+            nn.Linear(channels, channels),
+        )
+
+    def forward(self, features: Tensor, positions: Tensor, lines: MapTokens) -> MotionOutputs:
+        """features: (B, Q, C) of the objects. positions: (B, Q, 2) their centres, 0 to 1 over the range."""
+        modes = (features[:, :, None] + self.mode_queries).flatten(1, 2)  # (B, Q·M, C)
+        position = self.agent_position(positions).repeat_interleave(self.config.modes, dim=1)
+        modes = self.agent_attention(modes, position, modes, position)
+        modes = modes.unflatten(1, (-1, self.config.modes))  # (B, Q, M, C)
+        found = torch.cat([modes, self._attend_to_lines(modes, positions, lines)], dim=-1)  # (B, Q, M, 2 C)
+        offsets = self.trajectory_branch(found).unflatten(-1, (self.config.steps, 2))
+        return MotionOutputs(offsets, self.mode_branch(found)[..., 0], self.agent_fusion(found.flatten(2)))
+
+    def _attend_to_lines(self, modes: Tensor, positions: Tensor, lines: MapTokens) -> Tensor:
+        """(B, Q, M, C): each object attends to its own lines, at their positions relative to it."""
+        relative, masked = self.lines_in_reach(positions, lines)
+        features = F.pad(lines.features, (0, 0, 0, 1))  # the entry without a line has no features
+        values = features[:, None].expand(-1, positions.shape[1], -1, -1)
+        # As in the released code, the object itself is at the origin.
+        own = self.line_position(positions.new_zeros(1, 1, 2))
+        found = self.line_attention(
+            modes.flatten(0, 1),
+            own,
+            values.flatten(0, 1),
+            self.line_position(relative).flatten(0, 1),
+            masked.flatten(0, 1),
+        )
+        return found.unflatten(0, modes.shape[:2])
+
+    def lines_in_reach(self, positions: Tensor, lines: MapTokens) -> tuple[Tensor, Tensor]:
+        """Relative positions (B, Q, N + 1, 2) of the lines, and masks (B, Q, N + 1) of those not attended to.
+
+        The last entry is no line: an object without lines in reach attends to it alone. It is at (1, 1), as in the
+        released code.
+        """
+        relative = lines.positions[:, None] - positions[:, :, None]  # (B, Q, N, 2)
+        is_far = relative.norm(dim=-1) > self.config.max_line_distance
+        masked = is_far | (lines.scores <= self.config.min_line_score)[:, None]
+        return F.pad(relative, (0, 0, 0, 1), value=1.0), F.pad(masked, (0, 1), value=False)
+
+
+def line_positions(points: Tensor) -> Tensor:
+    """The position (B, N, 2) of lines with points (B, N, P, 2), 0 to 1 over the range.
+
+    As in the released code it is the point nearest to the corner of the range, (0, 0), not to the vehicle.
+    """
+    nearest = points.norm(dim=-1).argmin(-1)  # (B, N)
+    return points.gather(2, nearest[..., None, None].expand(-1, -1, 1, 2))[:, :, 0]

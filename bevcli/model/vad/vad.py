@@ -1,0 +1,97 @@
+"""VAD (Jiang et al. 2023): BEVFormer's BEV map and objects, lines of the map, futures of objects, a planned path."""
+
+from collections.abc import Iterator, Mapping
+
+import torch
+from torch import Tensor
+
+from bevcli.frame import FrameResult
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.config import ModelConfig
+from bevcli.model.network import STAGES, ConstantSelfAttention
+from bevcli.model.pillar_projection import PillarHits
+from bevcli.model.step import ModelOutputs
+from bevcli.model.vad.config import VADConfig
+from bevcli.model.vad.decoding import VADOutputs, decode_futures, decode_lines, decode_plan
+from bevcli.model.vad.export import VADForm
+from bevcli.model.vad.line_decoder import LineDecoder, LineEncoder, LineOutputs
+from bevcli.model.vad.motion_head import MapTokens, MotionHead, line_positions
+from bevcli.model.vad.official_keys import NAMES, UNUSED
+from bevcli.model.vad.planner import Planner
+
+
+class VAD(BEVFormer):
+    """The whole model: a recurrence, in which the BEV map of a frame is the history of the next."""
+
+    config: VADConfig
+    config_class = VADConfig
+    stages: Mapping[str, str] = STAGES | {"line_decoder": "map_decoder", "motion_head": "motion", "planner": "planner"}
+    official_names = NAMES
+    is_explained = False
+
+    def __init__(self, config: VADConfig) -> None:
+        super().__init__(config)
+        self.line_decoder = LineDecoder(config.line_decoder, config.channels, config.bev_grid)
+        self.line_encoder = LineEncoder(config.channels)
+        self.motion_head = MotionHead(config.motion, config.channels)
+        self.planner = Planner(config.motion, len(config.commands), config.channels)
+
+    def detect(self, bev: Tensor) -> VADOutputs:
+        """The outputs for a BEV map (B, Y·X, C)."""
+        with torch.autocast(bev.device.type, enabled=False):
+            class_logits, box_codes, features = self.decoder(bev.float(), self.detection_head)
+            lines = self.line_decoder(bev.float())
+            tokens = self.map_tokens(lines)
+            positions = self.positions(box_codes[-1])
+            motion = self.motion_head(features, positions, tokens)
+            plan = self.planner(motion.features, positions, tokens)
+        return VADOutputs(bev, class_logits, box_codes, lines=lines, motion=motion, plan=plan)
+
+    def map_tokens(self, lines: LineOutputs) -> MapTokens:
+        scores = lines.class_logits[-1].sigmoid().amax(-1)
+        return MapTokens(self.line_encoder(lines.features), line_positions(lines.points[-1]), scores)
+
+    def positions(self, box_codes: Tensor) -> Tensor:
+        """x and y (B, Q, 2), 0 to 1 over the range, of box codes (B, Q, 10)."""
+        head = self.detection_head
+        return (box_codes[..., :2] - head.range_start[:2]) / head.range_extent[:2]
+
+    def decode_boxes(self, outputs: ModelOutputs) -> Boxes3D:
+        assert isinstance(outputs, VADOutputs)
+        return decode_futures(outputs, self.config)
+
+    def decode_results(self, outputs: ModelOutputs) -> tuple[FrameResult, ...]:
+        assert isinstance(outputs, VADOutputs)
+        return decode_lines(outputs, self.config), decode_plan(outputs, self.config)
+
+    def exchange_parts(self) -> None:
+        """See `TemporalModel`: the queries of objects and of lines attend to each other before they see the frame."""
+        super().exchange_parts()
+        first = self.line_decoder.layers[0]
+        first.self_attention = ConstantSelfAttention(first, self.line_decoder.queries(batch=1))
+
+    def run_on_shapes(self, images: Tensor, camera_index: Tensor, hits: PillarHits) -> Tensor:
+        bev = super().run_on_shapes(images, camera_index, hits)
+        self.detect(bev)
+        return bev
+
+    @classmethod
+    def export_form(cls, config: ModelConfig, cameras: int) -> VADForm:
+        return VADForm(config, cameras)
+
+    @classmethod
+    def without_training_parts(cls, state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
+        return {key: tensor for key, tensor in state.items() if key != UNUSED}, UNUSED if UNUSED in state else ""
+
+    @classmethod
+    def part_names(cls, config: ModelConfig) -> Iterator[tuple[str, ...]]:
+        yield from super().part_names(config)
+        yield "map decoder", "line_decoder"
+        yield "line encoder", "line_encoder"
+        yield "motion head: objects to objects", "motion_head.agent_attention", "motion_head.agent_position"
+        yield "motion head: objects to lines", "motion_head.line_attention", "motion_head.line_position"
+        yield "motion head: futures", "motion_head"
+        yield "planner: vehicle to objects", "planner.agent_attention", "planner.agent_position"
+        yield "planner: vehicle to lines", "planner.line_attention", "planner.line_position"
+        yield "planner: paths", "planner"

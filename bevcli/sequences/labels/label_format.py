@@ -1,0 +1,70 @@
+"""LabelFormat: a format of labels, found through the entry points `bevcli.label_formats`."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from bevcli.errors import InputError
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.registry import entries, load
+
+GROUP = "bevcli.label_formats"
+FrameOfReference = Literal["world", "ego", "bev"]
+
+
+@dataclass(frozen=True)
+class LabelledFrame:
+    """The boxes of one frame.
+
+    Attributes:
+        index: of the frame; None if the file has times only.
+        timestamp_ns: of the frame; None if the file has indices only.
+        boxes: in the frame of reference of the file.
+    """
+
+    index: int | None
+    timestamp_ns: int | None
+    boxes: Boxes3D
+
+
+@dataclass(frozen=True)
+class Labels:
+    """The contents of a file of labels.
+
+    Attributes:
+        frame_of_reference: of all boxes.
+        frames: in the order of the file.
+        lists_empty: frames without boxes are in the file, too. If not, a frame of the drive that the file does not
+            have is labelled and empty.
+        notes: what was assumed, for the user.
+    """
+
+    frame_of_reference: FrameOfReference
+    frames: tuple[LabelledFrame, ...]
+    lists_empty: bool
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class LabelFormat:
+    """A format of labels.
+
+    Attributes:
+        name: with an article, for messages.
+        recognises: whether a file has this format; looks at its name, or at a few bytes.
+        read: reads a file. Raises InputError.
+    """
+
+    name: str
+    recognises: Callable[[Path], bool]
+    read: Callable[[Path], Labels]
+
+
+def read_labels(path: Path) -> Labels:
+    """The labels of a file of any known format. Raises InputError."""
+    known: list[LabelFormat] = [load(GROUP, name) for name in entries(GROUP)]
+    found = next((one for one in known if one.recognises(path)), None)
+    if found is None:
+        raise InputError(f"{path}: is no file of labels (expected {' or '.join(one.name for one in known)})")
+    return found.read(path)

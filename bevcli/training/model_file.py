@@ -1,0 +1,120 @@
+"""A new model file for a data set, with what its training costs on this machine."""
+
+import json
+import re
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from bevcli.config import config_of_table, read_model_file
+from bevcli.errors import InputError, OutputError
+from bevcli.frame import Sequence
+from bevcli.geometry.object_classes import NUSCENES_CLASSES
+from bevcli.sequences.open import open_sequence
+from bevcli.sequences.options import SequenceOptions
+from bevcli.synth.options import DriveOptions
+from bevcli.synth.splits import read_split
+from bevcli.training.cost import LONGEST_S, Cost, measure_cost
+from bevcli.training.data_facts import INSIDE_PERCENT, DataFacts, look_at
+from bevcli.training.job import prepare_training
+from bevcli.training.options import Preset, TrainOptions
+from bevcli.training.presets import PRESETS, model_table
+from bevcli.writing import write_whole
+
+
+def write_model_file(
+    path: Path, data: DriveOptions, preset: Preset, device: torch.device, longest_s: float = LONGEST_S
+) -> list[str]:
+    """Write a model file for the drives, from a preset, and return its first lines: the facts and the cost.
+
+    The file is trained for some seconds before it is written, so that it is known to work.
+
+    Args:
+        path: the file, which ends in .toml and does not exist.
+        data: the drives, folders.
+        preset: the model that it starts from.
+        device: device to measure on.
+        longest_s: time of the measurement, seconds.
+
+    Raises BevcliError where the drives, or the path, are wrong; nothing is written then.
+    """
+    if path.suffix != ".toml" or path.exists():
+        raise OutputError(f"{path}: " + ("exists already" if path.exists() else "expected a name that ends in .toml"))
+    name = re.sub(r"[^\w. +-]", "-", path.stem).lstrip("-. +")[:100] or "model"
+    base = config_of_table(*read_model_file(PRESETS[preset].model))
+    facts = look_at(_open_drives(data), base.bev_frame)
+    table = model_table(name, preset, facts)
+    lines = [f"Model {name} for {len(facts.drives)} drives, preset {preset}.", *_facts_lines(facts, table)]
+    with tempfile.TemporaryDirectory() as folder:
+        trial = Path(folder) / "model.toml"
+        trial.write_text(_toml(table), encoding="utf-8")
+        job = prepare_training(str(trial), device, data, TrainOptions(out=Path(folder) / "out"))
+        cost = measure_cost(job, longest_s)
+    lines += _cost_lines(cost)
+    write_whole(path, _commented(lines, table).encode(), parents=True)
+    return lines
+
+
+def _open_drives(data: DriveOptions) -> list[Sequence]:
+    """All drives, at their own frame rate. Raises InputError."""
+    if data.rendered is not None:
+        raise InputError("`init` needs drives in folders (`data` or `split`): rendered drives are trained with demo")
+    split = None if data.split is None else read_split(data.split)
+    folders = data.data if split is None else (*split.train, *split.validate)
+    if not folders or (split is not None and data.data):
+        raise InputError("`init`: choose the drives: give either `data=DIR` (repeatable) or `split=FILE`")
+    classes = tuple(dict.fromkeys([*NUSCENES_CLASSES, *data.class_map.values()]))
+    options = SequenceOptions(data.class_map, rate_hz="all", classes=classes)
+    return [open_sequence(folder, options) for folder in folders]
+
+
+def _facts_lines(facts: DataFacts, table: Mapping[str, Any]) -> Iterator[str]:
+    """The facts that the settings of the file follow from."""
+    named = ", ".join(f"{name} {facts.class_counts[name]}" for name in table["classes"])
+    yield f"Boxes in {facts.frames} frames: {named}."
+    own = [_key(name) for name in table["classes"] if name not in NUSCENES_CLASSES]
+    if own:
+        yield f'A table [class_settings.{own[0]}] with like = "car" gives it the range and the gate of nuScenes\' car.'
+    counts = sorted({len(rig.cameras) for rig in facts.rigs})
+    number = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
+    sizes = [" x ".join(map(str, size)) for size in (facts.image_size, table["image"]["size"])]
+    yield f"Cameras: {number}, images of {sizes[0]}, used at {sizes[1]}."
+    yield f"Frames per second: {facts.rate_hz:.3g}, used at {table['rate_hz']:g}."
+    grid = table["bev_grid"]
+    half = grid["x_range_m"][1]
+    cells = f"{grid['columns']} x {grid['rows']} BEV cells of {2 * half / grid['columns']:.2f} m"
+    yield f"{INSIDE_PERCENT:g} % of the boxes are within {facts.reach_m:.1f} m ahead and to the sides: {cells}."
+    if 0 < facts.map_reach_m < half:
+        yield f"Maps reach {facts.map_reach_m:g} m only, less than the grid: the model has no segmentation head."
+
+
+def _cost_lines(cost: Cost) -> Iterator[str]:
+    yield f"Cost, measured on this machine: {cost}."
+    yield f"In this file {cost.config.clips}."
+
+
+def _commented(lines: list[str], table: Mapping[str, Any]) -> str:
+    """The text of the file, with lines as comments at its top."""
+    return "\n".join([*(f"# {line}" for line in lines), _toml(table)])
+
+
+def _toml(table: Mapping[str, Any], prefix: str = "") -> str:
+    """A table as TOML: its values first, then the tables in it."""
+    lines = [f"{_key(key)} = {_value(value)}" for key, value in table.items() if not isinstance(value, Mapping)]
+    for key, value in table.items():
+        if isinstance(value, Mapping):
+            name = f"{prefix}{_key(key)}"
+            lines += ["", f"[{name}]", _toml(value, f"{name}.").rstrip("\n")]
+    return "\n".join(lines) + "\n"
+
+
+def _value(value: Any) -> str:
+    """A text, number, truth value or list in TOML, which writes these as JSON does."""
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _key(name: str) -> str:
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name, ensure_ascii=False)

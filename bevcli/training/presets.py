@@ -1,0 +1,116 @@
+"""Presets: a model file for a data set, made from one of the known models and the facts about the data."""
+
+import copy
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from bevcli.config import TRAINING, read_model_file
+from bevcli.geometry.object_classes import NUSCENES_CLASSES
+from bevcli.inference.training_rigs import rigs_of
+from bevcli.training.data_facts import DataFacts
+from bevcli.training.job import TrainingConfig
+from bevcli.training.options import Preset
+
+LARGEST_HELD_OUT = 10  # drives
+NEAREST_RATE = 0.75  # data with at least this share of the preset's frame rate is trained at the preset's
+
+
+@dataclass(frozen=True)
+class PresetSettings:
+    """A preset.
+
+    Attributes:
+        model: the known model whose file it starts from.
+        width_px: width of the network's input images; None for that of the model.
+        changes: keys of its tables with new values; None removes a key.
+    """
+
+    model: str
+    width_px: int | None = None
+    changes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+
+# The demo model, whose weights fit it, on smaller images and shorter clips.
+_QUICK: Mapping[str, Mapping[str, Any]] = {
+    "image": {"focal_px": None, "max_pixels": None},
+    "training": {"steps": 150, "evaluate_every": 30, "checkpoint_every": 5},
+    "training.clips": {"frames": 4, "batch": 2, "in_turn": 2},
+    "training.optimizer": {"warm_up_steps": 10},
+}
+_ONE_CLIP: Mapping[str, Mapping[str, Any]] = {
+    "training": {},
+    "training.clips": {"batch": 1},
+}  # as published, on each of eight GPUs
+PRESETS: Mapping[Preset, PresetSettings] = {
+    "quick": PresetSettings("demo", 384, _QUICK),
+    "demo": PresetSettings("demo"),
+    "tiny": PresetSettings("tiny", None, _ONE_CLIP),
+    "base": PresetSettings("base", None, _ONE_CLIP),
+}
+
+
+def model_table(name: str, preset: Preset, facts: DataFacts) -> dict[str, Any]:
+    """The contents of a model's file for a data set.
+
+    The number of BEV cells and all layers are those of the preset's model, so that its weights fit, except those of
+    its classes and cameras. name: of the new model.
+    """
+    chosen = PRESETS[preset]
+    table = copy.deepcopy(read_model_file(chosen.model)[0])
+    for path, changes in chosen.changes.items():
+        _change(table, path, changes)
+    table |= {"name": name, "classes": ordered_classes(facts.class_counts), "cameras": list(facts.cameras)}
+    table["rate_hz"] = rate_for(facts, table.get("rate_hz", 2.0))
+    table["max_gap_s"] = max(table.get("max_gap_s", 2.0), round(2 / table["rate_hz"], 2))
+    table["image"]["size"] = _image_size(facts, chosen.width_px or table["image"]["size"][0])
+    _set_range(table["bev_grid"], facts)
+    table["training_rigs"] = rigs_of(facts.rigs)
+    if facts.map_reach_m < table["bev_grid"]["x_range_m"][1]:
+        table["heads"] = ["detection"]
+        table.pop("segmentation", None)
+    training = table.setdefault(TRAINING, {})
+    training.pop("rigs", None)  # of rendered drives
+    training["held_out"] = 0 if len(facts.drives) == 1 else min(LARGEST_HELD_OUT, max(1, len(facts.drives) // 5))
+    clips = training.setdefault("clips", {})
+    clips["frames"] = min(clips.get("frames", TrainingConfig().clips.frames), facts.shortest(table["rate_hz"]))
+    return table
+
+
+def ordered_classes(counts: Mapping[str, int]) -> list[str]:
+    """Classes of nuScenes in its order, then the others, the most frequent first."""
+    return [name for name in NUSCENES_CLASSES if name in counts] + [n for n in counts if n not in NUSCENES_CLASSES]
+
+
+def rate_for(facts: DataFacts, preset_hz: float) -> float:
+    """The frame rate to train at: the preset's, or that of data with fewer frames."""
+    return preset_hz if facts.rate_hz >= NEAREST_RATE * preset_hz else float(f"{facts.rate_hz:.2g}")
+
+
+def _change(table: dict[str, Any], path: str, changes: Mapping[str, Any]) -> None:
+    for name in path.split("."):
+        table = table.setdefault(name, {})
+    for key, value in changes.items():
+        if value is None:
+            table.pop(key, None)
+        else:
+            table[key] = value
+
+
+def _image_size(facts: DataFacts, width_px: int) -> list[int]:
+    """The preset's width, or that of smaller images, with the data's aspect ratio."""
+    width, height = facts.image_size
+    size = min(width_px, width)
+    return [size, max(1, round(size * height / width))]
+
+
+def _set_range(grid: dict[str, Any], facts: DataFacts) -> None:
+    """A square of whole metres that holds most boxes, with as many cells as before; a higher one if it is needed."""
+    half = float(max(4, math.ceil(round(facts.reach_m, 3))))
+    grid["x_range_m"] = grid["y_range_m"] = [-half, half]
+    low, high = np.percentile(facts.centers_bev[:, 2], (1, 99))
+    z0, z1 = grid["z_range_m"]
+    grid["z_range_m"] = [float(min(z0, math.floor(low))), float(max(z1, math.ceil(high)))]

@@ -1,0 +1,52 @@
+"""Drives whose stated calibration is wrong by a known amount."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from bevcli.frame import DerivedSequence, Frame, Sequence
+from bevcli.geometry.cameras import CameraRig
+from bevcli.geometry.transforms import rigid
+
+
+class WrongRig(DerivedSequence):
+    """A drive that states another rig."""
+
+    def __init__(self, sequence: Sequence, rig: CameraRig) -> None:
+        super().__init__(sequence)
+        self.rig = rig
+
+    def load(self, place: int) -> Frame:
+        return replace(self.sequence.load(place), rig=self.rig)
+
+
+class BlackImages(DerivedSequence):
+    """A drive with black images."""
+
+    def load(self, place: int) -> Frame:
+        frame = self.sequence.load(place)
+        black = {name: replace(one, pixels_bgr=np.zeros_like(one.pixels_bgr)) for name, one in frame.images.items()}
+        return replace(frame, images=black)
+
+
+def wrong_rig(rig: CameraRig, camera: str, turn_deg: tuple[float, float, float], shift_m: tuple) -> CameraRig:
+    """The rig with one camera turned about its own axes (right, down, forward) and shifted in the ego frame."""
+    changed = []
+    for each in rig.cameras:
+        if each.name == camera:
+            pose = each.ego_from_camera @ rigid(rotation=Rotation.from_rotvec(turn_deg, degrees=True).as_matrix())
+            each = replace(each, ego_from_camera=rigid(shift_m) @ pose)
+        changed.append(each)
+    return replace(rig, cameras=tuple(changed))
+
+
+def angle_deg(a: CameraRig, b: CameraRig, camera: str) -> float:
+    """The angle between the rotations of a camera in two rigs."""
+    relative = a[camera].ego_from_camera[:3, :3].T @ b[camera].ego_from_camera[:3, :3]
+    return float(np.degrees(Rotation.from_matrix(relative).magnitude()))
+
+
+def distance_m(a: CameraRig, b: CameraRig, camera: str) -> float:
+    """The distance between the positions of a camera in two rigs."""
+    return float(np.linalg.norm(a[camera].ego_from_camera[:3, 3] - b[camera].ego_from_camera[:3, 3]))

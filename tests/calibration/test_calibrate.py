@@ -1,0 +1,188 @@
+"""`calibrate`: planted errors are found, a right calibration stays, and what is not shown is said."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+from command_line import MINI_TOML, command
+from memory_drive import MemorySequence
+from planted import BlackImages, WrongRig, angle_deg, distance_m, wrong_rig
+from typer.testing import CliRunner
+
+import bevcli
+from bevcli.calibration.corrected_drive import CorrectedDrive
+from bevcli.calibration.estimates import Verdict
+from bevcli.cli import bridge
+from bevcli.cli.calibrate import calibrate
+from bevcli.errors import InputError, OutputError
+from bevcli.robustness.calibration_accuracy import WrongTimes
+from bevcli.sequences.files.calibration_file import read_calibration, write_calibration
+
+STREET = Path(__file__).parents[2] / "samples/street"
+TURNED, LOW = "CAM_FRONT", "CAM_BACK"
+
+
+def two_cameras(rig):
+    return replace(rig, cameras=tuple(each for each in rig.cameras if each.name in (TURNED, LOW)))
+
+
+@pytest.fixture(scope="module")
+def street():
+    """Ten frames of the street with two of its cameras, one turned by 2.3°, the other 15 cm too high."""
+    drive = bevcli.open_sequence(STREET, frames=slice(5, 15), ground_truth=False)
+    right = two_cameras(drive.rig)
+    wrong = wrong_rig(right, TURNED, (1.0, -2.0, 0.5), (0, 0, 0))
+    wrong = wrong_rig(wrong, LOW, (0, 0, 0), (0, 0, 0.15))
+    return drive, right, wrong
+
+
+@pytest.fixture(scope="module")
+def result(street):
+    drive, _, wrong = street
+    return bevcli.calibrate(WrongRig(drive, wrong))
+
+
+def test_a_planted_rotation_is_found(street, result):
+    _, right, wrong = street
+    assert angle_deg(right, wrong, TURNED) > 2
+    assert angle_deg(right, result.rig, TURNED) < 0.3
+    yaw, pitch, _ = result[TURNED].rotation_deg
+    assert yaw == pytest.approx(2.0, abs=0.3)  # turned to the left
+    assert pitch == pytest.approx(1.0, abs=0.3)  # and up
+
+
+def test_a_planted_height_is_found(result):
+    assert result[LOW].position_m[2] == pytest.approx(0.15, abs=0.03)
+    assert result[LOW].verdict is Verdict.CORRECTED
+
+
+def test_errors_are_within_four_standard_deviations(street, result):
+    _, right, _ = street
+    for name in (TURNED, LOW):
+        found = result[name]
+        left = right[name].ego_from_camera[:3, 3] - (
+            street[2][name].ego_from_camera[:3, 3] - np.array(found.position_m)
+        )
+        assert (np.abs(left) < 4 * np.array(found.position_deviation_m)).all()
+
+
+def test_the_residual_falls_to_less_than_a_pixel(result):
+    assert result[TURNED].before_px > 3 * result[TURNED].after_px
+    assert result[TURNED].after_px < 1
+
+
+def test_the_files_give_the_corrected_rig_back(result, tmp_path):
+    result.write(tmp_path)
+    reread = read_calibration(tmp_path / "calibration.json")
+    assert reread.names == (TURNED, LOW)
+    assert angle_deg(reread, result.rig, TURNED) < 1e-6
+    assert distance_m(reread, result.rig, LOW) < 1e-9
+
+
+@pytest.mark.slow
+def test_a_right_calibration_is_not_changed():
+    drive = bevcli.open_sequence(STREET)
+    found = bevcli.calibrate(drive)
+    assert [each.verdict for each in found.cameras] == [Verdict.FINE] * 6
+    assert all(distance_m(drive.rig, found.rig, name) == 0 for name in drive.rig.names)
+
+
+def test_one_frame_is_refused():
+    with pytest.raises(InputError, match="has one frame"):
+        bevcli.calibrate(MemorySequence(count=1))
+
+
+def test_a_drive_without_ego_motion_is_refused():
+    drive = MemorySequence(count=9)
+    drive.has_ego_motion = False
+    with pytest.raises(InputError, match="has no ego-motion"):
+        bevcli.calibrate(drive)
+
+
+def test_a_vehicle_that_stands_is_refused():
+    drive = MemorySequence(count=9)
+    drive.pose = lambda place: MemorySequence.pose(drive, 0)
+    with pytest.raises(InputError, match="moves between 0 pairs"):
+        bevcli.calibrate(drive)
+
+
+def test_few_frames_are_refused():
+    with pytest.raises(InputError, match="moves between 3 pairs"):
+        bevcli.calibrate(MemorySequence(count=4))
+
+
+def test_several_scenes_are_refused():
+    with pytest.raises(InputError, match="has 2 scenes"):
+        bevcli.calibrate(MemorySequence(count=9, scenes="aaaabbbbb"))
+
+
+def test_black_images_are_refused():
+    with pytest.raises(InputError, match="no image shows anything"):
+        bevcli.calibrate(BlackImages(MemorySequence(count=9)))
+
+
+def test_images_of_noise_are_refused():
+    with pytest.raises(InputError, match="no points were found"):
+        bevcli.calibrate(MemorySequence(count=9))
+
+
+def typed(*arguments: str):
+    """The command as its user types it, also where its entry point is not installed."""
+    app = typer.Typer()
+    app.command()(bridge.command(calibrate))
+    return CliRunner().invoke(app, arguments)
+
+
+@pytest.mark.slow
+def test_the_command_writes_a_calibration(tmp_path):
+    done = typed(str(STREET), "--out", str(tmp_path / "rig"))
+    assert done.exit_code == 0, done.output
+    assert "CAM_FRONT_RIGHT" in done.output
+    assert {path.name for path in (tmp_path / "rig").iterdir()} == {
+        "calibration.json",
+        "report.json",
+        "calibration.png",
+        "recording.rrd",
+    }
+
+
+def test_the_command_refuses_to_write_into_the_drive():
+    done = typed(str(STREET), "--out", str(STREET))
+    assert isinstance(done.exception, OutputError)
+    assert "is the input" in str(done.exception)
+
+
+def test_few_frames_are_refused_in_one_line():
+    done = typed(str(STREET), "--frames", "0:2")
+    assert isinstance(done.exception, InputError)
+    assert "moves between 0 pairs" in str(done.exception)
+
+
+def test_a_corrected_drive_has_the_corrected_rig_in_its_frames(street, result):
+    drive = CorrectedDrive(WrongRig(street[0], street[2]), result)
+    assert drive.rig is result.rig
+    assert drive.load(0).rig is result.rig
+
+
+@pytest.mark.slow
+def test_a_run_measures_first_and_says_what_it_corrects(tmp_path):
+    right = bevcli.open_sequence(STREET).rig
+    write_calibration(tmp_path / "wrong.json", wrong_rig(right, TURNED, (1, -2, 0), (0, 0, 0)))
+    model = tmp_path / "mini.toml"
+    model.write_text(MINI_TOML)
+    done = command(
+        tmp_path, "run", STREET, "--calibration", "wrong.json", "--calibrate", "--model", model, "--untrained",
+        "--frames", "5:15", "--out", "run",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert f"calibration: {TURNED} is corrected: off by yaw +" in done.stderr
+
+
+@pytest.mark.slow
+def test_wrong_capture_times_are_found():
+    drive = bevcli.open_sequence(STREET, ground_truth=False)
+    found = bevcli.calibrate(WrongTimes(drive, TURNED, late_ms=100))
+    assert found[TURNED].delay_ms == pytest.approx(-100, abs=15)
+    assert angle_deg(drive.rig, found.rig, TURNED) < 0.3

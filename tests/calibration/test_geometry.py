@@ -1,0 +1,143 @@
+"""Residuals, levels and paths against points that are projected by hand."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from bevcli.calibration.levels import level_corrections
+from bevcli.calibration.options import CalibrateOptions
+from bevcli.calibration.residuals import EpipolarResiduals, RoadResiduals, derivatives, values
+from bevcli.calibration.road import beside_way
+from bevcli.calibration.unknowns import HEIGHT, OF_CAMERA, Unknowns, geometry_at
+from bevcli.calibration.views import DELAYS_S, View, Views
+from bevcli.geometry.cameras import Camera, CameraRig, Distortion, default_ego_from_bev
+from bevcli.geometry.transforms import inverse, rigid, rotation_about_z
+
+AHEAD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+BLANK = np.zeros((2, 2), dtype=np.uint8)
+SPEED, TURN = 6.0, 0.3  # m/s and rad/s
+
+
+def pose_after(seconds: float) -> np.ndarray:
+    """World_from_ego of a vehicle that drives along x, and turns faster and faster."""
+    return rigid((SPEED * seconds, 0, 0), rotation_about_z(TURN * seconds**2))
+
+
+def view(seconds: float) -> View:
+    return View(BLANK, BLANK, 0, np.stack([pose_after(seconds + delay) for delay in DELAYS_S]))
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """Two cameras, one pair of frames, and points that both cameras see in both."""
+    cameras = tuple(
+        Camera(name, 1000, 600, np.array([[600.0, 0, 500], [0, 600, 300], [0, 0, 1]]), rigid(place, turn @ AHEAD))
+        for name, place, turn in (("A", (1, 0.5, 1.5), np.eye(3)), ("B", (1, -0.5, 1.6), rotation_about_z(-0.4)))
+    )
+    rig = CameraRig(cameras, default_ego_from_bev())
+    views = Views(rig, rig, ((0, 1),), {(place, camera): view(place / 2) for place in (0, 1) for camera in (0, 1)})
+    return views, Unknowns.of(views, CalibrateOptions())
+
+
+def rays_in(views: Views, group: tuple[int, int, int], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit directions of points of the world in both images of a group."""
+    rays = []
+    for place, index in ((0, group[1]), (1, group[2])):
+        camera = inverse(pose_after(place / 2) @ views.rig.cameras[index].ego_from_camera)
+        seen = points @ camera[:3, :3].T + camera[:3, 3]
+        rays.append(seen / np.linalg.norm(seen, axis=-1, keepdims=True))
+    return rays[0], rays[1]
+
+
+def points_of(views: Views, points: np.ndarray) -> EpipolarResiduals:
+    """The same points in every group."""
+    rays = [rays_in(views, group, points) for group in views.groups()]
+    group = np.repeat(np.arange(len(rays)), len(points))
+    return EpipolarResiduals(
+        group, *(np.concatenate([each[side] for each in rays]) for side in (0, 1)), np.full(len(group), 600.0)
+    )
+
+
+SCENE = np.random.default_rng(0).uniform((12, -8, 0), (30, 3, 8), (60, 3))
+ROAD = np.random.default_rng(1).uniform((8, -3, 0), (20, 3, 0), (40, 3))
+
+
+def test_points_of_a_rigid_world_leave_no_residual(drive):
+    views, unknowns = drive
+    assert np.abs(values(unknowns, points_of(views, SCENE), np.zeros(len(unknowns.deviations)))).max() < 1e-6
+
+
+def test_a_turned_camera_leaves_residuals_of_pixels(drive):
+    views, unknowns = drive
+    x = np.zeros(len(unknowns.deviations))
+    x[0] = np.radians(1.0)  # camera A, pitch: 600 px times 1° is 10 px
+    residuals = points_of(views, SCENE)
+    within_a = residuals.group == views.groups().index((0, 0, 0))
+    assert 0.2 < np.abs(values(unknowns, residuals, x)[within_a]).mean() < 11
+
+
+def test_points_of_a_flat_road_leave_no_residual(drive):
+    views, unknowns = drive
+    rays_a, rays_b = rays_in(views, (0, 0, 0), ROAD)
+    road = RoadResiduals(
+        np.zeros(len(ROAD), dtype=int), rays_a, rays_b, np.tile(np.eye(3)[:2], (40, 1, 1)), rays_a[:, 0]
+    )
+    x = np.zeros(len(unknowns.deviations))
+    assert np.abs(values(unknowns, road, x)).max() < 1e-9
+    x[HEIGHT] = 0.05
+    assert np.abs(values(unknowns, road, x)).max() > 1e-3
+
+
+def test_derivatives_are_those_of_finite_differences(drive):
+    views, unknowns = drive
+    residuals, x = points_of(views, SCENE[:5]), np.linspace(-0.01, 0.01, len(unknowns.deviations))
+    _, slopes = derivatives(unknowns, residuals, x)
+    for place in range(0, len(x), 3):
+        step = np.zeros(len(x))
+        step[place] = 1e-5
+        expected = (values(unknowns, residuals, x + step) - values(unknowns, residuals, x - step)) / 2e-5
+        mine = (slopes[:, 0] * (unknowns.columns[residuals.group] == place)).sum(-1)
+        assert np.allclose(mine, expected[:, 0], atol=1e-2 * max(np.abs(expected).max(), 1))
+
+
+def test_a_camera_on_the_level_of_a_pavement_is_put_right(drive):
+    views, unknowns = drive
+    residuals = points_of(views, SCENE)
+    groups = unknowns.groups[residuals.group]
+    x = np.zeros(len(unknowns.deviations))
+    x[OF_CAMERA + HEIGHT] = -0.14  # camera B, seen from a kerb
+    found = level_corrections(unknowns, residuals.where(groups[:, 1] != groups[:, 2]), x)
+    assert found[HEIGHT] + 0.14 - found[OF_CAMERA + HEIGHT] == pytest.approx(0, abs=0.02)
+
+
+def test_a_delay_moves_the_vehicle(drive):
+    _, unknowns = drive
+    x = np.zeros(len(unknowns.deviations))
+    x[6] = x[OF_CAMERA + 6] = 0.1
+    expected = inverse(pose_after(0.6)) @ pose_after(0.1)
+    assert np.allclose(geometry_at(unknowns, x).ego_b_from_ego_a[0], expected, atol=1e-3)
+
+
+def test_points_beside_a_turn_are_measured_from_its_arc():
+    radius = 20.0
+    angle = 0.2
+    later = rigid((radius * np.sin(angle), radius * (1 - np.cos(angle)), 0), rotation_about_z(angle))
+    on_arc = [radius * np.sin(0.5), radius * (1 - np.cos(0.5)), 0]
+    inside = [0, 3.0, 0]
+    assert np.allclose(beside_way(np.array([on_arc, inside]), inverse(later)), [0, 3], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "distortion",
+    [
+        None,
+        Distortion("brown_conrady", (-0.3, 0.1, 0.001, -0.002, 0.01)),
+        Distortion("kannala_brandt", (0.05, -0.01, 0.002, 0.0)),
+    ],
+)
+def test_rays_are_the_inverse_of_the_projection(distortion):
+    camera = Camera("A", 1000, 600, np.array([[700.0, 0, 480], [0, 690, 310], [0, 0, 1]]), np.eye(4), distortion)
+    points = Rotation.random(200, rng=0).apply([0, 0, 5.0])
+    points = points[points[:, 2] > 3.5]
+    pixels, _ = camera.project(points)
+    assert np.allclose(camera.rays(pixels), points / 5, atol=1e-5)

@@ -1,0 +1,265 @@
+"""VAD-tiny equals the released code, from images to the planned path (float32, CPU).
+
+golden_vad.npz in tests/data holds a part of the original's numbers for the first two frames; all numbers of four frames
+are in the folder golden/ of BEVCLI_SHARED.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import original_reference as original
+import pytest
+import torch
+from vad_rule import rule_vad, vad_shapes, vad_tensor
+
+from bevcli.checkpoints import expected_state
+from bevcli.config import load_config
+from bevcli.model.ego_motion import rotate_history
+from bevcli.model.official_keys import from_official
+from bevcli.model.prepare import PreparedModel, prepare_for_inference
+from bevcli.model.step import ModelInputs
+from bevcli.model.vad.decoding import VADOutputs, decode_futures, decode_lines, decode_plan
+from bevcli.model.vad.motion_head import line_positions
+from bevcli.model.vad.vad import VAD
+
+KEPT = np.load(original.DATA / "golden_vad.npz")
+SCENE_STARTS = (0, 3)
+Arrays = Mapping[str, np.ndarray]
+
+
+@cache
+def model() -> VAD:
+    return rule_vad()
+
+
+@cache
+def prepared_model() -> PreparedModel:
+    return prepare_for_inference(model(), torch.device("cpu"))
+
+
+@cache
+def outputs_of(frame: int, prepared: bool = False) -> VADOutputs:
+    """The outputs for one of the four frames."""
+    network = prepared_model() if prepared else model()
+    history = None if frame in SCENE_STARTS else outputs_of(frame - 1, prepared).bev
+    with torch.inference_mode():
+        return network(original.inputs(frame, model().config), history)
+
+
+def close(found: torch.Tensor | np.ndarray, expected: np.ndarray, tolerance: float) -> None:
+    np.testing.assert_allclose(np.asarray(found), expected.reshape(found.shape), atol=tolerance, rtol=0)
+
+
+def of_frame(arrays: Arrays, frame: int) -> dict[str, np.ndarray]:
+    return {key.partition("_")[2]: arrays[key] for key in arrays if key.startswith(f"f{frame}_")}
+
+
+def check_results(outputs: VADOutputs, expected: Arrays) -> None:
+    """Boxes with futures, lines and plan. Neighbours in score are 1e-5 apart: match by class and place."""
+    config = model().config
+    boxes = decode_futures(outputs, config)
+    close(boxes.scores, expected["scores_3d"], 1e-4)
+    middle = expected["boxes_3d"].astype(float)
+    middle[:, 2] += middle[:, 5] / 2
+    rows = original.match_boxes(boxes, middle, expected["labels_3d"], config.classes)
+    boxes = boxes[rows]
+    assert np.abs(np.array(rows) - np.arange(len(rows))).max() <= 2
+    close(boxes.centers, middle[:, :3], 1e-2)
+    close(boxes.sizes_lwh[:, [1, 0, 2]], middle[:, 3:6], 1e-2)
+    close(np.exp(1j * boxes.yaws), np.exp(-1j * (middle[:, 6] + np.pi / 2)), 1e-3)
+    close(boxes.velocities, middle[:, 7:], 1e-2)
+    futures = boxes.futures[..., 1:] - boxes.centers[:, None, None, :2]
+    close(futures, expected["trajs_3d"].cumsum(2), 1e-2)
+    check_lines(outputs, expected)
+    plan = decode_plan(outputs, config)
+    assert plan.commands == ("right", "left", "straight")
+    close(plan.paths, expected["ego_traj"], 1e-2)
+    np.testing.assert_allclose(plan.times_s, [0.5, 1, 1.5, 2, 2.5, 3])
+
+
+def check_lines(outputs: VADOutputs, expected: Arrays) -> None:
+    lines = decode_lines(outputs, model().config)
+    close(lines.scores, expected["map_scores_3d"], 1e-4)
+    points, names = np.stack(lines.points), np.array(model().config.line_decoder.classes)
+    distance = np.abs(points - expected["map_pts_3d"][:, None]).max((2, 3))
+    distance[names[expected["map_labels_3d"]][:, None] != lines.classes] = np.inf
+    row = distance.argmin(1)
+    assert len(set(row.tolist())) == len(row)
+    assert np.abs(row - np.arange(len(row))).max() <= 2
+    close(points[row], expected["map_pts_3d"], 1e-2)
+
+
+def check_stages(outputs: VADOutputs, expected: Arrays) -> None:
+    """What enters the results, stage by stage."""
+    close(outputs.class_logits[:, 0], expected["all_cls_scores"], 1e-3)
+    codes = torch.from_numpy(expected["all_bbox_preds"])
+    close(outputs.box_codes[:, 0, :, :8], codes[..., :8].numpy(), 1e-2)
+    lines, motion = outputs.lines, outputs.motion
+    close(lines.class_logits[:, 0], expected["map_all_cls_scores"], 1e-3)
+    close(lines.points[-1, 0] * torch.tensor([30.0, 60.0]), expected["map_all_pts_preds_last"] * (30, 60), 1e-2)
+    close(motion.offsets[0], expected["traj_preds"], 1e-2)
+    close(motion.mode_logits[0], expected["traj_cls"], 1e-3)
+    close(outputs.plan[0], expected["ego_fut_preds"], 1e-2)
+    with torch.inference_mode():
+        check_selection(outputs, expected)
+
+
+def check_selection(outputs: VADOutputs, expected: Arrays) -> None:
+    """The lines that objects attend to; the released code selects them, ours masks them."""
+    network, lines = model(), outputs.lines
+    tokens = network.map_tokens(lines)
+    nearest = line_positions(lines.points[-1])
+    keep = expected["map_keep"]
+    assert np.array_equal(tokens.scores[0] > 0.5, keep)
+    index = (lines.points[-1, 0] - nearest[0][:, None]).abs().sum(-1).argmin(-1)
+    assert np.array_equal(index, expected["map_near_index"])
+    close(nearest[0], expected["map_near_pos"], 1e-4)
+    relative, masked = network.motion_head.lines_in_reach(network.positions(outputs.box_codes[-1]), tokens)
+    columns = [*np.flatnonzero(keep), len(keep)]
+    assert np.array_equal(masked[0][:, columns], expected["agent_map_masked"])
+    assert masked[0][:, :-1][:, ~keep].all()
+    close(relative[0, ::10][:, columns], expected["agent_map_pos_sub"], 1e-4)
+    close(tokens.features[0, :, ::2], expected["lane_query_sub"], 1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("frame", [0, 1])
+def test_vad_equals_the_original(frame: int) -> None:
+    outputs, expected = outputs_of(frame), of_frame(KEPT, frame)
+    close(outputs.bev[0, ::111], expected["bev_embed_sub"], 1e-3)
+    check_stages(outputs, expected)
+    check_results(outputs, expected)
+
+
+def test_the_released_files_keys_are_those_of_the_model() -> None:
+    released = {key: torch.empty(shape, device="meta") for key, shape in vad_shapes().items()}
+    assert len(released) == 746
+    found, left_out = from_official(released)
+    assert left_out == "pts_bbox_head.map_code_weights"
+    expected = expected_state(load_config("vad-tiny"))
+    assert {key: x.shape for key, x in found.items()} == {key: x.shape for key, x in expected.items()}
+
+
+def test_the_weights_follow_the_rule_of_the_goldens(shared: Path) -> None:
+    sys.path.insert(0, str(shared / "golden"))
+    try:
+        rule = importlib.import_module("rule_vad")
+    finally:
+        sys.path.pop(0)
+    left_out = ("img_", "pts_bbox_head.bev_embedding", "pts_bbox_head.code_weights")
+    keys = [key for key in vad_shapes() if not key.startswith(left_out)]
+    for key in keys[::5]:
+        shape = vad_shapes()[key]
+        np.testing.assert_array_equal(vad_tensor(key, shape), rule.fill_vad(key, shape), err_msg=key)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("frame", [0, 1, 2, 3])
+def test_prepared_vad_equals_all_results(shared: Path, frame: int) -> None:
+    expected = of_frame(np.load(shared / "golden/golden_vad_tiny.npz"), frame)
+    outputs = outputs_of(frame, prepared=True)
+    close(outputs.bev[0, ::37], expected["bev_embed_sub"], 1e-3)
+    check_stages(outputs, expected)
+    check_results(outputs, expected)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("frame", [0, 1, 2, 3])
+def test_every_stage_of_vad_equals_the_originals(shared: Path, frame: int) -> None:
+    arrays = of_frame(np.load(shared / "golden/golden_vad_tiny.npz"), frame)
+    history = None if frame in SCENE_STARTS else outputs_of(frame - 1).bev
+    inputs = original.inputs(frame, model().config)
+    with torch.inference_mode(), recorded(model()) as stages:
+        outputs = model()(inputs, history)
+    check_inputs(inputs, arrays)
+    if history is not None:
+        check_rotation(history, inputs, arrays)
+    check_inner_stages(stages, arrays)
+    check_references(outputs, arrays)
+    check_stages(outputs, arrays)
+    check_results(outputs, arrays)
+
+
+@contextmanager
+def recorded(network: VAD) -> Iterator[dict[str, Any]]:
+    """The outputs of modules by name, filled in by the next forward pass."""
+    found: dict[str, Any] = {}
+    names = ("neck", "bev_queries", "encoder.layers.0", "encoder.layers.1", "encoder.layers.2", "decoder")
+    names += tuple(f"{head}.{who}_attention" for head in ("motion_head", "planner") for who in ("agent", "line"))
+    parts = {name: network.get_submodule(name) for name in (*names, "line_decoder")}
+    hooks = [
+        part.register_forward_hook(lambda *call, name=name: found.update({name: call[-1]}))
+        for name, part in parts.items()
+    ]
+    try:
+        yield found
+    finally:
+        for hook in hooks:
+            hook.remove()
+
+
+def check_inputs(inputs: ModelInputs, expected: Arrays) -> None:
+    close(inputs.images[0, ..., ::16, ::16], expected["img_sub"], 1e-4)
+    np.testing.assert_allclose(inputs.image_from_bev[0], expected["lidar2img"], atol=1e-3, rtol=1e-5)
+    np.testing.assert_allclose(inputs.can_bus[0], expected["can_bus_in"], atol=2e-5, rtol=1e-6)
+    close(inputs.shift, expected["shift"], 1e-6)
+    projection = model().pillars.project(inputs.image_from_bev, inputs.image_size, inputs.has_image)
+    visible = projection.visible[0].numpy()
+    assert np.array_equal(projection.hit[0].sum(1), expected["bev_mask_count"])
+    if "bev_mask_bits" in expected:
+        assert np.array_equal(np.packbits(visible), expected["bev_mask_bits"])
+        points, seen = projection.reference_points[0, :, ::97].numpy(), visible[:, ::97]
+        close(points[seen], expected["refcam_sub"][seen], 1e-5)
+
+
+def check_rotation(history: torch.Tensor, inputs: ModelInputs, expected: Arrays) -> None:
+    """Each cell takes the old cell that the original takes; -1 is none."""
+    close(model().align_history(history, inputs.rotation_deg)[0, ::97], expected["prev_rot_sub"], 1e-3)
+    numbers = torch.arange(1, history.shape[1] + 1).float()[None, :, None]
+    turned = rotate_history(numbers, inputs.rotation_deg, model().config.bev_grid, "original")
+    assert np.array_equal(turned[0, :, 0] - 1, expected["prev_source"])
+
+
+def check_inner_stages(stages: Mapping[str, Any], expected: Arrays) -> None:
+    close(stages["neck"][0][:, ::8], expected["fpn_sub"], 1e-3)
+    close(stages["bev_queries"][0, ::97], expected["bev_query_sub"], 1e-4)
+    for layer in range(3):
+        close(stages[f"encoder.layers.{layer}"][0, ::97], expected[f"enc{layer}_sub"], 1e-3)
+    bev = stages["encoder.layers.2"][0]
+    close(bev[::37], expected["bev_embed_sub"], 1e-3)
+    close(torch.stack([bev.mean(), bev.std(correction=0), bev.abs().max()]), expected["bev_embed_stat"][:3], 1e-3)
+    close(stages["decoder"][2][0, ::3], expected["hs_last_sub"], 1e-3)
+    close(stages["line_decoder"].features[0].flatten(0, 1)[::19], expected["map_hs_last_sub"], 1e-3)
+    close(stages["motion_head.agent_attention"][0, ::7, ::4], expected["motion_hs_sub"], 1e-3)
+    close(stages["motion_head.line_attention"].flatten(0, 1)[::7, ::4], expected["ca_motion_sub"], 1e-3)
+    close(stages["planner.agent_attention"][0, 0], expected["ego_agent_query"], 1e-3)
+    close(stages["planner.line_attention"][0, 0], expected["ego_map_query"], 1e-3)
+
+
+def check_references(outputs: VADOutputs, expected: Arrays) -> None:
+    """Reference points before and after each layer, the lines' bounds and the objects' vectors."""
+    grid = model().config.bev_grid
+    low, high = np.array([grid.x_range_m, grid.y_range_m, grid.z_range_m]).T
+    centers = outputs.box_codes[:, 0][..., [0, 1, 4]].numpy()
+    close((centers - low) / (high - low), expected["inter_references"], 1e-4)
+    points = outputs.lines.points[:, 0]
+    close(points.flatten(1, 2), expected["map_inter_references"], 1e-4)
+    first, last = points.amin(2), points.amax(2)
+    close(torch.cat([(first + last) / 2, last - first], dim=-1), expected["map_all_bbox_preds"], 1e-4)
+    close(outputs.motion.features[0, :, ::4], expected["agent_query_sub"], 1e-3)
+    lines = decode_lines(outputs, model().config)
+    bounds = np.array([[*line.min(0), *line.max(0)] for line in lines.points])
+    close(bounds[np.lexsort(bounds.T)], expected["map_boxes_3d"][np.lexsort(expected["map_boxes_3d"].T)], 1e-2)
+    if "init_reference" in expected:
+        close(model().decoder.object_queries(1).reference_points[0].detach(), expected["init_reference"], 1e-5)
+        close(model().line_decoder.queries(1).reference_points[0].detach(), expected["map_init_reference"], 1e-5)

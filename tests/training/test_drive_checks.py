@@ -1,0 +1,227 @@
+"""A training looks at its drives before it writes anything: classes, ground truth, lengths and the split."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from command_line import MINI_TOML, command
+from small_fleet import write_fleet
+
+from bevcli.config import load_config
+from bevcli.errors import BevcliError, ConfigError, InputError
+from bevcli.synth.drives import FolderDrives
+from bevcli.synth.options import DriveOptions
+from bevcli.synth.splits import read_split, scored_drives
+from bevcli.training.changes import with_changes
+from bevcli.training.drive_checks import check_scored_drives, check_training_drives
+from bevcli.training.job import TrainingConfig, TrainingJob, prepare_training
+from bevcli.training.options import TrainOptions
+from bevcli.training.samples import ClipConfig
+
+CPU = torch.device("cpu")
+SETTINGS = {"clips.frames": "2", "clips.batch": "1", "held_out": "1", "steps": "1"}
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four drives of three frames with a car and a bicycle each, and mini.toml."""
+    folder = tmp_path_factory.mktemp("fleet")
+    write_fleet(folder, 4, truth=True)
+    write_fleet(folder / "without", 2)
+    (folder / "mini.toml").write_text(MINI_TOML)
+    return folder
+
+
+@pytest.fixture
+def prepare(fleet: Path, tmp_path: Path) -> Callable[..., TrainingJob]:
+    """`prepare_training` of the drives d000 to d003, into tmp_path/out."""
+
+    def prepare(
+        *names: str, classes: tuple[str, ...] = (), changes: dict[str, str] = SETTINGS, **data: object
+    ) -> TrainingJob:
+        toml = tmp_path / "mini.toml"
+        text = MINI_TOML.partition("cameras =")
+        toml.write_text(
+            f'name = "mini"\nclasses = {json.dumps(classes)}\n{"".join(text[1:])}' if classes else MINI_TOML
+        )
+        folders = tuple(fleet / name for name in names)
+        options = TrainOptions(out=tmp_path / "out", changes={**SETTINGS, **changes})
+        return prepare_training(str(toml), CPU, DriveOptions(data=folders, **data), options)
+
+    return prepare
+
+
+def test_a_note_a_set_names_dropped_boxes_with_counts(prepare: Callable[..., TrainingJob]) -> None:
+    job = prepare("d000", "d001", "d002", classes=("bicycle", "deer"))
+    dropped, absent, scored, _ = job.notes
+    assert dropped.startswith(
+        "the 2 drives to train on: 6 boxes have other classes and are not trained on: car (6) (`class_map`"
+    )
+    assert absent == "the 2 drives to train on: no box has the class deer of the model mini"
+    assert scored.startswith("the drive to score on: 3 boxes have other classes and are not scored: car (3)")
+
+
+def test_no_known_class_is_an_error(prepare: Callable[..., TrainingJob], tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"has no class of the model mini \(expected deer; found bicycle \(6\), car"):
+        prepare("d000", "d001", "d002", classes=("deer",))
+    with pytest.raises(InputError, match=r"ground truth of rendered drives has no class .*set classes in the model's"):
+        prepare(classes=("deer",), rendered=(1, 2))
+    assert not (tmp_path / "out").exists()
+    assert prepare("d000", "d001", classes=("deer",), class_map={"car": "deer"}).out.is_dir()
+
+
+@pytest.mark.parametrize(
+    ("names", "changes", "message"),
+    [
+        (
+            ("d000", "without/d000", "d001"),
+            {},
+            "d000: 3 of 3 frames to train on have no ground truth boxes, the first is frame 0",
+        ),
+        (("d000", "d001", "d002"), {"clips.frames": "4"}, r"fewer frames than a clip, 4 .*: d000 \(3\), d001 \(3\)"),
+        (("d000", "d001"), {"held_out": "2"}, "2 drives are too few with 2 of them held out"),
+        (("d000", "nowhere", "d001"), {}, "nowhere: is missing"),
+        (("d000", "d001"), {"clips.bach": "2"}, 'unknown key "clips.bach"; did you mean "clips.batch"'),
+    ],
+)
+def test_refused_drives_leave_no_folder(
+    names: tuple[str, ...], changes: dict, message: str, prepare: Callable[..., TrainingJob], tmp_path: Path
+) -> None:
+    with pytest.raises(BevcliError, match=message) as caught:
+        prepare(*names, changes=changes)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_frame_without_ground_truth_is_named(fleet: Path, tmp_path: Path) -> None:
+    drive = shutil.copytree(fleet / "d000", tmp_path / "part")
+    truth = json.loads((drive / "ground_truth.json").read_text())
+    (drive / "ground_truth.json").write_text(json.dumps(truth | {"frames": truth["frames"][1:]}))
+    drives, config = FolderDrives([drive], load_config("tiny")), load_config("tiny")
+    with pytest.raises(InputError, match=r"part: 1 of 3 frames to train on have no ground truth boxes, .* frame 0"):
+        check_training_drives(DriveOptions(), drives, None, ClipConfig(frames=2), config)
+    assert check_training_drives(DriveOptions(), drives, None, ClipConfig(frames=2, short_share=0.0), config)
+
+
+def test_wrong_weights_leave_no_folder(fleet: Path, tmp_path: Path) -> None:
+    options = TrainOptions(tmp_path / "out", changes=SETTINGS, weights=fleet / "mini.toml")
+    with pytest.raises(BevcliError):
+        prepare_training(str(fleet / "mini.toml"), CPU, DriveOptions(data=(fleet / "d000", fleet / "d001")), options)
+    assert not (tmp_path / "out").exists()
+
+
+def test_rendered_drives_are_as_long_as_a_clip(prepare: Callable[..., TrainingJob]) -> None:
+    with pytest.raises(InputError, match=r"fewer frames than a clip, 21 .*: rendered drives \(20\)"):
+        prepare(rendered=(1, 2), changes={"clips.frames": "21"})
+
+
+def test_scored_drives_have_notes_too(fleet: Path) -> None:
+    config = replace(load_config(fleet / "mini.toml"), classes=("car", "Rad"))
+    data = DriveOptions(data=(fleet / "d000",))
+    (dropped, _) = check_scored_drives(data, scored_drives(data, config), config)
+    assert dropped.startswith("the drive: 3 boxes have other classes and are not scored: bicycle (3)")
+    with pytest.raises(InputError, match="has no class of the model"):
+        check_scored_drives(data, scored_drives(data, config), replace(config, classes=("deer",)))
+
+
+def test_a_split_file_states_both_sets(fleet: Path, tmp_path: Path) -> None:
+    file = fleet / "good.toml"
+    file.write_text('train = ["d000", "d001"]\nvalidate = ["d003"]\n')
+    options = TrainOptions(tmp_path / "out", changes=SETTINGS)
+    job = prepare_training(str(fleet / "mini.toml"), CPU, DriveOptions(split=file), options)
+    assert [job.drives.open(index).name for index in range(len(job.drives))] == ["d000", "d001"]
+    assert [job.held_out.open(index).name for index in range(len(job.held_out))] == ["d003"]
+    assert read_split(job.out / "split.toml") == read_split(file)
+    scored = scored_drives(DriveOptions(split=file), load_config(fleet / "mini.toml"))
+    assert isinstance(scored, FolderDrives)
+    assert [scored.open(index).name for index in range(len(scored))] == ["d003"]
+    with pytest.raises(InputError, match="states the drives: remove `data`, or `split`"):
+        scored_drives(DriveOptions(data=(fleet,), split=file), load_config(fleet / "mini.toml"))
+    with pytest.raises(InputError, match="remove `held_out`, or `split`"):
+        prepare_training("demo", CPU, DriveOptions(split=file), TrainOptions(tmp_path / "other", held_out=1))
+
+
+def test_a_training_states_its_drives(prepare: Callable[..., TrainingJob], fleet: Path) -> None:
+    split = read_split(prepare("d001", "d000", "d003").out / "split.toml")
+    assert (split.train, split.validate) == ((fleet / "d001", fleet / "d000"), (fleet / "d003",))
+
+
+def test_a_star_stands_for_folders_in_order(fleet: Path) -> None:
+    file = fleet / "star.toml"
+    file.write_text('train = ["d00?"]\nvalidate = ["without/d*"]\n')
+    assert [path.name for path in read_split(file).train] == ["d000", "d001", "d002", "d003"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('train = ["d000"]\n', "expected the keys train and validate, found train"),
+        ('train = ["d000"]\nvalidate = []\n', "validate: leaves no drive"),
+        ('train = ["d000"]\nvalidate = ["d9*"]\n', r"validate: d9\*: there is no such folder"),
+        ('train = ["d000"]\nvalidate = ["./d000"]\n', "d000 stands there twice"),
+        ('train = "d000"\nvalidate = ["d001"]\n', "train: expected a list of folders"),
+    ],
+)
+def test_a_wrong_split_is_one_clear_line(text: str, message: str, fleet: Path) -> None:
+    file = fleet / "wrong.toml"
+    file.write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_split(file)
+
+
+def test_changes_have_the_types_of_toml() -> None:
+    changes = {
+        "optimizer.learning_rate": "1e-4",
+        "clips.batch": "2",
+        "weights_dtype": "float16",
+        "clips.learn": '"all"',
+    }
+    changed = with_changes(TrainingConfig(), changes)
+    assert changed.optimizer.learning_rate == 1e-4
+    assert changed.clips == ClipConfig(batch=2, learn="all")
+    assert changed.weights_dtype == "float16"
+    assert with_changes(TrainingConfig(), {"training.rigs.cameras": "[5, 6]"}).rigs.cameras == (5, 6)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("learning_rte", "1", 'unknown key "learning_rte"; did you mean "optimizer.learning_rate"'),
+        ("clips.batch", "two", "\"training.clips.batch\" must be an integer, but is 'two'"),
+        ("clips", "2", 'unknown key "clips"; did you mean "clips'),
+        ("clips.batch", "0", r"\[training.clips\]: frames and batch must be positive"),
+        ("zzz", "0", "the keys are in the table of docs/training.md"),
+    ],
+)
+def test_a_wrong_change_is_one_clear_line(key: str, value: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=f"`changes`: .*{message}"):
+        with_changes(TrainingConfig(), {key: value})
+
+
+def test_the_command_says_what_a_step_is_and_counts_updates(fleet: Path, tmp_path: Path) -> None:
+    settings = [
+        text for key, value in (SETTINGS | {"clips.learn": "all"}).items() for text in ("--set", f"{key}={value}")
+    ]
+    drives = [text for name in ("d000", "d001") for text in ("--data", str(fleet / name))]
+    done = command(
+        tmp_path, "train", "--model", fleet / "mini.toml", *drives, *settings, "--out", "out", "--log", "tensorboard"
+    )
+    assert done.returncode == 0, done.stderr
+    lines = done.stderr.splitlines()
+    assert lines[0] == (
+        "a step is 2 updates of the weights, one for each frame of a batch: 1 batch of 1 clip of 2 frames; "
+        "1 steps; drives: 1 to train on, 1 to evaluate on; output: out"
+    )
+    assert lines[1].startswith("note: the drive to train on: no box has the class truck or ")
+    assert lines[3].startswith("1/2 updates, ")
+    assert ", step 1, loss " in lines[3]
+    assert (tmp_path / "out" / "weights.safetensors").stat().st_mode & 0o777 == (
+        fleet / "mini.toml"
+    ).stat().st_mode & 0o777
+    assert list((tmp_path / "out" / "tensorboard").glob("events.out.tfevents.*"))

@@ -1,0 +1,155 @@
+"""A training that starts from the weights of a model with other classes, cameras, cells or parts."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import safetensors.torch
+import torch
+from memory_drive import make_rig
+
+from bevcli.checkpoints import bundled_weights
+from bevcli.errors import WeightsError
+from bevcli.geometry.cameras import CameraRig
+from bevcli.geometry.object_classes import ClassSettings
+from bevcli.inference.training_rigs import facts_notes, weights_facts
+from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.training.files import save_weights
+from bevcli.training.warm_start import WarmStart, warm_start
+from bevcli.weights.local import weights_file
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
+
+from small_model import small_config, small_model
+
+PREFIX, LAST = "detection_head.class_branches", "6"  # the linear layer with a row for each class
+RIG = make_rig({"front": 5.0, "left": 100.0, "rear": -178.0})
+
+
+def no_rig() -> CameraRig:
+    raise AssertionError("the names of the cameras suffice")
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights of a model with the classes car, pedestrian and barrier, and the cameras CAM_FRONT and CAM_BACK."""
+    path = tmp_path_factory.mktemp("warm") / "source.safetensors"
+    save_weights(path, small_model(1, name="source", cameras=("CAM_FRONT", "CAM_BACK")), torch.float32)
+    return path
+
+
+def own_model(**changes: object) -> BEVFormer:
+    settings = {"PKW": ClassSettings(like="car")}
+    classes = ("barrier", "PKW", "deer", "car")
+    given = {"name": "own", "classes": classes, "class_settings": settings, "cameras": ("CAM_FRONT", "CAM_BACK")}
+    return small_model(2, **{**given, **changes})
+
+
+def tensors(path: Path) -> dict[str, torch.Tensor]:
+    return dict(safetensors.torch.load_file(path))
+
+
+def test_rows_of_classes_go_by_name_and_by_like(source: Path) -> None:
+    model, before, given = own_model(), own_model().state_dict(), tensors(source)
+    start = warm_start(source, model, "own.toml", no_rig)
+    for layer in range(2):
+        for kind in ("weight", "bias"):
+            key = f"{PREFIX}.{layer}.{LAST}.{kind}"
+            car, _, barrier = given[key]
+            found = model.state_dict()[key]
+            assert torch.equal(found, torch.stack([barrier, car, before[key][2], car]))
+    table = start.table()
+    assert table.startswith(f"own.toml starts from {source} (model source): ")
+    assert " barrier, PKW from car, car\n" in table
+    assert " not in the file: deer\n" in table
+    assert table.endswith("not in the model: pedestrian")
+
+
+def test_every_other_tensor_is_that_of_the_file(source: Path) -> None:
+    model, given = own_model(), tensors(source)
+    start = warm_start(source, model, "own.toml", no_rig)
+    same = [key for key, tensor in model.state_dict().items() if not key.startswith(PREFIX)]
+    assert all(torch.equal(model.state_dict()[key], given[key]) for key in same)
+    row = 2 * (32 + 1)  # of a class: weights and a bias of each of two layers
+    assert (start.numbers("new"), start.numbers("unused")) == (row, row)
+    assert start.numbers("loaded") + row == sum(tensor.numel() for tensor in model.state_dict().values())
+
+
+def test_cameras_of_other_names_take_the_nearest_view(source: Path) -> None:
+    model, given = own_model(cameras=("rear", "front", "CAM_BACK", "roof")), tensors(source)
+    start = warm_start(source, model, "own.toml", lambda: RIG)
+    front, back = given["image_tokens.camera_embedding"]
+    embedding = model.image_tokens.camera_embedding
+    torch.testing.assert_close(embedding.data, torch.stack([back, front, back, (front + back) / 2]))
+    assert embedding.requires_grad
+    assert "rear from CAM_BACK, front from CAM_FRONT, CAM_BACK, roof from the mean of all; by heading" in start.table()
+
+
+def test_views_of_unknown_heading_take_the_mean(tmp_path: Path) -> None:
+    path = tmp_path / "source.safetensors"
+    save_weights(path, small_model(1), torch.float32)  # its cameras are FRONT and BACK
+    model = own_model(cameras=("left",))
+    warm_start(path, model, "own.toml", lambda: RIG)
+    mean = tensors(path)["image_tokens.camera_embedding"].mean(0)
+    torch.testing.assert_close(model.image_tokens.camera_embedding.data[0], mean)
+
+
+def test_parts_that_only_one_model_has_are_listed(source: Path) -> None:
+    decoder = replace(small_config().decoder, layers=1, queries=9)
+    start = warm_start(source, own_model(decoder=decoder), "own.toml", no_rig)
+    assert "another shape in the file (decoder.query_embedding: 12 × 64 and 9 × 64)" in start.table()
+    assert "not in the model (decoder.layers.1." in start.table()
+
+
+def test_weights_of_another_network_are_refused(source: Path) -> None:
+    model = own_model(channels=64)
+    before = {key: tensor.clone() for key, tensor in model.state_dict().items()}
+    with pytest.raises(WeightsError, match=r"source\.safetensors: holds \d+% .* of own\.toml .*of model source"):
+        warm_start(source, model, "own.toml", no_rig)
+    assert all(torch.equal(tensor, before[key]) for key, tensor in model.state_dict().items())
+
+
+def test_a_file_without_names_keeps_the_order_of_its_rows(tmp_path: Path) -> None:
+    path = tmp_path / "bare.safetensors"
+    given = small_model(1).state_dict()
+    safetensors.torch.save_file(given, path)
+    model = small_model(2)
+    assert "rows in the file's order" in warm_start(path, model, "small", no_rig).table()
+    assert all(torch.equal(tensor, given[key]) for key, tensor in model.state_dict().items())
+    other = own_model()
+    assert "another shape in the file (detection_head.class_branches" in warm_start(path, other, "x", no_rig).table()
+
+
+@pytest.mark.parametrize("stated", ["no JSON", "3", "[1, 2]", '["car"]', "[]"])
+def test_wrong_names_in_the_metadata_are_no_traceback(stated: str, tmp_path: Path) -> None:
+    path = tmp_path / "odd.safetensors"
+    safetensors.torch.save_file(small_model(1).state_dict(), path, {"classes": stated, "cameras": stated})
+    assert isinstance(warm_start(path, own_model(), "own.toml", lambda: RIG), WarmStart)
+
+
+def test_saved_weights_name_their_classes_and_cameras(source: Path) -> None:
+    with safetensors.safe_open(source, framework="pt") as file:
+        facts = file.metadata()
+    assert json.loads(facts["classes"]) == ["car", "pedestrian", "barrier"]
+    assert json.loads(facts["cameras"]) == ["CAM_FRONT", "CAM_BACK"]
+
+
+def test_a_run_notes_classes_of_other_names() -> None:
+    config = small_config()
+    assert not list(facts_notes(weights_facts(config), config))
+    (note,) = facts_notes(weights_facts(config), replace(config, classes=("pedestrian", "car", "barrier")))
+    assert "the weights were trained for the classes car, pedestrian, barrier, but the model's file names" in note
+
+
+def test_weights_have_the_name_of_their_model(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("BEVCLI_WEIGHTS_DIR", str(tmp_path))
+    assert weights_file(source) == source
+    assert weights_file(Path("demo")) == bundled_weights("demo")
+    with pytest.raises(WeightsError, match="the weights of base are not there yet: run `bevcli weights fetch base`"):
+        weights_file(Path("base"))
+    with pytest.raises(WeightsError, match='no weights are known as "nothing"'):
+        weights_file(Path("nothing"))
