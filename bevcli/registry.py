@@ -13,6 +13,7 @@ from bevcli.errors import BevcliError
 Group = Literal[
     "bevcli.models",
     "bevcli.sequences",
+    "bevcli.label_formats",
     "bevcli.drive_writers",
     "bevcli.box_formats",
     "bevcli.label_formats",

@@ -43,7 +43,7 @@ def convert(
         raise OutputError(f"{out}: contains the input: choose another path")
     sequence = open_sequence(source, replace(options, ego_motion="optional"), **format_options)
     if labels.labels is not None:
-        sequence = WithLabels(sequence, labels.labels, only_labelled=labels.only_labelled)
+        sequence = WithLabels(sequence, labels.labels, labels)
     count = len(sequence.stamps)
     gaps = 0
     with (

@@ -1,4 +1,4 @@
-"""`bevcli samples`: copy the sample drive of the package into the current folder."""
+"""`bevcli samples`: copy the sample drive and the notebook of the package into the current folder."""
 
 import shutil
 from pathlib import Path
@@ -8,9 +8,10 @@ import typer
 
 from bevcli.errors import OutputError
 from bevcli.printing import say
+from bevcli.writing import whole_file
 
 PANEL = "Start"
-NAME = "street"
+NAME, NOTEBOOK = "street", "first_steps.ipynb"
 
 
 def samples(
@@ -18,19 +19,29 @@ def samples(
         "samples"
     ),
 ) -> None:
-    """Copy the sample drive, a rendered street, to DIR/street. It is a complete sequence folder.
+    """Copy the sample drive, a rendered street, to DIR/street, and the notebook first_steps.ipynb.
 
-    An existing DIR/street is left as it is.
+    The drive is a complete sequence folder. What exists in DIR is left as it is.
     """
-    target = out / NAME
-    if target.exists():
-        say(f"{target}: exists already")
-        return
     package = Path(__file__).parents[1]
-    installed = package / "samples" / NAME
-    try:
-        # An editable installation has the sample beside the package.
-        shutil.copytree(installed if installed.is_dir() else package.parent / "samples" / NAME, target)
-    except OSError as error:
-        raise OutputError(f"{target}: cannot be written ({error.strerror or error})") from None
-    say(f"{target}: copied; run `bevcli run {target}`")
+    installed = package / "samples"
+    # An editable installation has the samples beside the package.
+    source = installed if installed.is_dir() else package.parent / "samples"
+    for name, advice in ((NAME, f"run `bevcli run {out / NAME}`"), (NOTEBOOK, "needs pip install 'bevcli[notebook]'")):
+        target = out / name
+        if target.exists():
+            say(f"{target}: exists already")
+            continue
+        try:
+            _copy(source / name, target)
+        except OSError as error:
+            raise OutputError(f"{target}: cannot be written ({error.strerror or error})") from None
+        say(f"{target}: copied; {advice}")
+
+
+def _copy(source: Path, target: Path) -> None:
+    if source.is_dir():
+        shutil.copytree(source, target)
+    else:
+        with whole_file(target) as unfinished:
+            shutil.copyfile(source, unfinished)

@@ -135,14 +135,18 @@ class LabelOptions:
     labels: Path | None = option(
         reads="path",
         default=None,
-        help="Ground truth in place of that of INPUT: a CSV table with the columns of `bevcli export --format csv`, or "
-        "an OpenLABEL file.",
+        help="Ground truth in place of that of INPUT: a CSV table with the columns of `bevcli export --format csv`, an "
+        "OpenLABEL file, or KITTI labels.",
         metavar="FILE",
     )
     only_labelled: bool = option(
         default=False,
-        help="Frames without a row in a CSV table of labels have no ground truth. By default they are labelled and "
-        "empty.",
+        help="Frames without a row in a table of labels have no ground truth. By default they are labelled and empty.",
+    )
+    labels_camera: str | None = option(
+        default=None,
+        help="The camera in whose frame KITTI labels are. Default: the one that looks most directly ahead.",
+        metavar="NAME",
     )
 
 

@@ -30,7 +30,7 @@ SECTIONS = {
     ],
     "Calibrate": ["docs/calibration"],
     "Score": ["docs/scoring", "docs/robustness"],
-    "Train": ["docs/training", "docs/model-card"],
+    "Train": ["docs/fine-tune", "docs/training", "docs/model-card"],
     "Deploy": ["docs/deploy", "docs/speed", "docs/fleet"],
     "Understand": ["docs/bevformer", "docs/vad", "docs/glossary"],
     "Python and extensions": ["docs/python", "docs/live", "docs/extend", "docs/reference"],

@@ -1,5 +1,7 @@
 """The options that select inputs, models and devices."""
 
+import json
+
 import pytest
 import torch
 from typer.testing import CliRunner
@@ -69,3 +71,4 @@ def test_the_sample_drive_is_copied_once(tmp_path):
         assert result.exit_code == 0
         assert words in result.output
     assert len(open_sequence(tmp_path / "samples/street").stamps) == 20
+    assert json.loads((tmp_path / "samples/first_steps.ipynb").read_text())["cells"]

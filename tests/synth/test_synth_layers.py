@@ -6,7 +6,7 @@ from pathlib import Path
 import bevcli.synth
 
 ROOT = Path(bevcli.synth.__file__).parent
-LAYERS = ("assets", "world", "render", "options", "rig", "drive", "export", "drives")
+LAYERS = ("assets", "world", "render", "options", "rig", "drive", "export", "drives", "splits")
 
 
 def test_parts_import_only_from_lower_parts():

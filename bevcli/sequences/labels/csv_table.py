@@ -1,5 +1,6 @@
 """Labels in a CSV table with the columns of `bevcli export --format csv`."""
 
+import codecs
 import csv
 import io
 from collections.abc import Mapping
@@ -18,17 +19,10 @@ from bevcli.sequences.labels.label_format import LabelFormat, LabelledFrame, Lab
 LARGEST_BYTES = 512 * MIB
 NUMBERS = ("x", "y", "z", "length", "width", "height", "yaw")
 OPTIONAL = (
-    "frame",
-    "timestamp_ns",
-    "frame_of_reference",
-    "vx",
-    "vy",
-    "attribute",
-    "instance",
-    "visibility",
-    "num_points",
-)
+    "frame", "timestamp_ns", "frame_of_reference", "vx", "vy", "attribute", "instance", "visibility", "num_points",
+)  # fmt: skip
 UNUSED = ("scene", "score", "track_score", "duplicate")  # of an export, without effect on ground truth
+SEPARATORS = {";": "semicolons", "\t": "tabs"}
 Row = Mapping[str, str]
 
 
@@ -38,36 +32,44 @@ def read_csv_labels(path: Path) -> Labels:
     The separator is a comma, a semicolon or a tab; with semicolons or tabs, numbers may have decimal commas. A byte
     order mark and CRLF are accepted. All of this is detected, and said in the notes.
     """
-    text, notes = _text(path)
+    text, found = _text(path)
     separator = max(",;\t", key=text.partition("\n")[0].count)
-    notes += (
-        [] if separator == "," else [f"the columns are separated by {'semicolons' if separator == ';' else 'tabs'}"]
-    )
-    reader = csv.DictReader(io.StringIO(text, newline=""), delimiter=separator)
-    columns = [name.strip().lower() for name in reader.fieldnames or ()]
-    reader.fieldnames = columns
-    _check_columns(path, columns)
-    try:
-        rows: list[tuple[int, Row]] = [(reader.line_num, row) for row in reader]
-    except csv.Error as error:
-        raise InputError(f"{path}: is not a table ({error})") from None
+    columns, rows = _rows(path, text, separator)
     table = _Table(path, rows, decimal_comma=separator != "," and any("," in (row["x"] or "") for _, row in rows))
-    notes += ["numbers have decimal commas"] if table.decimal_comma else []
+    found += [f"columns separated by {SEPARATORS[separator]}"] if separator in SEPARATORS else []
+    found += ["decimal commas"] if table.decimal_comma else []
+    notes = [f"found {', '.join(found)}"] if found else []
     others = [name for name in columns if name not in ("class", *NUMBERS, *OPTIONAL, *UNUSED)]
     notes += [f"columns without meaning here are ignored: {', '.join(others)}"] if others else []
     return table.labels(columns, notes)
 
 
+def _rows(path: Path, text: str, separator: str) -> tuple[list[str], list[tuple[int, Row]]]:
+    """The columns, and each row with its line number."""
+    reader = csv.DictReader(io.StringIO(text, newline=""), delimiter=separator)
+    try:
+        columns = [name.strip().lower() for name in reader.fieldnames or ()]
+        reader.fieldnames = columns
+        _check_columns(path, columns)
+        rows: list[tuple[int, Row]] = [(reader.line_num, row) for row in reader]
+    except csv.Error as error:
+        raise InputError(f"{path}: is not a table ({error})") from None
+    for line, row in rows:
+        if None in row:
+            raise InputError(f"{path}: line {line}: has more cells than the {len(columns)} columns of the first line")
+    return columns, rows
+
+
 def _text(path: Path) -> tuple[str, list[str]]:
-    content, notes = read_bytes(path, LARGEST_BYTES), []
-    if content.startswith(b"\xef\xbb\xbf"):
-        content, notes = content[3:], ["the file begins with a byte order mark"]
+    """The text, and the marks of a spreadsheet in it."""
+    content, found = read_bytes(path, LARGEST_BYTES), []
+    if content.startswith(codecs.BOM_UTF8):
+        content, found = content.removeprefix(codecs.BOM_UTF8), ["a byte order mark"]
     try:
         text = content.decode()
     except UnicodeDecodeError:
         raise InputError(f'{path}: is not UTF-8: save it as "CSV UTF-8"') from None
-    notes += ["lines end with CRLF"] if "\r\n" in text else []
-    return text, notes
+    return text, found + (["lines that end with CRLF"] if "\r\n" in text else [])
 
 
 def _check_columns(path: Path, columns: list[str]) -> None:
@@ -159,4 +161,6 @@ class _Table:
         return int(cell) if cell else None
 
 
-FORMAT = LabelFormat("a CSV table (.csv)", lambda path: path.suffix.lower() == ".csv", read_csv_labels)
+FORMAT = LabelFormat(
+    "a CSV table (.csv)", lambda path: path.suffix.lower() == ".csv", lambda path, rig, options: read_csv_labels(path)
+)

@@ -7,7 +7,9 @@ from typing import Literal
 
 from bevcli.errors import InputError
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.cameras import CameraRig
 from bevcli.registry import entries, load
+from bevcli.sequences.options import LabelOptions
 
 GROUP = "bevcli.label_formats"
 FrameOfReference = Literal["world", "ego", "bev"]
@@ -53,18 +55,18 @@ class LabelFormat:
     Attributes:
         name: with an article, for messages.
         recognises: whether a file has this format; looks at its name, or at a few bytes.
-        read: reads a file. Raises InputError.
+        read: reads a file of a drive with this rig. Raises InputError.
     """
 
     name: str
     recognises: Callable[[Path], bool]
-    read: Callable[[Path], Labels]
+    read: Callable[[Path, CameraRig, LabelOptions], Labels]
 
 
-def read_labels(path: Path) -> Labels:
-    """The labels of a file of any known format. Raises InputError."""
+def read_labels(path: Path, rig: CameraRig, options: LabelOptions) -> Labels:
+    """The labels of a file of any known format. rig: of the drive. Raises InputError."""
     known: list[LabelFormat] = [load(GROUP, name) for name in entries(GROUP)]
     found = next((one for one in known if one.recognises(path)), None)
     if found is None:
         raise InputError(f"{path}: is no file of labels (expected {' or '.join(one.name for one in known)})")
-    return found.read(path)
+    return found.read(path, rig, options)

@@ -85,10 +85,8 @@ def read_openlabel(path: Path) -> Labels:
     tilts: list[float] = []
     frames = tuple(_frame(path, content, number, frame, tilts) for number, frame in content.frames.items())
     tilted = sum(tilt > LARGEST_TILT_DEG for tilt in tilts)
-    notes = (
-        (f"{tilted} cuboids are tilted by more than {LARGEST_TILT_DEG:g}°: their boxes are upright",) if tilted else ()
-    )
-    return Labels(SYSTEMS[systems.pop()], frames, lists_empty=True, notes=notes)
+    note = f"{tilted} cuboids are tilted by more than {LARGEST_TILT_DEG:g}°: their boxes are upright"
+    return Labels(SYSTEMS[systems.pop()], frames, lists_empty=True, notes=(note,) if tilted else ())
 
 
 def _cuboids(content: _Content) -> list[tuple[str, str, _Cuboid]]:
@@ -149,4 +147,8 @@ def _time_ns(where: str, stated: str | int | float | None) -> int | None:
         raise InputError(f'{where}: timestamp "{stated:.40}" is not a time such as 2026-01-31T12:00:00.5Z') from None
 
 
-FORMAT = LabelFormat("an OpenLABEL file (.json)", lambda path: path.suffix.lower() == ".json", read_openlabel)
+FORMAT = LabelFormat(
+    "an OpenLABEL file (.json)",
+    lambda path: path.suffix.lower() == ".json",
+    lambda path, rig, options: read_openlabel(path),
+)

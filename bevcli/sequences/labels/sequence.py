@@ -12,6 +12,7 @@ from bevcli.errors import InputError
 from bevcli.frame import DerivedSequence, Frame, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.sequences.labels.label_format import LabelledFrame, Labels, read_labels
+from bevcli.sequences.options import LabelOptions
 from bevcli.sequences.tracks import with_track_velocities
 
 NEAREST_NS = 50_000_000  # largest difference between the time of a frame and of its labels
@@ -23,18 +24,18 @@ class WithLabels(DerivedSequence):
     Labels belong to the frame of the same time, or, where the file has no times, of the same index. Where the file has
     tracks and no velocities, velocities follow from the positions before and after.
 
-    only_labelled: frames that the file does not have are without ground truth, and not labelled and empty.
+    options: of the labels, whose file is `path`.
 
     Raises InputError where the file cannot be read, or where not all of its frames are in the drive.
     """
 
-    def __init__(self, sequence: Sequence, path: Path, *, only_labelled: bool = False) -> None:
+    def __init__(self, sequence: Sequence, path: Path, options: LabelOptions = LabelOptions()) -> None:
         super().__init__(sequence)
-        labels = read_labels(path)
+        labels = read_labels(path, sequence.rig, options)
         if labels.frame_of_reference == "world" and not sequence.has_ego_motion:
             raise InputError(f"{path}: its boxes are in the world frame, but the drive has no ego_motion.csv: add it")
         boxes, note = _with_velocities(sequence, _in_world(sequence, labels, path))
-        self._boxes, self._others_unknown = boxes, labels.lists_empty or only_labelled
+        self._boxes, self._others_unknown = boxes, labels.lists_empty or options.only_labelled
         notes = (*labels.notes, *note, self._summary())
         self.notes = (*sequence.notes, *(f"{path}: {text}" for text in notes))
 
