@@ -1,9 +1,10 @@
 """Writing of files under another name first, so that an interrupted command leaves no partial file."""
 
 import os
+import shutil
 import uuid
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -59,6 +60,37 @@ def write_whole(
     """Write a file, so that readers see the old or the new contents; see `whole_file`."""
     with whole_file(path, parents=parents, shared=shared, regular=regular) as unfinished:
         unfinished.write_bytes(content)
+
+
+@contextmanager
+def whole_folder(folder: Path, parts: Iterable[str]) -> Iterator[None]:
+    """Make a folder, in which the block writes files and folders of these names; after an error they are deleted.
+
+    So is the folder itself if it was missing before. Other files in it are kept.
+    Raises OutputError where the folder cannot be made.
+    """
+    is_new = not folder.exists()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be created ({error.strerror})") from None
+    try:
+        yield
+    except BaseException:
+        with suppress(OSError):
+            remove_parts(folder, parts)
+            if is_new:
+                folder.rmdir()
+        raise
+
+
+def remove_parts(folder: Path, parts: Iterable[str]) -> None:
+    """Delete files and folders of these names in a folder; of a link, the link alone. Raises OSError."""
+    for path in (folder / name for name in parts):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def check_output(path: Path, *inputs: Path) -> None:

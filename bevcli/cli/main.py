@@ -109,7 +109,8 @@ def run_app() -> None:
         sys.exit(0)
     except OSError as error:  # the system refuses: no space, no permission, a name that is too long
         where = "" if error.filename is None else f"{error.filename}: "
-        say(f"error: {one_line(where + str(error.strerror or error))}", err=True)
+        message = None if error.strerror else system_error(error)
+        say(f"error: {message or one_line(where + str(error.strerror or error))}", err=True)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more at its end
         sys.exit(1)
     except Exception as error:

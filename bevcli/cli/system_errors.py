@@ -9,7 +9,9 @@ from bevcli.printing import one_line, reason_of
 
 # Each library words it otherwise.
 NO_MEMORY = re.compile(
-    "map segment|out of memory|bad_alloc|bad allocation|(?:cannot|can't|unable to) allocate|start new thread", re.I
+    "map segment|out of memory|insufficient memory|bad_alloc|bad allocation|(?:cannot|can't|unable to) allocate"
+    "|start new thread",
+    re.I,
 )
 OURS = str(Path(bevcli.__file__).parent)
 

@@ -168,7 +168,7 @@ class RunFiles:
                 self._open_submission(resume.submission)
             if len({stamp.scene for stamp in sequence.stamps}) == 1:  # scenes may have rigs of their own
                 self._folder.add(out / CALIBRATION)
-                write_calibration(out / CALIBRATION, sequence.rig, sequence.facts)
+                write_calibration(out / CALIBRATION, sequence.rig, sequence.facts, regular=True)
             for note in sequence.notes if resume is None else ():
                 self._recording.event(note, "WARN")
             self._stack = self._stack.pop_all()

@@ -97,7 +97,8 @@ class ImageReader:
 
         dropped: cameras already known to have no image, with the reasons.
         Raises InputError where a camera's first image has another size than the calibration states, where an image
-        lies outside of the folder and, with `strict`, for a missing image. Raises WaitError if a disk does not answer.
+        lies outside of the folder, for a folder that is gone and, with `strict`, for a missing image. Raises WaitError
+        if a disk does not answer.
         """
         if self._strict and dropped:
             camera, reason = next(iter(dropped.items()))
@@ -113,6 +114,10 @@ class ImageReader:
                     hint = "replace the image, or remove `strict=True`"
                     raise InputError(f"camera {name}: {unreadable}: {hint}") from None
                 reasons[name] = str(unreadable)
+        if not images and self._inside is not None and not os.path.isdir(self._inside):
+            raise InputError(
+                f"{self._inside}: the folder is gone (expected until the last frame is read): bring it back"
+            )
         return images, reasons
 
     def _read_one(self, source: Source, camera: Camera) -> CameraImage:

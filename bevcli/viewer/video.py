@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from bevcli.errors import InputError, OutputError
+from bevcli.errors import InputError
 from bevcli.recording import entities
 from bevcli.recording.video_images import has_av
 from bevcli.viewer.recording_reader import RecordingReader
@@ -53,7 +53,7 @@ def _check_complete(video: Path, count: int) -> None:
 def _vp9(video: Path, rate: float) -> Iterator[Callable[[np.ndarray], object]]:
     writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*FOURCC[video.suffix.lower()]), rate, (WIDTH, HEIGHT))
     if not writer.isOpened():
-        raise _unwritable(video)
+        raise OSError("OpenCV cannot open it: is its folder there and writable, and is there enough memory?")
     try:
         yield writer.write
     finally:
@@ -64,20 +64,12 @@ def _vp9(video: Path, rate: float) -> Iterator[Callable[[np.ndarray], object]]:
 def _h264(video: Path, rate: float) -> Iterator[Callable[[np.ndarray], object]]:
     import av
 
-    try:
-        container = av.open(str(video), "w", options={"movflags": "+faststart"})
-    except OSError as error:
-        raise _unwritable(video) from error
-    with container:
+    with av.open(str(video), "w", options={"movflags": "+faststart"}) as container:
         exact = Fraction(rate).limit_denominator(1000)
         stream = container.add_stream("libx264", rate=exact, options={"crf": str(H264_QUALITY)})
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
         yield lambda image: container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
         container.mux(stream.encode(None))
-
-
-def _unwritable(video: Path) -> OutputError:
-    return OutputError(f"{video}: the video cannot be written (does the folder exist, and is it writable?)")
 
 
 def frame_rate(recording: Path) -> tuple[int, float]:

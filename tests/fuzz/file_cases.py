@@ -232,8 +232,8 @@ def batch_record(seeds: Path, case: Path, random: Random) -> None:
     record = read_record(content, "d-1")
     if record is not None:
         records = [record, RECORD]
-        assert to_parquet(records)
-        assert to_csv(records)
+        assert to_parquet(records, _model().config.classes)
+        assert to_csv(records, _model().config.classes)
         assert write_report(records, None, _model())
         assert BatchSummary(tuple(records), 2, 0, False, ()).table()
 

@@ -35,7 +35,7 @@ GROUPS = {
     "input or output exchanged under way": Group(exchanged_under_way, 300),
     "state with right hash and wrong content": Group(false_state, 600),
     "ONNX": Group(onnx_file, 600),
-    "mesh with siblings": Group(mesh, 1000),
+    "mesh with siblings": Group(mesh, 400),
     "batch record": Group(batch_record, 1000),
     "SQLite schema": Group(sqlite_schema, 700),
 }

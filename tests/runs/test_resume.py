@@ -320,6 +320,14 @@ def test_pipes_and_devices_in_place_of_files_are_not_waited_for(model, interrupt
             run_all(model, interrupted, resume=True)
 
 
+def test_a_pipe_in_place_of_the_calibration_is_replaced(model, interrupted):
+    calibration = interrupted / "calibration.json"
+    calibration.unlink(missing_ok=True)
+    os.mkfifo(calibration)
+    run_all(model, interrupted, resume=True)
+    assert calibration.is_file()
+
+
 def test_a_pipe_that_appears_under_way_is_replaced(model, tmp_path):
     summary, state = tmp_path / "out/summary.json", tmp_path / "state.safetensors"
     run_all(model, tmp_path / "out", Drive(1), after_frame=lambda frame, prediction: os.mkfifo(summary))

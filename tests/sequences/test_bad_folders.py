@@ -25,6 +25,13 @@ def test_missing_folder(tmp_path):
     assert str(tmp_path / "nothing") in message(tmp_path / "nothing")
 
 
+def test_a_folder_that_is_gone_is_an_error(drive):
+    sequence = open_sequence(drive)
+    shutil.rmtree(drive)
+    with pytest.raises(InputError, match="the folder is gone"):
+        sequence.load(0)
+
+
 def test_folder_of_unknown_format(tmp_path):
     assert "is not a sequence folder" in message(tmp_path)
 

@@ -15,6 +15,8 @@ from bevcli.frame import BevMap
 from bevcli.sequences.files.map_folder import write_map
 from bevcli.sequences.native.writer import NativeWriter
 from bevcli.sequences.open import open_sequence
+from bevcli.sequences.options import WriteOptions
+from bevcli.sequences.output import open_writer
 
 
 def convert(*arguments):
@@ -92,15 +94,35 @@ def write_native(folder, frames):
             writer.write(frame)
 
 
-def test_interrupted_conversion_is_not_a_sequence(drive, tmp_path):
-    def interrupted():
-        yield open_sequence(drive).load(0)
-        raise KeyboardInterrupt
+@pytest.mark.parametrize("form", ["native", "nuscenes", "mcap"])
+def test_an_interrupted_conversion_deletes_what_it_wrote(drive, tmp_path, form):
+    mine = tmp_path / "kept/mine.txt"
+    mine.parent.mkdir()
+    mine.touch()
+    sequence = open_sequence(drive)
 
-    with pytest.raises(KeyboardInterrupt):
-        write_native(tmp_path / "out", interrupted())
-    with pytest.raises(InputError, match=r"calibration.json"):
-        open_sequence(tmp_path / "out")
+    def write_and_end(out):
+        with open_writer(out, sequence, WriteOptions(form, force=True)) as writer:
+            writer.write(sequence.load(0))
+            raise SystemExit(143)
+
+    for out in (tmp_path / "new", mine.parent):
+        with pytest.raises(SystemExit):
+            write_and_end(out / "drive.mcap" if form == "mcap" else out)
+    assert not any((tmp_path / "new").glob("*"))
+    assert [*mine.parent.iterdir()] == [mine]
+
+
+@pytest.mark.parametrize(("form", "part"), [("native", "images"), ("nuscenes", "samples")])
+def test_a_forced_conversion_writes_through_no_link(drive, tmp_path, form, part):
+    outside, out = tmp_path / "outside", tmp_path / "out"
+    outside.mkdir()
+    out.mkdir()
+    (out / part).symlink_to(outside)
+    answer = convert(drive, out, "--force", "--format", form)
+    assert answer.exit_code == 0, answer.output
+    assert not any(outside.iterdir())
+    assert not (out / part).is_symlink()
 
 
 def test_scenes_with_different_rigs_are_an_error(drive, tmp_path):

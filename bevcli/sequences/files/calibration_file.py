@@ -75,16 +75,16 @@ def draft_calibration(path: Path) -> RigDraft:
     return RigDraft(CameraRig(cameras, ego_from_bev, ego_from_bev_assumed=not given), tuple(report.findings), facts)
 
 
-def write_calibration(path: Path, rig: CameraRig, facts: DriveFacts | None = None) -> None:
+def write_calibration(path: Path, rig: CameraRig, facts: DriveFacts | None = None, *, regular: bool = False) -> None:
     """Write the rig so that `read_calibration` returns exactly the same numbers. Raises OutputError.
 
-    A default `ego_from_bev` is left out, so that a reader also knows it as the default.
+    A default `ego_from_bev` is left out, so that a reader also knows it as the default. regular: see `whole_file`.
     """
     document: dict[str, Any] = {"format": FORMAT, **({} if facts is None else _facts_to_json(facts))}
     if not rig.ego_from_bev_assumed:
         document["ego_from_bev"] = transform_to_json(rig.ego_from_bev)
     document["cameras"] = {camera.name: _camera_to_json(camera) for camera in rig.cameras}
-    write_whole(path, f"{_lines(document)}\n".encode())
+    write_whole(path, f"{_lines(document)}\n".encode(), regular=regular)
 
 
 def _load_object(path: Path) -> dict[str, Any]:

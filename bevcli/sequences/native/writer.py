@@ -1,7 +1,6 @@
 """Writes frames one by one as a native sequence folder."""
 
 import csv
-import shutil
 from collections.abc import Mapping
 from contextlib import ExitStack
 from itertools import pairwise
@@ -25,7 +24,7 @@ from bevcli.sequences.files.map_folder import write_map
 from bevcli.sequences.native.folder import BOXES_FILE, MAPS_FOLDER
 from bevcli.sequences.native.tables import write_ego_motion
 from bevcli.sequences.options import WriteOptions
-from bevcli.writing import write_whole
+from bevcli.writing import remove_parts, whole_folder, write_whole
 
 # The files that the writer creates and `force` removes. Other files in the folder are kept.
 PARTS = ("calibration.json", "frames.csv", "ego_motion.csv", "images", BOXES_FILE, MAPS_FOLDER, TRUE_LINES)
@@ -45,7 +44,8 @@ class NativeWriter:
             writer.write(frame)
 
     Image files are copied byte for byte; images of a video become PNG. ego_motion.csv gets the pose at the time of
-    every frame and image. calibration.json is written last, so an unfinished folder is not a valid sequence.
+    every frame and image. After an error, what was written is deleted. calibration.json is written last, so that a
+    killed process leaves no valid sequence.
 
     with_ego_motion: whether the frames have poses. force: replace a sequence in the folder. facts: of the drive.
     Raises OutputError if the folder exists and `force` is false, or it cannot be written. Raises InputError for a
@@ -65,6 +65,8 @@ class NativeWriter:
         self._boxes: BoxesWriter | None = None
         self._lines: LinesWriter | None = None
         self._open = ExitStack()
+        self._open.enter_context(whole_folder(folder, PARTS))
+        self._open.push(self._finish)  # once the files below are closed
         try:
             table = self._open.enter_context((folder / "frames.csv").open("w", newline="", encoding="utf-8"))
         except OSError as error:
@@ -92,11 +94,11 @@ class NativeWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._open.close()
-        if kind is None:
-            self._finish()
+        self._open.__exit__(kind, error, trace)
 
-    def _finish(self) -> None:
+    def _finish(self, kind: type[BaseException] | None, *error: object) -> None:
+        if kind is not None:
+            return
         if self._rig is None:
             raise OutputError(f"{self.folder}: no frame was written (expected at least one)")
         if self._with_ego_motion:
@@ -175,16 +177,7 @@ def _make_room(folder: Path, force: bool) -> None:
     if folder.is_dir() and any(folder.iterdir()):
         if not force:
             raise OutputError(f"{folder}: exists already: choose another folder, or pass `force=True` to replace it")
-        for part in PARTS:
-            path = folder / part
-            if path.is_dir() and not path.is_symlink():
-                shutil.rmtree(path)
-            else:
-                path.unlink(missing_ok=True)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be created ({error.strerror})") from None
+        remove_parts(folder, PARTS)
 
 
 def _ego_motion(rows: Mapping[int, tuple[Pose, Kinematics]]) -> EgoMotion:

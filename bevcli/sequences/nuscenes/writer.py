@@ -1,9 +1,10 @@
 """Writes a drive as a nuScenes root."""
 
 import json
-import shutil
 from collections.abc import Iterable
+from contextlib import ExitStack
 from pathlib import Path
+from types import TracebackType
 from typing import Self
 
 import cv2
@@ -18,7 +19,7 @@ from bevcli.sequences.files.calibration_file import is_file_name
 from bevcli.sequences.nuscenes.format import versions_in
 from bevcli.sequences.nuscenes.new_tables import LIDAR, NewTables, Row
 from bevcli.sequences.options import WriteOptions
-from bevcli.writing import write_whole
+from bevcli.writing import remove_parts, whole_folder, write_whole
 
 VERSION = "v1.0-custom"
 PARTS = (VERSION, "samples", "maps", "can_bus")  # what the writer creates and `force` removes
@@ -35,7 +36,8 @@ class NuScenesWriter:
     - Motion goes to the CAN bus expansion. Times are rounded down to microseconds.
     - Velocities of the ground truth are not in nuScenes' tables: readers derive them from positions over time.
 
-    scene.json is written last, so that an unfinished root is none.
+    After an error, what was written is deleted. scene.json is written last, so that a killed process leaves no valid
+    root.
     """
 
     def __init__(self, root: Path, sequence: Sequence, options: WriteOptions) -> None:
@@ -43,6 +45,9 @@ class NuScenesWriter:
         if not sequence.has_ego_motion:
             raise InputError(f"{sequence.name}: has no ego-motion, which a nuScenes root must have: add it")
         _make_room(root, options.force)
+        self._open = ExitStack()
+        self._open.enter_context(whole_folder(root, PARTS))
+        self._open.push(self._finish)
         self.root, self._name = root, sequence.name
         self._tables = NewTables(sequence.name)
         self._messages: dict[str, list[Row]] = {}  # of the CAN bus, by scene
@@ -67,9 +72,10 @@ class NuScenesWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *error: object) -> None:
-        if error[0] is None:
-            self._finish()
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._open.__exit__(kind, error, trace)
 
     def _write_image(self, sample: str, camera: Camera, image: CameraImage) -> str:
         """Write an image; returns its path relative to the root."""
@@ -80,7 +86,9 @@ class NuScenesWriter:
         write_whole(self.root / file, encoded, parents=True)
         return file
 
-    def _finish(self) -> None:
+    def _finish(self, kind: type[BaseException] | None, *error: object) -> None:
+        if kind is not None:
+            return
         if not self._messages:
             raise OutputError(f"{self.root}: no frame was written (expected at least one)")
         write_whole(self.root / MAP_FILE, cv2.imencode(".png", np.zeros((1, 1), np.uint8))[1].tobytes(), parents=True)
@@ -115,5 +123,4 @@ def _make_room(root: Path, force: bool) -> None:
         if others or not force:
             way = "choose another folder" if others else "choose another folder, or pass `force=True` to replace it"
             raise OutputError(f"{root}: exists already: {way}")
-        for part in PARTS:
-            shutil.rmtree(root / part, ignore_errors=True)
+        remove_parts(root, PARTS)
