@@ -189,7 +189,7 @@ def endless_file(small_file) -> Path:
     return file
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])
 def test_two_signals_end_an_endless_loop_of_a_file(endless_file, tmp_path, number):
     process = FORKS.Process(target=run_for_ever, args=(endless_file, tmp_path / "ready"))
     process.start()
