@@ -123,6 +123,7 @@ def test_black_images_are_refused():
         bevcli.calibrate(BlackImages(MemorySequence(count=9)))
 
 
+@pytest.mark.slow
 def test_images_of_noise_are_refused():
     with pytest.raises(InputError, match="no points were found"):
         bevcli.calibrate(MemorySequence(count=9))
