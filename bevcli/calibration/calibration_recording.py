@@ -9,13 +9,11 @@ import rerun.blueprint as rrb
 from bevcli.calibration.drawings import LINE, POINT
 from bevcli.calibration.evidence import Evidence, epipolar_piece
 from bevcli.errors import OutputError
-from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.geometry.cameras import CameraRig
 from bevcli.recording import entities, log_static
-from bevcli.recording.blueprint import camera_rows, flat_view
-from bevcli.recording.colors import BACKGROUND
 from bevcli.rig.mounting import horizon
 from bevcli.rig.overlay import GROUND, HORIZON, ground_lines, visible_runs
-from bevcli.rig.rig_recording import JPEG_QUALITY, clipped
+from bevcli.rig.rig_recording import JPEG_QUALITY, camera_views, clipped, rig_view
 from bevcli.writing import whole_file
 
 TABLE = "calibration"
@@ -75,24 +73,11 @@ def _log_camera(stream: rr.RecordingStream, evidence: Evidence, index: int, *, m
 
 
 def _blueprint(rig: CameraRig) -> rrb.Blueprint:
-    kinds = ("matches", "epipolar_lines", "ground_grid", "horizon")
-    excluded = [f"- /{entities.overlay(name, kind)}/**" for name in rig.names for kind in kinds]
-    scene = rrb.Spatial3DView(
-        origin=entities.EGO,
-        contents=[f"/{entities.WORLD}/**", *excluded],
-        name="The rig",
-        background=list(BACKGROUND),
-        line_grid=False,
-        eye_controls=rrb.EyeControls3D(position=(-5.5, 0.0, 4.5), look_target=(0.9, 0.0, 0.8), eye_up=(0, 0, 1)),
-    )
+    scene = rig_view(rig, ("matches", "epipolar_lines", "ground_grid", "horizon"))
     middle = rrb.Horizontal(scene, rrb.TextDocumentView(origin=TABLE, name="Calibration"), column_shares=[2, 5])
-    rows = [rrb.Horizontal(*(_camera_view(rig[name]) for name in row)) for row in camera_rows(rig)]
+    rows = camera_views(rig)
     layout = rrb.Vertical(*rows[:1], middle, *rows[1:])
     return rrb.Blueprint(
         layout, rrb.TimePanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"), auto_views=False, auto_layout=False,
     )  # fmt: skip
-
-
-def _camera_view(camera: Camera) -> rrb.Spatial2DView:
-    return flat_view(entities.camera(camera.name), camera.name, (0, camera.width), (0, camera.height))

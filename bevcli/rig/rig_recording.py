@@ -1,6 +1,6 @@
 """recording.rrd of a calibration check: rig, images with pillars, ground and horizon, coverage and findings."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import cv2
@@ -120,25 +120,36 @@ def clipped(line: Array, camera: Camera) -> list[Array]:
 
 
 def _blueprint(rig: CameraRig) -> rrb.Blueprint:
-    drawn = ("pillars", "ground_grid", "pillar_lines", "horizon")
-    excluded = [f"- /{entities.overlay(name, kind)}/**" for name in rig.names for kind in drawn]
-    scene = rrb.Spatial3DView(
-        origin=entities.EGO,
-        contents=[f"/{entities.WORLD}/**", *excluded],
-        name="The rig",
-        background=list(BACKGROUND),
-        line_grid=False,
-        eye_controls=rrb.EyeControls3D(position=(-5.5, 0.0, 4.5), look_target=(0.9, 0.0, 0.8), eye_up=(0, 0, 1)),
-    )
+    overlays = ("pillars", "ground_grid", "pillar_lines", "horizon")
     seen = rrb.Spatial2DView(origin=COVERAGE, name="Cameras per BEV cell", background=list(BACKGROUND))
     findings = rrb.TextDocumentView(origin=FINDINGS, name="Findings")
-    middle = rrb.Horizontal(scene, seen, findings, column_shares=[4, 3, 4])
-    rows = [rrb.Horizontal(*(_camera_view(rig[name]) for name in row)) for row in camera_rows(rig)]
+    middle = rrb.Horizontal(rig_view(rig, overlays), seen, findings, column_shares=[4, 3, 4])
+    rows = camera_views(rig)
     layout = rrb.Vertical(*rows[:1], middle, *rows[1:], row_shares=[3, 5, 3][: len(rows) + 1])
     return rrb.Blueprint(
         layout, rrb.TimePanel(state="hidden"), rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"), auto_views=False, auto_layout=False,
     )  # fmt: skip
+
+
+def rig_view(rig: CameraRig, overlays: Iterable[str]) -> rrb.Spatial3DView:
+    """The rig from behind. overlays: kinds of drawings in the images, which it leaves out."""
+    return rrb.Spatial3DView(
+        origin=entities.EGO,
+        contents=[
+            f"/{entities.WORLD}/**",
+            *(f"- /{entities.overlay(name, kind)}/**" for name in rig.names for kind in overlays),
+        ],
+        name="The rig",
+        background=list(BACKGROUND),
+        line_grid=False,
+        eye_controls=rrb.EyeControls3D(position=(-5.5, 0.0, 4.5), look_target=(0.9, 0.0, 0.8), eye_up=(0, 0, 1)),
+    )
+
+
+def camera_views(rig: CameraRig) -> list[rrb.Horizontal]:
+    """The images of the cameras, in rows."""
+    return [rrb.Horizontal(*(_camera_view(rig[name]) for name in row)) for row in camera_rows(rig)]
 
 
 def _camera_view(camera: Camera) -> rrb.Spatial2DView:

@@ -211,6 +211,11 @@ class FrameEntry:
     dropped: Mapping[str, str]
     origin: str
 
+    @property
+    def image_files(self) -> tuple[Path, ...]:
+        """The image files and videos of the frame."""
+        return tuple(source.path for source in self.sources.values() if isinstance(source, ImageSource))
+
 
 class Motion(Protocol):
     """The vehicle's poses over time, such as `EgoMotion`."""

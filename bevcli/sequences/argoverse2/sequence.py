@@ -65,8 +65,7 @@ class Argoverse2Sequence(Sequence):
         return count_classes(self._truth.values())
 
     def image_files(self, place: int) -> tuple[Path, ...]:
-        sources = self._entries[place].sources.values()
-        return tuple(source.path for source in sources if isinstance(source, ImageSource))
+        return self._entries[place].image_files
 
     def ground_truth_frame(self, place: int) -> Frame:
         entry = self._entries[place]

@@ -70,8 +70,7 @@ class FolderSequence(Sequence):
         return tuple(sorted(path for path in self.path.iterdir() if path.is_file()))
 
     def image_files(self, place: int) -> tuple[Path, ...]:
-        sources = self._entries[place].sources.values()
-        return tuple(source.path for source in sources if isinstance(source, ImageSource))
+        return self._entries[place].image_files
 
     def ground_truth_frame(self, place: int) -> Frame:
         return self._frame(replace(self._entries[place], sources={}))
