@@ -130,6 +130,7 @@ class RunFiles:
         self._submission: SubmissionWriter | None = None
         self._tracks: CsvWriter | None = None
         self._reference = "world" if sequence.has_ego_motion else "ego"
+        self._classes = model.config.object_classes
         self._is_complete = done == len(sequence.stamps)
         self._results: dict[type, ResultWriter] = {}
         names = [RESULT_WRITERS[kind].name for kind in model.config.results]
@@ -192,8 +193,7 @@ class RunFiles:
             self._bev_frames.append(frame.stamp.index)
             self._add_bev(frame.stamp.index)
         self._recording.log(frame, prediction)
-        classes = self._model.config.object_classes
-        boxes = frame_boxes(frame, prediction, world=self._sequence.has_ego_motion, classes=classes)
+        boxes = frame_boxes(frame, prediction, world=self._sequence.has_ego_motion, classes=self._classes)
         if self._tracks is not None:
             instances = boxes.boxes.instances
             tracked = boxes if instances is None else replace(boxes, boxes=boxes.boxes[instances != ""])
