@@ -363,6 +363,10 @@ def test_nothing_is_deleted_or_written_through_links(model, interrupted, tmp_pat
     with pytest.raises(OutputError, match=r"segmentation/000000\.png: is a link, or leads out of"):
         run_all(model, interrupted, force=True)
     (interrupted / "segmentation").unlink()
+    (interrupted / "segmentation").symlink_to("segmentation")
+    with pytest.raises(OutputError, match=r"segmentation"):
+        run_all(model, interrupted, force=True)
+    (interrupted / "segmentation").unlink()
     (interrupted / "predictions.json").unlink(missing_ok=True)
     (interrupted / "predictions.json").symlink_to(elsewhere / "new")
     run_all(model, interrupted, force=True)
