@@ -7,9 +7,10 @@ from functools import partial
 
 from bevcli.errors import InputError
 from bevcli.frame import Sequence
-from bevcli.robustness import corruptions, sequences
+from bevcli.robustness import sequences
 from bevcli.robustness.options import LostImage, SeverityChoice
 from bevcli.robustness.sequences import Draws
+from bevcli.synth import corruptions
 
 CLEAN = "clean"
 # Makes of a scene what is run in its place, for a level: several sequences if they must not share a history.

@@ -15,9 +15,9 @@ from bevcli.frame import Frame, Sequence
 from bevcli.geometry.transforms import inverse
 from bevcli.recording.box_lines import lines_in_image
 from bevcli.robustness.conditions import Condition, Corruption, Shown
-from bevcli.robustness.corruptions import Pixels
 from bevcli.robustness.options import StressOptions
 from bevcli.robustness.results import ConditionScores, StressResults
+from bevcli.synth.corruptions import Pixels
 from bevcli.writing import write_whole
 
 SEVERITY_COLORS = ("#b8c9e8", "#7d9fd3", "#3f6fb5", "#173e7a")  # from the easiest severity to the hardest

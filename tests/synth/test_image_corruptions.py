@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image, ImageOps
 
-from bevcli.robustness.corruptions import (
+from bevcli.robustness.sequences import Draws
+from bevcli.synth.corruptions import (
     FOG,
     LOW_LIGHT,
     blur_kernel,
@@ -18,7 +19,6 @@ from bevcli.robustness.corruptions import (
     motion_blur,
     snow,
 )
-from bevcli.robustness.sequences import Draws
 
 LEVELS = {brightness: 5, low_light: 4, motion_blur: 5, color_quantisation: 3, fog: 5, snow: 3}
 
