@@ -16,6 +16,7 @@ LAYERS = (
     {"errors"},
     {"options", "registry"},
     {"parsing", "jit", "user_folders", "waiting", "writing"},
+    {"published"},
     {"geometry"},
     {"frame"},
     {"model"},

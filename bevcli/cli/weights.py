@@ -36,7 +36,7 @@ def list_weights(options: Annotated[ModelOptions, Part(only=("weights_dir",))], 
     where it lies on this machine or is published. Connects to no other machine.
     """
     from bevcli.weights.cache import all_weights
-    from bevcli.weights.sources import own_table
+    from bevcli.published import own_table
 
     found = list(all_weights(options.weights_dir))
     if as_json:

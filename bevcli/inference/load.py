@@ -167,11 +167,8 @@ def _load_network(options: ModelOptions) -> Model:
     if name is None:
         name = DEFAULT_MODEL if weights is None else _model_of(weights)
     named = find_weights(str(name), options.weights_dir)
-    config_name = name if named is None else named.model
-    config = load_config(config_name)
-    tracker = _tracker(load_table(config_name, TRACKING, TrackerConfig), config, str(name))
-    if named is not None:
-        config = replace(config, name=named.name)
+    config = load_config(name)
+    tracker = _tracker(load_table(name, TRACKING, TrackerConfig), config, str(name))
     wanted = weights is None and not untrained
     bundled = bundled_weights(str(name)) if wanted else None
     file = weights or bundled

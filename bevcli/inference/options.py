@@ -17,7 +17,7 @@ def model_names() -> list[str]:
 
 def complete_model(incomplete: str) -> list[str]:
     """The known models and weights that start with a text, for completion in a shell."""
-    from bevcli.weights.sources import read_sources
+    from bevcli.published import read_sources
 
     return sorted(name for name in {*model_names(), *read_sources()} if name.startswith(incomplete))
 
