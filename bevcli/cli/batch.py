@@ -29,8 +29,8 @@ def batch(
     drives: Annotated[
         list[str] | None,
         typer.Argument(
-            help="Sequence folders, nuScenes roots (one drive per scene), .mcap files, patterns such as 'fleet/*', "
-            "or URLs such as s3://bucket/fleet/*.",
+            help="Sequence folders, nuScenes roots (one drive per scene), folders of drives such as a DDAD root, "
+            ".mcap files, patterns such as 'fleet/*', or URLs such as s3://bucket/fleet/*.",
             show_default=False,
         ),
         INPUT_OR_PATTERN,

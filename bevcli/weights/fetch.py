@@ -9,9 +9,9 @@ from pathlib import Path
 from bevcli.checkpoints import expected_state, read_checkpoint, require_fit
 from bevcli.config import load_config
 from bevcli.errors import BevcliError, OutputError, WeightsError
+from bevcli.published import own_table
 from bevcli.weights.cache import HASHES, Known, NamedWeights
 from bevcli.weights.download import Report, download
-from bevcli.published import own_table
 
 PARTIAL = ".partial-"  # before the name of a file that is being downloaded
 

@@ -18,10 +18,10 @@ from bevcli.config import load_config
 from bevcli.errors import BevcliError, ConfigError, OutputError, WeightsError
 from bevcli.inference.load import load_model
 from bevcli.model.temporal_model import build_model
+from bevcli.published import own_table, read_sources
 from bevcli.weights import download
 from bevcli.weights.cache import all_weights, named_weights
 from bevcli.weights.fetch import fetch_weights
-from bevcli.published import own_table, read_sources
 
 
 @pytest.fixture(scope="module")
