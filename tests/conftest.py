@@ -24,7 +24,7 @@ from bevcli.viewer import recording_file
 
 # Files that one worker runs, because they share what takes long: imports for the export, processes to fork from.
 TOGETHER = {
-    **dict.fromkeys(("test_engines", "test_export_onnx", "test_export_window"), "export"),
+    **dict.fromkeys(("test_engines", "test_in_engine", "test_export_onnx", "test_export_window"), "export"),
     **dict.fromkeys(
         ("test_interrupted_run", "test_no_answer", "test_no_connections", "test_process_group"), "processes"
     ),
