@@ -127,6 +127,8 @@ class OpenVinoEngine(Engine):
             "INFERENCE_PRECISION_HINT": "f32",
             "INFERENCE_NUM_THREADS": threads,
             "NUM_STREAMS": 1,
+            # A thread that is bound to a core waits for it while another process computes there.
+            "ENABLE_CPU_PINNING": False,
         }
         try:
             check_size(file)
