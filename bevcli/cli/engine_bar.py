@@ -17,11 +17,12 @@ class EngineBar:
         self._said = ""
 
     def show(self, done: int, total: int, what: str) -> None:
-        """Show the steps that are done, and say what is done where that has changed."""
-        if self._progress is None:
-            once = "once for these weights, this number of cameras and image size; the file is kept"
-            self._progress = Progress(total, "steps of the export", [f"{what}: {once}"]).__enter__()
-        if self._said not in ("", what) and done < total:
+        """Show the steps that are done, and say what is done where that has changed. A new export gets a new bar."""
+        if self._progress is None or done < self._progress.done:
+            self.__exit__()
+            once = "once for these weights, number of cameras and image size"
+            self._progress = Progress(total, "steps", [f"{what}, {once}"]).__enter__()
+        elif what != self._said and done < total:
             self._progress.message(f"note: {what}")
         self._said = what
         if done > self._progress.done:

@@ -4,7 +4,7 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TypeVar
 
@@ -24,6 +24,7 @@ from bevcli.frame import Frame, FrameStamp, Sequence
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Pose
 from bevcli.inference.engine_choice import EngineChoice
+from bevcli.inference.engine_speeds import fastest_engine
 from bevcli.inference.load import Model
 from bevcli.inference.options import TORCH
 from bevcli.inference.paired_steps import paired_steps
@@ -77,8 +78,11 @@ def in_engine(
     engine = TORCH if parts else model.choice.resolve(model.config)
     choice, model = model.choice, replace(model, choice=None)
     if engine == TORCH:
-        return model
-    network, facts = _Making(model, rig, drive, choice, engine, report).file(choice.precision)
+        return replace(model, engine_note=f"engine {choice.engine} is torch: {_why_torch(model, parts)}")
+    making = _Making(model, rig, drive, choice, engine, report)
+    network, facts = making.file(choice.precision)
+    if making.done:
+        report(making.total, making.total, "kept")
     return replace(
         model,
         network=network,
@@ -87,6 +91,14 @@ def in_engine(
         file=network.file,
         engine_note=f"engine {engine}, {choice.precision}{_cost(facts, engine)}; the exported file is {network.file}",
     )
+
+
+def _why_torch(model: Model, parts: str) -> str:
+    if parts:
+        return f"{parts} need it"
+    if fastest_engine(model.config, "fp32") is not None:
+        return "the fastest one here by `bevcli bench --engines`"
+    return f"no engine was measured here: `bevcli bench --engines --model {model.name}` does"
 
 
 def _cost(facts: FileFacts, engine: str) -> str:
@@ -122,21 +134,20 @@ class _Making:
         """The file in a precision, from the cache or made now, and its facts."""
         file = EngineFile(self._key(precision))
         network, facts = _load(file, self.engine, file.stamp) or self._make(file, precision)
-        if self.engine not in facts.differences and precision == self.choice.precision:
-            drive = self._first_frames()
-            if drive is not None:
-                facts = facts.with_differences(self.engine, self._compare(network, drive))
-                file.state(facts)
+        is_new = self.engine not in facts.differences and precision == self.choice.precision
+        if is_new and self.first_frames is not None:
+            facts = facts.with_differences(self.engine, self._compare(network, self.first_frames))
+            file.state(facts)
         return network, facts
 
     def _make(self, file: EngineFile, precision: str) -> tuple[ExportedModel, FileFacts]:
         if precision == "fp32":
             return file.make(self._export, "", self.engine)
-        exact, drive = self.file("fp32")[0], self._first_frames()
+        exact, drive = self.file("fp32")[0], self.first_frames
         if drive is None:
             raise InputError("`precision=int8`: there are no frames to calibrate with: pass `calibrate_with=DRIVE`")
         images = calibration_images(self.sized.config, exact.cameras, [drive], CALIBRATION_FRAMES)
-        counted = self._counted(f"calibrating with {drive.name}", images)
+        counted = self._counted(f"calibrating {self.model.name} with {drive.name}", images)
         made = file.make(lambda path: quantize(exact.file, counted, path), drive.name, self.engine)
         self._tell("calibrated", 1)
         return made
@@ -155,38 +166,45 @@ class _Making:
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:KEY_DIGITS]
 
     def _export(self, path: Path) -> None:
-        self._tell(f"exporting {self.model.name} for {self.options.cameras} cameras")
+        self._tell(f"exporting {self.model.name} for {self.options.cameras} cameras to {self.engine}")
         model, contents = self.model, self.sized.contents()
         export_onnx(
             self.sized.network, path, self.options, contents=contents, untrained=model.untrained, bundled=model.bundled
         )
         self._tell("exported", 1)
 
-    def _first_frames(self) -> Sequence | None:
-        """The drive that calibrates or is compared; None where there is none. Raises InputError."""
+    @cached_property
+    def first_frames(self) -> Sequence | None:
+        """The frames that calibrate and are compared; None where there is no drive. Raises InputError."""
         drive = self.drive
         if self.choice.calibrate_with is not None:
             rate_hz = self.model.config.rate_hz
             drive = open_sequence(self.choice.calibrate_with, rate_hz=rate_hz, ground_truth=False)
         return None if drive is None else select_range(drive, slice(0, CALIBRATION_FRAMES))
 
+    @property
+    def total(self) -> int:
+        """The steps of the work: the export, each frame that is compared, each that calibrates, and the INT8 file."""
+        frames = 0 if self.first_frames is None else len(self.first_frames.stamps)
+        return 1 + min(frames, COMPARED_FRAMES) + (1 + frames if self.choice.precision == "int8" else 0)
+
     def _compare(self, network: ExportedModel, drive: Sequence) -> BoxDifferences:
         plain = prepare_for_inference(self.sized.network, torch.device("cpu"))
         preprocess = Preprocessor(self.sized.config)
         frames = (preprocess(drive.load(place)) for place in range(min(COMPARED_FRAMES, len(drive.stamps))))
-        steps = paired_steps(plain, network, self._counted("comparing with PyTorch", frames))
+        steps = paired_steps(plain, network, self._counted(f"comparing {self.engine} with PyTorch", frames))
         return box_differences((ours, theirs) for _, ours, theirs in steps)
 
     def _counted(self, what: str, items: Iterator[Item]) -> Iterator[Item]:
         """The items, each of which is reported as a step."""
+        self._tell(what)
         for item in items:
             yield item
             self._tell(what, 1)
 
     def _tell(self, what: str, steps: int = 0) -> None:
         self.done += steps
-        total = 1 + COMPARED_FRAMES + (1 + CALIBRATION_FRAMES if self.choice.precision == "int8" else 0)
-        self.report(min(self.done, total), total, what)
+        self.report(self.done, self.total, what)
 
 
 @lru_cache(maxsize=1)

@@ -5,17 +5,20 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from threading import Barrier
 
 import numpy as np
 import pytest
 import torch
 
+from bevcli.cli.main import app
 from bevcli.config import load_config
 from bevcli.engines.engine import installed_engines
 from bevcli.engines.exported import load_exported
-from bevcli.engines.file_cache import engines_folder
+from bevcli.engines.file_cache import EngineFile, engines_folder
 from bevcli.errors import BevcliError, InputError
 from bevcli.inference import in_engine as module
 from bevcli.inference.engine_choice import EngineChoice
@@ -28,6 +31,7 @@ from bevcli.inference.session import Session
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
 from memory_drive import MemorySequence, make_rig
 from small_model import model_for_engines
+from typer.testing import CliRunner
 
 pytest.importorskip("onnxscript")
 pytest.importorskip("onnxruntime")
@@ -82,8 +86,8 @@ def test_the_boxes_in_an_engine_are_those_of_torch(steps, drive, network):
 def test_the_first_time_reports_its_steps_and_its_cost(steps, drive, network):
     assert [done for done, _, _ in steps] == sorted(done for done, _, _ in steps)
     words = [what for _, _, what in steps]
-    assert words[0] == "exporting small-for-tests for 2 cameras"
-    assert {"calibrating with memory", "comparing with PyTorch"} <= set(words)
+    assert words[0] == "exporting small-for-tests for 2 cameras to openvino"
+    assert {"calibrating small-for-tests with memory", "comparing openvino with PyTorch"} <= set(words)
     assert steps[-1][0] == steps[-1][1] == 1 + 2 + 1 + 2
     again = []
     found = in_engine(chosen(network, "openvino", "int8"), drive.rig, drive, report=lambda *step: again.append(step))
@@ -103,12 +107,26 @@ def test_a_broken_file_is_made_anew(steps, drive, network):
     model = chosen(network, "onnxruntime")
     file = in_engine(model, drive.rig, drive).file
     whole, facts = file.read_bytes(), file.with_suffix(".json")
-    for path, broken in ((file, whole[:-100]), (file, b""), (facts, b"{"), (facts, b'{"sha256": "0"}')):
+    for path, broken in ((file, whole[:-100]), (facts, b"{"), (facts, b'{"sha256": "0"}')):
         path.write_bytes(broken)
         assert in_engine(model, drive.rig, drive).file == file
         assert load_exported(file, "onnxruntime").cameras == 2
         assert json.loads(facts.read_text())["differences"]["onnxruntime"]["frames"] == 2
     assert not list(file.parent.glob(".unfinished*"))
+
+
+def test_two_processes_may_make_a_file_at_the_same_time(steps, small_file):
+    both = Barrier(2, timeout=60)
+
+    def write(path):
+        shutil.copy(small_file, path)
+        both.wait()
+
+    with ThreadPoolExecutor(2) as pool:
+        made = [pool.submit(EngineFile("same").make, write, "", "onnxruntime") for _ in range(2)]
+        assert len({each.result()[1].sha256 for each in made}) == 1
+    assert EngineFile("same").load("onnxruntime") is not None
+    assert not list(engines_folder().glob(".unfinished*"))
 
 
 def test_probes_are_refused_but_auto_is_torch(steps, drive, network):
@@ -117,7 +135,8 @@ def test_probes_are_refused_but_auto_is_torch(steps, drive, network):
     remember_speeds(network.config, {"torch fp32": 2.0, "openvino fp32": 1.0, "onnxruntime int8": 0.5})
     assert fastest_engine(network.config, "fp32") == "openvino"
     assert in_engine(chosen(network, "auto"), drive.rig, drive).engine == "openvino"
-    assert in_engine(chosen(network, "auto"), drive.rig, drive, parts="`probes`").engine == "torch"
+    in_torch = in_engine(chosen(network, "auto"), drive.rig, drive, parts="`probes`")
+    assert (in_torch.engine, in_torch.engine_note) == ("torch", "engine auto is torch: `probes` need it")
     assert EngineChoice("auto", "int8").resolve(network.config) == "onnxruntime"
     (engines_folder() / "speeds.json").write_text("broken")
     assert EngineChoice("auto", "fp32").resolve(network.config) == "torch"
@@ -147,3 +166,21 @@ def test_what_cannot_be_exported_runs_in_torch_with_auto():
 def test_a_model_in_an_engine_needs_a_drive(network):
     with pytest.raises(BevcliError, match=r"`engine=openvino`: needs a drive"):
         chosen(network, "openvino").prepared.step(torch.zeros(1))
+
+
+@pytest.mark.slow
+def test_demo_runs_by_its_name_in_int8(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    options = ["--engine", "openvino", "--precision", "int8"]
+    done = CliRunner().invoke(app, ["run", str(STREET), *options, "--out", str(tmp_path / "run")])
+    assert done.exit_code == 0, done.output
+    assert "against PyTorch in fp32: " in done.stderr
+    summary = json.loads((tmp_path / "run/summary.json").read_text())
+    assert (summary["engine"], summary["precision"], summary["model"]) == ("openvino", "int8", "demo")
+    files = {path: path.stat().st_ino for path in tmp_path.glob("cache/bevcli/engines/*.onnx")}
+    done = CliRunner().invoke(app, ["validate", "--data", str(STREET), *options, "--json"])
+    assert done.exit_code == 0, done.output
+    reference = CliRunner().invoke(app, ["validate", "--data", str(STREET), "--json"])
+    maps = [json.loads(one.stdout)["classes_with_ground_truth"]["mean_ap"] for one in (done, reference)]
+    assert abs(maps[0] - maps[1]) < 0.05
+    assert files == {path: path.stat().st_ino for path in tmp_path.glob("cache/bevcli/engines/*.onnx")}
