@@ -132,7 +132,11 @@ class _Making:
 
     def file(self, precision: str) -> tuple[ExportedModel, FileFacts]:
         """The file in a precision, from the cache or made now, and its facts."""
-        file = EngineFile(self._key(precision))
+        file, best = (
+            EngineFile(self._key(precision, count)) for count in (self.calibration_frames, CALIBRATION_FRAMES)
+        )
+        if best != file and best.stamp:  # of an earlier, longer drive
+            file = best
         network, facts = _load(file, self.engine, file.stamp) or self._make(file, precision)
         is_new = self.engine not in facts.differences and precision == self.choice.precision
         if is_new and self.first_frames is not None:
@@ -152,7 +156,7 @@ class _Making:
         self._tell("calibrated", 1)
         return made
 
-    def _key(self, precision: str) -> str:
+    def _key(self, precision: str, frames: int) -> str:
         other = self.choice.calibrate_with if precision == "int8" else None
         facts = {
             "version": (__version__, FORMAT),
@@ -161,7 +165,7 @@ class _Making:
             "labels": (self.model.untrained, self.model.bundled),
             "options": repr(self.options),
             "precision": precision,
-            "calibration": None if other is None else str(other.resolve()),
+            "calibration": (frames if precision == "int8" else 0, None if other is None else str(other.resolve())),
         }
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:KEY_DIGITS]
 
@@ -181,6 +185,11 @@ class _Making:
             rate_hz = self.model.config.rate_hz
             drive = open_sequence(self.choice.calibrate_with, rate_hz=rate_hz, ground_truth=False)
         return None if drive is None else select_range(drive, slice(0, CALIBRATION_FRAMES))
+
+    @property
+    def calibration_frames(self) -> int:
+        """Number of frames that calibrate INT8; fewer for a short drive, whose file is not used for longer ones."""
+        return CALIBRATION_FRAMES if self.first_frames is None else len(self.first_frames.stamps)
 
     @property
     def total(self) -> int:
