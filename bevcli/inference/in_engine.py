@@ -132,11 +132,9 @@ class _Making:
 
     def file(self, precision: str) -> tuple[ExportedModel, FileFacts]:
         """The file in a precision, from the cache or made now, and its facts."""
-        file, best = (
-            EngineFile(self._key(precision, count)) for count in (self.calibration_frames, CALIBRATION_FRAMES)
-        )
-        if best != file and best.stamp:  # of an earlier, longer drive
-            file = best
+        file = EngineFile(self._key(precision, CALIBRATION_FRAMES))  # perhaps of an earlier, longer drive
+        if not file.stamp:
+            file = EngineFile(self._key(precision, self.calibration_frames))
         network, facts = _load(file, self.engine, file.stamp) or self._make(file, precision)
         is_new = self.engine not in facts.differences and precision == self.choice.precision
         if is_new and self.first_frames is not None:
