@@ -25,7 +25,7 @@ from bevcli.viewer import recording_file
 # Files that one worker runs, because they share what takes long: imports for the export, processes to fork from, and
 # syntax trees.
 GROUPS = {
-    "export": ("test_engines", "test_export_onnx", "test_export_window"),
+    "export": ("test_engines", "test_in_engine", "test_export_onnx", "test_export_window"),
     "processes": ("test_interrupted_run", "test_no_answer", "test_no_connections", "test_process_group"),
     "code": ("test_extend", "test_layers", "test_printing", "test_rooms", "test_synth_layers", "test_waits"),
 }

@@ -15,6 +15,7 @@ LAYERS = (
     {"errors"},
     {"options", "registry"},
     {"parsing", "jit", "user_folders", "waiting", "writing"},
+    {"published"},
     {"geometry"},
     {"frame"},
     {"model"},
