@@ -32,10 +32,11 @@ def stress(
     output: StressOutputOptions,
     as_json: Json = False,
 ) -> None:
-    """Score a model on the same drives under corruptions: RoboBEV's eight, calibration noise, and timing faults.
+    """Score a model on the same drives under corruptions: RoboBEV's eight, five others, calibration and timing faults.
 
     Each corruption has three severities (calibration noise: four levels) and is applied on the fly, before the model.
-    The table has NDS and mAP by corruption and severity, and mRR, the share of the clean NDS that is left. Ctrl-C or
+    The table has NDS and mAP by corruption and severity, and mRR, the share of the clean NDS that is left. No training of
+    bevcli uses the five others. Ctrl-C or
     SIGTERM end the test after the current frame; `--resume` goes on with it.
     """
     from bevcli.cli.fetching import fetch_if_asked

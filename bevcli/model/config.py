@@ -46,6 +46,8 @@ class ImageConfig:
             of the network's input, so that objects at the same distance have the same size for every rig
             (`bevcli.inference.preprocess.image_for_rig`). None: `size` holds for every rig.
         max_pixels: with `focal_px`, images become larger only as long as all images of a frame have no more pixels.
+        auto_levels: stretch the grey levels of each image to the full range first
+            (`bevcli.inference.auto_levels`), so that the model sees more in the dark and in fog.
     """
 
     size: tuple[int, int]
@@ -58,6 +60,7 @@ class ImageConfig:
     crop: tuple[int, int, int, int] | None = None
     focal_px: float | None = None
     max_pixels: int | None = None
+    auto_levels: bool = False
 
     def __post_init__(self) -> None:
         if min(self.size) < 1 or min(self.std) <= 0 or self.pad_divisor < 1:

@@ -25,6 +25,7 @@ from bevcli.sequences.selection import scenes_of
 from bevcli.synth.drives import Drives, InputShape
 from bevcli.training.augmentation import (
     AugmentationConfig,
+    BadConditions,
     CalibrationVariation,
     ImageVariation,
     distort_images,
@@ -252,5 +253,6 @@ def _load_clip(
 ) -> list[PreparedFrame]:
     sequence, preprocess = drives.open(clip.drive), Preprocessor(config)
     vary_images, vary_rig = ImageVariation(augmentation, random), CalibrationVariation(augmentation, random)
-    frames = (vary_rig(vary_images(sequence.load(index))) for index in clip.frames)
+    worsen = BadConditions(augmentation, random)
+    frames = (vary_rig(worsen(vary_images(sequence.load(index)))) for index in clip.frames)
     return [preprocess(distort_images(frame, augmentation.photometric, random)) for frame in frames]
