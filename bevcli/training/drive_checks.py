@@ -4,10 +4,11 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 
 from bevcli.errors import InputError
-from bevcli.frame import Sequence
+from bevcli.frame import MapLines, Sequence
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.model.config import ModelConfig
 from bevcli.sequences.files.class_names import ClassNames
+from bevcli.sequences.files.lines_file import TRUE_LINES
 from bevcli.sequences.selection import scenes_of
 from bevcli.synth.drives import FRAMES_PER_DRIVE, Drives
 from bevcli.synth.options import DriveOptions
@@ -35,7 +36,7 @@ def check_training_drives(
         _check_rendered_classes(data.class_map, config)
         return ()
     _check_lengths(drives, clips.frames)
-    _check_ground_truth(drives, clips)
+    _check_ground_truth(drives, clips, config)
     notes = [*check_classes(drives, f"{_count(drives)} to train on", "trained on", config)]
     if held_out is not None:
         notes += check_classes(held_out, f"{_count(held_out)} to score on", "scored", config)
@@ -85,17 +86,22 @@ def _check_rendered_classes(class_map: Mapping[str, str], config: ModelConfig) -
         raise _no_known_class("the ground truth of rendered drives", ", ".join(NUSCENES_CLASSES), "car", config)
 
 
-def _check_ground_truth(drives: Drives, clips: ClipConfig) -> None:
-    """Raise InputError for a drive with a frame that may be trained on and has no ground truth boxes."""
+def _check_ground_truth(drives: Drives, clips: ClipConfig, config: ModelConfig) -> None:
+    """Raise InputError for a drive with a frame that may be trained on and has no ground truth boxes, or no lines."""
     first = clips.frames - 1 if clips.learn == "last" and clips.short_share == 0 else 0
     for drive in map(drives.open, range(len(drives))):
         places = [place for scene in scenes_of(drive.stamps) for place in scene[first:]]
-        missing = [place for place in places if drive.ground_truth_frame(place).ground_truth is None]
-        if missing:
-            raise InputError(
-                f"{drive.name}: {len(missing)} of {len(places)} frames to train on have no ground truth boxes, the "
-                f"first is frame {drive.stamps[missing[0]].index}: add them to ground_truth.json, or remove the frames"
-            )
+        frames = [drive.ground_truth_frame(place) for place in places]
+        without = {"boxes": [frame.stamp.index for frame in frames if frame.ground_truth is None]}
+        if MapLines in config.results:
+            without["lines"] = [frame.stamp.index for frame in frames if frame.ground_truth_lines is None]
+        for truth, missing in without.items():
+            if missing:
+                file = "ground_truth.json" if truth == "boxes" else TRUE_LINES
+                raise InputError(
+                    f"{drive.name}: {len(missing)} of {len(places)} frames to train on have no ground truth {truth}, "
+                    f"the first is frame {missing[0]}: add them to {file}, or remove the frames"
+                )
 
 
 def _check_lengths(drives: Drives, clip_frames: int) -> None:

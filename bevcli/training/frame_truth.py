@@ -13,6 +13,7 @@ from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.model.config import ModelConfig
 from bevcli.model.truth import FrameTruth
 from bevcli.sequences.files.boxes_file import FrameBoxes
+from bevcli.sequences.files.lines_file import TRUE_LINES
 from bevcli.training.detection_loss import boxes_inside
 
 NO_LINES = MapLines((), np.zeros(0, dtype=np.str_))
@@ -34,7 +35,7 @@ def frame_truth(frame: Frame, sequence: Sequence, place: int, config: ModelConfi
     if MapLines in config.results and lines is None:
         raise InputError(
             f"frame {frame.stamp.index} of {frame.stamp.scene or 'the drive'} has no true lines of the map: training "
-            f"{config.name} needs ground_truth_lines.json (bevcli render writes it)"
+            f"{config.name} needs {TRUE_LINES} (bevcli render writes it)"
         )
     later = Drives(_frames_until(sequence, place, max(times, default=0.0)))
     bev_from_world = inverse(frame.world_from_ego.matrix @ frame.rig.ego_from_bev)
