@@ -9,6 +9,7 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.model.config import ModelConfig
 from bevcli.sequences.files.class_names import ClassNames
 from bevcli.sequences.files.lines_file import TRUE_LINES
+from bevcli.sequences.native.folder import BOXES_FILE
 from bevcli.sequences.selection import scenes_of
 from bevcli.synth.drives import FRAMES_PER_DRIVE, Drives
 from bevcli.synth.options import DriveOptions
@@ -91,13 +92,14 @@ def _check_ground_truth(drives: Drives, clips: ClipConfig, config: ModelConfig) 
     first = clips.frames - 1 if clips.learn == "last" and clips.short_share == 0 else 0
     for drive in map(drives.open, range(len(drives))):
         places = [place for scene in scenes_of(drive.stamps) for place in scene[first:]]
-        frames = [drive.ground_truth_frame(place) for place in places]
-        without = {"boxes": [frame.stamp.index for frame in frames if frame.ground_truth is None]}
-        if MapLines in config.results:
-            without["lines"] = [frame.stamp.index for frame in frames if frame.ground_truth_lines is None]
-        for truth, missing in without.items():
+        without: dict[tuple[str, str], list[int]] = {("boxes", BOXES_FILE): [], ("lines", TRUE_LINES): []}
+        for frame in map(drive.ground_truth_frame, places):
+            if frame.ground_truth is None:
+                without["boxes", BOXES_FILE].append(frame.stamp.index)
+            if frame.ground_truth_lines is None and MapLines in config.results:
+                without["lines", TRUE_LINES].append(frame.stamp.index)
+        for (truth, file), missing in without.items():
             if missing:
-                file = "ground_truth.json" if truth == "boxes" else TRUE_LINES
                 raise InputError(
                     f"{drive.name}: {len(missing)} of {len(places)} frames to train on have no ground truth {truth}, "
                     f"the first is frame {missing[0]}: add them to {file}, or remove the frames"

@@ -10,6 +10,7 @@ from memory_drive import make_rig
 from painted_drives import CONFIG, PaintedDrive
 from safetensors.torch import load_file
 
+from bevcli.config import load_config
 from bevcli.errors import InputError
 from bevcli.frame import Frame, FrameStamp, MapLines, Sequence
 from bevcli.geometry.boxes import Boxes3D
@@ -19,10 +20,12 @@ from bevcli.model.vad.config import VADConfig
 from bevcli.model.vad.line_decoder import LineDecoderConfig
 from bevcli.model.vad.motion_head import MotionConfig
 from bevcli.model.vad.vad import VAD
+from bevcli.training.augmentation import AugmentationConfig
+from bevcli.training.frame_losses import FrameLosses, LossConfigs
 from bevcli.training.frame_truth import frame_truth
-from bevcli.training.job import OptimizerConfig, TrainingConfig, TrainingJob
-from bevcli.training.samples import ClipConfig
-from bevcli.training.trainer import Trainer
+from bevcli.training.job import OptimizerConfig, TrainingConfig, TrainingJob, training_config
+from bevcli.training.samples import Clip, ClipConfig, load_batch
+from bevcli.training.trainer import Trainer, forward_clip
 
 VAD_CONFIG = VADConfig(
     **{field.name: getattr(CONFIG, field.name) for field in fields(CONFIG)} | {"heads": ("detection",)},
@@ -108,6 +111,24 @@ class LinedDrives:
 
     def open(self, index: int) -> LinedDrive:
         return self.drives[index]
+
+
+def test_losses_of_own_heads_join_those_of_boxes() -> None:
+    torch.manual_seed(0)
+    model, losses = VAD(VAD_CONFIG), {}
+    clips = [Clip(0, (0,)), Clip(1, (0,))]
+    batch = load_batch(LinedDrives(), clips, VAD_CONFIG, AugmentationConfig(0, 0), np.random.default_rng(0))
+    for outputs in forward_clip(model, batch):
+        losses = FrameLosses(model, LossConfigs())(batch.inputs[0], outputs, batch.targets[0])
+    lines, path = ("line classes", "line points", "line directions"), ("boundaries", "collisions", "directions")
+    assert [*losses] == ["classes", "boxes", *lines, "futures", "modes", "plan", *(f"plan {name}" for name in path)]
+    assert all(losses[name] > 0 for name in ("line points", "futures", "plan"))
+
+
+def test_the_small_vad_of_the_documents_can_be_trained() -> None:
+    file = str(Path(__file__).parents[2] / "docs" / "small-vad.toml")
+    assert MapLines in load_config(file).results
+    load_config(file).check_training(training_config(file).clips.frames)
 
 
 @pytest.mark.slow
