@@ -101,8 +101,8 @@ def _estimate(
         road_points=int(road.sum()),
         before_px=before,
         after_px=after,
-        change=change[:6],
-        covariance=covariance[:6, :6],
+        change=change,
+        covariance=covariance,
     )
 
 

@@ -124,10 +124,10 @@ def _error(
     drive: str, level: int, seed: int, right: Camera, result: CalibrationResult, estimate: CameraEstimate
 ) -> CameraError:
     corrected = result.rig[right.name].ego_from_camera
-    deviations = np.sqrt(np.diag(estimate.covariance))
+    deviations = np.sqrt(np.diag(estimate.covariance))[:6]
     measured = result.stated[right.name].ego_from_camera.copy()
     measured[:3, :3] = measured[:3, :3] @ cv2.Rodrigues(estimate.change[:3])[0]
-    measured[:3, 3] += estimate.change[3:]
+    measured[:3, 3] += estimate.change[3:6]
     return CameraError(
         drive,
         level,

@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 import bevcli
 from bevcli.calibration.corrected_drive import CorrectedDrive
 from bevcli.calibration.estimates import Verdict
+from bevcli.calibration.table import either_text
 from bevcli.cli import bridge
 from bevcli.cli.calibrate import calibrate
 from bevcli.errors import InputError, OutputError
@@ -179,6 +180,20 @@ def test_a_run_measures_first_and_says_what_it_corrects(tmp_path):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert f"calibration: {TURNED} is corrected: off by yaw +" in done.stderr
+
+
+def undecided(estimate, *, correlation):
+    """An estimate that is 50 ms late or turned to the left by one degree, as a vehicle that turns by 20° a second."""
+    covariance = np.diag([1e-8, np.radians(0.5) ** 2, 1e-8, 1e-4, 1e-4, 1e-4, 0.06**2])
+    covariance[1, 6] = covariance[6, 1] = correlation * np.sqrt(covariance[1, 1] * covariance[6, 6])
+    change = np.array([0, -np.radians(0.5), 0, 0, 0, 0, 0.06 * 0.99])
+    return replace(estimate, verdict=Verdict.CORRECTED, change=change, covariance=covariance, delay_deviation_ms=60.0)
+
+
+def test_a_time_offset_or_a_rotation_is_one_of_both(result):
+    text = either_text(undecided(result[TURNED], correlation=0.99))
+    assert text.startswith(f"the images of {TURNED} were taken 119 ms later than stated, or it is turned by 1.0°")
+    assert either_text(undecided(result[TURNED], correlation=0.1)) == ""
 
 
 @pytest.mark.slow
