@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from bevcli.calibration.road import beside_way, sampled
 from bevcli.calibration.unknowns import GroupGeometry, Unknowns, geometry_at
-from bevcli.calibration.views import Views
+from bevcli.calibration.views import THREADS, Views
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array
 
@@ -21,7 +21,7 @@ LANE_M = 4.0  # farther beside the vehicle's way a tile counts less
 
 def search_heights(views: Views, unknowns: Unknowns, x: Array) -> Array:
     """(C,) corrections of the heights in x (P,), metres."""
-    with ThreadPoolExecutor() as threads:
+    with ThreadPoolExecutor(THREADS) as threads:
         return np.array(list(threads.map(lambda c: _best(views, unknowns, x, c), range(unknowns.cameras))))
 
 

@@ -8,7 +8,7 @@ import pytest
 import typer
 from command_line import MINI_TOML, command
 from memory_drive import MemorySequence
-from planted import BlackImages, WrongRig, angle_deg, distance_m, wrong_rig
+from planted import BlackImages, ThroughLens, WrongRig, angle_deg, distance_m, wrong_rig
 from typer.testing import CliRunner
 
 import bevcli
@@ -18,6 +18,7 @@ from bevcli.calibration.table import either_text
 from bevcli.cli import bridge
 from bevcli.cli.calibrate import calibrate
 from bevcli.errors import InputError, OutputError
+from bevcli.geometry.cameras import Distortion
 from bevcli.robustness.calibration_accuracy import WrongTimes
 from bevcli.sequences.files.calibration_file import read_calibration, write_calibration
 
@@ -67,6 +68,24 @@ def test_errors_are_within_four_standard_deviations(street, result):
             street[2][name].ego_from_camera[:3, 3] - np.array(found.position_m)
         )
         assert (np.abs(left) < 4 * np.array(found.position_deviation_m)).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("lens", "zoom"),
+    [
+        (Distortion("brown_conrady", (0.12, -0.05, 0.001, -0.001, 0.0)), 1.0),
+        (Distortion("kannala_brandt", (0.02, -0.01, 0.0, 0.0)), 1.2),
+    ],
+)
+def test_lens_distortion_is_respected(street, lens, zoom):
+    drive, right, wrong = street
+    seen = ThroughLens(WrongRig(drive, right), lens, zoom)
+    poses = {each.name: each.ego_from_camera for each in wrong.cameras}
+    stated = tuple(replace(each, ego_from_camera=poses[each.name]) for each in seen.rig.cameras)
+    found = bevcli.calibrate(WrongRig(seen, replace(seen.rig, cameras=stated)))
+    assert angle_deg(right, found.rig, TURNED) < 0.3
+    assert found[LOW].position_m[2] == pytest.approx(0.15, abs=0.03)
 
 
 def test_the_residual_falls_to_less_than_a_pixel(result):
