@@ -31,7 +31,7 @@ class Measurement:
 
     Attributes:
         unknowns: their layout.
-        solution: their best values, with information and scatter.
+        solution: their best values, with the information and pull of each group.
         points: residuals of matched points.
         road: residuals of points of the road.
     """

@@ -28,7 +28,7 @@ from bevcli.printing import say
 from bevcli.robustness.sequences import CalibrationNoise, Draws
 from bevcli.sequences.open import open_sequence
 
-LARGEST_MEASURED_M = 0.1  # deviation of a height that counts as measured
+LARGEST_MEASURED_M = 0.05  # deviation of a height that counts as measured
 
 
 @dataclass(frozen=True)
