@@ -90,7 +90,7 @@ def _matched(a: _Features, b: _Features, first: Camera, second: Camera) -> tuple
     if first is second:
         good[good] = _rigid(rays_a[good], rays_b[good], first)
     chosen = np.flatnonzero(good)
-    chosen = chosen[_spread(pixels_a[chosen], quality[chosen], first)]
+    chosen = chosen[_spread(pixels_a[chosen], quality[chosen].astype(np.float64), first)]
     return pixels_a[chosen], pixels_b[chosen]
 
 

@@ -121,9 +121,9 @@ def _at(unknowns: Unknowns, terms: Items[Term], x: Array, *, curvature: bool = F
 def _summed(columns: Indices, parts: Array, size: int) -> Array:
     """Vectors (G, 20) or matrices (G, 20, 20) of groups summed up in all unknowns: (P,) or (P, P)."""
     if parts.ndim == 2:
-        return np.bincount(columns.ravel(), parts.ravel(), size)
+        return np.asarray(np.bincount(columns.ravel(), parts.ravel(), size), dtype=np.float64)
     places = columns[:, :, None] * size + columns[:, None, :]
-    return np.bincount(places.ravel(), parts.ravel(), size**2).reshape(size, size)
+    return np.asarray(np.bincount(places.ravel(), parts.ravel(), size**2), dtype=np.float64).reshape(size, size)
 
 
 def _curvature(squares: Array) -> float:
