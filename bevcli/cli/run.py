@@ -47,6 +47,7 @@ def run(
     Ctrl-C or SIGTERM finish the current frame; a second one ends the program at once.
     """
     with fast_imports():
+        from bevcli.cli.engine_bar import in_engine_with_bar
         from bevcli.cli.fetching import fetch_if_asked
         from bevcli.cli.progress import Progress
         from bevcli.cli.stop_signals import StopSignals
@@ -62,6 +63,7 @@ def run(
     if first.calibrate:
         drive = _calibrated(drive)
     drive = CheckedDrive(drive, shlex.quote(str(sequence)))
+    loaded = in_engine_with_bar(loaded, drive, "`probes`" if recording.probes else "")
     out = output.out or Path("runs") / f"{drive.name}-{loaded.name}"
     view = None
     if output.live:
@@ -115,6 +117,8 @@ def _run_notes(model: "Model", drive: "Sequence", *, live: bool = False) -> list
     found = list(drive.notes)
     if model.untrained:
         found.append("the weights are UNTRAINED: random weights, the boxes are meaningless")
+    if model.engine_note:
+        found.append(model.engine_note)
     if model.is_exported:
         found.append("an exported file shows no attention: the recording has no history map, pillars and probes")
     if model.left_out:

@@ -89,7 +89,9 @@ class SequenceOptions(ClassOptions):
         flag_value="static",
     )
     strict: bool = option(default=False, help="Treat a missing or unreadable image as an error.")
-    scene: str | None = option(default=None, help="Only this scene, such as scene-0103.")
+    scene: str | None = option(
+        default=None, help="Only this scene, such as scene-0103; of a folder of drives, this drive."
+    )
     ground_truth: bool = option(
         default=True, help="Read the ground truth, if any.", flag="--ground-truth/--no-ground-truth"
     )
