@@ -9,6 +9,7 @@ import typer
 
 from bevcli.calibration.options import CalibrateFirstOptions
 from bevcli.cli.bridge import INPUT, Part, as_flags
+from bevcli.cli.imports import fast_imports
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
 from bevcli.recording.options import RecordingOptions
@@ -45,14 +46,15 @@ def run(
     map_lines.json and plan.csv.
     Ctrl-C or SIGTERM finish the current frame; a second one ends the program at once.
     """
-    from bevcli.cli.engine_bar import in_engine_with_bar
-    from bevcli.cli.fetching import fetch_if_asked
-    from bevcli.cli.progress import Progress
-    from bevcli.cli.stop_signals import StopSignals
-    from bevcli.inference.load import load_model
-    from bevcli.rig.check_drive import CheckedDrive
-    from bevcli.runs.run_into_folder import run_into_folder
-    from bevcli.sequences.open import open_sequence
+    with fast_imports():
+        from bevcli.cli.engine_bar import in_engine_with_bar
+        from bevcli.cli.fetching import fetch_if_asked
+        from bevcli.cli.progress import Progress
+        from bevcli.cli.stop_signals import StopSignals
+        from bevcli.inference.load import load_model
+        from bevcli.rig.check_drive import CheckedDrive
+        from bevcli.runs.run_into_folder import run_into_folder
+        from bevcli.sequences.open import open_sequence
 
     fetch_if_asked(model)
     loaded = load_model(options=model)
