@@ -116,6 +116,7 @@ def test_a_broken_file_is_made_anew(steps, drive, network):
     assert not list(file.parent.glob(".unfinished*"))
 
 
+@pytest.mark.slow
 def test_a_longer_drive_is_not_run_with_a_file_of_a_short_one(steps, drive, network):
     short = select_range(drive, slice(0, 1))
     model = replace(chosen(network, "onnxruntime", "int8"), bundled=True)
