@@ -116,8 +116,8 @@ class Session:
             kinematics: acceleration, angular rate and velocity at the frame's time. Default: derived from the poses.
             command: of the driver, from this frame on. Default: the one before.
 
-        Raises InputError for an unknown camera or command, an image of another size or type, a pose that is not rigid, and a time
-        that is not later than the one before. The session is then as it was before the call.
+        Raises InputError for an unknown camera or command, an image of another size or type, a pose that is not rigid,
+        and a time that is not later than the one before. The session is then as it was before the call.
         """
         stamp = self._next_stamp(timestamp_ns)
         pose = _pose(world_from_ego, "`world_from_ego`")
