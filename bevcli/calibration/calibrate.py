@@ -20,7 +20,7 @@ from bevcli.geometry.transforms import Array
 from bevcli.options import gather
 
 FEWEST_MATCHES = 100  # of a camera
-WIDEST_DEG = 0.5  # deviation of a rotation that counts as measured
+WIDEST_DEG = 0.3  # deviation of a rotation that counts as measured
 FINE = np.array([np.radians(0.2)] * 3 + [0.03, 0.03, 0.015])  # changes that are not worth a correction,
 FINE_DEVIATIONS = 3.0  # or less than this many standard deviations
 STEPS = READING_STEPS + 1 + PARTS  # of the work, for progress
@@ -101,8 +101,8 @@ def _estimate(
         road_points=int(road.sum()),
         before_px=before,
         after_px=after,
-        change=change[:6],
-        covariance=covariance[:6, :6],
+        change=change,
+        covariance=covariance,
     )
 
 

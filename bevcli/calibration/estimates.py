@@ -35,8 +35,8 @@ class CameraEstimate:
         road_points: points of the road.
         before_px: median residual of the matched points with the stated calibration, pixels of the original image.
         after_px: the same with the measured one.
-        change: (6,) rotation in the camera frame, radians, and position in the ego frame, metres.
-        covariance: (6, 6) of it.
+        change: (7,) rotation in the camera frame, radians; position in the ego frame, metres; delay, seconds.
+        covariance: (7, 7) of it.
     """
 
     camera: str

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 from bevcli.calibration.calibrate import calibrate
 from bevcli.calibration.estimates import CameraEstimate, Verdict
-from bevcli.calibration.table import change_text, delay_text
+from bevcli.calibration.table import change_text, delay_text, either_text
 from bevcli.errors import InputError
 from bevcli.findings import Finding
 from bevcli.frame import Sequence
@@ -29,6 +29,9 @@ def findings_of(cameras: Iterable[CameraEstimate]) -> tuple[Finding, ...]:
             found.append(_off(each))
         if delay_text(each):
             found.append(_late(each))
+        if either_text(each):
+            advice = "choose a part of the drive that turns and drives straight on"
+            found.append(Finding("capture-times-off", "warning", each.camera, either_text(each), "", "", advice))
     return tuple(found)
 
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from bevcli.calibration.road import beside_way, sampled
 from bevcli.calibration.unknowns import GroupGeometry, Unknowns, geometry_at
-from bevcli.calibration.views import Views
+from bevcli.calibration.views import THREADS, Views
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array
 
@@ -15,13 +15,13 @@ CORRECTIONS_M = np.arange(-0.6, 0.61, 0.03)
 DISTANCES, ANGLES_DEG = np.linspace(2.0, 8.0, 60), np.linspace(-35, 35, 100)  # of road points; in heights of the camera
 TILES, POINTS = (6, 10), (10, 10)  # of the road: each has a level of its own, such as that of the pavement
 LEAST_CORRELATION = 0.6
-LEAST_SHARPNESS = 0.2  # of a peak of the scores, as a share of the sharpest one's
+LEAST_SHARPNESS, LEAST_SCORE = 0.2, 0.6  # of a peak of the scores, as shares of the sharpest and the highest one's
 LANE_M = 4.0  # farther beside the vehicle's way a tile counts less
 
 
 def search_heights(views: Views, unknowns: Unknowns, x: Array) -> Array:
     """(C,) corrections of the heights in x (P,), metres."""
-    with ThreadPoolExecutor() as threads:
+    with ThreadPoolExecutor(THREADS) as threads:
         return np.array(list(threads.map(lambda c: _best(views, unknowns, x, c), range(unknowns.cameras))))
 
 
@@ -39,8 +39,11 @@ def _lowest_level(scores: Array) -> int:
     sharpness = np.full(len(scores), -np.inf)
     sharpness[2:-2] = scores[2:-2] - (scores[:-4] + scores[4:]) / 2
     peak = np.r_[False, (scores[1:-1] >= scores[:-2]) & (scores[1:-1] >= scores[2:]), False]
+    peak &= scores >= LEAST_SCORE * scores.max()
     sharp = np.where(peak, sharpness, -np.inf)
-    return int(np.flatnonzero(sharp >= LEAST_SHARPNESS * sharp.max())[-1]) if peak.any() else int(scores.argmax())
+    if not sharp.max() > 0:
+        return int(scores.argmax())
+    return int(np.flatnonzero(sharp >= LEAST_SHARPNESS * sharp.max())[-1])
 
 
 def _scores(views: Views, unknowns: Unknowns, found: GroupGeometry, group: int) -> Array:

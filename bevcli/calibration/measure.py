@@ -1,7 +1,7 @@
 """The measurement: rounds of rotations from points, heights from the road, and both together."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -9,14 +9,18 @@ from bevcli.calibration.heights import search_heights
 from bevcli.calibration.levels import level_corrections, sees_road
 from bevcli.calibration.matches import PointMatches
 from bevcli.calibration.options import CalibrateOptions
-from bevcli.calibration.residuals import EpipolarResiduals, RoadResiduals, epipolar_residuals
+from bevcli.calibration.residuals import EpipolarResiduals, RoadResiduals, epipolar_residuals, values
 from bevcli.calibration.road import road_residuals
 from bevcli.calibration.solve import Solution, Term, solve, spread
-from bevcli.calibration.unknowns import HEIGHT, OF_CAMERA, Unknowns
+from bevcli.calibration.unknowns import HEIGHT, OF_CAMERA, OF_PAIR, Unknowns
 from bevcli.calibration.views import Views
+from bevcli.geometry.transforms import Array
 
 SCALES_PX = (20.0, 5.0, 1.5, 0.7)  # of Cauchy's loss for points, one search after the other
-ROAD_SCALES_PX = (3.0, 1.0, 0.5)
+POINT_SCALE_PX, ROAD_SCALES_PX = 0.3, (3.0, 1.0, 0.5)  # then: the smallest one, and those of road points
+CONSISTENT_PX, CONSISTENT_SHARE = 5.0, 0.5  # of the points of a pair of images: residual, and share of all
+LEARNINGS = 4  # rounds in which the error of the vehicle's rotation is learned
+SMALLEST_TURN = np.radians(0.005)  # of it
 FLOWS_PX = (12.0, 8.0)  # largest distance of road points from where they are expected, round by round
 PARTS = 2 + 2 * len(FLOWS_PX)  # of the work, for progress
 
@@ -27,7 +31,7 @@ class Measurement:
 
     Attributes:
         unknowns: their layout.
-        solution: their best values, with information and scatter.
+        solution: their best values, with the information and pull of each group.
         points: residuals of matched points.
         road: residuals of points of the road.
     """
@@ -47,6 +51,7 @@ def measure(
     within, x = points.where(matches.same), np.zeros(len(unknowns.deviations))
     for scale in SCALES_PX:
         x = solve(unknowns, [Term(within, scale)], x).x
+    within = consistent(unknowns, within, x)
     progress()
     heights = np.arange(unknowns.cameras) * OF_CAMERA + HEIGHT
     x[heights] += search_heights(views, unknowns, x)
@@ -56,13 +61,48 @@ def measure(
         road = road_residuals(views, unknowns, x, most_px)
         progress()
         for scale in ROAD_SCALES_PX:
-            terms = [Term(each, max(s, spread(unknowns, each, x))) for each, s in ((within, 0.3), (road, scale))]
-            solution = solve(unknowns, terms, x)
-            x = solution.x
+            x = solve(unknowns, _terms(unknowns, within, road, x, scale), x).x
         if most_px == FLOWS_PX[0]:
             x = x + level_corrections(unknowns, ties, x)
         progress()
-    certain = road.where(sees_road(unknowns, road, ties, x)[unknowns.groups[road.group, 1]])
-    if len(certain.group) < len(road.group):
-        road, solution = certain, solve(unknowns, [terms[0], Term(certain, terms[1].scale)], x)
+    road = road.where(sees_road(unknowns, road, ties, x)[unknowns.groups[road.group, 1]])
+    for _ in range(LEARNINGS):
+        solution = solve(unknowns, _terms(unknowns, within, road, x, ROAD_SCALES_PX[-1]), x)
+        x, unknowns = solution.x, with_learned_turns(unknowns, solution)
     return Measurement(unknowns, solution, within, road)
+
+
+def _terms(
+    unknowns: Unknowns, points: EpipolarResiduals, road: RoadResiduals, x: Array, road_scale: float
+) -> list[Term]:
+    """Both kinds of residuals, with the spread that they have at x (P,)."""
+    scales = ((points, POINT_SCALE_PX), (road, road_scale))
+    return [Term(each, max(least, spread(unknowns, each, x))) for each, least in scales]
+
+
+def consistent(unknowns: Unknowns, points: EpipolarResiduals, x: Array) -> EpipolarResiduals:
+    """The points that fit at x (P,), of the image pairs in which most of them do.
+
+    Repeated texture gives pairs whose matches fit a motion, but not that of the vehicle.
+    """
+    fits = np.abs(values(unknowns, points, x)[:, 0]) < CONSISTENT_PX
+    shares = np.bincount(points.group[fits], minlength=len(unknowns.groups)) / np.maximum(
+        np.bincount(points.group, minlength=len(unknowns.groups)), 1
+    )
+    return points.where(fits & (shares[points.group] >= CONSISTENT_SHARE))
+
+
+def with_learned_turns(unknowns: Unknowns, solution: Solution) -> Unknowns:
+    """The unknowns with the deviation of the vehicle's stated rotation that its pairs show, at most the present one.
+
+    It is estimated an axis, as the scatter of the solution over what the pairs determine (MacKay's rule).
+    """
+    deviations = unknowns.deviations.copy()
+    start = OF_CAMERA * unknowns.cameras
+    turns = slice(start, start + OF_PAIR * unknowns.pairs)
+    covariance = np.linalg.inv(solution.information + np.diag(1 / deviations**2))
+    determined = (1 - np.diag(covariance)[turns] / deviations[turns] ** 2).reshape(-1, OF_PAIR).sum(0)
+    squares = (solution.x[turns] ** 2).reshape(-1, OF_PAIR).sum(0)
+    learned = np.maximum(np.sqrt(squares / np.maximum(determined, 1)), SMALLEST_TURN)
+    deviations[turns] = np.minimum(deviations[turns], np.tile(learned, unknowns.pairs))
+    return replace(unknowns, deviations=deviations)

@@ -5,13 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from bevcli.calibration.measure import Measurement
-from bevcli.calibration.unknowns import OF_CAMERA, OF_RIG
+from bevcli.calibration.solve import Solution
+from bevcli.calibration.unknowns import OF_CAMERA, OF_RIG, Unknowns
 from bevcli.geometry.transforms import Array
 
 LEAST_INFORMATION = 3.0  # of a direction, in that of the stated value: the deviation is then halved at least
-FINEST = np.array(
-    [np.radians(0.015)] * 3 + [0.001] * 3 + [0.001]
-)  # errors of lens and images: radians, metres, seconds
+LEAST_FACTOR = 0.25  # of variances, by which the agreement of the pairs may make them smaller
+FINEST = np.array([np.radians(0.01)] * 3 + [0.001] * 3 + [0.001])  # errors of lens and images: radians, metres, seconds
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,7 @@ def observed(measurement: Measurement) -> Observed:
     """The changes along directions that are observed, with their covariance."""
     unknowns, solution = measurement.unknowns, measurement.solution
     deviations, count = unknowns.deviations, OF_CAMERA * unknowns.cameras
-    inverse: Array = np.asarray(np.linalg.inv(solution.information + np.diag(1 / deviations**2)), dtype=np.float64)
-    covariance = _honest(inverse, solution.scatter, deviations)
+    covariance = _honest(unknowns, solution)
     scale = deviations[:count]
     marginal = np.linalg.inv(covariance[:count, :count] / np.outer(scale, scale)) - np.eye(count)
     sizes, axes = np.linalg.eigh((marginal + marginal.T) / 2)
@@ -61,8 +60,19 @@ def observed(measurement: Measurement) -> Observed:
     )
 
 
-def _honest(covariance: Array, scatter: Array, deviations: Array) -> Array:
-    """The covariance, enlarged for each unknown where the frame pairs agree less than their residuals promise."""
-    agreed = covariance @ (scatter + np.diag(1 / deviations**2)) @ covariance
-    factor = np.sqrt(np.maximum(np.diag(agreed) / np.diag(covariance), 1.0))
+def _honest(unknowns: Unknowns, solution: Solution) -> Array:
+    """The covariance (P, P), each unknown scaled by how well the frame pairs agree about it: the jackknife.
+
+    The result without a pair differs by what that pair pulls. So an unknown that a single pair tells is not believed,
+    however small its residuals are.
+    """
+    prior = np.diag(1 / unknowns.deviations**2)
+    matrix = solution.information + prior
+    covariance: Array = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+    pulls = []
+    for pair in range(unknowns.pairs):
+        groups = unknowns.groups[:, 0] == pair
+        pulls.append(np.linalg.solve(matrix - solution.information_of(groups), solution.gradient_of(groups)))
+    agreed = (np.square(pulls).sum(0) + np.diag(covariance @ prior @ covariance)) / np.diag(covariance)
+    factor = np.sqrt(np.maximum(agreed, LEAST_FACTOR))
     return covariance * np.outer(factor, factor)

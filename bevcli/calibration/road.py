@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from bevcli.calibration.residuals import RoadResiduals, rays_of_road_points
 from bevcli.calibration.unknowns import GroupGeometry, Unknowns, geometry_at
-from bevcli.calibration.views import Views
+from bevcli.calibration.views import THREADS, Views
 from bevcli.geometry.cameras import OUTSIDE, Camera
 from bevcli.geometry.transforms import Array
 
@@ -47,7 +47,7 @@ class Warp:
 def road_residuals(views: Views, unknowns: Unknowns, x: Array, most_px: float) -> RoadResiduals:
     """Road points of all groups, at most `most_px` pixels from where the unknowns x (P,) expect them."""
     groups, found = unknowns.within_camera, geometry_at(unknowns, x)
-    with ThreadPoolExecutor() as threads:
+    with ThreadPoolExecutor(THREADS) as threads:
         parts = list(threads.map(lambda group: _points_of(views, unknowns, found, int(group), most_px), groups))
     counts = [len(part[0]) for part in parts]
     columns = (np.concatenate([part[side] for part in parts]) for side in range(4))

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bevcli.calibration.residuals import Residuals, derivatives, values
-from bevcli.calibration.unknowns import Unknowns
+from bevcli.calibration.unknowns import Indices, Unknowns
 from bevcli.geometry.transforms import Array
 
 STEPS = 25
@@ -36,13 +37,28 @@ class Solution:
 
     Attributes:
         x: (P,) their values.
-        information: (P, P) of the measurements alone.
-        scatter: (P, P) sum over the groups of the products of their gradients, which measures how well they agree.
+        columns: (G, 20) the places in x that each group depends on.
+        blocks: (G, 20, 20) the information of each group about them.
+        gradients: (G, 20) of each group; they sum up to little, and their scatter tells how well the groups agree.
     """
 
     x: Array
-    information: Array
-    scatter: Array
+    columns: Indices
+    blocks: Array
+    gradients: Array
+
+    @property
+    def information(self) -> Array:
+        """(P, P) of the measurements alone."""
+        return self.information_of(np.ones(len(self.columns), dtype=bool))
+
+    def information_of(self, groups: NDArray[np.bool_]) -> Array:
+        """(P, P) of some groups, by a mask (G,)."""
+        return _summed(self.columns[groups], self.blocks[groups], len(self.x))
+
+    def gradient_of(self, groups: NDArray[np.bool_]) -> Array:
+        """(P,) of some groups, by a mask (G,)."""
+        return _summed(self.columns[groups], self.gradients[groups], len(self.x))
 
 
 def solve(unknowns: Unknowns, terms: Items[Term], x: Array) -> Solution:
@@ -50,8 +66,9 @@ def solve(unknowns: Unknowns, terms: Items[Term], x: Array) -> Solution:
     prior = 1 / unknowns.deviations**2
     damping, cost = DAMPING[0], _cost(unknowns, terms, x, prior)
     for _ in range(STEPS):
-        information, gradients = _normal_equations(unknowns, terms, x)
-        matrix, gradient = information + np.diag(prior), gradients.sum(0) + prior * x
+        found = _at(unknowns, terms, x)
+        matrix = found.information + np.diag(prior)
+        gradient = _summed(found.columns, found.gradients, len(x)) + prior * x
         while damping < DAMPING[1]:
             step = -np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), gradient)
             reached = _cost(unknowns, terms, x + step, prior)
@@ -63,8 +80,7 @@ def solve(unknowns: Unknowns, terms: Items[Term], x: Array) -> Solution:
         x, cost, damping = x + step, reached, max(damping / 10, 1e-9)
         if np.abs(step / unknowns.deviations).max() < SMALLEST_STEP:
             break
-    information, gradients = _normal_equations(unknowns, terms, x, curvature=True)
-    return Solution(x, information, gradients.T @ gradients)
+    return _at(unknowns, terms, x, curvature=True)
 
 
 def spread(unknowns: Unknowns, residuals: Residuals, x: Array) -> float:
@@ -81,16 +97,13 @@ def _cost(unknowns: Unknowns, terms: Items[Term], x: Array, prior: Array) -> flo
     return cost
 
 
-def _normal_equations(
-    unknowns: Unknowns, terms: Items[Term], x: Array, *, curvature: bool = False
-) -> tuple[Array, Array]:
-    """The information (P, P), and the gradient of each group (G, P).
+def _at(unknowns: Unknowns, terms: Items[Term], x: Array, *, curvature: bool = False) -> Solution:
+    """The normal equations at x (P,), group by group.
 
     curvature: scale the information of a term by the mean curvature of its loss, as the covariance needs it.
     """
-    size = len(unknowns.deviations)
-    information, gradients = np.zeros((size, size)), np.zeros((len(unknowns.groups), size))
     columns = unknowns.columns
+    blocks, gradients = np.zeros((*columns.shape, columns.shape[1])), np.zeros(columns.shape)
     for term in terms:
         here, slopes = derivatives(unknowns, term.residuals, x)
         squares = (here**2).sum(-1) / term.scale**2
@@ -98,14 +111,19 @@ def _normal_equations(
         factor = _curvature(squares) if curvature else 1.0
         bounds = np.searchsorted(term.residuals.group, np.arange(len(columns) + 1))
         for group, (start, end) in enumerate(pairwise(bounds)):
-            if start == end:
-                continue
             part = slopes[start:end].reshape(-1, slopes.shape[-1])
             weighted = part * np.repeat(weights[start:end], here.shape[1])[:, None]
-            places = columns[group]
-            np.add.at(information, np.ix_(places, places), factor * part.T @ weighted)
-            np.add.at(gradients[group], places, weighted.T @ here[start:end].ravel())
-    return information, gradients
+            blocks[group] += factor * part.T @ weighted
+            gradients[group] += weighted.T @ here[start:end].ravel()
+    return Solution(x, columns, blocks, gradients)
+
+
+def _summed(columns: Indices, parts: Array, size: int) -> Array:
+    """Vectors (G, 20) or matrices (G, 20, 20) of groups summed up in all unknowns: (P,) or (P, P)."""
+    if parts.ndim == 2:
+        return np.asarray(np.bincount(columns.ravel(), parts.ravel(), size), dtype=np.float64)
+    places = columns[:, :, None] * size + columns[:, None, :]
+    return np.asarray(np.bincount(places.ravel(), parts.ravel(), size**2), dtype=np.float64).reshape(size, size)
 
 
 def _curvature(squares: Array) -> float:

@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence as Items
 
+import numpy as np
+
 from bevcli.calibration.estimates import CameraEstimate, RigEstimate, Verdict
 
 HEADER = (
@@ -10,6 +12,7 @@ HEADER = (
 LEFT = (0, 9)
 CERTAIN_DELAY = (3.0, 10.0)  # of a delay that is told: in standard deviations, and in milliseconds
 TOLD_DELAY_MS = 25.0  # the largest deviation of a delay that counts as measured
+MOST_DELAY_MS = 300.0  # a larger one is a rotation
 
 
 def table(cameras: Items[CameraEstimate]) -> str:
@@ -33,7 +36,7 @@ def rig_text(whole: RigEstimate, cameras: Items[CameraEstimate]) -> str:
         f"tilt of the ego frame: pitch {pitch}, roll {roll}",
         f"scale of the ego-motion off by {-100 * whole.scale:+.1f} % ± {100 * whole.scale_deviation:.1f} %",
     ]
-    lines += [f"time offset: {text}" for text in map(delay_text, cameras) if text]
+    lines += [f"time offset: {text}" for each in cameras for text in (delay_text(each), either_text(each)) if text]
     return "\n".join(lines)
 
 
@@ -43,8 +46,33 @@ def delay_text(estimate: CameraEstimate) -> str:
     size, deviation = abs(estimate.delay_ms), estimate.delay_deviation_ms
     if deviation > TOLD_DELAY_MS or size < max(deviations * deviation, least):
         return ""
-    word = "later" if estimate.delay_ms > 0 else "earlier"
+    word = _word(estimate.delay_ms)
     return f"the images of {estimate.camera} were taken {size:.0f} ± {deviation:.0f} ms {word} than stated"
+
+
+def either_text(estimate: CameraEstimate) -> str:
+    """A time offset or a rotation, in words, where the motion does not tell which of both; "" where it does.
+
+    A vehicle that turns evenly moves a late camera as if it were turned.
+    """
+    rotation, covariance = estimate.change[:3], estimate.covariance
+    if estimate.verdict is Verdict.FINE or estimate.delay_deviation_ms <= TOLD_DELAY_MS:
+        return ""
+    gain = np.linalg.solve(covariance[:3, :3], covariance[:3, 6])
+    delay_ms = 1000 * float(estimate.change[6] - gain @ rotation)  # if the stated rotation is right
+    deviation_ms = 1000 * float(np.sqrt(max(covariance[6, 6] - gain @ covariance[:3, 6], 0)))
+    certain = max(CERTAIN_DELAY[0] * deviation_ms, CERTAIN_DELAY[1])
+    if deviation_ms > TOLD_DELAY_MS or not certain <= abs(delay_ms) <= MOST_DELAY_MS:
+        return ""
+    turned = rotation - covariance[:3, 6] / covariance[6, 6] * estimate.change[6]  # if the stated times are right
+    return (
+        f"the images of {estimate.camera} were taken {abs(delay_ms):.0f} ms {_word(delay_ms)} than stated, or it is "
+        f"turned by {np.degrees(np.linalg.norm(turned)):.1f}°: the drive does not tell which of both"
+    )
+
+
+def _word(delay_ms: float) -> str:
+    return "later" if delay_ms > 0 else "earlier"
 
 
 def change_text(estimate: CameraEstimate) -> str:

@@ -84,11 +84,11 @@ class Unknowns:
 
     def ego_from_camera(self, x: Array) -> Array:
         """(C, 4, 4), metres."""
-        return moved(self.stated, self.of_camera(x)[:, :6])
+        return moved(self.stated, self.of_camera(x))
 
 
 def moved(ego_from_camera: Array, change: Array) -> Array:
-    """Poses (C, 4, 4) with a change (C, 6): rotation in the camera frame, radians; position in ego, metres."""
+    """Poses (C, 4, 4) with a change (C, 6 or 7): rotation in the camera frame, radians; position in ego, metres."""
     result = ego_from_camera.copy()
     result[:, :3, :3] = ego_from_camera[:, :3, :3] @ Rotation.from_rotvec(change[:, :3]).as_matrix()
     result[:, :3, 3] += change[:, 3:6]
@@ -137,7 +137,7 @@ def geometry(unknowns: Unknowns, local: Array) -> GroupGeometry:
     motion = inverse(after) @ before
     motion[:, :3, :3] = motion[:, :3, :3] @ Rotation.from_rotvec(pair).as_matrix()
     motion[:, :3, 3] *= 1 + rig[:, :1]
-    return GroupGeometry(moved(stated[first], of_a[:, :6]), moved(stated[second], of_b[:, :6]), motion, rig[0, 1:])
+    return GroupGeometry(moved(stated[first], of_a), moved(stated[second], of_b), motion, rig[0, 1:])
 
 
 def _pose_at(table: Array, delay: Array) -> Array:

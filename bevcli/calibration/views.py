@@ -1,5 +1,6 @@
 """The frame pairs of a drive that are used, and the grey images of their frames."""
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,6 +19,7 @@ WIDTH, MOST_ENLARGED = 1000, 2  # pixels: all images are brought to this width; 
 NEAREST_M, FARTHEST_M = 0.8, 12.0  # distance driven between the frames of a pair
 MOST_FRAMES = 120  # that are read where the poses of the drive are known only with its images
 FEWEST_PAIRS = 6  # a measurement from fewer would be sure of an error of the poses
+THREADS = min(os.cpu_count() or 1, 8)  # each needs about 150 MB while it finds features
 READING_STEPS = 10  # of progress
 DARKEST = 4  # grey levels of standard deviation; an image with less shows nothing
 SMOOTHING, COARSE = 1.2, 35  # pixels: finer structure is noise, coarser is light and shade

@@ -247,6 +247,11 @@ class ModelConfig:
         return 0
 
     @property
+    def future_times_s(self) -> tuple[float, ...]:
+        """Seconds after a frame at which its losses compare places of objects and of the vehicle; empty for none."""
+        return ()
+
+    @property
     def uses_history(self) -> bool:
         """Earlier or later frames change the result."""
         return True

@@ -28,7 +28,7 @@ from bevcli.printing import say
 from bevcli.robustness.sequences import CalibrationNoise, Draws
 from bevcli.sequences.open import open_sequence
 
-LARGEST_MEASURED_M = 0.1  # deviation of a height that counts as measured
+LARGEST_MEASURED_M = 0.05  # deviation of a height that counts as measured
 
 
 @dataclass(frozen=True)
@@ -124,10 +124,10 @@ def _error(
     drive: str, level: int, seed: int, right: Camera, result: CalibrationResult, estimate: CameraEstimate
 ) -> CameraError:
     corrected = result.rig[right.name].ego_from_camera
-    deviations = np.sqrt(np.diag(estimate.covariance))
+    deviations = np.sqrt(np.diag(estimate.covariance))[:6]
     measured = result.stated[right.name].ego_from_camera.copy()
     measured[:3, :3] = measured[:3, :3] @ cv2.Rodrigues(estimate.change[:3])[0]
-    measured[:3, 3] += estimate.change[3:]
+    measured[:3, 3] += estimate.change[3:6]
     return CameraError(
         drive,
         level,

@@ -1,4 +1,4 @@
-"""Corruptions of images with the parameters of RoboBEV, whose weather is that of ImageNet-C, and others of ImageNet-C."""
+"""Corruptions of images: RoboBEV's with its parameters (its weather is that of ImageNet-C), and more of ImageNet-C."""
 
 from collections.abc import Callable
 from typing import Any

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from bevcli.config import TRAINING, read_model_file
-from bevcli.geometry.object_classes import NUSCENES_CLASSES
+from bevcli.geometry.object_classes import NUSCENES_CLASSES, class_of_size
 from bevcli.inference.training_rigs import rigs_of
 from bevcli.training.data_facts import DataFacts
 from bevcli.training.job import TrainingConfig
@@ -66,6 +66,9 @@ def model_table(name: str, preset: Preset, facts: DataFacts) -> dict[str, Any]:
     for path, changes in chosen.changes.items():
         _change(table, path, changes)
     table |= {"name": name, "classes": ordered_classes(facts.class_counts), "cameras": list(facts.cameras)}
+    own = [name for name in table["classes"] if name not in NUSCENES_CLASSES]
+    if own:
+        table["class_settings"] = {name: {"like": class_of_size(*facts.class_sizes[name])} for name in own}
     table["rate_hz"] = rate_for(facts, table.get("rate_hz", 2.0))
     table["max_gap_s"] = max(table.get("max_gap_s", 2.0), round(2 / table["rate_hz"], 2))
     table["image"]["size"] = _image_size(facts, chosen.width_px or table["image"]["size"][0])

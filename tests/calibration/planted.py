@@ -2,11 +2,12 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bevcli.frame import DerivedSequence, Frame, Sequence
-from bevcli.geometry.cameras import CameraRig
+from bevcli.geometry.cameras import Camera, CameraRig, Distortion
 from bevcli.geometry.transforms import rigid
 
 
@@ -19,6 +20,29 @@ class WrongRig(DerivedSequence):
 
     def load(self, place: int) -> Frame:
         return replace(self.sequence.load(place), rig=self.rig)
+
+
+class ThroughLens(DerivedSequence):
+    """A drive of cameras without distortion, as lenses would have shown it; `zoom` keeps their images filled."""
+
+    def __init__(self, sequence: Sequence, lens: Distortion, zoom: float = 1.0) -> None:
+        super().__init__(sequence)
+        self.rig = replace(self.rig, cameras=tuple(_with_lens(each, lens, zoom) for each in self.rig.cameras))
+
+    def load(self, place: int) -> Frame:
+        frame = self.sequence.load(place)
+        images = {}
+        for plain, camera in zip(self.sequence.rig.cameras, self.rig.cameras, strict=True):
+            pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
+            source = plain.project(camera.rays(pixels))[0].astype(np.float32)
+            seen = frame.images[camera.name]
+            bent = cv2.remap(seen.pixels_bgr, source[..., 0], source[..., 1], cv2.INTER_CUBIC)
+            images[camera.name] = replace(seen, pixels_bgr=bent)
+        return replace(frame, rig=self.rig, images=images)
+
+
+def _with_lens(camera: Camera, lens: Distortion, zoom: float) -> Camera:
+    return replace(camera, distortion=lens, intrinsics=camera.intrinsics * [[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]])
 
 
 class BlackImages(DerivedSequence):

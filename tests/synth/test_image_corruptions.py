@@ -26,7 +26,12 @@ from bevcli.synth.corruptions import (
 )
 
 LEVELS = {
-    **{brightness: 5, low_light: 4, motion_blur: 5, color_quantisation: 3, fog: 5, snow: 3},
+    brightness: 5,
+    low_light: 4,
+    motion_blur: 5,
+    color_quantisation: 3,
+    fog: 5,
+    snow: 3,
     **dict.fromkeys((defocus_blur, low_contrast, impulse_noise, jpeg, saturation), 5),
 }
 
