@@ -32,6 +32,7 @@ class PlainCommand(TyperCommand):
         """Parse; an empty path, as of a variable that is not set, would be the current folder."""
         given, *_ = self.make_parser(ctx).parse_args(args=list(args))
         takes = inspect.signature(self.callback).parameters if self.callback else {}
+        each: Any
         for each in self.get_params(ctx):
             value = given.get(each.name)
             empty = "" in (value if isinstance(value, list | tuple) else [value])
