@@ -6,7 +6,7 @@ import math
 import re
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -18,6 +18,7 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import read_text
+from bevcli.published import read_sources
 from bevcli.registry import entries, load
 
 T = TypeVar("T")
@@ -36,7 +37,7 @@ def known_models() -> tuple[str, ...]:
 
 
 def load_config(name_or_path: str | Path) -> ModelConfig:
-    """The configuration of a known model ("tiny"), or of a file whose name ends in .toml.
+    """The configuration of a known model ("tiny"), of published weights ("tiny-fp16"), or of a FILE.toml.
 
     Raises ConfigError where there is none, or where its contents are wrong.
     """
@@ -91,19 +92,30 @@ def _plain(settings: Any) -> dict[str, Any]:
 
 
 def read_model_file(name: str) -> tuple[dict[str, Any], str]:
-    """Contents and name of the TOML file of a known model, or of a file whose name ends in .toml.
+    """Contents and name of the TOML file of a model. This is the one place that knows what the name of a model means.
 
+    name: a known model; a name of the table of published weights, whose model gets that name; or a FILE.toml.
     Raises ConfigError where there is no such file, or where it is no TOML.
     """
-    known = ", ".join(known_models())
+    published = {} if name.endswith(".toml") else read_sources()
+    if name in published and published[name].model:
+        contents, file = _read_toml(published[name].model)
+        return contents | {"name": name}, file
+    return _read_toml(name, published)
+
+
+def _read_toml(name: str, published: Iterable[str] = ()) -> tuple[dict[str, Any], str]:
+    """As `read_model_file`, for a known model or a FILE.toml. published: further names, for the error."""
+    known = known_models()
     if name.endswith(".toml"):
         path, file = Path(name), name
         if not path.is_file():
-            raise ConfigError(f"{path}: file not found; known models are {known}")
+            raise ConfigError(f"{path}: file not found; known models are {', '.join(known)}")
         text = read_text(path, TOML_BYTES, error=ConfigError)
     else:
-        if name not in known_models():
-            raise ConfigError(f'unknown model "{name}"; expected one of {known}, or a FILE.toml')
+        if name not in known:
+            names = ", ".join(dict.fromkeys([*known, *published]))
+            raise ConfigError(f'unknown model "{name}"; expected one of {names}, or a FILE.toml')
         file = f"{name}.toml"
         text = resources.files("bevcli").joinpath("configs", file).read_text(encoding="utf-8")
     return parse_toml(text, file, ConfigError), file

@@ -22,13 +22,14 @@ from bevcli.model.fpn import FPNConfig
 from bevcli.model.resnet import ResNetConfig
 from bevcli.viewer import recording_file
 
-# Files that one worker runs, because they share what takes long: imports for the export, processes to fork from.
-TOGETHER = {
-    **dict.fromkeys(("test_engines", "test_export_onnx", "test_export_window"), "export"),
-    **dict.fromkeys(
-        ("test_interrupted_run", "test_no_answer", "test_no_connections", "test_process_group"), "processes"
-    ),
+# Files that one worker runs, because they share what takes long: imports for the export, processes to fork from, and
+# syntax trees.
+GROUPS = {
+    "export": ("test_engines", "test_in_engine", "test_export_onnx", "test_export_window"),
+    "processes": ("test_interrupted_run", "test_no_answer", "test_no_connections", "test_process_group"),
+    "code": ("test_extend", "test_layers", "test_printing", "test_rooms", "test_synth_layers", "test_waits"),
 }
+TOGETHER = {file: group for group, files in GROUPS.items() for file in files}
 # What takes longest comes first, so that no worker ends with it.
 FIRST = ("export", "processes", "test_fuzz", "test_equals_original", "test_resume", "test_drive", "test_demo_model")
 

@@ -18,10 +18,8 @@ FORKS.set_forkserver_preload(
         "bevcli.cli.run",
         "bevcli.inference.load",
         "bevcli.runs.run_into_folder",
-        "bevcli.training.trainer",
         "numba.core.registry",
         "rerun.blueprint.api",
-        "torch._dynamo",  # optimizers import it
         "typer._adapters",
     ]
 )

@@ -9,7 +9,7 @@ from typing import Literal
 
 import pytest
 
-from bevcli.config import TRAINING, as_table, config_of_table, known_models, load_config, load_table
+from bevcli.config import TRAINING, as_table, config_of_table, known_models, load_config, load_table, read_model_file
 from bevcli.errors import ConfigError
 from bevcli.model.bevformer_v2.bevformer_v2 import BEVFormerV2Config
 from bevcli.model.uniad.uniad import UniADConfig
@@ -168,6 +168,12 @@ def test_a_uniad_file_configures_tracks_and_map(tmp_path: Path) -> None:
         with pytest.raises(ConfigError) as error:
             load_config(path)
         assert message in str(error.value)
+
+
+def test_a_name_of_published_weights_names_their_model() -> None:
+    """So every command knows it: they all read the file of a model in this way."""
+    assert read_model_file("tiny-fp16")[0] == read_model_file("tiny")[0] | {"name": "tiny-fp16"}
+    assert load_config("tiny-fp16").name == "tiny-fp16"
 
 
 @pytest.mark.parametrize("name", ["huge", "nowhere/x.toml"])

@@ -16,10 +16,10 @@ from textwrap import dedent
 
 import pytest
 from command_line import MINI_TOML
+from source_code import ROOT as PACKAGE, trees
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs/extend.md").read_text()
-PACKAGE = ROOT / "bevcli"
 ENTRIES = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]
 NAMED_BLOCK = re.compile(r"^ *`([\w./]+)`:\n\n *```\w+\n(.*?)^ *```", flags=re.MULTILINE | re.DOTALL)
 FILES = {name: dedent(text) for name, text in NAMED_BLOCK.findall(PAGE)}
@@ -108,7 +108,7 @@ def test_the_engine_of_the_page_runs_an_exported_file(folder):
 
 def imported(path: Path) -> Iterator[str]:
     """The modules that a file imports anywhere, also by a text "module:attribute"."""
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(trees()[path]):
         if isinstance(node, ast.ImportFrom) and node.module:
             yield from [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
         if isinstance(node, ast.Import):
@@ -124,7 +124,7 @@ def folders(group: str) -> set[str]:
 
 def test_nothing_outside_its_folder_names_a_model():
     inside = tuple(f"{folder}." for folder in folders("bevcli.models"))
-    for path in PACKAGE.rglob("*.py"):
+    for path in trees():
         module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
         if not module.startswith(inside):
             assert not [name for name in imported(path) if f"{name}.".startswith(inside)], module

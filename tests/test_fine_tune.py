@@ -40,11 +40,9 @@ def make_drive(folder: Path, name: str) -> None:
 def test_the_page_leads_to_a_model_that_runs(tmp_path: Path) -> None:
     for name in ("monday", "tuesday", "friday"):
         make_drive(tmp_path, name)
-    tables = iter(["split.toml", "my.toml"])
     for language, block in BLOCKS:
         if language == "toml":
-            with (tmp_path / next(tables)).open("a") as file:
-                file.write(f"\n{block}")
+            (tmp_path / "split.toml").write_text(block)
         for line in block.splitlines() if language == "sh" else ():
             arguments = shlex.split(line)[1:]
             small = SMALL if line.startswith("bevcli train --model") else []

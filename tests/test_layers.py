@@ -7,15 +7,15 @@ import ast
 import re
 from pathlib import Path
 
-import bevcli
+from source_code import ROOT, trees
 
-ROOT = Path(bevcli.__file__).parent
 # From the lowest to the highest; names in one set may not import each other.
 LAYERS = (
     {"_version", "duration", "findings", "printing"},
     {"errors"},
     {"options", "registry"},
     {"parsing", "jit", "user_folders", "waiting", "writing"},
+    {"published"},
     {"geometry"},
     {"frame"},
     {"model"},
@@ -47,7 +47,7 @@ FILES = {
 def imports(path: Path) -> set[str]:
     """The modules of bevcli that a file imports, anywhere: in functions and for type checking too."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(trees()[path]):
         if isinstance(node, ast.ImportFrom) and node.module:
             submodules = {f"{node.module}.{alias.name}" for alias in node.names} & FILES.keys()
             found |= submodules or {node.module}
@@ -87,8 +87,7 @@ def test_names_of_tests_have_at_most_60_characters() -> None:
 
 
 def functions(path: Path) -> list[ast.FunctionDef | ast.AsyncFunctionDef]:
-    nodes = ast.walk(ast.parse(path.read_text()))
-    return [node for node in nodes if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+    return [node for node in ast.walk(trees()[path]) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
 
 
 def test_no_function_has_more_than_10_parameters() -> None:
@@ -110,7 +109,7 @@ FLAG = re.compile(r"(?<![\w-])--[a-z]")
 
 def library_texts(path: Path) -> list[str]:
     """The texts of a file, but for arguments of programs and spellings of options."""
-    tree = ast.parse(path.read_text())
+    tree = trees()[path]
     spellings = {id(each.value) for each in ast.walk(tree) if isinstance(each, ast.keyword) and each.arg == "flag"}
     formatted = [node for node in ast.walk(tree) if isinstance(node, ast.JoinedStr)]
     parts = {id(part) for text in formatted for part in text.values}
@@ -130,3 +129,20 @@ def test_the_library_names_arguments_and_no_flags() -> None:
         texts = [text for text in library_texts(path) if ":root" not in text]  # CSS
         wrong += [f"{module}: {text:.100}" for text in texts if FLAG.search(COMMAND.sub("", text))]
     assert not wrong
+
+
+def test_only_a_download_uses_libcurl_and_http():
+    """And only `fetch_weights` downloads, which is called where `fetch` was given, or by a command that is for it."""
+    users: dict[str, set[str]] = {}
+    for path, tree in trees().items():
+        for node in ast.walk(tree):
+            names = [each.name for each in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom) and node.module:
+                names = [node.module, *(f"{node.module}.{each.name}" for each in node.names)]
+            for name in names:
+                users.setdefault(name, set()).add(path.relative_to(ROOT).as_posix())
+    assert users["pycurl"] == {"weights/download.py"}
+    assert users["bevcli.weights.download.download"] == {"weights/fetch.py"}
+    assert users["bevcli.weights.fetch.fetch_weights"] == {"inference/load.py", "cli/fetching.py"}
+    assert users["urllib.request"] == {"viewer/web.py"}  # which asks the viewer on this machine
+    assert not {"requests", "httpx", "aiohttp", "http.client", "urllib3"} & users.keys()

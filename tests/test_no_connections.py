@@ -1,6 +1,5 @@
 """bevcli opens no connection of its own, and the viewer's telemetry is off."""
 
-import ast
 import sys
 from pathlib import Path
 
@@ -51,23 +50,6 @@ def test_weights_are_never_fetched_without_being_asked(arguments, said, tmp_path
     done = command(tmp_path, *arguments)
     assert said in done.stdout + done.stderr
     assert list(tmp_path.iterdir()) == []
-
-
-def test_only_a_download_uses_libcurl_and_http():
-    """And only `fetch_weights` downloads, which is called where `fetch` was given, or by a command that is for it."""
-    users: dict[str, set[str]] = {}
-    for path in (ROOT / "bevcli").rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            names = [each.name for each in node.names] if isinstance(node, ast.Import) else []
-            if isinstance(node, ast.ImportFrom) and node.module:
-                names = [node.module, *(f"{node.module}.{each.name}" for each in node.names)]
-            for name in names:
-                users.setdefault(name, set()).add(path.relative_to(ROOT / "bevcli").as_posix())
-    assert users["pycurl"] == {"weights/download.py"}
-    assert users["bevcli.weights.download.download"] == {"weights/fetch.py"}
-    assert users["bevcli.weights.fetch.fetch_weights"] == {"inference/load.py", "cli/fetching.py"}
-    assert users["urllib.request"] == {"viewer/web.py"}  # which asks the viewer on this machine
-    assert not {"requests", "httpx", "aiohttp", "http.client", "urllib3"} & users.keys()
 
 
 def test_the_viewer_starts_without_telemetry():

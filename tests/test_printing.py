@@ -2,17 +2,15 @@
 
 import ast
 import shutil
-from pathlib import Path
 
 from command_line import command
+from source_code import ROOT, trees
 
-import bevcli
 from bevcli.cli.bridge import print_note
 from bevcli.cli.progress import Progress
 from bevcli.errors import InputError
 from bevcli.printing import LONGEST_MESSAGE, one_line, say
 
-ROOT = Path(bevcli.__file__).parent
 SAMPLE = ROOT.parent / "samples/street"
 NASTY = "\x1b]0;owned\x07\r\n\u202e\x9b2J\udc80"
 SHOWN = r"\x1b]0;owned\x07\r\n\u202e\x9b2J\udc80"
@@ -71,8 +69,8 @@ def test_an_error_of_the_system_is_clean(tmp_path):
 def test_only_say_prints():
     printing = {"print", "typer.echo", "typer.secho", "click.echo", "sys.stdout.write", "sys.stderr.write"}
     wrong = []
-    for path in ROOT.rglob("*.py"):
-        nodes = ast.walk(ast.parse(path.read_text()))
+    for path, tree in trees().items():
+        nodes = ast.walk(tree)
         if printing & {ast.unparse(node.func) for node in nodes if isinstance(node, ast.Call)}:
             wrong.append(path.relative_to(ROOT).as_posix())
     assert sorted(wrong) == ["cli/commands_page.py", "cli/progress.py", "printing.py"]

@@ -2,27 +2,37 @@
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
+from source_code import ROOT, trees
 
-import bevcli
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.registry import entries, load
 
-ROOT = Path(bevcli.__file__).parent
 MODEL = ROOT / "model"
 FOLDERS = sorted(path for path in MODEL.iterdir() if path.is_dir() and path.name not in ("kernels", "__pycache__"))
 
 
 def classes_of(folder: Path) -> set[str]:
-    trees = (ast.parse(path.read_text()) for path in folder.rglob("*.py"))
-    return {node.name for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
+    inside = [tree for path, tree in trees().items() if path.is_relative_to(folder)]
+    return {node.name for tree in inside for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
 
 
-def names_in(path: Path) -> Iterator[str]:
+def trees_outside() -> dict[Path, ast.Module]:
+    """The files outside of the models' folders."""
+    return {path: tree for path, tree in trees().items() if not any(path.is_relative_to(one) for one in FOLDERS)}
+
+
+@cache
+def names_in(path: Path) -> frozenset[str]:
     """Every name and imported module in a file's code; texts and comments are free to speak of models."""
-    for node in ast.walk(ast.parse(path.read_text())):
+    return frozenset(_names(trees()[path]))
+
+
+def _names(tree: ast.Module) -> Iterator[str]:
+    for node in ast.walk(tree):
         if isinstance(node, ast.Name):
             yield node.id
         elif isinstance(node, ast.Attribute):
@@ -42,10 +52,9 @@ def test_the_folders_of_models_are_those_of_the_entry_points():
 def test_no_other_room_names_a_model(folder):
     """UniAD extends BEVFormer, so that the models' folders may name each other."""
     own, module = classes_of(folder), f"bevcli.model.{folder.name}"
-    others = (path for path in ROOT.rglob("*.py") if not any(path.is_relative_to(one) for one in FOLDERS))
     named = [
         f"{path.relative_to(ROOT)}: {name}"
-        for path in others
+        for path in trees_outside()
         for name in names_in(path)
         if name in own or name == module or name.startswith(f"{module}.")
     ]
@@ -56,10 +65,8 @@ def test_no_other_room_asks_for_the_kind_of_a_model():
     """`Network` has the shared parts, which training, timing and figures need."""
     kinds = {name for folder in FOLDERS for name in classes_of(folder)} | {"ExportedModel", "PreparedModel"}
     asked = []
-    for path in ROOT.rglob("*.py"):
-        if any(path.is_relative_to(folder) for folder in FOLDERS):
-            continue
-        for node in ast.walk(ast.parse(path.read_text())):
+    for path, tree in trees_outside().items():
+        for node in ast.walk(tree):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "isinstance":
                 asked += [path for name in ast.walk(node.args[1]) if isinstance(name, ast.Name) and name.id in kinds]
     assert not asked

@@ -1,11 +1,9 @@
 """Nothing in bevcli waits for ever: each call that can wait has a time limit, or stands here with its reason."""
 
 import ast
-from pathlib import Path
 
-import bevcli
+from source_code import ROOT, trees
 
-ROOT = Path(bevcli.__file__).parent
 # Calls that wait without a limit, by file.
 ALLOWED = {
     (
@@ -94,11 +92,7 @@ def waits(tree: ast.AST) -> set[str]:
 
 
 def test_every_wait_has_a_limit_or_a_reason():
-    found = {
-        (path.relative_to(ROOT).as_posix(), name)
-        for path in ROOT.rglob("*.py")
-        for name in waits(ast.parse(path.read_text()))
-    }
+    found = {(path.relative_to(ROOT).as_posix(), name) for path, tree in trees().items() for name in waits(tree)}
     assert found == set(ALLOWED)
 
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from bevcli.batch.storage import RemoteFolder, Storage, StoredFile, expand, is_url, open_storage
 from bevcli.errors import BevcliError, InputError
 from bevcli.parsing.files import MIB, read_text
+from bevcli.sequences.format import drives_in, is_drive
 from bevcli.sequences.nuscenes.cache import open_index
 from bevcli.sequences.nuscenes.choice import choose_version, chosen_scenes, keyframes, sweep_frames, tables_of
 from bevcli.sequences.nuscenes.format import NuScenesOptions, is_nuscenes_root
@@ -70,7 +71,8 @@ def find_drives(
     A drive whose input cannot be listed has its `problem`.
 
     Args:
-        texts: paths, URLs and glob patterns. A nuScenes root gives one drive per scene.
+        texts: paths, URLs and glob patterns. A nuScenes root gives one drive per scene; a folder of drives, such as
+            the root of another data set, gives all of them.
         options: the part of a nuScenes root.
 
     Raises InputError where a pattern matches nothing, or there are no drives.
@@ -83,13 +85,17 @@ def find_drives(
     return _without_copies(drives)
 
 
-def _drives_of(source: str, options: NuScenesOptions) -> Iterator[Drive]:
+def _drives_of(source: str, options: NuScenesOptions, name: str = "") -> Iterator[Drive]:
+    """The drives of a path or URL. name: of a drive that is one of several in a folder; "" for the path's own."""
     path = source if is_url(source) else str(Path(source.removeprefix("file://")).absolute())
-    drive = Drive(path, _safe_name(path))
+    drive = Drive(path, _safe_name(name or path))
     try:
         storage = open_storage(path)
         if _versions_at(storage) if is_url(path) else is_nuscenes_root(Path(path)):
             yield from _scenes(drive, options)
+        elif not is_url(path) and not is_drive(Path(path)) and (inside := drives_in(Path(path))):
+            for name, one in inside.items():
+                yield from _drives_of(str(one), options, name.replace("/", "-"))
         else:
             yield replace(drive, input_hash=_hash(drive.name, None, storage.files()))
     except BevcliError as error:

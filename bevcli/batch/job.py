@@ -87,6 +87,7 @@ class Job:
             "weights": model.weights_hash,
             "device": self.model.device,
             "precision": self.model.precision,
+            "engine": (self.model.engine, _fact(self.model.calibrate_with)),
             "reading": reading,
             "run": {name: _fact(value) for name, value in vars(self.run).items()},
             "embed": self.embed,
@@ -105,8 +106,9 @@ def all_own_options(values: Mapping[str, Any]) -> tuple[FormatOptions, ...]:
 
 def with_absolute_paths(model: ModelOptions) -> ModelOptions:
     """The options for workers in other folders: they take the downloaded weights of this process, and fetch none."""
-    weights = None if model.weights is None else model.weights.absolute()
-    return replace(model, weights=weights, weights_dir=weights_folder(model.weights_dir).absolute(), fetch=False)
+    weights, drive = (None if path is None else path.absolute() for path in (model.weights, model.calibrate_with))
+    folder = weights_folder(model.weights_dir).absolute()
+    return replace(model, weights=weights, calibrate_with=drive, weights_dir=folder, fetch=False)
 
 
 def _fact(value: object) -> str:

@@ -7,12 +7,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from bevcli.benchmark.versions import NEAR_M
+from bevcli.engines.box_differences import CENTER, NEAR_M
 from bevcli.engines.exported import load_exported
 from bevcli.frame import Sequence
 from bevcli.inference.load import Model
+from bevcli.inference.paired_steps import paired_steps
 from bevcli.inference.preprocess import Preprocessor
-from bevcli.inference.runner import Runner
 from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.segmentation import SegmentationOutputs
 from bevcli.model.step import ModelOutputs
@@ -65,27 +65,17 @@ def compare_exported(file: Path, other: Path, sequence: Sequence, engine: str) -
 
 
 def _differences(networks: tuple[TemporalModel, TemporalModel], sequence: Sequence) -> Iterator[FrameDifference]:
-    cpu = torch.device("cpu")
-    outputs: dict[int, ModelOutputs] = {}  # of the last step of each network
-    for number, network in enumerate(networks):
-        network.observed.register_forward_hook(lambda *call, number=number: outputs.update({number: call[2]}))
-    runners = [Runner(network, cpu) for network in networks]
-    states = [None, None]
     preprocess = Preprocessor(networks[1].config)  # of the exported file, whose images have one size
-    for place, stamp in enumerate(sequence.stamps):
-        prepared = preprocess(sequence.load(place))
-        if not prepared.frame.images:
-            continue
-        states = [runner.step(state, prepared)[0] for runner, state in zip(runners, states, strict=True)]  # type: ignore[misc]
-        yield compare_outputs(stamp.index, outputs[0], outputs[1])
+    frames = (preprocess(sequence.load(place)) for place in range(len(sequence.stamps)))
+    for prepared, ours, theirs in paired_steps(*networks, frames):
+        yield compare_outputs(prepared.frame.stamp.index, ours, theirs)
 
 
 def compare_outputs(frame: int, ours: ModelOutputs, theirs: ModelOutputs) -> FrameDifference:
     """The largest differences of the last decoder layer, the BEV map and the segmentation of a frame."""
     codes = (ours.box_codes[-1] - theirs.box_codes[-1]).abs()
-    center = [0, 1, 4]
-    distances = codes[..., center].norm(dim=-1)
-    others = [index for index in range(codes.shape[-1]) if index not in center]
+    distances = codes[..., CENTER].norm(dim=-1)
+    others = [index for index in range(codes.shape[-1]) if index not in CENTER]
     probabilities = [_probabilities(one.segmentation) for one in (ours, theirs) if one.segmentation is not None]
     return FrameDifference(
         frame=frame,

@@ -1,7 +1,6 @@
 """The benchmark: times every stage, and compares with the plain version and with the machine's peak throughput."""
 
 import contextlib
-import platform
 import resource
 import sys
 import tempfile
@@ -21,6 +20,7 @@ from bevcli.benchmark.result import BenchmarkResult
 from bevcli.benchmark.versions import Version, compare_with_plain
 from bevcli.frame import Frame, Prediction
 from bevcli.inference.background import write_behind
+from bevcli.inference.engine_speeds import describe_machine
 from bevcli.inference.load import Model
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import BevState
@@ -80,18 +80,6 @@ def run_benchmark(
         limits=limits.fastest(measure_limits(device, precision)),
         comparison=comparison,
     )
-
-
-def describe_machine(device: torch.device) -> str:
-    """Name of the processor or GPU, number of threads and PyTorch's version."""
-    if device.type == "cuda":
-        return f"{torch.cuda.get_device_name(device)}, PyTorch {torch.__version__}"
-    cpu = Path("/proc/cpuinfo")
-    lines = cpu.read_text().splitlines() if cpu.is_file() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    name = names[0] if names else platform.processor() or platform.machine()
-    capability = torch.backends.cpu.get_cpu_capability()
-    return f"{name} ({capability}), {torch.get_num_threads()} threads, PyTorch {torch.__version__}"
 
 
 def _time_stages(fast: Version, drive: MadeUpDrive, first: int, timed: range) -> dict[str, tuple[float, ...]]:

@@ -29,6 +29,11 @@ class BenchOptions:
     against: Literal["plain"] | None = option(
         default=None, help="Also run the plain version; compare times and results."
     )
+    engines: bool = option(
+        default=False,
+        help="Time PyTorch and all installed engines side by side, alternating, and compare their boxes. From then on, "
+        "`engine=auto` takes the fastest one.",
+    )
     profile: Path | None = option(
         default=None, help="Write PyTorch's profile of one frame (open it at chrome://tracing).", metavar="OUT"
     )

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from bevcli.benchmark.limits import wait_for
 from bevcli.benchmark.made_up import MadeUpDrive
 from bevcli.benchmark.result import Comparison
+from bevcli.engines.box_differences import NEAR_M
 from bevcli.frame import Prediction
 from bevcli.inference.cpu_settings import keep_freed_memory, return_freed_memory
 from bevcli.inference.runner import BevState, Runner, StepOptions
@@ -20,7 +21,6 @@ from bevcli.model.network import Network
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import TemporalModel, model_class
 
-NEAR_M = 0.1
 QueryResults = tuple[Tensor, Tensor]
 
 

@@ -11,6 +11,7 @@ from bevcli.calibration.evidence import Evidence, epipolar_piece
 from bevcli.errors import OutputError
 from bevcli.geometry.cameras import CameraRig
 from bevcli.recording import entities, log_static
+from bevcli.recording.layout import Layout
 from bevcli.rig.mounting import horizon
 from bevcli.rig.overlay import GROUND, HORIZON, ground_lines, visible_runs
 from bevcli.rig.rig_recording import JPEG_QUALITY, camera_views, clipped, rig_view
@@ -23,10 +24,13 @@ def write_calibration_recording(path: Path, evidence: Evidence, table: str) -> N
     """Write the recording. table: the text of the result. Raises OutputError."""
     rig = evidence.views.rig
     with whole_file(path) as unfinished, rr.RecordingStream("bevcli-calibrate") as stream:
+        layout = _layout(rig)
         try:
-            stream.save(unfinished, default_blueprint=_blueprint(rig))
+            stream.save(unfinished, default_blueprint=layout)
         except RuntimeError as error:
             raise OutputError(f"{path}: the recording cannot be written ({error})") from error
+        finally:
+            layout.free()
         log_static.log_scene(stream, rig, {})
         text = rr.TextDocument(f"```\n{table}\n```", media_type="text/markdown")
         stream.log(TABLE, text, static=True)
@@ -72,12 +76,8 @@ def _log_camera(stream: rr.RecordingStream, evidence: Evidence, index: int, *, m
         stream.log(entities.overlay(camera.name, kind), archetype)
 
 
-def _blueprint(rig: CameraRig) -> rrb.Blueprint:
+def _layout(rig: CameraRig) -> Layout:
     scene = rig_view(rig, ("matches", "epipolar_lines", "ground_grid", "horizon"))
     middle = rrb.Horizontal(scene, rrb.TextDocumentView(origin=TABLE, name="Calibration"), column_shares=[2, 5])
     rows = camera_views(rig)
-    layout = rrb.Vertical(*rows[:1], middle, *rows[1:])
-    return rrb.Blueprint(
-        layout, rrb.TimePanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"),
-        rrb.BlueprintPanel(state="collapsed"), auto_views=False, auto_layout=False,
-    )  # fmt: skip
+    return Layout(rrb.Vertical(*rows[:1], middle, *rows[1:]), rrb.TimePanel(state="collapsed"))

@@ -29,8 +29,8 @@ def batch(
     drives: Annotated[
         list[str] | None,
         typer.Argument(
-            help="Sequence folders, nuScenes roots (one drive per scene), .mcap files, patterns such as 'fleet/*', "
-            "or URLs such as s3://bucket/fleet/*.",
+            help="Sequence folders, nuScenes roots (one drive per scene), folders of drives such as a DDAD root, "
+            ".mcap files, patterns such as 'fleet/*', or URLs such as s3://bucket/fleet/*.",
             show_default=False,
         ),
         INPUT_OR_PATTERN,
@@ -38,7 +38,7 @@ def batch(
     *,
     options: BatchOptions,
     workers: Workers,
-    model: Annotated[ModelOptions, Part(without=("engine",))],
+    model: ModelOptions,
     run_options: Annotated[RunOptions, Part(without=("save_bev",))],
     recording: Annotated[RecordingOptions, Part(without=("probes", "vehicle_mesh"))],
     source: Annotated[SequenceOptions, Part(without=("scene",))],
@@ -73,6 +73,8 @@ def batch(
     fetch_if_asked(model)
     loaded = load_for_batch(job, workers)
     found, notes = find_drives(texts, NuScenesOptions(format_options["version"], format_options.pop("split")))
+    if loaded.choice is not None:
+        notes = (*notes, "the first drive of each number of cameras and image size exports the model, and waits for it")
     source = source.for_model(loaded.config, temporal=run_options.temporal)
     job = replace(job, source=source, own=all_own_options(format_options))
     summary = run_with_progress(

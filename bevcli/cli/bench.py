@@ -1,12 +1,17 @@
 """`bevcli bench`: the speed of a model on this machine."""
 
 import json
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from bevcli.benchmark.options import BenchOptions
-from bevcli.cli.bridge import Json, Part
+from bevcli.cli.bridge import Json, Part, as_flags
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
+
+if TYPE_CHECKING:
+    import torch
+
+    from bevcli.inference.load import Model
 
 PANEL = "Deploy"
 
@@ -21,25 +26,50 @@ def bench(
     The peak throughput is the rate of matrix products and of copying memory, measured in the same run. Nothing else
     should run on the machine at the same time.
     """
+    from bevcli.benchmark.engines import compare_engines
     from bevcli.benchmark.measure import run_benchmark
     from bevcli.benchmark.result import write_table
+    from bevcli.cli.engine_bar import EngineBar
     from bevcli.config import load_config
-    from bevcli.engines.exported import SUFFIX
-    from bevcli.inference.load import choose_device, choose_precision, load_model, needs_exported_file
+    from bevcli.inference.load import choose_device, choose_precision
 
     target = choose_device(model_options.device)
     if options.table is not None:
         write_table(options.table, target, options.frames)
         say(f"wrote {options.table}", err=True)
         return
-    exported = None
-    if options.model.endswith(SUFFIX):
-        exported = load_model(options.model, options=model_options)
-        if options.against is not None or options.profile is not None:
-            exported.require_parts("`against`" if options.profile is None else "`profile`")
-    elif model_options.engine is not None:
-        raise needs_exported_file(model_options.engine, options.model)
+    if options.engines:
+        with EngineBar() as bar:
+            table = compare_engines(load_config(options.model), options.frames, bar.show)
+        say(json.dumps(table.as_data(), indent=1) if as_json else as_flags(table.text()))
+        return
+    exported = _exported(options, model_options, target)
     config, device = (load_config(options.model), target) if exported is None else (exported.config, exported.device)
-    precision = choose_precision(model_options.precision, target)
+    precision = "fp32" if model_options.precision == "int8" else choose_precision(model_options.precision, target)
     result = run_benchmark(config, device, precision, options, exported)
     say(json.dumps(result.as_data(), indent=1) if as_json else result.text())
+
+
+def _exported(options: BenchOptions, model_options: ModelOptions, device: "torch.device") -> "Model | None":
+    """The exported file, or a model with made-up weights in the engine that is asked for; None for PyTorch."""
+    from bevcli.benchmark.made_up import MadeUpDrive, made_up_model
+    from bevcli.cli.engine_bar import in_engine_with_bar
+    from bevcli.config import load_config
+    from bevcli.engines.exported import SUFFIX
+    from bevcli.inference.engine_choice import engine_choice
+    from bevcli.inference.in_engine import CALIBRATION_FRAMES
+    from bevcli.inference.load import Model, load_model
+
+    parts = "" if options.against is None else "`against`"
+    parts = parts if options.profile is None else "`profile`"
+    if options.model.endswith(SUFFIX):
+        found = load_model(options.model, options=model_options)
+        if parts:
+            found.require_parts(parts)
+        return found
+    config = load_config(options.model)
+    choice = engine_choice(model_options, config, device)
+    if choice is None:
+        return None
+    found = in_engine_with_bar(Model(made_up_model(config), choice=choice), MadeUpDrive(CALIBRATION_FRAMES), parts)
+    return found if found.is_exported else None

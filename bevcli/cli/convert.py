@@ -1,5 +1,6 @@
 """`bevcli convert`: writes any input as a drive of another format."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -39,7 +40,7 @@ def convert(
     from bevcli.sequences.open import open_sequence
     from bevcli.sequences.output import open_writer
 
-    if out.resolve() == source.resolve() or out.resolve() in source.resolve().parents:
+    if Path(os.path.realpath(source)).is_relative_to(os.path.realpath(out)):
         raise OutputError(f"{out}: contains the input: choose another path")
     sequence = open_sequence(source, replace(options, ego_motion="optional"), **format_options)
     if labels.labels is not None:

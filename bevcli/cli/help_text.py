@@ -1,8 +1,9 @@
-"""`--help` in plain text: the commands and the options of a command by panels, readable in a terminal of 80 columns."""
+"""Commands for typer: `--help` in plain text, by panels, readable in a terminal of 80 columns; no empty paths."""
 
 import inspect
 import sys
-from typing import Any
+from pathlib import Path
+from typing import Any, get_args
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -26,6 +27,17 @@ class PlainCommand(TyperCommand):
     def get_help(self, ctx: Any) -> str:
         """The help text, printable."""
         return printable(super().get_help(ctx))
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse; an empty path, as of a variable that is not set, would be the current folder."""
+        given, *_ = self.make_parser(ctx).parse_args(args=list(args))
+        takes = inspect.signature(self.callback).parameters if self.callback else {}
+        for each in self.get_params(ctx):
+            value = given.get(each.name)
+            empty = "" in (value if isinstance(value, list | tuple) else [value])
+            if empty and each.name in takes and _takes_path(takes[each.name].annotation):
+                raise typer.BadParameter("is empty (expected a path, . for this folder)", ctx=ctx, param=each)
+        return super().parse_args(ctx, args)
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """The options and the arguments, without hidden ones."""
@@ -63,6 +75,10 @@ class PlainGroup(TyperGroup):
             panel = getattr(sys.modules[entry.module], "PANEL", PANELS[-1])
             panels.setdefault(panel, []).append((name, summary))
         _write(panels, formatter)
+
+
+def _takes_path(hint: Any) -> bool:
+    return hint is Path or any(_takes_path(each) for each in get_args(hint))
 
 
 def _write(panels: dict[str, list[tuple[str, str]]], formatter: Any) -> None:

@@ -9,6 +9,7 @@ import typer
 
 from bevcli.calibration.options import CalibrateFirstOptions
 from bevcli.cli.bridge import INPUT, Part, as_flags
+from bevcli.cli.imports import fast_imports
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
 from bevcli.recording.options import RecordingOptions
@@ -45,13 +46,15 @@ def run(
     map_lines.json and plan.csv.
     Ctrl-C or SIGTERM finish the current frame; a second one ends the program at once.
     """
-    from bevcli.cli.fetching import fetch_if_asked
-    from bevcli.cli.progress import Progress
-    from bevcli.cli.stop_signals import StopSignals
-    from bevcli.inference.load import load_model
-    from bevcli.rig.check_drive import CheckedDrive
-    from bevcli.runs.run_into_folder import run_into_folder
-    from bevcli.sequences.open import open_sequence
+    with fast_imports():
+        from bevcli.cli.engine_bar import in_engine_with_bar
+        from bevcli.cli.fetching import fetch_if_asked
+        from bevcli.cli.progress import Progress
+        from bevcli.cli.stop_signals import StopSignals
+        from bevcli.inference.load import load_model
+        from bevcli.rig.check_drive import CheckedDrive
+        from bevcli.runs.run_into_folder import run_into_folder
+        from bevcli.sequences.open import open_sequence
 
     fetch_if_asked(model)
     loaded = load_model(options=model)
@@ -60,6 +63,7 @@ def run(
     if first.calibrate:
         drive = _calibrated(drive)
     drive = CheckedDrive(drive, shlex.quote(str(sequence)))
+    loaded = in_engine_with_bar(loaded, drive, "`probes`" if recording.probes else "")
     out = output.out or Path("runs") / f"{drive.name}-{loaded.name}"
     view = None
     if output.live:
@@ -113,6 +117,8 @@ def _run_notes(model: "Model", drive: "Sequence", *, live: bool = False) -> list
     found = list(drive.notes)
     if model.untrained:
         found.append("the weights are UNTRAINED: random weights, the boxes are meaningless")
+    if model.engine_note:
+        found.append(model.engine_note)
     if model.is_exported:
         found.append("an exported file shows no attention: the recording has no history map, pillars and probes")
     if model.left_out:

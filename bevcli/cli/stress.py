@@ -32,12 +32,13 @@ def stress(
     output: StressOutputOptions,
     as_json: Json = False,
 ) -> None:
-    """Score a model on the same drives under corruptions: RoboBEV's eight, calibration noise, and timing faults.
+    """Score a model on the same drives under corruptions: RoboBEV's eight, five others, calibration and timing faults.
 
     Each corruption has three severities (calibration noise: four levels) and is applied on the fly, before the model.
-    The table has NDS and mAP by corruption and severity, and mRR, the share of the clean NDS that is left. Ctrl-C or
-    SIGTERM end the test after the current frame; `--resume` goes on with it.
+    The table has NDS and mAP by corruption and severity, and mRR, the share of the clean NDS that is left. No training
+    of bevcli uses the five others. Ctrl-C or SIGTERM end the test after the current frame; `--resume` goes on with it.
     """
+    from bevcli.cli.engine_bar import in_engine_with_bar
     from bevcli.cli.fetching import fetch_if_asked
     from bevcli.cli.progress import Progress
     from bevcli.cli.stop_signals import StopSignals
@@ -66,6 +67,7 @@ def stress(
         drives = [rendered.open(index) for index in range(len(rendered))]
         if source.frames is not None:
             drives = [select_range(drive, source.frames) for drive in drives]
+    loaded = in_engine_with_bar(loaded, drives[0])
     out = output.out or Path("runs") / f"stress-{loaded.name}"
     total = len(conditions) * sum(len(drive.stamps) for drive in drives)
     notes = [note for drive in drives for note in drive.notes]

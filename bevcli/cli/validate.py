@@ -28,7 +28,7 @@ def validate(
         INPUT_OR_NAME,
     ] = None,
     *,
-    model_options: Annotated[ModelOptions, Part(only=("weights", "device", "engine"))],
+    model_options: Annotated[ModelOptions, Part(only=("weights", "device", "engine", "precision", "calibrate_with"))],
     run_options: Annotated[RunOptions, Part(only=("temporal",))],
     drive_options: DriveOptions,
     options: ValidationOptions,
@@ -39,6 +39,7 @@ def validate(
     Each drive is run as by `bevcli run` and scored as by `bevcli eval`, which scores the files of a run that is done.
     `bevcli train` never uses rendered drives with seeds of 1000000 and above: keep them for this.
     """
+    from bevcli.cli.engine_bar import in_engine_with_bar
     from bevcli.cli.progress import Progress
     from bevcli.inference.load import load_model
     from bevcli.inference.runner import Runner, StepOptions
@@ -53,6 +54,9 @@ def validate(
     data = drive_options
     drives = scored_drives(data, loaded.config, rig)
     notes = check_scored_drives(data, drives, loaded.config)
+    if loaded.choice is not None:
+        loaded = in_engine_with_bar(loaded, drives.open(0))
+        notes = (*notes, loaded.engine_note) if loaded.engine_note else notes
     runner = Runner(loaded.prepared, loaded.device, StepOptions(loaded.precision, run_options.temporal))
     with Progress(count_frames(drives), "frames", notes) as progress:
         scores = validate_model(

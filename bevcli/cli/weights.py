@@ -35,8 +35,8 @@ def list_weights(options: Annotated[ModelOptions, Part(only=("weights_dir",))], 
     Each has the scores that are published for it (nuScenes validation split, in per cent), its size, its licence, and
     where it lies on this machine or is published. Connects to no other machine.
     """
+    from bevcli.published import own_table
     from bevcli.weights.cache import all_weights
-    from bevcli.weights.sources import own_table
 
     found = list(all_weights(options.weights_dir))
     if as_json:

@@ -6,12 +6,13 @@ from collections.abc import Mapping
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from torch import nn
 
 from bevcli.errors import BevcliError, WeightsError
+from bevcli.registry import entries, load
 
 Arrays = Mapping[str, np.ndarray]
 
@@ -49,11 +50,19 @@ class Engine(nn.Module):
     An engine is an entry point of `bevcli.engines`: a subclass, made from the file and a number of threads.
 
     Attributes:
+        packages: that it needs.
+        extra: of bevcli, which installs them.
+        rank: of the engines that are installed, the lowest is taken where none is named and none was measured.
+        deformable_convolution: as `OnnxOptions.deformable_convolution`, for files that are exported for it.
         metadata: of the file: text by name.
         input_shapes: name of each input -> its shape.
         outputs: names of the outputs.
     """
 
+    packages: ClassVar[tuple[str, ...]] = ()
+    extra: ClassVar[str] = "onnx"
+    rank: ClassVar[int] = 2
+    deformable_convolution: ClassVar[Literal["operator", "gridsample"]] = "operator"
     metadata: Mapping[str, str]
     input_shapes: Mapping[str, tuple[int, ...]]
     outputs: tuple[str, ...]
@@ -61,6 +70,12 @@ class Engine(nn.Module):
     def __init__(self, file: Path, threads: int) -> None:
         """Raises BevcliError where the program is not installed, WeightsError for a file that it cannot load."""
         super().__init__()
+        self.require_packages()
+
+    @classmethod
+    def require_packages(cls) -> None:
+        """Raises BevcliError where a package that it needs is not installed."""
+        require(*cls.packages, extra=cls.extra)
 
     def forward(self, feed: Arrays) -> dict[str, np.ndarray]:
         """One step. feed: every input by name. Returns every output by name."""
@@ -70,9 +85,11 @@ class Engine(nn.Module):
 class OnnxRuntimeEngine(Engine):
     """ONNX Runtime on the CPU, in the precision of the file."""
 
+    packages = ("onnxruntime",)
+    rank = 1
+
     def __init__(self, file: Path, threads: int) -> None:
         super().__init__(file, threads)
-        require("onnxruntime")
         import onnxruntime
 
         options = onnxruntime.SessionOptions()
@@ -96,9 +113,13 @@ class OnnxRuntimeEngine(Engine):
 class OpenVinoEngine(Engine):
     """OpenVINO on the CPU, in the precision of the file."""
 
+    packages = ("openvino", "onnx")
+    extra = "openvino"
+    rank = 0  # the fastest one in INT8 on every processor that was measured
+    deformable_convolution = "gridsample"  # it lacks DeformConv
+
     def __init__(self, file: Path, threads: int) -> None:
         super().__init__(file, threads)
-        require("openvino", "onnx", extra="openvino")
         import onnx
 
         settings: dict[str, Any] = {
@@ -106,6 +127,8 @@ class OpenVinoEngine(Engine):
             "INFERENCE_PRECISION_HINT": "f32",
             "INFERENCE_NUM_THREADS": threads,
             "NUM_STREAMS": 1,
+            # A thread that is bound to a core waits for it while another process computes there.
+            "ENABLE_CPU_PINNING": False,
         }
         try:
             check_size(file)
@@ -122,6 +145,19 @@ class OpenVinoEngine(Engine):
     def forward(self, feed: Arrays) -> dict[str, np.ndarray]:
         found = self.request.infer(dict(feed), share_inputs=True)
         return {name: found[name] for name in self.outputs}
+
+
+def installed_engines() -> dict[str, type[Engine]]:
+    """The engines whose packages are installed, the one with the lowest rank first."""
+    found = {}
+    for name in entries("bevcli.engines"):
+        try:
+            engine: type[Engine] = load("bevcli.engines", name)
+            engine.require_packages()
+        except BevcliError:  # not installed, or a broken package of somebody else
+            continue
+        found[name] = engine
+    return dict(sorted(found.items(), key=lambda item: item[1].rank))
 
 
 @cache

@@ -66,6 +66,15 @@ def _require_world(pairs: FramePairs, option: str) -> None:
         raise InputError(f"`{option}`: needs boxes in the world frame (found the {pairs.frame_of_reference} frame)")
 
 
+def _drives(truth: ScoredInput) -> Drives:
+    if truth.boxes.frame_of_reference != "world":
+        raise InputError(
+            "forecasts and paths need ground truth in the world frame "
+            f"(found the {truth.boxes.frame_of_reference} frame)"
+        )
+    return Drives(truth.boxes.frames)
+
+
 def _true_lines(folder: Path) -> LinesFile:
     file = folder / TRUE_LINES
     if not file.exists():
@@ -88,7 +97,7 @@ def _lines(found: LinesFile, true: LinesFile, pairs: FramePairs) -> LineScores:
 
 
 def _motion(found: ScoredInput, truth: ScoredInput, pairs: FramePairs) -> MotionScores:
-    drives = Drives(truth.boxes)
+    drives = _drives(truth)
     times = _times(pairs.predictions)
     areas = _areas(found, pairs)
     return evaluate_motion(
@@ -143,7 +152,7 @@ def ego_from_bev_of(frame: FrameBoxes) -> Array:
 def _plan(file: Path, found: ScoredInput, truth: ScoredInput, pairs: FramePairs) -> tuple[PlanScores, tuple[str, ...]]:
     plans = {planned.stamp: planned for planned in read_plans(file)}
     of_stamp = {frame.stamp: frame for frame in found.boxes.frames}
-    drives, frames, left_out, guessed, times = Drives(truth.boxes), [], 0, 0, np.zeros(0)
+    drives, frames, left_out, guessed, times = _drives(truth), [], 0, 0, np.zeros(0)
     stamps = zip(pairs.prediction_stamps, pairs.ground_truth_stamps, pairs.reference_from_ego, strict=True)
     for stamp, true_stamp, world_from_ego in stamps:
         if stamp not in plans:

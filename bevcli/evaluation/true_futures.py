@@ -1,6 +1,6 @@
 """The futures of true objects: the places where the same objects are in later frames of the ground truth."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +9,7 @@ from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
-from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
+from bevcli.sequences.files.boxes_file import FrameBoxes
 
 LATE_S = 0.1  # a frame this near counts as one at the time of a step
 
@@ -17,13 +17,9 @@ LATE_S = 0.1  # a frame this near counts as one at the time of a step
 class Drives:
     """The frames of a ground truth by scene and time, with boxes in the world frame."""
 
-    def __init__(self, truth: BoxesFile) -> None:
-        if truth.frame_of_reference != "world":
-            raise InputError(
-                f"forecasts and paths need ground truth in the world frame (found the {truth.frame_of_reference} frame)"
-            )
+    def __init__(self, truth: Iterable[FrameBoxes]) -> None:
         self._scenes: dict[str, list[FrameBoxes]] = {}
-        for frame in truth.frames:
+        for frame in truth:
             self._scenes.setdefault(frame.stamp.scene, []).append(frame)
         for frames in self._scenes.values():
             frames.sort(key=lambda frame: frame.stamp.timestamp_ns)

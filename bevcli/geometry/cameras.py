@@ -252,14 +252,23 @@ def _undistorted(bent: Array, distortion: Distortion) -> Array:
     return np.where(error < LARGEST_RAY_ERROR, rays, np.nan)
 
 
-def _kannala_brandt_directions(bent: Array, coefficients: tuple[float, ...]) -> Array:
-    """Distorted coordinates (..., 2) of a fisheye -> unit directions (..., 3)."""
+def fisheye_table(coefficients: tuple[float, ...]) -> tuple[Array, Array]:
+    """Rising angles (A,) off the optical axis, and the normalised radii (A,) at which a Kannala-Brandt lens shows them.
+
+    The last angle is WIDEST_ANGLE, or that at which the lens model stops being monotonic.
+    """
     angles = np.linspace(0, WIDEST_ANGLE, ANGLES)
     radii = angles + sum(k * angles ** (2 * i + 3) for i, k in enumerate(coefficients))
     falls = np.flatnonzero(np.diff(radii) <= 0)
     end = int(falls[0]) + 1 if len(falls) else ANGLES
+    return angles[:end], radii[:end]
+
+
+def _kannala_brandt_directions(bent: Array, coefficients: tuple[float, ...]) -> Array:
+    """Distorted coordinates (..., 2) of a fisheye -> unit directions (..., 3)."""
+    angles, radii = fisheye_table(coefficients)
     radius = np.linalg.norm(bent, axis=-1)
-    angle = np.interp(radius, radii[:end], angles[:end], right=np.nan)
+    angle = np.interp(radius, radii, angles, right=np.nan)
     side = np.sin(angle) / np.where(radius > 0, radius, 1.0)
     return np.concatenate([bent * side[..., None], np.cos(angle)[..., None]], axis=-1)
 

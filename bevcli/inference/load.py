@@ -17,7 +17,8 @@ from bevcli.config import TRACKING, as_table, known_models, load_config, load_ta
 from bevcli.engines.exported import SUFFIX, load_exported
 from bevcli.errors import BevcliError, ConfigError, WeightsError
 from bevcli.geometry.cameras import CameraRig
-from bevcli.inference.options import ModelOptions
+from bevcli.inference.engine_choice import EngineChoice, engine_choice
+from bevcli.inference.options import AUTO, TORCH, ModelOptions
 from bevcli.inference.preprocess import image_for_rig
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.inference.training_rigs import facts_notes, rig_notes
@@ -29,6 +30,7 @@ from bevcli.weights.cache import NamedWeights, find_weights, weights_folder
 from bevcli.weights.fetch import by_hand, fetch_weights
 
 DEFAULT_MODEL = "demo"
+DEFAULT_ENGINE = "onnxruntime"  # of an exported file
 UNTRAINED_SEED = 0  # two untrained runs of one drive agree
 
 
@@ -48,6 +50,8 @@ class Model:
         engine: the program that computes it: "torch", or for an exported file "onnxruntime" or "openvino".
         facts: metadata in the weights file.
         file: the exported file; None for PyTorch.
+        choice: another engine than PyTorch that it is to run in: `in_engine` makes the file when the rig is known.
+        engine_note: the differences of that file from PyTorch; "" for other models.
     """
 
     network: TemporalModel
@@ -61,6 +65,8 @@ class Model:
     engine: str = "torch"
     facts: Mapping[str, str] = field(default_factory=dict)
     file: Path | None = None
+    choice: EngineChoice | None = None
+    engine_note: str = ""
 
     @property
     def config(self) -> ModelConfig:
@@ -84,6 +90,8 @@ class Model:
 
     def require_parts(self, what: str) -> None:
         """Raises BevcliError for an exported file. what: needs the network's parts, such as "`probes`"."""
+        if self.choice is not None and self.choice.engine != AUTO:
+            raise BevcliError(f"{what}: not available in {self.choice.engine}: use `engine=torch`")
         if self.is_exported:
             raise BevcliError(f"{what}: not available for {self.file}, an exported file: use {self.name} by its name")
 
@@ -119,7 +127,12 @@ class Model:
 
     @cached_property
     def prepared(self) -> TemporalModel:
-        """The network on its device, made ready for inference on the first use: same results, faster."""
+        """The network on its device, made ready for inference on the first use: same results, faster.
+
+        Raises BevcliError for a model that is to run in another engine, before `in_engine`.
+        """
+        if self.choice is not None:
+            raise BevcliError(f"`engine={self.choice.engine}`: needs a drive: pass the model to `bevcli.run`")
         if self.is_exported:
             return self.network
         assert self.precision != "int8"
@@ -144,7 +157,9 @@ def load_model(
             "demo" has, or downloaded ones.
         options: a model with its options; `model` and `weights` replace its own where they are given.
         changes: the other options of `ModelOptions` as keywords: `device` ("auto", "cpu", "cuda", "cuda:1", "mps" or a
-            torch.device), `precision`, `untrained`, `engine`, `fetch` (download missing weights) and `weights_dir`.
+            torch.device), `precision`, `untrained`, `engine`, `calibrate_with`, `fetch` (download missing weights) and
+            `weights_dir`. In another `engine` than "torch", or in "int8", the model is exported when it first meets a
+            rig (`run`, `Session`), which takes up to minutes; the file is kept in the user's cache.
 
     Raises:
         ConfigError: the model's TOML file is missing or wrong.
@@ -160,24 +175,22 @@ def load_model(
 def _load_network(options: ModelOptions) -> Model:
     """The model of a TOML file with its weights."""
     name, weights, untrained = options.model, options.weights, options.untrained
-    if options.engine is not None:
-        raise needs_exported_file(options.engine, "tiny" if name is None else str(name))
     if weights is not None and untrained:
         raise WeightsError(f"`weights={weights}` and `untrained` exclude each other: pass one of them")
     if name is None:
         name = DEFAULT_MODEL if weights is None else _model_of(weights)
     named = find_weights(str(name), options.weights_dir)
-    config_name = name if named is None else named.model
-    config = load_config(config_name)
-    tracker = _tracker(load_table(config_name, TRACKING, TrackerConfig), config, str(name))
-    if named is not None:
-        config = replace(config, name=named.name)
+    config = load_config(name)
+    tracker = _tracker(load_table(name, TRACKING, TrackerConfig), config, str(name))
     wanted = weights is None and not untrained
     bundled = bundled_weights(str(name)) if wanted else None
     file = weights or bundled
     if file is None and wanted:
         file = _named_file(config.name, named, options)
     target = choose_device(options.device)
+    choice = engine_choice(options, config, target)
+    if choice is not None:
+        target = torch.device("cpu")
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(UNTRAINED_SEED)
         network = build_model(config)
@@ -185,13 +198,14 @@ def _load_network(options: ModelOptions) -> Model:
     return Model(
         network.eval(),
         target,
-        choose_precision(options.precision, target),
+        "fp32" if choice is not None else choose_precision(options.precision, target),
         file,
         bundled=bundled is not None,
         left_out="" if loaded is None else loaded.left_out,
         tracker=tracker,
         not_read=() if loaded is None else loaded.not_read,
         facts={} if loaded is None else loaded.facts,
+        choice=choice,
     )
 
 
@@ -226,16 +240,11 @@ def _tracker(stated: TrackerConfig, config: ModelConfig, file: str) -> TrackerCo
         raise ConfigError(f"{file}: [{TRACKING}]: {error}") from None
 
 
-def needs_exported_file(engine: str, model: str) -> BevcliError:
-    """The error for an engine that is to run a model by its name."""
-    return BevcliError(
-        f"`engine={engine}`: runs exported files: export {model} with bevcli export-onnx, then `model={model}.onnx`"
-    )
-
-
 def _load_exported(options: ModelOptions) -> Model:
     """The model of a file of `bevcli export-onnx` or `bevcli quantize`."""
-    file, engine = Path(str(options.model)), options.engine or "onnxruntime"
+    file, engine = Path(str(options.model)), DEFAULT_ENGINE if options.engine in (None, AUTO) else options.engine
+    if engine == TORCH:
+        raise BevcliError(f"`engine=torch`: {file} is an exported file: use its model by its name")
     if options.weights is not None or options.untrained:
         option = "`untrained`" if options.untrained else f"`weights={options.weights}`"
         raise WeightsError(f"{file}: an exported file holds its weights: leave out {option}")
@@ -295,6 +304,7 @@ def choose_device(name: str | torch.device) -> torch.device:
     return torch.device(name)
 
 
-def choose_precision(chosen: Precision | None, device: torch.device) -> Precision:
-    """The chosen precision, or by default fp32 on the CPU and bf16 on a GPU."""
+def choose_precision(chosen: Precision | Literal["int8"] | None, device: torch.device) -> Precision:
+    """The chosen precision of PyTorch, or by default fp32 on the CPU and bf16 on a GPU."""
+    assert chosen != "int8"
     return chosen or ("bf16" if device.type == "cuda" else "fp32")

@@ -7,6 +7,8 @@ from typing import Literal
 from bevcli.options import option, options
 from bevcli.registry import entries
 
+AUTO, TORCH = "auto", "torch"  # values of `engine` beside the registered engines
+
 
 def model_names() -> list[str]:
     """The known models."""
@@ -17,14 +19,14 @@ def model_names() -> list[str]:
 
 def complete_model(incomplete: str) -> list[str]:
     """The known models and weights that start with a text, for completion in a shell."""
-    from bevcli.weights.sources import read_sources
+    from bevcli.published import read_sources
 
     return sorted(name for name in {*model_names(), *read_sources()} if name.startswith(incomplete))
 
 
 def complete_engine(incomplete: str) -> list[str]:
     """The known engines that start with a text, for completion in a shell."""
-    return [name for name in entries("bevcli.engines") if name.startswith(incomplete)]
+    return [name for name in (AUTO, TORCH, *entries("bevcli.engines")) if name.startswith(incomplete)]
 
 
 @options("Model")
@@ -59,11 +61,20 @@ class ModelOptions:
     )
     engine: str | None = option(
         default=None,
-        help="Program that runs a FILE.onnx: onnxruntime, openvino, or that of an installed package. Default: "
-        "onnxruntime.",
-        metavar="NAME",
+        help="Program that computes the model: torch, openvino, onnxruntime, that of an installed package, or auto, "
+        "the fastest one by `bevcli bench --engines`, else torch (openvino with int8). A named model is exported once. "
+        "Default: torch; onnxruntime for a FILE.onnx.",
+        metavar="auto|torch|NAME",
         complete=complete_engine,
     )
-    precision: Literal["fp32", "bf16", "fp16"] | None = option(
-        default=None, help="Precision of the image features. Default: fp32 on a CPU, bf16 on a GPU."
+    precision: Literal["fp32", "bf16", "fp16", "int8"] | None = option(
+        default=None,
+        help="Precision of the image features. int8 is for a CPU, and needs an engine. Default: fp32 on a CPU, bf16 on "
+        "a GPU.",
+    )
+    calibrate_with: Path | None = option(
+        reads="path",
+        default=None,
+        help="Drive whose first frames give the ranges of numbers for int8. Default: the first drive that is run.",
+        metavar="SEQUENCE",
     )

@@ -16,6 +16,7 @@ from bevcli.errors import InputError
 from bevcli.frame import Frame, Sequence
 from bevcli.geometry.cameras import Camera, CameraRig, level_rig
 from bevcli.geometry.transforms import Array, inverse
+from bevcli.inference.auto_levels import auto_levels
 from bevcli.jit import njit
 from bevcli.model.camera_assignment import CameraAssignment, assign_cameras
 from bevcli.model.config import ImageConfig, ModelConfig
@@ -50,7 +51,9 @@ class Preprocessor:
 
         def write(place: int, name: str) -> None:
             pixels = frame.rig[name].undistort(frame.images[name].pixels_bgr)
-            write_network_image(pixels, image, out=images[0, place].numpy())
+            write_network_image(
+                auto_levels(pixels) if image.auto_levels else pixels, image, out=images[0, place].numpy()
+            )
 
         tasks = [self._threads.submit(write, i, name) for i, name in enumerate(names) if name in frame.images]
         for task in wait(tasks).done:

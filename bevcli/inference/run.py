@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 from bevcli.frame import Frame, Prediction, Sequence
 from bevcli.inference.commands import read_commands
+from bevcli.inference.in_engine import in_engine
 from bevcli.inference.load import Model
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import BevState, Runner, StepOptions
@@ -89,8 +90,7 @@ def run(
         InputError: a frame cannot be read, a probe lies outside the BEV grid, a camera or a command is unknown, or the
             attention of an exported file is asked for.
     """
-    if attention or probes:
-        model.require_parts("attention and probes")
+    model = in_engine(model, sequence.rig, sequence, parts="attention and probes" if attention or probes else "")
     asked = StepOptions(
         model.precision,
         temporal,

@@ -13,6 +13,7 @@ from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.ego_motion import Kinematics
 from bevcli.geometry.recent_poses import RecentPoses
 from bevcli.geometry.transforms import Pose
+from bevcli.inference.in_engine import in_engine
 from bevcli.inference.load import Model
 from bevcli.inference.run import RunnerState, Steps
 from bevcli.inference.runner import StepOptions
@@ -78,6 +79,7 @@ class Session:
                 f"model {model.name} uses {model.config.later_frames} later frames, which a session does not have: "
                 "choose another model, or pass `temporal=False`"
             )
+        model = in_engine(model, rig)
         self.name, self.rig, self.notes = name, rig, model.rig_notes(rig)
         self.frame: Frame | None = None
         self._color_order = color_order

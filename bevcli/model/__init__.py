@@ -19,5 +19,5 @@ and, where it wants them: `exchange_parts` (for `prepare_for_inference`), `expor
 `without_training_parts` (of a released weights file), `part_names`, `stages`. The configuration says what the model
 needs of a sequence (`past_frames`, `later_frames`, `uses_history`), whether it `has_tracks`, and by `check_training`
 whether it can be trained. A subclass of `Network` (`network.py`) has the paper's parts; it can be trained and timed,
-and its attentions can be shown.
+and its attentions can be shown. Its `head_losses` are those of heads that make further results.
 """

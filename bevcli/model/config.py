@@ -46,6 +46,8 @@ class ImageConfig:
             of the network's input, so that objects at the same distance have the same size for every rig
             (`bevcli.inference.preprocess.image_for_rig`). None: `size` holds for every rig.
         max_pixels: with `focal_px`, images become larger only as long as all images of a frame have no more pixels.
+        auto_levels: stretch the grey levels of each image to the full range first
+            (`bevcli.inference.auto_levels`), so that the model sees more in the dark and in fog.
     """
 
     size: tuple[int, int]
@@ -58,6 +60,7 @@ class ImageConfig:
     crop: tuple[int, int, int, int] | None = None
     focal_px: float | None = None
     max_pixels: int | None = None
+    auto_levels: bool = False
 
     def __post_init__(self) -> None:
         if min(self.size) < 1 or min(self.std) <= 0 or self.pad_divisor < 1:
@@ -242,6 +245,11 @@ class ModelConfig:
     def later_frames(self) -> int:
         """Number of frames after the current one that a step needs."""
         return 0
+
+    @property
+    def future_times_s(self) -> tuple[float, ...]:
+        """Seconds after a frame at which its losses compare places of objects and of the vehicle; empty for none."""
+        return ()
 
     @property
     def uses_history(self) -> bool:

@@ -1,7 +1,7 @@
 """The object decoder and its detection head, after Deformable DETR: queries that attend to the BEV map find objects."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -96,6 +96,16 @@ class Decoder(nn.Module):
             box_codes.append(codes)
             reference_points = refined.detach()
         return torch.stack(class_logits), torch.stack(box_codes), query
+
+    def first_queries(self, state: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+        """A state dict with the first queries of one that has more; the same where this decoder has several groups.
+
+        prefix: of the keys of the decoder, such as "decoder.".
+        """
+        key, count = f"{prefix}query_embedding", len(self.query_embedding)
+        if self.training_groups > 1 or key not in state or len(state[key]) <= count:
+            return dict(state)
+        return {**state, key: state[key][:count]}
 
     def object_queries(self, batch: int, groups: int = 1) -> ObjectQueries:
         """The learned queries of the first groups, the same for each batch element."""

@@ -1,6 +1,6 @@
 """The base of the published models: the parts that they share, in the order of the paper's figure 2."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -20,6 +20,7 @@ from bevcli.model.resnet import ResNet
 from bevcli.model.segmentation import SegmentationHead
 from bevcli.model.step import ClipInputs, ModelOutputs
 from bevcli.model.temporal_model import TemporalModel, build_model
+from bevcli.model.truth import FrameTruth
 
 STAGES = {name: name for name in ("backbone", "neck", "encoder", "decoder", "segmentation_head")}
 CAMERA_EMBEDDING = "image_tokens.camera_embedding"  # the key of the tensor that has a row for each camera
@@ -88,6 +89,18 @@ class Network(TemporalModel):
     def learn(self, clip: ClipInputs, place: int, memory: Any) -> tuple[ModelOutputs, Any]:
         """The outputs for a frame of training clips, and the memory after it, which has no gradient."""
         raise NotImplementedError
+
+    def head_losses(
+        self, outputs: ModelOutputs, truths: Sequence[FrameTruth], matches: Sequence[tuple[Tensor, Tensor]]
+    ) -> dict[str, Tensor]:
+        """The weighted scalar losses, by name, of heads that make `ModelConfig.results`; by default none.
+
+        Args:
+            outputs: of B frames.
+            truths: B, with places at `ModelConfig.future_times_s`.
+            matches: of each frame the queries that the detection loss matches to boxes, and the indices of these.
+        """
+        return {}
 
     def run_on_shapes(self, images: Tensor, camera_index: Tensor, hits: PillarHits) -> Tensor:
         """Run the parts whose operations `bevcli bench` counts, for a frame with history; return the BEV map.

@@ -13,6 +13,7 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.recording import entities
 from bevcli.recording.colors import BACKGROUND
 from bevcli.recording.ground_lines import KINDS
+from bevcli.recording.layout import Layout
 from bevcli.recording.log_static import legend_size
 
 SIDEWAYS = np.pi / 2 + 1e-6  # a camera that looks exactly sideways belongs to the front row
@@ -88,7 +89,7 @@ class LayoutFacts:
     follows: bool = False
 
 
-def recording_blueprint(rig: CameraRig, facts: LayoutFacts) -> rrb.Blueprint:
+def recording_blueprint(rig: CameraRig, facts: LayoutFacts) -> Layout:
     """The layout for a rig."""
     titled = f" ({facts.note})" if facts.note else ""
     middle = rrb.Horizontal(_scene(rig, titled, facts), _bev_tabs(titled, facts), column_shares=[5, 3])
@@ -99,7 +100,7 @@ def recording_blueprint(rig: CameraRig, facts: LayoutFacts) -> rrb.Blueprint:
     heights = camera_row_shares(rig)
     shares = [*heights[:1], 1 - sum(heights), *heights[1:]]
     views = rrb.Vertical(*rows[:1], middle, *rows[1:], row_shares=shares)
-    return rrb.Blueprint(
+    return Layout(
         rrb.Horizontal(views, _texts(facts), column_shares=[1 - TEXTS_SHARE, TEXTS_SHARE]),
         # Playback of "time" runs at the drive's own speed; `fps` is that of the timeline "frame".
         rrb.TimePanel(
@@ -108,10 +109,6 @@ def recording_blueprint(rig: CameraRig, facts: LayoutFacts) -> rrb.Blueprint:
             fps=facts.rate_hz,
             play_state="following" if facts.follows else None,
         ),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.BlueprintPanel(state="collapsed"),
-        auto_views=False,
-        auto_layout=False,
     )
 
 

@@ -54,6 +54,7 @@ class RrdFile:
             raise OutputError(f"{path}: the recording cannot be written ({error.strerror})") from None
         self._pipe = -1
         self._busy = threading.Lock()
+        self._block = memoryview(bytearray(BLOCK))  # allocated here, where a lack of memory can be told
 
     def sink(self) -> rr.FileSink:
         """The sink that rerun writes to from now on. After it was passed to `set_sinks`, call `opened`.
@@ -125,17 +126,17 @@ class RrdFile:
             while True:
                 select.select([pipe], [], [])  # as long as rerun has nothing to write
                 with self._busy:
-                    block = os.read(pipe, BLOCK)
-                    if not block:
+                    size = os.readv(pipe, [self._block])
+                    if not size:
                         return
                     if pipe == self._pipe:
-                        self._write(block)
+                        self._write(self._block[:size])
         finally:
             os.close(pipe)
 
-    def _write(self, block: bytes) -> None:
+    def _write(self, block: memoryview) -> None:
         """Writes a block. After an error the rest is read and thrown away, so that rerun never waits."""
-        rest = memoryview(block)[self._to_skip :]
+        rest = block[self._to_skip :]
         self._to_skip -= len(block) - len(rest)
         try:
             while rest and self._error is None:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import rerun as rr
-import rerun.blueprint as rrb
 
 from bevcli.errors import OutputError, WaitError
 from bevcli.frame import DriveFacts, Frame, FrameStamp, MapLines, Plan, Prediction
@@ -21,6 +20,7 @@ from bevcli.recording import entities, log_bev, log_boxes, log_cameras, log_stat
 from bevcli.recording.blueprint import LayoutFacts, recording_blueprint
 from bevcli.recording.colors import EGO_COLOR, class_colors
 from bevcli.recording.ground_lines import future_lines, result_lines
+from bevcli.recording.layout import Layout
 from bevcli.recording.log_bev import BevColors, BevImages
 from bevcli.recording.log_cameras import PosedCamera, VideoImages
 from bevcli.recording.log_ground import log_ground_lines
@@ -179,7 +179,7 @@ class Recording:
             legend_entries=len(legend),
             grid=grid,
         )
-        self._blueprint = recording_blueprint(self.rig, facts)
+        self._layout = recording_blueprint(self.rig, facts)
         self._file = RrdFile(self.path, None if self._resume is None else self._resume.size)
         follows = replace(facts, follows=self._live is not None)
         self._connect(self._file, recording_blueprint(self.rig, follows))
@@ -213,14 +213,16 @@ class Recording:
         text = log_static.about_text(self.title, self.rig, self.options, untrained=self.untrained)
         self._stream.log(entities.RUN, rr.TextDocument(text, media_type="text/markdown"), facts, static=True)
 
-    def _connect(self, file: RrdFile, blueprint: rrb.Blueprint | None) -> None:
+    def _connect(self, file: RrdFile, layout: Layout | None) -> None:
         """Makes rerun write a new stream into the file. Raises OutputError."""
         try:
-            self._stream.set_sinks(file.sink(), default_blueprint=blueprint)
+            self._stream.set_sinks(file.sink(), default_blueprint=layout)
         except RuntimeError as error:
             raise OutputError(f"{self.path}: the recording cannot be written ({error})") from error
         finally:
             file.opened()
+            if layout is not None:
+                layout.free()
 
     def __exit__(self, *error: object) -> None:
         assert self._file is not None
@@ -230,7 +232,8 @@ class Recording:
             if self._video is not None:
                 self._video.close()
             if self._live is not None:  # who opens the file later sees it from the first frame on
-                self._stream.send_blueprint(self._blueprint, make_active=False)
+                self._stream.send_blueprint(self._layout, make_active=False)
+                self._layout.free()
             self._flush()
         finally:
             self._disconnect()

@@ -1,6 +1,7 @@
 """`check_calibration`: read a calibration and the data of its sequence, run all checks, and keep what they found."""
 
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -113,7 +114,7 @@ def check_calibration(
     found: _Found = ((), {})
     if folder is not None and draft.rig.cameras:
         found = _read_folder(folder, draft.rig, frame, bool(options.get("allow_outside")))
-    name = (folder or file.with_suffix("")).resolve().name
+    name = os.path.basename(os.path.realpath(folder or file.with_suffix("")))
     return CalibrationCheck(name, draft.rig, with_findings(check_rig(draft.rig, draft.findings), found[0]), found[1])
 
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from bevcli.findings import Finding
 from bevcli.geometry.cameras import Camera
@@ -119,8 +118,10 @@ def _turned_ego_frame(named: Mapping[str, float], yaws: Mapping[str, float]) -> 
 def _swapped_names(named: Mapping[str, float], yaws: Mapping[str, float]) -> tuple[Finding, ...]:
     """One finding if exchanging names makes them fit the poses; else one for each name that contradicts its pose."""
     names = list(named)
-    if not names:
-        return ()
+    if sum(turn_deg(named[name], yaws[name]) for name in names) < SWAP_GAIN_DEG:
+        return ()  # without scipy.optimize, whose import takes 0.3 s of each run
+    from scipy.optimize import linear_sum_assignment
+
     cost = np.array([[turn_deg(named[name], yaws[owner]) for owner in names] for name in names])
     rows, owners = linear_sum_assignment(cost)
     gain = float(np.trace(cost) - cost[rows, owners].sum())

@@ -15,6 +15,7 @@ from bevcli.geometry.transforms import Array, apply
 from bevcli.recording import entities, log_static
 from bevcli.recording.blueprint import camera_rows, flat_view
 from bevcli.recording.colors import BACKGROUND
+from bevcli.recording.layout import Layout
 from bevcli.rig.coverage import Coverage
 from bevcli.rig.drawings import COUNT_COLORS
 from bevcli.rig.mounting import horizon
@@ -40,10 +41,13 @@ JPEG_QUALITY = 90
 def write_rig_recording(path: Path, rig: CameraRig, report: RigReport, images: Mapping[str, Pixels]) -> None:
     """Write the recording. images: by camera, (H, W, 3) BGR; any may be missing. Raises OutputError."""
     with whole_file(path) as unfinished, rr.RecordingStream("bevcli-project-debug") as stream:
+        layout = _layout(rig)
         try:
-            stream.save(unfinished, default_blueprint=_blueprint(rig))
+            stream.save(unfinished, default_blueprint=layout)
         except RuntimeError as error:
             raise OutputError(f"{path}: the recording cannot be written ({error})") from error
+        finally:
+            layout.free()
         log_static.log_scene(stream, rig, {})
         _log_scene(stream, rig, report.coverage)
         for camera in rig.cameras:
@@ -119,17 +123,14 @@ def clipped(line: Array, camera: Camera) -> list[Array]:
     return visible_runs(np.where(inside, line, np.nan))
 
 
-def _blueprint(rig: CameraRig) -> rrb.Blueprint:
+def _layout(rig: CameraRig) -> Layout:
     overlays = ("pillars", "ground_grid", "pillar_lines", "horizon")
     seen = rrb.Spatial2DView(origin=COVERAGE, name="Cameras per BEV cell", background=list(BACKGROUND))
     findings = rrb.TextDocumentView(origin=FINDINGS, name="Findings")
     middle = rrb.Horizontal(rig_view(rig, overlays), seen, findings, column_shares=[4, 3, 4])
     rows = camera_views(rig)
-    layout = rrb.Vertical(*rows[:1], middle, *rows[1:], row_shares=[3, 5, 3][: len(rows) + 1])
-    return rrb.Blueprint(
-        layout, rrb.TimePanel(state="hidden"), rrb.SelectionPanel(state="collapsed"),
-        rrb.BlueprintPanel(state="collapsed"), auto_views=False, auto_layout=False,
-    )  # fmt: skip
+    views = rrb.Vertical(*rows[:1], middle, *rows[1:], row_shares=[3, 5, 3][: len(rows) + 1])
+    return Layout(views, rrb.TimePanel(state="hidden"))
 
 
 def rig_view(rig: CameraRig, overlays: Iterable[str]) -> rrb.Spatial3DView:

@@ -7,13 +7,22 @@ from functools import partial
 
 from bevcli.errors import InputError
 from bevcli.frame import Sequence
-from bevcli.robustness import corruptions, sequences
+from bevcli.robustness import sequences
 from bevcli.robustness.options import LostImage, SeverityChoice
 from bevcli.robustness.sequences import Draws
+from bevcli.synth import corruptions
 
 CLEAN = "clean"
 # Makes of a scene what is run in its place, for a level: several sequences if they must not share a history.
 Apply = Callable[[Sequence, int, Draws, LostImage], Sequence | tuple[Sequence, ...]]
+
+
+class Group(Enum):
+    """Corruptions whose scores are averaged together."""
+
+    ROBOBEV = auto()  # as published: mRR and mCE
+    UNSEEN = auto()  # those of ImageNet-C that no training here uses
+    OTHER = auto()  # averaged with nothing
 
 
 class Shown(Enum):
@@ -35,7 +44,7 @@ class Corruption:
         levels: severity, such as "easy", or a number -> level.
         apply: makes of a scene what is run.
         shown: on the contact sheet.
-        published: whether it is one of RoboBEV's; only these count in mRR and mCE.
+        group: the corruptions that it is averaged with.
     """
 
     name: str
@@ -43,7 +52,7 @@ class Corruption:
     levels: Mapping[str, int]
     apply: Apply
     shown: Shown = Shown.IMAGE
-    published: bool = True
+    group: Group = Group.ROBOBEV
 
 
 @dataclass(frozen=True)
@@ -79,6 +88,10 @@ def _severities(easy: int, mid: int, hard: int) -> dict[str, int]:
     return {"easy": easy, "mid": mid, "hard": hard}
 
 
+def _unseen(name: str, corrupt: corruptions.ImageCorruption) -> Corruption:
+    return Corruption(name, name.replace("_", " "), _severities(2, 4, 5), _images(corrupt), group=Group.UNSEEN)
+
+
 # Levels of the first eight as published: RoboBEV, docs/CREATE.md.
 CORRUPTIONS = (
     Corruption("camera_crash", "camera crash", _severities(2, 4, 5), sequences.CameraCrash, Shown.CAMERAS),
@@ -91,21 +104,26 @@ CORRUPTIONS = (
     Corruption("low_light", "low light", _severities(2, 3, 4), _images(corruptions.low_light)),
     Corruption("fog", "fog", _severities(2, 4, 5), _images(corruptions.fog)),
     Corruption("snow", "snow", _severities(1, 2, 3), _images(corruptions.snow)),
+    _unseen("defocus_blur", corruptions.defocus_blur),
+    _unseen("low_contrast", corruptions.low_contrast),
+    _unseen("impulse_noise", corruptions.impulse_noise),
+    _unseen("jpeg", corruptions.jpeg),
+    _unseen("saturation", corruptions.saturation),
     Corruption(
         "calibration_noise", "calibration noise", {"1": 1, "2": 2, "3": 3, "4": 4},
-        sequences.CalibrationNoise, Shown.BOXES, published=False,
+        sequences.CalibrationNoise, Shown.BOXES, group=Group.OTHER,
     ),
     Corruption(
         "time_offset", "capture times off by up to 50, 100, 200 ms", _severities(50, 100, 200),
-        sequences.TimeOffsets, Shown.BOXES, published=False,
+        sequences.TimeOffsets, Shown.BOXES, group=Group.OTHER,
     ),
     Corruption(
         "ego_motion_lost", "ego-motion lost in 2/6, 4/6, 5/6 of the frames", _severities(2, 4, 5),
-        sequences.EgoMotionLost, Shown.NOTHING, published=False,
+        sequences.EgoMotionLost, Shown.NOTHING, group=Group.OTHER,
     ),
     Corruption(
         "frame_rate", "1/2, 1/3, 1/4 of the frame rate", _severities(2, 3, 4),
-        lambda scene, step, *_: sequences.at_lower_rate(scene, step), Shown.NOTHING, published=False,
+        lambda scene, step, *_: sequences.at_lower_rate(scene, step), Shown.NOTHING, group=Group.OTHER,
     ),
 )  # fmt: skip
 NAMES = tuple(corruption.name for corruption in CORRUPTIONS)

@@ -9,7 +9,7 @@ from typing import Any, Self
 from bevcli.errors import InputError
 from bevcli.evaluation.scores_report import finite
 from bevcli.parsing.documents import read_json
-from bevcli.robustness.conditions import CLEAN, CORRUPTIONS, Corruption
+from bevcli.robustness.conditions import CLEAN, CORRUPTIONS, Corruption, Group
 
 FORMAT = "bevcli-stress/1"
 
@@ -87,13 +87,13 @@ class StressResults:
         below = sum(1 - other[severity].nd_score for severity in common)
         return sum(1 - own[severity].nd_score for severity in common) / below if below else math.nan
 
-    def mean_resilience(self) -> float:
-        """mRR: the mean resilience rate of RoboBEV's corruptions that were tested; NaN without any."""
-        return _mean(self.resilience(part.name) for part in self.tested() if part.published)
+    def mean_resilience(self, group: Group = Group.ROBOBEV) -> float:
+        """The mean resilience rate of a group's corruptions that were tested, RoboBEV's mRR; NaN without any."""
+        return _mean(self.resilience(part.name) for part in self.tested() if part.group is group)
 
     def mean_corruption_error(self, against: Self) -> float:
         """mCE: the mean corruption error of RoboBEV's corruptions that both runs have; NaN without any."""
-        return _mean(self.corruption_error(part.name, against) for part in self.tested() if part.published)
+        return _mean(self.corruption_error(part.name, against) for part in self.tested() if part.group is Group.ROBOBEV)
 
     def to_dict(self, against: Self | None = None) -> dict[str, Any]:
         """All of it for JSON; undefined numbers are None. docs/robustness.md explains the keys."""
@@ -105,6 +105,7 @@ class StressResults:
             "conditions": [scores.to_dict() for scores in self.scores],
             "resilience": {name: self.resilience(name) for name in names},
             "mRR": self.mean_resilience(),
+            "mean_resilience_unseen": self.mean_resilience(Group.UNSEEN),
         }
         if against is not None:
             content["against"] = {name: against.header.get(name) for name in ("model", "weights")}

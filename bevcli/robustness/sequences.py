@@ -14,9 +14,9 @@ from bevcli.frame import CameraImage, DerivedSequence, Frame, FrameStamp, Sequen
 from bevcli.geometry.cameras import Camera, CameraRig, camera_pose_noise
 from bevcli.geometry.ego_motion import Kinematics, motion_during
 from bevcli.geometry.transforms import Pose, inverse
-from bevcli.robustness.corruptions import ImageCorruption, Level, Pixels
 from bevcli.robustness.options import LostImage
 from bevcli.sequences.selection import scenes_of, select
+from bevcli.synth.corruptions import ImageCorruption, Level, Pixels
 
 
 @dataclass(frozen=True)

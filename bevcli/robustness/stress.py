@@ -13,6 +13,7 @@ from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import evaluate_detections
 from bevcli.frame import Sequence
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.inference.in_engine import in_engine
 from bevcli.inference.load import Model
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner, StepOptions
@@ -101,6 +102,7 @@ def stress(
     """
     if force and resume:
         raise OutputError("`force` and `resume` exclude each other: pass one of them")
+    model = in_engine(model, drives[0].rig, drives[0])
     store = FrameStore()
     scenes = [KeptFrames(scene, store) for drive in drives for scene in split_scenes(drive)]
     against = None if options.against is None else read_results(options.against)

@@ -95,7 +95,7 @@ class RunFolder:
 
     def _holds(self, path: Path) -> bool:
         """The folder of a file is in this one after all links are followed."""
-        return path.parent.resolve().is_relative_to(self.path.resolve())
+        return Path(os.path.realpath(path.parent)).is_relative_to(os.path.realpath(self.path))
 
     def _has_no_run(self) -> bool:
         return all(entry.name == OWN for entry in self.path.iterdir()) and not (self.path / OWN / "written").exists()

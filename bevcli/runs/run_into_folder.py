@@ -10,6 +10,7 @@ from bevcli.errors import BevcliError, OutputError
 from bevcli.frame import Frame, Prediction, Sequence
 from bevcli.inference.background import write_behind
 from bevcli.inference.commands import Commands, read_commands
+from bevcli.inference.in_engine import in_engine
 from bevcli.inference.load import Model
 from bevcli.inference.run import RunnerState, run_steps
 from bevcli.inference.runner import StepOptions
@@ -61,8 +62,7 @@ def run_into_folder(
             the run to resume was another one.
     """
     options = RunOptions() if options is None else options
-    if options.recording.probes:
-        model.require_parts("`probes`")
+    model = in_engine(model, sequence.rig, sequence, parts="`probes`" if options.recording.probes else "")
     commands = read_commands(options.command, model.config)
     if force and resume:
         raise OutputError("`force` and `resume` exclude each other: pass one of them")

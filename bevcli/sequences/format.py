@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import Field, dataclass, fields
 from pathlib import Path
 from pkgutil import resolve_name
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from bevcli.frame import Sequence
 
 GROUP = "bevcli.sequences"
+ROOT_DEPTH = 2  # levels of folders between a data set's root and its drives, such as ROOT/val/LOG
+FEW = 4  # names in a message
 
 
 @dataclass(frozen=True)
@@ -73,13 +76,20 @@ def option_classes() -> list[type[FormatOptions]]:
 
 
 def format_of(path: Path) -> Format:
-    """The format of a path. Raises InputError if it is missing, or has no known format or two."""
+    """The format of a path. Raises InputError if it is missing, or is no drive, or has two formats."""
     known, broken = _loaded()
     known = tuple(sorted(known, key=lambda one: one.precedence))  # in messages, the most general one comes first
     if not path.exists():
         raise InputError(f"{path}: is missing (expected {_either([one.name for one in known])})")
     matching = [one for one in known if one.recognises(path)]
     if not matching:
+        drives = list(drives_in(path))
+        if drives:
+            few = ", ".join(drives[:FEW]) + (", …" if len(drives) > FEW else "")
+            raise InputError(
+                f"{path}: is a folder of {len(drives)} drives ({few}): choose one with `scene`, or run all by "
+                "`bevcli batch`"
+            )
         kind = "is a file, and not" if path.is_file() else "is not"
         expected = _either([f"{one.name} (expected {one.expected})" for one in known])
         raise InputError("; ".join([f"{path}: {kind} {expected}", *map(str, broken)]))
@@ -88,6 +98,37 @@ def format_of(path: Path) -> Format:
     if others:
         raise InputError(f"{path}: is {first.name} and {others[0].name}: keep the files of one format there")
     return first
+
+
+def is_drive(path: Path) -> bool:
+    """True for a path that a format recognises."""
+    return any(one.recognises(path) for one in formats())
+
+
+def drives_in(root: Path, depth: int = ROOT_DEPTH) -> dict[str, Path]:
+    """The drives below a folder that is no drive itself, such as the root of a data set, by name.
+
+    The name of a drive is that of its folder or file; with the folders above it where two have the same.
+    """
+    known = formats()
+    found = {path.relative_to(root).as_posix(): path for path in _drives_below(root, known, depth)}
+    names = Counter(path.name for path in found.values())
+    return {name if names[path.name] > 1 else path.name: path for name, path in found.items()}
+
+
+def _drives_below(folder: Path, known: Iterable[Format], depth: int) -> Iterator[Path]:
+    if not folder.is_dir():
+        return
+    for path in sorted(folder.iterdir()):
+        try:
+            if path.name.startswith("."):
+                continue
+            if any(one.recognises(path) for one in known):
+                yield path
+            elif depth > 1:
+                yield from _drives_below(path, known, depth - 1)
+        except OSError:  # a folder that this user may not read holds no drive of theirs
+            continue
 
 
 def format_options() -> dict[str, Field[Any]]:

@@ -1,5 +1,6 @@
 """`open_sequence`: recognises the format of an input and opens it as a Sequence."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +8,7 @@ from bevcli.frame import Sequence
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.options import defaults, gather
 from bevcli.sequences.files.class_names import ClassNames
-from bevcli.sequences.format import format_of, own_options
+from bevcli.sequences.format import drives_in, format_of, is_drive, own_options
 from bevcli.sequences.options import SequenceOptions
 from bevcli.sequences.selection import (
     WithClassNames,
@@ -29,6 +30,7 @@ def open_sequence(path: str | Path, options: SequenceOptions | None = None, **ch
         drive = open_sequence("drive.mcap", calibration="calibration.json")
         drive = open_sequence("my_drive", rate_hz=2.0, frames=slice(0, 40))
         drive = open_sequence("nuscenes", version="v1.0-mini", scene="scene-0103")
+        drive = open_sequence("ddad_train_val", scene="000150")  # a folder of drives
         for place, stamp in enumerate(drive.stamps):
             frame = drive.load(place)
 
@@ -45,6 +47,8 @@ def open_sequence(path: str | Path, options: SequenceOptions | None = None, **ch
     """
     path, common = Path(path), defaults(SequenceOptions)
     options = gather(SequenceOptions, options, {name: changes.pop(name) for name in common if name in changes})
+    if options.scene is not None and (drive := _drive_of(path, options.scene)):
+        path, options = drive, replace(options, scene=None)
     chosen = format_of(path)
     own = own_options(path, chosen, changes)
     sequence = chosen.open(path, options, own)
@@ -62,3 +66,8 @@ def open_sequence(path: str | Path, options: SequenceOptions | None = None, **ch
     if rate_hz is not None and rate_hz != "all":
         sequence = select_rate(sequence, rate_hz)
     return sequence if options.frames is None else select_range(sequence, options.frames)
+
+
+def _drive_of(root: Path, name: str) -> Path | None:
+    """A drive of a folder of drives by its name; None where the path is a drive itself, or holds none of this name."""
+    return None if not root.is_dir() or is_drive(root) else drives_in(root).get(name)

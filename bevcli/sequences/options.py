@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -23,8 +24,8 @@ EgoMotionUse = Literal["required", "optional", "static"]
 def parse_frames(text: str) -> slice:
     """A frame range "A:B" with optional ends. Raises ValueError."""
     ends = text.split(":")
-    if len(ends) != 2 or not all(end == "" or end.isdecimal() for end in ends):
-        raise ValueError(f'"{text}" (expected A:B with integers, such as 0:10 or 5:)')
+    if len(ends) != 2 or not all(re.fullmatch("[0-9]{0,18}", end) for end in ends):
+        raise ValueError(f'"{text[:60]}" (expected A:B with integers, such as 0:10 or 5:)')
     start, stop = (int(end) if end else None for end in ends)
     return slice(start, stop)
 
@@ -89,7 +90,9 @@ class SequenceOptions(ClassOptions):
         flag_value="static",
     )
     strict: bool = option(default=False, help="Treat a missing or unreadable image as an error.")
-    scene: str | None = option(default=None, help="Only this scene, such as scene-0103.")
+    scene: str | None = option(
+        default=None, help="Only this scene, such as scene-0103; of a folder of drives, this drive."
+    )
     ground_truth: bool = option(
         default=True, help="Read the ground truth, if any.", flag="--ground-truth/--no-ground-truth"
     )

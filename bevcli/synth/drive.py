@@ -16,9 +16,10 @@ from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid, rotat
 from bevcli.synth.assets.catalog import Assets, Body
 from bevcli.synth.assets.triangles import TriangleSoup
 from bevcli.synth.render.ground import GroundTexture, MapWindow, draw_map, paint_ground
+from bevcli.synth.render.lens import lens_parts
 from bevcli.synth.render.line_truth import true_lines
 from bevcli.synth.render.rasteriser import ShadowMap
-from bevcli.synth.render.renderer import RenderedView, WorldSnapshot, render_view
+from bevcli.synth.render.renderer import RenderedView, WorldSnapshot, render_through_lens, render_view
 from bevcli.synth.rig import nuscenes_like_rig
 from bevcli.synth.world.city import CityPlan
 from bevcli.synth.world.ground_plan import GroundPlan
@@ -105,6 +106,7 @@ class RenderedDrive:
     ) -> None:
         self.seed, self.frames, self.rate_hz = seed, frames, rate_hz
         self.rig = rig or nuscenes_like_rig(400, 225)
+        self._lenses = {camera.name: lens_parts(camera) for camera in self.rig.cameras if camera.distortion}
         self.map_window = map_window
         self._delays_s = camera_delays_s or {}
         self._supersampling, self._threads = supersampling, threads
@@ -202,7 +204,10 @@ class RenderedDrive:
         snapshot = WorldSnapshot(TriangleSoup.gather([scenery, moving]), len(actors), ground, shadows, self.weather)
 
         def render_one(name: str) -> RenderedView:
-            return render_view(snapshot, self.rig[name], world_from_ego.matrix, self._supersampling)
+            pose = world_from_ego.matrix
+            if name in self._lenses:
+                return render_through_lens(snapshot, self._lenses[name], pose, self._supersampling)
+            return render_view(snapshot, self.rig[name], pose, self._supersampling)
 
         if self._threads == 1:
             return {name: render_one(name) for name in names}

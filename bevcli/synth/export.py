@@ -1,7 +1,8 @@
 """A rendered drive as a sequence folder: `render` makes the drive and writes it, `export_drive` writes a given one."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +12,19 @@ from numpy.typing import NDArray
 
 from bevcli.frame import CameraImage, DriveFacts, Frame
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.cameras import CameraRig
 from bevcli.options import gather
 from bevcli.sequences.native.tables import write_ego_motion
 from bevcli.sequences.native.writer import NativeWriter
-from bevcli.synth.drive import RenderedDrive, RenderedFrame
+from bevcli.synth.drive import RenderedDrive
 from bevcli.synth.options import JPEG_QUALITY, RenderOptions
 from bevcli.synth.rig import rig_for_rendering
+from bevcli.synth.workers import shared_out
 
 EGO_MOTION_HZ = 50.0
 SUPERSAMPLED_WIDTH = 1000  # images up to this width are supersampled by default
 THREADS = 2
+NO_PIXELS = np.empty((0, 0, 3), np.uint8)
 
 
 @dataclass(frozen=True)
@@ -46,7 +50,7 @@ def render(
     out: str | Path,
     options: RenderOptions | None = None,
     *,
-    progress: Callable[[RenderedFrame], None] | None = None,
+    progress: Callable[[Frame], None] | None = None,
     **changes: Any,
 ) -> RenderSummary:
     """Render a drive through a procedural city and write it as a sequence with ground truth boxes and maps.
@@ -56,8 +60,9 @@ def render(
 
     Args:
         out: the sequence folder to write.
-        options: the options; by default those of `RenderOptions`.
-        progress: called with each frame after it is written.
+        options: the options; by default those of `RenderOptions`. With several `workers`, a program must call this
+            function under `if __name__ == "__main__":`, because each of them imports the program.
+        progress: called with each frame after it is written. With several `workers`, its images have no pixels.
         changes: options by name, such as `seed=7` and `resolution=(800, 450)`.
 
     Raises:
@@ -65,14 +70,29 @@ def render(
         OutputError: `out` contains a sequence and `force` is false, or it cannot be written.
     """
     chosen = gather(RenderOptions, options, changes)
-    cameras = rig_for_rendering(chosen.rig, chosen.resolution)
-    width = max(camera.width for camera in cameras.cameras)
-    samples = chosen.supersampling or (2 if width <= SUPERSAMPLED_WIDTH else 1)
-    seed, frames, rate_hz, weather = chosen.seed, chosen.frames, chosen.rate_hz, chosen.weather
-    drive = RenderedDrive(seed, frames, rate_hz, cameras, weather, supersampling=samples, threads=THREADS)
-    folder = Path(out)
-    export_drive(drive, folder, force=chosen.force, quality=chosen.quality, progress=progress)
-    return RenderSummary(folder, seed, frames, cameras.names, drive.weather.name)
+    rig = rig_for_rendering(chosen.rig, chosen.resolution)
+    drive = _drive_of(chosen, rig, THREADS)
+    if chosen.workers == 1:
+        export_drive(drive, Path(out), force=chosen.force, quality=chosen.quality, progress=progress)
+    else:
+        with shared_out(partial(_frames_of, chosen, rig), chosen.frames, chosen.workers) as frames:
+            _write(drive, frames, Path(out), force=chosen.force, progress=progress)
+    return RenderSummary(Path(out), chosen.seed, chosen.frames, rig.names, drive.weather.name)
+
+
+def _drive_of(chosen: RenderOptions, rig: CameraRig, threads: int) -> RenderedDrive:
+    samples = chosen.supersampling or (2 if max(c.width for c in rig.cameras) <= SUPERSAMPLED_WIDTH else 1)
+    return RenderedDrive(
+        chosen.seed, chosen.frames, chosen.rate_hz, rig, chosen.weather, supersampling=samples, threads=threads
+    )
+
+
+def _frames_of(chosen: RenderOptions, rig: CameraRig, indices: Sequence[int]) -> Iterator[Frame]:
+    """Some frames of the drive, for a process of its own. Their images have no pixels, only files."""
+    drive = _drive_of(chosen, rig, threads=1)
+    for frame in _encoded(drive, indices, chosen.quality):
+        bare = {name: replace(image, pixels_bgr=NO_PIXELS) for name, image in frame.images.items()}
+        yield replace(frame, images=bare)
 
 
 def export_drive(
@@ -81,7 +101,7 @@ def export_drive(
     *,
     force: bool = False,
     quality: int = JPEG_QUALITY,
-    progress: Callable[[RenderedFrame], None] | None = None,
+    progress: Callable[[Frame], None] | None = None,
 ) -> None:
     """Render all frames of a drive and write them, with ego-motion at EGO_MOTION_HZ, ground truth boxes and maps.
 
@@ -89,28 +109,40 @@ def export_drive(
     progress: called with each frame after it is written.
     Raises OutputError where the folder contains a sequence and `force` is false, or cannot be written.
     """
-    motion = drive.ego_motion(EGO_MOTION_HZ)
+    _write(drive, _encoded(drive, range(drive.frames), quality), folder, force=force, progress=progress)
+
+
+def _write(
+    drive: RenderedDrive,
+    frames: Iterable[Frame],
+    folder: Path,
+    *,
+    force: bool,
+    progress: Callable[[Frame], None] | None,
+) -> None:
     with NativeWriter(folder, with_ego_motion=True, force=force, facts=DriveFacts(rendered=True)) as writer:
-        for index in range(drive.frames):
-            rendered = drive.frame(index)
-            kinematics = motion.kinematics_at(rendered.stamp.timestamp_ns)
-            times_ns = rendered.camera_timestamps_ns
-            images = {
-                name: CameraImage(times_ns[name], pixels, _encode_jpeg(pixels, quality), "image/jpeg")
-                for name, pixels in rendered.images.items()
-            }
-            writer.write(
-                Frame(
-                    rendered.stamp, drive.rig, images, rendered.world_from_ego,
-                    rendered.world_from_ego_at, kinematics,
-                    ground_truth=_rounded(rendered.boxes), ground_truth_map=rendered.bev_map,
-                    ground_truth_lines=rendered.lines,
-                )
-            )  # fmt: skip
+        for frame in frames:
+            writer.write(frame)
             if progress is not None:
-                progress(rendered)
+                progress(frame)
     # The writer has written a pose for each frame. Replace them by denser ones, so that cameras may have time offsets.
-    write_ego_motion(folder / "ego_motion.csv", motion)
+    write_ego_motion(folder / "ego_motion.csv", drive.ego_motion(EGO_MOTION_HZ))
+
+
+def _encoded(drive: RenderedDrive, indices: Sequence[int], quality: int) -> Iterator[Frame]:
+    """Frames of the drive with image files."""
+    motion = drive.ego_motion(EGO_MOTION_HZ)
+    for index in indices:
+        rendered = drive.frame(index)
+        images = {
+            name: CameraImage(rendered.camera_timestamps_ns[name], pixels, _encode_jpeg(pixels, quality), "image/jpeg")
+            for name, pixels in rendered.images.items()
+        }
+        yield Frame(
+            rendered.stamp, drive.rig, images, rendered.world_from_ego, rendered.world_from_ego_at,
+            motion.kinematics_at(rendered.stamp.timestamp_ns), ground_truth=_rounded(rendered.boxes),
+            ground_truth_map=rendered.bev_map, ground_truth_lines=rendered.lines,
+        )  # fmt: skip
 
 
 def _encode_jpeg(pixels_bgr: NDArray[np.uint8], quality: int) -> bytes:

@@ -1,4 +1,4 @@
-"""Augmentation: photometric distortion, exposure, noise, missing images, grid mask, and noise on the calibration.
+"""Augmentation: photometric distortion, exposure, noise, missing images, corruptions, grid mask, calibration noise.
 
 Boxes and maps stay as they are.
 """
@@ -14,6 +14,21 @@ from torch import Tensor
 from bevcli.frame import CameraImage, Frame
 from bevcli.geometry.cameras import Camera, CameraRig, camera_pose_noise
 from bevcli.geometry.transforms import Array
+from bevcli.synth.corruptions import (
+    BRIGHTNESS,
+    FOG,
+    LOW_LIGHT,
+    MOTION_BLUR,
+    SNOW,
+    ImageCorruption,
+    Pixels,
+    brightness,
+    color_quantisation,
+    fog,
+    low_light,
+    motion_blur,
+    snow,
+)
 
 MAX_BRIGHTNESS = 32.0  # added to pixel values of 0 to 255
 CONTRAST_RANGE = SATURATION_RANGE = (0.5, 1.5)  # factors
@@ -33,6 +48,10 @@ class AugmentationConfig:
         drop_image: probability (0 to 1) that an image is missing. A frame keeps at least one image.
         calibration_share: probability (0 to 1) that a clip has noise on the poses of its cameras; constant over a clip.
         calibration_noise: largest level of that noise (`camera_pose_noise`), drawn uniformly from 0.
+        corrupted_share: probability (0 to 1) that all images of a clip are corrupted: low light, fog, snow, brightness,
+            motion blur or few colours, of any severity.
+        lost_cameras_share: probability (0 to 1) that up to `MOST_LOST_CAMERAS` cameras of a clip deliver nothing, or
+            black images.
     """
 
     photometric: float = 0.5
@@ -43,11 +62,21 @@ class AugmentationConfig:
     drop_image: float = 0.0
     calibration_share: float = 0.0
     calibration_noise: float = 4.0
+    corrupted_share: float = 0.0
+    lost_cameras_share: float = 0.0
 
     def __post_init__(self) -> None:
-        shares = (self.photometric, self.grid_mask, self.drop_image, self.calibration_share)
-        if not all(0 <= share <= 1 for share in shares):
-            raise ValueError("photometric, grid_mask, drop_image and calibration_share are probabilities, from 0 to 1")
+        shares = (
+            "photometric",
+            "grid_mask",
+            "drop_image",
+            "calibration_share",
+            "corrupted_share",
+            "lost_cameras_share",
+        )
+        wrong = [name for name in shares if not 0 <= getattr(self, name) <= 1]
+        if wrong:
+            raise ValueError(f"{wrong[0]} is a probability, from 0 to 1")
         if min(self.exposure, self.white_balance, self.noise, self.calibration_noise) < 0 or self.white_balance >= 1:
             raise ValueError(
                 "exposure, white_balance, noise and calibration_noise must not be negative, and white_balance must be "
@@ -89,6 +118,54 @@ class ImageVariation:
         blue, red = 1 + self._random.uniform(-1, 1, 2) * self._config.white_balance
         gains = np.array([blue, 1.0, red]) * 2.0**stops
         return (np.arange(256)[None, :, None] * gains).clip(0, 255).round().astype(np.uint8)
+
+
+# Corruptions to train on, and their levels. The others of `bevcli.synth.corruptions` are kept for scores.
+TRAINED_CORRUPTIONS: tuple[tuple[ImageCorruption, tuple[int, ...]], ...] = (
+    (low_light, tuple(LOW_LIGHT)),
+    (fog, tuple(FOG)),
+    (snow, tuple(SNOW)),
+    (brightness, tuple(BRIGHTNESS)),
+    (motion_blur, tuple(MOTION_BLUR)),
+    (color_quantisation, (1, 2, 3)),
+)
+MOST_LOST_CAMERAS = 4
+
+
+class BadConditions:
+    """A corruption of all images of one clip, and cameras that deliver nothing, both drawn once."""
+
+    def __init__(self, config: AugmentationConfig, random: np.random.Generator) -> None:
+        self._random, self._lost, self._black = random, 0, False
+        self._corruption: tuple[ImageCorruption, int] | None = None
+        if random.random() < config.corrupted_share:
+            corrupt, levels = TRAINED_CORRUPTIONS[random.integers(len(TRAINED_CORRUPTIONS))]
+            self._corruption = corrupt, int(random.choice(levels))
+        if random.random() < config.lost_cameras_share:
+            self._lost, self._black = int(random.integers(1, MOST_LOST_CAMERAS + 1)), bool(random.random() < 0.5)
+        self._order: dict[str, int] = {}  # camera -> its place among those that are lost one after the other
+
+    def __call__(self, frame: Frame) -> Frame:
+        """A copy of the frame with its images corrupted, and some of them left out or black."""
+        if self._corruption is None and not self._lost:
+            return frame
+        if not self._order:
+            places = self._random.permutation(len(frame.rig.names))
+            self._order = dict(zip(frame.rig.names, map(int, places), strict=True))
+        lost = min(self._lost, len(self._order) - 1)
+        images = {}
+        for name, image in frame.images.items():
+            if self._order[name] >= lost:
+                images[name] = replace(image, pixels_bgr=self._corrupted(image.pixels_bgr))
+            elif self._black:
+                images[name] = replace(image, pixels_bgr=np.zeros_like(image.pixels_bgr))
+        return replace(frame, images=images)
+
+    def _corrupted(self, pixels_bgr: Pixels) -> Pixels:
+        if self._corruption is None:
+            return pixels_bgr
+        corrupt, level = self._corruption
+        return corrupt(pixels_bgr, level, self._random)
 
 
 class CalibrationVariation:

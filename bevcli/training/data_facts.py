@@ -26,6 +26,7 @@ class DataFacts:
         drives: the drives, with all their frames.
         frames: number of frames with ground truth.
         class_counts: number of boxes by class, the most frequent first.
+        class_sizes: median length, width and height of the boxes by class, metres.
         rigs: the rig of each drive.
         rate_hz: median rate of the frames with ground truth, per second.
         centers_bev: (N, 3) centres of all boxes in the bev frame, metres.
@@ -35,6 +36,7 @@ class DataFacts:
     drives: tuple[Sequence, ...]
     frames: int
     class_counts: dict[str, int]
+    class_sizes: dict[str, tuple[float, float, float]]
     rigs: tuple[CameraRig, ...]
     rate_hz: float
     centers_bev: Array
@@ -66,8 +68,7 @@ def look_at(drives: Items[Sequence], bev_frame: BevFrameConfig) -> DataFacts:
 
     bev_frame: of the model, for the centres of the boxes.
     """
-    counts: Counter[str] = Counter()
-    centers: list[Array] = []
+    labelled: list[Boxes3D] = []
     gaps_s: list[Array] = []
     map_reaches: list[float] = []
     for drive in drives:
@@ -75,22 +76,23 @@ def look_at(drives: Items[Sequence], bev_frame: BevFrameConfig) -> DataFacts:
         frames = [frame for frame in frames if frame.ground_truth is not None]
         if not frames:
             raise InputError(f"{drive.name}: has no ground truth boxes (expected for training): leave it out")
-        boxes = [_boxes_bev(frame, bev_frame) for frame in frames]
-        counts.update(name for each in boxes for name in each.classes.tolist())
-        centers += [each.centers for each in boxes]
+        labelled += [_boxes_bev(frame, bev_frame) for frame in frames]
         stamps = [frame.stamp for frame in frames]
         gaps_s += [np.diff([stamps[i].timestamp_ns for i in scene]) / 1e9 for scene in scenes_of(stamps)]
         maps = [frame.ground_truth_map for frame in frames if frame.ground_truth_map is not None]
         map_reaches += [min(abs(end) for end in (*each.x_range_m, *each.y_range_m)) for each in maps]
-    if not counts:
+    names = np.concatenate([boxes.classes for boxes in labelled])
+    if not len(names):
         raise InputError(f"the {len(drives)} drives have no boxes (expected some to train on)")
+    counts = dict(Counter(names.tolist()).most_common())
+    sizes = np.concatenate([boxes.sizes_lwh for boxes in labelled])
+    medians = {name: tuple(np.median(sizes[names == name], axis=0).tolist()) for name in counts}
     gaps = np.concatenate(gaps_s)
     rate_hz = 1 / float(np.median(gaps)) if len(gaps) else 2.0
     rigs = tuple(drive.rig for drive in drives)
     reach_m = min(map_reaches, default=0.0)
-    return DataFacts(
-        tuple(drives), len(centers), dict(counts.most_common()), rigs, rate_hz, np.concatenate(centers), reach_m
-    )
+    centers = np.concatenate([boxes.centers for boxes in labelled])
+    return DataFacts(tuple(drives), len(labelled), counts, medians, rigs, rate_hz, centers, reach_m)
 
 
 def _boxes_bev(frame: Frame, bev_frame: BevFrameConfig) -> Boxes3D:

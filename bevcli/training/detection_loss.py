@@ -9,15 +9,13 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.box_coding import encode
 from bevcli.model.config import ModelConfig
+from bevcli.model.matching import focal_cost, focal_loss, hungarian_matching
 
-ALPHA, GAMMA = 0.25, 2.0  # of the focal loss (Lin et al. 2017)
-UNUSABLE_COST = 1e5  # replaces a cost that is not finite, so that such a pair is chosen last
 VELOCITY_START = 8  # entries 8 and 9 of a box code are vx and vy
 MIN_MOVING_MPS = 0.5  # slower objects count as stationary
 
@@ -41,56 +39,30 @@ class DetectionTargets:
 
 def detection_targets(boxes: Boxes3D, config: ModelConfig) -> DetectionTargets:
     """The `box_targets` of the boxes (ground truth, bev frame) with a centre inside the BEV grid."""
+    return box_targets(boxes_inside(boxes, config), config.classes)
+
+
+def boxes_inside(boxes: Boxes3D, config: ModelConfig) -> Boxes3D:
+    """The boxes (ground truth, bev frame) that are `detection_targets`, in their order."""
     grid = config.bev_grid
     low, high = np.array([grid.x_range_m, grid.y_range_m, grid.z_range_m]).T
-    return box_targets(boxes[((boxes.centers >= low) & (boxes.centers <= high)).all(-1)], config.classes)
+    return _learned(boxes[((boxes.centers >= low) & (boxes.centers <= high)).all(-1)], config.classes)
 
 
 def box_targets(boxes: Boxes3D, classes: tuple[str, ...]) -> DetectionTargets:
     """Targets from all boxes (ground truth, bev frame) that have one of the classes and visible points."""
-    kept = boxes[np.isin(boxes.classes, classes) & has_points(boxes)]
+    kept = _learned(boxes, classes)
     labels = [classes.index(name) for name in kept.classes]
     return DetectionTargets(torch.tensor(labels, dtype=torch.int64), torch.from_numpy(encode(kept)).float())
+
+
+def _learned(boxes: Boxes3D, classes: tuple[str, ...]) -> Boxes3D:
+    return boxes[np.isin(boxes.classes, classes) & has_points(boxes)]
 
 
 def has_points(boxes: Boxes3D) -> NDArray[np.bool_]:
     """(N,) bool, false where the ground truth counts 0 points; boxes without a count are kept."""
     return np.ones(len(boxes), dtype=bool) if boxes.num_points is None else boxes.num_points != 0
-
-
-def focal_loss(logits: Tensor, targets: Tensor) -> Tensor:
-    """Elementwise focal loss, not reduced. Positives have weight ALPHA, negatives 1 - ALPHA.
-
-    Args:
-        logits: any shape.
-        targets: the same shape, 0 or 1.
-    """
-    probability = logits.sigmoid()
-    probability_of_target = probability * targets + (1 - probability) * (1 - targets)
-    weight = ALPHA * targets + (1 - ALPHA) * (1 - targets)
-    cross_entropy = F.binary_cross_entropy_with_logits(logits, targets, reduction="none")
-    return weight * (1 - probability_of_target) ** GAMMA * cross_entropy
-
-
-def focal_cost(logits: Tensor) -> Tensor:
-    """Focal loss as a positive minus focal loss as a negative; elementwise, negative for confident positives."""
-    probability = logits.sigmoid()
-    positive = -F.logsigmoid(logits) * ALPHA * (1 - probability) ** GAMMA
-    negative = -F.logsigmoid(-logits) * (1 - ALPHA) * probability**GAMMA
-    return positive - negative
-
-
-def hungarian_matching(costs: Tensor) -> tuple[Tensor, Tensor]:
-    """The one-to-one assignment with the smallest sum of costs: (K,) int64 query and (K,) ground truth indices.
-
-    The K = min(Q, G) pairs are sorted by query.
-
-    Args:
-        costs: (Q, G) cost of assigning each query to each ground truth object. The result is on its device.
-    """
-    finite = costs.detach().double().cpu().nan_to_num(UNUSABLE_COST, UNUSABLE_COST, -UNUSABLE_COST)
-    queries, truths = (torch.as_tensor(indices, device=costs.device) for indices in linear_sum_assignment(finite))
-    return queries, truths
 
 
 @dataclass(frozen=True)
@@ -153,6 +125,17 @@ def detection_loss(
     layers = [_layer_loss(*layer, targets, config) for layer in zip(logits, codes, strict=True)]
     classes, boxes = torch.stack(layers).sum(0) / groups
     return DetectionLoss(classes, boxes)
+
+
+def last_matches(
+    class_logits: Tensor, box_codes: Tensor, targets: Sequence[DetectionTargets], config: DetectionLossConfig
+) -> list[tuple[Tensor, Tensor]]:
+    """The queries of each of B frames that the last layer matches to boxes, and the indices of these, both (K,) int64.
+
+    class_logits: (L, B, Q, classes). box_codes: (L, B, Q, 10).
+    """
+    last = zip(class_logits[-1], box_codes[-1], targets, strict=True)
+    return [hungarian_matching(matching_costs(*element, config)) for element in last]
 
 
 def matching_costs(

@@ -4,10 +4,12 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 
 from bevcli.errors import InputError
-from bevcli.frame import Sequence
+from bevcli.frame import MapLines, Sequence
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.model.config import ModelConfig
 from bevcli.sequences.files.class_names import ClassNames
+from bevcli.sequences.files.lines_file import TRUE_LINES
+from bevcli.sequences.native.folder import BOXES_FILE
 from bevcli.sequences.selection import scenes_of
 from bevcli.synth.drives import FRAMES_PER_DRIVE, Drives
 from bevcli.synth.options import DriveOptions
@@ -35,7 +37,7 @@ def check_training_drives(
         _check_rendered_classes(data.class_map, config)
         return ()
     _check_lengths(drives, clips.frames)
-    _check_ground_truth(drives, clips)
+    _check_ground_truth(drives, clips, config)
     notes = [*check_classes(drives, f"{_count(drives)} to train on", "trained on", config)]
     if held_out is not None:
         notes += check_classes(held_out, f"{_count(held_out)} to score on", "scored", config)
@@ -85,17 +87,23 @@ def _check_rendered_classes(class_map: Mapping[str, str], config: ModelConfig) -
         raise _no_known_class("the ground truth of rendered drives", ", ".join(NUSCENES_CLASSES), "car", config)
 
 
-def _check_ground_truth(drives: Drives, clips: ClipConfig) -> None:
-    """Raise InputError for a drive with a frame that may be trained on and has no ground truth boxes."""
+def _check_ground_truth(drives: Drives, clips: ClipConfig, config: ModelConfig) -> None:
+    """Raise InputError for a drive with a frame that may be trained on and has no ground truth boxes, or no lines."""
     first = clips.frames - 1 if clips.learn == "last" and clips.short_share == 0 else 0
     for drive in map(drives.open, range(len(drives))):
         places = [place for scene in scenes_of(drive.stamps) for place in scene[first:]]
-        missing = [place for place in places if drive.ground_truth_frame(place).ground_truth is None]
-        if missing:
-            raise InputError(
-                f"{drive.name}: {len(missing)} of {len(places)} frames to train on have no ground truth boxes, the "
-                f"first is frame {drive.stamps[missing[0]].index}: add them to ground_truth.json, or remove the frames"
-            )
+        without: dict[tuple[str, str], list[int]] = {("boxes", BOXES_FILE): [], ("lines", TRUE_LINES): []}
+        for frame in map(drive.ground_truth_frame, places):
+            if frame.ground_truth is None:
+                without["boxes", BOXES_FILE].append(frame.stamp.index)
+            if frame.ground_truth_lines is None and MapLines in config.results:
+                without["lines", TRUE_LINES].append(frame.stamp.index)
+        for (truth, file), missing in without.items():
+            if missing:
+                raise InputError(
+                    f"{drive.name}: {len(missing)} of {len(places)} frames to train on have no ground truth {truth}, "
+                    f"the first is frame {missing[0]}: add them to {file}, or remove the frames"
+                )
 
 
 def _check_lengths(drives: Drives, clip_frames: int) -> None:

@@ -19,6 +19,7 @@ from bevcli.training.detection_loss import (
     DetectionTargets,
     assigned_loss,
     detection_loss,
+    last_matches,
 )
 from bevcli.training.perspective_loss import PerspectiveHead, PerspectiveLossConfig, perspective_loss
 from bevcli.training.samples import Targets
@@ -131,6 +132,7 @@ class FrameLosses:
     def __init__(self, model: Network, configs: LossConfigs) -> None:
         classes = len(model.config.classes)
         self.configs = configs
+        self._head_losses = model.head_losses
         self._query_groups = model.config.decoder.training_groups
         self._dense_head: DenseHead | None = None
         self._perspective_head: PerspectiveHead | None = None
@@ -181,6 +183,9 @@ class FrameLosses:
                 self.configs.perspective_loss,
             )
             losses |= {"perspective classes": perspective.classes, "perspective boxes": perspective.boxes}
+        if targets.truths:
+            matches = last_matches(logits, codes, targets.detection, weights)
+            losses |= self._head_losses(outputs, targets.truths, matches)
         if outputs.segmentation is not None:
             maps = segmentation_loss(outputs.segmentation, targets.segmentation, self.configs.segmentation_loss)
             losses |= {"map classes": maps.classes, "masks": maps.masks, "locations": maps.locations}

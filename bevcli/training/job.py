@@ -230,6 +230,8 @@ def prepare_training(
     model, started = build_network(model_config), None
     if options.weights is not None and not options.resume:
         started = warm_start(weights_file(options.weights), model, model_name_or_file, lambda: drives.open(0).rig)
+    if config.freeze_batch_norm and started is None and not options.resume:
+        notes += ("freeze_batch_norm: keeps the batch norms of random weights; pass `weights`, or set it to false",)
     if not options.resume:
         make_folder(out)
     group = join_process_group(device)

@@ -75,9 +75,9 @@ def _facts_lines(facts: DataFacts, table: Mapping[str, Any]) -> Iterator[str]:
     """The facts that the settings of the file follow from."""
     named = ", ".join(f"{name} {facts.class_counts[name]}" for name in table["classes"])
     yield f"Boxes in {facts.frames} frames: {named}."
-    own = [_key(name) for name in table["classes"] if name not in NUSCENES_CLASSES]
-    if own:
-        yield f'A table [class_settings.{own[0]}] with like = "car" gives it the range and the gate of nuScenes\' car.'
+    alike = ", ".join(f"{name} like {settings['like']}" for name, settings in table.get("class_settings", {}).items())
+    if alike:
+        yield f"Own classes, by the sizes of their boxes: {alike}; [class_settings] changes it."
     counts = sorted({len(rig.cameras) for rig in facts.rigs})
     number = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
     sizes = [" x ".join(map(str, size)) for size in (facts.image_size, table["image"]["size"])]

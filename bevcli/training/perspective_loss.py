@@ -14,8 +14,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from bevcli.geometry.boxes import BOX_EDGES
+from bevcli.model.matching import focal_loss
 from bevcli.model.pillar_projection import project_points
-from bevcli.training.detection_loss import DetectionLoss, DetectionTargets, focal_loss
+from bevcli.training.detection_loss import DetectionLoss, DetectionTargets
 
 BOX_NUMBERS = 8  # offset x, offset y, log depth, log length, log width, log height, sin, cos
 MAX_HALF_EXTENT = 8.0  # strides; a box with a larger half extent goes to a coarser level, as in FCOS (64 at stride 8)

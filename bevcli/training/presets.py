@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from bevcli.config import TRAINING, read_model_file
-from bevcli.geometry.object_classes import NUSCENES_CLASSES
+from bevcli.geometry.object_classes import NUSCENES_CLASSES, class_of_size
 from bevcli.inference.training_rigs import rigs_of
 from bevcli.training.data_facts import DataFacts
 from bevcli.training.job import TrainingConfig
@@ -34,12 +34,14 @@ class PresetSettings:
     changes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
 
-# The demo model, whose weights fit it, on smaller images and shorter clips.
+# The demo model on smaller images and shorter clips, to start from its weights: with a low learning rate, and batch
+# norms as they are.
 _QUICK: Mapping[str, Mapping[str, Any]] = {
     "image": {"focal_px": None, "max_pixels": None},
-    "training": {"steps": 150, "evaluate_every": 30, "checkpoint_every": 5},
-    "training.clips": {"frames": 4, "batch": 2, "in_turn": 2},
-    "training.optimizer": {"warm_up_steps": 10},
+    "training": {"steps": 75, "evaluate_every": 15, "checkpoint_every": 5, "freeze_batch_norm": True},
+    "training.clips": {"frames": 8, "batch": 2, "in_turn": 2},
+    "training.optimizer": {"warm_up_steps": 5, "learning_rate": 2e-4, "average": 0.99},
+    "training.perspective_loss": {"weight": 0.0},
 }
 _ONE_CLIP: Mapping[str, Mapping[str, Any]] = {
     "training": {},
@@ -64,6 +66,9 @@ def model_table(name: str, preset: Preset, facts: DataFacts) -> dict[str, Any]:
     for path, changes in chosen.changes.items():
         _change(table, path, changes)
     table |= {"name": name, "classes": ordered_classes(facts.class_counts), "cameras": list(facts.cameras)}
+    own = [name for name in table["classes"] if name not in NUSCENES_CLASSES]
+    if own:
+        table["class_settings"] = {name: {"like": class_of_size(*facts.class_sizes[name])} for name in own}
     table["rate_hz"] = rate_for(facts, table.get("rate_hz", 2.0))
     table["max_gap_s"] = max(table.get("max_gap_s", 2.0), round(2 / table["rate_hz"], 2))
     table["image"]["size"] = _image_size(facts, chosen.width_px or table["image"]["size"][0])

@@ -20,16 +20,19 @@ from bevcli.geometry.transforms import inverse
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.config import ModelConfig
 from bevcli.model.step import ModelInputs, PreparedFrame, model_inputs
+from bevcli.model.truth import FrameTruth
 from bevcli.sequences.selection import scenes_of
 from bevcli.synth.drives import Drives, InputShape
 from bevcli.training.augmentation import (
     AugmentationConfig,
+    BadConditions,
     CalibrationVariation,
     ImageVariation,
     distort_images,
     mask_images,
 )
 from bevcli.training.detection_loss import DetectionTargets, box_targets, detection_targets
+from bevcli.training.frame_truth import frame_truth
 from bevcli.training.segmentation_loss import SegmentationTargets, segmentation_targets
 
 _CHOICE = 8  # drives among which the other clips of a batch are drawn, at least
@@ -149,15 +152,20 @@ class Targets:
         detection: B, the boxes inside the BEV grid.
         perspective: B, all boxes, for the perspective loss.
         segmentation: B, or empty if the model has no segmentation head.
+        truths: B, for heads of the model's own, on the CPU; empty if it has none.
     """
 
     detection: tuple[DetectionTargets, ...]
     perspective: tuple[DetectionTargets, ...]
     segmentation: tuple[SegmentationTargets, ...]
+    truths: tuple[FrameTruth, ...] = ()
 
     def to(self, device: torch.device) -> Targets:
         """A copy on a device."""
-        return Targets(*(tuple(one.to(device) for one in targets) for targets in vars(self).values()))
+        detection, perspective = (
+            tuple(one.to(device) for one in targets) for targets in (self.detection, self.perspective)
+        )
+        return Targets(detection, perspective, tuple(one.to(device) for one in self.segmentation), self.truths)
 
 
 @dataclass(frozen=True)
@@ -204,10 +212,14 @@ def load_batch(
         step = model_inputs(prepared, previous_poses, config)
         mask_images(step.images, augmentation.grid_mask, random)
         inputs.append(step)
-    learned = frames if learn_all else frames[-1:]
+    learned = range(len(frames)) if learn_all else [len(frames) - 1]
     poses = [[one.frame.world_from_ego.matrix @ one.frame.rig.ego_from_bev for one in prepared] for prepared in frames]
-    targets = tuple(_targets([one.frame for one in prepared], config) for prepared in learned)
-    return Batch(tuple(inputs), torch.from_numpy(np.array(poses)), targets)
+    targets = []
+    for index in learned:
+        of_clips = [one.frame for one in frames[index]]
+        places = [(drives.open(clip.drive), clip.frames[index]) for clip in clips]
+        targets.append(_targets(of_clips, places, config))
+    return Batch(tuple(inputs), torch.from_numpy(np.array(poses)), tuple(targets))
 
 
 def ground_truth_boxes(frame: Frame) -> Boxes3D:
@@ -220,16 +232,20 @@ def ground_truth_boxes(frame: Frame) -> Boxes3D:
     return frame.ground_truth.transformed(inverse(frame.world_from_ego.matrix @ frame.rig.ego_from_bev))
 
 
-def _targets(frames: list[Frame], config: ModelConfig) -> Targets:
+def _targets(frames: list[Frame], places: list[tuple[Sequence, int]], config: ModelConfig) -> Targets:
+    """places: the drive and the place in it of each frame."""
     boxes = [ground_truth_boxes(frame) for frame in frames]
     detection = tuple(detection_targets(of_frame, config) for of_frame in boxes)
     perspective = tuple(box_targets(of_frame, config.classes) for of_frame in boxes)
+    truths: tuple[FrameTruth, ...] = ()
+    if config.results:
+        truths = tuple(frame_truth(frame, *place, config) for frame, place in zip(frames, places, strict=True))
     if "segmentation" not in config.heads:
-        return Targets(detection, perspective, ())
+        return Targets(detection, perspective, (), truths)
     maps = [frame.ground_truth_map for frame in frames]
     grid, classes = config.bev_grid, config.object_classes
     segmentation = (segmentation_targets(*pair, grid, classes) for pair in zip(boxes, maps, strict=True))
-    return Targets(detection, perspective, tuple(segmentation))
+    return Targets(detection, perspective, tuple(segmentation), truths)
 
 
 def _load_clip(
@@ -237,5 +253,6 @@ def _load_clip(
 ) -> list[PreparedFrame]:
     sequence, preprocess = drives.open(clip.drive), Preprocessor(config)
     vary_images, vary_rig = ImageVariation(augmentation, random), CalibrationVariation(augmentation, random)
-    frames = (vary_rig(vary_images(sequence.load(index))) for index in clip.frames)
+    worsen = BadConditions(augmentation, random)
+    frames = (vary_rig(worsen(vary_images(sequence.load(index)))) for index in clip.frames)
     return [preprocess(distort_images(frame, augmentation.photometric, random)) for frame in frames]

@@ -15,8 +15,9 @@ from bevcli.frame import BevMap
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
+from bevcli.model.matching import focal_cost, focal_loss, hungarian_matching
 from bevcli.model.segmentation import STUFF_CLASSES, SegmentationOutputs
-from bevcli.training.detection_loss import focal_cost, focal_loss, has_points, hungarian_matching
+from bevcli.training.detection_loss import has_points
 
 # A cell belongs to a class that covers at least this share of it. Lines are thinner than a cell: their share is lower.
 MIN_SHARES = {"drivable_road": 0.4, "lane_boundary": 0.2, "pedestrian_crossing": 0.4}

@@ -77,8 +77,8 @@ class Validation:
         return {**self.summary(), "mATE": table.of_classes_with_ground_truth().errors["trans_err"], **aps}
 
     def __str__(self) -> str:
-        """The summary on one line."""
-        return ", ".join(f"{name} {value:.3f}" for name, value in self.summary().items())
+        """What is measured of the summary, on one line."""
+        return ", ".join(f"{name} {value:.3f}" for name, value in self.summary().items() if not math.isnan(value))
 
     def to_dict(self) -> dict[str, Any]:
         """All scores for JSON; undefined numbers are None."""

@@ -67,7 +67,7 @@ def warm_start(file: Path, model: Network, model_file: str, rig: Callable[[], Ca
     """Load, in place, every tensor of a weights file that fits a model; the others keep the model's initial values.
 
     `named_rows` says which rows of classes and cameras are taken. BEV queries of another number of cells over the same
-    ground are interpolated.
+    ground are interpolated. Of more object queries the first are taken, unless the model has several groups of them.
 
     Args:
         file: an official .pth or a .safetensors of any model.
@@ -79,8 +79,11 @@ def warm_start(file: Path, model: Network, model_file: str, rig: Callable[[], Ca
     """
     checkpoint = read_checkpoint(file)
     start = WarmStart(file, checkpoint.facts.get("model") or " or ".join(checkpoint.models), model_file)
-    state, rows = model.bev_queries.resampled(checkpoint.state, "bev_queries."), named_rows(checkpoint, model, rig)
-    interpolated = {key for key, tensor in state.items() if tensor is not checkpoint.state[key]}
+    resampled, rows = model.bev_queries.resampled(checkpoint.state, "bev_queries."), named_rows(checkpoint, model, rig)
+    state = model.decoder.first_queries(resampled, "decoder.")
+    reasons = dict.fromkeys(rows, "rows in the file's order")
+    reasons |= {key: "interpolated from another grid" for key in state if resampled[key] is not checkpoint.state[key]}
+    reasons |= {key: "the first queries of the file" for key in state if state[key] is not resampled[key]}
     own = model.state_dict()
     for key, tensor in state.items():
         if key not in own:
@@ -88,8 +91,7 @@ def warm_start(file: Path, model: Network, model_file: str, rig: Callable[[], Ca
         elif key in rows and rows[key].fit(tensor, own[key]):
             own[key] = _named(start, rows[key], tensor, own[key])
         else:
-            reason = "interpolated from another grid" if key in interpolated else ""
-            own[key] = _whole(start, key, tensor, own[key], "rows in the file's order" if key in rows else reason)
+            own[key] = _whole(start, key, tensor, own[key], reasons.get(key, ""))
     for key in (key for key in own if key not in state):
         start.count("new", _part(key), "not in the file", own[key].numel(), key)
     _require_share(start)

@@ -9,8 +9,8 @@ import msgspec
 
 from bevcli.errors import WeightsError
 from bevcli.parsing.files import MIB, read_bytes
+from bevcli.published import Source, read_sources
 from bevcli.user_folders import user_cache
-from bevcli.weights.sources import Source, read_sources
 from bevcli.writing import write_whole
 
 VARIABLE = "BEVCLI_WEIGHTS_DIR"

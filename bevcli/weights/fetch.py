@@ -9,9 +9,9 @@ from pathlib import Path
 from bevcli.checkpoints import expected_state, read_checkpoint, require_fit
 from bevcli.config import load_config
 from bevcli.errors import BevcliError, OutputError, WeightsError
+from bevcli.published import own_table
 from bevcli.weights.cache import HASHES, Known, NamedWeights
 from bevcli.weights.download import Report, download
-from bevcli.weights.sources import own_table
 
 PARTIAL = ".partial-"  # before the name of a file that is being downloaded
 
@@ -96,7 +96,7 @@ def _check(weights: NamedWeights, path: Path) -> FetchedWeights:
             f"{path}: has the SHA-256 {found.sha256}, but the first download had {before.sha256}: the file at the "
             f"source has changed; if you trust it, remove its line from {weights.folder / HASHES}"
         )
-    config = load_config(weights.model)
+    config = load_config(weights.name)
     require_fit(read_checkpoint(path), config.name, expected_state(config))
     digits = len(source.sha256)
     if digits == 64:

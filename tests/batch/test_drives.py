@@ -10,6 +10,7 @@ from bevcli.batch.drives import find_drives, read_list
 from bevcli.batch.storage import open_storage
 from bevcli.errors import BevcliError, InputError
 from bevcli.sequences.nuscenes.format import NuScenesOptions
+from bevcli.sequences.open import open_sequence
 
 
 def test_patterns_lists_and_paths_give_each_drive_once(tmp_path):
@@ -38,6 +39,24 @@ def test_a_nuscenes_root_gives_a_drive_per_scene(tmp_path):
     assert len({drive.input_hash for drive in drives}) == 3
     (other,), _ = find_drives([str(tmp_path)], NuScenesOptions(version="v1.0-test"))
     assert 'has no version "v1.0-test"' in other.problem
+
+
+def test_a_folder_of_drives_gives_all_of_them(tmp_path):
+    """As ROOT/SPLIT/LOG of Argoverse 2, and ROOT/NUMBER/scene_*.json of DDAD, whose root has a file with splits."""
+    for log in ("train/a", "val/a", "val/b"):
+        (tmp_path / log / "calibration").mkdir(parents=True)
+        (tmp_path / log / "city_SE3_egovehicle.feather").write_text(log)
+    (tmp_path / "000150").mkdir()
+    (tmp_path / "000150/scene_12.json").write_text("{}")
+    (tmp_path / "ddad.json").write_text("{}")
+    (tmp_path / "locked").mkdir(mode=0)
+    drives, _ = find_drives([str(tmp_path)])
+    assert [drive.name for drive in drives] == ["000150", "train-a", "val-a", "b"]
+    assert [drive.source for drive in drives][1:] == [f"{tmp_path}/{log}" for log in ("train/a", "val/a", "val/b")]
+    with pytest.raises(InputError, match=r"is a folder of 4 drives \(000150, train/a, val/a, b\): choose one with `sc"):
+        open_sequence(tmp_path)
+    with pytest.raises(InputError, match=f'{tmp_path}/000150/scene_12.json: "data" is missing'):
+        open_sequence(tmp_path, scene="000150")
 
 
 def test_names_are_safe_as_folders(tmp_path):

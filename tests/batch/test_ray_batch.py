@@ -25,6 +25,8 @@ OPTIONS = ("--model", "mini.toml", "--untrained", "--rate", "all", "--score", "0
 BATCH = ("batch", "drives/*", "--out", "out", *OPTIONS, "--threads", "1")
 # Looking for Ray takes less time than importing it where these tests are only collected.
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed")]
+CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+two_workers = pytest.mark.skipif(CORES < 2, reason="this process may use one core only, and two workers need two")
 
 
 def family_of(pid: int) -> dict[int, str]:
@@ -65,6 +67,7 @@ def landed(out: Path) -> dict[Path, int]:
     return {path: path.stat().st_mtime_ns for path in (out / "drives").rglob("*") if path.is_file()}
 
 
+@two_workers
 @pytest.mark.timeout(1800)
 def test_200_drives_with_a_killed_worker_and_a_killed_batch(tmp_path):
     (tmp_path / "mini.toml").write_text(MINI_TOML)
@@ -119,6 +122,7 @@ def test_200_drives_with_a_killed_worker_and_a_killed_batch(tmp_path):
             assert (results[name] / file).read_bytes() == (tmp_path / "alone" / name / file).read_bytes(), name
 
 
+@two_workers
 def test_ctrl_c_ends_a_batch_and_counts_no_attempt(tmp_path):
     (tmp_path / "mini.toml").write_text(MINI_TOML)
     write_fleet(tmp_path / "drives", 40, frames=4)
@@ -133,6 +137,7 @@ def test_ctrl_c_ends_a_batch_and_counts_no_attempt(tmp_path):
     assert (tmp_path / "out/batch.parquet").exists()
 
 
+@two_workers
 def test_a_drive_that_kills_its_worker_each_time_is_given_up(tmp_path):
     (tmp_path / "mini.toml").write_text(MINI_TOML)
     write_fleet(tmp_path / "drives", 4, frames=2)
@@ -198,6 +203,7 @@ def s3(tmp_path, monkeypatch):
         server.wait(20)
 
 
+@two_workers
 @pytest.mark.timeout(1200)
 def test_drives_and_results_in_s3(s3, tmp_path):
     (tmp_path / "mini.toml").write_text(MINI_TOML)
@@ -275,6 +281,7 @@ def free_port() -> int:
         return free.getsockname()[1]
 
 
+@two_workers
 def test_a_local_batch_listens_on_this_machine_only(tmp_path):
     (tmp_path / "mini.toml").write_text(MINI_TOML)
     write_fleet(tmp_path / "drives", 6, frames=2)

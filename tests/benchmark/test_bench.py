@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from statistics import median
 
 import pytest
 import torch
@@ -15,6 +16,9 @@ from bevcli.benchmark.made_up import MadeUpDrive
 from bevcli.benchmark.result import BenchmarkResult, Comparison
 from bevcli.benchmark.versions import Version
 from bevcli.cli.main import app
+from bevcli.config import load_config
+from bevcli.engines.engine import installed_engines
+from bevcli.inference.engine_speeds import fastest_engine
 from bevcli.inference.preprocess import Preprocessor
 
 RESULT = BenchmarkResult(
@@ -85,6 +89,20 @@ def test_profile_of_a_frame_in_half_precision(small_model_file, tmp_path):
     answer = CliRunner().invoke(app, ["bench", "--model", str(small_model_file), *options], catch_exceptions=False)
     assert "bf16" in answer.stdout
     assert json.loads(profile.read_text())["traceEvents"]
+
+
+@pytest.mark.slow
+def test_engines_are_timed_and_auto_takes_the_fastest(small_model_file, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    done = CliRunner().invoke(app, ["bench", "--engines", "--model", str(small_model_file), "--count", "2", "--json"])
+    assert done.exit_code == 0, done.output
+    rows = {(row["engine"], row["precision"]): row for row in json.loads(done.stdout)["engines"]}
+    assert {engine for engine, _ in rows} == {"torch", *installed_engines()}
+    assert rows["torch", "fp32"]["largest_m"] == 0
+    assert rows["openvino", "fp32"]["largest_m"] < 1e-3
+    assert all(len(row["seconds"]) == 2 for row in rows.values())
+    times = {engine: median(row["seconds"]) for (engine, precision), row in rows.items() if precision == "fp32"}
+    assert fastest_engine(load_config(small_model_file), "fp32") == min(times, key=times.get)
 
 
 @pytest.mark.slow

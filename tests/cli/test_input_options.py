@@ -23,7 +23,7 @@ def test_frames_range_excludes_its_end(text, frames):
     assert [0, 1, 2, 3, 4][parse_frames(text)] == frames
 
 
-@pytest.mark.parametrize("text", ["3", "a:b", "-1:2", "1:2:3", ""])
+@pytest.mark.parametrize("text", ["3", "a:b", "-1:2", "1:2:3", "", "٠:٢", "0:" + "9" * 5000])
 def test_invalid_frames_range_is_a_usage_error(text):
     with pytest.raises(ValueError, match="expected A:B"):
         parse_frames(text)

@@ -1,5 +1,6 @@
 import contextlib
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -93,6 +94,17 @@ def test_a_missing_path_is_refused_before_slow_imports(arguments, monkeypatch):
     with pytest.raises(InputError, match=r"nope[.a-z]*: there is no such file|nope/\*: nothing matches"):
         app([str(each) for each in arguments], standalone_mode=False)
     assert [name for name in HEAVY if name in sys.modules] == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [(("run", ""), "SEQUENCE"), (("run", SAMPLE, "--out="), "--out"), (("convert", SAMPLE, ""), "OUT")],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_an_empty_path_is_not_the_current_folder(arguments, name, tmp_path):
+    done = command(tmp_path, *arguments)
+    assert done.returncode == 2
+    assert re.search(f"Invalid value for '{name}.*: is empty", done.stderr)
 
 
 @pytest.mark.parametrize(

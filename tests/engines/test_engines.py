@@ -4,25 +4,23 @@ from __future__ import annotations
 
 import gc
 import json
+import multiprocessing
 import os
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from forks import FORKS
 from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.cli.stop_signals import EndSignals
-from bevcli.config import as_table, load_config
-from bevcli.engines.export_onnx import export_onnx
+from bevcli.config import load_config
 from bevcli.engines.exported import load_exported
 from bevcli.engines.quantize import quantize
 from bevcli.errors import BevcliError, ConfigError, InputError, WeightsError
@@ -30,14 +28,11 @@ from bevcli.inference.load import load_model
 from bevcli.inference.preprocess import calibration_images
 from bevcli.inference.run import run
 from bevcli.inference.tracking import TrackerConfig
-from bevcli.model.export_form import raw_images
-from bevcli.model.image_tokens import ImageTokensConfig
-from bevcli.model.resnet import ResNetConfig
 from bevcli.registry import entries
 from bevcli.sequences.open import open_sequence
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
-from small_model import small_config, small_inputs, small_model, step_of_file
+from small_model import model_for_engines, small_inputs, step_of_file
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
@@ -45,34 +40,9 @@ pytest.importorskip("openvino")
 STREET = Path(__file__).parents[2] / "samples" / "street"
 
 
-@pytest.fixture(scope="module")
-def small_file(tmp_path_factory) -> Path:
-    """A small model without deformable convolutions, which OpenVINO lacks, for two cameras; its weights are random."""
-    model = _model()
-    file = tmp_path_factory.mktemp("small") / "small.onnx"
-    export_onnx(model, file, contents=as_table(model.config, TrackerConfig(birth_score=0.5)), untrained=True)
-    return file
-
-
-@pytest.fixture(scope="module")
-def int8_file(small_file) -> Path:
-    file = small_file.with_name("small-int8.onnx")
-    quantize(small_file, [raw_images(small_inputs(seed).images, _model().config).numpy() for seed in range(4)], file)
-    return file
-
-
-def _model():
-    return small_model(
-        encoder=replace(small_config().encoder, layers=1),
-        decoder=replace(small_config().decoder, layers=1),
-        backbone=ResNetConfig((1, 1, 1, 1), "pytorch", output_stages=(3, 4), deformable_stages=(), width=8),
-        image_tokens=ImageTokensConfig(level_embeddings=3, calibration_embedding=True),
-    )
-
-
 @pytest.mark.parametrize("engine", list(entries("bevcli.engines")))
 def test_an_engine_equals_the_model_with_and_without_history(small_file, engine):
-    exported, model = load_exported(small_file, engine), _model()
+    exported, model = load_exported(small_file, engine), model_for_engines()
     history = torch.randn(1, 48, 32, generator=torch.Generator().manual_seed(1))
     for previous in (None, history):
         with torch.inference_mode():
@@ -94,7 +64,7 @@ def test_ctrl_c_reaches_python_after_openvino_models_are_gone(small_file):
 
 def test_a_file_tells_its_model_and_that_its_weights_are_random(small_file):
     model = load_model(small_file)
-    assert model.config == _model().config
+    assert model.config == model_for_engines().config
     assert model.tracker == TrackerConfig(birth_score=0.5).for_classes(model.config.object_classes)
     assert model.untrained
     assert model.prepared is model.network
@@ -118,7 +88,7 @@ def test_int8_is_close_and_only_image_features_are_rounded(small_file, int8_file
 
 
 def test_more_cameras_on_a_cell_than_slots_are_an_error(small_file, int8_file, tmp_path):
-    model = _model()
+    model = model_for_engines()
     inputs = small_inputs()
     inputs.image_from_bev[:, 1] = inputs.image_from_bev[:, 0]  # both cameras look the same way
     with torch.inference_mode():
@@ -191,7 +161,7 @@ def endless_file(small_file) -> Path:
 
 @pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])
 def test_two_signals_end_an_endless_loop_of_a_file(endless_file, tmp_path, number):
-    process = FORKS.Process(target=run_for_ever, args=(endless_file, tmp_path / "ready"))
+    process = multiprocessing.get_context("spawn").Process(target=run_for_ever, args=(endless_file, tmp_path / "ready"))
     process.start()
     end = time.monotonic() + 60
     while not (tmp_path / "ready").exists():
@@ -251,8 +221,6 @@ def test_options_that_do_not_apply_are_named(small_file, int8_file):
     ):
         with pytest.raises(BevcliError, match=message):
             load_model(small_file, **options)
-    with pytest.raises(BevcliError, match=r"export tiny with bevcli export-onnx, then `model=tiny\.onnx`"):
-        load_model("tiny", untrained=True, engine="openvino")
     with pytest.raises(WeightsError, match="is quantised already"):
         quantize(int8_file, [], int8_file.with_name("again.onnx"))
     with pytest.raises(BevcliError, match="attention and probes: not available"):

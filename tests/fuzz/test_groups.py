@@ -20,18 +20,12 @@ from groups import GROUPS
 from seed_files import write_seeds
 from worker import Worker
 
-CASES_A_WORKER = 100  # rerun keeps two threads and some MB of the blueprint of every recording
 SHARE = float(os.environ.get("BEVCLI_FUZZ_SHARE", "0"))
 
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="limits are measured on Linux"),
 ]
-
-
-def batched(numbers: range, size: int) -> list[range]:
-    """The numbers in ranges of at most this size."""
-    return [numbers[start : start + size] for start in range(0, len(numbers), size)]
 
 
 @pytest.fixture(scope="module")
@@ -43,10 +37,8 @@ def seeds(tmp_path_factory):
 
 @pytest.mark.parametrize("name", GROUPS)
 def test_a_wrong_case_ends_well_or_is_refused_in_one_line(name, seeds):
-    outcomes = {}
-    for numbers in batched(range(max(10, ceil(SHARE * GROUPS[name].cases))), CASES_A_WORKER):
-        worker = Worker(seeds, name)
-        outcomes |= {number: worker.run(name, number) for number in numbers}
-        worker.close()
+    worker = Worker(seeds, name)
+    outcomes = {number: worker.run(name, number) for number in range(max(10, ceil(SHARE * GROUPS[name].cases)))}
+    worker.close()
     wrong = {number: said for number, said in outcomes.items() if said != "read" and not said.startswith("refused: ")}
     assert not wrong, f"{len(wrong)} of {len(outcomes)} cases; {dict(list(wrong.items())[:5])}"

@@ -29,8 +29,8 @@ START_SECONDS = 240.0
 class Worker:
     """Runs cases, one after the other, in another process, which is replaced where a case ends it.
 
-    seeds: the folder of seed files; each process works in a copy. group: of `groups.GROUPS`, run in
-    place of the readers.
+    seeds: the folder of seed files; each process works in a copy beside it, which `close` deletes: a process that is
+    killed cannot. group: of `groups.GROUPS`, run in place of the readers.
     """
 
     def __init__(self, seeds: Path, group: str | None = None) -> None:
@@ -44,6 +44,7 @@ class Worker:
         name: of a reader, whose file then holds the bytes; or of a group, whose case has this number.
         """
         if self._process is None or not self._process.is_alive():
+            self.close()
             self._start()
         assert self._connection is not None
         try:
@@ -57,17 +58,20 @@ class Worker:
         return answer
 
     def close(self) -> None:
-        """Ends the process."""
+        """Ends the process, and deletes its folder."""
         if self._process is not None:
             self._process.kill()
             self._process.join()
             self._process = None
+            shutil.rmtree(self._folder, ignore_errors=True)  # what it started may live a little longer
 
     def _start(self) -> None:
         context = multiprocessing.get_context("spawn")
         self._connection, other = context.Pipe()
         os.environ.setdefault("MALLOC_ARENA_MAX", "2")
-        self._process = context.Process(target=_serve, args=(other, self._seeds, self._group, sys.path), daemon=True)
+        self._folder = Path(tempfile.mkdtemp(prefix="fuzz-", dir=self._seeds.parent))
+        given = other, self._seeds, self._folder, self._group, sys.path
+        self._process = context.Process(target=_serve, args=given, daemon=True)
         self._process.start()
         other.close()
         if not self._connection.poll(START_SECONDS):
@@ -76,39 +80,38 @@ class Worker:
         assert answer == "ready", answer
 
 
-def _serve(connection: Connection, seeds: Path, group: str | None, path: list[str]) -> None:
+def _serve(connection: Connection, seeds: Path, folder: Path, group: str | None, path: list[str]) -> None:
     sys.path[:] = path
     from readers import READERS
 
     warnings.simplefilter("ignore")
     logging.disable()
-    with tempfile.TemporaryDirectory(prefix="bevcli-fuzz-") as folder:
-        own, case = Path(folder) / "files", Path(folder) / "case"
-        shutil.copytree(seeds, own)
-        os.environ["XDG_CACHE_HOME"] = folder
-        os.chdir(folder)
-        with open(os.devnull, "w") as silent:  # FFmpeg and libpng complain there about every broken file
-            os.dup2(silent.fileno(), 2)
-        try:
-            runs: dict[str, Callable[..., None]]
-            if group is not None:
-                runs = {group: _group_run(group, own, case)}
-                _outcome(partial(runs[group], 0), 0)  # makes what all cases share
-            else:
-                runs = {name: partial(_read, reader, own) for name, reader in READERS.items()}
-                for reader in READERS.values():
-                    reader.read(own)
-        except BaseException:
-            connection.send(traceback.format_exc())
-            raise
-        limit = _bytes_of("VmSize") + 4 * MEMORY
-        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-        base = _bytes_of("VmRSS")
-        connection.send("ready")
-        while True:
-            name, given = connection.recv()
-            Path("/proc/self/clear_refs").write_text("5")  # the peak is measured from now on
-            connection.send(_outcome(partial(runs[name], given), base))
+    own, case = folder / "files", folder / "case"
+    shutil.copytree(seeds, own)
+    os.environ |= {"XDG_CACHE_HOME": str(folder), "TMPDIR": str(folder)}
+    os.chdir(folder)
+    with open(os.devnull, "w") as silent:  # FFmpeg and libpng complain there about every broken file
+        os.dup2(silent.fileno(), 2)
+    try:
+        runs: dict[str, Callable[..., None]]
+        if group is not None:
+            runs = {group: _group_run(group, own, case)}
+            _outcome(partial(runs[group], 0), 0)  # makes what all cases share
+        else:
+            runs = {name: partial(_read, reader, own) for name, reader in READERS.items()}
+            for reader in READERS.values():
+                reader.read(own)
+    except BaseException:
+        connection.send(traceback.format_exc())
+        raise
+    limit = _bytes_of("VmSize") + 4 * MEMORY
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    base = _bytes_of("VmRSS")
+    connection.send("ready")
+    while True:
+        name, given = connection.recv()
+        Path("/proc/self/clear_refs").write_text("5")  # the peak is measured from now on
+        connection.send(_outcome(partial(runs[name], given), base))
 
 
 def _read(reader: Reader, own: Path, data: bytes) -> None:

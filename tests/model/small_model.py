@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -48,6 +50,16 @@ def small_model(seed: int = 0, **changes: object) -> BEVFormer:
             for parameter in model.parameters():
                 parameter.add_(0.1 * torch.randn(parameter.shape))
     return model
+
+
+def model_for_engines() -> BEVFormer:
+    """A small model without deformable convolutions, which OpenVINO lacks; for two cameras."""
+    return small_model(
+        encoder=replace(small_config().encoder, layers=1),
+        decoder=replace(small_config().decoder, layers=1),
+        backbone=ResNetConfig((1, 1, 1, 1), "pytorch", output_stages=(3, 4), deformable_stages=(), width=8),
+        image_tokens=ImageTokensConfig(level_embeddings=3, calibration_embedding=True),
+    )
 
 
 def small_inputs(seed: int = 0, batch: int = 1) -> ModelInputs:

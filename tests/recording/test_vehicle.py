@@ -1,8 +1,10 @@
 """The ego vehicle's mesh: from files of several formats, and the default car."""
 
+import io
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import PIL.Image
@@ -21,6 +23,20 @@ from bevcli.recording.vehicle import default_vehicle, load_vehicle
 from bevcli.viewer.recording_reader import RecordingReader
 
 RED = (200, 10, 20)
+
+
+@pytest.fixture
+def in_this_process(monkeypatch):
+    """Meshes are read without a process of their own, whose imports take a second."""
+
+    def read(code, arguments, memory, seconds):
+        output = io.BytesIO()
+        with monkeypatch.context() as patch:
+            patch.setattr(sys, "stdout", SimpleNamespace(buffer=output))
+            error = mesh_file.write_parts(*arguments)
+        return subprocess.CompletedProcess(arguments, int(bool(error)), output.getvalue(), (error or "").encode())
+
+    monkeypatch.setattr(mesh_file, "run_python", read)
 
 
 def van() -> trimesh.Trimesh:
@@ -45,12 +61,12 @@ def assert_is_the_van(vehicle) -> None:
     assert arrow[1, 1] == pytest.approx(0)
 
 
-def test_a_ply_file_has_the_axes_of_the_ego_frame(tmp_path):
+def test_a_ply_file_has_the_axes_of_the_ego_frame(tmp_path, in_this_process):
     van().export(tmp_path / "van.ply")
     assert_is_the_van(load_vehicle(tmp_path / "van.ply"))
 
 
-def test_a_glb_file_has_the_axes_of_gltf(tmp_path):
+def test_a_glb_file_has_the_axes_of_gltf(tmp_path, in_this_process):
     """y up, z forward, x left."""
     mesh = van()
     x, y, z = mesh.vertices.T
@@ -60,7 +76,7 @@ def test_a_glb_file_has_the_axes_of_gltf(tmp_path):
     assert_is_the_van(load_vehicle(tmp_path / "van.glb"))
 
 
-def test_the_parts_of_a_scene_keep_their_positions_and_colours(tmp_path):
+def test_the_parts_of_a_scene_keep_their_positions_and_colours(tmp_path, in_this_process):
     """One part has a material, one has no colour."""
     material = trimesh.visual.material.PBRMaterial(baseColorFactor=(0, 255, 0, 255))
     painted, plain = (trimesh.creation.box((1, 1, 1)) for _ in range(2))
@@ -76,7 +92,7 @@ def test_the_parts_of_a_scene_keep_their_positions_and_colours(tmp_path):
     assert (vehicle.colors[part == 1] == EGO_COLOR).all()
 
 
-def test_colours_of_faces_do_not_mix(tmp_path):
+def test_colours_of_faces_do_not_mix(tmp_path, in_this_process):
     mesh = van()
     mesh.visual.face_colors = [(*RED, 255)] * 6 + [(0, 0, 255, 255)] * 6
     mesh.export(tmp_path / "van.ply")
@@ -84,7 +100,7 @@ def test_colours_of_faces_do_not_mix(tmp_path):
     assert {tuple(color) for color in vehicle.colors.tolist()} == {RED, (0, 0, 255)}
 
 
-def test_colours_are_taken_from_a_texture(tmp_path):
+def test_colours_are_taken_from_a_texture(tmp_path, in_this_process):
     """The left half of the texture is red, the right half blue; all vertices lie in the left half."""
     image = PIL.Image.fromarray(np.repeat([[RED] * 8 + [(0, 0, 255)] * 8], 16, axis=0).astype(np.uint8))
     mesh = van()
@@ -94,7 +110,7 @@ def test_colours_are_taken_from_a_texture(tmp_path):
     assert (load_vehicle(tmp_path / "van.glb").colors == RED).all()
 
 
-def test_a_recording_has_the_mesh_of_the_file(tmp_path):
+def test_a_recording_has_the_mesh_of_the_file(tmp_path, in_this_process):
     van().export(tmp_path / "van.ply")
     record(tmp_path / "r.rrd", MemorySequence(1), RecordingOptions(vehicle_mesh=tmp_path / "van.ply"))
     (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
@@ -112,7 +128,7 @@ def test_a_recording_has_the_mesh_of_the_file(tmp_path):
         ("archive.zip", b"PK\x03\x04", "is not a mesh file"),
     ],
 )
-def test_a_file_without_a_mesh_is_an_error_of_one_line(tmp_path, capfd, name, content, message):
+def test_a_file_without_a_mesh_is_an_error_of_one_line(tmp_path, capfd, in_this_process, name, content, message):
     path = tmp_path / name
     path.write_bytes(content)
     with pytest.raises(InputError, match=message) as caught:
@@ -140,7 +156,7 @@ def test_a_mesh_reads_only_regular_files_of_its_folder(tmp_path, monkeypatch, na
     assert ("secret.mtl" in read, "own.mtl" in read) == (False, name == "own.mtl")
 
 
-def test_a_text_mesh_over_16_mib_is_refused_unread(tmp_path):
+def test_a_text_mesh_over_16_mib_is_refused_unread(tmp_path, in_this_process):
     path = tmp_path / "car.obj"
     with path.open("wb") as file:
         file.truncate((16 << 20) + 1)
@@ -166,11 +182,17 @@ def test_a_mesh_is_read_with_our_packages_not_the_folders(tmp_path, monkeypatch)
     for name in ("trimesh", "resource", "numpy"):
         (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
     monkeypatch.chdir(tmp_path)
-    load_vehicle(tmp_path / "van.ply")
+    assert_is_the_van(load_vehicle(tmp_path / "van.ply"))
     assert not (tmp_path / "ran").exists()
 
 
-def test_a_mesh_in_millimetres_is_an_error(tmp_path):
+def test_an_error_in_the_process_of_a_mesh_is_one_line(tmp_path):
+    (tmp_path / "empty.ply").touch()
+    with pytest.raises(InputError, match=r"^\S*/empty.ply: trimesh cannot read this mesh file \(.*$"):
+        load_vehicle(tmp_path / "empty.ply")
+
+
+def test_a_mesh_in_millimetres_is_an_error(tmp_path, in_this_process):
     van().apply_scale(1000).export(tmp_path / "van.stl")
     with pytest.raises(InputError, match="5000 x 2000 x 2000 m"):
         load_vehicle(tmp_path / "van.stl")

@@ -81,7 +81,7 @@ def assert_equals(out: Path, whole: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "finished", [pytest.param(n, marks=[pytest.mark.slow] * (n in (1, 2, 4))) for n in range(FRAMES + 1)]
+    "finished", [pytest.param(n, marks=[pytest.mark.slow] * (n in (1, 2, 3, 4))) for n in range(FRAMES + 1)]
 )
 def test_a_resumed_run_equals_an_uninterrupted_one(model, whole, tmp_path, finished):
     drive = Drive()
@@ -147,10 +147,21 @@ def test_a_killed_run_goes_on_from_its_last_saved_state(model, whole, tmp_path, 
     assert_equals(out, whole)
 
 
+@pytest.fixture(scope="module")
+def interrupted_once(model, tmp_path_factory):
+    """The folder of a run after three frames, and a copy of it, with all that is beside them."""
+    folder, kept = (tmp_path_factory.mktemp(name) for name in ("interrupted", "kept"))
+    run_all(model, folder / "out", should_stop=iter([False, False, True]).__next__)
+    shutil.copytree(folder, kept, dirs_exist_ok=True)
+    return folder, kept
+
+
 @pytest.fixture
-def interrupted(model, tmp_path):
-    run_all(model, tmp_path / "out", should_stop=iter([False, False, True]).__next__)
-    return tmp_path / "out"
+def interrupted(interrupted_once):
+    folder, kept = interrupted_once
+    yield folder / "out"
+    shutil.rmtree(folder)
+    shutil.copytree(kept, folder)
 
 
 def test_another_run_is_not_resumed_and_the_difference_is_named(model, mini_model, interrupted):
@@ -351,8 +362,8 @@ def test_changed_images_are_seen(model, tmp_path):
         run_all(model, out, WithImages(), resume=True)
 
 
-def test_nothing_is_deleted_or_written_through_links(model, interrupted, tmp_path):
-    elsewhere = tmp_path / "elsewhere"
+def test_nothing_is_deleted_or_written_through_links(model, interrupted):
+    elsewhere = interrupted.parent / "elsewhere"
     (elsewhere / "maps").mkdir(parents=True)
     precious = elsewhere / "maps" / "000000.png"
     precious.write_bytes(b"precious")
@@ -361,6 +372,10 @@ def test_nothing_is_deleted_or_written_through_links(model, interrupted, tmp_pat
     with (interrupted / ".bevcli" / "written").open("a") as file:
         file.write(f"segmentation/000000.png\n{precious}\n../elsewhere/maps/000000.png\n")
     with pytest.raises(OutputError, match=r"segmentation/000000\.png: is a link, or leads out of"):
+        run_all(model, interrupted, force=True)
+    (interrupted / "segmentation").unlink()
+    (interrupted / "segmentation").symlink_to("segmentation")
+    with pytest.raises(OutputError, match=r"segmentation"):
         run_all(model, interrupted, force=True)
     (interrupted / "segmentation").unlink()
     (interrupted / "predictions.json").unlink(missing_ok=True)

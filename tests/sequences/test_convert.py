@@ -10,7 +10,7 @@ from small_drive import CAMERAS, image_of
 from typer.testing import CliRunner
 
 from bevcli.cli.main import app
-from bevcli.errors import InputError, OutputError
+from bevcli.errors import BevcliError, InputError, OutputError
 from bevcli.frame import BevMap
 from bevcli.sequences.files.map_folder import write_map
 from bevcli.sequences.native.writer import NativeWriter
@@ -86,6 +86,13 @@ def test_input_is_never_overwritten(drive, target):
     answer = convert(drive, drive.parent / target, "--force")
     assert isinstance(answer.exception, OutputError)
     assert open_sequence(drive).load(3).images
+
+
+@pytest.mark.parametrize("ends", [("drive", "loop"), ("loop", "out")])
+def test_a_link_to_itself_is_an_error(drive, ends):
+    (drive.parent / "loop").symlink_to("loop")
+    answer = convert(*(drive.parent / end for end in ends))
+    assert isinstance(answer.exception, BevcliError)
 
 
 def write_native(folder, frames):

@@ -57,6 +57,10 @@ def test_true_lines_are_written_in_the_world_frame(written: tuple[RenderedDrive,
     for found, expected in zip(lines.frames[1].lines.points, rendered.lines.points, strict=True):
         at = apply(world_from_bev, np.pad(expected, ((0, 0), (0, 1))))
         np.testing.assert_allclose(found[:, :2], at[:, :2], atol=0.05)  # the bev frame is 1.84 m above the ground
+    read = open_sequence(folder).load(1).ground_truth_lines
+    assert read is not None
+    for found, expected in zip(read.points, rendered.lines.points, strict=True):
+        np.testing.assert_allclose(found, expected, atol=2e-3)  # files have millimetres
 
 
 def test_ego_motion_has_50_hz(written: tuple[RenderedDrive, Path]):

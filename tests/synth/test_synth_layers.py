@@ -3,6 +3,8 @@
 import ast
 from pathlib import Path
 
+from source_code import trees
+
 import bevcli.synth
 
 ROOT = Path(bevcli.synth.__file__).parent
@@ -11,11 +13,11 @@ LAYERS = ("assets", "world", "render", "options", "rig", "drive", "export", "dri
 
 def test_parts_import_only_from_lower_parts():
     checked = 0
-    for path in ROOT.rglob("*.py"):
+    for path in (path for path in trees() if path.is_relative_to(ROOT)):
         part = path.relative_to(ROOT).parts[0].removesuffix(".py")
         if part == "__init__":
             continue
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(trees()[path]):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("bevcli.synth."):
                 other = node.module.split(".")[2]
                 assert LAYERS.index(other) <= LAYERS.index(part), f"{path.relative_to(ROOT)} imports {node.module}"

@@ -9,6 +9,7 @@ from memory_drive import MemorySequence
 
 from bevcli.training.augmentation import (
     AugmentationConfig,
+    BadConditions,
     CalibrationVariation,
     ImageVariation,
     distort,
@@ -47,6 +48,7 @@ def test_images_and_calibration_stay_unless_the_config_says_so() -> None:
     frame, random = MemorySequence(1).load(0), np.random.default_rng(0)
     assert ImageVariation(NONE, random)(frame) is frame
     assert CalibrationVariation(NONE, random)(frame) is frame
+    assert BadConditions(NONE, random)(frame) is frame
 
 
 def test_exposure_and_white_balance_last_a_clip_by_camera() -> None:
@@ -90,3 +92,35 @@ def test_a_share_of_the_clips_has_calibration_noise() -> None:
     config = AugmentationConfig(calibration_share=0.25)
     noisy = [CalibrationVariation(config, random)(frame) is not frame for _ in range(200)]
     assert np.mean(noisy) == pytest.approx(0.25, abs=0.08)
+
+
+def test_all_images_of_a_clip_have_the_same_corruption() -> None:
+    sequence = MemorySequence(2)
+    kinds = set()
+    for seed in range(8):
+        worsen = BadConditions(AugmentationConfig(corrupted_share=1.0), np.random.default_rng(seed))
+        corrupt, level = worsen._corruption
+        kinds.add(corrupt)
+        for frame in (sequence.load(0), sequence.load(1)):
+            worse = worsen(frame)
+            for name, image in frame.images.items():
+                assert not np.array_equal(worse.images[name].pixels_bgr, image.pixels_bgr), corrupt.__name__
+        assert worsen._corruption == (corrupt, level)
+    assert len(kinds) >= 3
+
+
+def test_lost_cameras_stay_lost_and_one_is_left() -> None:
+    sequence = MemorySequence(2)
+    counts, black = set(), set()
+    for seed in range(40):
+        worsen = BadConditions(AugmentationConfig(lost_cameras_share=1.0), np.random.default_rng(seed))
+        lost = []
+        for frame in (sequence.load(0), sequence.load(1)):
+            images = worsen(frame).images
+            lost.append({name for name in frame.images if name not in images or not images[name].pixels_bgr.any()})
+            assert len(lost[-1]) < len(frame.images)
+            black |= {name in images for name in lost[-1]}
+        assert lost[0] == lost[1]
+        counts.add(len(lost[0]))
+    assert len(counts) >= 3
+    assert black == {True, False}

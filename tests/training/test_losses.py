@@ -9,14 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from bevcli.training.detection_loss import (
-    DetectionLossConfig,
-    DetectionTargets,
-    detection_loss,
-    focal_cost,
-    focal_loss,
-    hungarian_matching,
-)
+from bevcli.model.matching import focal_cost, focal_loss, hungarian_matching
+from bevcli.training.detection_loss import DetectionLossConfig, DetectionTargets, detection_loss
 from bevcli.training.segmentation_loss import dice_costs, dice_loss
 
 

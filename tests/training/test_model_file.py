@@ -14,6 +14,7 @@ from small_fleet import write_fleet
 
 from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import BevcliError, InputError
+from bevcli.geometry.object_classes import NUSCENES_CLASSES, NUSCENES_SIZES, class_of_size
 from bevcli.model.config import BevFrameConfig
 from bevcli.synth.options import DriveOptions
 from bevcli.training.cost import Cost
@@ -53,6 +54,8 @@ def test_the_file_trains_as_it_is_and_states_facts_and_cost(fleet: Path) -> None
     comments = [line.removeprefix("# ") for line in path.read_text().splitlines() if line.startswith("# ")]
     assert comments == lines
     assert lines[1] == "Boxes in 6 frames: car 6, Fahrrad 6."
+    assert "Fahrrad like car" in lines[2]  # the drive's bicycles are as long as cars
+    assert config.object_classes["Fahrrad"].gate_m == NUSCENES_CLASSES["car"].gate_m
     assert "s an update" in lines[-2]
     assert "memory" in lines[-2]
     with pytest.raises(BevcliError, match="exists already"):
@@ -105,3 +108,9 @@ def test_a_step_costs_its_updates_or_the_reading_of_its_batches() -> None:
     config = TrainingConfig(steps=10, loaders=2, clips=ClipConfig(frames=4, learn="all", in_turn=2))
     assert Cost(config, "cpu", 0.5, 2.0, 0).step_s == 4.0
     assert Cost(config, "cpu", 0.5, 6.0, 0).step_s == 6.0
+
+
+def test_a_class_is_like_that_of_the_nearest_size() -> None:
+    assert all(class_of_size(*size) == name for name, size in NUSCENES_SIZES.items())
+    assert class_of_size(4.1, 1.8, 1.5) == "car"
+    assert class_of_size(0.6, 0.6, 1.6) == "pedestrian"

@@ -99,10 +99,17 @@ def test_views_of_unknown_heading_take_the_mean(tmp_path: Path) -> None:
 
 
 def test_parts_that_only_one_model_has_are_listed(source: Path) -> None:
-    decoder = replace(small_config().decoder, layers=1, queries=9)
+    decoder = replace(small_config().decoder, layers=1, queries=15)
     start = warm_start(source, own_model(decoder=decoder), "own.toml", no_rig)
-    assert "another shape in the file (decoder.query_embedding: 12 × 64 and 9 × 64)" in start.table()
+    assert "another shape in the file (decoder.query_embedding: 12 × 64 and 15 × 64)" in start.table()
     assert "not in the model (decoder.layers.1." in start.table()
+
+
+def test_fewer_object_queries_are_the_first_of_the_file(source: Path) -> None:
+    model = own_model(decoder=replace(small_config().decoder, queries=9))
+    start = warm_start(source, model, "own.toml", no_rig)
+    assert torch.equal(model.decoder.query_embedding, tensors(source)["decoder.query_embedding"][:9])
+    assert "the first queries of the file" in start.table()
 
 
 def test_weights_of_another_network_are_refused(source: Path) -> None:

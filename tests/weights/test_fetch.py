@@ -18,10 +18,10 @@ from bevcli.config import load_config
 from bevcli.errors import BevcliError, ConfigError, OutputError, WeightsError
 from bevcli.inference.load import load_model
 from bevcli.model.temporal_model import build_model
+from bevcli.published import own_table, read_sources
 from bevcli.weights import download
 from bevcli.weights.cache import all_weights, named_weights
 from bevcli.weights.fetch import fetch_weights
-from bevcli.weights.sources import own_table, read_sources
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +143,7 @@ def test_the_next_command_goes_on_with_what_was_kept(server, model, content, mon
         ("other", {}, "refused, and deleted: the file .*"),
         ("other", {"sha256": "true hash"}, "refused, and deleted: the file has the SHA-256"),
         ("whole", {"sha256": "0" * 8}, r"has the SHA-256 \w+ \(expected 00000000\)"),
-        ("whole", {"model": "demo"}, "does not fit model demo"),
+        ("whole", {"model": "demo"}, "does not fit model own"),
     ],
 )
 def test_another_file_is_refused_in_one_line(server, model, content, tmp_path, how, facts, message):

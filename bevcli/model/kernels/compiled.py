@@ -1,5 +1,6 @@
 """Deformable attention and deformable convolution on the CPU, by compiled loops that hold no sampled values."""
 
+import contextlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -115,10 +116,14 @@ class CompiledDeformableConvolution(nn.Module):
 
 
 def load_compiled(dtype: torch.dtype) -> None:
-    """Loads the compiler and the loops for values of float32 and of a dtype, so that the first frame need not wait."""
-    sampling = CompiledSampling()
-    for values in (torch.zeros(1, 1, 1, 1), torch.zeros(1, 1, 1, 1, dtype=dtype)):
-        sampling(values, [(1, 1)], torch.zeros(1, 1, 1, 1, 2), torch.zeros(1, 1, 1, 1), [1])
+    """Loads the compiler and the loops for values of float32 and of a dtype, so that the first frame need not wait.
+
+    Raises nothing: the first frame meets the same error, in a thread that tells it.
+    """
+    with contextlib.suppress(Exception):
+        sampling = CompiledSampling()
+        for values in (torch.zeros(1, 1, 1, 1), torch.zeros(1, 1, 1, 1, dtype=dtype)):
+            sampling(values, [(1, 1)], torch.zeros(1, 1, 1, 1, 2), torch.zeros(1, 1, 1, 1), [1])
 
 
 def as_array(tensor: Tensor) -> np.ndarray:

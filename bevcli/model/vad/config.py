@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from bevcli.errors import ConfigError
 from bevcli.frame import FrameResult, MapLines, Plan
 from bevcli.model.config import ModelConfig
 from bevcli.model.vad.line_decoder import LineDecoderConfig
+from bevcli.model.vad.loss_weights import LossWeights
 from bevcli.model.vad.motion_head import MotionConfig
 
 
@@ -19,6 +19,7 @@ class VADConfig(ModelConfig):
         commands: of the driver, in the order of the planned paths.
         line_decoder: the map decoder.
         motion: the motion head and the planner.
+        loss_weights: of the losses of lines, futures and paths.
     """
 
     architecture: ClassVar[str] = "VAD"
@@ -26,6 +27,7 @@ class VADConfig(ModelConfig):
     commands: tuple[str, ...] = ("right", "left", "straight")
     line_decoder: LineDecoderConfig = field(default_factory=LineDecoderConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
+    loss_weights: LossWeights = field(default_factory=LossWeights)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -40,5 +42,6 @@ class VADConfig(ModelConfig):
     def results(self) -> Mapping[type[FrameResult], tuple[str, ...]]:
         return {MapLines: self.line_decoder.classes, Plan: self.commands}
 
-    def check_training(self, clip_frames: int) -> None:
-        raise ConfigError(f"{self.name}: a VAD cannot be trained; expected a BEVFormer, such as tiny, small or base")
+    @property
+    def future_times_s(self) -> tuple[float, ...]:
+        return tuple(self.motion.step_s * step for step in range(1, self.motion.steps + 1))

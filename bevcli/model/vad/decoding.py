@@ -64,4 +64,4 @@ def decode_plan(outputs: VADOutputs, config: VADConfig) -> Plan:
 
 def step_times(config: VADConfig) -> Array:
     """(T,) seconds from the frame's time to the end of each step."""
-    return config.motion.step_s * np.arange(1.0, config.motion.steps + 1)
+    return np.array(config.future_times_s)

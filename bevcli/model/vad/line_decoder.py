@@ -90,10 +90,11 @@ class LineDecoder(nn.Module):
         query, points = queries.content, queries.reference_points
         class_logits, all_points = [], []
         for layer, classes, moves in zip(self.layers, self.class_branches, self.point_branches, strict=True):
-            query = layer(query, queries.position, points.detach(), bev)
-            points = (moves(query) + inverse_sigmoid(points.detach())).sigmoid()
+            query = layer(query, queries.position, points, bev)
+            refined = (moves(query) + inverse_sigmoid(points)).sigmoid()
             class_logits.append(classes(query.unflatten(1, self.shape).mean(2)))
-            all_points.append(points.unflatten(1, self.shape))
+            all_points.append(refined.unflatten(1, self.shape))
+            points = refined.detach()
         return LineOutputs(torch.stack(class_logits), torch.stack(all_points), query.unflatten(1, self.shape))
 
     def queries(self, batch: int) -> ObjectQueries:

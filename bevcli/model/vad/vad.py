@@ -1,6 +1,6 @@
 """VAD (Jiang et al. 2023): BEVFormer's BEV map and objects, lines of the map, futures of objects, a planned path."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -12,10 +12,12 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.network import STAGES, ConstantSelfAttention
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.step import ModelOutputs
+from bevcli.model.truth import FrameTruth
 from bevcli.model.vad.config import VADConfig
 from bevcli.model.vad.decoding import VADOutputs, decode_futures, decode_lines, decode_plan
 from bevcli.model.vad.export import VADForm
 from bevcli.model.vad.line_decoder import LineDecoder, LineEncoder, LineOutputs
+from bevcli.model.vad.losses import head_losses
 from bevcli.model.vad.motion_head import MapTokens, MotionHead, line_positions
 from bevcli.model.vad.official_keys import NAMES, UNUSED
 from bevcli.model.vad.planner import Planner
@@ -64,6 +66,12 @@ class VAD(BEVFormer):
     def decode_results(self, outputs: ModelOutputs) -> tuple[FrameResult, ...]:
         assert isinstance(outputs, VADOutputs)
         return decode_lines(outputs, self.config), decode_plan(outputs, self.config)
+
+    def head_losses(
+        self, outputs: ModelOutputs, truths: Sequence[FrameTruth], matches: Sequence[tuple[Tensor, Tensor]]
+    ) -> dict[str, Tensor]:
+        assert isinstance(outputs, VADOutputs)
+        return head_losses(outputs, truths, matches, self.config)
 
     def exchange_parts(self) -> None:
         """See `TemporalModel`: the queries of objects and of lines attend to each other before they see the frame."""

@@ -4,17 +4,20 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from bevcli.errors import InputError
-from bevcli.frame import BevMap, DriveFacts, Frame, Sequence
+from bevcli.frame import BevMap, DriveFacts, Frame, MapLines, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
-from bevcli.geometry.transforms import Array, Pose, inverse
+from bevcli.geometry.transforms import Array, Pose, apply, inverse
 from bevcli.parsing.files import is_there
 from bevcli.sequences.files.boxes_file import read_boxes
 from bevcli.sequences.files.calibration_file import read_rig_and_facts
 from bevcli.sequences.files.class_names import count_classes
 from bevcli.sequences.files.incremental_json import existing
+from bevcli.sequences.files.lines_file import TRUE_LINES, read_lines
 from bevcli.sequences.files.map_folder import open_maps
 from bevcli.sequences.images import FrameEntry, ImageReader, ImageSource, read_frame
 from bevcli.sequences.native.tables import check_times, read_ego_motion, read_frames_table
@@ -83,7 +86,8 @@ class FolderSequence(Sequence):
         pose = self.ego_motion.pose_at(stamp.timestamp_ns) if self.ego_motion else None
         boxes = self._truth.boxes(stamp.index, pose, self.rig.ego_from_bev)
         bev_map = self._truth.bev_map(stamp.index)
-        return read_frame(entry, self.rig, self._images, self.ego_motion, boxes, bev_map)
+        frame = read_frame(entry, self.rig, self._images, self.ego_motion, boxes, bev_map)
+        return replace(frame, ground_truth_lines=self._truth.lines(frame) if self.has_ego_motion else None)
 
 
 def _read_entries(path: Path, rig: CameraRig) -> tuple[tuple[FrameEntry, ...], tuple[str, ...]]:
@@ -144,7 +148,9 @@ def rig_notes(rig: CameraRig, source: str = "calibration.json") -> tuple[str, ..
 
 
 class FolderGroundTruth:
-    """ground_truth.json, read at once, and ground_truth_map/, read frame by frame. Either may be missing.
+    """ground_truth.json and ground_truth_lines.json, read at once, and ground_truth_map/, read frame by frame.
+
+    Each may be missing.
 
     is_read: whether they are read at all.
 
@@ -159,6 +165,10 @@ class FolderGroundTruth:
         self.class_counts = count_classes(frame.boxes for frame in self._boxes.frames) if self._boxes else {}
         self._frames = {frame.stamp.index: frame for frame in self._boxes.frames} if self._boxes else {}
         self._maps = open_maps(maps_path) if is_read and maps_path.is_dir() else None
+        lines_path = folder / TRUE_LINES
+        has_lines = is_read and is_there(existing(lines_path))
+        self._lines = read_lines(lines_path) if has_lines else None
+        self._lines_of = {frame.stamp.index: frame.lines for frame in self._lines.frames} if self._lines else {}
 
     def boxes(self, frame: int, world_from_ego: Pose | None, ego_from_bev: Array) -> Boxes3D | None:
         """A frame's boxes in the world frame; None if the file does not have the frame.
@@ -183,3 +193,12 @@ class FolderGroundTruth:
     def bev_map(self, frame: int) -> BevMap | None:
         """A frame's map, None if there is none."""
         return self._maps.load(frame) if self._maps and self._maps.has(frame) else None
+
+    def lines(self, frame: Frame) -> MapLines | None:
+        """The true lines of a frame in its bev frame, None if there are none. The frame's pose is known."""
+        lines = self._lines_of.get(frame.stamp.index)
+        if lines is None or self._lines is None:
+            return None
+        reference_from_ego = frame.world_from_ego.matrix if self._lines.frame_of_reference == "world" else np.eye(4)
+        bev_from_reference = inverse(reference_from_ego @ frame.rig.ego_from_bev)
+        return replace(lines, points=tuple(apply(bev_from_reference, points)[:, :2] for points in lines.points))

@@ -17,7 +17,7 @@ from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.synth.assets.triangles import TriangleSoup
 from bevcli.synth.render.ground import GroundTexture
-from bevcli.synth.render.lens import LensPart, lens_parts
+from bevcli.synth.render.lens import LensPart
 from bevcli.synth.render.rasteriser import ShadowMap, VisibilityBuffer, rasterise
 from bevcli.synth.render.shading_kernels import LIGHT_LIMIT, shade_pixels
 from bevcli.synth.world.weather import Weather
@@ -59,24 +59,26 @@ class RenderedView:
     unoccluded: NDArray[np.int64]
 
 
-def render_view(snapshot: WorldSnapshot, camera: Camera, world_from_ego: Array, supersampling: int = 1) -> RenderedView:
+def render_view(
+    snapshot: WorldSnapshot,
+    camera: Camera,
+    world_from_ego: Array,
+    supersampling: int = 1,
+    needed: NDArray[np.uint8] | None = None,
+) -> RenderedView:
     """Render the image of a camera.
 
     world_from_ego: (4, 4) at the time of the image. supersampling: samples per pixel along each axis; the image is
-    their mean, `visible` and `unoccluded` count whole pixels. For a camera with distortion, pinhole images are
-    rendered and resampled: linearly for colours, by the nearest pixel for objects. What a fisheye sees more than 120
-    degrees off its optical axis is black.
-    Raises InputError where the field of view is too wide for the lens model.
+    their mean, `visible` and `unoccluded` count whole pixels. The camera's distortion is ignored.
+    needed: (H, W) 0 for pixels that may stay black. Default: all are coloured.
     """
-    if camera.distortion is not None:
-        parts = lens_parts(camera)
-        views = [render_view(snapshot, part.pinhole, world_from_ego, supersampling) for part in parts]
-        return _distorted(views, parts)
     soup = snapshot.soup
     fine = _supersampled(camera, supersampling)
     world_from_camera = world_from_ego @ camera.ego_from_camera
     buffer = rasterise(soup, fine, inverse(world_from_camera), snapshot.object_count)
-    image = shade(snapshot, buffer, fine, world_from_camera)
+    wanted = np.ones((camera.height, camera.width), np.uint8) if needed is None else needed
+    wanted = wanted.repeat(supersampling, axis=0).repeat(supersampling, axis=1)
+    image = shade(snapshot, buffer, fine, world_from_camera, wanted)
     objects = _seen_objects(buffer, soup)
     area = supersampling**2
     visible = np.bincount(objects[objects >= 0], minlength=snapshot.object_count)
@@ -86,15 +88,22 @@ def render_view(snapshot: WorldSnapshot, camera: Camera, world_from_ego: Array, 
     return RenderedView(image, objects, visible // area, -(-buffer.unoccluded // area))
 
 
-def _distorted(views: Sequence[RenderedView], parts: Sequence[LensPart]) -> RenderedView:
-    """Resample pinhole images. The ratio of visible to unoccluded pixels of each object stays as it is."""
-    image = np.zeros((*parts[0].inside.shape, 3), np.uint8)
-    objects = np.full(parts[0].inside.shape, -1, np.int32)
+def render_through_lens(
+    snapshot: WorldSnapshot, parts: Sequence[LensPart], world_from_ego: Array, supersampling: int = 1
+) -> RenderedView:
+    """Render the image of a camera with distortion, as `render_view` does.
+
+    parts: its `lens_parts`. Their images are resampled: linearly for colours, by the nearest pixel for objects. The
+    ratio of visible to unoccluded pixels of each object is that of the parts. What no part gives is black.
+    """
+    views = [render_view(snapshot, part.pinhole, world_from_ego, supersampling, part.needed) for part in parts]
+    shape = parts[0].columns.shape
+    image, seen = np.zeros((*shape, 3), np.uint8), np.full(shape, -1, np.float32)  # OpenCV resamples no int32
     for view, part in zip(views, parts, strict=True):
-        seen = cv2.remap(view.pixels_bgr, part.columns, part.rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-        image[part.inside] = seen[part.inside]
-        rows, columns = np.round(part.rows[part.inside]).astype(int), np.round(part.columns[part.inside]).astype(int)
-        objects[part.inside] = view.objects[rows, columns]
+        at = (part.columns, part.rows)
+        cv2.remap(view.pixels_bgr, *at, cv2.INTER_LINEAR, image, cv2.BORDER_TRANSPARENT)
+        cv2.remap(view.objects.astype(np.float32), *at, cv2.INTER_NEAREST, seen, cv2.BORDER_TRANSPARENT)
+    objects = seen.astype(np.int32)
     seen_flat = np.sum([view.visible for view in views], axis=0)
     unoccluded_flat = np.sum([view.unoccluded for view in views], axis=0)
     visible = np.bincount(objects[objects >= 0], minlength=len(seen_flat))
@@ -115,23 +124,27 @@ def _supersampled(camera: Camera, factor: int) -> Camera:
 def _seen_objects(buffer: VisibilityBuffer, soup: TriangleSoup) -> NDArray[np.int32]:
     """(H, W) index of the object that each pixel sees; -1 for none."""
     owners = np.repeat(soup.mesh_objects, soup.mesh_ranges[:, 1] - soup.mesh_ranges[:, 0])
-    return np.where(buffer.triangles >= 0, owners[buffer.triangles], -1).astype(np.int32)
+    return np.append(owners, -1).astype(np.int32)[buffer.triangles]  # triangle -1 is the last entry
 
 
 TABLE_SIZE = 4096
 
 
 def shade(
-    snapshot: WorldSnapshot, buffer: VisibilityBuffer, camera: Camera, world_from_camera: Array
+    snapshot: WorldSnapshot,
+    buffer: VisibilityBuffer,
+    camera: Camera,
+    world_from_camera: Array,
+    needed: NDArray[np.uint8],
 ) -> NDArray[np.uint8]:
     """Colour a visibility buffer. Returns (H, W, 3) uint8 BGR.
 
-    camera: the buffer's camera; its distortion is ignored. world_from_camera: (4, 4).
+    camera: the buffer's camera; its distortion is ignored. world_from_camera: (4, 4). needed: as in `render_view`.
     """
     soup, ground, shadows, w = snapshot.soup, snapshot.ground, snapshot.shadows, snapshot.weather
     light = np.stack([w.sun, w.sky, w.bounce, w.zenith, w.horizon, w.haze, w.cloud_color]).astype(np.float64)
     ray_from_image = world_from_camera[:3, :3] @ np.linalg.inv(camera.intrinsics)
-    image = np.empty((*buffer.triangles.shape, 3), np.uint8)
+    image = np.zeros((*buffer.triangles.shape, 3), np.uint8)
     shade_pixels(
         (buffer.triangles, buffer.inverse_depth),
         (soup.normals, soup.albedo, soup.material, soup.facade, soup.facades),
@@ -140,6 +153,7 @@ def shade(
         (light, w.to_sun, w.clouds, w.haze_m, w.lamps),
         (ray_from_image, np.ascontiguousarray(world_from_camera[:3, 3]), 1.0 / camera.intrinsics[0, 0]),
         _display_table(),
+        needed,
         image,
     )
     return image

@@ -20,8 +20,8 @@ GROUND, FACADE, GLASS, PAINT, GLOW = (
 
 
 @njit(nogil=True, error_model="numpy")
-def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, image):
-    """Colour every pixel of `image` (H, W, 3) uint8 BGR, in place.
+def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, needed, image):
+    """Colour the pixels of `image` (H, W, 3) uint8 BGR, in place.
 
     buffer: triangles and inverse depths of `VisibilityBuffer`.
     surfaces: normals, albedo, material, facade, facades of `TriangleSoup`.
@@ -30,6 +30,7 @@ def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, image)
     weather: light (7, 3) with rows sun, sky, bounce, zenith, horizon, haze, cloud; to_sun; clouds; haze_m; lamps.
     view: world ray from pixel (3, 3), camera position (3,), angle of a pixel in radians.
     table: sRGB bytes of light from 0 to LIGHT_LIMIT.
+    needed: (H, W) 0 for the pixels that stay as they are.
 
     The function is long because its parts would exchange a dozen numbers for every pixel.
     """
@@ -44,6 +45,8 @@ def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, image)
     height, width = triangles.shape
     for v in range(height):
         for u in range(width):
+            if not needed[v, u]:
+                continue
             rx = ray_from_image[0, 0] * u + ray_from_image[0, 1] * v + ray_from_image[0, 2]
             ry = ray_from_image[1, 0] * u + ray_from_image[1, 1] * v + ray_from_image[1, 2]
             rz = ray_from_image[2, 0] * u + ray_from_image[2, 1] * v + ray_from_image[2, 2]

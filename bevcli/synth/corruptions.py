@@ -1,4 +1,4 @@
-"""Corruptions of images with the parameters of RoboBEV; those of the weather are from imagecorruptions (ImageNet-C)."""
+"""Corruptions of images: RoboBEV's with its parameters (its weather is that of ImageNet-C), and more of ImageNet-C."""
 
 from collections.abc import Callable
 from typing import Any
@@ -149,3 +149,50 @@ def snow(pixels_bgr: Pixels, level: Level, random: np.random.Generator) -> Pixel
     grey = cv2.cvtColor(values, cv2.COLOR_BGR2GRAY)[..., None]
     whitened = kept * values + (1 - kept) * np.maximum(values, 1.5 * grey + 0.5)
     return to_uint8(whitened + (flakes + flakes[::-1, ::-1])[..., None])
+
+
+# Corruptions of ImageNet-C (Hendrycks and Dietterich, 2019) that no training here uses, so that they show how a model
+# copes with what it has never seen. Level -> its published parameters.
+DEFOCUS = {1: 3, 2: 4, 3: 6, 4: 8, 5: 10}  # radius of the disk, pixels
+CONTRAST = {1: 0.4, 2: 0.3, 3: 0.2, 4: 0.1, 5: 0.05}  # share of the contrast that is left
+IMPULSE_NOISE = {1: 0.03, 2: 0.06, 3: 0.09, 4: 0.17, 5: 0.27}  # share of the values that become 0 or 255
+JPEG_QUALITY = {1: 25, 2: 18, 3: 15, 4: 10, 5: 7}
+SATURATION = {1: (0.3, 0.0), 2: (0.1, 0.0), 3: (2.0, 0.0), 4: (5.0, 0.1), 5: (20.0, 0.2)}  # factor, and what is added
+
+
+def defocus_blur(pixels_bgr: Pixels, level: Level, random: np.random.Generator) -> Pixels:
+    """Each point becomes a disk, as out of focus."""
+    radius = DEFOCUS[level] * pixels_bgr.shape[1] / REFERENCE_WIDTH
+    reach = int(np.ceil(radius))
+    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    disk = np.clip(radius + 0.5 - np.hypot(x, y), 0, 1).astype(np.float32)
+    blurred = cv2.filter2D(pixels_bgr.astype(np.float32), -1, disk / disk.sum(), borderType=cv2.BORDER_REPLICATE)
+    return to_uint8(blurred / 255)
+
+
+def low_contrast(pixels_bgr: Pixels, level: Level, random: np.random.Generator) -> Pixels:
+    """Each channel comes nearer to its mean."""
+    values = pixels_bgr.astype(np.float32) / 255
+    mean = values.mean(axis=(0, 1))
+    return to_uint8(mean + CONTRAST[level] * (values - mean))
+
+
+def impulse_noise(pixels_bgr: Pixels, level: Level, random: np.random.Generator) -> Pixels:
+    """Single values become 0 or 255."""
+    draws = random.random(pixels_bgr.shape, dtype=np.float32)
+    noisy = np.where(draws < IMPULSE_NOISE[level] / 2, 0, pixels_bgr)
+    return np.where(draws > 1 - IMPULSE_NOISE[level] / 2, 255, noisy).astype(np.uint8)
+
+
+def jpeg(pixels_bgr: Pixels, level: Level, random: np.random.Generator) -> Pixels:
+    """A strong JPEG compression."""
+    _, encoded = cv2.imencode(".jpg", pixels_bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY[level]])
+    return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR), dtype=np.uint8)
+
+
+def saturation(pixels_bgr: Pixels, level: Level, random: np.random.Generator) -> Pixels:
+    """Pale (levels 1 and 2) or gaudy colours."""
+    factor, added = SATURATION[level]
+    hsv = cv2.cvtColor(pixels_bgr.astype(np.float32) / 255, cv2.COLOR_BGR2HSV)
+    hsv[..., 1] = np.clip(factor * hsv[..., 1] + added, 0, 1)
+    return to_uint8(cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR))

@@ -1,0 +1,31 @@
+"""A small exported model and its copy in INT8, which the tests of engines share."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from bevcli.config import as_table
+from bevcli.engines.export_onnx import export_onnx
+from bevcli.engines.quantize import quantize
+from bevcli.inference.tracking import TrackerConfig
+from bevcli.model.export_form import raw_images
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
+from small_model import model_for_engines, small_inputs
+
+
+@pytest.fixture(scope="session")
+def small_file(tmp_path_factory) -> Path:
+    model, file = model_for_engines(), tmp_path_factory.mktemp("small") / "small.onnx"
+    export_onnx(model, file, contents=as_table(model.config, TrackerConfig(birth_score=0.5)), untrained=True)
+    return file
+
+
+@pytest.fixture(scope="session")
+def int8_file(small_file) -> Path:
+    file, config = small_file.with_name("small-int8.onnx"), model_for_engines().config
+    quantize(small_file, [raw_images(small_inputs(seed).images, config).numpy() for seed in range(4)], file)
+    return file

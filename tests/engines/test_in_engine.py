@@ -1,0 +1,194 @@
+"""A model by its name in another engine: exported once, kept, made anew where the file is broken."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from threading import Barrier
+
+import numpy as np
+import pytest
+import torch
+
+from bevcli.cli.main import app
+from bevcli.config import load_config
+from bevcli.engines.engine import installed_engines
+from bevcli.engines.exported import load_exported
+from bevcli.engines.file_cache import EngineFile, engines_folder
+from bevcli.errors import BevcliError, InputError
+from bevcli.inference import in_engine as module
+from bevcli.inference.engine_choice import EngineChoice
+from bevcli.inference.engine_speeds import fastest_engine, remember_speeds
+from bevcli.inference.in_engine import in_engine
+from bevcli.inference.load import Model, load_model
+from bevcli.inference.run import run
+from bevcli.inference.session import Session
+from bevcli.sequences.selection import select_range
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
+from memory_drive import MemorySequence, make_rig
+from small_model import model_for_engines
+from typer.testing import CliRunner
+
+pytest.importorskip("onnxscript")
+pytest.importorskip("onnxruntime")
+pytest.importorskip("openvino")
+STREET = Path(__file__).parents[2] / "samples" / "street"
+
+
+@pytest.fixture(scope="module")
+def network():
+    return model_for_engines()
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return MemorySequence(2, make_rig({"FRONT": 0.0, "BACK": 180.0}))
+
+
+@pytest.fixture(scope="module")
+def steps(tmp_path_factory, network, drive, small_file, int8_file):
+    """The steps of the first use in INT8, in a cache of these tests. The export itself is that of the other tests."""
+
+    def calibrated(file, images, out):
+        assert list(images)
+        shutil.copy(int8_file, out)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        patch.setattr(module, "export_onnx", lambda network, path, options, **_: shutil.copy(small_file, path))
+        patch.setattr(module, "quantize", calibrated)
+        patch.setattr(module, "CALIBRATION_FRAMES", 2)
+        patch.setattr(module, "COMPARED_FRAMES", 2)
+        seen = []
+        in_engine(chosen(network, "openvino", "int8"), drive.rig, drive, report=lambda *step: seen.append(step))
+        yield seen
+
+
+def chosen(network, engine, precision="fp32", **settings) -> Model:
+    return Model(network, choice=EngineChoice(engine, precision, **settings))
+
+
+def boxes(model, drive):
+    return [prediction.boxes for _, prediction in run(model, drive, track=False)]
+
+
+def test_the_boxes_in_an_engine_are_those_of_torch(steps, drive, network):
+    expected = boxes(Model(network), drive)
+    for engine in installed_engines():
+        for mine, theirs in zip(boxes(chosen(network, engine), drive), expected, strict=True):
+            np.testing.assert_allclose(mine.scores, theirs.scores, atol=1e-3)
+
+
+def test_the_first_time_reports_its_steps_and_its_cost(steps, drive, network):
+    assert [done for done, _, _ in steps] == sorted(done for done, _, _ in steps)
+    words = [what for _, _, what in steps]
+    assert words[0] == "exporting small-for-tests for 2 cameras to openvino"
+    assert {"calibrating small-for-tests with memory", "comparing openvino with PyTorch"} <= set(words)
+    assert steps[-1][0] == steps[-1][1] == 1 + 2 + 1 + 2
+    again = []
+    found = in_engine(chosen(network, "openvino", "int8"), drive.rig, drive, report=lambda *step: again.append(step))
+    assert again == []
+    assert (found.engine, found.precision, found.is_exported) == ("openvino", "int8", True)
+    assert found.engine_note.startswith("engine openvino, int8, calibrated with memory; against PyTorch in fp32: ")
+
+
+def test_a_session_takes_the_file_and_int8_needs_frames(steps, drive, network):
+    assert Session(chosen(network, "openvino", "int8"), drive.rig).notes == ()
+    other = replace(drive.rig, cameras=drive.rig.cameras[:1])
+    with pytest.raises(InputError, match=r"no frames to calibrate with: pass `calibrate_with=DRIVE`"):
+        Session(chosen(network, "onnxruntime", "int8"), other)
+
+
+def test_a_broken_file_is_made_anew(steps, drive, network):
+    model = chosen(network, "onnxruntime")
+    file = in_engine(model, drive.rig, drive).file
+    whole, facts = file.read_bytes(), file.with_suffix(".json")
+    for path, broken in ((file, whole[:-100]), (facts, b'{"sha256": "0"}')):
+        path.write_bytes(broken)
+        assert in_engine(model, drive.rig, drive).file == file
+        assert load_exported(file, "onnxruntime").cameras == 2
+        assert json.loads(facts.read_text())["differences"]["onnxruntime"]["frames"] == 2
+    assert not list(file.parent.glob(".unfinished*"))
+
+
+def test_a_longer_drive_is_not_run_with_a_file_of_a_short_one(steps, drive, network):
+    short = select_range(drive, slice(0, 1))
+    model = replace(chosen(network, "onnxruntime", "int8"), bundled=True)
+    files = [in_engine(model, drive.rig, one).file for one in (short, short, drive, short)]
+    assert files[0] == files[1] != files[2] == files[3]
+
+
+def test_two_processes_may_make_a_file_at_the_same_time(steps, small_file):
+    both = Barrier(2, timeout=60)
+
+    def write(path):
+        shutil.copy(small_file, path)
+        both.wait()
+
+    with ThreadPoolExecutor(2) as pool:
+        made = [pool.submit(EngineFile("same").make, write, "", "onnxruntime") for _ in range(2)]
+        assert len({each.result()[1].sha256 for each in made}) == 1
+    assert EngineFile("same").load("onnxruntime") is not None
+    assert not list(engines_folder().glob(".unfinished*"))
+
+
+def test_probes_are_refused_but_auto_is_torch(steps, drive, network):
+    with pytest.raises(BevcliError, match=r"^attention and probes: not available in openvino: use `engine=torch`$"):
+        run(chosen(network, "openvino"), drive, attention=True)
+    remember_speeds(network.config, {"torch fp32": 2.0, "openvino fp32": 1.0, "onnxruntime int8": 0.5})
+    assert fastest_engine(network.config, "fp32") == "openvino"
+    assert in_engine(chosen(network, "auto"), drive.rig, drive).engine == "openvino"
+    in_torch = in_engine(chosen(network, "auto"), drive.rig, drive, parts="`probes`")
+    assert (in_torch.engine, in_torch.engine_note) == ("torch", "engine auto is torch: `probes` need it")
+    assert EngineChoice("auto", "int8").resolve(network.config) == "onnxruntime"
+    (engines_folder() / "speeds.json").write_text("broken")
+    assert EngineChoice("auto", "fp32").resolve(network.config) == "torch"
+    assert EngineChoice("auto", "int8").resolve(network.config) == "openvino"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"engine": "openvinno"}, "unknown engine .expected auto, torch, onnxruntime, openvino"),
+        ({"engine": "openvino", "precision": "bf16"}, "`engine=openvino` computes in fp32 or int8"),
+        ({"engine": "openvino", "device": "mps"}, "PyTorch sees no Apple GPU|runs on the CPU"),
+        ({"engine": "torch", "precision": "int8"}, "PyTorch has no INT8"),
+        ({"calibrate_with": STREET}, "`calibrate_with`: is for `precision=int8`"),
+        ({"model": "uniad-track-map", "engine": "openvino"}, "a UniAD cannot be exported"),
+    ],
+)
+def test_options_that_exclude_each_other_are_one_line(options, message):
+    with pytest.raises(BevcliError, match=message):
+        load_model(**{"model": "demo", "untrained": True, "device": "cpu", **options})
+
+
+def test_what_cannot_be_exported_runs_in_torch_with_auto():
+    assert EngineChoice("auto", "fp32").resolve(load_config("uniad-track-map")) == "torch"
+
+
+def test_a_model_in_an_engine_needs_a_drive(network):
+    with pytest.raises(BevcliError, match=r"`engine=openvino`: needs a drive"):
+        chosen(network, "openvino").prepared.step(torch.zeros(1))
+
+
+@pytest.mark.slow
+def test_demo_runs_by_its_name_in_int8(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    options = ["--engine", "openvino", "--precision", "int8"]
+    done = CliRunner().invoke(app, ["run", str(STREET), *options, "--out", str(tmp_path / "run")])
+    assert done.exit_code == 0, done.output
+    assert "against PyTorch in fp32: " in done.stderr
+    summary = json.loads((tmp_path / "run/summary.json").read_text())
+    assert (summary["engine"], summary["precision"], summary["model"]) == ("openvino", "int8", "demo")
+    files = {path: path.stat().st_ino for path in tmp_path.glob("cache/bevcli/engines/*.onnx")}
+    done = CliRunner().invoke(app, ["validate", "--data", str(STREET), *options, "--json"])
+    assert done.exit_code == 0, done.output
+    reference = CliRunner().invoke(app, ["validate", "--data", str(STREET), "--json"])
+    maps = [json.loads(one.stdout)["classes_with_ground_truth"]["mean_ap"] for one in (done, reference)]
+    assert abs(maps[0] - maps[1]) < 0.05
+    assert files == {path: path.stat().st_ino for path in tmp_path.glob("cache/bevcli/engines/*.onnx")}
