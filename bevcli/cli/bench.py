@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from bevcli.benchmark.options import BenchOptions
 from bevcli.cli.bridge import Json, Part, as_flags
+from bevcli.errors import BevcliError
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
 
@@ -39,6 +40,8 @@ def bench(
         say(f"wrote {options.table}", err=True)
         return
     if options.engines:
+        if model_options != ModelOptions() or options.against is not None or options.profile is not None:
+            raise BevcliError("`engines` compares all of them on the CPU: leave out other options")
         with EngineBar() as bar:
             table = compare_engines(load_config(options.model), options.frames, bar.show)
         say(json.dumps(table.as_data(), indent=1) if as_json else as_flags(table.text()))

@@ -33,12 +33,14 @@ def convert(
     """Write any input as a native sequence folder, or as a drive of another format.
 
     Image files are copied byte for byte; images of a video become PNG. Ego-motion and ground truth are kept.
+    Maps and lines of the map go into sequence folders only; a note says where they are left out.
     """
     from bevcli.cli.progress import Progress
     from bevcli.errors import OutputError
+    from bevcli.registry import load
     from bevcli.sequences.labels.sequence import WithLabels
     from bevcli.sequences.open import open_sequence
-    from bevcli.sequences.output import open_writer
+    from bevcli.sequences.output import GROUP, open_writer
 
     if Path(os.path.realpath(source)).is_relative_to(os.path.realpath(out)):
         raise OutputError(f"{out}: contains the input: choose another path")
@@ -46,7 +48,7 @@ def convert(
     if labels.labels is not None:
         sequence = WithLabels(sequence, labels.labels, labels)
     count = len(sequence.stamps)
-    gaps = 0
+    gaps, left_out = 0, set[str]()
     with (
         open_writer(out, sequence, written) as writer,
         Progress(count, "frames", sequence.notes) as progress,
@@ -57,6 +59,10 @@ def convert(
                 progress.message(f"warning: frame {frame.stamp.index}: camera {camera}: {reason}")
             gaps += len(frame.dropped)
             writer.write(frame)
+            left_out |= load(GROUP, written.form).left_out(frame)
             progress.advance()
+    if left_out:
+        name = load(GROUP, written.form).name
+        say(f"note: {name} has no place for {' and '.join(sorted(left_out))} of the ground truth: left out", err=True)
     missing = f", {gaps} images missing" if gaps else ""
     say(f"{out}: {count} frames, {len(frame.rig.cameras)} cameras{missing}")

@@ -32,7 +32,8 @@ class PlainCommand(TyperCommand):
         """Parse; an empty path, as of a variable that is not set, would be the current folder."""
         given, *_ = self.make_parser(ctx).parse_args(args=list(args))
         takes = inspect.signature(self.callback).parameters if self.callback else {}
-        for each in self.get_params(ctx):
+        parameters: list[Any] = self.get_params(ctx)
+        for each in parameters:
             value = given.get(each.name)
             empty = "" in (value if isinstance(value, list | tuple) else [value])
             if empty and each.name in takes and _takes_path(takes[each.name].annotation):

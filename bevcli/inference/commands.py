@@ -35,19 +35,30 @@ def read_commands(command: str | None, config: ModelConfig) -> Commands:
     """
     if command is None:
         return Commands()
-    known = config.results.get(Plan, ())
-    if not known:
-        raise InputError(f"`command={command}`: {config.name} plans no path: leave out the option")
-    expected = f"expected {', '.join(known)}"
-    if command in known:
-        return Commands(((0, command),))
     path = Path(command)
     if path.suffix != ".json":
-        raise InputError(f"`command={command}`: is unknown ({expected} or a FILE.json)")
+        return one_command(command, config)
+    known = _known(command, config)
     found = read_json(path)
     if not isinstance(found, dict) or not found:
         raise InputError(f'{path}: is not a file of commands (expected {{"0": "{known[0]}"}}, by frame index)')
     for frame, name in found.items():
         if not (frame.isascii() and frame.isdigit() and len(frame) < 10) or name not in known:
-            raise InputError(f'{path}: "{frame}": {name!r:.40}: is no command ({expected}, by frame index)')
+            expected = f"expected {', '.join(known)}, by frame index"
+            raise InputError(f'{path}: "{frame}": {name!r:.40}: is no command ({expected})')
     return Commands(tuple(sorted((int(frame), name) for frame, name in found.items())))
+
+
+def one_command(command: str, config: ModelConfig) -> Commands:
+    """A command by its name, for all frames. Raises InputError for a model that does not plan, or another name."""
+    known = _known(command, config)
+    if command not in known:
+        raise InputError(f"`command={command}`: is unknown (expected {', '.join(known)} or a FILE.json)")
+    return Commands(((0, command),))
+
+
+def _known(command: str, config: ModelConfig) -> tuple[str, ...]:
+    known = config.results.get(Plan, ())
+    if not known:
+        raise InputError(f"`command={command}`: {config.name} plans no path: leave out the option")
+    return known

@@ -96,8 +96,11 @@ def in_engine(
 def _why_torch(model: Model, parts: str) -> str:
     if parts:
         return f"{parts} need it"
-    if fastest_engine(model.config, "fp32") is not None:
+    measured = fastest_engine(model.config, "fp32")
+    if measured == TORCH:
         return "the fastest one here by `bevcli bench --engines`"
+    if measured is not None:
+        return f"{measured}, the fastest one, is no longer installed"
     return f"no engine was measured here: `bevcli bench --engines --model {model.name}` does"
 
 

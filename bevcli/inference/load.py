@@ -92,6 +92,8 @@ class Model:
         """Raises BevcliError for an exported file. what: needs the network's parts, such as "`probes`"."""
         if self.choice is not None and self.choice.engine != AUTO:
             raise BevcliError(f"{what}: not available in {self.choice.engine}: use `engine=torch`")
+        if self.choice is not None and self.choice.precision == "int8":
+            raise BevcliError(f"{what}: not available in INT8, which PyTorch does not have: leave out `precision=int8`")
         if self.is_exported:
             raise BevcliError(f"{what}: not available for {self.file}, an exported file: use {self.name} by its name")
 

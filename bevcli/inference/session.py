@@ -1,6 +1,7 @@
 """`Session`: a model on frames from memory, one at a time, such as those of a running vehicle or a simulator."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from operator import index
 from typing import Literal
 
@@ -13,6 +14,7 @@ from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.ego_motion import Kinematics
 from bevcli.geometry.recent_poses import RecentPoses
 from bevcli.geometry.transforms import Pose
+from bevcli.inference.commands import one_command, read_commands
 from bevcli.inference.in_engine import in_engine
 from bevcli.inference.load import Model
 from bevcli.inference.run import RunnerState, Steps
@@ -54,6 +56,7 @@ class Session:
         temporal: bool = True,
         track: bool = True,
         cameras: Mapping[str, str] | None = None,
+        command: str | None = None,
         name: str = "live",
     ) -> None:
         """Prepare the model for a rig.
@@ -65,10 +68,11 @@ class Session:
             temporal: whether the previous BEV map is used.
             track: whether the boxes get identities over time.
             cameras: camera of the rig -> camera of the model whose embedding it takes; see `run`.
+            command: of the driver, which chooses one of the planned paths; see `run`. `step` may change it.
             name: of the drive, for titles.
 
-        Raises InputError for a rig without cameras or with two of one name, an unknown camera in `cameras` or color
-        order, and for a model that needs later frames.
+        Raises InputError for a rig without cameras or with two of one name, an unknown camera in `cameras`, color order
+        or command, and for a model that needs later frames.
         """
         if color_order not in ("bgr", "rgb"):
             raise InputError(f'`color_order={color_order}`: expected "bgr" or "rgb"')
@@ -83,7 +87,8 @@ class Session:
         self.name, self.rig, self.notes = name, rig, model.rig_notes(rig)
         self.frame: Frame | None = None
         self._color_order = color_order
-        self._steps = Steps(model, StepOptions(model.precision, temporal), cameras, track=track)
+        options = StepOptions(model.precision, temporal, commands=read_commands(command, model.config))
+        self._steps = Steps(model, options, cameras, track=track)
         self._state, self._poses = RunnerState(), RecentPoses()
         self._drive = 1
         self._last_ns: int | None = None
@@ -96,6 +101,7 @@ class Session:
         *,
         world_from_ego_at: Mapping[str, Pose | ArrayLike] | None = None,
         kinematics: Kinematics | None = None,
+        command: str | None = None,
     ) -> Prediction:
         """The prediction for one frame.
 
@@ -110,9 +116,10 @@ class Session:
             timestamp_ns: the frame's time; later than that of the frame before.
             world_from_ego_at: camera -> the vehicle's pose when its image was taken. Default: `world_from_ego`.
             kinematics: acceleration, angular rate and velocity at the frame's time. Default: derived from the poses.
+            command: of the driver, from this frame on. Default: the one before.
 
-        Raises InputError for an unknown camera, an image of another size or type, a pose that is not rigid, and a time
-        that is not later than the one before. The session is then as it was before the call.
+        Raises InputError for an unknown camera or command, an image of another size or type, a pose that is not rigid,
+        and a time that is not later than the one before. The session is then as it was before the call.
         """
         stamp = self._next_stamp(timestamp_ns)
         pose = _pose(world_from_ego, "`world_from_ego`")
@@ -130,6 +137,8 @@ class Session:
             kinematics=poses.kinematics() if kinematics is None else kinematics,
             dropped={name: "not given" for name in self.rig.names if name not in images},
         )
+        if command is not None:
+            self._commanded(command)
         self._state, prediction = self._steps.step(self._state, self._steps.prepare(frame))
         self.frame, self._poses, self._last_ns = frame, poses, stamp.timestamp_ns
         return prediction
@@ -138,6 +147,11 @@ class Session:
         """Forget the history: the next frame begins a new drive, at any time and place. Its number goes on."""
         self._state, self._poses = RunnerState(), RecentPoses()
         self._drive, self._last_ns = self._drive + 1, None
+
+    def _commanded(self, command: str) -> None:
+        """Take a command in place of all others."""
+        runner = self._steps.runner
+        runner.options = replace(runner.options, commands=one_command(command, runner.config))
 
     def _next_stamp(self, timestamp_ns: int) -> FrameStamp:
         time = index(timestamp_ns)

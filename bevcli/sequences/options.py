@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 # required: the ego-motion must exist. optional: without it there are no poses, and boxes are in the ego frame only.
 # static: the vehicle stands, and the ego-motion is not read.
 EgoMotionUse = Literal["required", "optional", "static"]
+UnlistedFrames = Literal["empty", "unlabelled"]
 
 
 def parse_frames(text: str) -> slice:
@@ -139,12 +140,13 @@ class LabelOptions:
         reads="path",
         default=None,
         help="Ground truth in place of that of INPUT: a CSV table with the columns of `bevcli export --format csv`, an "
-        "OpenLABEL file, or KITTI labels.",
+        "OpenLABEL file, KITTI labels, or CVAT's cuboids.",
         metavar="FILE",
     )
-    only_labelled: bool = option(
-        default=False,
-        help="Frames without a row in a table of labels have no ground truth. By default they are labelled and empty.",
+    unlisted_frames: UnlistedFrames | None = option(
+        default=None,
+        help="Frames without a row in a table of labels are empty, or not labelled. Default: empty, unless no two "
+        "successive frames have rows; then only every n-th frame is labelled.",
     )
     labels_camera: str | None = option(
         default=None,

@@ -41,11 +41,18 @@ class OutputFormat:
         opener: makes the writer of a path for a sequence, or the name of what does, "module:attribute", which is
             imported when it is needed. Raises OutputError, and InputError for a drive that the format cannot hold.
         takes_boxes: the option `boxes` is for this format.
+        keeps_maps: maps and lines of the ground truth are written; otherwise they are left out.
     """
 
     name: str
     opener: str | Callable[[Path, Sequence, WriteOptions], DriveWriter]
     takes_boxes: bool = False
+    keeps_maps: bool = False
+
+    def left_out(self, frame: Frame) -> set[str]:
+        """What the format cannot hold of a frame, in words."""
+        maps = {"maps": frame.ground_truth_map, "lines of the map": frame.ground_truth_lines}
+        return set() if self.keeps_maps else {name for name, value in maps.items() if value is not None}
 
 
 def open_writer(path: Path, sequence: Sequence, options: WriteOptions) -> DriveWriter:

@@ -44,7 +44,7 @@ class WithoutGroundTruth(DerivedSequence):
 
     def load(self, place: int) -> Frame:
         """The frame at a place, without boxes and map."""
-        return replace(super().load(place), ground_truth=None, ground_truth_map=None)
+        return replace(super().load(place), ground_truth=None, ground_truth_map=None, ground_truth_lines=None)
 
 
 class WithClassNames(DerivedSequence):

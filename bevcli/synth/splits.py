@@ -1,6 +1,7 @@
 """Splits: the drives to train on, and those to score on. A file states them, or the last drives are held out."""
 
 import glob
+import hashlib
 import json
 from collections import Counter
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from bevcli.synth.rig import RigDistribution
 from bevcli.writing import write_whole
 
 KEYS = ("train", "validate")
+DRAWN_KEYS = ("drives", "validate_share", "seed")  # of a file whose drives are drawn
 
 
 @dataclass(frozen=True)
@@ -33,18 +35,26 @@ class Split:
 
 
 def read_split(path: Path) -> Split:
-    """The drives in a TOML file with the keys train and validate.
+    """The drives in a TOML file with the keys train and validate, or with drives that are drawn by a seed.
 
         train = ["drives/2024-*"]
         validate = ["drives/2025-01", "drives/2025-02"]
+
+        drives = ["drives/*"]
+        validate_share = 0.2
+        seed = 0
 
     Folders are relative to the file; *, ? and [abc] stand for the folders that match, in the order of their names.
     Raises InputError for another key, a list that leaves no drive, or a drive that is missing or stands there twice.
     """
     table = parse_toml(read_text(path, TOML_BYTES), path)
-    if set(table) != set(KEYS):
-        raise InputError(f"{path}: expected the keys {' and '.join(KEYS)}, found {', '.join(table) or 'none'}")
-    split = Split(*(_folders(path, key, table[key]) for key in KEYS))
+    if set(table) == set(DRAWN_KEYS):
+        split = _drawn(path, **table)
+    elif set(table) == set(KEYS):
+        split = Split(*(_folders(path, key, table[key]) for key in KEYS))
+    else:
+        either = f"{' and '.join(KEYS)}, or {', '.join(DRAWN_KEYS)}"
+        raise InputError(f"{path}: expected the keys {either}, found {', '.join(table) or 'none'}")
     times = Counter(folder.resolve() for folder in (*split.train, *split.validate))
     twice = [str(folder) for folder, count in times.items() if count > 1]
     if twice:
@@ -93,6 +103,21 @@ def _only_split(data: DriveOptions, path: Path) -> Split:
     if data.data or data.rendered is not None:
         raise InputError(f"{path}: states the drives: remove `{'data' if data.data else 'rendered'}`, or `split`")
     return read_split(path)
+
+
+def _drawn(path: Path, drives: object, validate_share: object, seed: object) -> Split:
+    """The split that follows from a seed and the names of the drives, whatever their order. Raises InputError."""
+    folders = _folders(path, "drives", drives)
+    if not isinstance(validate_share, float) or not 0 < validate_share < 1:
+        raise InputError(f"{path}: validate_share: expected a number between 0 and 1, found {validate_share!r:.40}")
+    if not isinstance(seed, int):
+        raise InputError(f"{path}: seed: expected an integer, found {seed!r:.40}")
+    if len(folders) < 2:
+        raise InputError(f"{path}: drives: leaves no drive to score on (expected at least two folders)")
+    drawn = sorted(folders, key=lambda folder: hashlib.sha256(f"{seed} {folder.name}".encode()).digest())
+    count = min(max(1, round(validate_share * len(folders))), len(folders) - 1)
+    validate = set(drawn[:count])
+    return Split(*(tuple(each for each in folders if (each in validate) == chosen) for chosen in (False, True)))
 
 
 def _folders(path: Path, key: str, names: object) -> tuple[Path, ...]:

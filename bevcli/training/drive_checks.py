@@ -7,7 +7,7 @@ from bevcli.errors import InputError
 from bevcli.frame import MapLines, Sequence
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.model.config import ModelConfig
-from bevcli.sequences.files.class_names import ClassNames
+from bevcli.sequences.files.class_names import ClassNames, count_classes
 from bevcli.sequences.files.lines_file import TRUE_LINES
 from bevcli.sequences.native.folder import BOXES_FILE
 from bevcli.sequences.selection import scenes_of
@@ -55,10 +55,8 @@ def check_scored_drives(data: DriveOptions, drives: Drives, config: ModelConfig)
 def check_classes(drives: Drives, where: str, use: str, config: ModelConfig) -> Iterator[str]:
     """Notes about the classes in the ground truth of drives: boxes that are left out, and classes without a box.
 
-    Drives of a format that does not count its boxes are passed over.
-
     Args:
-        drives: folders; opens each of them.
+        drives: folders; opens each of them, and reads the frames of a format that has no table of its boxes.
         where: the set of drives, for messages, such as "the 4 held-out drives".
         use: what happens to boxes of known classes: "trained on" or "scored".
         config: of the model.
@@ -66,18 +64,21 @@ def check_classes(drives: Drives, where: str, use: str, config: ModelConfig) -> 
     Raises InputError where no box has a class of the model.
     """
     counts: Counter[str] = Counter()
-    all_counted = True
-    for index in range(len(drives)):
-        found = drives.open(index).class_counts
-        all_counted &= bool(found)
-        counts.update(found)
+    for drive in map(drives.open, range(len(drives))):
+        counts.update(drive.class_counts or _count_in_frames(drive))
     absent = [name for name in config.classes if not counts[name]]
-    if counts and all_counted and len(absent) == len(config.classes):
+    if counts and len(absent) == len(config.classes):
         named = ", ".join(f"{name} ({count})" for name, count in sorted(counts.items()))
         raise _no_known_class(f"the ground truth of {where}", named, counts.most_common(1)[0][0], config)
     yield from ClassNames(classes=config.classes).note(counts, where, use)
-    if absent and all_counted:
+    if counts and absent:
         yield f"{where}: no box has the class {' or '.join(absent)} of the model {config.name}"
+
+
+def _count_in_frames(drive: Sequence) -> Counter[str]:
+    """Number of boxes by class in the frames of a drive."""
+    truths = (drive.ground_truth_frame(place).ground_truth for place in range(len(drive.stamps)))
+    return count_classes(boxes for boxes in truths if boxes is not None)
 
 
 def _check_rendered_classes(class_map: Mapping[str, str], config: ModelConfig) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -138,8 +139,9 @@ def draw_learning_curves(loss: LearningCurve, validation: LearningCurve, path: P
 
 def _draw_rows(axes: Axes, rows: list[Row], skipped: tuple[str, ...], marker: str = "") -> None:
     for name in rows[0] if rows else ():
-        if name not in skipped:
-            axes.plot([row["step"] for row in rows], [row[name] for row in rows], label=name, marker=marker)
+        values = [row[name] for row in rows]
+        if name not in skipped and not all(map(math.isnan, values)):
+            axes.plot([row["step"] for row in rows], values, label=name, marker=marker)
     if rows:
         axes.legend(fontsize=8)
     axes.grid(alpha=0.3)

@@ -227,11 +227,14 @@ def prepare_training(
     notes = check_training_drives(data, drives, own, config.clips, model_config)
     if data.rendered is not None and not (out / "drives").exists():
         notes += ("each drive is rendered when it is first drawn, which takes seconds: the first step waits for some",)
+    if config.freeze_batch_norm and options.weights is None and not options.resume:
+        notes += (
+            "the model starts from random weights, but its file keeps the statistics of batch norms: pass `weights` or "
+            '`changes={"freeze_batch_norm": "false"}`',
+        )
     model, started = build_network(model_config), None
     if options.weights is not None and not options.resume:
         started = warm_start(weights_file(options.weights), model, model_name_or_file, lambda: drives.open(0).rig)
-    if config.freeze_batch_norm and started is None and not options.resume:
-        notes += ("freeze_batch_norm: keeps the batch norms of random weights; pass `weights`, or set it to false",)
     if not options.resume:
         make_folder(out)
     group = join_process_group(device)

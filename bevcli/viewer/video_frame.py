@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -46,16 +47,35 @@ Canvas = NDArray[np.uint8]
 ToCanvas = Callable[[Array], Array]  # points (K, 2) in the space of an entity -> (K, 2) pixels of a canvas
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 SUBPIXEL_BITS = 3
+OPACITIES = 10  # steps of opacity, faint to opaque
 
 
 def draw_strips(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: ToCanvas, thickness: int = 1) -> None:
-    """Draws the line strips of an entity."""
+    """Draws the line strips of an entity, opaque."""
     strips = frame.values(entity, "LineStrips2D:strips")
     colors = entity_colors(frame, entity, "LineStrips2D:colors", len(strips))
     for strip, color in zip(strips, colors, strict=True):
-        points = np.clip(to_canvas(np.array(strip)), -1e5, 1e5) * (1 << SUBPIXEL_BITS)
-        points = np.round(points).astype(np.int32)
-        cv2.polylines(canvas, [points], False, color, thickness, cv2.LINE_AA, SUBPIXEL_BITS)
+        _draw_line(canvas, strip, color, to_canvas, thickness)
+
+
+def draw_faded_strips(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: ToCanvas) -> None:
+    """Draws the line strips of an entity with the opacity of their colours, in OPACITIES steps."""
+    strips = frame.values(entity, "LineStrips2D:strips")
+    colors = entity_colors(frame, entity, "LineStrips2D:colors", len(strips))
+    packed = np.array(frame.values(entity, "LineStrips2D:colors") or [255], dtype=np.uint32)
+    opacity = np.broadcast_to(packed if len(packed) == len(strips) else packed[:1], len(strips)) & 255
+    step = np.ceil(opacity / 255 * OPACITIES).astype(int)
+    for level in np.unique(step[step > 0]):
+        below = canvas.copy()
+        for place in np.flatnonzero(step == level):
+            _draw_line(canvas, strips[place], colors[place], to_canvas)
+        canvas[:] = cv2.addWeighted(canvas, level / OPACITIES, below, 1 - level / OPACITIES, 0)
+
+
+def _draw_line(canvas: Canvas, strip: Any, color: Color, to_canvas: ToCanvas, thickness: int = 1) -> None:
+    points = np.clip(to_canvas(np.array(strip)), -1e5, 1e5) * (1 << SUBPIXEL_BITS)
+    points = np.round(points).astype(np.int32)
+    cv2.polylines(canvas, [points], False, color, thickness, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
 def draw_arrows(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: ToCanvas) -> None:
@@ -185,8 +205,9 @@ def _draw_camera(canvas: Canvas, frame: RecordedFrame, tile: Tile, image: Canvas
         return points * scale
 
     boxes = entities.overlay(tile.camera, "boxes")
-    for kind in (*KINDS, "ground_truth"):
-        draw_strips(canvas, frame, entities.overlay(tile.camera, kind), to_canvas)
+    for kind in KINDS:
+        draw_faded_strips(canvas, frame, entities.overlay(tile.camera, kind), to_canvas)
+    draw_strips(canvas, frame, entities.overlay(tile.camera, "ground_truth"), to_canvas)
     draw_strips(canvas, frame, boxes, to_canvas)
     draw_labels(canvas, frame, f"{boxes}/labels", to_canvas, 0.36)
     cv2.rectangle(canvas, (0, 0), (10 * len(tile.camera) + 12, 22), BACKGROUND, -1)
@@ -207,7 +228,7 @@ def _draw_bev(canvas: Canvas, frame: RecordedFrame) -> None:
     draw_strips(canvas, frame, entities.BEV_RINGS, to_canvas)
     draw_labels(canvas, frame, f"{entities.BEV_RINGS}/labels", to_canvas, 0.35)
     for kind in KINDS:
-        draw_strips(canvas, frame, entities.bev_ground_lines(kind), to_canvas)
+        draw_faded_strips(canvas, frame, entities.bev_ground_lines(kind), to_canvas)
     for entity in BELOW_BOXES:
         draw_strips(canvas, frame, entity, to_canvas)
     draw_strips(canvas, frame, entities.BEV_BOXES, to_canvas, 2)

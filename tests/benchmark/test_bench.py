@@ -91,6 +91,11 @@ def test_profile_of_a_frame_in_half_precision(small_model_file, tmp_path):
     assert json.loads(profile.read_text())["traceEvents"]
 
 
+def test_engines_are_compared_as_they_are():
+    answer = CliRunner().invoke(app, ["bench", "--engines", "--precision", "int8"])
+    assert "--engines compares all of them" in str(answer.exception)
+
+
 @pytest.mark.slow
 def test_engines_are_timed_and_auto_takes_the_fastest(small_model_file, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

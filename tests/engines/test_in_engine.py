@@ -116,6 +116,7 @@ def test_a_broken_file_is_made_anew(steps, drive, network):
     assert not list(file.parent.glob(".unfinished*"))
 
 
+@pytest.mark.slow
 def test_a_longer_drive_is_not_run_with_a_file_of_a_short_one(steps, drive, network):
     short = select_range(drive, slice(0, 1))
     model = replace(chosen(network, "onnxruntime", "int8"), bundled=True)
@@ -140,6 +141,8 @@ def test_two_processes_may_make_a_file_at_the_same_time(steps, small_file):
 def test_probes_are_refused_but_auto_is_torch(steps, drive, network):
     with pytest.raises(BevcliError, match=r"^attention and probes: not available in openvino: use `engine=torch`$"):
         run(chosen(network, "openvino"), drive, attention=True)
+    with pytest.raises(BevcliError, match=r"not available in INT8, which PyTorch does not have"):
+        run(chosen(network, "auto", "int8"), drive, attention=True)
     remember_speeds(network.config, {"torch fp32": 2.0, "openvino fp32": 1.0, "onnxruntime int8": 0.5})
     assert fastest_engine(network.config, "fp32") == "openvino"
     assert in_engine(chosen(network, "auto"), drive.rig, drive).engine == "openvino"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
 from bevcli.inference.commands import Commands, read_commands
 from bevcli.inference.load import Model
 from bevcli.inference.run import run
+from bevcli.inference.session import Session
 from bevcli.model.config import ModelConfig
 from bevcli.model.vad.config import VADConfig
 from bevcli.model.vad.line_decoder import LineDecoderConfig
@@ -137,3 +139,41 @@ def test_wrong_files_of_lines_are_refused(change: dict, message: str, tmp_path: 
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
     with pytest.raises(InputError, match=message):
         read_lines(path)
+
+
+def test_a_session_takes_commands_as_a_run_does(model: Model, options: RunOptions, out: Path) -> None:
+    drive = MemorySequence(FRAMES)
+    ways = {"file": (options.command, {}), "steps": (None, {0: "straight", 1: "left"})}
+    plans = {way: list(_session_plans(model, drive, *given)) for way, given in ways.items()}
+    for (_, prediction), *others in zip(run(model, drive, command=options.command), *plans.values(), strict=True):
+        (expected,) = (result for result in prediction.results if isinstance(result, Plan))
+        for plan in others:
+            assert plan.command == expected.command
+            assert plan.paths.tobytes() == expected.paths.tobytes()
+
+
+def _session_plans(model: Model, drive: MemorySequence, first: str | None, later: dict[int, str]) -> Iterator[Plan]:
+    session = Session(model, drive.rig, command=first)
+    for place in range(FRAMES):
+        frame = drive.load(place)
+        prediction = session.step(
+            {name: image.pixels_bgr for name, image in frame.images.items()},
+            frame.world_from_ego,
+            frame.stamp.timestamp_ns,
+            world_from_ego_at=frame.world_from_ego_at,
+            kinematics=frame.kinematics,
+            command=later.get(place),
+        )
+        (plan,) = (result for result in prediction.results if isinstance(result, Plan))
+        yield plan
+
+
+def test_a_wrong_command_leaves_a_session_as_it_was(model: Model) -> None:
+    drive = MemorySequence(1)
+    session, frame = Session(model, drive.rig, command="left"), drive.load(0)
+    images = {name: image.pixels_bgr for name, image in frame.images.items()}
+    with pytest.raises(InputError, match="`command=up`: is unknown"):
+        session.step(images, frame.world_from_ego, 0, command="up")
+    assert session.frame is None
+    with pytest.raises(InputError, match="`command=up`: is unknown"):
+        Session(model, drive.rig, command="up")

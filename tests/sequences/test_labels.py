@@ -18,12 +18,12 @@ from bevcli.evaluation.formats.openlabel import openlabel
 from bevcli.frame import Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes, write_boxes
-from bevcli.sequences.labels import csv_table, kitti, label_format, openlabel as openlabel_reader
-from bevcli.sequences.labels.sequence import WithLabels
+from bevcli.sequences.labels import csv_table, cvat, kitti, label_format, openlabel as openlabel_reader
+from bevcli.sequences.labels.sequence import WithLabels, _labelled_places
 from bevcli.sequences.native.writer import NativeWriter
-from bevcli.sequences.options import LabelOptions
+from bevcli.sequences.options import LabelOptions, UnlistedFrames
 
-FORMATS = {"csv": csv_table.FORMAT, "kitti": kitti.FORMAT, "openlabel": openlabel_reader.FORMAT}
+FORMATS = {"csv": csv_table.FORMAT, "cvat": cvat.FORMAT, "kitti": kitti.FORMAT, "openlabel": openlabel_reader.FORMAT}
 HEAD = "frame,class,x,y,z,length,width,height,yaw"
 
 
@@ -101,14 +101,33 @@ def test_tracks_give_velocities_over_ground(tmp_path: Path) -> None:
     assert any('are taken to be in the "ego" frame' in note for note in labelled.notes)
 
 
-def test_frames_without_a_row_are_empty_or_left_out(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("listed", "unlisted", "expected", "note"),
+    [
+        ((0, 1), None, "1100", "2 frames with labels: PKW (2); 2 frames without rows are empty"),
+        ((0, 2), None, "1x1x", "2 frames with labels: PKW (2); 2 frames are not labelled"),  # at half the rate
+        ((1,), None, "x1xx", "1 frames with labels: PKW (1); 3 frames are not labelled"),
+        ((0, 2), "empty", "1010", "2 frames without rows are empty (see `unlisted_frames`)"),
+        ((0, 1), "unlabelled", "11xx", "2 frames are not labelled: they have no ground truth"),
+        ((), None, "xxxx", "0 frames with labels: none; 4 frames are not labelled"),
+    ],
+)
+def test_frames_without_a_row_are_empty_or_unlabelled(
+    listed: tuple[int, ...], unlisted: UnlistedFrames | None, expected: str, note: str, tmp_path: Path
+) -> None:
     drive, path = Drive(), tmp_path / "labels.csv"
-    path.write_text(f"{HEAD}\n{drive.stamps[1].index},PKW,1,2,0,4,2,1,0\n")
-    assert [len(WithLabels(drive, path).load(place).ground_truth) for place in range(3)] == [0, 1, 0]
-    labelled = WithLabels(drive, path, LabelOptions(only_labelled=True))
-    assert [labelled.load(place).ground_truth is None for place in range(3)] == [True, False, True]
-    assert any("1 frames with boxes: PKW (1); 3 frames without boxes have no" in note for note in labelled.notes)
-    assert any("a column `instance` would give them" in note for note in labelled.notes)
+    path.write_text("\n".join([HEAD, *(f"{drive.stamps[place].index},PKW,1,2,0,4,2,1,0" for place in listed)]))
+    labelled = WithLabels(drive, path, LabelOptions(unlisted_frames=unlisted))
+    truths = [labelled.load(place).ground_truth for place in range(4)]
+    assert "".join("x" if truth is None else str(len(truth)) for truth in truths) == expected
+    assert any(note in each for each in labelled.notes)
+    assert any("a column `instance` would give them" in each for each in labelled.notes) == bool(listed)
+
+
+def test_an_empty_frame_at_the_rate_of_the_labels_is_empty() -> None:
+    stamps = tuple(replace(Drive().stamps[0], index=index, scene="ab"[index // 12]) for index in range(24))
+    assert sorted(_labelled_places(stamps, {3, 9, 18}, None)) == [3, 9, 18]
+    assert sorted(_labelled_places(stamps, {1, 4, 10}, None)) == [1, 4, 7, 10]
 
 
 @pytest.mark.parametrize(
@@ -153,8 +172,9 @@ def test_openlabel_angles_turn_about_the_vertical(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[]", "is not OpenLABEL"),
-        ("{", "is not OpenLABEL"),
+        ('{"openlabel": []}', "is not OpenLABEL"),
+        ('{"openlabel": {', "is not OpenLABEL"),
+        ("[]", "is no file of labels .*an OpenLABEL file"),
         (openlabel_text({"val": [1, 2]}), "object 7: expected a cuboid of 10 or 9 numbers"),
         (openlabel_text({"val": [0] * 10}), "sizes above 0"),
         (openlabel_text({"val": [1] * 9, "coordinate_system": "lidar"}), "in one of world, odom, ego, .* found lidar"),
@@ -165,6 +185,50 @@ def test_wrong_openlabel_is_one_clear_line(text: str, message: str, tmp_path: Pa
     (tmp_path / "labels.json").write_text(text)
     with pytest.raises(InputError, match=message) as caught:
         WithLabels(Drive(), tmp_path / "labels.json")
+    assert "\n" not in str(caught.value)
+
+
+def cvat_text(**changes: object) -> str:
+    """An export with two frames, the second empty, and a cuboid that is turned by 0.7 about the vertical."""
+    cuboid = {
+        "id": 0, "type": "cuboid_3d", "attributes": {"occluded": False, "track_id": 7}, "group": 0, "label_id": 1,
+        "position": [1, 2, 3], "rotation": [0, 0, 0.7], "scale": [4, 2, 1],
+    }  # fmt: skip
+    items = [
+        {"id": "000000", "annotations": [cuboid | changes], "attr": {"frame": 0}, "point_cloud": {"path": ""}},
+        {"id": "000001", "annotations": [{"type": "label", "label_id": 0}], "attr": {"frame": 1}},
+    ]
+    labels = [{"name": name, "parent": "", "attributes": []} for name in ("Lorry", "PKW")]
+    return json.dumps({"info": {}, "categories": {"label": {"labels": labels, "attributes": []}}, "items": items})
+
+
+def test_cuboids_of_cvat_are_boxes_in_ego_with_tracks(tmp_path: Path) -> None:
+    path, drive = tmp_path / "default.json", Drive()
+    path.write_text(cvat_text())
+    labelled = WithLabels(drive, path)
+    box = labelled.load(0).ground_truth.transformed(np.linalg.inv(drive.load(0).world_from_ego.matrix))
+    np.testing.assert_allclose([*box.centers[0], *box.sizes_lwh[0], box.yaws[0]], [1, 2, 3, 4, 2, 1, 0.7], atol=1e-9)
+    assert (box.classes.tolist(), box.instances.tolist()) == (["PKW"], ["7"])
+    assert [len(labelled.load(1).ground_truth), labelled.load(2).ground_truth] == [0, None]
+    assert not any("tilted" in note for note in labelled.notes)
+    path.write_text(cvat_text(rotation=[0.2, 0, 0.7]))
+    assert any("1 cuboids are tilted by more than 5°" in note for note in WithLabels(drive, path).notes)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"categories": {', 'is not a CVAT export "Datumaro 3D"'),
+        (cvat_text().replace('"attr": {"frame": 1}', '"attr": {}'), 'item 000001: "attr" has no "frame"'),
+        (cvat_text(label_id=2), r"item 000000: label_id is 2 \(expected 0 to 1"),
+        (cvat_text(scale=[1, 1, 0]), "expected cuboids with three numbers each"),
+        (cvat_text(rotation=[1]), "expected cuboids with three numbers each"),
+    ],
+)
+def test_a_wrong_export_of_cvat_is_one_clear_line(text: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "default.json").write_text(text)
+    with pytest.raises(InputError, match=message) as caught:
+        WithLabels(Drive(), tmp_path / "default.json")
     assert "\n" not in str(caught.value)
 
 

@@ -15,6 +15,7 @@ from small_fleet import write_fleet
 
 from bevcli.config import load_config
 from bevcli.errors import BevcliError, ConfigError, InputError
+from bevcli.sequences.native.folder import FolderSequence
 from bevcli.synth.drives import FolderDrives
 from bevcli.synth.options import DriveOptions
 from bevcli.synth.splits import read_split, scored_drives
@@ -124,6 +125,14 @@ def test_rendered_drives_are_as_long_as_a_clip(prepare: Callable[..., TrainingJo
         prepare(rendered=(1, 2), changes={"clips.frames": "21"})
 
 
+def test_boxes_of_a_format_without_a_table_are_counted(fleet: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config, data = load_config(fleet / "mini.toml"), DriveOptions(data=(fleet / "d000",))
+    config = replace(config, classes=("car", "Rad"))
+    expected = check_scored_drives(data, scored_drives(data, config), config)
+    monkeypatch.setattr(FolderSequence, "class_counts", {})
+    assert check_scored_drives(data, scored_drives(data, config), config) == expected
+
+
 def test_scored_drives_have_notes_too(fleet: Path) -> None:
     config = replace(load_config(fleet / "mini.toml"), classes=("car", "Rad"))
     data = DriveOptions(data=(fleet / "d000",))
@@ -161,10 +170,35 @@ def test_a_star_stands_for_folders_in_order(fleet: Path) -> None:
     assert [path.name for path in read_split(file).train] == ["d000", "d001", "d002", "d003"]
 
 
+def test_a_seed_draws_a_split_whatever_the_order(fleet: Path) -> None:
+    def drawn(text: str, seed: int) -> list[str]:
+        file = fleet / "drawn.toml"
+        file.write_text(f"drives = {text}\nvalidate_share = 0.4\nseed = {seed}\n")
+        split = read_split(file)
+        assert len({*split.train, *split.validate}) == 4
+        return sorted(path.name for path in split.validate)
+
+    splits = [drawn('["d00?"]', seed) for seed in range(8)]
+    assert {len(split) for split in splits} == {2}
+    assert len({tuple(split) for split in splits}) > 1
+    assert [drawn('["d003", "d001", "d002", "d000"]', seed) for seed in range(8)] == splits
+
+
+def test_batch_norms_kept_from_random_weights_are_said(prepare: Callable[..., TrainingJob]) -> None:
+    notes = prepare("d000", "d001", changes={"freeze_batch_norm": "true"}).notes
+    assert any("starts from random weights, but its file keeps the statistics of batch norms" in note for note in notes)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('train = ["d000"]\n', "expected the keys train and validate, found train"),
+        ('train = ["d000"]\n', "expected the keys train and validate, or drives, validate_share, seed, found train"),
+        (
+            'drives = ["d00?"]\nvalidate_share = 1\nseed = 0',
+            "validate_share: expected a number between 0 and 1, found 1",
+        ),
+        ('drives = ["d00?"]\nvalidate_share = 0.5\nseed = "a"', "seed: expected an integer, found 'a'"),
+        ('drives = ["d000"]\nvalidate_share = 0.5\nseed = 0', "leaves no drive to score on"),
         ('train = ["d000"]\nvalidate = []\n', "validate: leaves no drive"),
         ('train = ["d000"]\nvalidate = ["d9*"]\n', r"validate: d9\*: there is no such folder"),
         ('train = ["d000"]\nvalidate = ["./d000"]\n', "d000 stands there twice"),

@@ -49,7 +49,7 @@ def test_the_file_trains_as_it_is_and_states_facts_and_cost(fleet: Path) -> None
     config, training = load_config(path), load_table(path, TRAINING, TrainingConfig)
     assert (config.name, config.classes, config.image.size) == ("my model", ("car", "Fahrrad"), (80, 45))
     assert (config.bev_grid.y_range_m, config.rate_hz, config.heads) == ((-21, 21), 2.0, ("detection",))
-    assert (training.held_out, training.clips.frames) == (1, 3)
+    assert (training.held_out, training.clips.frames, training.freeze_batch_norm) == (1, 3, True)
     assert config.training_rigs.cameras == (6, 6)
     comments = [line.removeprefix("# ") for line in path.read_text().splitlines() if line.startswith("# ")]
     assert comments == lines

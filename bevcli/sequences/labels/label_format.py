@@ -1,6 +1,6 @@
 """LabelFormat: a format of labels, found through the entry points `bevcli.label_formats`."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -12,6 +12,8 @@ from bevcli.registry import entries, load
 from bevcli.sequences.options import LabelOptions
 
 GROUP = "bevcli.label_formats"
+FIRST_BYTES = 4096
+LARGEST_TILT_DEG = 5.0
 FrameOfReference = Literal["world", "ego", "bev"]
 
 
@@ -38,7 +40,7 @@ class Labels:
         frame_of_reference: of all boxes.
         frames: in the order of the file.
         lists_empty: frames without boxes are in the file, too. If not, a frame of the drive that the file does not
-            have is labelled and empty.
+            have may be empty or not labelled.
         notes: what was assumed, for the user.
     """
 
@@ -61,6 +63,20 @@ class LabelFormat:
     name: str
     recognises: Callable[[Path], bool]
     read: Callable[[Path, CameraRig, LabelOptions], Labels]
+
+
+def is_json_with(path: Path, key: str) -> bool:
+    """True for a .json file with a key, in quotes, in its first 4 KiB."""
+    if path.suffix.lower() != ".json" or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return key.encode() in file.read(FIRST_BYTES)
+
+
+def tilt_note(tilts_deg: Iterable[float]) -> tuple[str, ...]:
+    """A note about cuboids that are not upright, if there are any."""
+    tilted = sum(tilt > LARGEST_TILT_DEG for tilt in tilts_deg)
+    return (f"{tilted} cuboids are tilted by more than {LARGEST_TILT_DEG:g}°: their boxes are upright",) * bool(tilted)
 
 
 def read_labels(path: Path, rig: CameraRig, options: LabelOptions) -> Labels:

@@ -11,14 +11,20 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.parsing.files import MIB, read_bytes
-from bevcli.sequences.labels.label_format import FrameOfReference, LabelFormat, LabelledFrame, Labels
+from bevcli.sequences.labels.label_format import (
+    FrameOfReference,
+    LabelFormat,
+    LabelledFrame,
+    Labels,
+    is_json_with,
+    tilt_note,
+)
 
 LARGEST_BYTES = 1024 * MIB
 # Names of coordinate systems -> our frames; those with other names need a transform, which is not read.
 SYSTEMS: Mapping[str, FrameOfReference] = {
     "world": "world", "odom": "world", "ego": "ego", "vehicle-iso8855": "ego", "bev": "bev",
 }  # fmt: skip
-LARGEST_TILT_DEG = 5.0
 
 
 class _Value(msgspec.Struct):
@@ -84,9 +90,7 @@ def read_openlabel(path: Path) -> Labels:
         raise InputError(f"{path}: expected all cuboids in one of {', '.join(SYSTEMS)}, found {found}")
     tilts: list[float] = []
     frames = tuple(_frame(path, content, number, frame, tilts) for number, frame in content.frames.items())
-    tilted = sum(tilt > LARGEST_TILT_DEG for tilt in tilts)
-    note = f"{tilted} cuboids are tilted by more than {LARGEST_TILT_DEG:g}°: their boxes are upright"
-    return Labels(SYSTEMS[systems.pop()], frames, lists_empty=True, notes=(note,) if tilted else ())
+    return Labels(SYSTEMS[systems.pop()], frames, lists_empty=True, notes=tilt_note(tilts))
 
 
 def _cuboids(content: _Content) -> list[tuple[str, str, _Cuboid]]:
@@ -149,6 +153,6 @@ def _time_ns(where: str, stated: str | int | float | None) -> int | None:
 
 FORMAT = LabelFormat(
     "an OpenLABEL file (.json)",
-    lambda path: path.suffix.lower() == ".json",
+    lambda path: is_json_with(path, '"openlabel"'),
     lambda path, rig, options: read_openlabel(path),
 )

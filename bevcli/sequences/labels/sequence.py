@@ -1,18 +1,20 @@
 """A drive with the ground truth of a file of labels."""
 
+import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence as Items
 from dataclasses import replace
-from itertools import groupby
+from itertools import groupby, pairwise
 from pathlib import Path
 
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.frame import DerivedSequence, Frame, Sequence
+from bevcli.frame import DerivedSequence, Frame, FrameStamp, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.sequences.labels.label_format import LabelledFrame, Labels, read_labels
-from bevcli.sequences.options import LabelOptions
+from bevcli.sequences.options import LabelOptions, UnlistedFrames
+from bevcli.sequences.selection import scenes_of
 from bevcli.sequences.tracks import with_track_velocities
 
 NEAREST_NS = 50_000_000  # largest difference between the time of a frame and of its labels
@@ -35,7 +37,9 @@ class WithLabels(DerivedSequence):
         if labels.frame_of_reference == "world" and not sequence.has_ego_motion:
             raise InputError(f"{path}: its boxes are in the world frame, but the drive has no ego_motion.csv: add it")
         boxes, note = _with_velocities(sequence, _in_world(sequence, labels, path))
-        self._boxes, self._others_unknown = boxes, labels.lists_empty or options.only_labelled
+        unlisted = "unlabelled" if labels.lists_empty else options.unlisted_frames
+        labelled = _labelled_places(sequence.stamps, boxes, unlisted)
+        self._listed, self._boxes = len(boxes), {place: Boxes3D.empty() for place in labelled} | boxes
         notes = (*labels.notes, *note, self._summary())
         self.notes = (*sequence.notes, *(f"{path}: {text}" for text in notes))
 
@@ -51,16 +55,38 @@ class WithLabels(DerivedSequence):
         return self._labelled(self.sequence.load(place), place)
 
     def _labelled(self, frame: Frame, place: int) -> Frame:
-        return replace(frame, ground_truth=self._boxes.get(place, None if self._others_unknown else Boxes3D.empty()))
+        return replace(frame, ground_truth=self._boxes.get(place))
 
     def _summary(self) -> str:
         counts = ", ".join(f"{name} ({count})" for name, count in sorted(self.class_counts.items()))
-        text = f"{len(self._boxes)} frames with boxes: {counts or 'none'}"
-        others = len(self.stamps) - len(self._boxes)
-        if others:
-            rest = "have no ground truth" if self._others_unknown else "count as empty (see `only_labelled`)"
-            text += f"; {others} frames without boxes {rest}"
-        return text
+        parts = [f"{self._listed} frames with labels: {counts or 'none'}"]
+        empty, unlabelled = len(self._boxes) - self._listed, len(self.stamps) - len(self._boxes)
+        if empty:
+            parts.append(f"{empty} frames without rows are empty (see `unlisted_frames`)")
+        if unlabelled:
+            parts.append(f"{unlabelled} frames are not labelled: they have no ground truth")
+        return "; ".join(parts)
+
+
+def _labelled_places(stamps: Items[FrameStamp], listed: Collection[int], unlisted: UnlistedFrames | None) -> set[int]:
+    """The places of labelled frames, with or without boxes.
+
+    If a file lists no two successive frames, the labelling tool was given every n-th frame of a scene: the largest n
+    that all listed frames fit. Otherwise every frame is labelled.
+
+    listed: the places that the file has. unlisted: the user's choice for the others; None to decide as above.
+    """
+    scenes = list(scenes_of(stamps))
+    if unlisted == "unlabelled":
+        return set(listed)
+    if unlisted == "empty" or any(a in listed and b in listed for scene in scenes for a, b in pairwise(scene)):
+        return set(range(len(stamps)))
+    labelled: set[int] = set()
+    for scene in scenes:
+        found = [number for number, place in enumerate(scene) if place in listed]
+        step = math.gcd(*(other - one for one, other in pairwise(found))) or len(scene)
+        labelled.update(scene[found[0] % step :: step] if found else ())
+    return labelled
 
 
 def _in_world(sequence: Sequence, labels: Labels, path: Path) -> dict[int, Boxes3D]:

@@ -24,4 +24,4 @@ FORMAT = Format(
     precedence=-10,
 )
 
-OUTPUT = OutputFormat("a sequence folder", "bevcli.sequences.native.writer:write_native")
+OUTPUT = OutputFormat("a sequence folder", "bevcli.sequences.native.writer:write_native", keeps_maps=True)

@@ -1,0 +1,32 @@
+"""Lines on the ground in videos: opaque ones hide what is below, faint ones let it through."""
+
+import numpy as np
+
+from bevcli.viewer.video_frame import draw_faded_strips
+
+GREEN = 0x00FF0000  # RGB, without opacity
+
+
+class Recorded:
+    """One horizontal line on a row, with a colour."""
+
+    def __init__(self, opacity: int) -> None:
+        strips = [[[2.0, 5.0], [17.0, 5.0]]]
+        self.components = {"LineStrips2D:strips": strips, "LineStrips2D:colors": [GREEN | opacity]}
+
+    def values(self, entity: str, component: str) -> list:
+        return self.components[component]
+
+
+def green_of(opacity: int) -> int:
+    canvas = np.full((11, 20, 3), 40, dtype=np.uint8)
+    draw_faded_strips(canvas, Recorded(opacity), "lines", lambda points: points)
+    return int(canvas[5, 10, 1])
+
+
+def test_lines_in_videos_have_their_opacity():
+    opaque = green_of(255)
+    assert opaque > 200  # its edge is smoothed
+    assert green_of(0) == 40  # invisible
+    shares = [(green_of(opacity) - 40) / (opaque - 40) for opacity in (51, 128)]
+    np.testing.assert_allclose(shares, [0.2, 0.5], atol=0.11)  # drawn in tenths
