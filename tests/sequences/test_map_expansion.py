@@ -127,7 +127,7 @@ def test_a_root_is_ground_truth_of_lines_futures_and_plans(root: Path, tmp_path:
 def test_missing_or_wrong_maps_are_named(root: Path, tmp_path: Path) -> None:
     run, bare = perfect_run(root, tmp_path / "run"), tmp_path / "bare"
     write_tables(bare / "v1.0-mini", Size(scenes=1, samples=8, objects=2))
-    with pytest.raises(InputError, match=r"scene-0001.* has no true lines .*expected the map expansion in .*/expansion"):
+    with pytest.raises(InputError, match=r"scene-0001.* has no true lines .*the map expansion in .*/expansion"):
         evaluate(run, bare, driving=["map"])
     (bare / "v1.0-mini" / "log.json").write_text(json.dumps([{"token": token(9, 0), "location": "here"}]))
     (bare / "maps" / "expansion").mkdir(parents=True)
