@@ -33,8 +33,8 @@ def two_cameras(rig):
 
 @pytest.fixture(scope="module")
 def street():
-    """Seven frames of the street with two of its cameras, one turned by 2.3°, the other 15 cm too high."""
-    drive = bevcli.open_sequence(STREET, frames=slice(5, 12), ground_truth=False)
+    """Eight frames of the street with two of its cameras, one turned by 2.3°, the other 15 cm too high."""
+    drive = bevcli.open_sequence(STREET, frames=slice(5, 13), ground_truth=False)
     right = two_cameras(drive.rig)
     wrong = wrong_rig(right, TURNED, (1.0, -2.0, 0.5), (0, 0, 0))
     wrong = wrong_rig(wrong, LOW, (0, 0, 0), (0, 0, 0.15))
