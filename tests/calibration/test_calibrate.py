@@ -80,7 +80,8 @@ def test_errors_are_within_four_standard_deviations(street, result):
     ],
 )
 def test_lens_distortion_is_respected(street, lens, zoom):
-    drive, right, wrong = street
+    _, right, wrong = street
+    drive = bevcli.open_sequence(STREET, frames=slice(5, 17), ground_truth=False)
     seen = ThroughLens(WrongRig(drive, right), lens, zoom)
     poses = {each.name: each.ego_from_camera for each in wrong.cameras}
     stated = tuple(replace(each, ego_from_camera=poses[each.name]) for each in seen.rig.cameras)
