@@ -1,18 +1,19 @@
 """`check_exported`: runs a drive through an exported file and through our model, and compares what they compute."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from bevcli.engines.box_differences import CENTER, NEAR_M
-from bevcli.engines.exported import load_exported
+from bevcli.engines.exported import ExportedModel, ExportedOutputs, load_exported
 from bevcli.frame import Sequence
 from bevcli.inference.load import Model
 from bevcli.inference.paired_steps import paired_steps
 from bevcli.inference.preprocess import Preprocessor
+from bevcli.model.export_form import ExportForm
 from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.segmentation import SegmentationOutputs
 from bevcli.model.step import ModelOutputs
@@ -31,6 +32,7 @@ class FrameDifference:
         near: share of the box centres that differ by at most 0.1 m, 0 to 1.
         code: of the other numbers of the box codes: logarithms of sizes, sine and cosine, m/s.
         masks: of the probabilities of the map's cells; 0 without segmentation.
+        further: of each output that only this model has, by its name in the file.
     """
 
     frame: int
@@ -40,6 +42,7 @@ class FrameDifference:
     near: float
     code: float
     masks: float
+    further: Mapping[str, float] = field(default_factory=dict)
 
 
 def check_exported(
@@ -64,15 +67,15 @@ def compare_exported(file: Path, other: Path, sequence: Sequence, engine: str) -
     yield from _differences((load_exported(other, engine), load_exported(file, engine)), sequence)
 
 
-def _differences(networks: tuple[TemporalModel, TemporalModel], sequence: Sequence) -> Iterator[FrameDifference]:
+def _differences(networks: tuple[TemporalModel, ExportedModel], sequence: Sequence) -> Iterator[FrameDifference]:
     preprocess = Preprocessor(networks[1].config)  # of the exported file, whose images have one size
     frames = (preprocess(sequence.load(place)) for place in range(len(sequence.stamps)))
     for prepared, ours, theirs in paired_steps(*networks, frames):
-        yield compare_outputs(prepared.frame.stamp.index, ours, theirs)
+        yield compare_outputs(prepared.frame.stamp.index, ours, theirs, networks[1].form)
 
 
-def compare_outputs(frame: int, ours: ModelOutputs, theirs: ModelOutputs) -> FrameDifference:
-    """The largest differences of the last decoder layer, the BEV map and the segmentation of a frame."""
+def compare_outputs(frame: int, ours: ModelOutputs, theirs: ModelOutputs, form: ExportForm) -> FrameDifference:
+    """The largest differences of the last layers and the BEV map of a frame."""
     codes = (ours.box_codes[-1] - theirs.box_codes[-1]).abs()
     distances = codes[..., CENTER].norm(dim=-1)
     others = [index for index in range(codes.shape[-1]) if index not in CENTER]
@@ -85,19 +88,28 @@ def compare_outputs(frame: int, ours: ModelOutputs, theirs: ModelOutputs) -> Fra
         near=(distances <= NEAR_M).float().mean().item(),
         code=codes[..., others].max().item(),
         masks=_largest(*probabilities) if len(probabilities) == 2 else 0.0,
+        further={name: _largest(*both) for name, both in _further(form, ours, theirs).items()},
     )
 
 
 def difference_lines(differences: list[FrameDifference]) -> list[str]:
     """A table, one line a frame, and the largest of each column; of the share of boxes, the smallest."""
     columns = ("bev", "logits", "box_m", "code", "masks")
-    rows = [
-        (str(row.frame), *(f"{getattr(row, name):.1e}" for name in columns), f"{row.near:.1%}") for row in differences
-    ]
-    worst = (f"{max(getattr(row, name) for row in differences):.1e}" for name in columns)
-    largest = ("largest", *worst, f"{min(row.near for row in differences):.1%}")
-    heads = ("frame", "BEV map", "logits", "centres m", "codes", "masks", "in 0.1 m")
-    return ["  ".join(f"{text:>9}" for text in row) for row in (heads, *rows, largest)]
+    numbers = [(*(getattr(row, name) for name in columns), *row.further.values()) for row in differences]
+    written = [[f"{number:.1e}" for number in row] for row in (*numbers, map(max, zip(*numbers, strict=True)))]
+    near = [row.near for row in differences]
+    firsts = [*((str(row.frame), f"{row.near:.1%}") for row in differences), ("largest", f"{min(near):.1%}")]
+    heads = ("frame", "in 0.1 m", "BEV map", "logits", "centres m", "codes", "masks", *differences[0].further)
+    rows = [heads, *((*first, *row) for first, row in zip(firsts, written, strict=True))]
+    widths = [max(9, len(head)) for head in heads]
+    return ["  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)) for row in rows]
+
+
+def _further(form: ExportForm, *steps: ModelOutputs) -> dict[str, tuple[Tensor, ...]]:
+    """Both versions of each output that only this model has."""
+    outputs = (form.model_outputs(one, one.found) if isinstance(one, ExportedOutputs) else one for one in steps)
+    named = [form.further_outputs(one) for one in outputs]
+    return {name: tuple(one[name] for one in named) for name in named[0]}
 
 
 def _probabilities(segmentation: SegmentationOutputs) -> Tensor:

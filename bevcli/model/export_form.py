@@ -67,6 +67,10 @@ class ExportForm:
         """The outputs as the model's own decoders take them. found: all outputs of the file by name."""
         return outputs
 
+    def further_outputs(self, outputs: ModelOutputs) -> dict[str, Tensor]:
+        """The outputs that only this model has, by their names in the file. outputs: as of `model_outputs`."""
+        return {}
+
     def decode_boxes(self, outputs: ModelOutputs) -> Boxes3D:
         """As `TemporalModel.decode_boxes`, of `model_outputs`."""
         return decode(outputs, self.config)[0]

@@ -10,6 +10,7 @@ import pytest
 import torch
 from memory_drive import MemorySequence
 
+from bevcli.benchmark.exported import FrameDifference, check_exported, difference_lines
 from bevcli.engines.export_onnx import export_onnx
 from bevcli.engines.exported import load_exported
 from bevcli.inference.load import Model
@@ -44,6 +45,11 @@ def test_an_exported_vad_equals_the_model(model: VAD, tmp_path: Path) -> None:
     export_onnx(model, file)
     exported = load_exported(file, "onnxruntime")
     drive = MemorySequence(3)
+    *_, last = check_exported(file, Model(model), drive)
+    assert last.further.keys() == {
+        "line_class_logits", "line_points", "future_offsets", "mode_logits", "plan_offsets"
+    }  # fmt: skip
+    assert max(last.further.values()) < 1e-3
     for (_, ours), (_, theirs) in zip(
         run(Model(model), drive), run(Model(exported, engine="onnxruntime"), drive), strict=True
     ):
@@ -53,3 +59,12 @@ def test_an_exported_vad_equals_the_model(model: VAD, tmp_path: Path) -> None:
         np.testing.assert_allclose(np.stack(lines.points), np.stack(our_lines.points), atol=1e-2)
         assert (lines.classes == our_lines.classes).all()
         np.testing.assert_allclose(plan.paths, our_plan.paths, atol=1e-2)
+
+
+def test_differences_of_further_outputs_have_columns() -> None:
+    frames = [
+        FrameDifference(frame, 0, 0, 0, 1, 0, 0, {"plan_offsets": value}) for frame, value in ((3, 0.5), (4, 0.1))
+    ]
+    heads, *rows = (line.split() for line in difference_lines(frames))
+    assert heads[-1] == "plan_offsets"
+    assert [(row[0], row[-1]) for row in rows] == [("3", "5.0e-01"), ("4", "1.0e-01"), ("largest", "5.0e-01")]

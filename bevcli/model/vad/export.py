@@ -23,8 +23,7 @@ class VADStep(RecurrentStep):
     def outputs(self, bev: Tensor, most_cameras: Tensor) -> tuple[Tensor, ...]:
         """The outputs in the order of `VADForm.outputs`."""
         found = self.network.detect(bev)
-        logits, codes, lines, motion = found.class_logits[-1], found.box_codes[-1], found.lines, found.motion
-        of_heads = (lines.class_logits[-1], lines.points[-1], motion.offsets, motion.mode_logits, found.plan)
+        logits, codes, of_heads = found.class_logits[-1], found.box_codes[-1], _of_heads(found).values()
         boxes = decode_boxes(logits, codes, self.config) if self.decode else ()
         return (bev, logits, codes, most_cameras, *of_heads, *boxes)
 
@@ -46,6 +45,10 @@ class VADForm(RecurrentForm):
         parts = outputs.bev, outputs.class_logits, outputs.box_codes
         return VADOutputs(*parts, lines=lines, motion=motion, plan=found["plan_offsets"])
 
+    def further_outputs(self, outputs: ModelOutputs) -> dict[str, Tensor]:
+        assert isinstance(outputs, VADOutputs)
+        return _of_heads(outputs)
+
     def decode_boxes(self, outputs: ModelOutputs) -> Boxes3D:
         assert isinstance(outputs, VADOutputs)
         return decode_futures(outputs, self.config)
@@ -53,6 +56,18 @@ class VADForm(RecurrentForm):
     def decode_results(self, outputs: ModelOutputs) -> tuple[FrameResult, ...]:
         assert isinstance(outputs, VADOutputs)
         return decode_lines(outputs, self.config), decode_plan(outputs, self.config)
+
+
+def _of_heads(outputs: VADOutputs) -> dict[str, Tensor]:
+    """The outputs of `_ports`."""
+    lines, motion = outputs.lines, outputs.motion
+    return {
+        "line_class_logits": lines.class_logits[-1],
+        "line_points": lines.points[-1],
+        "future_offsets": motion.offsets,
+        "mode_logits": motion.mode_logits,
+        "plan_offsets": outputs.plan,
+    }
 
 
 def _ports(config: VADConfig) -> Iterator[Port]:
