@@ -18,6 +18,7 @@ from bevcli.model.scene_attention import SceneAttention
 
 WEIGHT_COLORS = LinearSegmentedColormap.from_list("weight", ["#d3d7de", "#f5b39a", ACCENT, "#6d0f23"])
 LISTED = 8  # rows of a table of weights
+LEAST = 1e-9  # the scale of weights that are all 0
 SURE = 0.5  # lines with a lower score are dashed
 ROW = tuple[float, str, float | None, Array | None]  # weight, name, score, place
 
@@ -64,40 +65,48 @@ def _figure(trace: Trace, attention: SceneAttention, chosen: int | None, title: 
     )
     for place, (name, weights, draw) in enumerate(sides):
         axes = drawing.bev_panel(figure, spec[place], trace, f"{name} by weight", y_labels=place == 0)
-        most = max(float(weights.max()), 1e-9)
+        most = max(float(weights.max()), LEAST)
         scale = ScalarMappable(Normalize(0, most), WEIGHT_COLORS)
-        draw(axes, attention, scale)
+        draw(axes, attention)
         _draw_paths(axes, attention, chosen)
         bounds = axes.get_position()
         bar = drawing.color_bar(figure, scale, (bounds.x1 + 0.006, bounds.y0 + 0.02, 0.008, 0.22), (0, most / 2, most))
         bar.ax.yaxis.set_major_formatter(lambda weight, _: f"{100 * weight:.1f} %")
     _draw_table(figure.add_subplot(spec[2]), attention)
-    figure.text(0.68, 0.075, "Dashed: lines with a score below 0.5. Places of lines: their middle\n"
-                "point. Blue: paths; the dots are the steps.", fontsize=11, color=GREY, linespacing=1.5)  # fmt: skip
+    note = f"Dashed: lines with a score below {SURE:g}; places in the table: middle points. Blue: paths, a dot a step."
+    figure.text(0.045, 0.008, note, fontsize=11, color=GREY)
     return figure
 
 
-def _draw_objects(axes: Axes, attention: SceneAttention, scale: ScalarMappable) -> None:
+def _draw_objects(axes: Axes, attention: SceneAttention) -> None:
     for place in np.argsort(attention.object_weights):  # the largest on top
-        color = to_hex(scale.to_rgba(attention.object_weights[place]))
+        color = _color(attention.object_weights, place)
         drawing.outline_boxes(axes, attention.objects[[place]], color, width=_width(attention.object_weights, place))
     if attention.attending is not None:
         drawing.outline_boxes(axes, attention.objects[[attention.attending]], SECOND, width=2.6, halo=True)
 
 
-def _draw_lines(axes: Axes, attention: SceneAttention, scale: ScalarMappable) -> None:
+def _draw_lines(axes: Axes, attention: SceneAttention) -> None:
     scores = attention.lines.scores
     assert scores is not None
     for place in np.argsort(attention.line_weights):
         style = "-" if scores[place] >= SURE else (0, (3, 2))
-        color, width = to_hex(scale.to_rgba(attention.line_weights[place])), _width(attention.line_weights, place)
+        color, width = _color(attention.line_weights, place), _width(attention.line_weights, place)
         axes.plot(*attention.lines.points[place].T, color=color, lw=width, ls=style, zorder=5)
     if attention.attending is not None:
         drawing.outline_boxes(axes, attention.objects[[attention.attending]], SECOND, width=2.6, halo=True)
 
 
+def _share(weights: Array, place: int) -> float:
+    return float(weights[place] / max(weights.max(), LEAST))
+
+
+def _color(weights: Array, place: int) -> str:
+    return str(to_hex(WEIGHT_COLORS(_share(weights, place))))
+
+
 def _width(weights: Array, place: int) -> float:
-    return 0.8 + 2.4 * float(weights[place] / max(weights.max(), 1e-9))
+    return 0.8 + 2.4 * _share(weights, place)
 
 
 def _draw_paths(axes: Axes, attention: SceneAttention, chosen: int | None) -> None:
