@@ -18,7 +18,7 @@ from bevcli.model.scene_attention import SceneAttention
 
 WEIGHT_COLORS = LinearSegmentedColormap.from_list("weight", ["#d3d7de", "#f5b39a", ACCENT, "#6d0f23"])
 LISTED = 8  # rows of a table of weights
-LEAST = 1e-9  # the scale of weights that are all 0
+LEAST = 0.01  # of the largest weight of a scale: lower ones must not look large
 SURE = 0.5  # lines with a lower score are dashed
 ROW = tuple[float, str, float | None, Array | None]  # weight, name, score, place
 
