@@ -31,6 +31,8 @@ ALLOWED = {
     ("model/kernels/compiled.py", "ThreadPoolExecutor"): "the tasks only compute",
     ("model/kernels/compiled.py", "future.result"): "the tasks only compute",
     ("synth/drive.py", "ThreadPoolExecutor"): "the tasks only compute",
+    ("synth/workers.py", "process.join"): "the process was killed",
+    ("synth/workers.py", "connection.recv"): "the connection has something to read, or its process has ended",
     ("robustness/sequences.py", "ThreadPoolExecutor"): "the tasks only compute",
     ("calibration/matches.py", "ThreadPoolExecutor"): "the tasks only compute",
     ("calibration/heights.py", "ThreadPoolExecutor"): "the tasks only compute",

@@ -38,7 +38,7 @@ def calibrate(
     from bevcli.sequences.open import open_sequence
     from bevcli.writing import check_output
 
-    drive = open_sequence(sequence, source, ground_truth=False, **format_options)
+    drive = open_sequence(sequence, source, ego_motion="optional", ground_truth=False, **format_options)
     out = output.out or Path("runs") / f"{drive.name}-calibrate"
     check_output(out / "calibration.json", sequence / "calibration.json")
     with Progress(STEPS, "steps", drive.notes) as progress:

@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -77,8 +77,6 @@ class ExportedOutputs(ModelOutputs):
     Attributes:
         found: every output of the file by name.
     """
-
-    stays_on_device: ClassVar[bool] = True  # it is on the CPU
 
     found: Mapping[str, Tensor] = field(default_factory=dict)
 

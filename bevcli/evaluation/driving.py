@@ -20,7 +20,7 @@ from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.files.json_fields import pose_from_json
-from bevcli.sequences.files.lines_file import TRUE_LINES, LinesFile, LinesWriter, read_lines
+from bevcli.sequences.files.lines_file import LinesFile, LinesWriter, read_lines
 from bevcli.sequences.files.plan_file import PlanWriter, read_plans
 
 Scored = Literal["map", "motion", "plan"]
@@ -39,24 +39,23 @@ class DrivingScores:
 
 
 def evaluate_driving(
-    asked: Sequence[Scored], files: tuple[Path, Path], found: ScoredInput, truth: ScoredInput, pairs: FramePairs
+    asked: Sequence[Scored], predictions: Path, found: ScoredInput, truth: ScoredInput, pairs: FramePairs
 ) -> DrivingScores:
     """Score what is asked for.
 
-    files: predictions and ground truth, each a folder or a file in it. Raises InputError where a side lacks it.
+    predictions: a folder, or a file in it. Raises InputError where a side lacks what is asked for.
     """
-    folders = tuple(path if path.is_dir() else path.parent for path in files)
+    folder = predictions if predictions.is_dir() else predictions.parent
     scores = DrivingScores()
     if "map" in asked:
-        scores = replace(
-            scores, lines=_lines(read_lines(folders[0] / LinesWriter.name), _true_lines(folders[1]), pairs)
-        )
+        assert truth.lines is not None
+        scores = replace(scores, lines=_lines(read_lines(folder / LinesWriter.name), truth.lines(), pairs))
     if "motion" in asked:
         _require_world(pairs, "motion")
         scores = replace(scores, motion=_motion(found, truth, pairs))
     if "plan" in asked:
         _require_world(pairs, "plan")
-        plan, notes = _plan(folders[0] / PlanWriter.name, found, truth, pairs)
+        plan, notes = _plan(folder / PlanWriter.name, found, truth, pairs)
         scores = replace(scores, plan=plan, notes=notes)
     return scores
 
@@ -73,13 +72,6 @@ def _drives(truth: ScoredInput) -> Drives:
             f"(found the {truth.boxes.frame_of_reference} frame)"
         )
     return Drives(truth.boxes.frames)
-
-
-def _true_lines(folder: Path) -> LinesFile:
-    file = folder / TRUE_LINES
-    if not file.exists():
-        raise InputError(f"{file}: `map`: the file is missing (expected true lines, as `bevcli render` writes them)")
-    return read_lines(file)
 
 
 def _lines(found: LinesFile, true: LinesFile, pairs: FramePairs) -> LineScores:

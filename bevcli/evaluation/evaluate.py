@@ -128,7 +128,7 @@ def evaluate(
     limits = _range_notes(max_range, model_range, pairs)
     of_classes = [] if are_nuscenes(classes) else [OWN_CLASSES]
     of_classes += _other_class_notes(pairs, classes)
-    drives = evaluate_driving(driving, (Path(predictions), Path(ground_truth)), found, truth, pairs)
+    drives = evaluate_driving(driving, Path(predictions), found, truth, pairs)
     notes = (*pairs.notes, *map_notes, *of_classes, *limits, *_detection_notes(detection), *track_notes)
     return Scores(pairs, config, detection, segmentation, tracks, (*notes, *drives.notes), drives)
 

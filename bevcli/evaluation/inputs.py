@@ -1,7 +1,8 @@
 """Reads predictions and ground truth from files, folders or a nuScenes root."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +10,13 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.evaluation.pairing import FramePairs
 from bevcli.evaluation.submission import is_submission, read_submission
-from bevcli.frame import FrameStamp
+from bevcli.frame import LINE_CLASSES, FrameStamp, Ground, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import Pose, apply, rigid, rotation_about_z
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes
 from bevcli.sequences.files.class_names import ClassNames
+from bevcli.sequences.files.lines_file import TRUE_LINES, FrameLines, LinesFile, read_lines
 from bevcli.sequences.files.map_folder import MapFolder, open_maps
 from bevcli.sequences.format import formats
 from bevcli.sequences.nuscenes.cache import open_index
@@ -33,11 +35,13 @@ class ScoredInput:
         boxes: by frame.
         maps: None where there is no folder of maps.
         bicycle_racks: by sample token, in the world frame; only of a nuScenes root.
+        lines: reads the true lines of the map, and raises InputError without them; None of predictions.
     """
 
     boxes: BoxesFile
     maps: MapFolder | None = None
     bicycle_racks: Mapping[str, Boxes3D] = field(default_factory=dict)
+    lines: Callable[[], LinesFile] | None = None
 
 
 def open_predictions(path: Path, class_map: Mapping[str, str] | None = None) -> ScoredInput:
@@ -81,7 +85,7 @@ def open_ground_truth(
         if not kept:
             raise InputError(f'{file}: has no scene "{scene}"')
         boxes = replace(boxes, frames=kept)
-    return ScoredInput(boxes, _maps_next_to(file, "ground_truth_map"))
+    return ScoredInput(boxes, _maps_next_to(file, "ground_truth_map"), lines=partial(_lines_next_to, file))
 
 
 def without_cycles_in_racks(pairs: FramePairs, bicycle_racks: Mapping[str, Boxes3D]) -> FramePairs:
@@ -113,6 +117,26 @@ def _maps_next_to(file: Path, name: str) -> MapFolder | None:
     return open_maps(folder) if folder.is_dir() else None
 
 
+def _lines_next_to(file: Path) -> LinesFile:
+    lines = file.with_name(TRUE_LINES)
+    if not lines.exists():
+        raise InputError(f"{lines}: `map`: the file is missing (expected true lines, as `bevcli render` writes them)")
+    return read_lines(lines)
+
+
+def _lines_of(open_drive: Callable[[], Sequence], expected: str) -> LinesFile:
+    """The true lines of a drive in the world frame. expected: what would have them."""
+    drive, frames = open_drive(), []
+    for place in range(len(drive.stamps)):
+        frame = drive.ground_truth_frame(place)
+        if (lines := frame.ground_truth_lines) is None:
+            where = f'scene "{frame.stamp.scene}"' if frame.stamp.scene else f"frame {frame.stamp.index}"
+            raise InputError(f"{drive.name}: `map`: {where} has no true lines of the map (expected {expected})")
+        ground = Ground(frame.stamp, frame.rig.ego_from_bev, frame.world_from_ego)
+        frames.append(FrameLines(frame.stamp, replace(lines, points=tuple(map(ground.points, lines.points)))))
+    return LinesFile("world", LINE_CLASSES, tuple(frames))
+
+
 def _open_nuscenes(root: Path, options: NuScenesOptions, only: str | None, names: ClassNames) -> ScoredInput:
     tables = tables_of(root, options.version)
     index, _ = open_index(tables)
@@ -122,7 +146,9 @@ def _open_nuscenes(root: Path, options: NuScenesOptions, only: str | None, names
         for sample in range(*index.scenes.first_sample[scene : scene + 2]):
             frames.append(_nuscenes_frame(index, scene, sample, len(frames), tables, names))
             racks[frames[-1].extras["sample_token"]] = index.bicycle_racks(sample)
-    return ScoredInput(BoxesFile("world", tuple(frames)), bicycle_racks=racks)
+    drive = partial(open_sequence, root, scene=only, version=options.version, split=options.split)
+    lines = partial(_lines_of, drive, f"the map expansion in {root / 'maps' / 'expansion'}")
+    return ScoredInput(BoxesFile("world", tuple(frames)), bicycle_racks=racks, lines=lines)
 
 
 def _open_drive(path: Path, options: SequenceOptions) -> ScoredInput:
@@ -137,7 +163,8 @@ def _open_drive(path: Path, options: SequenceOptions) -> ScoredInput:
     ]
     if not found:
         raise InputError(f"{path}: has no ground truth (expected for scoring): score another drive")
-    return ScoredInput(BoxesFile("world", tuple(found)))
+    lines = partial(_lines_of, lambda: drive, "a drive that has them")
+    return ScoredInput(BoxesFile("world", tuple(found)), lines=lines)
 
 
 def _nuscenes_frame(

@@ -138,6 +138,11 @@ def color_of_hex(text: str) -> Color:
     return red, green, blue
 
 
+def hex_of_color(color: Color) -> str:
+    """The text of a colour."""
+    return f"#{bytes(color).hex()}"
+
+
 def object_classes(names: Iterable[str], settings: Mapping[str, ClassSettings]) -> dict[str, ObjectClass]:
     """Classes by name, in the order of the names. Raises ValueError for no or a repeated name, or settings of no class.
 

@@ -4,11 +4,11 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import fields, is_dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from bevcli.model.segmentation import SegmentationOutputs
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.upload import upload
 
@@ -41,23 +41,30 @@ class ImageUploader:
 def read_back(outputs: ModelOutputs, images: Tensor) -> tuple[ModelOutputs, bool]:
     """The last layers' outputs on the CPU, and whether the BEV map, the class logits and the box codes are finite.
 
-    All copies from a CUDA GPU share one wait. The BEV map stays on its device; where `ModelOutputs.stays_on_device`, so
-    does everything. On a CPU the input images must be finite too: the ReLU of oneDNN turns NaN into zero, so NaN in the
-    images may not reach the outputs. Weights are checked when they are read and when they are prepared. Not seen are
-    numbers inside of the backbone that grow beyond the range of their type and that ReLU then turns into zeros.
+    All copies from a CUDA GPU share one wait. What `ModelOutputs.stay_on_device` names stays there. On a CPU the input
+    images must be finite too: the ReLU of oneDNN turns NaN into zero, so NaN in the images may not reach the outputs.
+    Weights are checked when they are read and when they are prepared. Not seen are numbers inside of the backbone that
+    grow beyond the range of their type and that ReLU then turns into zeros.
     """
-    logits, codes = outputs.class_logits[-1:], outputs.box_codes[-1:]
-    checked = [outputs.bev, logits, codes, *([images] if outputs.bev.device.type == "cpu" else [])]
+    last = outputs.last_layers()
+    checked = [last.bev, last.class_logits, last.box_codes, *([images] if last.bev.device.type == "cpu" else [])]
     extremes = torch.stack([end.float() for x in checked for end in _extremes(x)])
-    if outputs.stays_on_device:
-        return outputs, bool(torch.isfinite(extremes).all())
-    found = [logits, codes, extremes]
-    segmentation = outputs.segmentation
-    if segmentation is not None:
-        found += [segmentation.mask_logits[-1:], segmentation.class_logits[-1:], segmentation.locations[-1:]]
-    logits, codes, extremes, *masks = _on_cpu(found)
-    on_cpu = ModelOutputs(outputs.bev, logits, codes, SegmentationOutputs(*masks) if masks else None)
+    moved = {part.name: getattr(last, part.name) for part in fields(last) if part.name not in last.stay_on_device}
+    extremes, *copies = _on_cpu([extremes, *(tensor for _, tensor in _tensors(list(moved.values()), ""))])
+    source = iter(copies)
+    on_cpu = replace(last, **{name: _exchanged(value, source) for name, value in moved.items()})
     return on_cpu, bool(torch.isfinite(extremes).all())
+
+
+def _exchanged(value: Any, tensors: Iterator[Tensor]) -> Any:
+    """The value with other tensors in the place of its own, in the order of `_tensors`."""
+    if isinstance(value, Tensor):
+        return next(tensors)
+    if isinstance(value, tuple | list):
+        return type(value)(_exchanged(part, tensors) for part in value)
+    if is_dataclass(value) and not isinstance(value, type):
+        return replace(value, **{part.name: _exchanged(getattr(value, part.name), tensors) for part in fields(value)})
+    return value
 
 
 def _extremes(tensor: Tensor) -> tuple[Tensor, Tensor]:

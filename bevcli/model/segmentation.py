@@ -86,6 +86,10 @@ class SegmentationOutputs:
     class_logits: Tensor
     locations: Tensor
 
+    def last_layers(self) -> "SegmentationOutputs":
+        """The outputs of the last layers."""
+        return SegmentationOutputs(self.mask_logits[-1:], self.class_logits[-1:], self.locations[-1:])
+
 
 class SegmentationHead(nn.Module):
     """Stuff queries, and thing queries from the location decoder, through one mask decoder."""

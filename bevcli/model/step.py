@@ -1,8 +1,8 @@
 """The data of one step: a preprocessed frame, the tensors that enter a network, and those that leave it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import ClassVar, Protocol
+from dataclasses import dataclass, fields, replace
+from typing import ClassVar, Protocol, Self
 
 import numpy as np
 import torch
@@ -84,19 +84,26 @@ class ModelOutputs:
     """The outputs of one step.
 
     Attributes:
-        stays_on_device: the boxes are decoded on the model's device; else the last layers are copied to the CPU first.
+        stay_on_device: names of the fields that are decoded on the model's device. The last layers of all others are
+            copied to the CPU first.
         bev: (B, Y·X, C), the BEV map.
         class_logits: (L, B, Q, classes) of the L decoder layers.
         box_codes: (L, B, Q, 10): cx, cy, log w, log l, cz, log h, sin, cos, vx, vy; centres in metres, bev frame.
         segmentation: outputs of the segmentation head, None without one.
     """
 
-    stays_on_device: ClassVar[bool] = False
+    stay_on_device: ClassVar[tuple[str, ...]] = ("bev",)
 
     bev: Tensor
     class_logits: Tensor
     box_codes: Tensor
     segmentation: SegmentationOutputs | None = None
+
+    def last_layers(self) -> Self:
+        """The outputs of the last layers, all that results are decoded from."""
+        segmentation = None if self.segmentation is None else self.segmentation.last_layers()
+        logits, codes = self.class_logits[-1:], self.box_codes[-1:]
+        return replace(self, class_logits=logits, box_codes=codes, segmentation=segmentation)
 
 
 class ClipInputs(Protocol):

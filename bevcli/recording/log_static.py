@@ -6,9 +6,11 @@ import numpy as np
 import rerun as rr
 
 from bevcli._version import __version__
+from bevcli.frame import MapLines, Plan
 from bevcli.geometry.bev_grid import BevGrid, rectangle
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Array, apply, inverse
+from bevcli.model.config import ModelConfig
 from bevcli.recording import entities
 from bevcli.recording.box_lines import UNSEEN, labels_2d
 from bevcli.recording.colors import (
@@ -181,23 +183,27 @@ TEXT_COLOR: Color = (225, 228, 235)
 def legend_entries(
     classes: Mapping[str, Color],
     map_classes: Sequence[str] = (),
-    line_classes: Sequence[str] = (),
-    *,
-    plans: bool = False,
+    lines: Sequence[tuple[str, Color]] = (),
 ) -> list[tuple[str, Color]]:
     """The texts and colours of the legend.
 
     Args:
         classes: of the objects, with their colours.
         map_classes: of the model's map; empty without one.
-        line_classes: of the model's lines of the map; empty without these.
-        plans: whether the model plans paths.
+        lines: of `line_entries`.
     """
     of_classes = [(name.replace("_", " "), color) for name, color in classes.items()]
     states = [("ground truth", GROUND_TRUTH_COLOR), ("missed, false", MISSED_COLOR), ("duplicate", DUPLICATE_COLOR)]
     maps = [(f"map: {name.replace('_', ' ')}", color) for name, color in map_colors(map_classes).items()]
-    lines = [(f"line: {name.replace('_', ' ')}", color) for name, color in line_colors(line_classes).items()]
-    return [*of_classes, *states, *maps, *lines, *([("planned path", EGO_COLOR)] if plans else [])]
+    return [*of_classes, *states, *maps, *lines]
+
+
+def line_entries(config: ModelConfig) -> list[tuple[str, Color]]:
+    """The texts and colours of the lines on the ground that a model finds."""
+    of_map = line_colors(config.results.get(MapLines, ()))
+    lines = [(f"line: {name.replace('_', ' ')}", color) for name, color in of_map.items()]
+    plans = [("planned path", EGO_COLOR)] if Plan in config.results else []
+    return [*lines, *plans, *([("futures: colour of the box", TEXT_COLOR)] if config.future_times_s else [])]
 
 
 def legend_size(entries: int) -> tuple[float, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import uuid
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -12,13 +13,14 @@ import numpy as np
 import rerun as rr
 
 from bevcli.errors import OutputError, WaitError
-from bevcli.frame import DriveFacts, Frame, FrameStamp, MapLines, Plan, Prediction
+from bevcli.frame import DriveFacts, Frame, FrameStamp, Prediction
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
+from bevcli.geometry.object_classes import hex_of_color
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid
 from bevcli.recording import entities, log_bev, log_boxes, log_cameras, log_static
 from bevcli.recording.blueprint import LayoutFacts, recording_blueprint
-from bevcli.recording.colors import EGO_COLOR, class_colors
+from bevcli.recording.colors import EGO_COLOR, Color, class_colors
 from bevcli.recording.ground_lines import future_lines, result_lines
 from bevcli.recording.layout import Layout
 from bevcli.recording.log_bev import BevColors, BevImages
@@ -167,9 +169,8 @@ class Recording:
         mesh, grid = self.options.vehicle_mesh, self._config.bev_grid
         vehicle = None if mesh is None else load_vehicle(mesh)
         map_classes = self._config.map_classes if self.options.shows_internals else ()
-        results = self._config.results
-        lines = results.get(MapLines, ())
-        legend = log_static.legend_entries(self.classes, map_classes, lines, plans=Plan in results)
+        lines = log_static.line_entries(self._config)
+        legend = log_static.legend_entries(self.classes, map_classes, lines)
         facts = LayoutFacts(
             note=self.note,
             probes=bool(self.options.probes),
@@ -186,7 +187,7 @@ class Recording:
         if self._live is not None:
             self._live.open(self.path)
         log_static.log_scene(self._stream, self.rig, self.classes, vehicle, grid)
-        self._log_about(map_classes)
+        self._log_about(map_classes, lines)
         log_static.log_legend(self._stream, legend)
         if self._resume is not None:
             self._origin, self._last = self._resume.origin, self._resume.last
@@ -195,18 +196,19 @@ class Recording:
                 self._bev_images.colors = self._resume.colors
         return self
 
-    def _log_about(self, map_classes: tuple[str, ...]) -> None:
+    def _log_about(self, map_classes: tuple[str, ...], lines: Sequence[tuple[str, Color]]) -> None:
         """Writes the page "About", and the facts of the run that readers of the file need."""
         of_map: dict[str, Any] = {"map_classes": list(map_classes)} if map_classes else {}
-        if lines := self._config.results.get(MapLines):
-            of_map["line_classes"] = list(lines)
+        if lines:
+            names, colors = zip(*lines, strict=True)
+            of_map |= {"line_names": list(names), "line_colors": list(map(hex_of_color, colors))}
         facts = rr.AnyValues(
             title=self.title,
             untrained=self.untrained,
             note=self.note,
             score=self.options.score,
             class_names=list(self.classes),
-            class_colors=[f"#{bytes(color).hex()}" for color in self.classes.values()],
+            class_colors=list(map(hex_of_color, self.classes.values())),
             camera_names=list(self.rig.names),
             **of_map,
         )

@@ -103,8 +103,8 @@ class RecordingReader:
 
 OWN_COMPONENTS = frozenset(
     ("score", "velocity_x", "velocity_y", "name", "scene", "timestamp_ns", "pose", "origin")
-    + ("title", "untrained", "note", "class_names", "class_colors", "camera_names", "map_classes", "line_classes")
-    + ("track", "seconds")
+    + ("title", "untrained", "note", "class_names", "class_colors", "camera_names", "map_classes")
+    + ("line_names", "line_colors", "track", "seconds")
 )
 
 

@@ -15,7 +15,7 @@ from bevcli.geometry.transforms import Array
 from bevcli.parsing.images import decode_image
 from bevcli.recording import entities
 from bevcli.recording.blueprint import rows_of_largest_images
-from bevcli.recording.colors import Color, class_colors, line_colors, map_colors
+from bevcli.recording.colors import Color, class_colors, map_colors
 from bevcli.recording.ground_lines import KINDS
 from bevcli.recording.video_images import Av1Decoder, require_av
 from bevcli.viewer.recording_reader import RecordedFrame
@@ -259,9 +259,9 @@ def _draw_legend(canvas: Canvas, frame: RecordedFrame) -> None:
     for index, (name, color) in enumerate(_class_colors(frame).items()):
         place = 16 + 250 * (index % 5), 60 + 32 * (index // 5)
         _draw_entry(canvas, place, color, f"{name.replace('_', ' ')} {counts[name]}")
-    lines = line_colors(frame.values(entities.RUN, "line_classes"))
-    for index, (name, color) in enumerate(lines.items()):
-        _draw_entry(canvas, (16 + 250 * index, 60 + 32 * 2), color, f"line: {name.replace('_', ' ')}")
+    names, colors = (frame.values(entities.RUN, key) for key in ("line_names", "line_colors"))
+    for index, (name, color) in enumerate(zip(names, map(color_of_hex, colors), strict=True)):
+        _draw_entry(canvas, (16 + 250 * index, 60 + 32 * 2), color, name)
     if frame.has(entities.BEV_SEGMENTATION, "Image:buffer"):
         # Recordings of version 0.1.0 do not name their classes, which are those of the segmentation head.
         classes = frame.values(entities.RUN, "map_classes") or list(MAP_CLASSES)

@@ -1,5 +1,6 @@
 """`calibrate`: planted errors are found, a right calibration stays, and what is not shown is said."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,8 +33,8 @@ def two_cameras(rig):
 
 @pytest.fixture(scope="module")
 def street():
-    """Seven frames of the street with two of its cameras, one turned by 2.3°, the other 15 cm too high."""
-    drive = bevcli.open_sequence(STREET, frames=slice(5, 12), ground_truth=False)
+    """Eight frames of the street with two of its cameras, one turned by 2.3°, the other 15 cm too high."""
+    drive = bevcli.open_sequence(STREET, frames=slice(5, 13), ground_truth=False)
     right = two_cameras(drive.rig)
     wrong = wrong_rig(right, TURNED, (1.0, -2.0, 0.5), (0, 0, 0))
     wrong = wrong_rig(wrong, LOW, (0, 0, 0), (0, 0, 0.15))
@@ -179,6 +180,16 @@ def test_few_frames_are_refused_in_one_line():
     done = typed(str(STREET), "--frames", "0:2")
     assert isinstance(done.exception, InputError)
     assert "moves between 0 pairs" in str(done.exception)
+
+
+def test_a_folder_without_ego_motion_is_refused(tmp_path):
+    drive = tmp_path / "drive"
+    drive.mkdir()
+    for name in ("calibration.json", "frames.csv"):
+        shutil.copy(STREET / name, drive)
+    done = typed(str(drive))
+    assert isinstance(done.exception, InputError)
+    assert "has no ego-motion" in str(done.exception)
 
 
 def test_a_corrected_drive_has_the_corrected_rig_in_its_frames(street, result):

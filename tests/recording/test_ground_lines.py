@@ -65,6 +65,12 @@ def test_lines_from_above_are_in_the_bev_frame(frames: list[RecordedFrame]) -> N
     np.testing.assert_allclose(line * (1, -1), LINES.points[0], atol=1e-3)
 
 
+def test_the_legend_names_lines_paths_and_futures(frames: list[RecordedFrame]) -> None:
+    expected = ["line: divider", "line: ped crossing", "line: boundary", "planned path", "futures: colour of the box"]
+    assert frames[1].values(entities.RUN, "line_names") == expected
+    assert frames[1].values(f"{entities.LEGEND}/texts", "Points2D:labels")[-5:] == expected
+
+
 def test_lines_in_the_scene_lie_on_the_ground(frames: list[RecordedFrame], drive: MemorySequence) -> None:
     (line,) = strips(frames[0], entities.ground_lines("map_lines"))
     origin = frames[0].array(entities.WORLD, "origin", 3)[0]

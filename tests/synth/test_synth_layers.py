@@ -8,7 +8,10 @@ from source_code import trees
 import bevcli.synth
 
 ROOT = Path(bevcli.synth.__file__).parent
-LAYERS = ("assets", "world", "render", "options", "rig", "drive", "export", "drives", "splits")
+LAYERS = (
+    *("corruptions", "workers", "assets", "world", "render"),
+    *("options", "rig", "drive", "export", "drives", "splits"),
+)
 
 
 def test_parts_import_only_from_lower_parts():

@@ -80,7 +80,7 @@ class UniADOutputs(ModelOutputs):
         map: of the map head; None where it was not asked for.
     """
 
-    stays_on_device: ClassVar[bool] = True
+    stay_on_device: ClassVar[tuple[str, ...]] = ("bev", "tracks", "map")
 
     ids: Tensor
     scores: Tensor

@@ -1,7 +1,7 @@
 """The outputs of a VAD, and the boxes with futures, lines and planned paths that are decoded from them."""
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Self
 
 import numpy as np
 from torch import Tensor
@@ -26,11 +26,15 @@ class VADOutputs(ModelOutputs):
         plan: (B, commands, T, 2) movement of the vehicle in each step along x and y of the bev frame, metres.
     """
 
-    stays_on_device: ClassVar[bool] = True
-
     lines: LineOutputs
     motion: MotionOutputs
     plan: Tensor
+
+    def last_layers(self) -> Self:
+        """See `ModelOutputs`. Features, which only the network uses, are left out."""
+        lines, none = self.lines, self.plan[:0]
+        last = LineOutputs(lines.class_logits[-1:], lines.points[-1:], none)
+        return replace(super().last_layers(), lines=last, motion=replace(self.motion, features=none))
 
 
 def decode_futures(outputs: VADOutputs, config: VADConfig) -> Boxes3D:

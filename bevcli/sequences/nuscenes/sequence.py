@@ -2,20 +2,21 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 
 from bevcli.frame import Frame, FrameStamp, Sequence
-from bevcli.geometry.transforms import Pose
+from bevcli.geometry.transforms import Pose, inverse
 from bevcli.sequences.images import ImageReader, ImageSource
 from bevcli.sequences.nuscenes.cache import open_index
 from bevcli.sequences.nuscenes.choice import chosen_scenes, keyframes, sweep_frames, tables_of
 from bevcli.sequences.nuscenes.dialect import NUSCENES, Dialect
 from bevcli.sequences.nuscenes.format import NuScenesOptions
 from bevcli.sequences.nuscenes.index import Images, Ints, Samples
+from bevcli.sequences.nuscenes.map_expansion import MapExpansion
 from bevcli.sequences.nuscenes.scene import read_scene_facts, scene_rig
 from bevcli.sequences.options import SequenceOptions
 
@@ -131,7 +132,8 @@ class TableSequence(Sequence):
 class NuScenesSequence(TableSequence):
     """Frames of a nuScenes root: keyframes, and sweeps if they are chosen.
 
-    The bev frame is the scene's LIDAR_TOP frame. The world frame is that of nuScenes' map.
+    The bev frame is the scene's LIDAR_TOP frame. The world frame is that of nuScenes' map. Keyframes have true lines of
+    the map where the root has the map expansion.
     Raises InputError as `TableSequence`.
     """
 
@@ -141,8 +143,16 @@ class NuScenesSequence(TableSequence):
         tables = tables_of(root, own.version)
         super().__init__(root, tables, common, NUSCENES, split=own.split, sweeps=own.sweeps)
         self.name = common.scene or own.split or tables.name
+        self._maps = MapExpansion(root, tables) if common.ground_truth else None
         note = self._can_bus_note()
         self.notes = (*self.notes, note) if note else self.notes
+
+    def _frame(self, entry: _FrameEntry, *, with_images: bool) -> Frame:
+        frame = super()._frame(entry, with_images=with_images)
+        if self._maps is None or entry.sample is None:
+            return frame
+        bev_from_world = inverse(frame.world_from_ego.matrix @ frame.rig.ego_from_bev)
+        return replace(frame, ground_truth_lines=self._maps.lines(frame.stamp.scene, bev_from_world))
 
     def _can_bus_note(self) -> str:
         names = [str(self.index.scenes.names[scene]) for scene in self.scenes]
