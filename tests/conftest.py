@@ -20,6 +20,10 @@ from bevcli.model.decoder import DecoderConfig
 from bevcli.model.encoder import EncoderConfig
 from bevcli.model.fpn import FPNConfig
 from bevcli.model.resnet import ResNetConfig
+from bevcli.model.vad.config import VADConfig
+from bevcli.model.vad.line_decoder import LineDecoderConfig
+from bevcli.model.vad.motion_head import MotionConfig
+from bevcli.model.vad.vad import VAD
 from bevcli.viewer import recording_file
 
 # Files that one worker runs, because they share what takes long: imports for the export, processes to fork from, and
@@ -107,6 +111,21 @@ def mini_model(mini_config) -> BEVFormer:
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.add_(0.05 * torch.randn_like(parameter))
+    return model
+
+
+@pytest.fixture(scope="session")
+def mini_vad(mini_config) -> VAD:
+    """Random weights with which some lines score above the threshold, so that objects attend to them."""
+    settings = {field.name: getattr(mini_config, field.name) for field in fields(mini_config)}
+    lines = LineDecoderConfig(lines=8, line_points=5, layers=1, attention_heads=4, feed_forward_width=32, max_lines=6)
+    motion = MotionConfig(modes=2, steps=3, attention_heads=4, feed_forward_width=32, max_line_distance=0.4)
+    torch.manual_seed(0)
+    model = VAD(VADConfig(**settings | {"name": "mini-vad"}, line_decoder=lines, motion=motion)).eval()
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(0.05 * torch.randn_like(parameter))
+        model.line_decoder.class_branches[-1][-1].bias.zero_()
     return model
 
 

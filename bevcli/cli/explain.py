@@ -1,4 +1,4 @@
-"""`bevcli explain`: figures of what each step of BEVFormer does with one frame."""
+"""`bevcli explain`: figures of what each step of a model does with one frame."""
 
 from pathlib import Path
 from typing import Annotated
@@ -9,6 +9,7 @@ from bevcli.cli.bridge import INPUT, Part
 from bevcli.explain.options import ExplainOptions
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
+from bevcli.runs.options import RunOptions
 from bevcli.sequences.options import SequenceOptions
 
 PANEL = "Look"
@@ -20,14 +21,16 @@ def explain(
     ],
     model: Annotated[ModelOptions, Part(only=("model", "weights", "untrained", "device"))],
     options: ExplainOptions,
+    run_options: Annotated[RunOptions, Part(only=("command",))],
     source: Annotated[SequenceOptions, Part(only=("scene",))],
 ) -> None:
-    """Draw what each step of BEVFormer does with one frame of SEQUENCE.
+    """Draw what each step of the model does with one frame of SEQUENCE.
 
     The model runs over all frames of the scene up to --frame, so that the recurrent state is the real one. One figure
     is written per step: image features, BEV queries, can-bus, pillars, spatial cross-attention, temporal
     self-attention, encoder layers, recurrence, object decoder, box code, segmentation, and an overview.
-    docs/bevformer.md explains the steps with these figures.
+    docs/bevformer.md explains the steps with these figures. For VAD two more figures show the objects and the map lines
+    that its plan, and the motion of the object nearest to --cell, attended to: see docs/vad.md.
     """
     from bevcli.explain.figures import check_figures, write_figures
     from bevcli.explain.trace import trace
@@ -38,9 +41,9 @@ def explain(
     loaded.require_parts("bevcli explain")
     drive = open_sequence(sequence, source, rate_hz=loaded.config.rate_hz)
     out = options.out or Path("runs") / f"{drive.name}-{loaded.name}-explained"
-    check_figures(out, force=options.force)
+    check_figures(loaded.config, out, force=options.force)
     place = options.place([stamp.index for stamp in drive.stamps])
-    traced = trace(loaded.network, loaded.device, drive, place, options.cell)
+    traced = trace(loaded.network, loaded.device, drive, place, options.cell, run_options.command)
     if loaded.untrained:
         say("note: the weights are UNTRAINED (random): the figures only show how data flows", err=True)
     x, y = traced.cell_center

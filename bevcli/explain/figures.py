@@ -1,149 +1,21 @@
-"""All figures of one traced frame with their files, and the overview of the whole model."""
+"""The figures of a model, and their files."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, get_args
 
-import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
-from numpy.typing import NDArray
 
 from bevcli.errors import OutputError
-from bevcli.explain import drawing
-from bevcli.explain.bev_figures import bev_queries, can_bus, encoder_layers, recurrence, temporal_attention
-from bevcli.explain.camera_figures import image_features, pillars, spatial_attention
-from bevcli.explain.drawing import ACCENT, GREY, INK, LEAST_SCORE, SECOND
-from bevcli.explain.head_figures import box_code, decoder, segmentation
+from bevcli.explain.drawing import ACCENT
 from bevcli.explain.options import ImageFormat
+from bevcli.explain.step_figure import StepFigure
 from bevcli.explain.trace import Trace
+from bevcli.model.config import ModelConfig
+from bevcli.model.temporal_model import model_class
 from bevcli.writing import whole_file
-
-HEIGHT = 7.7  # inches
-MOST_CAMERAS = 6
-BLOCK = "#e3eefb"  # fill of a learned part
-# Arrows of every model: images, backbone, features, encoder, queries, BEV map, decoder, boxes.
-FLOW = (
-    ((0.139, 0.385), (0.155, 0.385)), ((0.247, 0.385), (0.263, 0.385)), ((0.392, 0.45), (0.418, 0.45)),
-    ((0.485, 0.64), (0.485, 0.575)), ((0.627, 0.45), (0.653, 0.45)), ((0.745, 0.615), (0.776, 0.685)),
-    ((0.861, 0.685), (0.873, 0.685)),
-)  # fmt: skip
-
-
-def overview(trace: Trace) -> Figure:
-    """All steps of one frame."""
-    figure = drawing.titled_figure(
-        HEIGHT,
-        "BEVFormer: one frame through the model",
-        f"Model {trace.config.name}, frame {trace.frame.stamp.index}. Blue: learned parts of the model. "
-        "Orange: the recurrent state.",
-        heading_inches=1.0,
-    )
-    canvas = figure.add_axes((0, 0, 1, 1), zorder=0)
-    canvas.set(xlim=(0, 1), ylim=(0, 1))
-    canvas.axis("off")
-    _images_and_features(figure, trace)
-    maps = [trace.cell_map(trace.outputs.bev[0])]
-    if trace.aligned_history is not None:
-        maps.append(trace.cell_map(trace.aligned_history))
-    colors = drawing.feature_colors(maps)
-    _bev(figure, trace, (0.435, 0.645), "BEV queries", drawing.feature_colors([trace.cell_map(trace.bev_embedding)])[0])
-    if trace.aligned_history is not None:
-        image = colors[1]
-        image[(maps[1] == 0).all(-1)] = 255
-        _bev(figure, trace, (0.435, 0.045), "Previous map, rotated", image)
-    _bev(figure, trace, (0.655, 0.29), "BEV map", colors[0], width=0.16)
-    _results(figure, trace)
-    _flow(canvas, trace)
-    return figure
-
-
-def _images_and_features(figure: Figure, trace: Trace) -> None:
-    names = trace.prepared.assignment.cameras[:MOST_CAMERAS]
-    lengths = trace.feature_maps[0].norm(dim=1).float().cpu().numpy()
-    for place, name in enumerate(names):
-        bottom = 0.79 - 0.127 * (place + 1)
-        axes = figure.add_axes((0.012, bottom, 0.125, 0.118))
-        image = drawing.rgb_image(trace.frame, name)
-        axes.imshow(np.full((9, 16, 3), 225, np.uint8) if image is None else image, aspect="auto")
-        drawing.bare(axes)
-        drawing.show_lengths(figure.add_axes((0.265, bottom, 0.125, 0.118)), trace, lengths, place, aspect="auto")
-    figure.text(0.012, 0.8, f"{len(trace.frame.rig.cameras)} cameras", fontsize=12.5, color=INK)
-    figure.text(0.265, 0.8, "image features", fontsize=12.5, color=INK)
-
-
-def _bev(
-    figure: Figure, trace: Trace, corner: tuple[float, float], title: str, image: NDArray | None, width: float = 0.1
-) -> Axes:
-    axes = figure.add_axes((*corner, width, width * 14.0 / HEIGHT))
-    drawing.bev_axes(axes, trace, title, ticks=False)
-    axes.title.set_fontsize(12.5)
-    if image is not None:
-        drawing.show_bev(axes, trace, image)
-    return axes
-
-
-def _results(figure: Figure, trace: Trace) -> None:
-    axes = _bev(figure, trace, (0.875, 0.56), "Objects", None, width=0.118)
-    drawing.outline_boxes(axes, trace.prediction.boxes.scored(LEAST_SCORE), ACCENT, width=1.3)
-    bev_map = trace.prediction.segmentation
-    if bev_map is not None:
-        axes = _bev(figure, trace, (0.875, 0.145), "Segmentation", None, width=0.118)
-        drawing.show_map(axes, trace, bev_map)
-
-
-def _flow(canvas: Axes, trace: Trace) -> None:
-    _block(canvas, (0.157, 0.29, 0.088, 0.19), "ResNet\nbackbone\n+\nFPN neck")
-    parts = "temporal self-attention\nspatial cross-attention\nfeed-forward network"
-    _block(canvas, (0.42, 0.335, 0.205, 0.235), f"Encoder × {trace.config.encoder.layers}\n\n{parts}")
-    _block(canvas, (0.778, 0.63, 0.082, 0.115), "Object\ndecoder", 11.5)
-    for start, end in FLOW:
-        _arrow(canvas, start, end)
-    canvas.text(0.548, 0.74, "+ position\n+ can-bus", fontsize=11.5, color=GREY, va="center")
-    if trace.aligned_history is not None:
-        _arrow(canvas, (0.485, 0.262), (0.485, 0.33), ACCENT)
-    else:
-        canvas.text(0.485, 0.2, "no history in\nthis frame", fontsize=11.5, color=ACCENT, va="center", ha="center")
-    curve: dict[str, Any] = {"connectionstyle": "arc3,rad=-0.35", "lw": 2.2, "ls": "--", "mutation_scale": 18}
-    canvas.add_patch(FancyArrowPatch((0.715, 0.285), (0.542, 0.135), arrowstyle="-|>", color=ACCENT, **curve))
-    state = "the state: BEV map and pose,\nkept for the next frame"
-    canvas.text(0.63, 0.075, state, fontsize=11.5, color=ACCENT, va="top")
-    if trace.prediction.segmentation is not None:
-        _block(canvas, (0.778, 0.175, 0.085, 0.09), "Segmentation\nhead", 11)
-        _arrow(canvas, (0.755, 0.285), (0.79, 0.267))
-        _arrow(canvas, (0.864, 0.22), (0.873, 0.22))
-
-
-def _block(canvas: Axes, place: tuple[float, float, float, float], text: str, size: float = 12.5) -> None:
-    x, y, width, height = place
-    style = "round,pad=0,rounding_size=0.012"
-    canvas.add_patch(FancyBboxPatch((x, y), width, height, boxstyle=style, fc=BLOCK, ec=SECOND, lw=1.6))
-    label = canvas.text(x + width / 2, y + height / 2, text, ha="center", va="center", fontsize=size, color=INK)
-    label.set_linespacing(1.4)
-
-
-def _arrow(canvas: Axes, start: tuple[float, float], end: tuple[float, float], color: str = GREY) -> None:
-    style: dict[str, Any] = {"arrowstyle": "-|>", "mutation_scale": 17, "lw": 2, "shrinkA": 0, "shrinkB": 0}
-    canvas.add_patch(FancyArrowPatch(start, end, color=color, **style))
-
-
-# In the order of the model.
-FIGURES: dict[str, Callable[[Trace], Figure]] = {
-    "overview": overview,
-    "image-features": image_features,
-    "bev-queries": bev_queries,
-    "can-bus": can_bus,
-    "pillars": pillars,
-    "spatial-attention": spatial_attention,
-    "temporal-attention": temporal_attention,
-    "encoder-layers": encoder_layers,
-    "recurrence": recurrence,
-    "decoder": decoder,
-    "box-code": box_code,
-    "segmentation": segmentation,
-}
 
 
 @dataclass(frozen=True)
@@ -151,7 +23,7 @@ class FigureFile:
     """One figure.
 
     Attributes:
-        step: its name, a key of FIGURES.
+        step: its name, `StepFigure.step`.
         path: the file that was written; None where the figure was left out.
         left_out: why it was left out, "" where it was written.
     """
@@ -161,9 +33,15 @@ class FigureFile:
     left_out: str = ""
 
 
-def check_figures(folder: Path, *, force: bool) -> None:
-    """Raises OutputError where a folder holds figures already and may not lose them. force: it may."""
-    found = [] if force else [path for step in FIGURES for path in _figures_of(step, folder) if path.exists()]
+def figures_of(config: ModelConfig) -> tuple[StepFigure, ...]:
+    """The figures of a model, in the order of its steps."""
+    return tuple(figure for listed in model_class(config).figures for figure in resolve_name(listed))
+
+
+def check_figures(config: ModelConfig, folder: Path, *, force: bool) -> None:
+    """Raises OutputError where a folder holds figures of the model already and may not lose them. force: it may."""
+    paths = [path for figure in figures_of(config) for path in _paths(config, figure, folder)]
+    found = [] if force else [path for path in paths if path.exists()]
     if found:
         raise OutputError(
             f"{found[0]}: exists already; pass `force=True` to replace the figures of the folder, or `out=DIR`"
@@ -173,7 +51,7 @@ def check_figures(folder: Path, *, force: bool) -> None:
 def write_figures(
     trace: Trace, folder: Path, image_format: ImageFormat = "png", *, untrained: bool = False
 ) -> Iterator[FigureFile]:
-    """Writes `bevformer-STEP.png` (or .jpg) per step into a folder, which is created; yields each file when written.
+    """Writes `ARCHITECTURE-STEP.png` (or .jpg) per step into a folder, which is created; yields each file when written.
 
     untrained: whether the weights are random; then every figure is labelled UNTRAINED.
     Figures that the folder holds are replaced, also those of the other format.
@@ -183,36 +61,24 @@ def write_figures(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{folder}: the folder for the figures cannot be made: {error.strerror}") from error
-    for step, draw in FIGURES.items():
-        reason = reason_to_leave_out(step, trace)
-        path = folder / f"bevformer-{step}.{image_format}"
-        for earlier in _figures_of(step, folder):
-            if reason or earlier != path:
-                earlier.unlink(missing_ok=True)
+    for step in figures_of(trace.config):
+        reason = step.left_out(trace)
+        path, *others = sorted(_paths(trace.config, step, folder), key=lambda one: one.suffix != f".{image_format}")
+        for earlier in (path, *others) if reason else others:
+            earlier.unlink(missing_ok=True)
         if reason:
-            yield FigureFile(step, None, reason)
+            yield FigureFile(step.step, None, reason)
             continue
-        figure = draw(trace)
+        figure = step.draw(trace)
         if untrained:
             figure.text(0.985, 0.985, "UNTRAINED", color=ACCENT, fontsize=17, fontweight="bold", ha="right", va="top")
         _save(figure, path, image_format)
-        yield FigureFile(step, path)
+        yield FigureFile(step.step, path)
 
 
-def _figures_of(step: str, folder: Path) -> tuple[Path, ...]:
-    return tuple(folder / f"bevformer-{step}.{ending}" for ending in get_args(ImageFormat))
-
-
-def reason_to_leave_out(step: str, trace: Trace) -> str:
-    """Why a figure cannot be drawn of this trace; "" where it can."""
-    prediction = trace.prediction
-    if step == "temporal-attention" and prediction.started_anew:
-        return f"the frame has no history ({prediction.started_anew})"
-    if step == "recurrence" and len(trace.recent) < 2:
-        return "there is no earlier frame"
-    if step == "segmentation" and trace.outputs.segmentation is None:
-        return f"model {trace.config.name} has no segmentation head"
-    return ""
+def _paths(config: ModelConfig, figure: StepFigure, folder: Path) -> tuple[Path, ...]:
+    stem = f"{config.architecture.lower()}-{figure.step}"
+    return tuple(folder / f"{stem}.{ending}" for ending in get_args(ImageFormat))
 
 
 def _save(figure: Figure, path: Path, image_format: ImageFormat) -> None:

@@ -1,6 +1,6 @@
 """A trace: one frame through the model, with the intermediate results that the figures show."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -12,11 +12,13 @@ from bevcli.errors import InputError
 from bevcli.frame import Frame, Prediction, Sequence
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.transforms import Array, inverse
+from bevcli.inference.commands import read_commands
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import BevState, Runner, StepOptions
 from bevcli.model.config import ModelConfig
 from bevcli.model.network import Network
 from bevcli.model.pillar_projection import project_pillars
+from bevcli.model.scene_attention import SceneAttention
 from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.sequences.selection import scenes_of
@@ -43,6 +45,8 @@ class Trace:
         first_reference_points: (Q, 3), where the object queries start, 0 to 1 over the grid's ranges.
         visible: (N, Y·X, Z) bool, which pillar points each camera sees.
         cell: row and column of the BEV cell that the figures follow.
+        attentions: to objects and lines by the attending part, of a model that has such parts; that of an object is
+            of the one nearest to the cell.
     """
 
     config: ModelConfig
@@ -58,6 +62,7 @@ class Trace:
     first_reference_points: Tensor
     visible: Tensor
     cell: tuple[int, int]
+    attentions: Mapping[str, SceneAttention]
 
     @property
     def frame(self) -> Frame:
@@ -96,23 +101,29 @@ class Trace:
 
 
 def trace(
-    model: TemporalModel, device: torch.device, sequence: Sequence, place: int, cell_xy: tuple[float, float] | None
+    model: TemporalModel,
+    device: torch.device,
+    sequence: Sequence,
+    place: int,
+    cell_xy: tuple[float, float] | None,
+    command: str | None = None,
 ) -> Trace:
     """Runs the model over the frames of one scene up to a place, with its recurrent state, and traces the last one.
 
     model: the plain model, not a prepared one. place: index in `sequence.stamps`.
     cell_xy: x, y of the cell to follow, metres, bev frame; None takes the cell under the best box ahead of the
-    vehicle. Raises InputError when the cell lies outside the grid, when the frame has no image, or for a model without
-    figures.
+    vehicle. command: of the driver, or a file of commands, for a model that plans.
+    Raises InputError when the cell lies outside the grid, when the frame has no image, for a model without figures, or
+    for an unknown command.
     """
-    if not model.is_explained:
+    if not model.figures:
         kind = model.config.architecture
         raise InputError(
-            f"model {model.config.name} is a {kind}: the figures show BEVFormer's recurrence "
+            f"model {model.config.name} is a {kind}, which has no figures "
             f"(use tiny, small, base or demo; docs/bevformer.md explains {kind})"
         )
     cell = None if cell_xy is None else cell_at(cell_xy, model.config.bev_grid)
-    runner = Runner(model, device, StepOptions())
+    runner = Runner(model, device, StepOptions(commands=read_commands(command, model.config)))
     preprocessor = Preprocessor(model.config)
     scene = next(places for places in scenes_of(sequence.stamps) if place in places)
     places = range(scene[0], place)
@@ -183,6 +194,7 @@ def _traced_step(
         first_reference_points=model.decoder.reference_points(position).sigmoid(),
         visible=_visible_points(inputs, config),
         cell=cell,
+        attentions=model.scene_attentions(outputs[model], (float(x), float(y))),
     )
 
 

@@ -74,7 +74,7 @@ class PreparedModel(TemporalModel):
     def __init__(self, network: TemporalModel, precision: Precision) -> None:
         super().__init__(network.config)
         self.network = network
-        self.stages, self.has_parts, self.is_explained = network.stages, network.has_parts, False
+        self.stages, self.has_parts = network.stages, network.has_parts
         if network.image_parts:
             dtype = DTYPES[precision]
             network.image_parts[0].register_forward_pre_hook(lambda _, images: (images[0].to(dtype), *images[1:]))

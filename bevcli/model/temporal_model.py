@@ -16,6 +16,7 @@ from bevcli.geometry.transforms import Pose
 from bevcli.model.box_coding import decode
 from bevcli.model.config import ModelConfig
 from bevcli.model.export_form import ExportForm
+from bevcli.model.scene_attention import SceneAttention
 from bevcli.model.segmentation import decode_maps
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.registry import entries, load
@@ -35,7 +36,7 @@ class TemporalModel(nn.Module):
         official_names: patterns of key names in the released weights file, and ours; see `from_official`.
         stages: name of a submodule -> stage of the step that ends with it, for the times of a run.
         has_parts: the network has the parts of `bevcli.model.network.Network`, which probes and figures look into.
-        is_explained: `bevcli explain` has figures for it.
+        figures: of `bevcli explain`, as texts "module:attribute", each of a list of `StepFigure`. () for none.
         config: of the model.
     """
 
@@ -44,7 +45,7 @@ class TemporalModel(nn.Module):
     official_names: ClassVar[tuple[tuple[str, Any], ...]] = ()
     stages: Mapping[str, str] = {}
     has_parts: bool = False
-    is_explained: bool = False
+    figures: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
@@ -81,6 +82,15 @@ class TemporalModel(nn.Module):
     def decode_results(self, outputs: ModelOutputs) -> tuple[FrameResult, ...]:
         """The further results, of the types of `ModelConfig.results`."""
         return ()
+
+    def scene_attentions(self, outputs: ModelOutputs, place: tuple[float, float]) -> Mapping[str, SceneAttention]:
+        """Attention to objects and lines of the map by the attending part, for figures. {} for a model without such.
+
+        Args:
+            outputs: of a step of a batch of one.
+            place: x and y in metres, bev frame, of the object whose own attention is asked for.
+        """
+        return {}
 
     @property
     def device(self) -> torch.device:

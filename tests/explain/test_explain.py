@@ -13,8 +13,9 @@ from memory_drive import MemorySequence, make_rig
 from bevcli.errors import InputError, OutputError
 from bevcli.explain import figures
 from bevcli.explain.drawing import project_bev
-from bevcli.explain.figures import FIGURES, check_figures, write_figures
+from bevcli.explain.figures import check_figures, figures_of, write_figures
 from bevcli.explain.head_figures import reference_points
+from bevcli.explain.overview import FIGURES
 from bevcli.explain.trace import cell_at, trace
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner
@@ -23,6 +24,7 @@ from bevcli.model.pillar_projection import project_pillars
 SAMPLE = Path(__file__).parents[2] / "samples/street"
 CPU = torch.device("cpu")
 HISTORY_FIGURES = {"temporal-attention", "recurrence"}
+STEPS = [figure.step for figure in FIGURES]
 
 
 def explain(*arguments) -> subprocess.CompletedProcess:
@@ -37,7 +39,7 @@ def write_all(folder: Path, *options: str) -> None:
 
 
 def draw_only(monkeypatch, *steps: str) -> None:
-    monkeypatch.setattr(figures, "FIGURES", {step: FIGURES[step] for step in steps})
+    monkeypatch.setattr(figures, "figures_of", lambda _: [figure for figure in FIGURES if figure.step in steps])
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +49,7 @@ def written(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("step", FIGURES)
+@pytest.mark.parametrize("step", STEPS)
 def test_the_command_writes_a_figure_for_every_step(written, step):
     image = cv2.imread(str(written / f"bevformer-{step}.jpg"))
     height, width, _ = image.shape
@@ -61,7 +63,7 @@ def test_two_runs_write_the_same_bytes(tmp_path):
     folders = [tmp_path / name for name in ("one", "other")]
     for folder in folders:
         write_all(folder)
-    for step in FIGURES:
+    for step in STEPS:
         one, other = (folder / f"bevformer-{step}.png" for folder in folders)
         assert one.read_bytes() == other.read_bytes(), step
 
@@ -77,12 +79,12 @@ def test_a_figure_of_the_same_frame_has_the_same_bytes(mini_model, tmp_path, mon
 def test_figures_are_replaced_only_when_asked(mini_model, tmp_path, monkeypatch):
     draw_only(monkeypatch, "overview", "segmentation")  # the second one is left out
     traced = trace(mini_model, CPU, MemorySequence(1), 0, None)
-    check_figures(tmp_path / "new", force=False)
+    check_figures(mini_model.config, tmp_path / "new", force=False)
     for name in ("bevformer-segmentation.png", "bevformer-overview.jpg", "mine.png"):
         (tmp_path / name).write_text("earlier")
         with pytest.raises(OutputError, match="exists already; pass `force=True`"):
-            check_figures(tmp_path, force=False)
-    check_figures(tmp_path, force=True)
+            check_figures(mini_model.config, tmp_path, force=False)
+    check_figures(mini_model.config, tmp_path, force=True)
     list(write_figures(traced, tmp_path))
     assert {path.name for path in tmp_path.iterdir()} == {"bevformer-overview.png", "mine.png"}
 
@@ -126,11 +128,11 @@ def test_a_model_without_segmentation_leaves_one_figure_out(mini_model, tmp_path
     assert {path.suffix for path in tmp_path.iterdir()} == {".jpg"}
 
 
-def test_the_first_frame_of_a_scene_has_no_figures_of_history(mini_model, tmp_path):
+def test_the_first_frame_of_a_scene_has_no_figures_of_history(mini_model):
     sequence = MemorySequence(4, make_rig({"FRONT": 0.0, "BACK": 180.0}), scenes="aabb")
     traced = trace(mini_model, CPU, sequence, 2, (0.0, -5.0))
     assert traced.prediction.started_anew
-    left_out = {file.step for file in write_figures(traced, tmp_path, "jpg") if file.path is None}
+    left_out = {figure.step for figure in figures_of(mini_model.config) if figure.left_out(traced)}
     assert left_out == HISTORY_FIGURES | {"segmentation"}
 
 

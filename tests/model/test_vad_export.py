@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from memory_drive import MemorySequence
 
 from bevcli.benchmark.exported import FrameDifference, check_exported, difference_lines
@@ -15,34 +13,15 @@ from bevcli.engines.export_onnx import export_onnx
 from bevcli.engines.exported import load_exported
 from bevcli.inference.load import Model
 from bevcli.inference.run import run
-from bevcli.model.config import ModelConfig
-from bevcli.model.vad.config import VADConfig
-from bevcli.model.vad.line_decoder import LineDecoderConfig
-from bevcli.model.vad.motion_head import MotionConfig
 from bevcli.model.vad.vad import VAD
 
 pytest.importorskip("onnxruntime")
 
 
-@pytest.fixture(scope="module")
-def model(mini_config: ModelConfig) -> VAD:
-    """Random weights with which some lines score above the threshold, so that objects attend to them."""
-    settings = {field.name: getattr(mini_config, field.name) for field in fields(mini_config)}
-    lines = LineDecoderConfig(lines=8, line_points=5, layers=1, attention_heads=4, feed_forward_width=32, max_lines=6)
-    motion = MotionConfig(modes=2, steps=3, attention_heads=4, feed_forward_width=32, max_line_distance=0.4)
-    torch.manual_seed(0)
-    model = VAD(VADConfig(**settings | {"name": "mini-vad"}, line_decoder=lines, motion=motion)).eval()
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter.add_(0.05 * torch.randn_like(parameter))
-        model.line_decoder.class_branches[-1][-1].bias.zero_()
-    return model
-
-
 @pytest.mark.slow
-def test_an_exported_vad_equals_the_model(model: VAD, tmp_path: Path) -> None:
+def test_an_exported_vad_equals_the_model(mini_vad: VAD, tmp_path: Path) -> None:
     file = tmp_path / "vad.onnx"
-    export_onnx(model, file)
+    export_onnx(mini_vad, file)
     exported = load_exported(file, "onnxruntime")
     drive = MemorySequence(3)
     *_, last = check_exported(file, Model(model), drive)
@@ -51,7 +30,7 @@ def test_an_exported_vad_equals_the_model(model: VAD, tmp_path: Path) -> None:
     }  # fmt: skip
     assert max(last.further.values()) < 1e-3
     for (_, ours), (_, theirs) in zip(
-        run(Model(model), drive), run(Model(exported, engine="onnxruntime"), drive), strict=True
+        run(Model(mini_vad), drive), run(Model(exported, engine="onnxruntime"), drive), strict=True
     ):
         np.testing.assert_allclose(theirs.boxes.scores, ours.boxes.scores, atol=1e-4)
         np.testing.assert_allclose(theirs.boxes.futures, ours.boxes.futures, atol=1e-2)

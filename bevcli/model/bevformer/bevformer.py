@@ -35,7 +35,7 @@ class BEVFormer(Network):
     """The whole model: a recurrence, in which the BEV map of a frame is the history of the next."""
 
     memory_type: ClassVar[type] = BevHistory
-    is_explained = True
+    figures: ClassVar[tuple[str, ...]] = ("bevcli.explain.overview:FIGURES",)
 
     def forward(self, inputs: ModelInputs, history: Tensor | None = None) -> ModelOutputs:
         """One step. history: (B, Y·X, C), the BEV map of the previous frame, or None for a scene's first frame."""

@@ -118,7 +118,7 @@ class UniAD(BEVFormer):
     memory_type = TrackMemory
     stages: Mapping[str, str] = STAGES | {"query_interaction": "tracks", "map_head": "map_head"}
     official_names = NAMES
-    is_explained = False
+    figures = ()
 
     def __init__(self, config: UniADConfig) -> None:
         super().__init__(config)

@@ -1,5 +1,8 @@
 """The attention layer of VAD's interactions: queries attend to keys that have positions of their own."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from torch import Tensor, nn
 
 from bevcli.model.feed_forward import FeedForward
@@ -32,3 +35,26 @@ class AttentionLayer(nn.Module):
         )
         query = self.norms[0](query + self.dropout(attended))
         return self.norms[1](query + self.feed_forward(query))
+
+    def weights(
+        self, query: Tensor, query_position: Tensor, value: Tensor, key_position: Tensor, masked: Tensor | None = None
+    ) -> Tensor:
+        """The attention weights (B, Q, K) of `forward`, the mean over heads; each row sums to 1."""
+        _, weights = self.attention(query + query_position, value + key_position, value, key_padding_mask=masked)
+        return weights
+
+
+@contextmanager
+def attention_weights(*layers: AttentionLayer) -> Iterator[dict[AttentionLayer, Tensor]]:
+    """A dict that is filled with the `AttentionLayer.weights` of each call inside the context; the last call stays."""
+    found: dict[AttentionLayer, Tensor] = {}
+
+    def keep(layer: AttentionLayer, arguments: tuple[Tensor, ...]) -> None:
+        found[layer] = layer.weights(*arguments)
+
+    handles = [layer.register_forward_pre_hook(keep) for layer in layers]
+    try:
+        yield found
+    finally:
+        for handle in handles:
+            handle.remove()

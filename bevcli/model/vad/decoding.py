@@ -52,13 +52,19 @@ def decode_lines(outputs: VADOutputs, config: VADConfig) -> MapLines:
 
     A query gives one line for each of its classes that is among the best scores.
     """
-    decoder, grid = config.line_decoder, config.bev_grid
+    decoder = config.line_decoder
     scores = outputs.lines.class_logits[-1, 0].sigmoid().flatten()  # (N · classes,)
     best, index = scores.topk(min(decoder.max_lines, len(scores)))
-    points = outputs.lines.points[-1, 0, index // len(decoder.classes)].double().cpu().numpy()  # (K, P, 2)
-    (x0, x1), (y0, y1) = grid.x_range_m, grid.y_range_m
+    points = line_places(outputs.lines.points[-1, 0, index // len(decoder.classes)], config)  # (K, P, 2)
     classes = np.asarray(decoder.classes)[(index % len(decoder.classes)).cpu().numpy()]
-    return MapLines(tuple(points * (x1 - x0, y1 - y0) + (x0, y0)), classes, best.double().cpu().numpy())
+    return MapLines(tuple(points), classes, best.double().cpu().numpy())
+
+
+def line_places(points: Tensor, config: VADConfig) -> Array:
+    """Points of lines (..., 2), 0 to 1 over the range -> metres, bev frame."""
+    (x0, x1), (y0, y1) = config.bev_grid.x_range_m, config.bev_grid.y_range_m
+    places: Array = points.double().cpu().numpy() * (x1 - x0, y1 - y0) + (x0, y0)
+    return places
 
 
 def decode_plan(outputs: VADOutputs, config: VADConfig) -> Plan:

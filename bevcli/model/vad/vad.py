@@ -11,10 +11,13 @@ from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.config import ModelConfig
 from bevcli.model.network import STAGES, ConstantSelfAttention
 from bevcli.model.pillar_projection import PillarHits
+from bevcli.model.scene_attention import SceneAttention
 from bevcli.model.step import ModelOutputs
 from bevcli.model.truth import FrameTruth
+from bevcli.model.vad.attention_layer import attention_weights
 from bevcli.model.vad.config import VADConfig
 from bevcli.model.vad.decoding import VADOutputs, decode_futures, decode_lines, decode_plan
+from bevcli.model.vad.explained import motion_attention, plan_attention
 from bevcli.model.vad.export import VADForm
 from bevcli.model.vad.line_decoder import LineDecoder, LineEncoder, LineOutputs
 from bevcli.model.vad.losses import head_losses
@@ -30,7 +33,7 @@ class VAD(BEVFormer):
     config_class = VADConfig
     stages: Mapping[str, str] = STAGES | {"line_decoder": "map_decoder", "motion_head": "motion", "planner": "planner"}
     official_names = NAMES
-    is_explained = False
+    figures = (*BEVFormer.figures, "bevcli.explain.attention_figures:FIGURES")
 
     def __init__(self, config: VADConfig) -> None:
         super().__init__(config)
@@ -66,6 +69,19 @@ class VAD(BEVFormer):
     def decode_results(self, outputs: ModelOutputs) -> tuple[FrameResult, ...]:
         assert isinstance(outputs, VADOutputs)
         return decode_lines(outputs, self.config), decode_plan(outputs, self.config)
+
+    def scene_attentions(self, outputs: ModelOutputs, place: tuple[float, float]) -> dict[str, SceneAttention]:
+        """See `TemporalModel`. The heads run again: outputs have no attention weights."""
+        assert isinstance(outputs, VADOutputs)
+        planner, motion = self.planner, self.motion_head
+        of_plan, of_motion = ((head.agent_attention, head.line_attention) for head in (planner, motion))
+        with attention_weights(*of_plan, *of_motion) as found:
+            self.detect(outputs.bev)
+        to_plan, to_motion = ([found[layer] for layer in layers] for layers in (of_plan, of_motion))
+        return {
+            "plan": plan_attention(outputs, to_plan, self.config),
+            "motion": motion_attention(outputs, to_motion, self.config, place),
+        }
 
     def head_losses(
         self, outputs: ModelOutputs, truths: Sequence[FrameTruth], matches: Sequence[tuple[Tensor, Tensor]]
