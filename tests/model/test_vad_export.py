@@ -24,7 +24,7 @@ def test_an_exported_vad_equals_the_model(mini_vad: VAD, tmp_path: Path) -> None
     export_onnx(mini_vad, file)
     exported = load_exported(file, "onnxruntime")
     drive = MemorySequence(3)
-    *_, last = check_exported(file, Model(model), drive)
+    *_, last = check_exported(file, Model(mini_vad), drive)
     assert last.further.keys() == {
         "line_class_logits", "line_points", "future_offsets", "mode_logits", "plan_offsets"
     }  # fmt: skip
