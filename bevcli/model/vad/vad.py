@@ -21,7 +21,7 @@ from bevcli.model.vad.explained import motion_attention, plan_attention
 from bevcli.model.vad.export import VADForm
 from bevcli.model.vad.line_decoder import LineDecoder, LineEncoder, LineOutputs
 from bevcli.model.vad.losses import head_losses
-from bevcli.model.vad.motion_head import MapTokens, MotionHead, line_positions
+from bevcli.model.vad.motion_head import MapTokens, MotionHead, MotionOutputs, line_positions
 from bevcli.model.vad.official_keys import NAMES, UNUSED
 from bevcli.model.vad.planner import Planner
 
@@ -46,12 +46,15 @@ class VAD(BEVFormer):
         """The outputs for a BEV map (B, Y·X, C)."""
         with torch.autocast(bev.device.type, enabled=False):
             class_logits, box_codes, features = self.decoder(bev.float(), self.detection_head)
-            lines = self.line_decoder(bev.float())
-            tokens = self.map_tokens(lines)
-            positions = self.positions(box_codes[-1])
-            motion = self.motion_head(features, positions, tokens)
-            plan = self.planner(motion.features, positions, tokens)
+            lines, motion, plan = self.further(bev.float(), box_codes[-1], features)
         return VADOutputs(bev, class_logits, box_codes, lines=lines, motion=motion, plan=plan)
+
+    def further(self, bev: Tensor, box_codes: Tensor, features: Tensor) -> tuple[LineOutputs, MotionOutputs, Tensor]:
+        """Lines, futures and plan for a BEV map, and box codes (B, Q, 10) and features (B, Q, C) of objects."""
+        lines = self.line_decoder(bev)
+        tokens, positions = self.map_tokens(lines), self.positions(box_codes)
+        motion = self.motion_head(features, positions, tokens)
+        return lines, motion, self.planner(motion.features, positions, tokens)
 
     def map_tokens(self, lines: LineOutputs) -> MapTokens:
         scores = lines.class_logits[-1].sigmoid().amax(-1)
@@ -96,8 +99,8 @@ class VAD(BEVFormer):
         first.self_attention = ConstantSelfAttention(first, self.line_decoder.queries(batch=1))
 
     def run_on_shapes(self, images: Tensor, camera_index: Tensor, hits: PillarHits) -> Tensor:
-        bev = super().run_on_shapes(images, camera_index, hits)
-        self.detect(bev)
+        bev, queries = super().run_on_shapes(images, camera_index, hits), self.config.decoder.queries
+        self.further(bev, torch.empty(1, queries, 10), torch.empty(1, queries, self.config.channels))
         return bev
 
     @classmethod
