@@ -23,7 +23,7 @@ CONNECT_S = 15.0  # for the connection to a cluster
 # Settings that Ray reads from the environment: no telemetry, and no messages on stdout, such as that a worker died. The
 # record of its drive says it, if it cannot be run at all.
 _ENVIRONMENT = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_DEDUP_LOGS_SKIP_REGEX": ".*"}
-# On this machine, Ray's processes then listen on 127.0.0.1 only.
+# On this machine, Ray's processes then listen on 127.0.0.1 only. Ray reads it once a process.
 _LOOPBACK = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
 
 
@@ -37,6 +37,8 @@ def run_on_ray(job: Job, job_hash: str, drives: Sequence[Drive], workers: Worker
     """
     if not ray_is_installed():
         raise BevcliError("Ray is not installed: run pip install 'bevcli[ray]', or pass `count=1`")
+    if workers.address and _LOOPBACK.items() <= os.environ.items():
+        raise BevcliError("Ray ran on this machine only in this process: use a new process for `address`")
     settings = _ENVIRONMENT if workers.address else _ENVIRONMENT | _LOOPBACK
     for name, value in settings.items():
         os.environ.setdefault(name, value)

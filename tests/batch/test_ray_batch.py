@@ -253,11 +253,12 @@ def test_a_batch_runs_on_a_cluster_that_is_up_already(tmp_path, monkeypatch):
     )  # fmt: skip
     try:
         wait_for_port(port, 120)
-        done = command(tmp_path, *BATCH, "--ray", f"127.0.0.1:{port}", "--workers", "2")
+        batch = start(tmp_path, *BATCH, "--ray", f"127.0.0.1:{port}", "--workers", "2")
+        _, errors = batch.communicate(timeout=240)
     finally:
         cluster.terminate()
         cluster.wait(60)
-    assert done.returncode == 0, done.stderr
+    assert batch.returncode == 0, errors
     command(tmp_path, *BATCH[:2], "--out", "alone", *BATCH[4:], "--workers", "1")
     alone = results_of(tmp_path / "alone")
     for name, folder in results_of(tmp_path / "out").items():

@@ -27,10 +27,15 @@ pytestmark = [
     pytest.mark.skipif(not SHARED, reason="BEVCLI_SHARED is not set: no full numbers of the original"),
 ]
 
-# Share of cells and logits that may differ. Where the nearest-neighbour rotation meets a tie, a cell may take its
-# neighbour's history. With the weights of stated_rule.py, the decoder of base turns noise of 1e-6 in the BEV map into
-# 9e-4 in the logits of its most sensitive query.
+# Share of cells that may differ: where the nearest-neighbour rotation meets a tie, a cell may take its neighbour's
+# history.
 SHARE_OFF = {"tiny": 0.0, "base": 1e-3}
+# With the weights of stated_rule.py, the decoder of base is sensitive: noise of 8e-6 in its BEV map, which is float32's
+# rounding, moves a few of the 900 queries by up to 4.6e-3 in the logits and 0.022 in the codes. Processors round
+# differently.
+LOGITS_OFF = {"tiny": 0.0, "base": 1e-2}
+LARGEST_LOGIT_OFF = {"tiny": 1e-3, "base": 1e-2}
+LARGEST_CODE_OFF = {"tiny": 1e-2, "base": 5e-2}
 
 
 @dataclass(frozen=True)
@@ -110,9 +115,10 @@ def check_outputs(outputs: ModelOutputs, model: BEVFormer, golden: Golden, frame
     expected = golden(frame, "bev_embed" if whole else "bev_embed_sub")
     assert_cells_close(bev, expected, SHARE_OFF[name])
     logits, codes = golden(frame, "all_cls_scores"), golden(frame, "all_bbox_preds")
-    off = np.abs(outputs.class_logits[-len(logits) :, 0].numpy() - logits) > 1e-3
-    assert off.mean() <= SHARE_OFF[name]
-    np.testing.assert_allclose(outputs.box_codes[-len(codes) :, 0], codes, atol=1e-2)
+    off = np.abs(outputs.class_logits[-len(logits) :, 0].numpy() - logits)
+    assert (off > 1e-3).mean() <= LOGITS_OFF[name]
+    assert off.max() <= LARGEST_LOGIT_OFF[name]
+    np.testing.assert_allclose(outputs.box_codes[-len(codes) :, 0], codes, atol=LARGEST_CODE_OFF[name])
     boxes = decode(outputs, model.config)[0]
     expected_boxes, labels = golden(frame, "coder_bboxes"), golden(frame, "labels_3d")
     np.testing.assert_allclose(boxes.scores, golden(frame, "scores_3d"), atol=1e-4)
