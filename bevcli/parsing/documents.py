@@ -1,4 +1,4 @@
-"""JSON, TOML and YAML with limits on nesting and on the size of numbers.
+"""JSON, TOML, YAML and XML with limits on nesting and on the size of numbers.
 
 Parsers refuse a broken text, but many well-formed texts break the code behind them: lists nested a thousand levels
 deep, integers that no array can hold, YAML objects that contain themselves. They are refused here, for all
@@ -13,6 +13,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
+from xml.parsers import expat
 
 import numpy as np
 import yaml
@@ -73,6 +75,26 @@ def parse_json(text: bytes, path: Path, *, pairs: Callable[[list[tuple[str, Any]
         raise InputError(f"{path}: cannot be read as JSON ({reason_of(error)[:200]})") from None
     except RecursionError:
         raise InputError(f"{path}: is nested too deeply to be read as JSON") from None
+
+
+def parse_xml(text: bytes, path: Path) -> ElementTree.Element:
+    """The root of an XML document without entities of its own. Raises InputError, which names `path`.
+
+    A few short entities can stand for gigabytes of text. None is read from another file.
+    """
+
+    def refuse(name: str, *declaration: object) -> None:
+        raise InputError(f"{path}: declares the entity {name:.40} (expected XML without entities)")
+
+    builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
+    parser.CharacterDataHandler, parser.EntityDeclHandler = builder.data, refuse
+    parser.buffer_text = True
+    try:
+        parser.Parse(text, True)
+        return builder.close()
+    except (expat.ExpatError, ValueError, LookupError) as error:
+        raise InputError(f"{path}: broken XML: {reason_of(error)[:200]}") from None
 
 
 def parse_toml(text: str, path: str | Path, error: type[BevcliError] = InputError) -> dict[str, Any]:

@@ -140,7 +140,7 @@ class LabelOptions:
         reads="path",
         default=None,
         help="Ground truth in place of that of INPUT: a CSV table with the columns of `bevcli export --format csv`, an "
-        "OpenLABEL file, KITTI labels, or CVAT's cuboids.",
+        "OpenLABEL file, KITTI labels or tracklets, or CVAT's cuboids.",
         metavar="FILE",
     )
     unlisted_frames: UnlistedFrames | None = option(

@@ -14,17 +14,26 @@ from typer.testing import CliRunner
 from bevcli.cli.main import app
 from bevcli.errors import InputError
 from bevcli.evaluation.boxes_csv import write_csv
+from bevcli.evaluation.formats import kitti_raw as tracklet_export
 from bevcli.evaluation.formats.kitti import write_kitti
 from bevcli.evaluation.formats.openlabel import openlabel
+from bevcli.evaluation.options import ExportOptions
 from bevcli.frame import Frame
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.object_classes import object_classes
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes, write_boxes
-from bevcli.sequences.labels import csv_table, cvat, kitti, label_format, openlabel as openlabel_reader
+from bevcli.sequences.labels import csv_table, cvat, kitti, kitti_raw, label_format, openlabel as openlabel_reader
 from bevcli.sequences.labels.sequence import WithLabels, _labelled_places
 from bevcli.sequences.native.writer import NativeWriter
 from bevcli.sequences.options import LabelOptions, UnlistedFrames
 
-FORMATS = {"csv": csv_table.FORMAT, "cvat": cvat.FORMAT, "kitti": kitti.FORMAT, "openlabel": openlabel_reader.FORMAT}
+FORMATS = {
+    "csv": csv_table.FORMAT,
+    "cvat": cvat.FORMAT,
+    "kitti": kitti.FORMAT,
+    "kitti-raw": kitti_raw.FORMAT,
+    "openlabel": openlabel_reader.FORMAT,
+}
 HEAD = "frame,class,x,y,z,length,width,height,yaw"
 
 
@@ -222,8 +231,8 @@ def test_cuboids_of_cvat_are_boxes_in_ego_with_tracks(tmp_path: Path) -> None:
         ('{"categories": {', 'is not a CVAT export "Datumaro 3D"'),
         (cvat_text().replace('"attr": {"frame": 1}', '"attr": {}'), 'item 000001: "attr" has no "frame"'),
         (cvat_text(label_id=2), r"item 000000: label_id is 2 \(expected 0 to 1"),
-        (cvat_text(scale=[1, 1, 0]), "expected cuboids with three numbers each"),
-        (cvat_text(rotation=[1]), "expected cuboids with three numbers each"),
+        (cvat_text(scale=[1, 1, 0]), "expected three numbers each .* sizes above 0"),
+        (cvat_text(rotation=[1]), "expected three numbers each"),
     ],
 )
 def test_a_wrong_export_of_cvat_is_one_clear_line(text: str, message: str, tmp_path: Path) -> None:
@@ -272,6 +281,67 @@ def test_wrong_kitti_labels_are_one_clear_line(text: str, message: str, tmp_path
         WithLabels(Drive(), tmp_path / "0000.txt")
     with pytest.raises(InputError, match="`labels_camera=roof`: is not in the rig"):
         WithLabels(Drive(), tmp_path / "0000.txt", LabelOptions(labels_camera="roof"))
+
+
+def test_tracklets_that_bevcli_exports_are_read_again(tmp_path: Path) -> None:
+    drive = Drive()
+    given = replace(boxes_of_drive(drive), classes=object_classes(("PKW", "Lorry"), {}))
+    tracklet_export.FORMAT.write(given, tmp_path, ExportOptions("kitti-raw"), tmp_path)
+    labelled = WithLabels(drive, tmp_path / drive.stamps[0].scene / "tracklet_labels.xml")
+    for place, frame in enumerate(given.frames):
+        found = labelled.load(place).ground_truth
+        same_boxes(replace(found, velocities=frame.boxes.velocities), frame.boxes)
+    assert np.allclose(labelled.load(1).ground_truth.velocities[0], (4, 0), atol=1e-3)  # they follow from the tracks
+    assert found.instances.tolist() == ["0", "1"]
+
+
+# As CVAT 2 exports a track of two frames with a gap of one between them: a PKW, 4 m long, 2 m wide and 1.5 m high.
+POSE = "<item><tx>{}</tx><ty>2</ty><tz>1</tz><rx>0</rx><ry>0</ry><rz>0.7</rz><truncation>{}</truncation></item>"
+CVAT_TRACKLETS = f"""<?xml version="1.0" encoding="UTF-8" standalone="yes"?>
+<!DOCTYPE boost_serialization>
+<boost_serialization version="9" signature="serialization::archive">
+<tracklets version="0" tracking_level="0" class_id="0"><count>1</count><item_version>1</item_version>
+<item version="1" tracking_level="0" class_id="1">
+<objectType>PKW</objectType><h>2.0</h><w>4.0</w><l>1.5</l><first_frame>1</first_frame>
+<poses version="0" tracking_level="0" class_id="2"><count>3</count><item_version>0</item_version>
+{POSE.format(8, 0)}{POSE.format(8, 2)}{POSE.format(12, 0)}
+</poses><finished>1</finished></item></tracklets></boost_serialization>"""
+
+
+def test_tracklets_of_cvat_have_other_sizes_and_middles(tmp_path: Path) -> None:
+    path = tmp_path / "tracklet_labels.xml"
+    path.write_text(CVAT_TRACKLETS)
+    labels = label_format.read_labels(path, Drive().rig, LabelOptions())
+    assert [frame.index for frame in labels.frames] == [1, 3]
+    box = labels.frames[1].boxes
+    np.testing.assert_allclose([*box.centers[0], *box.sizes_lwh[0], box.yaws[0]], [12, 2, 1, 4, 2, 1.5, 0.7])
+    assert (box.classes.tolist(), box.instances.tolist()) == (["PKW"], ["0"])
+    assert any("CVAT's version" in note for note in labels.notes)
+    path.write_text(CVAT_TRACKLETS.replace("<item_version>0", "<item_version>2").replace('"yes"', '"true"'))
+    as_kitti = label_format.read_labels(path, Drive().rig, LabelOptions())
+    assert [frame.index for frame in as_kitti.frames] == [1, 2, 3]
+    np.testing.assert_allclose([*as_kitti.frames[0].boxes.centers[0]], [8, 2, 2])  # 1 m is the bottom
+    np.testing.assert_allclose([*as_kitti.frames[0].boxes.sizes_lwh[0]], [1.5, 4, 2])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("<!DOCTYPE boost_serialization>", '<!DOCTYPE x [<!ENTITY a "b">]>', "declares the entity a"),
+        ("</tracklets>", "", "broken XML: mismatched tag"),
+        ("<h>2.0</h>", "", "tracklet 0: w, h, l: expected a number for each"),
+        ("<h>2.0</h>", "<h>nan</h>", "tracklet 0: w, h, l: expected a number for each"),
+        ("<h>2.0</h>", "<h>0</h>", "tracklet 0: expected three numbers each of .* sizes above 0"),
+        ("<tx>12</tx>", "<tx>x</tx>", "tracklet 0: tx, ty, tz: expected"),
+        ("<first_frame>1", "<first_frame>7000", "the frame 7000 is not in the drive"),
+        ("PKW", "", "tracklet 0: objectType is missing"),
+    ],
+)
+def test_wrong_tracklets_are_one_clear_line(old: str, new: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "labels.xml").write_text(CVAT_TRACKLETS.replace(old, new))
+    with pytest.raises(InputError, match=message) as caught:
+        WithLabels(Drive(), tmp_path / "labels.xml")
+    assert "\n" not in str(caught.value)
 
 
 def test_labels_of_another_kind_are_refused(tmp_path: Path) -> None:

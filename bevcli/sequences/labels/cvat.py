@@ -3,12 +3,12 @@
 from pathlib import Path
 
 import msgspec
-import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.parsing.files import MIB, read_bytes
-from bevcli.sequences.labels.label_format import LabelFormat, LabelledFrame, Labels, is_json_with, tilt_note
+from bevcli.sequences.labels.cuboid import IN_EGO, Cuboid, tilt_note
+from bevcli.sequences.labels.label_format import LabelFormat, LabelledFrame, Labels, starts_with
 
 LARGEST_BYTES = 1024 * MIB
 CUBOID = "cuboid_3d"
@@ -60,46 +60,30 @@ def read_cvat_labels(path: Path) -> Labels:
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise InputError(f'{path}: is not a CVAT export "Datumaro 3D": {error}') from None
     classes = [label.name for label in content.categories.label.labels]
-    frames = tuple(_frame(path, item, classes) for item in content.items)
-    tilts = [_tilt(one) for item in content.items for one in item.annotations if one.type == CUBOID]
-    note = 'the cuboids are taken to be in the "ego" frame: that of the point clouds that were labelled'
-    return Labels("ego", frames, lists_empty=True, notes=(note, *tilt_note(tilts)))
+    tilts: list[float] = []
+    frames = tuple(_frame(path, item, classes, tilts) for item in content.items)
+    return Labels("ego", frames, lists_empty=True, notes=(IN_EGO, *tilt_note(tilts)))
 
 
-def _frame(path: Path, item: _Item, classes: list[str]) -> LabelledFrame:
+def _frame(path: Path, item: _Item, classes: list[str], tilts: list[float]) -> LabelledFrame:
     where = f"{path}: item {item.id:.40}"
     if item.attr.frame is None:
         raise InputError(f'{where}: "attr" has no "frame", the index of the frame')
-    boxes = [_box(where, one, classes) for one in item.annotations if one.type == CUBOID]
-    return LabelledFrame(item.attr.frame, None, Boxes3D.concatenate(boxes))
+    cuboids = [_cuboid(where, one, classes) for one in item.annotations if one.type == CUBOID]
+    tilts += [one.tilt_deg for one in cuboids]
+    return LabelledFrame(item.attr.frame, None, Boxes3D.concatenate(one.box() for one in cuboids))
 
 
-def _box(where: str, cuboid: _Annotation, classes: list[str]) -> Boxes3D:
-    numbers = np.array([*cuboid.position, *cuboid.rotation, *cuboid.scale])
-    if [len(each) for each in (cuboid.position, cuboid.rotation, cuboid.scale)] != [3, 3, 3] or not (
-        np.isfinite(numbers).all() and numbers[-3:].min() > 0
-    ):
-        raise InputError(f"{where}: expected cuboids with three numbers each of position, rotation and scale, above 0")
-    if cuboid.label_id is None or not 0 <= cuboid.label_id < len(classes):
-        raise InputError(
-            f'{where}: label_id is {cuboid.label_id} (expected 0 to {len(classes) - 1}, from "categories")'
-        )
-    (sx, sy, sz), (cx, cy, cz) = np.sin(cuboid.rotation), np.cos(cuboid.rotation)
-    track = cuboid.attributes.get("track_id")
-    return Boxes3D(
-        numbers[None, :3], numbers[None, -3:], np.array([np.arctan2(cx * sz + sx * sy * cz, cy * cz)]),
-        np.full((1, 2), np.nan), np.array([classes[cuboid.label_id]]),
-        instances=np.array(["" if track is None else str(track)]),
-    )  # fmt: skip
-
-
-def _tilt(cuboid: _Annotation) -> float:
-    """Angle between the cuboid's vertical and that of the frame, degrees."""
-    return float(np.degrees(np.arccos(np.prod(np.cos(cuboid.rotation[:2])))))
+def _cuboid(where: str, one: _Annotation, classes: list[str]) -> Cuboid:
+    if one.label_id is None or not 0 <= one.label_id < len(classes):
+        raise InputError(f'{where}: label_id is {one.label_id} (expected 0 to {len(classes) - 1}, from "categories")')
+    track = one.attributes.get("track_id")
+    name, identity = classes[one.label_id], "" if track is None else str(track)
+    return Cuboid.checked(where, name, identity, one.position, one.rotation, one.scale)
 
 
 FORMAT = LabelFormat(
     'a CVAT export "Datumaro 3D" (annotations/default.json)',
-    lambda path: is_json_with(path, '"categories"'),
+    lambda path: starts_with(path, ".json", '"categories"'),
     lambda path, rig, options: read_cvat_labels(path),
 )

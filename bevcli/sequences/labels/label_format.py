@@ -1,6 +1,6 @@
 """LabelFormat: a format of labels, found through the entry points `bevcli.label_formats`."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -13,7 +13,6 @@ from bevcli.sequences.options import LabelOptions
 
 GROUP = "bevcli.label_formats"
 FIRST_BYTES = 4096
-LARGEST_TILT_DEG = 5.0
 FrameOfReference = Literal["world", "ego", "bev"]
 
 
@@ -65,18 +64,12 @@ class LabelFormat:
     read: Callable[[Path, CameraRig, LabelOptions], Labels]
 
 
-def is_json_with(path: Path, key: str) -> bool:
-    """True for a .json file with a key, in quotes, in its first 4 KiB."""
-    if path.suffix.lower() != ".json" or not path.is_file():
+def starts_with(path: Path, ending: str, word: str) -> bool:
+    """True for a file with an ending such as ".json" and a word in its first 4 KiB."""
+    if path.suffix.lower() != ending or not path.is_file():
         return False
     with path.open("rb") as file:
-        return key.encode() in file.read(FIRST_BYTES)
-
-
-def tilt_note(tilts_deg: Iterable[float]) -> tuple[str, ...]:
-    """A note about cuboids that are not upright, if there are any."""
-    tilted = sum(tilt > LARGEST_TILT_DEG for tilt in tilts_deg)
-    return (f"{tilted} cuboids are tilted by more than {LARGEST_TILT_DEG:g}°: their boxes are upright",) * bool(tilted)
+        return word.encode() in file.read(FIRST_BYTES)
 
 
 def read_labels(path: Path, rig: CameraRig, options: LabelOptions) -> Labels:

@@ -11,14 +11,8 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.parsing.files import MIB, read_bytes
-from bevcli.sequences.labels.label_format import (
-    FrameOfReference,
-    LabelFormat,
-    LabelledFrame,
-    Labels,
-    is_json_with,
-    tilt_note,
-)
+from bevcli.sequences.labels.cuboid import tilt_note
+from bevcli.sequences.labels.label_format import FrameOfReference, LabelFormat, LabelledFrame, Labels, starts_with
 
 LARGEST_BYTES = 1024 * MIB
 # Names of coordinate systems -> our frames; those with other names need a transform, which is not read.
@@ -153,6 +147,6 @@ def _time_ns(where: str, stated: str | int | float | None) -> int | None:
 
 FORMAT = LabelFormat(
     "an OpenLABEL file (.json)",
-    lambda path: is_json_with(path, '"openlabel"'),
+    lambda path: starts_with(path, ".json", '"openlabel"'),
     lambda path, rig, options: read_openlabel(path),
 )

@@ -1,0 +1,74 @@
+"""Labels of KITTI raw, tracklet_labels.xml: tracks, as KITTI, `bevcli export` and CVAT write them."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from bevcli.errors import InputError
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.parsing.documents import parse_xml
+from bevcli.parsing.files import MIB, read_bytes
+from bevcli.sequences.labels.cuboid import IN_EGO, Cuboid, tilt_note
+from bevcli.sequences.labels.label_format import LabelFormat, LabelledFrame, Labels, starts_with
+
+LARGEST_BYTES = 32 * MIB  # a tree of elements takes thirty times as much
+CVAT_VERSION = "0"  # of the poses; KITTI's is 2
+OUT_OF_IMAGE = "2"
+
+
+def read_tracklets(path: Path) -> Labels:
+    """The poses of all tracklets, which are instances; the boxes are taken to be in the ego frame. Raises InputError.
+
+    KITTI states height, width and length as h, w and l, and the middle of the bottom. CVAT ("Kitti Raw Format 1.0")
+    states the sizes along x, y and z as w, h and l, and the middle of the box; where its track has a gap, a pose is out
+    of the image.
+    """
+    content = read_bytes(path, LARGEST_BYTES).replace(b'standalone="true"', b'standalone="yes"', 1)  # KITTI's own files
+    tracks = parse_xml(content, path).findall("tracklets/item")
+    frames: dict[int, list[Cuboid]] = {}
+    for number, track in enumerate(tracks):
+        for index, cuboid in _cuboids(f"{path}: tracklet {number}", track, str(number)):
+            frames.setdefault(index, []).append(cuboid)
+    listed = [LabelledFrame(at, None, Boxes3D.concatenate(one.box() for one in frames[at])) for at in sorted(frames)]
+    cvat = any(map(_is_cvats, tracks))
+    note = "the poses have CVAT's version: w, h and l are taken to be the sizes along x, y and z, tz to be the middle"
+    tilts = [one.tilt_deg for cuboids in frames.values() for one in cuboids]
+    return Labels("ego", tuple(listed), lists_empty=False, notes=(IN_EGO, *([note] if cvat else []), *tilt_note(tilts)))
+
+
+def _is_cvats(track: Element) -> bool:
+    return track.findtext("poses/item_version", "").strip() == CVAT_VERSION
+
+
+def _cuboids(where: str, track: Element, number: str) -> Iterator[tuple[int, Cuboid]]:
+    """Index of the frame and cuboid of each pose."""
+    kind, is_cvats = track.findtext("objectType", "").strip(), _is_cvats(track)
+    if not kind:
+        raise InputError(f"{where}: objectType is missing")
+    size, (first,) = _numbers(where, track, *("whl" if is_cvats else "lwh")), _numbers(where, track, "first_frame")
+    for place, pose in enumerate(track.iterfind("poses/item")):
+        if is_cvats and pose.findtext("truncation") == OUT_OF_IMAGE:
+            continue
+        position, rotation = _numbers(where, pose, "tx", "ty", "tz"), _numbers(where, pose, "rx", "ry", "rz")
+        if not is_cvats:
+            position[2] += size[2] / 2
+        yield int(first) + place, Cuboid.checked(where, kind, number, position, rotation, size)
+
+
+def _numbers(where: str, element: Element, *names: str) -> list[float]:
+    try:
+        numbers = [float(element.findtext(name, "")) for name in names]
+    except ValueError:
+        numbers = [np.nan]
+    if not np.isfinite(numbers).all():
+        raise InputError(f"{where}: {', '.join(names)}: expected a number for each")
+    return numbers
+
+
+FORMAT = LabelFormat(
+    "KITTI raw or CVAT tracklets (tracklet_labels.xml)",
+    lambda path: starts_with(path, ".xml", "boost_serialization"),
+    lambda path, rig, options: read_tracklets(path),
+)
