@@ -7,6 +7,7 @@ import re
 import types
 import typing
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -14,6 +15,7 @@ from typing import Any, Literal, TypeVar
 import msgspec
 
 from bevcli.errors import ConfigError
+from bevcli.geometry.object_classes import ClassSettings, without_meshes
 from bevcli.model.config import ModelConfig
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
@@ -45,7 +47,10 @@ def load_config(name_or_path: str | Path) -> ModelConfig:
 
 
 def config_of_table(table: dict[str, Any], file: str) -> ModelConfig:
-    """The configuration in the parsed contents of a model's file. Raises ConfigError, which names `file`."""
+    """The configuration in the parsed contents of a model's file. Raises ConfigError, which names `file`.
+
+    Paths of meshes are relative to the folder of `file`.
+    """
     architecture, known = table.get(ARCHITECTURE, ModelConfig.architecture), list(entries("bevcli.models"))
     if architecture not in known:
         expected = " or ".join(f'"{name}"' for name in known)
@@ -56,7 +61,12 @@ def config_of_table(table: dict[str, Any], file: str) -> ModelConfig:
     if not re.fullmatch(r"[\w][\w. +-]{0,99}", config.name):
         expected = "up to 100 letters, digits and - . + _, because it names folders"
         raise ConfigError(f'{file}: "name" is {config.name!r:.60} (expected {expected})')
-    return config
+    return replace(config, class_settings=_with_meshes_of(config.class_settings, Path(file).parent))
+
+
+def _with_meshes_of(settings: Mapping[str, ClassSettings], folder: Path) -> dict[str, ClassSettings]:
+    """The settings of classes with the paths of their meshes from here, given those from a folder."""
+    return {name: replace(one, mesh=one.mesh and str(folder / one.mesh)) for name, one in settings.items()}
 
 
 def load_table(name_or_path: str | Path, table: str, kind: type[T]) -> T:
@@ -77,11 +87,12 @@ def settings_of_table(contents: dict[str, Any], table: str, kind: type[T], file:
 
 
 def as_table(config: ModelConfig, tracking: object = None) -> dict[str, Any]:
-    """The contents of the file of a model, from which `config_of_table` makes the same configuration.
+    """The contents of the file of a model, from which `config_of_table` makes the same configuration without meshes.
 
     tracking: the dataclass of the table TRACKING; None for no such table.
     """
-    table = {ARCHITECTURE: config.architecture, **_plain(config)}
+    portable = replace(config, class_settings=without_meshes(config.class_settings))
+    table = {ARCHITECTURE: config.architecture, **_plain(portable)}
     return table if tracking is None else table | {TRACKING: _plain(tracking)}
 
 

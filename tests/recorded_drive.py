@@ -14,6 +14,7 @@ from bevcli.frame import AttentionView, CameraSamples, Frame, NewStart, Predicti
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import inverse
+from bevcli.model.config import ModelConfig
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.writer import Recording
 from bevcli.viewer.screenshot import NO_DRIVER, take_screenshot
@@ -28,7 +29,7 @@ class NamedModel:
 
     untrained: bool = False
     bundled: bool = False
-    config = TINY
+    config: ModelConfig = TINY
 
 
 def boxes_ahead() -> Boxes3D:

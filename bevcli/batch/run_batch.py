@@ -30,6 +30,7 @@ from bevcli.geometry.object_classes import are_nuscenes
 from bevcli.inference.load import Model
 from bevcli.model.config import ModelConfig
 from bevcli.parsing.csv_cells import cell_of
+from bevcli.recording.class_meshes import read_class_meshes
 from bevcli.runs.folder import folder_lock
 from bevcli.runs.state import load_state
 
@@ -122,10 +123,11 @@ def run_batch(
 
     Raises:
         OutputError: the folder has a batch already, is in use by another one, or cannot be written.
-        InputError: no drive has the format of an option.
+        InputError: no drive has the format of an option, or the mesh of a class cannot be read.
         BevcliError: see `Worker` and `run_on_ray`.
     """
     job.check_options(drives)
+    read_class_meshes(model.config.object_classes)  # each drive's recording needs them
     out, job_hash = open_storage(job.out), job.hash(model)
     with folder_lock(out.path) if isinstance(out, LocalFolder) else contextlib.nullcontext():
         _check_folder(out, resume)

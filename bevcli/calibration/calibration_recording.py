@@ -2,20 +2,17 @@
 
 from pathlib import Path
 
-import cv2
 import rerun as rr
 import rerun.blueprint as rrb
 
 from bevcli.calibration.drawings import LINE, POINT
 from bevcli.calibration.evidence import Evidence, epipolar_piece
-from bevcli.errors import OutputError
 from bevcli.geometry.cameras import CameraRig
-from bevcli.recording import entities, log_static
+from bevcli.recording import entities
 from bevcli.recording.layout import Layout
 from bevcli.rig.mounting import horizon
 from bevcli.rig.overlay import GROUND, HORIZON, ground_lines, visible_runs
-from bevcli.rig.rig_recording import JPEG_QUALITY, camera_views, clipped, rig_view
-from bevcli.writing import whole_file
+from bevcli.rig.recorded_rig import Lines, camera_views, log_image, log_lines, log_pose, rig_recording, rig_view
 
 TABLE = "calibration"
 
@@ -23,15 +20,7 @@ TABLE = "calibration"
 def write_calibration_recording(path: Path, evidence: Evidence, table: str) -> None:
     """Write the recording. table: the text of the result. Raises OutputError."""
     rig = evidence.views.rig
-    with whole_file(path) as unfinished, rr.RecordingStream("bevcli-calibrate") as stream:
-        layout = _layout(rig)
-        try:
-            stream.save(unfinished, default_blueprint=layout)
-        except RuntimeError as error:
-            raise OutputError(f"{path}: the recording cannot be written ({error})") from error
-        finally:
-            layout.free()
-        log_static.log_scene(stream, rig, {})
+    with rig_recording(path, "bevcli-calibrate", rig, _layout(rig)) as stream:
         text = rr.TextDocument(f"```\n{table}\n```", media_type="text/markdown")
         stream.log(TABLE, text, static=True)
         for index in range(len(rig.cameras)):
@@ -47,8 +36,7 @@ def _log_image(stream: rr.RecordingStream, evidence: Evidence, index: int) -> No
     name, pixels = evidence.views.rig.names[index], evidence.image(index)
     if pixels is None:
         return
-    encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
-    stream.log(entities.image(name), rr.EncodedImage(contents=encoded, media_type="image/jpeg"), static=True)
+    log_image(stream, name, pixels)
     points = evidence.matches(index, measured=True).pixels_b
     dots = rr.Points2D(points, colors=POINT, radii=rr.Radius.ui_points(2.5), draw_order=30)
     stream.log(entities.overlay(name, "matches"), dots, static=True)
@@ -57,23 +45,19 @@ def _log_image(stream: rr.RecordingStream, evidence: Evidence, index: int) -> No
 def _log_camera(stream: rr.RecordingStream, evidence: Evidence, index: int, *, measured: bool) -> None:
     """Pose, epipolar lines, ground grid and horizon by one of the two calibrations."""
     camera, matches = evidence.camera(index, measured=measured), evidence.matches(index, measured=measured)
-    pose = rr.Transform3D(translation=camera.ego_from_camera[:3, 3], mat3x3=camera.ego_from_camera[:3, :3])
-    stream.log(entities.camera(camera.name), pose)
+    log_pose(stream, camera, static=False)
     motion = matches.camera_b_from_camera_a
     pieces = [
         piece
         for ray, point in zip(matches.rays_a, matches.pixels_b, strict=True)
         for piece in epipolar_piece(camera, motion, ray, point)
     ]
-    lines = {
+    lines: dict[str, Lines] = {
         "epipolar_lines": (pieces, LINE, 1.2),
         "ground_grid": (ground_lines(camera), GROUND, 0.6),
         "horizon": (visible_runs(horizon(camera)), HORIZON, 1.0),
     }
-    for kind, (strips, color, width) in lines.items():
-        inside = [strip for line in strips for strip in clipped(line, camera)]
-        archetype = rr.LineStrips2D(inside, colors=color, radii=rr.Radius.ui_points(width), draw_order=20)
-        stream.log(entities.overlay(camera.name, kind), archetype)
+    log_lines(stream, camera, lines, static=False)
 
 
 def _layout(rig: CameraRig) -> Layout:

@@ -3,7 +3,7 @@
 import math
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 Color = tuple[int, int, int]
@@ -24,6 +24,7 @@ class ObjectClass:
         vehicle: whether its objects are drawn into the map layer "vehicle".
         kitti: type in KITTI's label files; "" for the name.
         color: RGB, 0 to 255; None for one by the index among the model's classes.
+        mesh: path of a mesh file that is drawn in the boxes of the class; "" for none.
     """
 
     name: str
@@ -36,6 +37,7 @@ class ObjectClass:
     vehicle: bool = False
     kitti: str = ""
     color: Color | None = None
+    mesh: str = ""
 
 
 def _vehicle(
@@ -102,6 +104,8 @@ class ClassSettings:
         like: one of nuScenes' ten classes.
         range_m, gate_m, tracked, attributes, kitti: see `ObjectClass`.
         color: such as "#ff9e2c".
+        mesh: path of a mesh file, relative to the TOML file. It changes nothing but recordings, and is a path of one
+            machine: files of results and exports do not have it, and no hash depends on it.
     """
 
     like: str = ""
@@ -111,6 +115,7 @@ class ClassSettings:
     attributes: tuple[str, str] | None = None
     kitti: str | None = None
     color: str | None = None
+    mesh: str | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if self.like and self.like not in NUSCENES_CLASSES:
@@ -123,7 +128,7 @@ class ClassSettings:
     def resolve(self, name: str) -> ObjectClass:
         """The class of this name with these settings."""
         base = NUSCENES_CLASSES.get(self.like or name, ObjectClass(name))
-        own = ("range_m", "gate_m", "tracked", "attributes", "kitti")
+        own = ("range_m", "gate_m", "tracked", "attributes", "kitti", "mesh")
         given: dict[str, Any] = {key: getattr(self, key) for key in own if getattr(self, key) is not None}
         if self.attributes is not None:
             given["undefined_errors"] = () if any(self.attributes) else (*base.undefined_errors, "attr_err")
@@ -168,6 +173,12 @@ def object_classes(names: Iterable[str], settings: Mapping[str, ClassSettings]) 
     return made
 
 
+def without_meshes(settings: Mapping[str, ClassSettings]) -> dict[str, ClassSettings]:
+    """The settings that mean the same on every machine; a class with none of them is left out."""
+    portable = {name: replace(one, mesh=None) for name, one in settings.items()}
+    return {name: one for name, one in portable.items() if one != ClassSettings()}
+
+
 def class_of_size(length: float, width: float, height: float) -> str:
     """The nuScenes class whose boxes are most alike to one of this size, in metres, by the ratios of their sides."""
     size = length, width, height
@@ -187,4 +198,4 @@ def are_nuscenes(classes: Mapping[str, ObjectClass]) -> bool:
 
 def _scoring(one: ObjectClass) -> ObjectClass:
     """The class without what changes no score."""
-    return replace(one, color=None, kitti="", gate_m=1.0)
+    return replace(one, color=None, kitti="", gate_m=1.0, mesh="")

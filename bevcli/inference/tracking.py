@@ -33,7 +33,8 @@ class TrackerConfig:
         duplicate_widths: a box is a duplicate when the centre of a better box of its class is closer than this many
             widths of the better box. 0: no box is a duplicate.
         use_velocity: whether tracks move with the predicted velocity; if not, they stay where their last box is.
-        gates_m: the largest distance of a match, by class, "other" for other classes. Default: `ObjectClass.gate_m`.
+        gates_m: the largest distance of a match, by class, "other" for other classes, 4 m if left out. `for_classes`
+            adds those of a model's classes.
     """
 
     birth_score: float = 0.2
@@ -68,9 +69,8 @@ class TrackerConfig:
 
     def gates_of(self, classes: NDArray[np.str_]) -> Array:
         """(N,) the gates of boxes of these classes (N,), metres."""
-        gates = {name: one.gate_m for name, one in NUSCENES_CLASSES.items()} | dict(self.gates_m)
-        other = gates.get(OTHER, ObjectClass.gate_m)
-        return np.array([gates.get(name, other) for name in classes.tolist()], dtype=np.float64)
+        other = self.gates_m.get(OTHER, ObjectClass.gate_m)
+        return np.array([self.gates_m.get(name, other) for name in classes.tolist()], dtype=np.float64)
 
 
 @dataclass(frozen=True)

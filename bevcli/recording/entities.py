@@ -5,6 +5,8 @@ in float32). `bev` is a flat image of the bev frame in metres: x to the right, -
 longitudes, where the drive states its place on Earth.
 """
 
+import rerun as rr
+
 WORLD = "world"
 EGO = "world/ego"
 VEHICLE = "world/ego/vehicle"
@@ -66,7 +68,12 @@ def image(name: str) -> str:
 
 def track(class_name: str, identity: str) -> str:
     """The entity of a track, such as "world/tracks/car_12"."""
-    return f"{TRACKS}/{class_name}_{identity}"
+    return f"{TRACKS}/{rr.escape_entity_path_part(f'{class_name}_{identity}')}"
+
+
+def class_mesh(class_name: str) -> str:
+    """The entity of the mesh in all boxes of a class, such as "world/boxes/mesh/car"."""
+    return f"{BOXES}/mesh/{rr.escape_entity_path_part(class_name)}"
 
 
 def ground_lines(kind: str) -> str:

@@ -200,10 +200,14 @@ def footprints(boxes: Boxes3D) -> pa.Array:
 
 
 def _shape(boxes: Boxes3D) -> dict[str, Any]:
-    halves, zeros = boxes.yaws / 2, np.zeros(len(boxes))
-    quaternions = np.stack([zeros, zeros, np.sin(halves), np.cos(halves)], axis=-1)  # rerun's order is x, y, z, w
-    shape = {"centers": boxes.centers, "half_sizes": boxes.sizes_lwh / 2, "quaternions": quaternions}
+    shape = {"centers": boxes.centers, "half_sizes": boxes.sizes_lwh / 2, "quaternions": quaternions(boxes)}
     return {**shape, "fill_mode": "majorwireframe"}
+
+
+def quaternions(boxes: Boxes3D) -> Array:
+    """(N, 4) the headings of boxes as unit quaternions in rerun's order, x, y, z, w."""
+    halves, zeros = boxes.yaws / 2, np.zeros(len(boxes))
+    return np.stack([zeros, zeros, np.sin(halves), np.cos(halves)], axis=-1)
 
 
 def _names(boxes: Boxes3D) -> pa.Array:

@@ -25,6 +25,7 @@ from bevcli.recording.colors import (
     line_colors,
     map_colors,
 )
+from bevcli.recording.mesh_file import Mesh
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.vehicle import VehicleMesh, default_vehicle
 
@@ -134,15 +135,18 @@ def _log_pinhole(stream: rr.RecordingStream, camera: Camera) -> None:
 
 
 def _log_vehicle(stream: rr.RecordingStream, rig: CameraRig, vehicle: VehicleMesh) -> None:
-    mesh = rr.Mesh3D(
-        vertex_positions=vehicle.vertices,
-        triangle_indices=vehicle.faces,
-        vertex_normals=vehicle.normals,
-        vertex_colors=vehicle.colors,
-    )
-    stream.log(entities.VEHICLE, mesh, static=True)
+    log_mesh(stream, entities.VEHICLE, vehicle.mesh)
     strips = [_bev_image_points(rig, strip) for strip in vehicle.top_view]
     stream.log(entities.BEV_VEHICLE, rr.LineStrips2D(strips, colors=EGO_COLOR, draw_order=40), static=True)
+
+
+def log_mesh(stream: rr.RecordingStream, entity: str, mesh: Mesh) -> None:
+    """Writes the triangles of a mesh as an entity that does not change."""
+    vertices, normals, faces, colors = mesh
+    archetype = rr.Mesh3D(
+        vertex_positions=vertices, vertex_normals=normals, triangle_indices=faces, vertex_colors=colors
+    )
+    stream.log(entity, archetype, static=True)
 
 
 def ring_distances_m(grid: BevGrid | None) -> list[int]:

@@ -4,7 +4,7 @@ import io
 import subprocess
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +14,13 @@ from bevcli.geometry.transforms import Array
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.parsing.own_process import run_python
 from bevcli.printing import reason_of
-from bevcli.recording.colors import EGO_COLOR
+from bevcli.recording.colors import EGO_COLOR, Color
 
 SMOOTH_BELOW_RAD = np.radians(40.0)  # faces that meet at a smaller angle are shaded as one curved surface
 LARGEST_BYTES = 64 * MIB  # of the file, and of each that it names
 LARGEST_TEXT_BYTES = 16 * MIB  # of a format of text, of which trimesh makes sixty times as much
 TEXT_FORMATS = (".obj", ".off")
 FORMATS = (".glb", ".gltf", ".ply", ".obj", ".stl", ".off")  # no archives, whose contents may have any size
-Part = tuple[Array, Array, NDArray[np.int64], NDArray[np.uint8]]  # vertices, normals, faces, colours
 GLTF_FILES = (".glb", ".gltf")
 EGO_FROM_GLTF = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # glTF: y up, z forward, x left
 MEMORY, SECONDS = 1024 * MIB, 20.0  # limits of the process
@@ -29,26 +28,41 @@ READ = """
 import sys, trimesh
 from bevcli.recording.mesh_file import write_parts
 limit_memory()
-sys.exit(write_parts(sys.argv[1]))
+sys.exit(write_parts(*sys.argv[1:]))
 """
 TOO_LARGE = 3  # exit code
 
 
-def read_mesh(path: Path) -> Part:
-    """All triangles of a mesh file in the ego frame: vertices (V, 3) in metres, normals, faces (F, 3), colours.
+class Mesh(NamedTuple):
+    """Triangles with colours.
+
+    Attributes:
+        vertices: (V, 3) metres.
+        normals: (V, 3) unit vectors.
+        faces: (F, 3) vertex indices.
+        colors: (V, 3) uint8 RGB.
+    """
+
+    vertices: Array
+    normals: Array
+    faces: NDArray[np.int64]
+    colors: NDArray[np.uint8]
+
+
+def read_mesh(path: Path, color: Color = EGO_COLOR) -> Mesh:
+    """All triangles of a mesh file, with the axes of the ego frame. color: of the parts that have none.
 
     Raises InputError where trimesh cannot read the file within 1 GiB and 20 s, and where it has no triangles.
     """
     if path.suffix.lower() not in FORMATS:
         raise InputError(f"{path}: is not a mesh file (expected a name that ends in {', '.join(FORMATS)})")
     try:
-        done = run_python(READ, [path], MEMORY, SECONDS)
+        done = run_python(READ, [path, *color], MEMORY, SECONDS)
     except subprocess.TimeoutExpired:
         raise InputError(f"{path}: takes more than {SECONDS:.0f} s to read (expected fewer triangles)") from None
     if done.returncode == 0:
         file = io.BytesIO(done.stdout)
-        vertices, normals, faces, colors = (np.load(file, allow_pickle=False) for _ in range(4))
-        return vertices, normals, faces, colors
+        return Mesh(*(np.load(file, allow_pickle=False) for _ in range(4)))
     lines = done.stderr.decode(errors="replace").strip().splitlines()
     if done.returncode == 1 and lines:
         raise InputError(lines[-1])
@@ -56,12 +70,12 @@ def read_mesh(path: Path) -> Part:
     raise InputError(f"{path}: {what} (expected a mesh of fewer triangles)")
 
 
-def write_parts(path: str) -> str | int | None:
+def write_parts(path: str, *color: str) -> str | int | None:
     """Write the arrays of a mesh file to stdout, for `read_mesh`. Returns what `sys.exit` takes."""
     import sys
 
     try:
-        corners, normals, faces, colors = zip(*read_parts(Path(path)), strict=True)
+        corners, normals, faces, colors = zip(*read_parts(Path(path), tuple(map(int, color))), strict=True)
         starts = np.cumsum([0, *map(len, corners[:-1])])
         shifted = np.concatenate([part + start for part, start in zip(faces, starts, strict=True)])
         for array in (np.concatenate(corners), np.concatenate(normals), shifted, np.concatenate(colors)):
@@ -73,8 +87,8 @@ def write_parts(path: str) -> str | int | None:
     return None
 
 
-def read_parts(path: Path) -> list[Part]:
-    """The triangle meshes of a file in the ego frame, read in this process. Raises InputError, MemoryError."""
+def read_parts(path: Path, color: tuple[int, ...] = EGO_COLOR) -> list[Mesh]:
+    """The triangle meshes of a file, as `read_mesh`, read in this process. Raises InputError, MemoryError."""
     import trimesh  # only here: it takes half a second to load
 
     suffix = path.suffix.lower()
@@ -83,7 +97,7 @@ def read_parts(path: Path) -> list[Part]:
         scene = trimesh.load_scene(io.BytesIO(content), file_type=suffix[1:], resolver=_Siblings(path.parent))
         if suffix in GLTF_FILES:
             scene.apply_transform(EGO_FROM_GLTF)
-        parts = [_part(mesh) for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
+        parts = [_part(mesh, color) for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
     except MemoryError:
         raise
     except Exception as error:  # each of trimesh's many readers raises errors of its own
@@ -92,7 +106,7 @@ def read_parts(path: Path) -> list[Part]:
             f"{path}: trimesh cannot read this mesh file ({reason}); try .glb, .ply, .obj or .stl"
         ) from error
     if not parts:
-        raise InputError(f"{path}: the file has no triangles (expected a triangle mesh of the vehicle)")
+        raise InputError(f"{path}: the file has no triangles (expected a triangle mesh)")
     return parts
 
 
@@ -115,7 +129,7 @@ class _Siblings(Mapping[str, bytes]):
         return sum(1 for _ in self)
 
 
-def _part(mesh: Any) -> Part:
+def _part(mesh: Any, color: tuple[int, ...]) -> Mesh:
     """Vertices, normals, faces and colours of a trimesh.Trimesh, with sharp edges."""
     import trimesh
 
@@ -125,8 +139,8 @@ def _part(mesh: Any) -> Part:
         visual = mesh.visual
     if visual.kind == "texture":
         visual = visual.to_color()  # of each vertex; one colour for all of them where there is no texture image
-    colors = visual.vertex_colors if visual.defined else (*EGO_COLOR, 255)
+    colors = visual.vertex_colors if visual.defined else (*color, 255)
     mesh.visual = trimesh.visual.ColorVisuals(vertex_colors=np.broadcast_to(colors, (len(mesh.vertices), 4)))
     mesh = trimesh.graph.smooth_shade(mesh, angle=SMOOTH_BELOW_RAD, facet_minarea=None)
     colors = np.array(mesh.visual.vertex_colors, dtype=np.uint8)[:, :3]
-    return np.array(mesh.vertices), np.array(mesh.vertex_normals), np.array(mesh.faces), colors
+    return Mesh(np.array(mesh.vertices), np.array(mesh.vertex_normals), np.array(mesh.faces), colors)

@@ -4,12 +4,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array
 from bevcli.recording.colors import EGO_COLOR, Color
-from bevcli.recording.mesh_file import read_mesh
+from bevcli.recording.mesh_file import Mesh, read_mesh
 
 BODY_LWH = (4.6, 1.86, 0.75)
 REAR_AXLE_TO_MIDDLE = 1.35  # metres ahead; the ego frame's origin is on the ground under the rear axle
@@ -26,17 +25,11 @@ class VehicleMesh:
     """The ego vehicle in the ego frame.
 
     Attributes:
-        vertices: (V, 3) metres.
-        normals: (V, 3) unit vectors.
-        faces: (F, 3) vertex indices.
-        colors: (V, 3) uint8 RGB.
+        mesh: its triangles.
         top_view: line strips (K, 2), metres: the vehicle from above, its outline and an arrow at its front.
     """
 
-    vertices: Array
-    normals: Array
-    faces: NDArray[np.int64]
-    colors: NDArray[np.uint8]
+    mesh: Mesh
     top_view: tuple[Array, ...]
 
 
@@ -52,14 +45,14 @@ def load_vehicle(path: Path) -> VehicleMesh:
     Raises InputError where trimesh cannot read the file within 1 GiB and 20 s, and where it has no triangles or is
     longer than 50 m.
     """
-    vertices, normals, faces, colors = read_mesh(path)
-    low, high = vertices.min(0), vertices.max(0)
-    if not np.isfinite(vertices).all() or not (high - low).max() <= LONGEST_M:
+    mesh = read_mesh(path)
+    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    if not np.isfinite(mesh.vertices).all() or not (high - low).max() <= LONGEST_M:
         size = " x ".join(f"{length:.4g}" for length in high - low)
         raise InputError(
             f"{path}: the vehicle's size is {size} m (expected at most {LONGEST_M:g} m; scale it to metres)"
         )
-    return VehicleMesh(vertices, normals, faces, colors, _top_view(low, high))
+    return VehicleMesh(mesh, _top_view(low, high))
 
 
 def _top_view(low: Array, high: Array) -> tuple[Array, ...]:
@@ -121,4 +114,5 @@ def _joined(parts: list[tuple[Array, Color]]) -> VehicleMesh:
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     colors = np.concatenate([np.tile(color, (3 * len(part), 1)) for part, color in parts]).astype(np.uint8)
     faces = np.arange(3 * len(triangles)).reshape(-1, 3)
-    return VehicleMesh(triangles.reshape(-1, 3), normals.repeat(3, axis=0), faces, colors, (OUTLINE, FRONT_ARROW))
+    mesh = Mesh(triangles.reshape(-1, 3), normals.repeat(3, axis=0), faces, colors)
+    return VehicleMesh(mesh, (OUTLINE, FRONT_ARROW))

@@ -20,6 +20,7 @@ from bevcli.geometry.object_classes import hex_of_color
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid
 from bevcli.recording import entities, log_bev, log_boxes, log_cameras, log_static
 from bevcli.recording.blueprint import LayoutFacts, recording_blueprint
+from bevcli.recording.class_meshes import log_class_meshes, read_class_meshes
 from bevcli.recording.colors import EGO_COLOR, Color, class_colors
 from bevcli.recording.ground_lines import future_lines, result_lines
 from bevcli.recording.layout import Layout
@@ -127,7 +128,7 @@ class Recording:
         live: a viewer that follows the recording; None for no viewer.
         resume: `state()` of the recording that was interrupted; the file is cut to its size and goes on from there.
 
-    Raises OutputError when the file cannot be written, and InputError when the vehicle's mesh cannot be read.
+    Raises OutputError when the file cannot be written, and InputError when a mesh cannot be read.
     """
 
     def __init__(
@@ -168,6 +169,7 @@ class Recording:
     def __enter__(self) -> Recording:
         mesh, grid = self.options.vehicle_mesh, self._config.bev_grid
         vehicle = None if mesh is None else load_vehicle(mesh)
+        meshes = read_class_meshes(self._config.object_classes)
         map_classes = self._config.map_classes if self.options.shows_internals else ()
         lines = log_static.line_entries(self._config)
         legend = log_static.legend_entries(self.classes, map_classes, lines)
@@ -187,6 +189,9 @@ class Recording:
         if self._live is not None:
             self._live.open(self.path)
         log_static.log_scene(self._stream, self.rig, self.classes, vehicle, grid)
+        for name, of_class in meshes.items():
+            log_static.log_mesh(self._stream, entities.class_mesh(name), of_class)
+        self._with_mesh = tuple(meshes)
         self._log_about(map_classes, lines)
         log_static.log_legend(self._stream, legend)
         if self._resume is not None:
@@ -369,6 +374,7 @@ class Recording:
         stream, names = self._stream, self.classes
         ego_xy = self._moved_to_origin(prediction.world_from_ego.matrix)[:2, 3]
         log_boxes.log_boxes_3d(stream, in_world, marks, names, ego_xy)
+        log_class_meshes(stream, in_world, self._with_mesh)
         log_boxes.log_boxes_bev(stream, shown, marks, names)
         self._tracks.log(in_world, frame.stamp, inverse(world_from_bev))
         if self._geo_origin is not None:

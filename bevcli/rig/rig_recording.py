@@ -1,19 +1,16 @@
 """recording.rrd of a calibration check: rig, images with pillars, ground and horizon, coverage and findings."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
-import cv2
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from matplotlib.colors import to_rgb
 
-from bevcli.errors import OutputError
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Array, apply
-from bevcli.recording import entities, log_static
-from bevcli.recording.blueprint import camera_rows, flat_view
+from bevcli.recording import entities
 from bevcli.recording.colors import BACKGROUND
 from bevcli.recording.layout import Layout
 from bevcli.rig.coverage import Coverage
@@ -30,25 +27,16 @@ from bevcli.rig.overlay import (
     pillars_in,
     visible_runs,
 )
+from bevcli.rig.recorded_rig import Lines, camera_views, log_image, log_lines, log_pose, rig_recording, rig_view
 from bevcli.rig.rig_report import RigReport
-from bevcli.writing import whole_file
 
 COVERAGE, COVERAGE_ON_GROUND, FINDINGS = "coverage", f"{entities.EGO}/coverage", "findings"
 PIXELS_PER_CELL = 6
-JPEG_QUALITY = 90
 
 
 def write_rig_recording(path: Path, rig: CameraRig, report: RigReport, images: Mapping[str, Pixels]) -> None:
     """Write the recording. images: by camera, (H, W, 3) BGR; any may be missing. Raises OutputError."""
-    with whole_file(path) as unfinished, rr.RecordingStream("bevcli-project-debug") as stream:
-        layout = _layout(rig)
-        try:
-            stream.save(unfinished, default_blueprint=layout)
-        except RuntimeError as error:
-            raise OutputError(f"{path}: the recording cannot be written ({error})") from error
-        finally:
-            layout.free()
-        log_static.log_scene(stream, rig, {})
+    with rig_recording(path, "bevcli-project-debug", rig, _layout(rig)) as stream:
         _log_scene(stream, rig, report.coverage)
         for camera in rig.cameras:
             _log_camera(stream, camera, rig.ego_from_bev, images.get(camera.name))
@@ -94,33 +82,19 @@ def _log_scene(stream: rr.RecordingStream, rig: CameraRig, coverage: Coverage) -
 
 
 def _log_camera(stream: rr.RecordingStream, camera: Camera, ego_from_bev: Array, pixels: Pixels | None) -> None:
-    entity = entities.camera(camera.name)
-    pose = rr.Transform3D(translation=camera.ego_from_camera[:3, 3], mat3x3=camera.ego_from_camera[:3, :3])
-    stream.log(entity, pose, static=True)
+    log_pose(stream, camera, static=True)
     if pixels is not None:
-        encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
-        image = rr.EncodedImage(contents=encoded, media_type="image/jpeg")
-        stream.log(entities.image(camera.name), image, static=True)
+        log_image(stream, camera.name, pixels)
     points = pillars_in(camera, ego_from_bev)
     radii = np.clip(60 / np.maximum(points.distances, 1e-3), 1.2, 6) * camera.width / 800
     dots = rr.Points2D(points.pixels, colors=points.colors, radii=radii, draw_order=30)
     stream.log(entities.overlay(camera.name, "pillars"), dots, static=True)
-    lines = {
+    lines: dict[str, Lines] = {
         "ground_grid": (ground_lines(camera), (*GROUND, 120), 0.6),
         "pillar_lines": (pillar_lines(camera, ego_from_bev), (235, 238, 245, 90), 0.6),
         "horizon": (visible_runs(horizon(camera)), HORIZON, 1.0),
     }
-    for kind, (strips, color, width) in lines.items():
-        inside = [strip for line in strips for strip in clipped(line, camera)]
-        archetype = rr.LineStrips2D(inside, colors=color, radii=rr.Radius.ui_points(width), draw_order=20)
-        stream.log(entities.overlay(camera.name, kind), archetype, static=True)
-
-
-def clipped(line: Array, camera: Camera) -> list[Array]:
-    """The parts of a line (P, 2) inside the image. The viewer does not clip lines."""
-    size = np.array([camera.width, camera.height])
-    inside = ((line >= 0) & (line <= size)).all(axis=-1, keepdims=True)
-    return visible_runs(np.where(inside, line, np.nan))
+    log_lines(stream, camera, lines, static=True)
 
 
 def _layout(rig: CameraRig) -> Layout:
@@ -131,27 +105,3 @@ def _layout(rig: CameraRig) -> Layout:
     rows = camera_views(rig)
     views = rrb.Vertical(*rows[:1], middle, *rows[1:], row_shares=[3, 5, 3][: len(rows) + 1])
     return Layout(views, rrb.TimePanel(state="hidden"))
-
-
-def rig_view(rig: CameraRig, overlays: Iterable[str]) -> rrb.Spatial3DView:
-    """The rig from behind. overlays: kinds of drawings in the images, which it leaves out."""
-    return rrb.Spatial3DView(
-        origin=entities.EGO,
-        contents=[
-            f"/{entities.WORLD}/**",
-            *(f"- /{entities.overlay(name, kind)}/**" for name in rig.names for kind in overlays),
-        ],
-        name="The rig",
-        background=list(BACKGROUND),
-        line_grid=False,
-        eye_controls=rrb.EyeControls3D(position=(-5.5, 0.0, 4.5), look_target=(0.9, 0.0, 0.8), eye_up=(0, 0, 1)),
-    )
-
-
-def camera_views(rig: CameraRig) -> list[rrb.Horizontal]:
-    """The images of the cameras, in rows."""
-    return [rrb.Horizontal(*(_camera_view(rig[name]) for name in row)) for row in camera_rows(rig)]
-
-
-def _camera_view(camera: Camera) -> rrb.Spatial2DView:
-    return flat_view(entities.camera(camera.name), camera.name, (0, camera.width), (0, camera.height))

@@ -13,7 +13,7 @@ import numpy as np
 
 from bevcli.config import as_table
 from bevcli.errors import InputError, OutputError
-from bevcli.evaluation.export import CsvWriter
+from bevcli.evaluation.boxes_csv import CsvWriter
 from bevcli.evaluation.submission import SubmissionWriter
 from bevcli.frame import Frame, Prediction, Sequence
 from bevcli.geometry.boxes import attributes_by_speed

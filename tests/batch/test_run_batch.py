@@ -139,6 +139,15 @@ def test_an_option_that_no_drive_has_is_refused_by_name(fleet, tmp_path):
     replace(job, own=(BagOptions(topics={"CAM": "/image"}), NuScenesOptions())).check_options(mixed)
 
 
+def test_a_wrong_mesh_of_a_class_ends_a_batch_before_it_starts(fleet, tmp_path):
+    (tmp_path / "meshed.toml").write_text(f'{MINI_TOML}\n[class_settings.car]\nmesh = "car.glb"\n')
+    job = make_job(tmp_path / "out", tmp_path / "meshed.toml")
+    drives, _ = find_drives([str(fleet / "drives/*")])
+    with pytest.raises(InputError, match=f'^mesh of class "car": {tmp_path}/car.glb: the file is missing$'):
+        run_batch(job, job.load_model(), drives)
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_stopped_batch_goes_on_with_the_drives_that_are_left(batch, fleet, tmp_path):
     answers = iter([False] * 5)
     stopped = batch(should_stop=lambda: next(answers, True))

@@ -14,7 +14,8 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError, OutputError
-from bevcli.evaluation.export import kitti_labels, write_csv, write_kitti
+from bevcli.evaluation.boxes_csv import write_csv
+from bevcli.evaluation.formats.kitti import kitti_labels, write_kitti
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, default_ego_from_bev

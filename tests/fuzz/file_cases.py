@@ -203,7 +203,7 @@ def mesh(seeds: Path, case: Path, random: Random) -> None:
                 path.write_bytes(
                     content.replace(old, random.choice(names)) if kind == 1 else edited(content, random, TEXT)
                 )
-    found = load_vehicle(case / "mesh" / name)
+    found = load_vehicle(case / "mesh" / name).mesh
     assert np.isfinite(found.vertices).all()
     assert np.isfinite(found.normals).all()
     assert found.faces.min() >= 0

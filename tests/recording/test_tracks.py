@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import rerun as rr
 from memory_drive import MemorySequence
 from recorded_drive import NamedModel, boxes_ahead, predict, with_truth
 
@@ -117,3 +118,14 @@ def test_duplicates_are_marked_in_both_views(tmp_path, entity):
     kind = "LineStrips3D" if entity == entities.DUPLICATES else "LineStrips2D"
     assert len(read.values(entity, f"{kind}:strips")) == 1
     assert len(read.values(entities.FALSE_BOXES, "LineStrips3D:strips")) == 2  # the pedestrian
+
+
+def test_a_track_of_a_class_of_any_name_is_one_entity(tmp_path, capfd):
+    stream = rr.RecordingStream("test")
+    stream.save(tmp_path / "r.rrd")
+    stream.log(entities.track("PKW / Lorry", "3"), rr.Points3D([[0, 0, 0]]), static=True)
+    stream.disconnect()
+    (chunk,) = (each for each in RecordingReader(tmp_path / "r.rrd").chunks() if "PKW" in each.entity_path)
+    assert chunk.entity_path.strip("/") == entities.track("PKW / Lorry", "3")
+    assert chunk.entity_path.replace("\\/", "").count("/") == 3  # /world/tracks/ and one name
+    assert capfd.readouterr().err == ""  # rerun warns of names that it changes

@@ -1,10 +1,8 @@
 """The ego vehicle's mesh: from files of several formats, and the default car."""
 
-import io
 import os
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import PIL.Image
@@ -25,20 +23,6 @@ from bevcli.viewer.recording_reader import RecordingReader
 RED = (200, 10, 20)
 
 
-@pytest.fixture
-def in_this_process(monkeypatch):
-    """Meshes are read without a process of their own, whose imports take a second."""
-
-    def read(code, arguments, memory, seconds):
-        output = io.BytesIO()
-        with monkeypatch.context() as patch:
-            patch.setattr(sys, "stdout", SimpleNamespace(buffer=output))
-            error = mesh_file.write_parts(*arguments)
-        return subprocess.CompletedProcess(arguments, int(bool(error)), output.getvalue(), (error or "").encode())
-
-    monkeypatch.setattr(mesh_file, "run_python", read)
-
-
 def van() -> trimesh.Trimesh:
     """A red box in the ego frame: x -1 to 4 m, y -1 to 1 m, z 0.3 to 2.3 m."""
     mesh = trimesh.creation.box(bounds=[(-1, -1, 0.3), (4, 1, 2.3)])
@@ -47,14 +31,14 @@ def van() -> trimesh.Trimesh:
 
 
 def assert_is_the_van(vehicle) -> None:
-    np.testing.assert_allclose(vehicle.vertices.min(0), (-1, -1, 0.3), atol=1e-6)
-    np.testing.assert_allclose(vehicle.vertices.max(0), (4, 1, 2.3), atol=1e-6)
-    triangles = vehicle.vertices[vehicle.faces]
+    np.testing.assert_allclose(vehicle.mesh.vertices.min(0), (-1, -1, 0.3), atol=1e-6)
+    np.testing.assert_allclose(vehicle.mesh.vertices.max(0), (4, 1, 2.3), atol=1e-6)
+    triangles = vehicle.mesh.vertices[vehicle.mesh.faces]
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     outward = triangles.mean(1) - (1.5, 0, 1.3)
     assert ((normals * outward).sum(-1) > 0).all()
-    np.testing.assert_allclose(np.abs(vehicle.normals).max(-1), 1)  # the edges of a box are sharp
-    assert (vehicle.colors == RED).all()
+    np.testing.assert_allclose(np.abs(vehicle.mesh.normals).max(-1), 1)  # the edges of a box are sharp
+    assert (vehicle.mesh.colors == RED).all()
     outline, arrow = vehicle.top_view
     np.testing.assert_allclose((outline.min(0), outline.max(0)), [(-1, -1), (4, 1)], atol=1e-6)
     assert 3 < arrow[1, 0] < 4  # its tip is at the front
@@ -86,10 +70,10 @@ def test_the_parts_of_a_scene_keep_their_positions_and_colours(tmp_path, in_this
         scene.add_geometry(part, transform=trimesh.transformations.translation_matrix((0, 0, 3 * x)))
     scene.export(tmp_path / "parts.glb")
     vehicle = load_vehicle(tmp_path / "parts.glb")
-    part = np.round(vehicle.vertices[:, 0] / 3).astype(int)  # z of glTF is x of the ego frame
+    part = np.round(vehicle.mesh.vertices[:, 0] / 3).astype(int)  # z of glTF is x of the ego frame
     assert set(part) == {0, 1}
-    assert (vehicle.colors[part == 0] == (0, 255, 0)).all()
-    assert (vehicle.colors[part == 1] == EGO_COLOR).all()
+    assert (vehicle.mesh.colors[part == 0] == (0, 255, 0)).all()
+    assert (vehicle.mesh.colors[part == 1] == EGO_COLOR).all()
 
 
 def test_colours_of_faces_do_not_mix(tmp_path, in_this_process):
@@ -97,7 +81,7 @@ def test_colours_of_faces_do_not_mix(tmp_path, in_this_process):
     mesh.visual.face_colors = [(*RED, 255)] * 6 + [(0, 0, 255, 255)] * 6
     mesh.export(tmp_path / "van.ply")
     vehicle = load_vehicle(tmp_path / "van.ply")
-    assert {tuple(color) for color in vehicle.colors.tolist()} == {RED, (0, 0, 255)}
+    assert {tuple(color) for color in vehicle.mesh.colors.tolist()} == {RED, (0, 0, 255)}
 
 
 def test_colours_are_taken_from_a_texture(tmp_path, in_this_process):
@@ -107,7 +91,7 @@ def test_colours_are_taken_from_a_texture(tmp_path, in_this_process):
     material = trimesh.visual.material.PBRMaterial(baseColorTexture=image)
     mesh.visual = trimesh.visual.TextureVisuals(uv=np.full((len(mesh.vertices), 2), 0.2), material=material)
     mesh.export(tmp_path / "van.glb")
-    assert (load_vehicle(tmp_path / "van.glb").colors == RED).all()
+    assert (load_vehicle(tmp_path / "van.glb").mesh.colors == RED).all()
 
 
 def test_a_recording_has_the_mesh_of_the_file(tmp_path, in_this_process):
@@ -209,9 +193,9 @@ def test_the_default_car_is_drawn_without_trimesh(tmp_path):
 
 def test_the_default_car_stands_on_the_ground_and_faces_forward():
     car = default_vehicle()
-    low, high = car.vertices.min(0), car.vertices.max(0)
+    low, high = car.mesh.vertices.min(0), car.mesh.vertices.max(0)
     assert low[2] == pytest.approx(0, abs=0.01)
     assert high[0] > -low[0]  # the origin is under the rear axle
-    np.testing.assert_allclose(np.linalg.norm(car.normals, axis=-1), 1)
+    np.testing.assert_allclose(np.linalg.norm(car.mesh.normals, axis=-1), 1)
     outline, _ = car.top_view
     np.testing.assert_allclose(outline.max(0), high[:2], atol=0.01)

@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError
-from bevcli.evaluation.export import write_csv, write_kitti
+from bevcli.evaluation.boxes_csv import write_csv
+from bevcli.evaluation.formats.kitti import write_kitti
 from bevcli.evaluation.formats.openlabel import openlabel
 from bevcli.frame import Frame
 from bevcli.geometry.boxes import Boxes3D

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from bevcli.evaluation.box_format import BoxFormat
-from bevcli.evaluation.export import write_csv
+from bevcli.evaluation.boxes_csv import write_csv
 from bevcli.evaluation.options import ExportOptions
 from bevcli.sequences.files.boxes_file import BoxesFile
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.evaluation.box_format import BoxFormat
-from bevcli.evaluation.export import kitti_type
+from bevcli.evaluation.formats.kitti import kitti_type
 from bevcli.evaluation.formats.tracks import Place, tracks_of
 from bevcli.evaluation.options import ExportOptions
 from bevcli.geometry.boxes import Boxes3D
