@@ -37,7 +37,7 @@ def _read(name: str, path: Path, color: Color) -> Mesh:
         raise InputError(f'mesh of class "{name}": {error}') from None
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=16)
 def _unit_cube(path: Path, color: Color, changed_s: float) -> Mesh:
     mesh = read_mesh(path, color)
     if len(mesh.faces) > MOST_TRIANGLES:
