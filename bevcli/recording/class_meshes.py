@@ -11,6 +11,7 @@ import rerun as rr
 from bevcli.errors import InputError
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import ObjectClass
+from bevcli.parsing.files import open_regular
 from bevcli.recording import entities
 from bevcli.recording.colors import Color, class_colors
 from bevcli.recording.log_boxes import quaternions
@@ -32,13 +33,16 @@ def read_class_meshes(classes: Mapping[str, ObjectClass]) -> dict[str, Mesh]:
 
 def _read(name: str, path: Path, color: Color) -> Mesh:
     try:
-        return _unit_cube(path, color, os.path.getmtime(path) if os.path.exists(path) else 0.0)
+        with open_regular(path) as file:
+            changed_ns = os.fstat(file.fileno()).st_mtime_ns
+        return _unit_cube(path, color, changed_ns)
     except InputError as error:
         raise InputError(f'mesh of class "{name}": {error}') from None
 
 
 @lru_cache(maxsize=16)
-def _unit_cube(path: Path, color: Color, changed_s: float) -> Mesh:
+def _unit_cube(path: Path, color: Color, changed_ns: int) -> Mesh:
+    """changed_ns: time of the file's last change; a file that has changed is read again."""
     mesh = read_mesh(path, color)
     if len(mesh.faces) > MOST_TRIANGLES:
         raise InputError(f"{path}: the mesh has {len(mesh.faces):,} triangles (expected at most {MOST_TRIANGLES:,})")
