@@ -4,6 +4,7 @@ import gc
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import median
 
 import cv2
 import pytest
@@ -80,9 +81,12 @@ def measured_run(mini_model, out: Path, frames: int, measured: range) -> list[Us
     return found
 
 
-def assert_flat(found: list[Usage], memory: int) -> None:
-    first = found[0]
-    assert max(later.memory for later in found) - first.memory <= memory
+def assert_flat(found: list[Usage], growth: int, peak: int) -> None:
+    """growth, peak: bytes that the median of the last tenth, and any measurement, may be above the first ones."""
+    first, tenth = found[0], max(1, len(found) // 10)
+    memory = [each.memory for each in found]
+    assert median(memory[-tenth:]) - median(memory[:tenth]) <= growth
+    assert max(memory) - first.memory <= peak
     for name in ("files", "sockets", "threads"):
         # A few more for a moment: rerun closes a stream when the next one is open already.
         assert max(getattr(later, name) for later in found) <= getattr(first, name) + 3, name
@@ -91,10 +95,11 @@ def assert_flat(found: list[Usage], memory: int) -> None:
 @pytest.mark.slow
 def test_memory_files_threads_and_sockets_stay_flat(mini_model, tmp_path, monkeypatch):
     monkeypatch.setattr(writer, "INDEXED_FRAMES", 10)  # one index of 100 frames takes 28 MB
-    assert_flat(measured_run(mini_model, tmp_path / "out", 60, range(20, 60, 10)), 9 * MIB)
+    assert_flat(measured_run(mini_model, tmp_path / "out", 60, range(20, 60, 10)), 9 * MIB, 9 * MIB)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_ten_thousand_frames_take_the_memory_of_a_hundred(mini_model, tmp_path):
-    assert_flat(measured_run(mini_model, tmp_path / "out", 10_000, range(100, 10_000, 50)), 50 * MIB)
+    found = measured_run(mini_model, tmp_path / "out", 10_000, range(100, 10_000, 50))
+    assert_flat(found, 20 * MIB, 120 * MIB)  # now and then four indexes of 28 MB are in memory
