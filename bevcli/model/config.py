@@ -46,7 +46,7 @@ class ImageConfig:
             of the network's input, so that objects at the same distance have the same size for every rig
             (`bevcli.inference.preprocess.image_for_rig`). None: `size` holds for every rig.
         max_pixels: with `focal_px`, images become larger only as long as all images of a frame have no more pixels.
-        auto_levels: stretch the grey levels of each image to the full range first
+        auto_levels: move the grey levels of dark, pale and foggy images into an ordinary range first
             (`bevcli.inference.auto_levels`), so that the model sees more in the dark and in fog.
     """
 
