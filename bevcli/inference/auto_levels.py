@@ -29,6 +29,6 @@ def auto_levels(pixels_bgr: NDArray[np.uint8]) -> NDArray[np.uint8]:
         return pixels_bgr
     low, high = min(black, BLACK), max(white, WHITE)
     stretched = ((np.arange(256) - black) * (high - low) / (white - black) + low).clip(0, 255) / 255
-    middle = np.clip(stretched[median], 0.004, 0.99)
-    gamma = np.clip(np.log(np.clip(middle, *(level / 255 for level in MEDIAN))) / np.log(middle), *GAMMAS)
+    middle, dark, pale = np.clip(stretched[median], 0.004, 0.99), MEDIAN[0] / 255, MEDIAN[1] / 255
+    gamma = np.clip(np.log(np.clip(middle, dark, pale)) / np.log(middle), *GAMMAS)
     return np.asarray(cv2.LUT(pixels_bgr, np.rint(255 * stretched**gamma).astype(np.uint8)), dtype=np.uint8)
