@@ -97,15 +97,16 @@ def camera_ports(
     left, top, right, bottom = image.crop_box
     pad = ", ".join(f"{value:g}" for value in pad_value_bgr(config))
     cropped = "" if image.crop is None else f", cropped to columns {left} to {right - 1} and rows {top} to {bottom - 1}"
+    levels = ", their grey levels moved as by bevcli.inference.auto_levels" if image.auto_levels else ""
     level = f", level, {config.bev_frame.height_m:g} m above the ground" if config.bev_frame.level else ""
     names = ", ".join(f"{index} {name}" for index, name in enumerate(config.cameras))
     return (
         Port(
             "images",
             (1, lead[-1], height, width, 3),
-            f"(1, N, H, W, 3): undistorted images, channels B G R, 0 to 255, not normalised. Each image is resized by "
-            f"min({image.size[0]} / width, {image.size[1]} / height) as float32{cropped} and written to the top left "
-            f"corner; all other pixels are {pad}.",
+            f"(1, N, H, W, 3): undistorted images, channels B G R, 0 to 255, not normalised{levels}. Each image is "
+            f"resized by min({image.size[0]} / width, {image.size[1]} / height) as float32{cropped} and written to the "
+            f"top left corner; all other pixels are {pad}.",
         ),
         Port(
             "image_from_bev",
