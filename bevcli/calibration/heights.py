@@ -11,7 +11,7 @@ from bevcli.calibration.views import THREADS, Views
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array
 
-CORRECTIONS_M = np.arange(-0.6, 0.61, 0.03)
+FAR_M, STEP_M = 0.6, 0.03  # of the corrections that are tried
 DISTANCES, ANGLES_DEG = np.linspace(2.0, 8.0, 60), np.linspace(-35, 35, 100)  # of road points; in heights of the camera
 TILES, POINTS = (6, 10), (10, 10)  # of the road: each has a level of its own, such as that of the pavement
 LEAST_CORRELATION = 0.6
@@ -19,19 +19,25 @@ LEAST_SHARPNESS, LEAST_SCORE = 0.2, 0.6  # of a peak of the scores, as shares of
 LANE_M = 4.0  # farther beside the vehicle's way a tile counts less
 
 
-def search_heights(views: Views, unknowns: Unknowns, x: Array) -> Array:
-    """(C,) corrections of the heights in x (P,), metres."""
+def search_heights(
+    views: Views, unknowns: Unknowns, x: Array, cameras: NDArray[np.bool_] | None = None, reach_m: float = FAR_M
+) -> Array:
+    """(C,) corrections of the heights in x (P,), at most `reach_m` metres; 0 for cameras that are not in a mask (C,)."""
+    corrections = np.arange(-reach_m, reach_m + STEP_M / 2, STEP_M)
+    searched = range(unknowns.cameras) if cameras is None else np.flatnonzero(cameras).tolist()
+    found = np.zeros(unknowns.cameras)
     with ThreadPoolExecutor(THREADS) as threads:
-        return np.array(list(threads.map(lambda c: _best(views, unknowns, x, c), range(unknowns.cameras))))
+        found[list(searched)] = list(threads.map(lambda c: _best(views, unknowns, x, c, corrections), searched))
+    return found
 
 
-def _best(views: Views, unknowns: Unknowns, x: Array, index: int) -> float:
-    """The correction of a camera, by all its pairs of images."""
+def _best(views: Views, unknowns: Unknowns, x: Array, index: int, corrections: Array) -> float:
+    """The correction of a camera among some (H,), by all its pairs of images."""
     groups = [group for group in unknowns.within_camera if unknowns.groups[group, 1] == index]
-    found, scores = geometry_at(unknowns, x), np.zeros(len(CORRECTIONS_M))
+    found, scores = geometry_at(unknowns, x), np.zeros(len(corrections))
     for group in groups:
-        scores += _scores(views, unknowns, found, int(group))
-    return float(CORRECTIONS_M[_lowest_level(scores)]) if scores.any() else 0.0
+        scores += _scores(views, unknowns, found, int(group), corrections)
+    return float(corrections[_lowest_level(scores)]) if scores.any() else 0.0
 
 
 def _lowest_level(scores: Array) -> int:
@@ -46,8 +52,8 @@ def _lowest_level(scores: Array) -> int:
     return int(np.flatnonzero(sharp >= LEAST_SHARPNESS * sharp.max())[-1])
 
 
-def _scores(views: Views, unknowns: Unknowns, found: GroupGeometry, group: int) -> Array:
-    """The score of each correction in a pair of images: tiles of the road that look alike vote for it."""
+def _scores(views: Views, unknowns: Unknowns, found: GroupGeometry, group: int, corrections: Array) -> Array:
+    """The score of each correction (H,) in a pair of images: tiles of the road that look alike vote for it."""
     pair, index, _ = (int(each) for each in unknowns.groups[group])
     camera = views.rig.cameras[index]
     images = [view.texture for view in views.sides((pair, index, index))]
@@ -55,7 +61,7 @@ def _scores(views: Views, unknowns: Unknowns, found: GroupGeometry, group: int) 
     points = _grid(pose)
     moved = points @ motion[:3, :3].T + motion[:3, 3]
     alike = []
-    for height in CORRECTIONS_M:
+    for height in corrections:
         at = pose[:3, 3] + [0, 0, height]
         first, second = (
             _seen(camera, image, (each - at) @ pose[:3, :3])

@@ -21,6 +21,7 @@ POINT_SCALE_PX, ROAD_SCALES_PX = 0.3, (3.0, 1.0, 0.5)  # then: the smallest one,
 CONSISTENT_PX, CONSISTENT_SHARE = 5.0, 0.5  # of the points of a pair of images: residual, and share of all
 LEARNINGS = 4  # rounds in which the error of the vehicle's rotation is learned
 SMALLEST_TURN = np.radians(0.005)  # of it
+KERB_M = 0.09  # less than from the road to a pavement
 FLOWS_PX = (12.0, 8.0)  # largest distance of road points from where they are expected, round by round
 PARTS = 2 + 2 * len(FLOWS_PX)  # of the work, for progress
 
@@ -63,7 +64,10 @@ def measure(
         for scale in ROAD_SCALES_PX:
             x = solve(unknowns, _terms(unknowns, within, road, x, scale), x).x
         if most_px == FLOWS_PX[0]:
-            x = x + level_corrections(unknowns, ties, x)
+            levels = level_corrections(unknowns, ties, x)
+            x = x + levels
+            # Shared points tell the level, and the road then tells the height to the step of the search.
+            x[heights] += search_heights(views, unknowns, x, levels[heights] != 0, KERB_M)
         progress()
     road = road.where(sees_road(unknowns, road, ties, x)[unknowns.groups[road.group, 1]])
     for _ in range(LEARNINGS):
