@@ -22,7 +22,7 @@ LANE_M = 4.0  # farther beside the vehicle's way a tile counts less
 def search_heights(
     views: Views, unknowns: Unknowns, x: Array, cameras: NDArray[np.bool_] | None = None, reach_m: float = FAR_M
 ) -> Array:
-    """(C,) corrections of the heights in x (P,), at most `reach_m` metres; 0 for cameras that are not in a mask (C,)."""
+    """(C,) corrections of the heights in x (P,), at most `reach_m` metres; 0 for cameras outside a mask (C,)."""
     corrections = np.arange(-reach_m, reach_m + STEP_M / 2, STEP_M)
     searched = range(unknowns.cameras) if cameras is None else np.flatnonzero(cameras).tolist()
     found = np.zeros(unknowns.cameras)
