@@ -20,7 +20,7 @@ from bevcli.cli import bridge
 from bevcli.cli.calibrate import calibrate
 from bevcli.errors import InputError, OutputError
 from bevcli.geometry.cameras import Distortion
-from bevcli.robustness.calibration_accuracy import WrongTimes
+from bevcli.robustness.calibration_accuracy import WrongTimes, errors_of_drive
 from bevcli.sequences.files.calibration_file import read_calibration, write_calibration
 
 STREET = Path(__file__).parents[2] / "samples/street"
@@ -233,3 +233,12 @@ def test_wrong_capture_times_are_found():
     found = bevcli.calibrate(WrongTimes(drive, TURNED, late_ms=100))
     assert found[TURNED].delay_ms == pytest.approx(-100, abs=15)
     assert angle_deg(drive.rig, found.rig, TURNED) < 0.3
+
+
+@pytest.mark.slow
+def test_a_camera_that_sees_a_pavement_finds_the_road(tmp_path):
+    bevcli.render(tmp_path / "d", seed=1000100, rig=STREET.parents[1] / "docs/rigs/four-100.json")
+    drive = bevcli.open_sequence(tmp_path / "d", ground_truth=False)
+    errors = {each.camera: each for each in errors_of_drive(drive, [4], [0])}
+    assert abs(errors["right"].height_m) < 0.03  # the pavement to its right is 15 cm higher
+    assert errors["right"].rotation_deg < 0.2
