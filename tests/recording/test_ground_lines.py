@@ -27,8 +27,7 @@ LINES = MapLines(
 PLAN = Plan(("left", "straight"), np.array([[[-1.0, 3], [-3, 6]], [[0, 4], [0, 8]]]), TIMES, "straight")
 
 
-class Planner(NamedModel):
-    config = load_config("vad-tiny")
+PLANNER = NamedModel(config=load_config("vad-tiny"))
 
 
 def with_futures():
@@ -48,7 +47,7 @@ def drive() -> MemorySequence:
 def frames(drive: MemorySequence, tmp_path_factory: pytest.TempPathFactory) -> list[RecordedFrame]:
     """Two frames; the second has no image, and so no results."""
     path = tmp_path_factory.mktemp("lines") / "r.rrd"
-    with Recording(path, drive, Planner()) as recording:
+    with Recording(path, drive, PLANNER) as recording:
         for place, results in enumerate([(LINES, PLAN), ()]):
             frame = drive.load(place)
             boxes = with_futures() if results else boxes_ahead()[:0]

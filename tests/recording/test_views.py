@@ -156,17 +156,8 @@ def test_the_segmentation_lies_on_the_ground(tmp_path):
     assert left_ahead[1] == pytest.approx(51.2, abs=1e-3)
 
 
-@dataclass(frozen=True)
-class LaneModel(NamedModel):
-    """A model whose map has classes of its own; "kerb" has no colour of its own."""
-
-    @property
-    def config(self):
-        return LaneConfig(**{part.name: getattr(TINY, part.name) for part in fields(TINY)})
-
-
 class LaneConfig(ModelConfig):
-    """The configuration of that model."""
+    """The configuration of a model whose map has classes of its own; "kerb" has no colour of its own."""
 
     @property
     def map_classes(self):
@@ -177,8 +168,9 @@ def test_a_model_with_its_own_map_classes_is_drawn_with_a_legend(tmp_path):
     drive = MemorySequence(1)
     cells = np.zeros((20, 20), dtype=np.uint8)
     cells[0, :3] = [1, 1 + 2, 4]
-    maps = BevMap(cells, GRID.x_range_m, GRID.y_range_m, class_bits(LaneModel().config.map_classes))
-    with Recording(tmp_path / "r.rrd", drive, LaneModel()) as recording:
+    config = LaneConfig(**{part.name: getattr(TINY, part.name) for part in fields(TINY)})
+    maps = BevMap(cells, GRID.x_range_m, GRID.y_range_m, class_bits(config.map_classes))
+    with Recording(tmp_path / "r.rrd", drive, NamedModel(config=config)) as recording:
         recording.log(drive.load(0), replace(predict(drive.load(0)), segmentation=maps))
     (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
     texture = frame.blob(entities.SEGMENTATION_ON_GROUND, "Mesh3D:albedo_texture_buffer")
