@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from bevcli.model.deformable_attention import FeatureMaps
+from bevcli.model.deformable_attention import FeatureMaps, LevelShapes
 from bevcli.model.upload import upload
 
 RAY_FEATURES = 9
@@ -42,12 +42,28 @@ class CalibrationEmbedding(nn.Module):
             image_from_bev: (B, N, 4, 4) float32, bev metres to pixels of the network's input, on the CPU or the device.
             image_size: (height, width) of the network's input, pixels.
         """
-        tokens = image_features.tokens
+        shapes = image_features.level_shapes
+        return modulated(image_features, *self.factor_and_shift(image_from_bev, shapes, image_size))
+
+    def factor_and_shift(
+        self, image_from_bev: Tensor, level_shapes: LevelShapes, image_size: tuple[int, int]
+    ) -> tuple[Tensor, Tensor]:
+        """What tokens are multiplied by and what is added to them, (B·N, S, C) float32 each; depends on no image.
+
+        image_from_bev, image_size: as for `forward`. level_shapes: (rows, columns) of each feature map.
+        """
+        device = self.layers[-1].weight.device
         # In float32: half precision is too coarse for rays.
-        with torch.autocast(tokens.device.type, enabled=False):
-            rays = ray_features(image_from_bev.flatten(0, 1), image_features.level_shapes, image_size, self.height_m)
-            scale, shift = self.layers(upload(rays, tokens.device)).chunk(2, dim=-1)  # (B·N, S, C) each
-        return FeatureMaps((tokens * (1 + scale) + shift).to(tokens.dtype), image_features.level_shapes)
+        with torch.autocast(device.type, enabled=False):
+            rays = ray_features(image_from_bev.flatten(0, 1), level_shapes, image_size, self.height_m)
+            scale, shift = self.layers(upload(rays, device)).chunk(2, dim=-1)
+            return 1 + scale, shift
+
+
+def modulated(image_features: FeatureMaps, factor: Tensor, shift: Tensor) -> FeatureMaps:
+    """The tokens times the factor plus the shift, in their dtype. factor, shift: (B·N, S, C) float32."""
+    tokens = image_features.tokens
+    return FeatureMaps((tokens * factor + shift).to(tokens.dtype), image_features.level_shapes)
 
 
 def ray_features(

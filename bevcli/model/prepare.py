@@ -15,6 +15,8 @@ from torch import Tensor, nn
 from bevcli.errors import WeightsError
 from bevcli.frame import BevMap, FrameResult
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.model.calibration_embedding import CalibrationEmbedding, modulated
+from bevcli.model.deformable_attention import FeatureMaps, LevelShapes
 from bevcli.model.encoder import SpatialCrossAttention
 from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms
 from bevcli.model.kernels.compiled import load_compiled
@@ -33,7 +35,8 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
 
     Batch norms are folded into their convolutions, which run in channels-last layout. Deformable attention and
     deformable convolution use the device's fastest kernels, and on a CPU oneDNN runs convolutions and linear layers.
-    Results that do not change from frame to frame are computed once (`TemporalModel.exchange_parts`, `CachedPillars`).
+    Results that do not change from frame to frame are computed once (`TemporalModel.exchange_parts`, `CachedPillars`,
+    `CachedCalibrationEmbedding`).
 
     The precision applies to the path of the images: backbone, neck, image tokens and their values. BEV queries,
     sampling locations, decoder and heads stay in float32: they are a small part of the work, and rounding them would
@@ -51,6 +54,8 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
     for name, module in list(network.named_modules()):
         if type(module) is Pillars:
             network.set_submodule(name, CachedPillars(network.config.bev_grid).to(device))
+        if isinstance(module, CalibrationEmbedding):
+            network.set_submodule(name, CachedCalibrationEmbedding(module))
         if isinstance(module, SpatialCrossAttention):
             module.attention.value_projection.to(DTYPES[precision])
     _check_finite(network)
@@ -137,6 +142,25 @@ class CachedPillars(Pillars):
             self._inputs = image_from_bev.clone(), has_image.clone(), image_size
             self._hits = super().forward(image_from_bev, image_size, has_image)
         return self._hits
+
+
+class CachedCalibrationEmbedding(nn.Module):
+    """Computes the embedding again only when the projections or the images' sizes are not those of the last call."""
+
+    _inputs: tuple[Tensor, LevelShapes, tuple[int, int]] | None = None
+    _factor_and_shift: tuple[Tensor, Tensor]
+
+    def __init__(self, embedding: CalibrationEmbedding) -> None:
+        super().__init__()
+        self.embedding = embedding
+
+    def forward(self, image_features: FeatureMaps, image_from_bev: Tensor, image_size: tuple[int, int]) -> FeatureMaps:
+        """As `CalibrationEmbedding.forward`."""
+        sizes = image_features.level_shapes, image_size
+        if self._inputs is None or self._inputs[1:] != sizes or not _equal(image_from_bev, self._inputs[0]):
+            self._factor_and_shift = self.embedding.factor_and_shift(image_from_bev, *sizes)
+            self._inputs = image_from_bev.clone(), *sizes
+        return modulated(image_features, *self._factor_and_shift)
 
 
 def _equal(one: Tensor, other: Tensor) -> bool:

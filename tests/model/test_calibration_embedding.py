@@ -16,8 +16,10 @@ from bevcli.errors import WeightsError
 from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.transforms import apply, inverse
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.model.calibration_embedding import ray_features
+from bevcli.model.calibration_embedding import CalibrationEmbedding, ray_features
+from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.image_tokens import ImageTokensConfig
+from bevcli.model.prepare import CachedCalibrationEmbedding
 from bevcli.training.warm_start import warm_start
 
 WITH_RAYS = ImageTokensConfig(level_embeddings=3, calibration_embedding=True)
@@ -84,3 +86,25 @@ def test_a_drive_in_memory_gives_rays_of_finite_numbers():
     features = ray_features(torch.tensor(matrix, dtype=torch.float32)[None], ((9, 16),), (180, 320), 1.84)
     assert features.isfinite().all()
     assert features.abs().max() < 5
+
+
+def test_a_prepared_embedding_follows_rig_and_image_size():
+    torch.manual_seed(0)
+    embedding = CalibrationEmbedding(8, 1.84).requires_grad_(False)
+    torch.nn.init.normal_(embedding.layers[-1].weight, std=0.1)
+    prepared = CachedCalibrationEmbedding(embedding)
+    rig = small_inputs().image_from_bev
+    moved = rig.clone()
+    moved[:, 0, 0, 3] += 5.0
+    for image_from_bev, size in (
+        (rig, (64, 96)),
+        (rig, (64, 96)),
+        (moved, (64, 96)),
+        (moved, (96, 64)),
+        (rig, (64, 96)),
+    ):
+        rows, columns = size[0] // 16, size[1] // 16
+        tokens = torch.randn(rig.shape[1], rows * columns, 8)
+        features = FeatureMaps(tokens, ((rows, columns),))
+        expected = embedding(features, image_from_bev, size).tokens
+        assert torch.equal(prepared(features, image_from_bev, size).tokens, expected)
