@@ -52,7 +52,7 @@ class CalibrationEmbedding(nn.Module):
 
         image_from_bev, image_size: as for `forward`. level_shapes: (rows, columns) of each feature map.
         """
-        device = self.layers[-1].weight.device
+        device = next(self.layers.parameters()).device
         # In float32: half precision is too coarse for rays.
         with torch.autocast(device.type, enabled=False):
             rays = ray_features(image_from_bev.flatten(0, 1), level_shapes, image_size, self.height_m)
