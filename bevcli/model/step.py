@@ -141,7 +141,8 @@ def model_inputs(
     return ModelInputs(
         # Copying the images of a single frame would take milliseconds.
         images=frames[0].images if len(frames) == 1 else _together([prepared.images for prepared in frames]),
-        image_from_bev=torch.cat([prepared.image_from_bev for prepared in frames]).float(),
+        # Without the noise of the poses' products (1e-14), so that frames of one rig have equal projections.
+        image_from_bev=torch.cat([prepared.image_from_bev for prepared in frames]).round(decimals=12).float(),
         camera_index=indices[0] if same else torch.stack(indices),
         has_image=torch.cat([prepared.has_image for prepared in frames]),
         can_bus=torch.from_numpy(np.stack([motion.can_bus for motion in motions])),
