@@ -24,10 +24,10 @@ def search_heights(
 ) -> Array:
     """(C,) corrections of the heights in x (P,), at most `reach_m` metres; 0 for cameras outside a mask (C,)."""
     corrections = np.arange(-reach_m, reach_m + STEP_M / 2, STEP_M)
-    searched = range(unknowns.cameras) if cameras is None else np.flatnonzero(cameras).tolist()
     found = np.zeros(unknowns.cameras)
+    searched = np.arange(len(found)) if cameras is None else np.flatnonzero(cameras)
     with ThreadPoolExecutor(THREADS) as threads:
-        found[list(searched)] = list(threads.map(lambda c: _best(views, unknowns, x, c, corrections), searched))
+        found[searched] = list(threads.map(lambda c: _best(views, unknowns, x, c, corrections), searched))
     return found
 
 
