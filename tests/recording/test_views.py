@@ -26,7 +26,8 @@ from bevcli.recording.colors import (
     map_colors,
 )
 from bevcli.recording.log_static import legend_entries, ring_distances_m
-from bevcli.recording.writer import FROM_RENDERED, UNTRAINED, Recording, frame_rate_hz, weights_note
+from bevcli.recording.recorded import FROM_RENDERED, UNTRAINED, frame_rate_hz, weights_note
+from bevcli.recording.writer import Recording
 from bevcli.viewer.recording_reader import RecordingReader
 
 
