@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -33,9 +34,11 @@ class DeformableAttention(nn.Module):
     Attributes:
         sampling: computes the weighted sums, without parameters; a faster module can take its place.
         level_sizes: makes the table of level sizes; a function that keeps the table can take its place.
+        softmax: over the last axis; a faster function can take its place.
     """
 
     level_sizes: Callable[[LevelShapes, torch.device], Tensor]
+    softmax: Callable[[Tensor], Tensor]
 
     def __init__(
         self, channels: int, query_channels: int, heads: int, points: int, levels: int = 1, maps: int = 1
@@ -59,6 +62,7 @@ class DeformableAttention(nn.Module):
         self.output_projection = nn.Linear(channels, channels)
         self.sampling: nn.Module = GridSampling()
         self.level_sizes = level_sizes
+        self.softmax = partial(torch.softmax, dim=-1)
         self._initialize()
 
     def predict(self, query: Tensor) -> tuple[Tensor, Tensor]:
@@ -72,7 +76,7 @@ class DeformableAttention(nn.Module):
     def as_samples(self, offsets: Tensor, logits: Tensor) -> tuple[Tensor, Tensor]:
         """Offsets (..., heads · maps · L · P · 2) and logits (..., heads · maps · L · P) in the form of `predict`."""
         heads, maps, levels, points = self.shape
-        weights = logits.unflatten(-1, (heads, maps, levels * points)).softmax(-1)
+        weights = self.softmax(logits.unflatten(-1, (heads, maps, levels * points)))
         return offsets.float().unflatten(-1, (*self.shape, 2)), weights.unflatten(-1, (levels, points))
 
     def locations(self, reference_points: Tensor, offsets: Tensor, level_shapes: LevelShapes) -> Tensor:

@@ -7,7 +7,7 @@ import torch
 
 from bevcli.benchmark.versions import PaddedSampling
 from bevcli.model.deformable_attention import GridSampling
-from bevcli.model.kernels.choose import fastest_sampling
+from bevcli.model.kernels.choose import fastest_sampling, softmax_of_few
 from bevcli.model.kernels.compiled import CompiledSampling
 from bevcli.model.upload import Tables
 
@@ -94,3 +94,9 @@ def test_the_gpu_equals_the_cpu(dtype):
     found = fastest_sampling(gpu, Tables())(*on_gpu).float().cpu()
     expected = PLAIN(values, shapes, locations, weights, counts)
     torch.testing.assert_close(found, expected, rtol=2e-2 if dtype != torch.float32 else 1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize("elements", [1, 4, 8, 16])
+def test_the_softmax_of_few_elements_equals_that_of_pytorch(elements):
+    logits = 200 * torch.randn(50, 3, elements, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(softmax_of_few(logits), logits.softmax(-1))

@@ -13,6 +13,8 @@ from bevcli.model.resnet import BasicBlock, Bottleneck, ResNet
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.model.upload import Tables
 
+VECTORISED = 16  # elements from which on PyTorch's own softmax is faster
+
 
 def choose_kernels(model: TemporalModel, device: torch.device, *, gradients: bool = False) -> None:
     """Gives a model, in place, the memory layout and the deformable attention that are fastest on a device.
@@ -27,6 +29,8 @@ def choose_kernels(model: TemporalModel, device: torch.device, *, gradients: boo
             module.sampling = fastest_sampling(device, tables, gradients=gradients)
             if not gradients:
                 module.level_sizes = tables.level_sizes
+            if not gradients and device.type == "cpu":
+                module.softmax = softmax_of_few
 
 
 def fastest_sampling(device: torch.device, tables: Tables, *, gradients: bool = False) -> nn.Module:
@@ -44,6 +48,14 @@ def fastest_sampling(device: torch.device, tables: Tables, *, gradients: bool = 
 
         return TritonSampling(tables)
     return GridSampling()
+
+
+def softmax_of_few(logits: Tensor) -> Tensor:
+    """Softmax over the last axis. On a CPU that of PyTorch takes ten times as long where this has 4 or 8 elements."""
+    if logits.shape[-1] >= VECTORISED:
+        return logits.softmax(-1)
+    exponentials = (logits - logits.amax(-1, keepdim=True)).exp_()
+    return exponentials.div_(exponentials.sum(-1, keepdim=True))
 
 
 def fold_batch_norms(model: nn.Module, device: torch.device) -> None:
