@@ -21,6 +21,7 @@ from bevcli.training.detection_loss import (
     detection_loss,
     last_matches,
 )
+from bevcli.training.distillation import DistillationLossConfig
 from bevcli.training.perspective_loss import PerspectiveHead, PerspectiveLossConfig, perspective_loss
 from bevcli.training.samples import Targets
 from bevcli.training.segmentation_loss import SegmentationLossConfig, segmentation_loss
@@ -108,6 +109,7 @@ class LossConfigs:
         segmentation_loss: the segmentation head's, where the model has one.
         dense_loss: auxiliary, on the BEV map.
         perspective_loss: auxiliary, on the image features.
+        distillation_loss: auxiliary, against the BEV map of a teacher.
         RENAMED_KEYS: tables of earlier versions, and what replaces them.
     """
 
@@ -115,6 +117,7 @@ class LossConfigs:
     segmentation_loss: SegmentationLossConfig = field(default_factory=SegmentationLossConfig)
     dense_loss: DenseLossConfig = field(default_factory=DenseLossConfig)
     perspective_loss: PerspectiveLossConfig = field(default_factory=PerspectiveLossConfig)
+    distillation_loss: DistillationLossConfig = field(default_factory=DistillationLossConfig)
 
     RENAMED_KEYS: ClassVar[Mapping[str, str]] = {
         "picture_loss": "[training.perspective_loss] replaces it, with other keys (docs/training.md)"
@@ -160,8 +163,12 @@ class FrameLosses:
         finally:
             hook.remove()
 
-    def __call__(self, inputs: ModelInputs, outputs: ModelOutputs, targets: Targets) -> dict[str, Tensor]:
+    def __call__(
+        self, inputs: ModelInputs, outputs: ModelOutputs, targets: Targets, taught: Tensor | None = None
+    ) -> dict[str, Tensor]:
         """The weighted scalar losses by name; their sum is minimised.
+
+        taught: (B, Y·X, C), the BEV map of the teacher.
 
         Call it inside `watching`, right after the forward pass that made the outputs.
         """
@@ -183,6 +190,9 @@ class FrameLosses:
                 self.configs.perspective_loss,
             )
             losses |= {"perspective classes": perspective.classes, "perspective boxes": perspective.boxes}
+        if taught is not None:
+            difference = nn.functional.mse_loss(outputs.bev.float(), taught)
+            losses |= {"distillation": self.configs.distillation_loss.weight * difference}
         if targets.truths:
             matches = last_matches(logits, codes, targets.detection, weights)
             losses |= self._head_losses(outputs, targets.truths, matches)

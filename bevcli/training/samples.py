@@ -5,6 +5,7 @@ As in the paper, the last frame of a clip is trained on; the others are its hist
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -16,7 +17,7 @@ from torch import Tensor
 from bevcli.errors import InputError
 from bevcli.frame import Frame, Sequence
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.transforms import inverse
+from bevcli.geometry.transforms import Pose, inverse
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.config import ModelConfig
 from bevcli.model.step import ModelInputs, PreparedFrame, model_inputs
@@ -176,16 +177,19 @@ class Batch:
         inputs: the network inputs, one a frame of the clips, each for B clips.
         world_from_bev: (frames, B, 4, 4) float64, the poses of the bev frames, metres.
         targets: of the last frames of the clips. There are fewer than inputs if the first frames are history only.
+        plain: the same clips before augmentation, for a teacher; None without one.
     """
 
     inputs: tuple[ModelInputs, ...]
     world_from_bev: Tensor
     targets: tuple[Targets, ...]
+    plain: Batch | None = None
 
     def to(self, device: torch.device) -> Batch:
         """A copy on a device. Projections and poses stay on the CPU, which reads them without waiting for a GPU."""
         inputs = tuple(one.to(device, keep_geometry=True) for one in self.inputs)
-        return Batch(inputs, self.world_from_bev, tuple(targets.to(device) for targets in self.targets))
+        plain = None if self.plain is None else self.plain.to(device)
+        return Batch(inputs, self.world_from_bev, tuple(targets.to(device) for targets in self.targets), plain)
 
 
 def load_batch(
@@ -196,30 +200,33 @@ def load_batch(
     random: np.random.Generator,
     *,
     learn_all: bool = False,
+    plain: bool = False,
 ) -> Batch:
     """Reads, augments and preprocesses the frames of clips of the same length.
 
     Args:
         learn_all: give targets for every frame, not for the last one only.
+        plain: give the clips before augmentation too.
 
     Raises:
         InputError: a frame to train on has no ground truth.
     """
-    frames = list(zip(*(_load_clip(drives, clip, config, augmentation, random) for clip in clips), strict=True))
-    inputs = []
-    for index, prepared in enumerate(frames):
-        previous_poses = [one.frame.world_from_ego for one in frames[index - 1]] if index else [None] * len(clips)
-        step = model_inputs(prepared, previous_poses, config)
+    loaded = [[drives.open(clip.drive).load(index) for index in clip.frames] for clip in clips]
+    augmented = (_augmented(of_clip, augmentation, random) for of_clip in loaded)
+    frames = _prepared(augmented, config)
+    inputs = _inputs(frames, config)
+    for step in inputs:
         mask_images(step.images, augmentation.grid_mask, random)
-        inputs.append(step)
     learned = range(len(frames)) if learn_all else [len(frames) - 1]
     poses = [[one.frame.world_from_ego.matrix @ one.frame.rig.ego_from_bev for one in prepared] for prepared in frames]
+    world_from_bev = torch.from_numpy(np.array(poses))
     targets = []
     for index in learned:
         of_clips = [one.frame for one in frames[index]]
         places = [(drives.open(clip.drive), clip.frames[index]) for clip in clips]
         targets.append(_targets(of_clips, places, config))
-    return Batch(tuple(inputs), torch.from_numpy(np.array(poses)), tuple(targets))
+    shown = Batch(_inputs(_prepared(loaded, config), config), world_from_bev, ()) if plain else None
+    return Batch(inputs, world_from_bev, tuple(targets), shown)
 
 
 def ground_truth_boxes(frame: Frame) -> Boxes3D:
@@ -248,11 +255,19 @@ def _targets(frames: list[Frame], places: list[tuple[Sequence, int]], config: Mo
     return Targets(detection, perspective, tuple(segmentation), truths)
 
 
-def _load_clip(
-    drives: Drives, clip: Clip, config: ModelConfig, augmentation: AugmentationConfig, random: np.random.Generator
-) -> list[PreparedFrame]:
-    sequence, preprocess = drives.open(clip.drive), Preprocessor(config)
+def _augmented(clip: list[Frame], augmentation: AugmentationConfig, random: np.random.Generator) -> list[Frame]:
     vary_images, vary_rig = ImageVariation(augmentation, random), CalibrationVariation(augmentation, random)
     worsen = BadConditions(augmentation, random)
-    frames = (vary_rig(worsen(vary_images(sequence.load(index)))) for index in clip.frames)
-    return [preprocess(distort_images(frame, augmentation.photometric, random)) for frame in frames]
+    frames = (vary_rig(worsen(vary_images(frame))) for frame in clip)
+    return [distort_images(frame, augmentation.photometric, random) for frame in frames]
+
+
+def _prepared(clips: Iterable[list[Frame]], config: ModelConfig) -> list[tuple[PreparedFrame, ...]]:
+    """For each frame of the clips, that of every clip."""
+    return list(zip(*([*map(Preprocessor(config), clip)] for clip in clips), strict=True))
+
+
+def _inputs(frames: list[tuple[PreparedFrame, ...]], config: ModelConfig) -> tuple[ModelInputs, ...]:
+    poses: list[list[Pose | None]] = [[None] * len(frames[0])]
+    poses += [[one.frame.world_from_ego for one in prepared] for prepared in frames[:-1]]
+    return tuple(model_inputs(prepared, before, config) for prepared, before in zip(frames, poses, strict=True))

@@ -4,6 +4,7 @@ import contextlib
 import copy
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import islice, repeat
 from typing import Any, TypeVar
 
 import numpy as np
@@ -20,6 +21,7 @@ from bevcli.model.kernels.onednn import use_onednn
 from bevcli.model.network import Network
 from bevcli.model.resnet import ResNet
 from bevcli.model.step import ModelOutputs
+from bevcli.training.distillation import Teacher
 from bevcli.training.files import LearningCurve, draw_learning_curves, load_checkpoint, save_checkpoint, save_weights
 from bevcli.training.frame_losses import FrameLosses
 from bevcli.training.job import CHECKPOINT, OptimizerConfig, TrainingJob
@@ -153,6 +155,9 @@ class Trainer:
         if resume:
             self.done = load_checkpoint(job.out / CHECKPOINT, self.trained, self.optimizer, self._average)
         choose_kernels(job.model, job.device, gradients=True)
+        self._teacher: Teacher | None = None
+        if job.config.distillation_loss.weight > 0:
+            self._teacher = Teacher(job.model, job.config.distillation_loss.teacher, job.device)
         self._frozen: FrozenStages | None = None
         if job.config.frozen_stages and job.config.freeze_batch_norm:
             dtype = torch.bfloat16 if computes_in_bfloat16(job.device) else torch.float32
@@ -213,7 +218,9 @@ class Trainer:
         batches = []
         for _ in range(config.clips.in_turn):
             clips = draw_clips(job.drives, config.clips, random, with_gap=model.trains_with_gaps)
-            batches.append(load_batch(job.drives, clips, model, augmentation, random, learn_all=learn_all))
+            plain = self._teacher is not None
+            batch = load_batch(job.drives, clips, model, augmentation, random, learn_all=learn_all, plain=plain)
+            batches.append(batch)
         return batches
 
     def _step(self, batches: list[Batch], after_update: Callable[[float], None]) -> dict[str, float]:
@@ -239,10 +246,14 @@ class Trainer:
         """The losses of each frame to train on, lazily: the model may be updated in between."""
         job, config = self.job, self.job.config
         outputs = forward_clip(job.model, batch, learn_all=self._learn_all, freeze_batch_norm=config.freeze_batch_norm)
-        for inputs, targets in zip(batch.inputs[-len(batch.targets) :], batch.targets, strict=True):
+        learned = len(batch.targets)
+        maps: Iterator[Tensor | None] = repeat(None)
+        if self._teacher is not None and batch.plain is not None:
+            maps = islice(self._teacher.bev_maps(batch.plain), len(batch.inputs) - learned, None)
+        for inputs, targets in zip(batch.inputs[-learned:], batch.targets, strict=True):
             with torch.autocast(job.device.type, torch.bfloat16, enabled=computes_in_bfloat16(job.device)):
-                output = next(outputs)
-            yield self._losses(inputs, output, targets)
+                output, taught = next(outputs), next(maps)
+            yield self._losses(inputs, output, targets, taught)
 
     def _update(self, losses: dict[str, Tensor]) -> dict[str, float]:
         """One update of the weights."""
