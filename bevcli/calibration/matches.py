@@ -90,6 +90,8 @@ def _matched(a: _Features, b: _Features, first: Camera, second: Camera) -> tuple
     if first is second:
         good[good] = _rigid(rays_a[good], rays_b[good], first)
     chosen = np.flatnonzero(good)
+    # SIFT gives a point with several orientations several times.
+    chosen = chosen[np.sort(np.unique(pixels_a[chosen].astype(int), axis=0, return_index=True)[1])]
     chosen = chosen[_spread(pixels_a[chosen], quality[chosen].astype(np.float64), first)]
     return pixels_a[chosen], pixels_b[chosen]
 

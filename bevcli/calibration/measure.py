@@ -64,7 +64,7 @@ def measure(
         for scale in ROAD_SCALES_PX:
             x = solve(unknowns, _terms(unknowns, within, road, x, scale), x).x
         if most_px == FLOWS_PX[0]:
-            levels = level_corrections(unknowns, ties, x)
+            levels = level_corrections(unknowns, road, ties, x)
             x = x + levels
             # Shared points tell the level, and the road then tells the height to the step of the search.
             x[heights] += search_heights(views, unknowns, x, levels[heights] != 0, KERB_M)
@@ -81,7 +81,7 @@ def _terms(
 ) -> list[Term]:
     """Both kinds of residuals, with the spread that they have at x (P,)."""
     scales = ((points, POINT_SCALE_PX), (road, road_scale))
-    return [Term(each, max(least, spread(unknowns, each, x))) for each, least in scales]
+    return [Term(each, np.maximum(least, spread(unknowns, each, x))) for each, least in scales]
 
 
 def consistent(unknowns: Unknowns, points: EpipolarResiduals, x: Array) -> EpipolarResiduals:

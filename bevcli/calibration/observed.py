@@ -10,7 +10,7 @@ from bevcli.calibration.unknowns import OF_CAMERA, OF_RIG, Unknowns
 from bevcli.geometry.transforms import Array
 
 LEAST_INFORMATION = 3.0  # of a direction, in that of the stated value: the deviation is then halved at least
-LEAST_FACTOR = 0.25  # of variances, by which the agreement of the pairs may make them smaller
+LEAST_FACTOR = 0.5  # of variances, by which the agreement of the pairs may make them smaller
 FINEST = np.array([np.radians(0.01)] * 3 + [0.001] * 3 + [0.001])  # errors of lens and images: radians, metres, seconds
 
 

@@ -63,6 +63,15 @@ class EpipolarResiduals:
         length = np.sqrt((normal_a**2).sum(-1) + (normal_b**2).sum(-1))
         return (self.focal * (self.rays_b * normal_a).sum(-1) / np.maximum(length, SHORTEST))[:, None]
 
+    def depths(self, geometry: GroupGeometry) -> Array:
+        """(N, 2) metres along both rays to where they meet, or come nearest to it; 0 for parallel rays."""
+        relative = geometry.camera_b_from_camera_a[self.group]
+        ray_a, ray_b = np.einsum("nij,nj->ni", relative[:, :3, :3], self.rays_a), self.rays_b
+        shift, cosine = relative[:, :3, 3], (ray_a * ray_b).sum(-1)
+        along_a, along_b = (shift * ray_a).sum(-1), (shift * ray_b).sum(-1)
+        found = np.stack([cosine * along_b - along_a, along_b - cosine * along_a], axis=-1)
+        return found / np.maximum(1 - cosine**2, SHORTEST)[:, None]
+
 
 @dataclass(frozen=True)
 class RoadResiduals:

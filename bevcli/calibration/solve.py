@@ -21,14 +21,15 @@ DAMPING = (1e-4, 1e8)  # at the start, and where the search ends without success
 DEVIATION = 1.4826  # standard deviation by the median of absolute values
 LEAST_CURVATURE = 0.1  # where most residuals are outliers
 SMALLEST_PX = 0.05  # a smaller spread of residuals is not believed
+FEWEST = 50  # residuals of a camera that tell their spread
 
 
 @dataclass(frozen=True)
 class Term:
-    """Residuals with their spread, pixels: Cauchy's loss treats those far beyond it as outliers."""
+    """Residuals with their spread, pixels, one or (N,): Cauchy's loss treats those far beyond it as outliers."""
 
     residuals: Residuals
-    scale: float
+    scale: float | Array
 
 
 @dataclass(frozen=True)
@@ -83,10 +84,18 @@ def solve(unknowns: Unknowns, terms: Items[Term], x: Array) -> Solution:
     return _at(unknowns, terms, x, curvature=True)
 
 
-def spread(unknowns: Unknowns, residuals: Residuals, x: Array) -> float:
-    """The standard deviation of the residuals at x, pixels, outliers left out."""
-    found = np.abs(values(unknowns, residuals, x))
-    return max(DEVIATION * float(np.median(found)), SMALLEST_PX) if found.size else 1.0
+def spread(unknowns: Unknowns, residuals: Residuals, x: Array) -> Array:
+    """The standard deviation of the residuals at x, pixels, outliers left out: (N,), that of the camera of each.
+
+    A camera with few residuals has that of all.
+    """
+    found, camera = np.abs(values(unknowns, residuals, x)), unknowns.groups[residuals.group, 1]
+    result = np.full(len(found), DEVIATION * np.median(found) if found.size else 1.0)
+    for each in np.unique(camera):
+        mine = camera == each
+        if mine.sum() >= FEWEST:
+            result[mine] = DEVIATION * np.median(found[mine])
+    return np.maximum(result, SMALLEST_PX)
 
 
 def _cost(unknowns: Unknowns, terms: Items[Term], x: Array, prior: Array) -> float:

@@ -15,7 +15,9 @@ from typer.testing import CliRunner
 import bevcli
 from bevcli.calibration.corrected_drive import CorrectedDrive
 from bevcli.calibration.estimates import Verdict
+from bevcli.calibration.matches import match_points
 from bevcli.calibration.table import either_text
+from bevcli.calibration.views import read_views
 from bevcli.cli import bridge
 from bevcli.cli.calibrate import calibrate
 from bevcli.errors import InputError, OutputError
@@ -88,6 +90,12 @@ def test_lens_distortion_is_respected(street, lens, zoom):
     found = bevcli.calibrate(WrongRig(seen, replace(seen.rig, cameras=stated)))
     assert angle_deg(right, found.rig, TURNED) < 0.3
     assert found[LOW].position_m[2] == pytest.approx(0.15, abs=0.03)
+
+
+def test_no_point_is_matched_twice(street):
+    found = match_points(read_views(WrongRig(*street[:2]), 6))
+    points = np.column_stack([found.group, found.pixels_a.astype(int)])
+    assert len(np.unique(points, axis=0)) == len(points) > 1000
 
 
 def test_the_residual_falls_to_less_than_a_pixel(result):

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bevcli.calibration.levels import level_corrections
+from bevcli.calibration.levels import level_corrections, sees_road
 from bevcli.calibration.options import CalibrateOptions
 from bevcli.calibration.residuals import EpipolarResiduals, RoadResiduals, derivatives, values
 from bevcli.calibration.road import beside_way
+from bevcli.calibration.solve import spread
 from bevcli.calibration.unknowns import HEIGHT, OF_CAMERA, Unknowns, geometry_at
 from bevcli.calibration.views import DELAYS_S, View, Views
 from bevcli.geometry.cameras import Camera, CameraRig, Distortion, default_ego_from_bev
@@ -100,14 +101,58 @@ def test_derivatives_are_those_of_finite_differences(drive):
         assert np.allclose(mine, expected[:, 0], atol=1e-2 * max(np.abs(expected).max(), 1))
 
 
-def test_a_camera_on_the_level_of_a_pavement_is_put_right(drive):
-    views, unknowns = drive
+def road_of(views: Views, group: int, points: np.ndarray, beside_m: float) -> RoadResiduals:
+    """Points of the road in one group, with unit weights of 600 pixels."""
+    rays_a, rays_b = rays_in(views, views.groups()[group], points)
+    weights, count = np.tile(600 * np.eye(3)[:2], (len(points), 1, 1)), len(points)
+    return RoadResiduals(np.full(count, group), rays_a, rays_b, weights, np.full(count, beside_m))
+
+
+def shared_points(views: Views, unknowns: Unknowns) -> EpipolarResiduals:
+    """The points that camera A sees in one frame and camera B in the other."""
     residuals = points_of(views, SCENE)
     groups = unknowns.groups[residuals.group]
+    return residuals.where(groups[:, 1] != groups[:, 2])
+
+
+def lowered(unknowns: Unknowns, height_m: float) -> np.ndarray:
+    """Values with camera B lower by a kerb, as if it saw a pavement."""
     x = np.zeros(len(unknowns.deviations))
-    x[OF_CAMERA + HEIGHT] = -0.14  # camera B, seen from a kerb
-    found = level_corrections(unknowns, residuals.where(groups[:, 1] != groups[:, 2]), x)
-    assert found[HEIGHT] + 0.14 - found[OF_CAMERA + HEIGHT] == pytest.approx(0, abs=0.02)
+    x[OF_CAMERA + HEIGHT] = -height_m
+    return x
+
+
+def test_a_camera_on_the_level_of_a_pavement_is_put_right(drive):
+    views, unknowns = drive
+    road = road_of(views, 0, np.repeat(ROAD, 2, axis=0), beside_m=0.5)  # A sees it right where the vehicle drives
+    found = level_corrections(unknowns, road, shared_points(views, unknowns), lowered(unknowns, 0.14))
+    assert found[HEIGHT] == 0
+    assert found[OF_CAMERA + HEIGHT] == pytest.approx(0.14, abs=0.02)
+
+
+def test_a_camera_level_with_a_pavement_does_not_see_the_road(drive):
+    views, unknowns = drive
+    road, shared = road_of(views, 0, np.repeat(ROAD, 2, axis=0), beside_m=0.5), shared_points(views, unknowns)
+    assert sees_road(unknowns, road, shared, lowered(unknowns, 0)).tolist() == [True, True]
+    assert sees_road(unknowns, road, shared, lowered(unknowns, 0.14)).tolist() == [True, False]
+
+
+def test_the_road_beside_the_way_may_be_a_pavement(drive):
+    views, unknowns = drive
+    road, shared = road_of(views, 0, np.repeat(ROAD, 2, axis=0), beside_m=5.0), shared_points(views, unknowns)
+    assert not sees_road(unknowns, road, shared, lowered(unknowns, 0)).any()
+
+
+def test_the_spread_of_residuals_is_that_of_their_camera(drive):
+    views, unknowns = drive
+    shared = points_of(views, SCENE)
+    turned = np.zeros(len(unknowns.deviations))
+    turned[OF_CAMERA] = np.radians(1.0)  # camera B alone
+    of_camera = unknowns.groups[shared.group]
+    within = shared.where(of_camera[:, 1] == of_camera[:, 2])
+    found = spread(unknowns, within, turned)
+    b = unknowns.groups[within.group, 1] == 1
+    assert found[b].min() > 10 * found[~b].max()
 
 
 def test_a_delay_moves_the_vehicle(drive):
