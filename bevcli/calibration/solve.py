@@ -137,4 +137,6 @@ def _summed(columns: Indices, parts: Array, size: int) -> Array:
 
 def _curvature(squares: Array) -> float:
     """The mean curvature of Cauchy's loss as a share of the mean weight, for squared residuals (N,) in its scale."""
+    if not len(squares):
+        return 1.0
     return max(float(np.sum((1 - squares) / (1 + squares) ** 2) / np.sum(1 / (1 + squares))), LEAST_CURVATURE)
