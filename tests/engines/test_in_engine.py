@@ -38,6 +38,8 @@ pytest.importorskip("onnxscript")
 pytest.importorskip("onnxruntime")
 pytest.importorskip("openvino")
 STREET = Path(__file__).parents[2] / "samples" / "street"
+REPLACED = ("export_onnx", "quantize", "CALIBRATION_FRAMES", "COMPARED_FRAMES")  # by `steps`, for all tests after it
+ORIGINAL = {name: getattr(module, name) for name in REPLACED}
 
 
 @pytest.fixture(scope="module")
@@ -182,6 +184,8 @@ def test_a_model_in_an_engine_needs_a_drive(network):
 @pytest.mark.slow
 def test_demo_runs_by_its_name_in_int8(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    for name, original in ORIGINAL.items():
+        monkeypatch.setattr(module, name, original)
     options = ["--engine", "openvino", "--precision", "int8"]
     done = CliRunner().invoke(app, ["run", str(STREET), *options, "--out", str(tmp_path / "run")])
     assert done.exit_code == 0, done.output
