@@ -215,10 +215,9 @@ class Trainer:
         job, config = self.job, self.job.config
         random = np.random.default_rng(self._seeds(step))
         model, augmentation, learn_all = job.model.config, config.augmentation, self._learn_all
-        batches = []
+        batches, plain = [], self._teacher is not None
         for _ in range(config.clips.in_turn):
             clips = draw_clips(job.drives, config.clips, random, with_gap=model.trains_with_gaps)
-            plain = self._teacher is not None
             batch = load_batch(job.drives, clips, model, augmentation, random, learn_all=learn_all, plain=plain)
             batches.append(batch)
         return batches
