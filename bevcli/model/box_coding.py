@@ -48,6 +48,7 @@ def encode(boxes: Boxes3D) -> Array:
 
 
 def boxes_of_codes(code: Array, classes: np.ndarray, scores: Array) -> Boxes3D:
+    """The inverse of `encode`, for codes (N, 10) with the classes (N,) and scores (N,) of their boxes."""
     angle = np.arctan2(code[:, 6], code[:, 7])
     return Boxes3D(
         centers=code[:, [0, 1, 4]],

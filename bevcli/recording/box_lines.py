@@ -36,8 +36,9 @@ def lines_in_image(boxes: Boxes3D, camera: Camera, camera_from_boxes: Array) -> 
     camera_from_boxes: (4, 4) from the boxes' frame to the camera frame at the image's time.
     """
     corners = apply(camera_from_boxes, boxes.corners())  # (N, 8, 3)
-    edges = corners[:, _EDGES]  # (N, 14, 2, 3)
-    owners = np.repeat(np.arange(len(boxes)), len(_EDGES))
+    before = np.flatnonzero((corners[..., 2] >= NEAR_CLIP_M).any(-1))
+    edges = corners[before][:, _EDGES]  # (N', 14, 2, 3)
+    owners = np.repeat(before, len(_EDGES))
     return cut_to_image(edges.reshape(-1, 2, 3), owners, camera)
 
 

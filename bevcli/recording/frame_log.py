@@ -11,6 +11,7 @@ from bevcli.frame import Frame, FrameStamp, Prediction
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid
 from bevcli.recording import entities, log_bev, log_boxes, log_cameras, log_static
+from bevcli.recording.box_lines import box_labels
 from bevcli.recording.class_meshes import log_class_meshes
 from bevcli.recording.colors import EGO_COLOR, class_colors
 from bevcli.recording.ground_lines import future_lines, result_lines
@@ -200,8 +201,9 @@ class FrameLog:
         if self._geo_origin is not None:
             in_sequence = shown.transformed(prediction.world_from_ego.matrix @ prediction.ego_from_bev)
             log_boxes.log_boxes_on_map(stream, self._geo_origin, in_sequence, names)
+        colors, texts = log_boxes.box_colors(shown, names), box_labels(shown)
         for posed in cameras:
-            log_cameras.log_boxes_in_image(stream, posed, in_world, names)
+            log_cameras.log_boxes_in_image(stream, posed, in_world, colors, texts)
         counts = [float((shown.classes == name).sum()) for name in names]
         stream.log(entities.BOX_CURVES, rr.Scalars(counts))
 

@@ -1,6 +1,6 @@
 """Writes one camera of a frame into a recording: pose, image, and the overlays of the image."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -12,9 +12,8 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.recording import entities
-from bevcli.recording.box_lines import ImageLines, box_labels, labels_2d, labels_in_image, lines_in_image
-from bevcli.recording.colors import Color, colormap
-from bevcli.recording.log_boxes import box_colors
+from bevcli.recording.box_lines import ImageLines, labels_2d, labels_in_image, lines_in_image
+from bevcli.recording.colors import colormap
 from bevcli.recording.video_images import Av1Encoder
 
 JPEG_QUALITY = 85  # for images that have no encoded bytes, such as those of a video
@@ -84,14 +83,15 @@ class VideoImages:
 
 
 def log_boxes_in_image(
-    stream: rr.RecordingStream, posed: PosedCamera, boxes: Boxes3D, classes: Mapping[str, Color]
+    stream: rr.RecordingStream, posed: PosedCamera, boxes: Boxes3D, colors: np.ndarray, texts: list[str]
 ) -> None:
-    """Draws predicted boxes (in the recording's world) into the image: lines and labels."""
+    """Draws predicted boxes (in the recording's world) into the image: lines and labels.
+
+    colors: (N, 3) uint8. texts: the label of each box.
+    """
     name = posed.name
-    colors = box_colors(boxes, classes)
     lines = lines_in_image(boxes, posed.camera, posed.camera_from_world)
     stream.log(entities.overlay(name, "boxes"), _strips(lines, colors, 1.0, draw_order=30))
-    texts = box_labels(boxes)
     places, owners = labels_in_image(lines, texts, posed.camera.width, posed.camera.height)
     labels = labels_2d(places, [texts[owner] for owner in owners], colors=colors[owners], draw_order=31)
     stream.log(entities.overlay(name, "boxes/labels"), labels)
