@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import date
+from itertools import product
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -15,6 +16,7 @@ import torch
 from bevcli.benchmark.limits import MachineLimits
 from bevcli.config import known_models
 from bevcli.errors import BevcliError
+from bevcli.model.kernels.onednn import has_onednn
 from bevcli.parsing.files import MIB, read_text
 from bevcli.printing import say
 from bevcli.writing import write_whole
@@ -167,16 +169,28 @@ class BenchmarkResult:
 def write_table(path: Path, device: torch.device, frames: int) -> None:
     """Measures every model in every precision, and writes the table between the lines BEGIN and END of a document.
 
-    Raises BevcliError where an existing file lacks these lines.
+    The table is written after each measurement. One that fails is said and left out. A CPU without bfloat16 instructions
+    measures float32 only.
+
+    Raises BevcliError where an existing file lacks these lines, and at the end where a measurement failed.
     """
     text = read_text(path, LARGEST_DOCUMENT) if path.is_file() else f"{BEGIN}\n{END}\n"
     before, begin, rest = text.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not (begin and end):
         raise BevcliError(f"{path}: cannot find where to write the table (expected the lines {BEGIN} and {END})")
-    precisions = ("bf16", "fp16") if device.type == "cuda" else ("fp32", "bf16")
-    results = [measure(model, precision, device, frames) for model in known_models() for precision in precisions]
-    write_whole(path, f"{before}{begin}\n{markdown_table(results)}\n{end}{after}".encode())
+    on_cpu = ("fp32", "bf16") if has_onednn(torch.bfloat16) else ("fp32",)
+    results, failures = [], 0
+    for model, precision in product(known_models(), ("bf16", "fp16") if device.type == "cuda" else on_cpu):
+        try:
+            results.append(measure(model, precision, device, frames))
+        except BevcliError as error:
+            say(str(error), err=True)
+            failures += 1
+        else:
+            write_whole(path, f"{before}{begin}\n{markdown_table(results)}\n{end}{after}".encode())
+    if failures:
+        raise BevcliError(f"{path}: {failures} of {failures + len(results)} measurements failed and are left out")
 
 
 def measure(

@@ -47,7 +47,7 @@ class Preprocessor:
         frame = frame if frame.rig is self._model_rig else replace(frame, rig=self._model_rig)
         image, names = self._image, self._assignment.cameras
         width, height = image.padded_size
-        images = torch.zeros(1, len(names), 3, height, width)
+        images = torch.zeros(1, len(names), height, width, 3).movedim(-1, 2)  # as convolutions read them
 
         def write(place: int, name: str) -> None:
             pixels = frame.rig[name].undistort(frame.images[name].pixels_bgr)

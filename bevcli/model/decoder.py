@@ -26,6 +26,8 @@ class DecoderConfig:
         feed_forward_width: channels between the two linear layers of the feed-forward network.
         dropout: probability, 0 to below 1.
         max_boxes: number of boxes that are decoded, those with the best scores.
+        fade_duplicates: share of its score that a box loses at the place of a better box of its class, and less beside
+            it; see `box_coding.faded_scores`. With 0, as published, scores stay as they are.
         training_groups: number of sets of queries that are trained side by side, each to find every object
             (Group DETR, Chen et al. 2023). Inference uses the first set only.
     """
@@ -37,6 +39,7 @@ class DecoderConfig:
     feed_forward_width: int = 512
     dropout: float = 0.1
     max_boxes: int = 300
+    fade_duplicates: float = 0.0
     training_groups: int = 1
 
     def __post_init__(self) -> None:
@@ -45,6 +48,8 @@ class DecoderConfig:
             raise ValueError(
                 "layers, heads, points, queries, boxes, groups and width must be positive, dropout from 0 to below 1"
             )
+        if not 0 <= self.fade_duplicates <= 1:
+            raise ValueError("fade_duplicates must be from 0 to 1")
 
 
 @dataclass(frozen=True)

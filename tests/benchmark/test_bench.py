@@ -10,7 +10,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from bevcli.benchmark import limits, measure
+from bevcli.benchmark import limits, measure, result
 from bevcli.benchmark.limits import MachineLimits
 from bevcli.benchmark.made_up import MadeUpDrive
 from bevcli.benchmark.result import BenchmarkResult, Comparison
@@ -18,6 +18,7 @@ from bevcli.benchmark.versions import Version
 from bevcli.cli.main import app
 from bevcli.config import load_config
 from bevcli.engines.engine import installed_engines
+from bevcli.errors import BevcliError
 from bevcli.inference.engine_speeds import fastest_engine
 from bevcli.inference.preprocess import Preprocessor
 
@@ -56,6 +57,36 @@ def test_the_text_contains_the_derived_numbers():
         "100.0%",
     ):
         assert words in text
+
+
+def test_a_table_has_all_rows_but_those_that_fail(tmp_path, monkeypatch):
+    document = tmp_path / "speed.md"
+    document.write_text(f"before\n{result.BEGIN}\nold\n{result.END}\nafter\n")
+    rows = []
+
+    def measured(model: str, precision: str, *_: object) -> dict[str, object]:
+        rows.append(document.read_text().count("| two"))
+        if model == "two" and precision == "bf16":
+            raise BevcliError("bench: two, bf16: not done within 4 h")
+        return replace(RESULT, model=model, precision=precision).as_data()
+
+    monkeypatch.setattr(result, "measure", measured)
+    monkeypatch.setattr(result, "known_models", lambda: ["one", "two", "three"])
+    monkeypatch.setattr(result, "has_onednn", lambda _: True)
+    with pytest.raises(BevcliError, match="1 of 6 measurements failed"):
+        result.write_table(document, torch.device("cpu"), 5)
+    text = document.read_text()
+    assert [line.split(" | ")[:2] for line in text.splitlines() if "| bf16 " in line] == [
+        ["| one", "bf16"],
+        ["| three", "bf16"],
+    ]
+    assert text.startswith("before\n")
+    assert text.endswith("after\n")
+    assert "old" not in text
+    assert rows == [0, 0, 0, 1, 1, 1]  # written after each measurement
+    monkeypatch.setattr(result, "has_onednn", lambda _: False)
+    result.write_table(document, torch.device("cpu"), 5)
+    assert "bf16" not in document.read_text()
 
 
 def test_json_of_a_whole_benchmark(small_model_file, monkeypatch):

@@ -38,8 +38,9 @@ ROOT = Path(__file__).parents[2]
 
 
 def one_encoder_layer() -> BEVFormer:
-    """A small model with deformable convolutions. Half of the layers take half of the time to export."""
-    return small_model(encoder=replace(small_config().encoder, layers=1))
+    """A small model with deformable convolutions and fading duplicates. Few layers are soon exported."""
+    config = small_config()
+    return small_model(encoder=replace(config.encoder, layers=1), decoder=replace(config.decoder, fade_duplicates=0.7))
 
 
 @pytest.fixture(scope="module", params=["operator", pytest.param("gridsample", marks=pytest.mark.slow)])

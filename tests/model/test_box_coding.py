@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from small_model import small_config
 
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.transforms import wrap_angle
+from bevcli.geometry.transforms import Array, wrap_angle
 from bevcli.model.box_coding import decode, encode
+from bevcli.model.config import ModelConfig
 from bevcli.model.step import ModelOutputs
 
 CONFIG = small_config()
+FADING = replace(CONFIG, decoder=replace(CONFIG.decoder, fade_duplicates=0.7))
 
 
 def outputs(logits: np.ndarray, codes: np.ndarray) -> ModelOutputs:
@@ -77,3 +81,46 @@ def test_there_are_at_most_max_boxes_boxes(queries: int, expected: int) -> None:
     random = np.random.default_rng(0)
     boxes = decode(outputs(random.normal(size=(queries, 3)), random.normal(size=(queries, 10))), CONFIG)[0]
     assert len(boxes) == expected
+
+
+def scores_in_a_row(config: ModelConfig, x: list[float], logits: list[list[float]]) -> Array:
+    """Scores of boxes 2 m wide at these x, in metres, by x and class. logits: (Q, classes)."""
+    boxes = Boxes3D(
+        np.array([[place, 0, 0] for place in x]),
+        np.full((len(x), 3), 2.0),
+        np.zeros(len(x)),
+        np.zeros((len(x), 2)),
+        np.full(len(x), "car"),
+    )
+    decoded = decode(outputs(np.array(logits), encode(boxes)), config)[0]
+    assert decoded.scores is not None
+    assert (np.diff(decoded.scores) <= 0).all()
+    best = decoded[decoded.scores > 0.01]
+    assert best.scores is not None
+    return best.scores[np.lexsort((best.classes, best.centers[:, 0]))]
+
+
+def test_a_duplicate_fades_with_its_distance_from_the_better_box() -> None:
+    x, logits = [0.0, 0.001, 1.4, 9.0], [[2.0, -9, -9], [1.0, -9, -9], [0.0, -9, -9], [0.5, -9, -9]]
+    before = scores_in_a_row(CONFIG, x, logits)
+    after = scores_in_a_row(FADING, x, logits)
+    # 1.4 m are FADING_WIDTHS widths of 2 m.
+    np.testing.assert_allclose(after / before, [1, 0.3, 1 - 0.7 / np.e, 1], atol=0.002)
+
+
+def test_only_boxes_of_the_same_class_fade() -> None:
+    x, logits = [0.0, 0.0], [[2.0, -9, -9], [-9, 1.0, -9]]
+    np.testing.assert_array_equal(scores_in_a_row(FADING, x, logits), scores_in_a_row(CONFIG, x, logits))
+
+
+def test_several_better_boxes_fade_a_box_once() -> None:
+    x, logits = [0.0, 0.0, 0.0], [[2.0, -9, -9], [1.0, -9, -9], [0.0, -9, -9]]
+    np.testing.assert_allclose(
+        np.sort(scores_in_a_row(FADING, x, logits)), np.sort(1 / (1 + np.exp([-2.0, -1, 0])) * [1, 0.3, 0.3]), rtol=1e-5
+    )
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.1])
+def test_a_share_outside_0_to_1_is_refused(share: float) -> None:
+    with pytest.raises(ValueError, match="fade_duplicates must be from 0 to 1"):
+        replace(CONFIG.decoder, fade_duplicates=share)

@@ -20,60 +20,63 @@ BFLOAT16_BITS = 16
 
 
 @njit(nogil=True, inline="always")
-def sum_samples(values, corners, shares, out, place, depth):  # type: ignore[no-untyped-def]
+def sum_samples(values, first, step, cells, shares, begin, end, out, place, depth):  # type: ignore[no-untyped-def]
     """Writes the weighted sums of `depth` successive channels to out[place], out[place + 1] and so on.
 
-    values: (N,) float32, or bfloat16 bits as uint16. corners: (T, 4) int64, where the first channel of a sample's
-    corners lies in values. shares: (T, 4) float32, their weights. out: (M,) float32.
+    values: (N,) float32, or bfloat16 bits as uint16. first: index of the first channel in cell 0. step: from a cell to
+    the next. cells (int32), shares: (4, T), the corners of all samples and their weights; samples begin to end - 1 are
+    summed. out: (M,) float32.
     """
     if depth % 32 == 0:
-        for channel in range(0, depth, 32):
-            _sum_channels(32, values, channel, corners, shares, out, place + channel)
+        for c in range(0, depth, 32):
+            _sum_channels(32, values, first + c, step, cells, shares, begin, end, out, place + c)
     elif depth % 16 == 0:
-        for channel in range(0, depth, 16):
-            _sum_channels(16, values, channel, corners, shares, out, place + channel)
+        for c in range(0, depth, 16):
+            _sum_channels(16, values, first + c, step, cells, shares, begin, end, out, place + c)
     elif depth % 8 == 0:
-        for channel in range(0, depth, 8):
-            _sum_channels(8, values, channel, corners, shares, out, place + channel)
+        for c in range(0, depth, 8):
+            _sum_channels(8, values, first + c, step, cells, shares, begin, end, out, place + c)
     else:
-        for channel in range(depth):
-            _sum_channels(1, values, channel, corners, shares, out, place + channel)
+        for c in range(depth):
+            _sum_channels(1, values, first + c, step, cells, shares, begin, end, out, place + c)
 
 
 @intrinsic(prefer_literal=True)
-def _sum_channels(typing, width, values, channel, corners, shares, out, place):  # type: ignore[no-untyped-def]
-    """The sums of `width` channels from `channel` on; arguments as for `sum_samples`. The width is a constant."""
+def _sum_channels(typing, width, values, first, step, cells, shares, begin, end, out, place):  # type: ignore[no-untyped-def]
+    """The sums of `width` channels from `first` on; arguments as for `sum_samples`. The width is a constant."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         data = [
             context.make_array(kind)(context, builder, argument) if isinstance(kind, types.Array) else argument
             for kind, argument in zip(signature.args, arguments, strict=True)
         ]
-        _, value_array, first, corner_array, share_array, out_array, target = data
+        _, value_array, start, cell_step, cell_array, share_array, first_sample, last_sample, out_array, target = data
         lanes, halves = signature.args[0].literal_value, signature.args[1].dtype == types.uint16
         floats, words = ir.VectorType(ir.FloatType(), lanes), ir.VectorType(ir.IntType(32), lanes)
         stored = ir.VectorType(ir.IntType(16), lanes) if halves else floats
         undefined, everywhere = ir.Constant(floats, ir.Undefined), ir.Constant(words, None)
 
         total = cgutils.alloca_once_value(builder, ir.Constant(floats, None))  # becomes a register
-        start = builder.gep(value_array.data, [first])
-        corner_count = builder.mul(builder.extract_value(corner_array.shape, 0), first.type(4))
-        with cgutils.for_range(builder, corner_count) as loop:
-            corner = builder.load(builder.gep(corner_array.data, [loop.index]))
-            pointer = builder.bitcast(builder.gep(start, [corner]), stored.as_pointer())
-            read = builder.load(pointer, align=2 if halves else 4)
-            if halves:
-                shift = ir.Constant(words, [BFLOAT16_BITS] * lanes)
-                read = builder.bitcast(builder.shl(builder.zext(read, words), shift), floats)
-            share = builder.load(builder.gep(share_array.data, [loop.index]))
-            share = builder.insert_element(undefined, share, ir.IntType(32)(0))
-            product = builder.fmul(read, builder.shuffle_vector(share, undefined, everywhere), flags=("contract",))
-            builder.store(builder.fadd(builder.load(total), product, flags=("contract",)), total)
+        origin = builder.gep(value_array.data, [start])
+        samples = builder.extract_value(cell_array.shape, 1)
+        with cgutils.for_range(builder, last_sample, start=first_sample) as loop:
+            for corner in range(4):
+                index = builder.add(loop.index, builder.mul(samples, samples.type(corner)))
+                cell = builder.sext(builder.load(builder.gep(cell_array.data, [index])), ir.IntType(64))
+                pointer = builder.bitcast(builder.gep(origin, [builder.mul(cell, cell_step)]), stored.as_pointer())
+                read = builder.load(pointer, align=2 if halves else 4)
+                if halves:
+                    shift = ir.Constant(words, [BFLOAT16_BITS] * lanes)
+                    read = builder.bitcast(builder.shl(builder.zext(read, words), shift), floats)
+                share = builder.load(builder.gep(share_array.data, [index]))
+                share = builder.insert_element(undefined, share, ir.IntType(32)(0))
+                product = builder.fmul(read, builder.shuffle_vector(share, undefined, everywhere), flags=("contract",))
+                builder.store(builder.fadd(builder.load(total), product, flags=("contract",)), total)
         pointer = builder.bitcast(builder.gep(out_array.data, [target]), floats.as_pointer())
         builder.store(builder.load(total), pointer, align=4)
         return context.get_dummy_value()
 
-    return types.void(width, values, channel, corners, shares, out, place), generate
+    return types.void(width, values, first, step, cells, shares, begin, end, out, place), generate
 
 
 def as_float32(number: object) -> np.float32:
@@ -132,44 +135,69 @@ def bilinear_corners(x, y, height, width):  # type: ignore[no-untyped-def]
     return top, bottom, left, right, shares
 
 
+@njit(nogil=True, error_model="numpy", fastmath={"contract"}, inline="never")
+def _find_corners(locations, weights, maps, cells, shares):  # type: ignore[no-untyped-def]
+    """Writes the four cells around each sample, and their weights, to cells and shares (4, T).
+
+    locations: (T, 2) float32, x and y, 0 to 1. weights: (T,) float32. maps: (3, T) float32, width, height and first
+    cell. A neighbour outside the map has weight zero, and its index is replaced by one inside.
+
+    Without branches and in float32, which holds all indices exactly, so that several samples are computed at once.
+    """
+    one, zero, half = np.float32(1), np.float32(0), np.float32(0.5)
+    for sample in range(len(weights)):
+        width, height = maps[0, sample], maps[1, sample]
+        x, y = locations[sample, 0] * width - half, locations[sample, 1] * height - half
+        # NaN counts as outside. A location outside gets weight zero, and the first cell is read for it.
+        inside = (x > -one) & (x < width) & (y > -one) & (y < height)
+        x, y = x if inside else zero, y if inside else zero
+        weight = weights[sample] if inside else zero
+        left, top = np.floor(x), np.floor(y)
+        right, bottom = left + one, top + one
+        right_share, bottom_share = x - left, y - top
+        left_share, top_share = one - right_share, one - bottom_share
+        left_share, left = (zero, zero) if left < zero else (left_share, left)
+        top_share, top = (zero, zero) if top < zero else (top_share, top)
+        right_share, right = (zero, width - one) if right >= width else (right_share, right)
+        bottom_share, bottom = (zero, height - one) if bottom >= height else (bottom_share, bottom)
+        upper, lower = maps[2, sample] + top * width, maps[2, sample] + bottom * width
+        cells[0, sample], cells[1, sample] = np.int32(upper + left), np.int32(upper + right)
+        cells[2, sample], cells[3, sample] = np.int32(lower + left), np.int32(lower + right)
+        shares[0, sample] = weight * (top_share * left_share)
+        shares[1, sample] = weight * (top_share * right_share)
+        shares[2, sample] = weight * (bottom_share * left_share)
+        shares[3, sample] = weight * (bottom_share * right_share)
+
+
 @njit(nogil=True, error_model="numpy", fastmath={"contract"})
 def sample_maps(values, level_shapes, locations, weights, map_of_query, out, begin, end) -> None:  # type: ignore[no-untyped-def]
     """Writes the weighted sums of queries begin to end - 1 to out (M, heads, D) float32.
 
-    values: (G, S, heads, D) float32 or bfloat16 bits. level_shapes: (L, 2) int64 height, width.
+    values: (G, S, heads, D) float32 or bfloat16 bits; S less than 2^24. level_shapes: (L, 2) int64 height, width.
     locations: (M, heads, L, P, 2) float32, x and y, 0 to 1. weights: (M, heads, L, P) float32.
     map_of_query: (M,) int64, which of the G maps a query samples. Values outside a map are zero.
 
-    For each head of a query, the indices of all corners are computed before any is read, so that the reads overlap.
+    The corners of all samples of a query are computed before any is read, so that the reads overlap.
     """
     heads, levels, points = weights.shape[1:]
     depth = values.shape[3]
     flat, sums = values.reshape(-1), out.reshape(-1)
-    step = heads * depth
-    corners = np.empty((levels * points, 4), np.int64)
-    shares = np.empty((levels * points, 4), np.float32)
+    flat_locations, flat_weights = locations.reshape(len(locations), -1, 2), weights.reshape(len(weights), -1)
+    samples, step = levels * points, heads * depth
+    maps = np.empty((3, heads * samples), np.float32)  # width, height and first cell of the map of each sample
+    for sample in range(heads * samples):
+        level = sample // points % levels
+        maps[0, sample], maps[1, sample] = level_shapes[level, 1], level_shapes[level, 0]
+        maps[2, sample] = (level_shapes[:level, 0] * level_shapes[:level, 1]).sum()
+    cells = np.empty((4, heads * samples), np.int32)
+    shares = np.empty((4, heads * samples), np.float32)
     for query in range(begin, end):
+        _find_corners(flat_locations[query], flat_weights[query], maps, cells, shares)
+        first = map_of_query[query] * values.shape[1] * step
         for head in range(heads):
-            first = map_of_query[query] * values.shape[1] * step + head * depth
-            for level in range(levels):
-                height, width = level_shapes[level]
-                for point in range(points):
-                    x = locations[query, head, level, point, 0] * np.float32(width) - np.float32(0.5)
-                    y = locations[query, head, level, point, 1] * np.float32(height) - np.float32(0.5)
-                    # NaN counts as outside. A location outside gets weight zero, and the first cell is read for it.
-                    inside = x > -1 and x < width and y > -1 and y < height
-                    x, y = (x, y) if inside else (np.float32(0), np.float32(0))
-                    weight = weights[query, head, level, point] if inside else np.float32(0)
-                    top, bottom, left, right, corner_shares = bilinear_corners(x, y, height, width)
-                    tap = level * points + point
-                    corners[tap, 0] = first + (top * width + left) * step
-                    corners[tap, 1] = first + (top * width + right) * step
-                    corners[tap, 2] = first + (bottom * width + left) * step
-                    corners[tap, 3] = first + (bottom * width + right) * step
-                    for corner in range(4):
-                        shares[tap, corner] = weight * corner_shares[corner]
-                first += height * width * step
-            sum_samples(flat, corners, shares, sums, (query * heads + head) * depth, depth)
+            channel, chosen = head * depth, head * samples
+            place = query * step + channel
+            sum_samples(flat, first + channel, step, cells, shares, chosen, chosen + samples, sums, place, depth)
 
 
 @njit(nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})

@@ -39,7 +39,8 @@ class VADOutputs(ModelOutputs):
 
 def decode_futures(outputs: VADOutputs, config: VADConfig) -> Boxes3D:
     """The boxes of `bevcli.model.box_coding.decode`, with futures: the places of each object's centre in each mode."""
-    boxes, queries = decode(outputs, config)[0], best_queries(outputs, config)[0][0]
+    boxes = decode(outputs, config)[0]
+    queries = best_queries(outputs.class_logits[-1], outputs.box_codes[-1], config)[0][0]
     offsets = outputs.motion.offsets[0, queries].double().cpu().numpy()  # (K, M, T, 2)
     places = boxes.centers[:, None, None, :2] + offsets.cumsum(2)
     seconds = np.broadcast_to(step_times(config)[:, None], (*places.shape[:3], 1))
