@@ -169,8 +169,8 @@ class BenchmarkResult:
 def write_table(path: Path, device: torch.device, frames: int) -> None:
     """Measures every model in every precision, and writes the table between the lines BEGIN and END of a document.
 
-    The table is written after each measurement. One that fails is said and left out. A CPU without bfloat16 instructions
-    measures float32 only.
+    The table is written after each measurement. One that fails is said and left out. On a CPU without bfloat16
+    instructions only float32 is measured.
 
     Raises BevcliError where an existing file lacks these lines, and at the end where a measurement failed.
     """

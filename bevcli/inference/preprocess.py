@@ -17,6 +17,7 @@ from bevcli.frame import Frame, Sequence
 from bevcli.geometry.cameras import Camera, CameraRig, level_rig
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.inference.auto_levels import auto_levels
+from bevcli.inference.denoise import denoised
 from bevcli.jit import njit
 from bevcli.model.camera_assignment import CameraAssignment, assign_cameras
 from bevcli.model.config import ImageConfig, ModelConfig
@@ -50,10 +51,8 @@ class Preprocessor:
         images = torch.zeros(1, len(names), height, width, 3).movedim(-1, 2)  # as convolutions read them
 
         def write(place: int, name: str) -> None:
-            pixels = frame.rig[name].undistort(frame.images[name].pixels_bgr)
-            write_network_image(
-                auto_levels(pixels) if image.auto_levels else pixels, image, out=images[0, place].numpy()
-            )
+            pixels = repaired(frame.rig[name].undistort(frame.images[name].pixels_bgr), image)
+            write_network_image(pixels, image, out=images[0, place].numpy())
 
         tasks = [self._threads.submit(write, i, name) for i, name in enumerate(names) if name in frame.images]
         for task in wait(tasks).done:
@@ -127,6 +126,15 @@ def network_from_image(camera: Camera, image: ImageConfig) -> Array:
 def resize_shift(scale: float, image: ImageConfig) -> float:
     """Pixels of the resized image that are added to scaled pixel coordinates: see `ImageConfig.half_pixel_shift`."""
     return (scale - 1) / 2 if image.half_pixel_shift else 0.0
+
+
+def repaired(pixels_bgr: NDArray[np.uint8], image: ImageConfig) -> NDArray[np.uint8]:
+    """(H, W, 3) with ordinary grey levels and without strong noise, as far as the model asks for it."""
+    levels = auto_levels if image.auto_levels else np.asarray
+    if not image.denoise:
+        return levels(pixels_bgr)
+    height, width = pixels_bgr.shape[:2]
+    return denoised(pixels_bgr, min(image.size[0] / width, image.size[1] / height), levels)
 
 
 def write_network_image(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: NDArray[np.float32]) -> None:

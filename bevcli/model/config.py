@@ -48,6 +48,7 @@ class ImageConfig:
         max_pixels: with `focal_px`, images become larger only as long as all images of a frame have no more pixels.
         auto_levels: move the grey levels of dark, pale and foggy images into an ordinary range first
             (`bevcli.inference.auto_levels`), so that the model sees more in the dark and in fog.
+        denoise: smooth images with strong noise, as of a camera in the dark (`bevcli.inference.denoise`).
     """
 
     size: tuple[int, int]
@@ -61,6 +62,7 @@ class ImageConfig:
     focal_px: float | None = None
     max_pixels: int | None = None
     auto_levels: bool = False
+    denoise: bool = False
 
     def __post_init__(self) -> None:
         if min(self.size) < 1 or min(self.std) <= 0 or self.pad_divisor < 1:
