@@ -17,6 +17,7 @@ from bevcli.frame import Frame, Sequence
 from bevcli.geometry.cameras import Camera, CameraRig, level_rig
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.inference.auto_levels import auto_levels
+from bevcli.inference.defog import defogged
 from bevcli.inference.denoise import denoised
 from bevcli.jit import njit
 from bevcli.model.camera_assignment import CameraAssignment, assign_cameras
@@ -129,8 +130,9 @@ def resize_shift(scale: float, image: ImageConfig) -> float:
 
 
 def repaired(pixels_bgr: NDArray[np.uint8], image: ImageConfig) -> NDArray[np.uint8]:
-    """(H, W, 3) with ordinary grey levels and without strong noise, as far as the model asks for it."""
+    """(H, W, 3) without fog, with ordinary grey levels and without strong noise, as far as the model asks for it."""
     levels = auto_levels if image.auto_levels else np.asarray
+    pixels_bgr = defogged(pixels_bgr) if image.defog else pixels_bgr
     if not image.denoise:
         return levels(pixels_bgr)
     height, width = pixels_bgr.shape[:2]

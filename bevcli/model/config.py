@@ -48,6 +48,7 @@ class ImageConfig:
         max_pixels: with `focal_px`, images become larger only as long as all images of a frame have no more pixels.
         auto_levels: move the grey levels of dark, pale and foggy images into an ordinary range first
             (`bevcli.inference.auto_levels`), so that the model sees more in the dark and in fog.
+        defog: take away the light that fog adds to an image, before its levels are moved (`bevcli.inference.defog`).
         denoise: smooth images with strong noise, as of a camera in the dark (`bevcli.inference.denoise`).
     """
 
@@ -62,6 +63,7 @@ class ImageConfig:
     focal_px: float | None = None
     max_pixels: int | None = None
     auto_levels: bool = False
+    defog: bool = False
     denoise: bool = False
 
     def __post_init__(self) -> None:
