@@ -20,10 +20,7 @@ def auto_levels(pixels_bgr: NDArray[np.uint8]) -> NDArray[np.uint8]:
     An ordinary image, and one without contrast, is returned as it is. All channels are changed by one table, so that
     hues stay.
     """
-    step = max(1, pixels_bgr.shape[1] // SAMPLED_WIDTH)
-    grey = cv2.cvtColor(np.ascontiguousarray(pixels_bgr[::step, ::step]), cv2.COLOR_BGR2GRAY)
-    below = np.cumsum(np.bincount(grey.ravel(), minlength=256)) / grey.size
-    black, median, white = (int(level) for level in np.searchsorted(below, (BLACK_SHARE, 0.5, WHITE_SHARE)))
+    black, median, white = grey_levels(sampled(pixels_bgr), (BLACK_SHARE, 0.5, WHITE_SHARE))
     ordinary = black <= BLACK and MEDIAN[0] <= median <= MEDIAN[1] and white >= WHITE
     if ordinary or white - black < SMALLEST_RANGE:
         return pixels_bgr
@@ -32,3 +29,16 @@ def auto_levels(pixels_bgr: NDArray[np.uint8]) -> NDArray[np.uint8]:
     middle, dark, pale = np.clip(stretched[median], 0.004, 0.99), MEDIAN[0] / 255, MEDIAN[1] / 255
     gamma = np.clip(np.log(np.clip(middle, dark, pale)) / np.log(middle), *GAMMAS)
     return np.asarray(cv2.LUT(pixels_bgr, np.rint(255 * stretched**gamma).astype(np.uint8)), dtype=np.uint8)
+
+
+def sampled(pixels_bgr: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Every n-th pixel of an image (H, W, 3), so that about SAMPLED_WIDTH are in a row."""
+    step = max(1, pixels_bgr.shape[1] // SAMPLED_WIDTH)
+    return np.ascontiguousarray(pixels_bgr[::step, ::step])
+
+
+def grey_levels(pixels_bgr: NDArray[np.uint8], shares: tuple[float, ...]) -> tuple[int, ...]:
+    """The grey levels that these shares of the pixels (H, W, 3) do not exceed."""
+    grey = cv2.cvtColor(pixels_bgr, cv2.COLOR_BGR2GRAY)
+    below = np.cumsum(np.bincount(grey.ravel(), minlength=256)) / grey.size
+    return tuple(int(level) for level in np.searchsorted(below, shares))

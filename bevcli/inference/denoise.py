@@ -13,7 +13,7 @@ NOISE_OF_A_PIXEL = 30.0  # a blur whose standard deviation is one pixel is right
 SPIKE = 60  # grey levels; a pixel that differs so much from the median of its neighbours is wrong
 SPIKES_SHARE = 0.05  # of the pixels; where more are wrong, a median filter is right
 SIZE, GREY_LEVELS, DISTANCE = 9, 60.0, 3.0  # the bilateral filter: diameter and standard deviations
-MEASURED_ROWS = 24
+MEASURED_ROWS = 12
 
 
 def denoised(pixels_bgr: Pixels, scale: float, levels: Callable[[Pixels], Pixels]) -> Pixels:
