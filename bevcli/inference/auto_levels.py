@@ -33,8 +33,10 @@ def auto_levels(pixels_bgr: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 def sampled(pixels_bgr: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Every n-th pixel of an image (H, W, 3), so that about SAMPLED_WIDTH are in a row."""
-    step = max(1, pixels_bgr.shape[1] // SAMPLED_WIDTH)
-    return np.ascontiguousarray(pixels_bgr[::step, ::step])
+    step = min(max(1, pixels_bgr.shape[1] // SAMPLED_WIDTH), len(pixels_bgr))
+    height, width = pixels_bgr.shape[0] // step, pixels_bgr.shape[1] // step
+    whole = pixels_bgr[: height * step, : width * step]
+    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
 
 
 def grey_levels(pixels_bgr: NDArray[np.uint8], shares: tuple[float, ...]) -> tuple[int, ...]:

@@ -29,7 +29,7 @@ def defogged(pixels_bgr: Pixels) -> Pixels:
         return pixels_bgr
     grey = cv2.cvtColor(small, cv2.COLOR_BGR2GRAY)
     blocks = grey[: rows * BLOCK, : columns * BLOCK].reshape(rows, BLOCK, columns, BLOCK).swapaxes(1, 2)
-    ordered = np.sort(blocks.reshape(rows * columns, -1), axis=1).astype(np.float64)
+    ordered = np.sort(blocks.reshape(rows * columns, -1)[:, ::3], axis=1).astype(np.float64)  # a third is enough
     last = ordered.shape[1] - 1
     contrast = np.percentile(ordered[:, round(0.95 * last)] - ordered[:, round(0.05 * last)], 90)
     if contrast >= CONTRAST * (white - black):
