@@ -32,7 +32,7 @@ def denoised(pixels_bgr: Pixels, scale: float, levels: Callable[[Pixels], Pixels
     noise = measure_noise(levelled) * scale
     if noise < NOISY:
         return levelled
-    size = round(pixels_bgr.shape[1] * scale), round(pixels_bgr.shape[0] * scale)
+    size = max(round(pixels_bgr.shape[1] * scale), 1), max(round(pixels_bgr.shape[0] * scale), 1)
     small = cv2.resize(pixels_bgr, size, interpolation=cv2.INTER_AREA)
     median = cv2.medianBlur(small, 3)
     if np.mean(cv2.absdiff(small, median).max(axis=2) > SPIKE) > SPIKES_SHARE:

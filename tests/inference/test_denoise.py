@@ -72,3 +72,8 @@ def test_noise_that_resizing_averages_is_left_alone():
     image = noisy(large, 35)
     assert np.array_equal(denoised(image, 0.25, np.asarray), image)
     assert denoised(image, 0.5, np.asarray).shape == (288, 512, 3)
+
+
+def test_a_noisy_image_keeps_at_least_one_row():
+    image = RANDOM.choice(np.array([0, 255], dtype=np.uint8), (3, 4000, 1)).repeat(3, axis=2)
+    assert denoised(image, 0.13, np.asarray).shape == (1, 520, 3)
