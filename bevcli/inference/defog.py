@@ -2,11 +2,8 @@
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from bevcli.inference.auto_levels import BLACK_SHARE, WHITE_SHARE, grey_levels, sampled
-
-Pixels = NDArray[np.uint8]
+from bevcli.inference.auto_levels import BLACK_SHARE, WHITE_SHARE, Pixels, grey_levels, sampled
 
 BLOCK = 16  # sampled pixels; fog leaves little contrast within a block
 BLACK = 24  # grey level of the darkest pixels; fog makes them brighter

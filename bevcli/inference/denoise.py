@@ -4,9 +4,8 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Pixels = NDArray[np.uint8]
+from bevcli.inference.auto_levels import Pixels
 
 NOISY = 10.0  # standard deviation in grey levels; clean images have at most 1, falling snow up to 9
 NOISE_OF_A_PIXEL = 30.0  # a blur whose standard deviation is one pixel is right for so much noise
