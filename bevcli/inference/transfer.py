@@ -48,12 +48,12 @@ def read_back(outputs: ModelOutputs, images: Tensor) -> tuple[ModelOutputs, bool
     """
     last = outputs.last_layers()
     checked = [last.bev, last.class_logits, last.box_codes, *([images] if last.bev.device.type == "cpu" else [])]
-    extremes = torch.stack([end.float() for x in checked for end in _extremes(x)])
+    sums = torch.stack([tensor.sum(dtype=torch.float32) for tensor in checked])  # NaN and infinity stay in a sum
     moved = {part.name: getattr(last, part.name) for part in fields(last) if part.name not in last.stay_on_device}
-    extremes, *copies = _on_cpu([extremes, *(tensor for _, tensor in _tensors(list(moved.values()), ""))])
+    sums, *copies = _on_cpu([sums, *(tensor for _, tensor in _tensors(list(moved.values()), ""))])
     source = iter(copies)
     on_cpu = replace(last, **{name: _exchanged(value, source) for name, value in moved.items()})
-    return on_cpu, bool(torch.isfinite(extremes).all())
+    return on_cpu, bool(torch.isfinite(sums).all())
 
 
 def _exchanged(value: Any, tensors: Iterator[Tensor]) -> Any:
@@ -65,13 +65,6 @@ def _exchanged(value: Any, tensors: Iterator[Tensor]) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         return replace(value, **{part.name: _exchanged(getattr(value, part.name), tensors) for part in fields(value)})
     return value
-
-
-def _extremes(tensor: Tensor) -> tuple[Tensor, Tensor]:
-    """The smallest and the largest number; NaN where any is NaN."""
-    if tensor.device.type == "mps":  # has no aminmax
-        return tensor.amin(), tensor.amax()
-    return torch.aminmax(tensor)
 
 
 def _on_cpu(tensors: list[Tensor]) -> list[Tensor]:

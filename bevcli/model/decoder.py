@@ -212,7 +212,11 @@ def class_branch(channels: int, classes: int) -> nn.Sequential:
     return nn.Sequential(*hidden[0], *hidden[1], last)
 
 
-def branch(channels: int, layers: int, outputs: int) -> nn.Sequential:
-    """Linear layers with ReLU between them: (..., C) -> (..., outputs)."""
+class RegressionBranch(nn.Sequential):
+    """Linear layers with ReLU between them that predict numbers such as positions and sizes."""
+
+
+def branch(channels: int, layers: int, outputs: int) -> RegressionBranch:
+    """(..., C) -> (..., outputs)."""
     hidden = [module for _ in range(layers - 1) for module in (nn.Linear(channels, channels), nn.ReLU())]
-    return nn.Sequential(*hidden, nn.Linear(channels, outputs))
+    return RegressionBranch(*hidden, nn.Linear(channels, outputs))

@@ -35,8 +35,10 @@ class DeformableAttention(nn.Module):
         sampling: computes the weighted sums, without parameters; a faster module can take its place.
         level_sizes: makes the table of level sizes; a function that keeps the table can take its place.
         softmax: over the last axis; a faster function can take its place.
+        value_dtype: data type of the value projection, where it is not that of the tokens.
     """
 
+    value_dtype: torch.dtype | None = None
     level_sizes: Callable[[LevelShapes, torch.device], Tensor]
     softmax: Callable[[Tensor], Tensor]
 
@@ -113,6 +115,7 @@ class DeformableAttention(nn.Module):
         queries_per_map: Sequence[int],
     ) -> Tensor:
         """Projects tokens (G, S, C) to values and samples them; see `GridSampling`. Returns (M, C) float32."""
+        tokens = tokens.to(self.value_dtype or tokens.dtype)
         values = self.value_projection(tokens).unflatten(-1, (self.shape[0], -1))  # (G, S, heads, C / heads)
         return self.sampling(values, level_shapes, locations, weights, queries_per_map)
 

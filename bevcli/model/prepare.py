@@ -16,12 +16,14 @@ from bevcli.errors import WeightsError
 from bevcli.frame import BevMap, FrameResult
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.calibration_embedding import CalibrationEmbedding, modulated
+from bevcli.model.decoder import DecoderLayer
 from bevcli.model.deformable_attention import FeatureMaps, LevelShapes
-from bevcli.model.encoder import SpatialCrossAttention
+from bevcli.model.encoder import SpatialCrossAttention, TemporalSelfAttention
 from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms
-from bevcli.model.kernels.compiled import load_compiled
-from bevcli.model.kernels.onednn import use_onednn
+from bevcli.model.kernels.compiled import CompiledPool, load_compiled
+from bevcli.model.kernels.onednn import has_matrix_unit, use_onednn
 from bevcli.model.pillar_projection import PillarHits, Pillars
+from bevcli.model.resnet import ResNet
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import Memory, TemporalModel
 
@@ -51,19 +53,29 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
     choose_kernels(network, device)
     for part in network.image_parts:
         part.to(DTYPES[precision])
+    rounds = precision == "bf16" and device.type == "cpu" and has_matrix_unit()
+    rounded = (SpatialCrossAttention, TemporalSelfAttention) if rounds else (SpatialCrossAttention,)
     for name, module in list(network.named_modules()):
         if type(module) is Pillars:
             network.set_submodule(name, CachedPillars(network.config.bev_grid).to(device))
         if isinstance(module, CalibrationEmbedding):
             network.set_submodule(name, CachedCalibrationEmbedding(module))
-        if isinstance(module, SpatialCrossAttention):
+        if rounds and isinstance(module, DecoderLayer) and isinstance(module.self_attention, nn.MultiheadAttention):
+            network.set_submodule(f"{name}.self_attention", RoundedAttention(module.self_attention))
+        if isinstance(module, rounded):
             module.attention.value_projection.to(DTYPES[precision])
+            module.attention.value_dtype = DTYPES[precision]
     _check_finite(network)
     if device.type == "cpu":
-        use_onednn(network)
+        use_onednn(network, rounds=rounds)
+        loaded = threading.Event()
+        for name, module in list(network.named_modules()):
+            if isinstance(module, ResNet):
+                network.set_submodule(f"{name}.pool", CompiledPool(module.pool, loaded))
         # Runs beside the first frame's backbone, which needs no Python. Started any earlier, it would slow down the
         # copying of the model.
-        loading = threading.Thread(target=load_compiled, args=(DTYPES[precision],), name="load-compiled", daemon=True)
+        arguments = DTYPES[precision], loaded
+        loading = threading.Thread(target=load_compiled, args=arguments, name="load-compiled", daemon=True)
         loading.start()
         atexit.register(loading.join, LOADING_TIMEOUT_S)  # Python cannot end in the middle of a compilation
     return PreparedModel(network, precision)
@@ -121,6 +133,19 @@ def _check_finite(model: nn.Module) -> None:
                 f"{name}: has NaN or infinity after batch norms were folded into it and it was cast to "
                 f"{str(parameter.dtype).removeprefix('torch.')}: the weights are damaged, or need `precision=fp32`"
             )
+
+
+class RoundedAttention(nn.Module):
+    """A multi-head attention that computes in bfloat16, for queries, keys and values in float32."""
+
+    def __init__(self, attention: nn.MultiheadAttention) -> None:
+        super().__init__()
+        self.attention = attention.to(torch.bfloat16)
+
+    def forward(self, query: Tensor, key: Tensor, value: Tensor, *, need_weights: bool) -> tuple[Tensor, None]:
+        """As `nn.MultiheadAttention.forward` without weights."""
+        rounded = (tensor.to(torch.bfloat16) for tensor in (query, key, value))
+        return self.attention(*rounded, need_weights=need_weights)[0].float(), None
 
 
 class CachedPillars(Pillars):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import threading
 
 import pytest
 import torch
@@ -13,8 +14,16 @@ from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.feed_forward import FeedForward
 from bevcli.model.kernels import onednn as onednn_layers
 from bevcli.model.kernels.choose import fold_batch_norms
-from bevcli.model.kernels.compiled import CompiledDeformableConvolution
-from bevcli.model.kernels.onednn import FusedBlock, PackedConvolution, PackedLinear, has_onednn, use_onednn
+from bevcli.model.kernels.compiled import CompiledDeformableConvolution, CompiledPool
+from bevcli.model.kernels.onednn import (
+    FusedBlock,
+    PackedConvolution,
+    PackedLinear,
+    has_matrix_unit,
+    has_onednn,
+    rounded_products,
+    use_onednn,
+)
 from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.resnet import Bottleneck, ResNet, ResNetConfig
 
@@ -111,3 +120,37 @@ def test_without_onednn_a_model_keeps_its_layers(monkeypatch):
         kept = prepare_for_inference(model, cpu)
         assert not any(isinstance(module, PackedLinear | FusedBlock) for module in kept.modules())
         torch.testing.assert_close(kept(small_inputs(0)).bev, expected, atol=1e-4, rtol=1e-4)
+
+
+def test_rounded_products_are_close_and_leave_no_setting_behind():
+    linear, x = nn.Linear(256, 64), torch.randn(900, 256)
+    setting = getattr(torch.backends.mkldnn, "matmul", None)
+    before = getattr(setting, "fp32_precision", None)
+    with torch.inference_mode():
+        found = PackedLinear(linear, rounds=has_matrix_unit())(x)
+        torch.testing.assert_close(found, linear(x), atol=0.02, rtol=0.02)
+        assert found.dtype == torch.float32
+    assert getattr(setting, "fp32_precision", None) == before
+
+
+def test_layers_that_predict_positions_are_not_rounded():
+    model = small_model().eval().requires_grad_(False)
+    fold_batch_norms(model, torch.device("cpu"))
+    use_onednn(model, rounds=True)
+    rounded = {name for name, part in model.named_modules() if getattr(part, "product", None) is rounded_products}
+    assert any(name.startswith("encoder.layers.0.feed_forward") for name in rounded)
+    assert any(name.startswith("detection_head.class_branches") for name in rounded)
+    assert not [name for name in rounded if "box_branches" in name or "reference_points" in name]
+
+
+@pytest.mark.parametrize("size", [(8, 12), (7, 5), (1, 1)])
+def test_a_compiled_pool_and_a_relu_equal_the_plain_ones(size):
+    plain, loaded = nn.MaxPool2d(3, stride=2, padding=1), threading.Event()
+    compiled = CompiledPool(plain, loaded)
+    for dtype in (torch.float32, torch.bfloat16, torch.float16):
+        x = torch.randn(2, 24, *size).to(dtype)
+        expected = plain(x.float()).relu().to(dtype)
+        loaded.clear()
+        assert torch.equal(compiled(x).relu(), expected)
+        loaded.set()
+        assert torch.equal(compiled(x).relu(), expected)

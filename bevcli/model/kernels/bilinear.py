@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
-from numba.extending import intrinsic, overload
+from numba.extending import intrinsic
 
 from bevcli.jit import njit
 
@@ -25,7 +25,7 @@ def sum_samples(values, first, step, cells, shares, begin, end, out, place, dept
 
     values: (N,) float32, or bfloat16 bits as uint16. first: index of the first channel in cell 0. step: from a cell to
     the next. cells (int32), shares: (4, T), the corners of all samples and their weights; samples begin to end - 1 are
-    summed. out: (M,) float32.
+    summed. out: (M,) float32, or bfloat16 bits as uint16.
     """
     if depth % 32 == 0:
         for c in range(0, depth, 32):
@@ -52,6 +52,7 @@ def _sum_channels(typing, width, values, first, step, cells, shares, begin, end,
         ]
         _, value_array, start, cell_step, cell_array, share_array, first_sample, last_sample, out_array, target = data
         lanes, halves = signature.args[0].literal_value, signature.args[1].dtype == types.uint16
+        rounds = signature.args[8].dtype == types.uint16
         floats, words = ir.VectorType(ir.FloatType(), lanes), ir.VectorType(ir.IntType(32), lanes)
         stored = ir.VectorType(ir.IntType(16), lanes) if halves else floats
         undefined, everywhere = ir.Constant(floats, ir.Undefined), ir.Constant(words, None)
@@ -72,44 +73,16 @@ def _sum_channels(typing, width, values, first, step, cells, shares, begin, end,
                 share = builder.insert_element(undefined, share, ir.IntType(32)(0))
                 product = builder.fmul(read, builder.shuffle_vector(share, undefined, everywhere), flags=("contract",))
                 builder.store(builder.fadd(builder.load(total), product, flags=("contract",)), total)
-        pointer = builder.bitcast(builder.gep(out_array.data, [target]), floats.as_pointer())
-        builder.store(builder.load(total), pointer, align=4)
+        result = builder.load(total)
+        if rounds:  # to the nearest bfloat16
+            half, shift = (ir.Constant(words, [number] * lanes) for number in (0x8000, BFLOAT16_BITS))
+            bits = builder.lshr(builder.add(builder.bitcast(result, words), half), shift)
+            result = builder.trunc(bits, ir.VectorType(ir.IntType(16), lanes))
+        pointer = builder.bitcast(builder.gep(out_array.data, [target]), result.type.as_pointer())
+        builder.store(result, pointer, align=2 if rounds else 4)
         return context.get_dummy_value()
 
     return types.void(width, values, first, step, cells, shares, begin, end, out, place), generate
-
-
-def as_float32(number: object) -> np.float32:
-    """A float32, or the 16 bits of a bfloat16 (uint16), as float32. For compiled code only."""
-    raise NotImplementedError
-
-
-@overload(as_float32, inline="always")
-def _as_float32(number):  # type: ignore[no-untyped-def]
-    if number == types.uint16:
-        return lambda number: np.uint32(np.uint32(number) << np.uint32(16)).view(np.float32)
-    return lambda number: np.float32(number)
-
-
-def put_float32(array: object, index: int, number: object) -> None:
-    """Stores a float32 in an array of float32, or of bfloat16 bits, rounded to nearest. For compiled code only."""
-    raise NotImplementedError
-
-
-@overload(put_float32, inline="always")
-def _put_float32(array, index, number):  # type: ignore[no-untyped-def]
-    if array.dtype == types.float32:
-
-        def put(array, index, number):  # type: ignore[no-untyped-def]
-            array[index] = number
-    else:
-
-        def put(array, index, number):  # type: ignore[no-untyped-def]
-            # Cast after every step: the compiler adds uint32 in 64 bits, which halves the SIMD width.
-            bits = np.uint32(np.float32(number).view(np.uint32) + np.uint32(0x8000))
-            array[index] = np.uint16(np.uint32(bits >> np.uint32(16)))
-
-    return put
 
 
 @njit(nogil=True, error_model="numpy", fastmath={"contract"}, inline="never")
@@ -281,7 +254,8 @@ def sample_taps(x, offsets, mask, stride, first, out, begin, end) -> None:  # ty
     """
     _, height, width, channels = x.shape
     _, out_height, out_width, taps = mask.shape
-    total = np.empty(channels, dtype=np.float32)
+    flat, sums = x.reshape(-1), out.reshape(-1)
+    cells, shares = np.empty((4, 1), np.int32), np.empty((4, 1), np.float32)
     for row in range(begin, end):
         position = first + row
         image = position // (out_height * out_width)
@@ -290,23 +264,13 @@ def sample_taps(x, offsets, mask, stride, first, out, begin, end) -> None:  # ty
         for tap in range(taps):
             place_y = np.float32(line * stride - 1 + tap // 3) + offsets[image, line, column, tap, 0]
             place_x = np.float32(column * stride - 1 + tap % 3) + offsets[image, line, column, tap, 1]
-            target = out[row, tap]
             if not (place_x > -1 and place_x < width and place_y > -1 and place_y < height):
-                target[:] = 0
+                out[row, tap] = 0
                 continue
-            top, bottom, left, right, shares = bilinear_corners(place_x, place_y, height, width)
-            weight = mask[image, line, column, tap]
-            w00, w01 = weight * shares[0], weight * shares[1]
-            w10, w11 = weight * shares[2], weight * shares[3]
-            a, b = x[image, top, left], x[image, top, right]
-            c, d = x[image, bottom, left], x[image, bottom, right]
-            for channel in range(channels):
-                total[channel] = (
-                    w00 * as_float32(a[channel])
-                    + w01 * as_float32(b[channel])
-                    + w10 * as_float32(c[channel])
-                    + w11 * as_float32(d[channel])
-                )
-            # A separate loop: together with the rounding, the sums of bfloat16 would not be vectorised.
-            for channel in range(channels):
-                put_float32(target, channel, total[channel])
+            top, bottom, left, right, corners = bilinear_corners(place_x, place_y, height, width)
+            cells[0, 0], cells[1, 0] = top * width + left, top * width + right
+            cells[2, 0], cells[3, 0] = bottom * width + left, bottom * width + right
+            for corner in range(4):
+                shares[corner, 0] = mask[image, line, column, tap] * corners[corner]
+            start, target = image * height * width * channels, (row * taps + tap) * channels
+            sum_samples(flat, start, channels, cells, shares, 0, 1, sums, target, channels)

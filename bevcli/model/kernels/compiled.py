@@ -1,9 +1,11 @@
 """Deformable attention and deformable convolution on the CPU, by compiled loops that hold no sampled values."""
 
 import contextlib
+import os
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,8 @@ from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, 
 
 # More ranges than threads: where another process delays one thread, the others take over its ranges.
 RANGES_PER_THREAD = 8
+# Samples that are worth a thread's while: about half a millisecond.
+SAMPLES_PER_RANGE = 1 << 15
 # Sampled taps of one tile: large enough for a fast matrix product, small enough to stay in the cache.
 TILE_BYTES = 8 << 20
 
@@ -55,7 +59,8 @@ class _WeightedSums(torch.autograd.Function):
         map_of_query = np.repeat(np.arange(len(values)), queries_per_map)
         out = torch.empty(len(locations), *values.shape[2:])
         arrays = (as_array(values), shapes, as_array(locations), as_array(weights), map_of_query)
-        in_threads(partial(sample_maps, *arrays, out.numpy()), len(locations))
+        samples = max(weights[:1].numel(), 1)  # of a query
+        in_threads(partial(sample_maps, *arrays, out.numpy()), len(locations), max(64, SAMPLES_PER_RANGE // samples))
         return out.flatten(1)
 
     @staticmethod
@@ -115,15 +120,45 @@ class CompiledDeformableConvolution(nn.Module):
         return out.view(batch, height, width, -1).permute(0, 3, 1, 2)
 
 
-def load_compiled(dtype: torch.dtype) -> None:
+class CompiledPool(nn.Module):
+    """Takes the place of the max-pooling of a backbone's stem, which a ReLU follows: it gives 0 for negative maxima.
+
+    Numbers that are not negative have the order of their bits, so that the loop compares integers.
+    """
+
+    def __init__(self, pool: nn.MaxPool2d, loaded: threading.Event) -> None:
+        """loaded: set when the compiled loops are loaded. Until then the plain pooling runs, which need not wait."""
+        super().__init__()
+        assert (pool.kernel_size, pool.stride, pool.padding, pool.dilation) == (3, 2, 1, 1)
+        self.pool, self.loaded = pool, loaded
+
+    def forward(self, x: Tensor) -> Tensor:
+        """x: (B, C, H, W), 0 or more -> (B, C, H', W'), channels last; H' and W' are half of H and W, rounded up."""
+        if not self.loaded.is_set():
+            return self.pool(x)
+        from bevcli.model.kernels.pooling import max_of_windows
+
+        x = x.permute(0, 2, 3, 1).contiguous()  # (B, H, W, C)
+        bits = torch.int32 if x.dtype == torch.float32 else torch.int16
+        batch, height, width, channels = x.shape
+        out = x.new_empty(batch, -(-height // 2), -(-width // 2), channels)
+        in_threads(partial(max_of_windows, x.view(bits).numpy(), out.view(bits).numpy()), batch * out.shape[1])
+        return out.permute(0, 3, 1, 2)
+
+
+def load_compiled(dtype: torch.dtype, loaded: threading.Event) -> None:
     """Loads the compiler and the loops for values of float32 and of a dtype, so that the first frame need not wait.
 
-    Raises nothing: the first frame meets the same error, in a thread that tells it.
+    Raises nothing: the first frame meets the same error, in a thread that tells it. Then `loaded` is not set.
     """
     with contextlib.suppress(Exception):
         sampling = CompiledSampling()
         for values in (torch.zeros(1, 1, 1, 1), torch.zeros(1, 1, 1, 1, dtype=dtype)):
             sampling(values, [(1, 1)], torch.zeros(1, 1, 1, 1, 2), torch.zeros(1, 1, 1, 1), [1])
+        pool = CompiledPool(nn.MaxPool2d(3, stride=2, padding=1), threading.Event())
+        pool.loaded.set()
+        pool(torch.zeros(1, 1, 1, 1, dtype=dtype))
+        loaded.set()
 
 
 def as_array(tensor: Tensor) -> np.ndarray:
@@ -145,6 +180,12 @@ def in_threads(work: Callable[[int, int], None], rows: int, min_range: int = 64)
     if threads == 1 or len(starts) <= 1:
         work(0, rows)
         return
-    with ThreadPoolExecutor(threads) as pool:
-        for future in [pool.submit(work, start, min(start + step, rows)) for start in starts]:
-            future.result()
+    pool = _pool(os.getpid(), threads)
+    for future in [pool.submit(work, start, min(start + step, rows)) for start in starts]:
+        future.result()
+
+
+@cache
+def _pool(process: int, threads: int) -> ThreadPoolExecutor:
+    """The threads of a process, which wait between calls. A forked process has none of its parent's."""
+    return ThreadPoolExecutor(threads, thread_name_prefix="compiled-loops")

@@ -5,12 +5,16 @@ for memory. The operators are those that PyTorch's compiler uses; where a build 
 own layers.
 """
 
+import contextlib
+from collections.abc import Iterator
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
+from bevcli.model.decoder import RegressionBranch
 from bevcli.model.feed_forward import FeedForward
+from bevcli.model.kernels.compiled import CompiledDeformableConvolution
 from bevcli.model.resnet import BasicBlock, Bottleneck
 
 OPERATORS = (
@@ -30,18 +34,41 @@ def has_onednn(dtype: torch.dtype) -> bool:
     return dtype == torch.float32 or (dtype == torch.bfloat16 and torch.ops.mkldnn._is_mkldnn_bf16_supported())
 
 
+def has_matrix_unit() -> bool:
+    """This CPU multiplies matrices of bfloat16 in a unit of its own (AMX), and this build of PyTorch can use it."""
+    can_round = hasattr(torch.backends.mkldnn, "matmul") and has_onednn(torch.bfloat16)
+    return can_round and torch.cpu._is_amx_tile_supported()
+
+
+@contextlib.contextmanager
+def rounded_products() -> Iterator[None]:
+    """Inside, the products of float32 matrices round their operands to bfloat16; sums and results stay in float32."""
+    setting = torch.backends.mkldnn.matmul  # type: ignore[attr-defined]
+    before = setting.fp32_precision
+    setting.fp32_precision = "bf16"
+    try:
+        yield
+    finally:
+        setting.fp32_precision = before
+
+
 class PackedLinear(nn.Module):
     """A linear layer with its weight in oneDNN's own layout, and an activation in the same pass."""
 
-    def __init__(self, layer: nn.Linear, activation: Literal["none", "relu", "gelu"] = "none") -> None:
+    def __init__(
+        self, layer: nn.Linear, activation: Literal["none", "relu", "gelu"] = "none", *, rounds: bool = False
+    ) -> None:
+        """rounds: compute in `rounded_products`."""
         super().__init__()
+        self.product = rounded_products if rounds else contextlib.nullcontext
         self.weight, self.bias = layer.weight, layer.bias
         self.packed = torch.ops.mkldnn._reorder_linear_weight(layer.weight)
         self.activation: tuple[str, list[float], str] = (activation, [], "none" if activation == "gelu" else "")
 
     def forward(self, x: Tensor) -> Tensor:
         """x: (..., in) -> (..., out)."""
-        return torch.ops.mkldnn._linear_pointwise(x, self.packed, self.bias, *self.activation)
+        with self.product():
+            return torch.ops.mkldnn._linear_pointwise(x, self.packed, self.bias, *self.activation)
 
 
 class PackedConvolution(nn.Module):
@@ -92,21 +119,25 @@ class FusedBlock(nn.Module):
 def _with_relu(convolution: nn.Module) -> nn.Module:
     if isinstance(convolution, nn.Conv2d):
         return PackedConvolution(convolution, "relu")
-    return nn.Sequential(convolution, nn.ReLU(inplace=True))  # a deformable convolution
+    assert isinstance(convolution, CompiledDeformableConvolution)
+    convolution.set_submodule("product", PackedLinear(convolution.product, "relu"))
+    return convolution
 
 
-def use_onednn(part: nn.Module) -> None:
+def use_onednn(part: nn.Module, *, rounds: bool = False) -> None:
     """Replaces convolutions, linear layers and residual blocks of a module, in place, for inference.
 
-    Batch norms must be folded already.
+    Batch norms must be folded already. rounds: linear layers of float32 compute in `rounded_products`, except for those
+    that predict positions: boxes would move.
     """
     for name, child in part.named_children():
-        fast = _fast(child)
+        rounds_child = rounds and name != "reference_points" and not isinstance(child, RegressionBranch)
+        fast = _fast(child, rounds_child)
         setattr(part, name, fast)
-        use_onednn(fast)
+        use_onednn(fast, rounds=rounds_child)
 
 
-def _fast(layer: nn.Module) -> nn.Module:
+def _fast(layer: nn.Module, rounds: bool) -> nn.Module:
     """The replacement of a layer; the layer itself where oneDNN has nothing for it, or not in this dtype."""
     parameter = next(layer.parameters(), None)
     if parameter is None or not has_onednn(parameter.dtype):
@@ -114,8 +145,9 @@ def _fast(layer: nn.Module) -> nn.Module:
     if isinstance(layer, Bottleneck | BasicBlock):
         return FusedBlock(layer)
     if isinstance(layer, FeedForward):  # dropout has no effect in inference
-        return nn.Sequential(PackedLinear(layer.expand, layer.activation), PackedLinear(layer.reduce))
+        expand = PackedLinear(layer.expand, layer.activation, rounds=rounds)
+        return nn.Sequential(expand, PackedLinear(layer.reduce, rounds=rounds))
     # Not subclasses, such as the layer in multi-head attention whose weight is read by its owner.
     if type(layer) is nn.Linear:
-        return PackedLinear(layer)
+        return PackedLinear(layer, rounds=rounds)
     return PackedConvolution(layer) if type(layer) is nn.Conv2d else layer
