@@ -10,17 +10,17 @@ UNUSABLE_COST = 1e5  # replaces a cost that is not finite, so that such a pair i
 
 
 def focal_loss(logits: Tensor, targets: Tensor) -> Tensor:
-    """Elementwise focal loss, not reduced. Positives have weight ALPHA, negatives 1 - ALPHA.
+    """Elementwise focal loss, not reduced. Positives (targets above 0) have weight ALPHA, negatives 1 - ALPHA.
+
+    It is smallest where the probability is the target. Between 0 and 1 it is the quality focal loss (Li et al. 2020).
 
     Args:
         logits: any shape.
-        targets: the same shape, 0 or 1.
+        targets: the same shape, 0 to 1.
     """
-    probability = logits.sigmoid()
-    probability_of_target = probability * targets + (1 - probability) * (1 - targets)
-    weight = ALPHA * targets + (1 - ALPHA) * (1 - targets)
-    cross_entropy = F.binary_cross_entropy_with_logits(logits, targets, reduction="none")
-    return weight * (1 - probability_of_target) ** GAMMA * cross_entropy
+    distance = (targets - logits.sigmoid()).abs()
+    weight = torch.where(targets > 0, ALPHA, 1 - ALPHA)
+    return weight * distance**GAMMA * F.binary_cross_entropy_with_logits(logits, targets, reduction="none")
 
 
 def focal_cost(logits: Tensor) -> Tensor:

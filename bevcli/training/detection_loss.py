@@ -75,16 +75,19 @@ class DetectionLossConfig:
         velocity_weight: of vx and vy within the L1 loss.
         moving_weight: additional factor on the velocity of moving objects (0.5 m/s or faster). If most objects are
             stationary, L1 alone is smallest for a model that predicts zero velocity everywhere.
+        quality_m: with a positive value, the class target of a query with an object is exp(-d / quality_m) instead of
+            1, d metres from the predicted to the true centre on the ground, so that scores rank boxes by their place.
     """
 
     class_weight: float = 2.0
     box_weight: float = 0.25
     velocity_weight: float = 0.2
     moving_weight: float = 1.0
+    quality_m: float = 0.0
 
     def __post_init__(self) -> None:
-        if min(self.class_weight, self.box_weight, self.velocity_weight, self.moving_weight) < 0:
-            raise ValueError("the weights must not be negative")
+        if min(vars(self).values()) < 0:
+            raise ValueError("the weights and quality_m must not be negative")
 
 
 @dataclass(frozen=True)
@@ -153,6 +156,13 @@ def matching_costs(
     return config.class_weight * classes + config.box_weight * boxes
 
 
+def qualities_of(predicted: Tensor, truth: Tensor, quality_m: float) -> Tensor:
+    """(K,) the class targets of matched box codes (K, 10): see `DetectionLossConfig.quality_m`. No gradient."""
+    if not quality_m:
+        return torch.ones(len(predicted), device=predicted.device)
+    return torch.exp((truth[:, :2] - predicted[:, :2].detach().float()).norm(dim=-1) / -quality_m)
+
+
 def box_loss(predicted: Tensor, truth: Tensor, config: DetectionLossConfig) -> Tensor:
     """() L1 loss of matched box codes, summed. Boxes of unknown velocity are left out entirely, as published.
 
@@ -198,9 +208,10 @@ def assigned_loss(
     class_targets = torch.zeros_like(class_logits)  # (B, Q, classes)
     predicted, truths = [], []
     for element, (truth, (queries, objects)) in enumerate(zip(targets, assignments, strict=True)):
-        class_targets[element, queries, truth.labels[objects]] = 1
         predicted.append(box_codes[element, queries])
         truths.append(truth.codes[objects])
+        qualities = qualities_of(predicted[-1], truths[-1], config.quality_m)
+        class_targets[element, queries, truth.labels[objects]] = qualities.to(class_targets.dtype)
     classes = config.class_weight * focal_loss(class_logits, class_targets).sum()
     boxes = config.box_weight * box_loss(torch.cat(predicted), torch.cat(truths), config)
     return torch.stack([classes, boxes]) / max(sum(map(len, predicted)), 1)

@@ -120,6 +120,18 @@ def test_velocities_of_moving_objects_can_have_a_higher_weight(true_speed: float
     assert loss.boxes.item() == pytest.approx(0.25 * 0.5 * weight * true_speed)
 
 
+def test_the_class_target_can_fall_with_the_distance() -> None:
+    codes, config = torch.tensor([[code(3.0)]])[None], DetectionLossConfig(quality_m=2.0)
+
+    def class_loss(score: float) -> float:
+        logits = torch.full((1, 1, 1, 1), log(score / (1 - score)))
+        return detection_loss(logits, codes, [targets(code(1.0))], config).classes.item()
+
+    best = exp(-1)  # 2 m from the true centre
+    assert class_loss(best) == pytest.approx(0, abs=1e-6)
+    assert class_loss(best - 0.1) > 1e-3 < class_loss(best + 0.1)
+
+
 def test_without_boxes_every_query_is_background() -> None:
     loss = detection_loss(torch.zeros(1, 1, 3, 2), torch.zeros(1, 1, 3, 10), [targets()], CONFIG)
     assert loss.boxes.item() == 0
