@@ -115,9 +115,11 @@ class DeformableAttention(nn.Module):
         queries_per_map: Sequence[int],
     ) -> Tensor:
         """Projects tokens (G, S, C) to values and samples them; see `GridSampling`. Returns (M, C) float32."""
-        tokens = tokens.to(self.value_dtype or tokens.dtype)
-        values = self.value_projection(tokens).unflatten(-1, (self.shape[0], -1))  # (G, S, heads, C / heads)
-        return self.sampling(values, level_shapes, locations, weights, queries_per_map)
+        return self.sampling(self.values(tokens), level_shapes, locations, weights, queries_per_map)
+
+    def values(self, tokens: Tensor) -> Tensor:
+        """The values (G, S, heads, C / heads) of tokens (G, S, C)."""
+        return self.value_projection(tokens.to(self.value_dtype or tokens.dtype)).unflatten(-1, (self.shape[0], -1))
 
     def _initialize(self) -> None:
         """As published: heads sample in a ring of directions, farther with each point, all with the same weight."""

@@ -1,5 +1,6 @@
 """The BEV encoder: layers of temporal self-attention, spatial cross-attention and a feed-forward network."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -177,7 +178,13 @@ class SpatialCrossAttention(nn.Module):
     """Deformable attention of BEV queries to the cameras that see their pillars (paper, section 3.3).
 
     Samples lie around the projected points of a pillar. The results of the cameras that see a cell are averaged.
+
+    Attributes:
+        sample_hits: samples the values of all hits at once; see `kernels.compiled.sample_hits`. None to compute the
+            sampling locations first.
     """
+
+    sample_hits: Callable[[Tensor, LevelShapes, PillarHits, Tensor, Tensor], Tensor] | None = None
 
     def __init__(self, channels: int, heads: int, points: int, levels: int, dropout: float) -> None:
         super().__init__()
@@ -190,22 +197,23 @@ class SpatialCrossAttention(nn.Module):
 
         query: (B, Y·X, C). image_features: tokens of B·N images. hits: the M pairs of a camera and a cell that it sees.
         """
-        locations, weights = self._sampling_points(query, image_features.level_shapes, hits)
-        sampled = self.attention.sample(
-            image_features.tokens, image_features.level_shapes, locations, weights, hits.hits_per_camera
-        )  # (M, C)
+        sampled = self._sample(query, image_features, hits)  # (M, C)
         summed = sampled.new_zeros(query.shape).flatten(0, 1).index_add(0, hits.cell, sampled)
         mean = summed / hits.cameras_per_cell.clamp(min=1)[:, None]
         return self.dropout(self.attention.output_projection(mean.view_as(query)))
 
-    def _sampling_points(self, query: Tensor, level_shapes: LevelShapes, hits: PillarHits) -> tuple[Tensor, Tensor]:
-        """Sampling locations (M, heads, L, P, 2) and weights (M, heads, L, P) of the hits."""
+    def _sample(self, query: Tensor, image_features: FeatureMaps, hits: PillarHits) -> Tensor:
+        """The weighted sums (M, C) of the hits."""
         # A cell has the same offsets and weights in every camera, so they are predicted once for each cell.
-        offsets, weights = self.attention.predict(query.flatten(0, 1))  # (B·Y·X, heads, 1, L, P, 2)
+        offsets, weights = (part[:, :, 0] for part in self.attention.predict(query.flatten(0, 1)))  # (B·Y·X, heads, …)
+        tokens, level_shapes = image_features.tokens, image_features.level_shapes
+        if self.sample_hits is not None:
+            return self.sample_hits(self.attention.values(tokens), level_shapes, hits, offsets, weights)
         pillar_points = hits.reference_points.shape[1]
         reference = hits.reference_points.repeat(1, self.points // pillar_points, 1)  # point p: height p mod Z
-        offsets, weights = offsets[:, :, 0].index_select(0, hits.cell), weights[:, :, 0].index_select(0, hits.cell)
-        return self.attention.locations(reference[:, None, None], offsets, level_shapes), weights
+        offsets, weights = offsets.index_select(0, hits.cell), weights.index_select(0, hits.cell)
+        locations = self.attention.locations(reference[:, None, None], offsets, level_shapes)  # (M, heads, L, P, 2)
+        return self.attention.sample(tokens, level_shapes, locations, weights, hits.hits_per_camera)
 
 
 def normalized_centers(grid: BevGrid) -> Tensor:

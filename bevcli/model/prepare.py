@@ -20,7 +20,7 @@ from bevcli.model.decoder import DecoderLayer
 from bevcli.model.deformable_attention import FeatureMaps, LevelShapes
 from bevcli.model.encoder import SpatialCrossAttention, TemporalSelfAttention
 from bevcli.model.kernels.choose import choose_kernels, fold_batch_norms
-from bevcli.model.kernels.compiled import CompiledPool, load_compiled
+from bevcli.model.kernels.compiled import CompiledPool, load_compiled, sample_hits
 from bevcli.model.kernels.onednn import has_matrix_unit, use_onednn
 from bevcli.model.pillar_projection import PillarHits, Pillars
 from bevcli.model.resnet import ResNet
@@ -65,6 +65,8 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
         if isinstance(module, rounded):
             module.attention.value_projection.to(DTYPES[precision])
             module.attention.value_dtype = DTYPES[precision]
+        if isinstance(module, SpatialCrossAttention) and device.type == "cpu":
+            module.sample_hits = sample_hits
     _check_finite(network)
     if device.type == "cpu":
         use_onednn(network, rounds=rounds)

@@ -109,18 +109,18 @@ def bilinear_corners(x, y, height, width):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, error_model="numpy", fastmath={"contract"}, inline="never")
-def _find_corners(locations, weights, maps, cells, shares):  # type: ignore[no-untyped-def]
+def _find_corners(places, weights, maps, cells, shares):  # type: ignore[no-untyped-def]
     """Writes the four cells around each sample, and their weights, to cells and shares (4, T).
 
-    locations: (T, 2) float32, x and y, 0 to 1. weights: (T,) float32. maps: (3, T) float32, width, height and first
-    cell. A neighbour outside the map has weight zero, and its index is replaced by one inside.
+    places: (2, T) float32, x and y in cells, 0 at the centre of the first. weights: (T,) float32. maps: (3, T) float32,
+    width, height and first cell. A neighbour outside the map has weight zero, and its index is replaced by one inside.
 
     Without branches and in float32, which holds all indices exactly, so that several samples are computed at once.
     """
-    one, zero, half = np.float32(1), np.float32(0), np.float32(0.5)
+    one, zero = np.float32(1), np.float32(0)
     for sample in range(len(weights)):
         width, height = maps[0, sample], maps[1, sample]
-        x, y = locations[sample, 0] * width - half, locations[sample, 1] * height - half
+        x, y = places[0, sample], places[1, sample]
         # NaN counts as outside. A location outside gets weight zero, and the first cell is read for it.
         inside = (x > -one) & (x < width) & (y > -one) & (y < height)
         x, y = x if inside else zero, y if inside else zero
@@ -153,24 +153,68 @@ def sample_maps(values, level_shapes, locations, weights, map_of_query, out, beg
     The corners of all samples of a query are computed before any is read, so that the reads overlap.
     """
     heads, levels, points = weights.shape[1:]
-    depth = values.shape[3]
-    flat, sums = values.reshape(-1), out.reshape(-1)
     flat_locations, flat_weights = locations.reshape(len(locations), -1, 2), weights.reshape(len(weights), -1)
-    samples, step = levels * points, heads * depth
-    maps = np.empty((3, heads * samples), np.float32)  # width, height and first cell of the map of each sample
-    for sample in range(heads * samples):
-        level = sample // points % levels
+    maps, samples, half = _maps_of_samples(level_shapes, heads, points), levels * points, np.float32(0.5)
+    places, cells, shares = _room_for(heads * samples)
+    for query in range(begin, end):
+        for sample in range(heads * samples):
+            places[0, sample] = flat_locations[query, sample, 0] * maps[0, sample] - half
+            places[1, sample] = flat_locations[query, sample, 1] * maps[1, sample] - half
+        _find_corners(places, flat_weights[query], maps, cells, shares)
+        _sum_heads(values, map_of_query[query], cells, shares, samples, out, query)
+
+
+@njit(nogil=True, error_model="numpy", fastmath={"contract"})
+def sample_hits(values, level_shapes, points, offsets, weights, cell, map_of_hit, out, begin, end) -> None:  # type: ignore[no-untyped-def]
+    """As `sample_maps` for hits begin to end - 1, whose samples lie around the points of a pillar.
+
+    points: (M, Z, 2) float32, x and y, 0 to 1; sample p lies around point p mod Z. offsets: (Y·X, heads, L, P, 2)
+    float32, in cells of a level. weights: (Y·X, heads, L, P) float32. cell, map_of_hit: (M,) int64.
+    """
+    heads, levels, count = weights.shape[1:]
+    flat_offsets, flat_weights = offsets.reshape(len(offsets), -1, 2), weights.reshape(len(weights), -1)
+    maps, samples, half = _maps_of_samples(level_shapes, heads, count), levels * count, np.float32(0.5)
+    places, cells, shares = _room_for(heads * samples)
+    heights = points.shape[1]
+    for hit in range(begin, end):
+        row = cell[hit]
+        for first in range(0, heads * samples, heights):
+            for height in range(heights):
+                sample = first + height
+                x, y = points[hit, height, 0] * maps[0, sample], points[hit, height, 1] * maps[1, sample]
+                places[0, sample] = x + flat_offsets[row, sample, 0] - half
+                places[1, sample] = y + flat_offsets[row, sample, 1] - half
+        _find_corners(places, flat_weights[row], maps, cells, shares)
+        _sum_heads(values, map_of_hit[hit], cells, shares, samples, out, hit)
+
+
+@njit(nogil=True)
+def _room_for(samples):  # type: ignore[no-untyped-def]
+    """Places (2, T), cells (4, T) and shares (4, T) of `_find_corners`."""
+    return np.empty((2, samples), np.float32), np.empty((4, samples), np.int32), np.empty((4, samples), np.float32)
+
+
+@njit(nogil=True)
+def _maps_of_samples(level_shapes, heads, points):  # type: ignore[no-untyped-def]
+    """(3, heads · L · P) float32: width, height and first cell of the level of each sample of a query."""
+    maps = np.empty((3, heads * len(level_shapes) * points), np.float32)
+    for sample in range(maps.shape[1]):
+        level = sample // points % len(level_shapes)
         maps[0, sample], maps[1, sample] = level_shapes[level, 1], level_shapes[level, 0]
         maps[2, sample] = (level_shapes[:level, 0] * level_shapes[:level, 1]).sum()
-    cells = np.empty((4, heads * samples), np.int32)
-    shares = np.empty((4, heads * samples), np.float32)
-    for query in range(begin, end):
-        _find_corners(flat_locations[query], flat_weights[query], maps, cells, shares)
-        first = map_of_query[query] * values.shape[1] * step
-        for head in range(heads):
-            channel, chosen = head * depth, head * samples
-            place = query * step + channel
-            sum_samples(flat, first + channel, step, cells, shares, chosen, chosen + samples, sums, place, depth)
+    return maps
+
+
+@njit(nogil=True, inline="always")
+def _sum_heads(values, chosen_map, cells, shares, samples, out, query):  # type: ignore[no-untyped-def]
+    """Writes the weighted sums of a query, whose samples (`samples` a head) have these corners, to out[query]."""
+    heads, depth = values.shape[2:]
+    flat, sums, step = values.reshape(-1), out.reshape(-1), heads * depth
+    start = chosen_map * values.shape[1] * step
+    for head in range(heads):
+        channel, first = head * depth, head * samples
+        place = query * step + channel
+        sum_samples(flat, start + channel, step, cells, shares, first, first + samples, sums, place, depth)
 
 
 @njit(nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})

@@ -1,6 +1,7 @@
 """Deformable attention and deformable convolution on the CPU, by compiled loops that hold no sampled values."""
 
 import contextlib
+import math
 import os
 import threading
 from collections.abc import Callable, Sequence
@@ -12,7 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from bevcli.model.deformable_attention import LevelShapes
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, split_offsets_and_mask
+from bevcli.model.pillar_projection import PillarHits
 
 # More ranges than threads: where another process delays one thread, the others take over its ranges.
 RANGES_PER_THREAD = 8
@@ -39,6 +42,33 @@ class CompiledSampling(nn.Module):
         return _WeightedSums.apply(values, locations.float(), weights.float(), level_shapes, queries_per_map)
 
 
+def sample_hits(
+    values: Tensor, level_shapes: LevelShapes, hits: PillarHits, offsets: Tensor, weights: Tensor
+) -> Tensor:
+    """The weighted sums (M, C) float32 of the M hits, without a table of their sampling locations. No gradients.
+
+    Args:
+        values: (G, S, heads, C / heads), see `GridSampling`.
+        level_shapes: (height, width) of each level.
+        hits: the pairs of a map and a cell.
+        offsets: (B·Y·X, heads, L, P, 2) float32, in cells of a level, from the points of a cell's pillar.
+        weights: (B·Y·X, heads, L, P).
+    """
+    from bevcli.model.kernels.bilinear import sample_hits as compiled  # loads the compiler
+
+    map_of_hit = np.repeat(np.arange(len(values)), hits.hits_per_camera)
+    out = torch.empty(len(hits.cell), *values.shape[2:])
+    arrays = (hits.reference_points, offsets, weights)
+    read = (as_array(values), np.asarray(level_shapes, dtype=np.int64), *map(as_array, arrays), hits.cell.numpy())
+    in_threads(partial(compiled, *read, map_of_hit, out.numpy()), len(out), _range_of(weights))
+    return out.flatten(1)
+
+
+def _range_of(weights: Tensor) -> int:
+    """The smallest number of queries for which a thread is worth its while. weights: (M, heads, L, P)."""
+    return max(64, SAMPLES_PER_RANGE // max(math.prod(weights.shape[1:]), 1))
+
+
 class _WeightedSums(torch.autograd.Function):
     """The sums, and their gradients for values in float32."""
 
@@ -59,8 +89,7 @@ class _WeightedSums(torch.autograd.Function):
         map_of_query = np.repeat(np.arange(len(values)), queries_per_map)
         out = torch.empty(len(locations), *values.shape[2:])
         arrays = (as_array(values), shapes, as_array(locations), as_array(weights), map_of_query)
-        samples = max(weights[:1].numel(), 1)  # of a query
-        in_threads(partial(sample_maps, *arrays, out.numpy()), len(locations), max(64, SAMPLES_PER_RANGE // samples))
+        in_threads(partial(sample_maps, *arrays, out.numpy()), len(locations), _range_of(weights))
         return out.flatten(1)
 
     @staticmethod
