@@ -8,8 +8,10 @@ import pytest
 import torch
 
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.model import prepare
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.box_coding import decode
+from bevcli.model.kernels.onednn import has_matrix_unit
 from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.step import ModelOutputs
 
@@ -50,8 +52,18 @@ def test_float32_equals_the_model(model, prepared_fp32):
         assert (found.class_logits.sigmoid() - expected.class_logits.sigmoid()).abs().max() < 1e-4
 
 
-def test_95_percent_of_bfloat16_boxes_are_within_a_tenth_metre(model, prepared_fp32):
+def test_most_boxes_in_bfloat16_are_within_a_tenth_metre(model, prepared_fp32, monkeypatch):
+    monkeypatch.setattr(prepare, "has_matrix_unit", lambda: False)
+    assert share_within_a_tenth_metre(model, prepared_fp32) >= 0.95
+
+
+@pytest.mark.skipif(not has_matrix_unit(), reason="this CPU has no unit for products of bfloat16")
+def test_rounded_products_move_a_quarter_of_the_boxes(model, prepared_fp32):
+    assert share_within_a_tenth_metre(model, prepared_fp32) >= 0.7  # docs/speed.md states it
+
+
+def share_within_a_tenth_metre(model: BEVFormer, prepared_fp32: list[ModelOutputs]) -> float:
     half = four_frames(prepare_for_inference(model, CPU, "bf16"))
     pairs = zip(prepared_fp32, half, strict=True)
     distances = [nearest(decode(one, model.config)[0], decode(other, model.config)[0]) for one, other in pairs]
-    assert (np.concatenate(distances) < 0.1).mean() >= 0.95
+    return float((np.concatenate(distances) < 0.1).mean())
