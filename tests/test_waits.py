@@ -28,7 +28,6 @@ ALLOWED = {
     ("viewer/web.py", "self._server.serve_forever"): "until Ctrl-C, or `close`",
     ("recording/rrd_file.py", "select.select"): "in a daemon thread, until rerun writes or closes the pipe",
     ("inference/preprocess.py", "task.result"): "the task is done",
-    ("model/kernels/compiled.py", "ThreadPoolExecutor"): "the tasks only compute",
     ("model/kernels/compiled.py", "future.result"): "the tasks only compute",
     ("synth/drive.py", "ThreadPoolExecutor"): "the tasks only compute",
     ("synth/workers.py", "process.join"): "the process was killed",
