@@ -14,7 +14,7 @@ from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.feed_forward import FeedForward
 from bevcli.model.kernels import onednn as onednn_layers
 from bevcli.model.kernels.choose import fold_batch_norms
-from bevcli.model.kernels.compiled import CompiledDeformableConvolution, CompiledPool
+from bevcli.model.kernels.compiled import CompiledDeformableConvolution, CompiledPool, load_compiled
 from bevcli.model.kernels.onednn import (
     FusedBlock,
     PackedConvolution,
@@ -154,3 +154,10 @@ def test_a_compiled_pool_and_a_relu_equal_the_plain_ones(size):
         assert torch.equal(compiled(x).relu(), expected)
         loaded.set()
         assert torch.equal(compiled(x).relu(), expected)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
+def test_all_loops_of_a_data_type_are_loaded(dtype):
+    loaded = threading.Event()
+    load_compiled(dtype, loaded)
+    assert loaded.is_set()  # it raises nothing, so a mistake would only cost time

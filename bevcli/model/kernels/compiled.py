@@ -163,8 +163,10 @@ class CompiledPool(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """x: (B, C, H, W), 0 or more -> (B, C, H', W'), channels last; H' and W' are half of H and W, rounded up."""
-        if not self.loaded.is_set():
-            return self.pool(x)
+        return self.pooled(x) if self.loaded.is_set() else self.pool(x)
+
+    def pooled(self, x: Tensor) -> Tensor:
+        """As `forward`, by the compiled loop."""
         from bevcli.model.kernels.pooling import max_of_windows
 
         x = x.permute(0, 2, 3, 1).contiguous()  # (B, H, W, C)
@@ -181,12 +183,13 @@ def load_compiled(dtype: torch.dtype, loaded: threading.Event) -> None:
     Raises nothing: the first frame meets the same error, in a thread that tells it. Then `loaded` is not set.
     """
     with contextlib.suppress(Exception):
-        sampling = CompiledSampling()
+        sampling, pool = CompiledSampling(), CompiledPool(nn.MaxPool2d(3, stride=2, padding=1), loaded)
+        place = torch.zeros(1, 1, 1, 1, 2)
+        hit = PillarHits(torch.zeros(1, dtype=torch.int64), place[0, 0], (1,), torch.ones(1))
         for values in (torch.zeros(1, 1, 1, 1), torch.zeros(1, 1, 1, 1, dtype=dtype)):
-            sampling(values, [(1, 1)], torch.zeros(1, 1, 1, 1, 2), torch.zeros(1, 1, 1, 1), [1])
-        pool = CompiledPool(nn.MaxPool2d(3, stride=2, padding=1), threading.Event())
-        pool.loaded.set()
-        pool(torch.zeros(1, 1, 1, 1, dtype=dtype))
+            sampling(values, [(1, 1)], place, place[..., 0], [1])
+            sample_hits(values, ((1, 1),), hit, place, place[..., 0])
+        pool.pooled(torch.zeros(1, 1, 1, 1, dtype=dtype))
         loaded.set()
 
 
