@@ -162,7 +162,7 @@ class CompiledPool(nn.Module):
         self.pool, self.loaded = pool, loaded
 
     def forward(self, x: Tensor) -> Tensor:
-        """x: (B, C, H, W), 0 or more -> (B, C, H', W'), channels last; H' and W' are half of H and W, rounded up."""
+        """x: (B, C, H, W) -> (B, C, H', W'), channels last; H' and W' are half of H and W, rounded up."""
         return self.pooled(x) if self.loaded.is_set() else self.pool(x)
 
     def pooled(self, x: Tensor) -> Tensor:
