@@ -35,6 +35,8 @@ SHARE_OFF = {"tiny": 0.0, "base": 1e-3}
 # differently.
 LOGITS_OFF = {"tiny": 0.0, "base": 1e-2}
 LARGEST_LOGIT_OFF = {"tiny": 1e-3, "base": 1e-2}
+# The same base, the same code, frame 2: scores differ by 7e-5 with AVX2 and by 1.7e-4 (one box of 300) with AVX-512.
+LARGEST_SCORE_OFF = {"tiny": 1e-4, "base": 5e-4}
 LARGEST_CODE_OFF = {"tiny": 1e-2, "base": 5e-2}  # of box codes, and of decoded centres in metres
 
 
@@ -121,7 +123,7 @@ def check_outputs(outputs: ModelOutputs, model: BEVFormer, golden: Golden, frame
     np.testing.assert_allclose(outputs.box_codes[-len(codes) :, 0], codes, atol=LARGEST_CODE_OFF[name])
     boxes = decode(outputs, model.config)[0]
     expected_boxes, labels = golden(frame, "coder_bboxes"), golden(frame, "labels_3d")
-    np.testing.assert_allclose(boxes.scores, golden(frame, "scores_3d"), atol=1e-4)
+    np.testing.assert_allclose(boxes.scores, golden(frame, "scores_3d"), atol=LARGEST_SCORE_OFF[name])
     rows = original.match_boxes(boxes, expected_boxes, labels, model.config.classes)
     np.testing.assert_allclose(boxes.centers[rows], expected_boxes[:, :3], atol=LARGEST_CODE_OFF[name])
 
