@@ -162,14 +162,15 @@ def _draw_truth(axes: Axes, trace: Trace, width: float) -> list[Line2D]:
 
 
 def _label_boxes(axes: Axes, boxes: Boxes3D, room: Array) -> None:
-    """Class and score beside each box, best first; no label where it would cover another one.
+    """Class and score beside each box, best first, within the axes; no label where it would cover another one.
 
     room: (2,) width and height of a label, metres.
     """
     assert boxes.scores is not None
     labelled: list[Array] = []
+    last_place = np.array([axes.get_xlim()[1], axes.get_ylim()[1]]) - room
     for center, name, score in zip(boxes.centers[:, :2], boxes.classes, boxes.scores, strict=True):
-        place = center + room * (0.1, 0.7)
+        place = np.minimum(center + room * (0.1, 0.7), last_place)
         if any((np.abs(place - other) < room).all() for other in labelled):
             continue
         labelled.append(place)
