@@ -86,29 +86,6 @@ def _sum_channels(typing, width, values, first, step, cells, shares, begin, end,
 
 
 @njit(nogil=True, error_model="numpy", fastmath={"contract"}, inline="never")
-def bilinear_corners(x, y, height, width):  # type: ignore[no-untyped-def]
-    """The four cells around a location (x, y) in cells: (top, bottom, left, right, their interpolation weights).
-
-    A neighbour outside the map has weight zero, and its index is replaced by one inside.
-    """
-    one, zero = np.float32(1), np.float32(0)
-    left, top = np.int64(np.floor(x)), np.int64(np.floor(y))
-    right, bottom = left + 1, top + 1
-    right_share, bottom_share = x - np.float32(left), y - np.float32(top)
-    left_share, top_share = one - right_share, one - bottom_share
-    if left < 0:
-        left, left_share = 0, zero
-    if right >= width:
-        right, right_share = width - 1, zero
-    if top < 0:
-        top, top_share = 0, zero
-    if bottom >= height:
-        bottom, bottom_share = height - 1, zero
-    shares = (top_share * left_share, top_share * right_share, bottom_share * left_share, bottom_share * right_share)
-    return top, bottom, left, right, shares
-
-
-@njit(nogil=True, error_model="numpy", fastmath={"contract"}, inline="never")
 def _find_corners(places, weights, maps, cells, shares):  # type: ignore[no-untyped-def]
     """Writes the four cells around each sample, and their weights, to cells and shares (4, T).
 
@@ -299,22 +276,18 @@ def sample_taps(x, offsets, mask, stride, first, out, begin, end) -> None:  # ty
     _, height, width, channels = x.shape
     _, out_height, out_width, taps = mask.shape
     flat, sums = x.reshape(-1), out.reshape(-1)
-    cells, shares = np.empty((4, 1), np.int32), np.empty((4, 1), np.float32)
+    maps = np.zeros((3, taps), np.float32)
+    maps[0], maps[1] = width, height
+    places, cells, shares = _room_for(taps)
     for row in range(begin, end):
         position = first + row
         image = position // (out_height * out_width)
         line = position // out_width % out_height
         column = position % out_width
         for tap in range(taps):
-            place_y = np.float32(line * stride - 1 + tap // 3) + offsets[image, line, column, tap, 0]
-            place_x = np.float32(column * stride - 1 + tap % 3) + offsets[image, line, column, tap, 1]
-            if not (place_x > -1 and place_x < width and place_y > -1 and place_y < height):
-                out[row, tap] = 0
-                continue
-            top, bottom, left, right, corners = bilinear_corners(place_x, place_y, height, width)
-            cells[0, 0], cells[1, 0] = top * width + left, top * width + right
-            cells[2, 0], cells[3, 0] = bottom * width + left, bottom * width + right
-            for corner in range(4):
-                shares[corner, 0] = mask[image, line, column, tap] * corners[corner]
-            start, target = image * height * width * channels, (row * taps + tap) * channels
-            sum_samples(flat, start, channels, cells, shares, 0, 1, sums, target, channels)
+            places[0, tap] = np.float32(column * stride - 1 + tap % 3) + offsets[image, line, column, tap, 1]
+            places[1, tap] = np.float32(line * stride - 1 + tap // 3) + offsets[image, line, column, tap, 0]
+        _find_corners(places, mask[image, line, column], maps, cells, shares)
+        start, target = image * height * width * channels, row * taps * channels
+        for tap in range(taps):
+            sum_samples(flat, start, channels, cells, shares, tap, tap + 1, sums, target + tap * channels, channels)
