@@ -1,6 +1,7 @@
 """Made-up inputs for timing: a drive with six cameras, and a model with random weights."""
 
 import math
+from functools import partial
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
 from bevcli.model.camera_assignment import NUSCENES_YAWS_DEG
 from bevcli.model.config import ModelConfig
 from bevcli.model.network import Network, build_network
+from bevcli.sequences.images import ImageReader, MessageSource
 
 WIDTH, HEIGHT = 1600, 900
 FOCAL_LENGTH = 1266.0  # pixels, of all nuScenes cameras but the one at the back
@@ -40,14 +42,17 @@ class MadeUpDrive(Sequence):
         self.rig = CameraRig(tuple(map(_camera, NUSCENES_YAWS_DEG)), default_ego_from_bev())
         self.stamps = tuple(FrameStamp(i, "", 10**18 + int(i * STEP_S * 1e9)) for i in range(frames))
         self._files = [_jpeg(seed) for seed in range(ENCODED_IMAGES)]
+        self._reader = ImageReader(strict=True)
 
     def load(self, place: int) -> Frame:
-        """The frame at an index; every call decodes its six images."""
-        stamp, pose = self.stamps[place], self.pose(place)
+        """The frame at an index; every call decodes its six images, in threads as those of other drives."""
+        stamp, pose, first = self.stamps[place], self.pose(place), place * len(self.rig.names)
+        decoders = {name: partial(self._image, first + i, stamp) for i, name in enumerate(self.rig.names)}
+        sources = {name: MessageSource(name, stamp.timestamp_ns, decode) for name, decode in decoders.items()}
         return Frame(
             stamp=stamp,
             rig=self.rig,
-            images={name: self._image(place * len(self.rig.names) + i, stamp) for i, name in enumerate(self.rig.names)},
+            images=self._reader.read(sources, self.rig, dropped={})[0],
             world_from_ego=pose,
             world_from_ego_at=dict.fromkeys(self.rig.names, pose),
             kinematics=Kinematics(np.array([0, 0, GRAVITY]), np.array([0, 0, 0.05]), np.array([SPEED, 0, 0])),

@@ -49,7 +49,9 @@ class Preprocessor:
         frame = frame if frame.rig is self._model_rig else replace(frame, rig=self._model_rig)
         image, names = self._image, self._assignment.cameras
         width, height = image.padded_size
-        images = torch.zeros(1, len(names), height, width, 3).movedim(-1, 2)  # as convolutions read them
+        # Channels last, as convolutions read them. Not torch.zeros: OpenMP's threads wait less well once there are more of
+        # them than processors, and PyTorch's operations in this thread would start some of their own.
+        images = torch.from_numpy(np.zeros((1, len(names), height, width, 3), np.float32)).movedim(-1, 2)
 
         def write(place: int, name: str) -> None:
             pixels = repaired(frame.rig[name].undistort(frame.images[name].pixels_bgr), image)

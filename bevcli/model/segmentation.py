@@ -253,7 +253,8 @@ def assign_cells(probabilities: Tensor, minimum: float, scale: int) -> NDArray[n
     """
     candidates = (probabilities.amax((1, 2)) > minimum).nonzero()[:, 0]  # the others can win no cell
     none = probabilities.new_full((1, *probabilities.shape[1:]), minimum)
-    winner = _upsampled(torch.cat([none, probabilities[candidates]]), scale).argmax(0)
+    layers = torch.cat([none, probabilities[candidates]])
+    winner = _upsampled(layers, scale).max(0).indices  # `argmax` takes nine times as long on a CPU
     queries: NDArray[np.int64] = torch.cat([candidates.new_full((1,), -1), candidates])[winner].cpu().numpy()
     return queries
 

@@ -3,6 +3,7 @@ import os
 import threading
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -14,6 +15,8 @@ from bevcli.geometry.cameras import CameraRig, Distortion
 from bevcli.geometry.transforms import Pose, apply, inverse
 from bevcli.inference.preprocess import Preprocessor, image_for_rig
 from bevcli.model.step import model_inputs
+
+TASKS = Path("/proc/self/task")
 
 
 def textbook_image(pixels, image):
@@ -177,6 +180,29 @@ def test_frames_with_images_of_different_sizes_form_one_batch(mini_config):
     torch.testing.assert_close(batch.images[1, ..., :height, :width], prepared[1].images[0])
     assert (batch.images[1, ..., height:, :] == 0).all()
     assert (batch.images[1, ..., width:] == 0).all()
+
+
+@pytest.mark.skipif(not TASKS.exists(), reason="the kernel's threads are counted on Linux only")
+def test_frames_are_prepared_without_threads_of_openmp(mini_config, monkeypatch):
+    """More of them than processors would no longer spin while they wait: the model would take a fifth longer."""
+    monkeypatch.setattr(os, "cpu_count", lambda: 1)
+    preprocess = Preprocessor(replace(mini_config, image=replace(mini_config.image, size=(512, 288))))
+    frame, started, threads = MemorySequence().load(1), [], torch.get_num_threads()
+    preprocess(frame)
+
+    def prepare():
+        before = len(list(TASKS.iterdir()))
+        preprocess(frame)
+        started.append(len(list(TASKS.iterdir())) - before)
+
+    torch.set_num_threads(2)
+    try:
+        reading = threading.Thread(target=prepare)
+        reading.start()
+        reading.join()
+    finally:
+        torch.set_num_threads(threads)
+    assert started == [0]
 
 
 def preprocessing_threads() -> set[int | None]:
