@@ -49,8 +49,8 @@ class Preprocessor:
         frame = frame if frame.rig is self._model_rig else replace(frame, rig=self._model_rig)
         image, names = self._image, self._assignment.cameras
         width, height = image.padded_size
-        # Channels last, as convolutions read them. Not torch.zeros: OpenMP's threads wait less well once there are more of
-        # them than processors, and PyTorch's operations in this thread would start some of their own.
+        # Channels last, as convolutions read them. Not torch.zeros: PyTorch's operations would start threads of OpenMP
+        # here, and where it has more threads than there are processors, those of the model no longer spin.
         images = torch.from_numpy(np.zeros((1, len(names), height, width, 3), np.float32)).movedim(-1, 2)
 
         def write(place: int, name: str) -> None:

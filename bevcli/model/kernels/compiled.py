@@ -5,7 +5,7 @@ import math
 import os
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache, partial
 from typing import Any
 
@@ -204,6 +204,8 @@ def as_array(tensor: Tensor) -> np.ndarray:
 def in_threads(work: Callable[[int, int], None], rows: int, min_range: int = 64) -> None:
     """Calls work(begin, end) for ranges that together cover 0 to rows, in as many threads as PyTorch uses.
 
+    This thread is one of them.
+
     work: must release the GIL; an exception in it is raised here. min_range: rows that are worth a call of their own.
     """
     threads = torch.get_num_threads()
@@ -212,9 +214,19 @@ def in_threads(work: Callable[[int, int], None], rows: int, min_range: int = 64)
     if threads == 1 or len(starts) <= 1:
         work(0, rows)
         return
-    pool = _pool(os.getpid(), threads)
-    for future in [pool.submit(work, start, min(start + step, rows)) for start in starts]:
-        future.result()
+    left = iter(starts)
+
+    def take_ranges() -> None:
+        for start in left:
+            work(start, min(start + step, rows))
+
+    helpers = [_pool(os.getpid(), threads - 1).submit(take_ranges) for _ in range(min(threads, len(starts)) - 1)]
+    try:
+        take_ranges()
+    finally:
+        wait(helpers)
+    for helper in helpers:
+        helper.result()
 
 
 @cache
