@@ -4,6 +4,8 @@ A code is (cx, cy, log w, log l, cz, log h, sin, cos, vx, vy). As in the release
 from -y: yaw = -angle - pi/2, with yaw counter-clockwise from +x.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -14,6 +16,39 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.step import ModelOutputs
 
 FADING_WIDTHS = 0.7  # distance from a better box, in its widths, where fading has fallen to 1/e
+RADIAL_REACH = 2.0  # boxes of one object differ more along the line from the vehicle, where cameras measure less well
+SUPPORT = 0.3  # share of its score that a duplicate adds to that of another box, where neither is near 1
+
+
+class BestBoxes(NamedTuple):
+    """The K boxes of each batch element with the best scores, by falling score.
+
+    Attributes:
+        query: (B, K), index of the object query.
+        label: (B, K), index of the class.
+        scores: (B, K).
+        codes: (B, K, 10).
+    """
+
+    query: Tensor
+    label: Tensor
+    scores: Tensor
+    codes: Tensor
+
+    def with_scores(self, scores: Tensor) -> "BestBoxes":
+        """The same boxes with other scores (B, K), by falling score."""
+        scores, order = scores.topk(scores.shape[1])
+        codes = self.codes.gather(1, order[..., None].expand_as(self.codes))
+        return BestBoxes(self.query.gather(1, order), self.label.gather(1, order), scores, codes)
+
+    def of_same_class(self) -> Tensor:
+        """(B, K, K) float32, 1 where two boxes have the same class, else 0."""
+        return (self.label[:, :, None] == self.label[:, None]).float()
+
+    def offsets(self) -> Tensor:
+        """(B, K, K, 2), metres on the ground from the second box to the first one."""
+        places = self.codes[..., :2].float()
+        return places[:, :, None] - places[:, None]
 
 
 def decode(outputs: ModelOutputs, config: ModelConfig) -> list[Boxes3D]:
@@ -23,45 +58,61 @@ def decode(outputs: ModelOutputs, config: ModelConfig) -> list[Boxes3D]:
     each object to one query. A query gives one box for each of its classes that is among the best scores.
     """
     classes = np.asarray(config.classes)
-    last_codes = outputs.box_codes[-1].detach()
-    query, label, best = best_queries(outputs.class_logits[-1].detach(), last_codes, config)
-    codes = last_codes.gather(1, query[..., None].expand(-1, -1, last_codes.shape[-1]))
+    best = best_boxes(outputs.class_logits[-1].detach(), outputs.box_codes[-1].detach(), config)
     return [
         boxes_of_codes(code.double().cpu().numpy(), classes[names.cpu().numpy()], score.double().cpu().numpy())
-        for code, names, score in zip(codes, label, best, strict=True)
+        for code, names, score in zip(best.codes, best.label, best.scores, strict=True)
     ]
 
 
-def best_queries(class_logits: Tensor, box_codes: Tensor, config: ModelConfig) -> tuple[Tensor, Tensor, Tensor]:
-    """Query, class index and score, each (B, K), of the boxes with the K best scores, by falling score.
+def best_boxes(class_logits: Tensor, box_codes: Tensor, config: ModelConfig) -> BestBoxes:
+    """The config.decoder.max_boxes best boxes, with duplicates merged and faded as the decoder's configuration says.
 
     class_logits: (B, Q, classes). box_codes: (B, Q, 10).
     """
-    classes = len(config.classes)
+    classes, decoder = len(config.classes), config.decoder
     scores = class_logits.float().sigmoid().flatten(1)  # (B, Q · classes)
-    best, index = scores.topk(min(config.decoder.max_boxes, scores.shape[1]))
-    query, label = index // classes, index % classes
-    share = config.decoder.fade_duplicates
-    if share:
-        places = box_codes.float().gather(1, query[..., None].expand(-1, -1, 3))  # x, y and log w
-        best, order = faded_scores(places, label, best, share).topk(best.shape[1])
-        query, label = query.gather(1, order), label.gather(1, order)
-    return query, label, best
+    best, index = scores.topk(min(decoder.max_boxes, scores.shape[1]))
+    query = index // classes
+    codes = box_codes.gather(1, query[..., None].expand(-1, -1, box_codes.shape[-1]))
+    boxes = BestBoxes(query, index % classes, best, codes)
+    if decoder.merge_duplicates:
+        boxes = merged(boxes, decoder.merge_duplicates)
+    if decoder.fade_duplicates:
+        boxes = boxes.with_scores(faded_scores(boxes, decoder.fade_duplicates))
+    return boxes
 
 
-def faded_scores(places: Tensor, label: Tensor, scores: Tensor, share: float) -> Tensor:
+def merged(boxes: BestBoxes, reach: float) -> BestBoxes:
+    """Each box at the mean place of the boxes of its class around it, which also raise its score.
+
+    Several queries that find the same object err differently, so that their mean is nearer to it (weighted boxes
+    fusion, Solovyev et al. 2019, does so with boxes in images). A box at a distance of d counts by its score times
+    exp(-(d / (reach · size))²), where the size is the root of width times length; along the line from the vehicle,
+    distances count by 1 / RADIAL_REACH. For counts n of the others, a score s becomes 1 - (1 - s)^(1 + SUPPORT · n).
+    """
+    offsets, places = boxes.offsets(), boxes.codes[..., :2].float()
+    ray = places / places.square().sum(-1, keepdim=True).sqrt().clamp(min=1e-6)
+    along = (offsets * ray[:, :, None]).sum(-1)
+    squares = offsets.square().sum(-1) - (1 - RADIAL_REACH**-2) * along.square()
+    size = (boxes.codes[..., 2:4].float().mean(-1)).exp()
+    weights = boxes.scores.clamp(min=1e-6)[:, None]
+    counts = torch.exp(-squares / (reach * size[..., None]).square()) * boxes.of_same_class() * weights  # (B, K, K)
+    total = counts.sum(-1)
+    means = (counts @ places / total[..., None]).to(boxes.codes.dtype)
+    moved = boxes._replace(codes=torch.cat([means, boxes.codes[..., 2:]], dim=-1))
+    return moved.with_scores(1 - (1 - boxes.scores) ** (1 + SUPPORT * (total - weights[:, 0])))
+
+
+def faded_scores(boxes: BestBoxes, share: float) -> Tensor:
     """Scores (B, K) of boxes, lower for those near a better box of their class, as soft non-maximum suppression does.
 
     At a distance of d widths of the better box, a score is multiplied by 1 - share · exp(-d / FADING_WIDTHS); of
     several better boxes, the one counts that lowers it most.
-
-    places: (B, K, 3) x, y in metres and the logarithm of the width. label: (B, K). scores: (B, K), falling.
     """
-    x, y, log_width = places.unbind(-1)
-    squares = (x[:, :, None] - x[:, None]).square() + (y[:, :, None] - y[:, None]).square()  # (B, better, worse)
-    lost = share * torch.exp(-squares.sqrt() / (FADING_WIDTHS * log_width.exp()[:, :, None]))
-    same = (label[:, :, None] == label[:, None]).float().triu(1)
-    return scores * (1 - same * lost).amin(1)
+    distances = boxes.offsets().square().sum(-1).sqrt()  # (B, better, worse)
+    lost = share * torch.exp(-distances / (FADING_WIDTHS * boxes.codes[..., 2].float().exp()[:, :, None]))
+    return boxes.scores * (1 - boxes.of_same_class().triu(1) * lost).amin(1)
 
 
 def encode(boxes: Boxes3D) -> Array:

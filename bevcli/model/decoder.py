@@ -26,6 +26,8 @@ class DecoderConfig:
         feed_forward_width: channels between the two linear layers of the feed-forward network.
         dropout: probability, 0 to below 1.
         max_boxes: number of boxes that are decoded, those with the best scores.
+        merge_duplicates: distance, in sizes of a box, within which boxes of its class count as the same object: they
+            share their places; see `box_coding.merged`. With 0, as published, boxes stay where they are.
         fade_duplicates: share of its score that a box loses at the place of a better box of its class, and less beside
             it; see `box_coding.faded_scores`. With 0, as published, scores stay as they are.
         training_groups: number of sets of queries that are trained side by side, each to find every object
@@ -39,6 +41,7 @@ class DecoderConfig:
     feed_forward_width: int = 512
     dropout: float = 0.1
     max_boxes: int = 300
+    merge_duplicates: float = 0.0
     fade_duplicates: float = 0.0
     training_groups: int = 1
 
@@ -50,6 +53,8 @@ class DecoderConfig:
             )
         if not 0 <= self.fade_duplicates <= 1:
             raise ValueError("fade_duplicates must be from 0 to 1")
+        if not 0 <= self.merge_duplicates < math.inf:
+            raise ValueError("merge_duplicates must be 0 or more, and finite")
 
 
 @dataclass(frozen=True)

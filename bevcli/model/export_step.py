@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from bevcli.model.box_coding import best_queries
+from bevcli.model.box_coding import best_boxes
 from bevcli.model.config import ModelConfig
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, split_offsets_and_mask
@@ -73,13 +73,12 @@ def decode_boxes(class_logits: Tensor, box_codes: Tensor, config: ModelConfig) -
     class_logits: (1, Q, classes). box_codes: (1, Q, 10). Returns boxes (1, K, 9): centre x, y, z and length, width,
     height in metres, yaw in radians, velocity x, y in m/s, all in the bev frame; falling scores (1, K); classes (1, K).
     """
-    query, label, best = best_queries(class_logits, box_codes, config)
-    code = box_codes[0].index_select(0, query[0])[None]  # (1, K, 10)
-    x, y, log_width, log_length, z, log_height, sin, cos, *velocity = code.unbind(-1)
+    best = best_boxes(class_logits, box_codes, config)
+    x, y, log_width, log_length, z, log_height, sin, cos, *velocity = best.codes.unbind(-1)
     # The code's angle a is clockwise from -y: yaw = -a - pi / 2, whose sine is -cos a and whose cosine is -sin a.
     yaw = torch.atan2(-cos, -sin)
     sizes = [log.exp() for log in (log_length, log_width, log_height)]
-    return torch.stack([x, y, z, *sizes, yaw, *velocity], dim=-1), best, label
+    return torch.stack([x, y, z, *sizes, yaw, *velocity], dim=-1), best.scores, best.label
 
 
 DeformableConvolution = Literal["operator", "gridsample"]

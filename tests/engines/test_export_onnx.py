@@ -38,9 +38,10 @@ ROOT = Path(__file__).parents[2]
 
 
 def one_encoder_layer() -> BEVFormer:
-    """A small model with deformable convolutions and fading duplicates. Few layers are soon exported."""
+    """A small model with deformable convolutions, and duplicates that merge and fade. Few layers are soon exported."""
     config = small_config()
-    return small_model(encoder=replace(config.encoder, layers=1), decoder=replace(config.decoder, fade_duplicates=0.7))
+    decoder = replace(config.decoder, merge_duplicates=0.6, fade_duplicates=0.7)
+    return small_model(encoder=replace(config.encoder, layers=1), decoder=decoder)
 
 
 @pytest.fixture(scope="module", params=["operator", pytest.param("gridsample", marks=pytest.mark.slow)])

@@ -17,6 +17,7 @@ from bevcli.model.step import ModelOutputs
 
 CONFIG = small_config()
 FADING = replace(CONFIG, decoder=replace(CONFIG.decoder, fade_duplicates=0.7))
+MERGING = replace(CONFIG, decoder=replace(CONFIG.decoder, merge_duplicates=0.6))
 
 
 def outputs(logits: np.ndarray, codes: np.ndarray) -> ModelOutputs:
@@ -124,3 +125,54 @@ def test_several_better_boxes_fade_a_box_once() -> None:
 def test_a_share_outside_0_to_1_is_refused(share: float) -> None:
     with pytest.raises(ValueError, match="fade_duplicates must be from 0 to 1"):
         replace(CONFIG.decoder, fade_duplicates=share)
+
+
+def merged_boxes(centers: list[tuple[float, float]], logits: list[list[float]]) -> Boxes3D:
+    """The decoded boxes with scores above 0.01, of queries with boxes 2 m wide and long, duplicates merged."""
+    count = len(centers)
+    boxes = replace(some_boxes(count), sizes_lwh=np.full((count, 3), 2.0), centers=np.insert(centers, 2, 0.5, axis=1))
+    decoded = decode(outputs(np.array(logits), encode(boxes)), MERGING)[0]
+    assert decoded.scores is not None
+    assert (np.diff(decoded.scores) <= 0).all()
+    return decoded[decoded.scores > 0.01]
+
+
+def test_duplicates_share_their_places_by_score_and_distance() -> None:
+    boxes = merged_boxes([(0.0, 9.4), (0.0, 10.6)], [[0.0, -9, -9], [0.0, -9, -9]])
+    # 1.2 m along the line from the vehicle count as 0.6 m, which is 0.3 of the size; the reach is 0.6.
+    other = np.exp(-((0.3 / 0.6) ** 2))
+    moved = 1.2 * other / (1 + other)
+    np.testing.assert_allclose(np.sort(boxes.centers[:, 1]), [9.4 + moved, 10.6 - moved], rtol=1e-4)
+    np.testing.assert_allclose(boxes.centers[:, 2], 0.5, rtol=1e-5)
+    np.testing.assert_allclose(boxes.scores, 1 - 0.5 ** (1 + 0.3 * 0.5 * other), rtol=1e-4)
+
+
+def test_boxes_side_by_side_are_merged_less_than_behind_each_other() -> None:
+    behind = merged_boxes([(0.0, 9.4), (0.0, 10.6)], [[0.0, -9, -9], [0.0, -9, -9]])
+    beside = merged_boxes([(-0.6, 10.0), (0.6, 10.0)], [[0.0, -9, -9], [0.0, -9, -9]])
+    assert np.ptp(behind.centers[:, 1]) < 0.2 < np.ptp(beside.centers[:, 0])
+
+
+def test_boxes_of_other_objects_and_classes_stay() -> None:
+    centers, logits = [(0.0, 9.0), (0.0, 9.5), (0.0, 19.0)], [[0.0, -9, -9], [-9, 0.0, -9], [0.0, -9, -9]]
+    boxes = merged_boxes(centers, logits)
+    np.testing.assert_allclose(np.sort(boxes.centers[:, 1]), [9, 9.5, 19], rtol=1e-4)
+    np.testing.assert_allclose(boxes.scores, 0.5, rtol=1e-3)
+
+
+def test_scores_of_merged_boxes_stay_below_1() -> None:
+    boxes = merged_boxes([(0.0, 9.0)] * 6, [[4.0, -9, -9]] * 6)
+    assert boxes.scores is not None
+    assert (boxes.scores > 1 / (1 + np.exp(-4.0))).all()
+    assert (boxes.scores <= 1).all()
+
+
+def test_boxes_of_tiny_scores_keep_their_numbers_finite() -> None:
+    boxes = decode(outputs(np.full((3, 3), -300.0), encode(some_boxes(3))), MERGING)[0]
+    assert np.isfinite(boxes.centers).all()
+
+
+@pytest.mark.parametrize("reach", [-0.1, float("inf"), float("nan")])
+def test_a_reach_below_0_or_without_end_is_refused(reach: float) -> None:
+    with pytest.raises(ValueError, match="merge_duplicates must be 0 or more, and finite"):
+        replace(CONFIG.decoder, merge_duplicates=reach)

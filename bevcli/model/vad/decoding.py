@@ -9,7 +9,7 @@ from torch import Tensor
 from bevcli.frame import MapLines, Plan
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
-from bevcli.model.box_coding import best_queries, decode
+from bevcli.model.box_coding import best_boxes, decode
 from bevcli.model.step import ModelOutputs
 from bevcli.model.vad.config import VADConfig
 from bevcli.model.vad.line_decoder import LineOutputs
@@ -40,7 +40,7 @@ class VADOutputs(ModelOutputs):
 def decode_futures(outputs: VADOutputs, config: VADConfig) -> Boxes3D:
     """The boxes of `bevcli.model.box_coding.decode`, with futures: the places of each object's centre in each mode."""
     boxes = decode(outputs, config)[0]
-    queries = best_queries(outputs.class_logits[-1], outputs.box_codes[-1], config)[0][0]
+    queries = best_boxes(outputs.class_logits[-1], outputs.box_codes[-1], config).query[0]
     offsets = outputs.motion.offsets[0, queries].double().cpu().numpy()  # (K, M, T, 2)
     places = boxes.centers[:, None, None, :2] + offsets.cumsum(2)
     seconds = np.broadcast_to(step_times(config)[:, None], (*places.shape[:3], 1))
