@@ -16,8 +16,7 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.step import ModelOutputs
 
 FADING_WIDTHS = 0.7  # distance from a better box, in its widths, where fading has fallen to 1/e
-RADIAL_REACH = 2.0  # boxes of one object differ more along the line from the vehicle, where cameras measure less well
-SUPPORT = 0.3  # share of its score that a duplicate adds to that of another box, where neither is near 1
+SUPPORT = 0.5  # share of its score that a duplicate adds to that of another box, where neither is near 1
 
 
 class BestBoxes(NamedTuple):
@@ -88,19 +87,16 @@ def merged(boxes: BestBoxes, reach: float) -> BestBoxes:
 
     Several queries that find the same object err differently, so that their mean is nearer to it (weighted boxes
     fusion, Solovyev et al. 2019, does so with boxes in images). A box at a distance of d counts by its score times
-    exp(-(d / (reach · size))²), where the size is the root of width times length; along the line from the vehicle,
-    distances count by 1 / RADIAL_REACH. For counts n of the others, a score s becomes 1 - (1 - s)^(1 + SUPPORT · n).
+    exp(-(d / (reach · size))²), where the size is the root of width times length. Where those of the others add up to n,
+    a score s becomes 1 - (1 - s)^(1 + SUPPORT · n).
     """
-    offsets, places = boxes.offsets(), boxes.codes[..., :2].float()
-    ray = places / places.square().sum(-1, keepdim=True).sqrt().clamp(min=1e-6)
-    along = (offsets * ray[:, :, None]).sum(-1)
-    squares = offsets.square().sum(-1) - (1 - RADIAL_REACH**-2) * along.square()
-    size = (boxes.codes[..., 2:4].float().mean(-1)).exp()
+    size = boxes.codes[..., 2:4].float().mean(-1, keepdim=True).exp()  # of the logarithms of width and length
     weights = boxes.scores.clamp(min=1e-6)[:, None]
-    counts = torch.exp(-squares / (reach * size[..., None]).square()) * boxes.of_same_class() * weights  # (B, K, K)
+    near = torch.exp(-boxes.offsets().square().sum(-1) / (reach * size).square())
+    counts = near * boxes.of_same_class() * weights  # (B, K, K)
     total = counts.sum(-1)
-    means = (counts @ places / total[..., None]).to(boxes.codes.dtype)
-    moved = boxes._replace(codes=torch.cat([means, boxes.codes[..., 2:]], dim=-1))
+    places = counts @ boxes.codes[..., :2].float() / total[..., None]
+    moved = boxes._replace(codes=torch.cat([places.to(boxes.codes.dtype), boxes.codes[..., 2:]], dim=-1))
     return moved.with_scores(1 - (1 - boxes.scores) ** (1 + SUPPORT * (total - weights[:, 0])))
 
 
