@@ -87,8 +87,8 @@ def merged(boxes: BestBoxes, reach: float) -> BestBoxes:
 
     Several queries that find the same object err differently, so that their mean is nearer to it (weighted boxes
     fusion, Solovyev et al. 2019, does so with boxes in images). A box at a distance of d counts by its score times
-    exp(-(d / (reach · size))²), where the size is the root of width times length. Where those of the others add up to n,
-    a score s becomes 1 - (1 - s)^(1 + SUPPORT · n).
+    exp(-(d / (reach · size))²), where the size is the root of width times length. If those of the others add up to n, a
+    score s becomes 1 - (1 - s)^(1 + SUPPORT · n).
     """
     size = boxes.codes[..., 2:4].float().mean(-1, keepdim=True).exp()  # of the logarithms of width and length
     weights = boxes.scores.clamp(min=1e-6)[:, None]
