@@ -88,14 +88,22 @@ class RrdFile:
         self._raise_error()
         self.size = self._file.tell()
 
+    def leave_out_index(self) -> None:
+        """Call after the last `sync`, before rerun closes the sink: of several streams, the last has no index either.
+
+        It would count the bytes from the start of its stream, and readers would not find the frames before.
+        """
+        with self._busy:
+            if self._is_joined:
+                self._pipe = -1
+
     def close(self) -> None:
         """Waits until rerun has closed the sink, and closes the file. Raises OutputError as `sync` does."""
         self._thread.join(TIMEOUT_S)
         if self._thread.is_alive():
             raise self._no_answer()
         with self._file:
-            if self._error is not None or self._is_joined:
-                # A cut message; or an index that counts the bytes from the start of its stream.
+            if self._error is not None or self._is_joined:  # there may be a cut message
                 with contextlib.suppress(OSError):
                     self._file.truncate(self.size)
         self._raise_error()

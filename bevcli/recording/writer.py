@@ -165,6 +165,7 @@ class Recording:
                 self._layout.free()
             self._flush()
         finally:
+            self._file.leave_out_index()
             self._disconnect()
             self._file.close()
             if self._live is not None:

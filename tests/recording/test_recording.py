@@ -249,6 +249,26 @@ with Recording({str(tmp_path / "r.rrd")!r}, drive, NamedModel()) as r:
     assert all(frame.values(entities.BOXES, "name") == ["car", "pedestrian"] for frame in frames)
 
 
+def test_a_resumed_recording_killed_before_it_is_closed_can_be_read(tmp_path, monkeypatch):
+    """Its last stream has an index that does not fit the file: a kill before the index was cut off left it there."""
+    drive, path, close, read = MemorySequence(2), tmp_path / "r.rrd", RrdFile.close, []
+    frames, options = [drive.load(place) for place in range(2)], RecordingOptions(level="minimal")
+    with Recording(path, drive, NamedModel(), options) as recording:
+        recording.log(frames[0], predict(frames[0]))
+        state = recording.state()
+    assert state is not None
+
+    def read_and_close(file):
+        file._thread.join(20)  # all that rerun wrote is in the file
+        read.extend(frame.index for frame in RecordingReader(path).frames())
+        close(file)
+
+    monkeypatch.setattr(RrdFile, "close", read_and_close)
+    with Recording(path, drive, NamedModel(), options, resume=state) as recording:
+        recording.log(frames[1], predict(frames[1]))
+    assert read == [0, 1]
+
+
 def test_moving_bytes_into_the_file_needs_no_new_memory(tmp_path):
     content = np.random.default_rng(0).bytes(3 * BLOCK)
     file = RrdFile(tmp_path / "recording.rrd")
