@@ -158,9 +158,10 @@ def sample_hits(values, level_shapes, points, offsets, weights, cell, map_of_hit
         for first in range(0, heads * samples, heights):
             for height in range(heights):
                 sample = first + height
-                x, y = points[hit, height, 0] * maps[0, sample], points[hit, height, 1] * maps[1, sample]
-                places[0, sample] = x + flat_offsets[row, sample, 0] - half
-                places[1, sample] = y + flat_offsets[row, sample, 1] - half
+                x = points[hit, height, 0] + flat_offsets[row, sample, 0] / maps[0, sample]
+                y = points[hit, height, 1] + flat_offsets[row, sample, 1] / maps[1, sample]
+                places[0, sample] = x * maps[0, sample] - half
+                places[1, sample] = y * maps[1, sample] - half
         _find_corners(places, flat_weights[row], maps, cells, shares)
         _sum_heads(values, map_of_hit[hit], cells, shares, samples, out, hit)
 
