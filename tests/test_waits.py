@@ -28,7 +28,7 @@ ALLOWED = {
     ("viewer/web.py", "self._server.serve_forever"): "until Ctrl-C, or `close`",
     ("recording/rrd_file.py", "select.select"): "in a daemon thread, until rerun writes or closes the pipe",
     ("inference/preprocess.py", "task.result"): "the task is done",
-    ("model/kernels/compiled.py", "future.result"): "the tasks only compute",
+    ("model/kernels/compiled.py", "helper.result"): "the tasks only compute",
     ("synth/drive.py", "ThreadPoolExecutor"): "the tasks only compute",
     ("synth/workers.py", "process.join"): "the process was killed",
     ("synth/workers.py", "connection.recv"): "the connection has something to read, or its process has ended",
@@ -100,5 +100,5 @@ def test_every_wait_has_a_limit_or_a_reason():
 def test_waits_without_a_limit_are_seen():
     text = "thread.join()\nthread.join(3)\nfuture.result()\nsubprocess.run(x, check=True)\nlock.acquire(timeout=1)\n"
     text += "', '.join(names)\nprocess.communicate(data)\nwith ThreadPoolExecutor(2) as pool:\n    pass\n"
-    expected = {"thread.join", "future.result", "subprocess.run", "process.communicate", "ThreadPoolExecutor"}
+    expected = {"thread.join", "helper.result", "subprocess.run", "process.communicate", "ThreadPoolExecutor"}
     assert waits(ast.parse(text)) == expected

@@ -249,7 +249,7 @@ with Recording({str(tmp_path / "r.rrd")!r}, drive, NamedModel()) as r:
     assert all(frame.values(entities.BOXES, "name") == ["car", "pedestrian"] for frame in frames)
 
 
-def test_a_resumed_recording_killed_before_it_is_closed_can_be_read(tmp_path, monkeypatch):
+def test_a_resumed_recording_can_be_read_before_it_is_closed(tmp_path, monkeypatch):
     """Its last stream has an index that does not fit the file: a kill before the index was cut off left it there."""
     drive, path, close, read = MemorySequence(2), tmp_path / "r.rrd", RrdFile.close, []
     frames, options = [drive.load(place) for place in range(2)], RecordingOptions(level="minimal")
