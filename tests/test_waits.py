@@ -100,5 +100,5 @@ def test_every_wait_has_a_limit_or_a_reason():
 def test_waits_without_a_limit_are_seen():
     text = "thread.join()\nthread.join(3)\nfuture.result()\nsubprocess.run(x, check=True)\nlock.acquire(timeout=1)\n"
     text += "', '.join(names)\nprocess.communicate(data)\nwith ThreadPoolExecutor(2) as pool:\n    pass\n"
-    expected = {"thread.join", "helper.result", "subprocess.run", "process.communicate", "ThreadPoolExecutor"}
+    expected = {"thread.join", "future.result", "subprocess.run", "process.communicate", "ThreadPoolExecutor"}
     assert waits(ast.parse(text)) == expected
