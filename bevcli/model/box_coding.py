@@ -78,7 +78,7 @@ def best_boxes(class_logits: Tensor, box_codes: Tensor, config: ModelConfig) -> 
     if decoder.merge_duplicates:
         boxes = merged(boxes, decoder.merge_duplicates)
     if decoder.fade_duplicates:
-        boxes = boxes.with_scores(faded_scores(boxes, decoder.fade_duplicates))
+        boxes = faded(boxes, decoder.fade_duplicates)
     return boxes
 
 
@@ -100,15 +100,15 @@ def merged(boxes: BestBoxes, reach: float) -> BestBoxes:
     return moved.with_scores(1 - (1 - boxes.scores) ** (1 + SUPPORT * (total - weights[:, 0])))
 
 
-def faded_scores(boxes: BestBoxes, share: float) -> Tensor:
-    """Scores (B, K) of boxes, lower for those near a better box of their class, as soft non-maximum suppression does.
+def faded(boxes: BestBoxes, share: float) -> BestBoxes:
+    """Boxes near a better box of their class with lower scores, as by soft non-maximum suppression.
 
     At a distance of d widths of the better box, a score is multiplied by 1 - share · exp(-d / FADING_WIDTHS); of
     several better boxes, the one counts that lowers it most.
     """
     distances = boxes.offsets().square().sum(-1).sqrt()  # (B, better, worse)
     lost = share * torch.exp(-distances / (FADING_WIDTHS * boxes.codes[..., 2].float().exp()[:, :, None]))
-    return boxes.scores * (1 - boxes.of_same_class().triu(1) * lost).amin(1)
+    return boxes.with_scores(boxes.scores * (1 - boxes.of_same_class().triu(1) * lost).amin(1))
 
 
 def encode(boxes: Boxes3D) -> Array:

@@ -29,7 +29,7 @@ class DecoderConfig:
         merge_duplicates: distance, in sizes of a box, within which boxes of its class count as the same object: they
             share their places; see `box_coding.merged`. With 0, as published, boxes stay where they are.
         fade_duplicates: share of its score that a box loses at the place of a better box of its class, and less beside
-            it; see `box_coding.faded_scores`. With 0, as published, scores stay as they are.
+            it; see `box_coding.faded`. With 0, as published, scores stay as they are.
         training_groups: number of sets of queries that are trained side by side, each to find every object
             (Group DETR, Chen et al. 2023). Inference uses the first set only.
     """

@@ -214,13 +214,14 @@ def in_threads(work: Callable[[int, int], None], rows: int, min_range: int = 64)
     if threads == 1 or len(starts) <= 1:
         work(0, rows)
         return
-    left = iter(starts)
+    left = iter(starts)  # gives each start to one thread
 
     def take_ranges() -> None:
         for start in left:
             work(start, min(start + step, rows))
 
-    helpers = [_pool(os.getpid(), threads - 1).submit(take_ranges) for _ in range(min(threads, len(starts)) - 1)]
+    pool = _pool(os.getpid(), threads - 1)
+    helpers = [pool.submit(take_ranges) for _ in range(min(threads, len(starts)) - 1)]
     try:
         take_ranges()
     finally:
