@@ -11,10 +11,9 @@ from bevcli.evaluation.config import ClassRanges, DetectionConfig, TrackingConfi
 from bevcli.evaluation.detection import evaluate_detections
 from bevcli.evaluation.detection_scores import DetectionScores
 from bevcli.evaluation.driving import DrivingScores, Scored, evaluate_driving
-from bevcli.evaluation.driving_report import driving_tables, driving_to_dict
 from bevcli.evaluation.inputs import ScoredInput, open_ground_truth, open_predictions, without_cycles_in_racks
 from bevcli.evaluation.pairing import FramePairs, pair_frames
-from bevcli.evaluation.scores_report import finite, scores_table, scores_to_dict
+from bevcli.evaluation.scores_report import driving_tables, driving_to_dict, finite, scores_table, scores_to_dict
 from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmentation
 from bevcli.evaluation.tracking.scoring import TrackingScores, evaluate_tracking
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
