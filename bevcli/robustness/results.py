@@ -1,12 +1,13 @@
 """The result of a stress test: scores by condition, resilience rates, corruption errors, and the file stress.json."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
 from bevcli.errors import InputError
+from bevcli.evaluation.detection_scores import known_mean
 from bevcli.evaluation.scores_report import finite
 from bevcli.parsing.documents import read_json
 from bevcli.robustness.conditions import CLEAN, CORRUPTIONS, Corruption, Group
@@ -89,11 +90,13 @@ class StressResults:
 
     def mean_resilience(self, group: Group = Group.ROBOBEV) -> float:
         """The mean resilience rate of a group's corruptions that were tested, RoboBEV's mRR; NaN without any."""
-        return _mean(self.resilience(part.name) for part in self.tested() if part.group is group)
+        return known_mean(self.resilience(part.name) for part in self.tested() if part.group is group)
 
     def mean_corruption_error(self, against: Self) -> float:
         """mCE: the mean corruption error of RoboBEV's corruptions that both runs have; NaN without any."""
-        return _mean(self.corruption_error(part.name, against) for part in self.tested() if part.group is Group.ROBOBEV)
+        return known_mean(
+            self.corruption_error(part.name, against) for part in self.tested() if part.group is Group.ROBOBEV
+        )
 
     def to_dict(self, against: Self | None = None) -> dict[str, Any]:
         """All of it for JSON; undefined numbers are None. docs/robustness.md explains the keys."""
@@ -136,8 +139,3 @@ def _scores(entry: Any) -> ConditionScores:
     aps = {str(name): float(value) for name, value in entry["mean_dist_aps"].items()}
     numbers = float(entry["mean_ap"]), float(entry["nd_score"])
     return ConditionScores(str(entry["corruption"]), str(entry["severity"]), *numbers, errors, aps)
-
-
-def _mean(values: Iterable[float]) -> float:
-    known = [value for value in values if not math.isnan(value)]
-    return sum(known) / len(known) if known else math.nan

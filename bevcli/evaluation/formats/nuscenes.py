@@ -1,5 +1,6 @@
 """nuScenes submissions for detection and tracking."""
 
+from functools import partial
 from pathlib import Path
 
 from bevcli.evaluation.box_format import BoxFormat
@@ -8,15 +9,10 @@ from bevcli.evaluation.submission import write_submission
 from bevcli.sequences.files.boxes_file import BoxesFile
 
 
-def _write(boxes: BoxesFile, target: Path, options: ExportOptions, source: Path) -> str:
-    write_submission(boxes, target)
-    return f"{len(boxes.frames)} samples"
-
-
-def _write_tracking(boxes: BoxesFile, target: Path, options: ExportOptions, source: Path) -> str:
-    write_submission(boxes, target, tracking=True)
+def _write(boxes: BoxesFile, target: Path, options: ExportOptions, source: Path, *, tracking: bool = False) -> str:
+    write_submission(boxes, target, tracking=tracking)
     return f"{len(boxes.frames)} samples"
 
 
 DETECTION = BoxFormat("results_nusc.json", _write)
-TRACKING = BoxFormat("tracking_nusc.json", _write_tracking)
+TRACKING = BoxFormat("tracking_nusc.json", partial(_write, tracking=True))
