@@ -25,8 +25,8 @@ from bevcli.writing import whole_file
 _PLOT_COLORS = (
     "#1f77b4", "#ff7f0e", "#bcbd22", "#9467bd", "#8c564b", "#7f7f7f", "#d62728", "#2ca02c", "#e377c2", "#17becf",
 )  # fmt: skip
-_GRID_COLOR = "#e6e6e6"
-_DISTANCE_COLORS = ("#b8c9e8", "#7d9fd3", "#3f6fb5", "#173e7a")  # from the shortest matching distance to the longest
+GRID_COLOR = "#e6e6e6"
+BLUES = ("#b8c9e8", "#7d9fd3", "#3f6fb5", "#173e7a")  # from the shortest matching distance to the longest
 _ERROR_TITLES = {
     "trans_err": "translation error (m)",
     "scale_err": "scale error (1 - IoU)",
@@ -92,7 +92,7 @@ def draw_errors_by_range(detection: DetectionScores) -> Figure:
         axes.set_title("AP" if error is None else _ERROR_TITLES[error], fontsize=11)
         axes.set_ylim(bottom=0)
         axes.set_xticks(sorted({end for part in bins for end in (part.low_m, part.high_m)}))
-        axes.grid(color=_GRID_COLOR)
+        axes.grid(color=GRID_COLOR)
     for axes in panels[-1]:
         axes.set_xlabel("distance from the ego vehicle (m)")
     handles, labels = panels[0, 0].get_legend_handles_labels()
@@ -102,11 +102,11 @@ def draw_errors_by_range(detection: DetectionScores) -> Figure:
 
 def _draw_precision_recall(axes: Axes, name: str, scores: ClassScores) -> None:
     axes.set_title(f"{name}  AP {scores.mean_ap:.2f}", fontsize=11, loc="left")
-    for (distance, curve), color in zip(scores.curves.items(), _DISTANCE_COLORS, strict=False):
+    for (distance, curve), color in zip(scores.curves.items(), BLUES, strict=False):
         reached = curve.score > 0
         axes.plot(RECALLS[reached], curve.precision[reached], color=color, linewidth=2, label=f"{distance:g} m")
     axes.set(xlim=(0, 1), ylim=(0, 1.02))
-    axes.grid(color=_GRID_COLOR)
+    axes.grid(color=GRID_COLOR)
     aps = " · ".join(f"{ap:.2f}" for ap in scores.aps.values())
     text = f"{scores.ground_truth_count} boxes, APs {aps}" if scores.ground_truth_count else "no ground truth"
     axes.text(0.98, 0.03, text, ha="right", va="bottom", fontsize=8, color="#555555", transform=axes.transAxes)
@@ -114,11 +114,9 @@ def _draw_precision_recall(axes: Axes, name: str, scores: ClassScores) -> None:
 
 def _value(scores: ClassScores | None, error: str | None) -> float:
     """AP (error None) or an error of a class in a bin; NaN without true positives."""
-    if scores is None:
+    if scores is None or (error is not None and not scores.recall > 0):
         return np.nan
-    if error is None:
-        return scores.mean_ap
-    return scores.errors[error] if scores.recall > 0 else np.nan
+    return scores.mean_ap if error is None else scores.errors[error]
 
 
 WORST_FRAMES = 4
@@ -217,14 +215,14 @@ def _draw_dots(
 def _draw_frame(axes: Axes, frame: int, outcomes: list[_Outcome], pairs: FramePairs, radius: float) -> None:
     ego_from_reference = inverse(pairs.reference_from_ego[frame])
     counts = [0, 0]
-    for outcome in outcomes:
-        truth, found = outcome.matches.ground_truth, outcome.matches.predictions
-        truth_here, found_here = truth.frames == frame, found.frames == frame
-        _draw_boxes(axes, truth[truth_here & ~outcome.missed], ego_from_reference, _FOUND, "-")
-        _draw_boxes(axes, truth[truth_here & outcome.missed], ego_from_reference, _MISSED, "-")
-        _draw_boxes(axes, found[found_here & outcome.false_positives], ego_from_reference, _FALSE, "--")
-        counts[0] += int((truth_here & outcome.missed).sum())
-        counts[1] += int((found_here & outcome.false_positives).sum())
+    for matches, missed, false_positives in outcomes:
+        truth, found = matches.ground_truth, matches.predictions
+        here, missed_here = truth.frames == frame, missed & (truth.frames == frame)
+        false_here = false_positives & (found.frames == frame)
+        _draw_boxes(axes, truth[here & ~missed], ego_from_reference, _FOUND, "-")
+        _draw_boxes(axes, truth[missed_here], ego_from_reference, _MISSED, "-")
+        _draw_boxes(axes, found[false_here], ego_from_reference, _FALSE, "--")
+        counts = [counts[0] + int(missed_here.sum()), counts[1] + int(false_here.sum())]
     _draw_ground(axes, radius)
     stamp = pairs.ground_truth_stamps[frame]
     scene = f"{stamp.scene} " if stamp.scene else ""

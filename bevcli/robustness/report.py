@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bevcli.evaluation.plots import titled_figure
+from bevcli.evaluation.plots import BLUES, GRID_COLOR, titled_figure
 from bevcli.evaluation.scores_report import aligned
 from bevcli.frame import Frame, Sequence
 from bevcli.geometry.transforms import inverse
@@ -20,7 +20,6 @@ from bevcli.robustness.results import ConditionScores, StressResults
 from bevcli.synth.corruptions import Pixels
 from bevcli.writing import write_whole
 
-SEVERITY_COLORS = ("#b8c9e8", "#7d9fd3", "#3f6fb5", "#173e7a")  # from the easiest severity to the hardest
 _OTHER_COLOR = "#d62728"
 
 
@@ -91,7 +90,7 @@ def draw_stress(results: StressResults, against: StressResults | None = None) ->
         if against is not None:
             _draw_bars(axes, against, label, color=_OTHER_COLOR, order=tested)
         axes.set(ylabel=label, ylim=(0, 1), axisbelow=True)
-        axes.grid(axis="y", color="#e6e6e6")
+        axes.grid(axis="y", color=GRID_COLOR)
     titles = [part.title.replace(" of the ", "\nof the ").replace(" by up to ", "\nby up to ") for part in tested]
     panels[1].set_xticks(range(len(tested)), titles, rotation=35, ha="right")
     return figure
@@ -104,7 +103,7 @@ def _draw_bars(
     for place, corruption in enumerate(results.tested() if order is None else order):
         severities = tuple(corruption.levels)
         width = 0.8 / len(severities)
-        colors = [SEVERITY_COLORS[i] for i in np.linspace(0, len(SEVERITY_COLORS) - 1, len(severities)).astype(int)]
+        colors = [BLUES[i] for i in np.linspace(0, len(BLUES) - 1, len(severities)).astype(int)]
         for severity, scores in results.of(corruption.name).items():
             index = severities.index(severity)
             x = place - 0.4 + width * (index + 0.5)
@@ -134,7 +133,7 @@ def write_contact_sheet(path: Path, scene: Sequence, conditions: Items[Condition
     place, rows = len(scene.stamps) // 2, dict[str, list[Pixels]]()
     for condition in conditions:
         corruption = condition.corruption
-        if corruption is None or corruption.shown is Shown.NOTHING:
+        if corruption.shown is Shown.NOTHING:
             continue
         if corruption.name not in rows:
             clean = _tile(scene.load(place), corruption)
@@ -157,13 +156,11 @@ def _tile(frame: Frame, corruption: Corruption) -> Pixels:
 
 def _mosaic(frame: Frame) -> Pixels:
     """All cameras in rows of three, from left to right as they look."""
-    names = [camera.name for camera in sorted(frame.rig.cameras, key=lambda camera: -camera.yaw)]
-    tiles = [_camera_tile(frame, name, TILE_WIDTH // 3) for name in names]
+    cameras, cell = sorted(frame.rig.cameras, key=lambda camera: -camera.yaw), TILE_WIDTH // 3
+    tiles = [_camera_tile(frame, camera.name, cell) for camera in cameras]
     height = max(tile.shape[0] for tile in tiles)
-    tiles = [_padded(tile, TILE_WIDTH // 3, height) for tile in tiles]
-    tiles += [_padded(tiles[0][:0], TILE_WIDTH // 3, height)] * (-len(tiles) % 3)
-    rows = [np.concatenate(tiles[start : start + 3], axis=1) for start in range(0, len(tiles), 3)]
-    return _padded(np.concatenate(rows), TILE_WIDTH, height * len(rows))
+    rows = [_row(tiles[start : start + 3], cell, height, TILE_WIDTH) for start in range(0, len(tiles), 3)]
+    return np.concatenate(rows)
 
 
 def _camera_tile(frame: Frame, name: str, width: int, *, boxes: bool = False) -> Pixels:
@@ -196,14 +193,14 @@ def _captioned(tile: Pixels, text: str) -> Pixels:
 
 
 def _sheet(rows: list[list[Pixels]]) -> Pixels:
-    columns = max(map(len, rows))
-    width = columns * (TILE_WIDTH + GAP) + GAP
-    lines = []
-    for row in rows:
-        height = max(tile.shape[0] for tile in row)
-        tiles = [_padded(tile, TILE_WIDTH + GAP, height + GAP) for tile in row]
-        lines.append(_padded(np.concatenate(tiles, axis=1), width, height + GAP))
-    return np.concatenate(lines)
+    cell = TILE_WIDTH + GAP
+    width = max(map(len, rows)) * cell + GAP
+    return np.concatenate([_row(row, cell, max(tile.shape[0] for tile in row) + GAP, width) for row in rows])
+
+
+def _row(tiles: list[Pixels], cell_width: int, height: int, width: int) -> Pixels:
+    """Tiles side by side, each in a cell, in a row of a height and a width."""
+    return _padded(np.concatenate([_padded(tile, cell_width, height) for tile in tiles], axis=1), width, height)
 
 
 def _padded(tile: Pixels, width: int, height: int) -> Pixels:

@@ -17,34 +17,23 @@ FORMAT = "bevcli-stress/1"
 
 @dataclass(frozen=True)
 class ConditionScores:
-    """The scores under one condition, over the classes that have ground truth.
+    """The scores under one condition, over the classes that have ground truth: an entry of "conditions" in stress.json.
 
     Attributes:
         corruption: its name, or "clean".
         severity: "easy", "mid", "hard" or a level; "" for clean.
-        mean_ap: mAP, 0 to 1.
         nd_score: NDS, 0 to 1.
-        errors: true-positive errors by the devkit's names; NaN where undefined.
-        class_aps: class -> AP.
+        mean_ap: mAP, 0 to 1.
+        tp_errors: true-positive errors by the devkit's names; NaN where undefined.
+        mean_dist_aps: class -> AP.
     """
 
     corruption: str
     severity: str
-    mean_ap: float
     nd_score: float
-    errors: Mapping[str, float]
-    class_aps: Mapping[str, float]
-
-    def to_dict(self) -> dict[str, Any]:
-        """The scores for JSON; undefined numbers are NaN."""
-        return {
-            "corruption": self.corruption,
-            "severity": self.severity,
-            "nd_score": self.nd_score,
-            "mean_ap": self.mean_ap,
-            "tp_errors": dict(self.errors),
-            "mean_dist_aps": dict(self.class_aps),
-        }
+    mean_ap: float
+    tp_errors: Mapping[str, float]
+    mean_dist_aps: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -64,7 +53,7 @@ class StressResults:
     @property
     def clean(self) -> ConditionScores | None:
         """The scores without corruption; None if they are not there yet."""
-        return next((scores for scores in self.scores if scores.corruption == CLEAN), None)
+        return next((scores for scores in self.scores if scores.corruption == CLEAN.name), None)
 
     def of(self, name: str) -> dict[str, ConditionScores]:
         """Severity -> scores of a corruption, in the order of the severities."""
@@ -105,7 +94,7 @@ class StressResults:
             "format": FORMAT,
             **self.header,
             "complete": self.is_complete,
-            "conditions": [scores.to_dict() for scores in self.scores],
+            "conditions": [vars(scores) for scores in self.scores],
             "resilience": {name: self.resilience(name) for name in names},
             "mRR": self.mean_resilience(),
             "mean_resilience_unseen": self.mean_resilience(Group.UNSEEN),
@@ -137,5 +126,5 @@ def read_results(path: Path) -> StressResults:
 def _scores(entry: Any) -> ConditionScores:
     errors = {str(name): math.nan if value is None else float(value) for name, value in entry["tp_errors"].items()}
     aps = {str(name): float(value) for name, value in entry["mean_dist_aps"].items()}
-    numbers = float(entry["mean_ap"]), float(entry["nd_score"])
+    numbers = float(entry["nd_score"]), float(entry["mean_ap"])
     return ConditionScores(str(entry["corruption"]), str(entry["severity"]), *numbers, errors, aps)

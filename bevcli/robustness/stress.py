@@ -180,7 +180,7 @@ class _Test:
         truths = [frame for scene in boxes for frame in scene.ground_truth]
         table = evaluate_detections(predictions, truths, self.metrics).overall.of_classes_with_ground_truth()
         aps = {name: scores.mean_ap for name, scores in table.classes.items()}
-        return ConditionScores(condition.name, condition.severity, table.mean_ap, table.nd_score, table.errors, aps)
+        return ConditionScores(condition.name, condition.severity, table.nd_score, table.mean_ap, table.errors, aps)
 
     def remove_boxes(self, condition: Condition) -> None:
         """Removes the stored boxes of a finished condition."""
