@@ -1,6 +1,5 @@
 """Pairs the frames of predictions and ground truth, and moves their boxes into one frame of reference."""
 
-from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -124,7 +123,7 @@ def _common_frames(
 
 
 def _ambiguous(keys: Sequence[Hashable]) -> bool:
-    return None in keys or max(Counter(keys).values()) > 1
+    return None in keys or len(set(keys)) < len(keys)
 
 
 def _described(frame: FrameBoxes) -> str:
