@@ -26,6 +26,7 @@ from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.recording.colors import Color, map_colors
 from bevcli.recording.log_bev import fit_colors
 
+Rect = tuple[float, float, float, float]  # left, bottom (in an image: top), width, height
 INK, GREY, FAINT = "#1f2430", "#6b7280", "#d7dae0"
 ACCENT, SECOND, THIRD, PALE = "#e4572e", "#1769aa", "#2a9d5c", "#9aa0ab"
 WIDTH_INCHES, DPI = 14.0, 100
@@ -109,13 +110,8 @@ def page_colors(classes: Iterable[str]) -> dict[str, Color]:
     return map_colors(classes, MAP_COLORS, OTHER_MAP_COLORS)
 
 
-def color_bar(
-    figure: Figure,
-    image: ScalarMappable,
-    place: tuple[float, float, float, float],
-    ticks: tuple[float, ...] | None = None,
-) -> Colorbar:
-    """An upright colour bar at a place of the figure: left, bottom, width, height."""
+def color_bar(figure: Figure, image: ScalarMappable, place: Rect, ticks: Sequence[float] | None = None) -> Colorbar:
+    """An upright colour bar at a place of the figure."""
     bar = figure.colorbar(image, cax=figure.add_axes(place), ticks=ticks)
     bar.ax.tick_params(labelsize=10, colors=GREY)
     return bar
@@ -164,10 +160,8 @@ def mark_cell(axes: Axes, trace: Trace) -> None:
     outline(axes, (*(trace.cell_center - size / 2), *size), (4.5, 2.2), zorder=9)
 
 
-def outline(
-    axes: Axes, place: tuple[float, float, float, float], widths: tuple[float, float], zorder: float = 1
-) -> None:
-    """A rectangle with a white border. place: x, y, width, height. widths: of the white and of the coloured line."""
+def outline(axes: Axes, place: Rect, widths: tuple[float, float], zorder: float = 1) -> None:
+    """A rectangle with a white border. widths: of the white and of the coloured line."""
     for color, width, order in (("white", widths[0], zorder), (ACCENT, widths[1], zorder + 1)):
         axes.add_patch(Rectangle(place[:2], *place[2:], fc="none", ec=color, lw=width, zorder=order))
 
