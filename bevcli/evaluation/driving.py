@@ -183,7 +183,7 @@ def _plan(file: Path, found: ScoredInput, truth: ScoredInput, pairs: FramePairs)
     notes = [f"{left_out} frames at the end of scenes have no whole driven path: left out"] if left_out else []
     if guessed:
         notes.append(f"{guessed} frames have no command: the path of the command that the driver followed is scored")
-    return evaluate_plans(frames, len(times), float(times[0])), tuple(notes)
+    return evaluate_plans(frames, float(times[0])), tuple(notes)
 
 
 def _planned(plan: Plan, world_from_bev: Array, ego_from_bev: Array, later: Sequence[FrameBoxes]) -> PlannedFrame:

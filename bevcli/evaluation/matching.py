@@ -14,14 +14,11 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
 
 # Value of an optional column in frames that do not have it. Futures are scored on their own.
-_UNKNOWN = {
-    "scores": np.float64(np.nan),
-    "attributes": np.str_(""),
-    "instances": np.str_(""),
-    "track_scores": np.float64(np.nan),
-    "duplicates": np.bool_(False),
-    "visibilities": np.float64(np.nan),
-    "num_points": np.int64(-1),
+_UNKNOWN: dict[str, Any] = {
+    **dict.fromkeys(("scores", "track_scores", "visibilities"), np.nan),
+    **dict.fromkeys(("attributes", "instances"), ""),
+    "duplicates": False,
+    "num_points": -1,
 }
 
 

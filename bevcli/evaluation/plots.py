@@ -12,7 +12,6 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
-from numpy.typing import NDArray
 
 from bevcli.evaluation.config import ERRORS, DetectionConfig
 from bevcli.evaluation.detection_scores import RECALLS, ClassScores, DetectionScores
@@ -125,11 +124,11 @@ _MISSED, _FALSE, _FOUND = "#d62728", "#ff9d1e", "#3a9a4b"
 
 
 class _Outcome(NamedTuple):
-    """One class above the score threshold with the largest F1: missed (G,) bool, false positives (P,) bool."""
+    """One class above the score threshold with the largest F1: ground truth found and missed, and false positives."""
 
-    matches: ClassMatches
-    missed: NDArray[np.bool_]
-    false_positives: NDArray[np.bool_]
+    found: ScoredBoxes
+    missed: ScoredBoxes
+    false: ScoredBoxes
 
 
 def draw_bev_sheet(detection: DetectionScores, config: DetectionConfig, pairs: FramePairs) -> Figure:
@@ -139,19 +138,19 @@ def draw_bev_sheet(detection: DetectionScores, config: DetectionConfig, pairs: F
     vehicle's forward direction is up.
     """
     row = config.distances_m.index(config.error_distance_m)
-    outcomes = [_best_outcome(matches, row) for matches in detection.matches]
+    outcomes = {matches.name: _best_outcome(matches, row) for matches in detection.matches}
     threshold = f"largest F1 of each class at {config.error_distance_m:g} m"
     subtitle = f"score threshold: {threshold}; forward is up, rings every 10 m"
     figure = titled_figure((12, 10), "Missed ground truth and false positives, seen from above", subtitle)
     grid = figure.add_gridspec(2, 2 * WORST_FRAMES, height_ratios=(2, 1.15))
     radius = _radius(detection)
-    missed = {matches.name: matches.ground_truth[chosen] for matches, chosen, _ in outcomes}
-    false = {matches.name: matches.predictions[chosen] for matches, _, chosen in outcomes}
+    missed = {name: outcome.missed for name, outcome in outcomes.items()}
+    false = {name: outcome.false for name, outcome in outcomes.items()}
     for place, (title, parts) in enumerate((("missed", missed), ("false positives", false))):
         axes = figure.add_subplot(grid[0, place * WORST_FRAMES : (place + 1) * WORST_FRAMES])
         _draw_dots(axes, title, parts, pairs.reference_from_ego, radius)
-    for place, frame in enumerate(_worst_frames(outcomes)):
-        _draw_frame(figure.add_subplot(grid[1, 2 * place : 2 * place + 2]), frame, outcomes, pairs, radius)
+    for place, frame in enumerate(_worst_frames(outcomes.values())):
+        _draw_frame(figure.add_subplot(grid[1, 2 * place : 2 * place + 2]), frame, outcomes.values(), pairs, radius)
     heading = {"title": "class: missed / false positives", "title_fontsize": 9}
     handles = _legend(missed, false)
     figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=9, frameon=False, **heading)
@@ -163,9 +162,10 @@ def _best_outcome(matches: ClassMatches, row: int) -> _Outcome:
     is_match = matches.matched[row] >= 0
     f1 = 2 * np.cumsum(is_match) / (np.arange(1, len(is_match) + 1) + len(matches.ground_truth))
     kept = np.arange(len(is_match)) < (int(f1.argmax()) + 1 if is_match.any() else 0)
-    missed = np.ones(len(matches.ground_truth), dtype=bool)
-    missed[matches.matched[row][kept & is_match]] = False
-    return _Outcome(matches, missed, kept & ~is_match)
+    found = np.zeros(len(matches.ground_truth), dtype=bool)
+    found[matches.matched[row][kept & is_match]] = True
+    truth = matches.ground_truth
+    return _Outcome(truth[found], truth[~found], matches.predictions[kept & ~is_match])
 
 
 def _legend(missed: Mapping[str, ScoredBoxes], false: Mapping[str, ScoredBoxes]) -> list[Line2D]:
@@ -185,11 +185,9 @@ def _radius(detection: DetectionScores) -> float:
     return min(10 * np.ceil(farthest / 10), 100.0)
 
 
-def _worst_frames(outcomes: list[_Outcome]) -> list[int]:
-    counts: Counter[int] = Counter()
-    for matches, missed, false_positives in outcomes:
-        counts.update(matches.ground_truth.frames[missed].tolist())
-        counts.update(matches.predictions.frames[false_positives].tolist())
+def _worst_frames(outcomes: Iterable[_Outcome]) -> list[int]:
+    mistakes = [part.frames for outcome in outcomes for part in (outcome.missed, outcome.false)]
+    counts = Counter(np.concatenate(mistakes).tolist())
     return [frame for frame, _ in counts.most_common(WORST_FRAMES)]
 
 
@@ -212,21 +210,18 @@ def _draw_dots(
     axes.set_title(f"{len(points)} {title}{thinned}", fontsize=12)
 
 
-def _draw_frame(axes: Axes, frame: int, outcomes: list[_Outcome], pairs: FramePairs, radius: float) -> None:
+def _draw_frame(axes: Axes, frame: int, outcomes: Iterable[_Outcome], pairs: FramePairs, radius: float) -> None:
     ego_from_reference = inverse(pairs.reference_from_ego[frame])
-    counts = [0, 0]
-    for matches, missed, false_positives in outcomes:
-        truth, found = matches.ground_truth, matches.predictions
-        here, missed_here = truth.frames == frame, missed & (truth.frames == frame)
-        false_here = false_positives & (found.frames == frame)
-        _draw_boxes(axes, truth[here & ~missed], ego_from_reference, _FOUND, "-")
-        _draw_boxes(axes, truth[missed_here], ego_from_reference, _MISSED, "-")
-        _draw_boxes(axes, found[false_here], ego_from_reference, _FALSE, "--")
-        counts = [counts[0] + int(missed_here.sum()), counts[1] + int(false_here.sum())]
+    counts = np.zeros(3, dtype=int)
+    for outcome in outcomes:
+        parts = [part[part.frames == frame] for part in outcome]
+        for part, color, style in zip(parts, (_FOUND, _MISSED, _FALSE), ("-", "-", "--"), strict=True):
+            _draw_boxes(axes, part, ego_from_reference, color, style)
+        counts += [len(part) for part in parts]
     _draw_ground(axes, radius)
     stamp = pairs.ground_truth_stamps[frame]
     scene = f"{stamp.scene} " if stamp.scene else ""
-    axes.set_title(f"{scene}frame {stamp.index}\n{counts[0]} missed, {counts[1]} false positives", fontsize=10)
+    axes.set_title(f"{scene}frame {stamp.index}\n{counts[1]} missed, {counts[2]} false positives", fontsize=10)
 
 
 def _draw_boxes(axes: Axes, part: ScoredBoxes, ego_from_reference: Array, color: str, style: str) -> None:

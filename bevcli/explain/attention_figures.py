@@ -110,9 +110,6 @@ def _draw_paths(axes: Axes, attention: SceneAttention, chosen: int | None) -> No
 
 def _draw_table(axes: Axes, attention: SceneAttention) -> None:
     """The largest weights of objects and of lines."""
-    rows = 2 * (LISTED + 2.5)
-    axes.set(xlim=(0, 10), ylim=(rows, -1))
-    axes.axis("off")
     boxes, lines = attention.objects, attention.lines
     assert boxes.scores is not None
     assert lines.scores is not None
@@ -126,7 +123,7 @@ def _draw_table(axes: Axes, attention: SceneAttention) -> None:
 
 
 def _draw_rows(axes: Axes, top: float, kind: str, rows: list[ROW]) -> None:
-    write = drawing.table_text(axes)
+    write = drawing.table_text(axes, -1, 2 * (LISTED + 2.5))
     largest = sorted((row for row in rows if row[0] > 0), key=lambda row: -row[0])[:LISTED]
     columns = ((1.6, "weight", "right"), (2.1, kind, "left"), (6.9, "score", "right"), (10, "at x, y in m", "right"))
     for x, name, align in columns:

@@ -192,9 +192,7 @@ def can_bus(trace: Trace) -> Figure:
 
 def _draw_numbers(axes: Axes, trace: Trace) -> None:
     values = trace.inputs.can_bus[0].cpu().numpy()
-    axes.set(xlim=(0, 10), ylim=(len(values) + 0.1, -0.6))
-    axes.axis("off")
-    write = drawing.table_text(axes)
+    write = drawing.table_text(axes, -0.6, len(values) + 0.1)
     start = 0
     for place, (name, unit, count) in enumerate(GROUPS):
         group = values[start : start + count]

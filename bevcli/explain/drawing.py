@@ -210,8 +210,10 @@ def show_camera(axes: Axes, frame: Frame, name: str, title: str | None = None) -
     axes.set_title(name if title is None else title, fontsize=12, color=INK, loc="left", pad=5)
 
 
-def table_text(axes: Axes) -> Callable[..., Text]:
-    """`axes.text` for the cells of a table: 12 points, centred about the line."""
+def table_text(axes: Axes, top: float, bottom: float) -> Callable[..., Text]:
+    """`axes.text` for the cells of a table on these axes: 12 points, centred about the line. Columns are 0 to 10."""
+    axes.set(xlim=(0, 10), ylim=(bottom, top))
+    axes.axis("off")
     return partial(axes.text, fontsize=12, color=INK, va="center")
 
 

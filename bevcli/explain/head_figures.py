@@ -197,10 +197,8 @@ def _box_of(trace: Trace, layer: int, query: int) -> Boxes3D:
 
 
 def _draw_code_table(axes: Axes, codes: Array, scores: Array, name: str) -> None:
-    layers, write = len(codes), drawing.table_text(axes)
+    layers, write = len(codes), drawing.table_text(axes, -1.5, 11.3)
     shown = sorted({0, layers // 2, layers - 1})
-    axes.set(xlim=(0, 10), ylim=(11.3, -1.5))
-    axes.axis("off")
     columns = np.linspace(2.3, 2.3 + 1.35 * (len(shown) - 1), len(shown))
     for x, layer in zip(columns, shown, strict=True):
         write(x, -1.0, f"layer {layer + 1}", ha="right", color=GREY)

@@ -125,7 +125,7 @@ def test_steps_of_planned_paths_equal_vads(golden: dict[str, Any]) -> None:
 
 def plan_scores(golden: dict[str, Any]) -> PlanScores:
     valid = [sample for sample in golden["planning"]["samples"] if sample["fut_valid_flag"]]
-    return evaluate_plans(map(planned, valid), 6, 0.5)
+    return evaluate_plans(map(planned, valid), 0.5)
 
 
 def test_planned_paths_in_vads_convention_equal_vads(golden: dict[str, Any]) -> None:
