@@ -50,12 +50,12 @@ def gather(frames: Sequence[Boxes3D], ego_xy: Array) -> ScoredBoxes:
     ego_xy: (F, 2), the ego vehicle's position in the frame of reference of each frame's boxes, metres.
     """
     indices = np.repeat(np.arange(len(frames)), [len(boxes) for boxes in frames])
-    boxes = _filled(Boxes3D.concatenate(map(_filled, frames)))
+    boxes = with_all_columns(Boxes3D.concatenate(map(with_all_columns, frames)))
     ranges = np.linalg.norm(boxes.centers[:, :2] - ego_xy[indices], axis=1)
     return ScoredBoxes(boxes, indices, ranges)
 
 
-def _filled(boxes: Boxes3D) -> Boxes3D:
+def with_all_columns(boxes: Boxes3D) -> Boxes3D:
     """The boxes with all optional columns but futures."""
     missing: dict[str, Any] = {
         name: np.full(len(boxes), value) for name, value in _UNKNOWN.items() if getattr(boxes, name) is None

@@ -136,22 +136,25 @@ def write_contact_sheet(path: Path, scene: Sequence, conditions: Items[Condition
         if corruption.shown is Shown.NOTHING:
             continue
         if corruption.name not in rows:
-            clean = _tile(scene.load(place), corruption)
-            rows[corruption.name] = [_captioned(clean, f"{corruption.name}: clean")]
+            rows[corruption.name] = [_tile(scene.load(place), corruption, "clean")]
         (changed,) = condition.sequences(scene, options.seed, options.lost_images)
-        tile = _tile(changed.load(place), corruption)
-        rows[corruption.name].append(_captioned(tile, f"{corruption.name}: {condition.severity}"))
+        rows[corruption.name].append(_tile(changed.load(place), corruption, condition.severity))
     if not rows:
         return
     _, encoded = cv2.imencode(".png", _sheet(list(rows.values())))
     write_whole(path, encoded.tobytes())
 
 
-def _tile(frame: Frame, corruption: Corruption) -> Pixels:
-    if corruption.shown is Shown.CAMERAS:
-        return _mosaic(frame)
+def _tile(frame: Frame, corruption: Corruption, severity: str) -> Pixels:
+    """The part of a frame that shows a corruption, below its caption."""
     ahead = min(frame.rig.cameras, key=lambda camera: abs(camera.yaw)).name
-    return _camera_tile(frame, ahead, TILE_WIDTH, boxes=corruption.shown is Shown.BOXES)
+    if corruption.shown is Shown.CAMERAS:
+        tile = _mosaic(frame)
+    else:
+        tile = _camera_tile(frame, ahead, TILE_WIDTH, boxes=corruption.shown is Shown.BOXES)
+    top, text = np.full((CAPTION, TILE_WIDTH, 3), PAPER, dtype=np.uint8), f"{corruption.name}: {severity}"
+    cv2.putText(top, text, (2, CAPTION - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.45, INK, 1, cv2.LINE_AA)
+    return np.concatenate([top, tile])
 
 
 def _mosaic(frame: Frame) -> Pixels:
@@ -184,12 +187,6 @@ def _draw_boxes(pixels: Pixels, frame: Frame, name: str) -> None:
     thickness = max(1, round(pixels.shape[1] / 500))
     for start, end in lines_in_image(frame.ground_truth, camera, camera_from_world).segments.astype(int):
         cv2.line(pixels, start.tolist(), end.tolist(), BOX, thickness, cv2.LINE_AA)
-
-
-def _captioned(tile: Pixels, text: str) -> Pixels:
-    top = np.full((CAPTION, tile.shape[1], 3), PAPER, dtype=np.uint8)
-    cv2.putText(top, text, (2, CAPTION - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.45, INK, 1, cv2.LINE_AA)
-    return np.concatenate([top, tile])
 
 
 def _sheet(rows: list[list[Pixels]]) -> Pixels:
