@@ -1,7 +1,7 @@
 """Scores as a dict for JSON, with the key names of the nuScenes devkit, and as a table for the terminal."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from bevcli.evaluation.config import ERRORS, DetectionConfig
@@ -140,17 +140,11 @@ def _maps(segmentation: SegmentationScores) -> str:
     return f"{aligned(rows)}\n({segmentation.frame_count} maps)"
 
 
-def aligned(rows: Iterable[Sequence[str]]) -> str:
+def aligned(rows: Sequence[Sequence[str]]) -> str:
     """Rows as aligned columns, the first to the left, the others to the right."""
-    lines = list(rows)
-    widths = [max(len(cell) for cell in column) for column in zip(*lines, strict=True)]
-    return "\n".join(
-        "  ".join(
-            cell.rjust(width) if place else cell.ljust(width)
-            for place, (cell, width) in enumerate(zip(line, widths, strict=True))
-        ).rstrip()
-        for line in lines
-    )
+    first, *others = (max(map(len, column)) for column in zip(*rows, strict=True))
+    lines = ("  ".join([row[0].ljust(first), *map(str.rjust, row[1:], others)]) for row in rows)
+    return "\n".join(map(str.rstrip, lines))
 
 
 def _number(value: float, digits: int = 3) -> str:
