@@ -148,8 +148,7 @@ def _times(predictions: Sequence[Boxes3D]) -> Array:
     """(T,) seconds of the steps of the predicted futures."""
     for boxes in predictions:
         if boxes.futures is not None and len(boxes):
-            times: Array = boxes.futures[0, 0, :, 0]
-            return times
+            return np.asarray(boxes.futures[0, 0, :, 0])
     raise InputError('`motion`: the predictions have no "futures" (expected those of a model that forecasts)')
 
 

@@ -242,5 +242,4 @@ def cosine_to(features: NDArray, cell: tuple[int, int]) -> NDArray:
     """(Y, X, C) -> (Y, X) cosine similarity with the cell's vector, after the mean of all cells is removed."""
     centered = features - features.reshape(-1, features.shape[-1]).mean(0)
     centered = centered / np.maximum(np.linalg.norm(centered, axis=-1, keepdims=True), 1e-9)
-    similarity: NDArray = centered @ centered[cell]
-    return similarity
+    return np.asarray(centered @ centered[cell])

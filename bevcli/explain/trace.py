@@ -92,8 +92,7 @@ class Trace:
     @property
     def cell_center(self) -> Array:
         """(2,) x, y of the followed cell, metres, bev frame."""
-        center: Array = self.grid.cell_centers()[self.cell]
-        return center
+        return np.asarray(self.grid.cell_centers()[self.cell])
 
     def cell_map(self, tokens: Tensor) -> np.ndarray:
         """Tokens (Y·X, C) -> array (Y, X, C) float32, rows from the smallest y."""

@@ -142,7 +142,8 @@ class LostImages(ChangedSequence):
         raise NotImplementedError
 
     def change(self, place: int, frame: Frame) -> Frame:
-        lost = [name for name in frame.images if name in self.lost(frame)]
+        all_lost = self.lost(frame)
+        lost = [name for name in frame.images if name in all_lost]
         if self._lost_images == "missing":
             kept = {name: image for name, image in frame.images.items() if name not in lost}
             dropped = {**frame.dropped, **dict.fromkeys(lost, "lost by bevcli stress")}
