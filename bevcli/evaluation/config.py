@@ -28,11 +28,15 @@ class ClassRanges:
             raise ConfigError(f"the largest range is not positive (expected more than 0 m, found {max_range_m:g})")
         return replace(self, class_ranges_m={name: min(m, max_range_m) for name, m in self.class_ranges_m.items()})
 
+    def unlimited(self) -> Self:
+        """The same score without class ranges: the devkit's score of boxes without an ego pose."""
+        return replace(self, class_ranges_m=dict.fromkeys(self.class_ranges_m, math.inf))
+
     def for_frames(self, max_range_m: float | None, *, ego_pose_known: bool) -> Self:
-        """The score cut at max_range_m, if any; else without class ranges where poses are not known, as the devkit."""
+        """The score with the ranges that hold for frames: cut at max_range_m, if any; unlimited without ego poses."""
         if max_range_m is not None:
             return self.cut_at(max_range_m)
-        return self if ego_pose_known else replace(self, class_ranges_m=dict.fromkeys(self.class_ranges_m, math.inf))
+        return self if ego_pose_known else self.unlimited()
 
 
 @dataclass(frozen=True)

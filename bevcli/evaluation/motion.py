@@ -49,24 +49,14 @@ class MotionSums:
     ade_count: int = 0
 
     @property
-    def epa(self) -> float:
-        """End-to-end prediction accuracy; it may be negative."""
-        return _ratio(self.hits - FALSE_POSITIVE_SHARE * self.false_positives, self.truths)
-
-    @property
-    def min_ade(self) -> float:
-        """Metres."""
-        return _ratio(self.ade_m, self.ade_count)
-
-    @property
-    def min_fde(self) -> float:
-        """Metres."""
-        return _ratio(self.fde_m, self.hits + self.misses)
-
-    @property
-    def miss_rate(self) -> float:
-        """0 to 1."""
-        return _ratio(self.misses, self.hits + self.misses)
+    def metrics(self) -> dict[str, float]:
+        """EPA (end-to-end prediction accuracy, may be negative), minADE and minFDE (metres), MR (miss rate, 0 to 1)."""
+        return {
+            "EPA": _ratio(self.hits - FALSE_POSITIVE_SHARE * self.false_positives, self.truths),
+            "minADE": _ratio(self.ade_m, self.ade_count),
+            "minFDE": _ratio(self.fde_m, self.hits + self.misses),
+            "MR": _ratio(self.misses, self.hits + self.misses),
+        }
 
 
 def evaluate_motion(pairs: Iterable[tuple[Boxes3D, Boxes3D]]) -> dict[str, MotionSums]:

@@ -213,16 +213,7 @@ def driving_to_dict(scores: DrivingScores) -> dict[str, Any]:
             "frames": lines.frame_count,
         }
     if (motion := scores.motion) is not None:
-        content["motion"] = {
-            name: {
-                "EPA": of_class.epa,
-                "minADE": of_class.min_ade,
-                "minFDE": of_class.min_fde,
-                "MR": of_class.miss_rate,
-                "ground_truth": of_class.truths,
-            }
-            for name, of_class in motion.items()
-        }
+        content["motion"] = {name: {**sums.metrics, "ground_truth": sums.truths} for name, sums in motion.items()}
     if (plan := scores.plan) is not None:
         content["plan"] = {
             "averaged_up_to_horizon": _horizons(plan, plan.averaged, plan.collisions),
@@ -252,8 +243,7 @@ def driving_tables(scores: DrivingScores) -> Iterator[str]:
     if (motion := scores.motion) is not None:
         rows = [("forecasts", "objects", "EPA", "minADE m", "minFDE m", "miss rate")]
         for name, sums in motion.items():
-            numbers = (sums.epa, sums.min_ade, sums.min_fde, sums.miss_rate)
-            rows.append((name, str(sums.truths), *map(_number, numbers)))
+            rows.append((name, str(sums.truths), *map(_number, sums.metrics.values())))
         yield aligned(rows)
     if (plan := scores.plan) is not None:
         averaged = _horizons(plan, plan.averaged, plan.collisions)

@@ -146,8 +146,7 @@ def test_what_is_beyond_the_range_of_its_class_does_not_count() -> None:
     assert numbers(both) == pytest.approx(numbers(near), nan_ok=True)
     cut = evaluate_detections([cars([0, 35], [0.5, 0.9])], [cars([0, 40])], DetectionConfig().cut_at(32))
     assert numbers(cut) == pytest.approx(numbers(near), nan_ok=True)
-    config = DetectionConfig().for_frames(None, ego_pose_known=False)
-    unlimited = evaluate_detections([cars([0, 51], [0.5, 0.9])], [cars([0])], config)
+    unlimited = evaluate_detections([cars([0, 51], [0.5, 0.9])], [cars([0])], DetectionConfig().unlimited())
     assert unlimited.prediction_count == 2
 
 
