@@ -126,8 +126,7 @@ def _lines_next_to(file: Path) -> LinesFile:
 def _lines_of(open_drive: Callable[[], Sequence], expected: str) -> LinesFile:
     """The true lines of a drive in the world frame. expected: what would have them."""
     drive, frames = open_drive(), []
-    for place in range(len(drive.stamps)):
-        frame = drive.ground_truth_frame(place)
+    for frame in map(drive.ground_truth_frame, range(len(drive.stamps))):
         if (lines := frame.ground_truth_lines) is None:
             where = f'scene "{frame.stamp.scene}"' if frame.stamp.scene else f"frame {frame.stamp.index}"
             raise InputError(f"{drive.name}: `map`: {where} has no true lines of the map (expected {expected})")
@@ -156,13 +155,11 @@ def _open_nuscenes(root: Path, options: NuScenesOptions, only: str | None, names
 
 def _open_drive(path: Path, options: SequenceOptions) -> ScoredInput:
     drive = open_sequence(path, options)
-    frames = [drive.ground_truth_frame(place) for place in range(len(drive.stamps))]
-    tokens = [{"sample_token": frame.sample_token} if frame.sample_token else {} for frame in frames]
-    found = [
-        FrameBoxes(frame.stamp, frame.world_from_ego, frame.ground_truth, extras)
-        for frame, extras in zip(frames, tokens, strict=True)
-        if frame.ground_truth is not None
-    ]
+    found = []
+    for frame in map(drive.ground_truth_frame, range(len(drive.stamps))):
+        if frame.ground_truth is not None:
+            token = {"sample_token": frame.sample_token} if frame.sample_token else {}
+            found.append(FrameBoxes(frame.stamp, frame.world_from_ego, frame.ground_truth, token))
     if not found:
         raise InputError(f"{path}: has no ground truth (expected for scoring): score another drive")
     lines = partial(_lines_of, lambda: drive, "a drive that has them")
