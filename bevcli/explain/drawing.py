@@ -1,6 +1,6 @@
 """Parts that the figures share: titles, BEV axes, camera images, boxes and feature colours."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -47,6 +47,7 @@ OTHER_MAP_COLORS: tuple[Color, ...] = (
     (42, 157, 92), (142, 91, 181), (160, 90, 44), (214, 93, 177), (58, 63, 75), (127, 184, 0), (10, 165, 165),
     (125, 133, 151),
 )  # fmt: skip
+page_colors = partial(map_colors, named=MAP_COLORS, others=OTHER_MAP_COLORS)  # map classes -> colours on a white page
 
 
 def titled_figure(height_inches: float, title: str, subtitle: str, heading_inches: float = 1.55) -> Figure:
@@ -103,11 +104,6 @@ def show_map(axes: Axes, trace: Trace, bev_map: BevMap, **options: Any) -> None:
         image[bev_map.layer(name)] = color  # later classes lie on top
     axes.imshow(image, extent=(*bev_map.x_range_m, *bev_map.y_range_m), zorder=0, **options)
     axes.set(xlim=trace.grid.x_range_m, ylim=trace.grid.y_range_m)
-
-
-def page_colors(classes: Iterable[str]) -> dict[str, Color]:
-    """Map class -> colour on a white page, as `map_colors`."""
-    return map_colors(classes, MAP_COLORS, OTHER_MAP_COLORS)
 
 
 def color_bar(figure: Figure, image: ScalarMappable, place: Rect, ticks: Sequence[float] | None = None) -> Colorbar:
