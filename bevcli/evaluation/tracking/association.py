@@ -206,15 +206,13 @@ def associate(truth: TrackedBoxes, predictions: TrackedBoxes, pairs: Pairs, thre
 
 def _matches(pairs: list[Pair], objects: list[int], tracks: list[int], memory: dict[int, int]) -> list[Pair]:
     """The matches of one frame: first what is remembered, then the assignment of the rest."""
-    matches: list[Pair] = []
-    truths, predictions = set(), set()
+    kept: dict[int, Pair] = {}  # by the box of the predictions
     for g, p, distance in pairs:
-        if memory.get(objects[g]) == tracks[p] and p not in predictions:
-            matches.append((g, p, distance))
-            truths.add(g)
-            predictions.add(p)
-    rest = [pair for pair in pairs if pair[0] not in truths and pair[1] not in predictions]
-    return matches + _assignment(rest)
+        if memory.get(objects[g]) == tracks[p]:
+            kept.setdefault(p, (g, p, distance))
+    truths = {g for g, _, _ in kept.values()}
+    rest = [pair for pair in pairs if pair[0] not in truths and pair[1] not in kept]
+    return [*kept.values(), *_assignment(rest)]
 
 
 def _assignment(pairs: list[Pair]) -> list[Pair]:
