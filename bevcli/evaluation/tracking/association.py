@@ -134,8 +134,7 @@ def _interpolated(boxes: TrackedBoxes, times_ns: Indices) -> TrackedBoxes:
     weight = (times_ns[boxes.frames[right]] - times_ns[frames]) / span
     xy = (1 - weight)[:, None] * boxes.xy[left] + weight[:, None] * boxes.xy[right]
     scores = (1 - weight) * boxes.scores[left] + weight * boxes.scores[right]
-    first_appearance = np.full(int(boxes.tracks.max(initial=-1)) + 1, len(boxes))
-    np.minimum.at(first_appearance, boxes.tracks, np.arange(len(boxes)))
+    _, first_appearance = np.unique(boxes.tracks, return_index=True)
     added = TrackedBoxes(frames, boxes.tracks[right], xy, boxes.classes[right], scores)
     added = added[np.argsort(first_appearance[added.tracks], kind="stable")]
     both = TrackedBoxes(*map(np.concatenate, zip(vars(boxes).values(), vars(added).values(), strict=True)))
