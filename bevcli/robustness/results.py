@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
+import msgspec
+
 from bevcli.errors import InputError
 from bevcli.evaluation.detection_scores import known_mean
 from bevcli.evaluation.scores_report import finite
@@ -24,7 +26,7 @@ class ConditionScores:
         severity: "easy", "mid", "hard" or a level; "" for clean.
         nd_score: NDS, 0 to 1.
         mean_ap: mAP, 0 to 1.
-        tp_errors: true-positive errors by the devkit's names; NaN where undefined.
+        tp_errors: true-positive errors by the devkit's names; NaN, or None of a file, where undefined.
         mean_dist_aps: class -> AP.
     """
 
@@ -32,7 +34,7 @@ class ConditionScores:
     severity: str
     nd_score: float
     mean_ap: float
-    tp_errors: Mapping[str, float]
+    tp_errors: Mapping[str, float | None]
     mean_dist_aps: Mapping[str, float]
 
 
@@ -117,14 +119,7 @@ def read_results(path: Path) -> StressResults:
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(f'{path}: is no result of `bevcli stress` (expected "format": "{FORMAT}")')
     try:
-        scores = tuple(map(_scores, content["conditions"]))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        scores = msgspec.convert(content["conditions"], tuple[ConditionScores, ...])
+    except (KeyError, msgspec.ValidationError) as error:
         raise InputError(f'{path}: "conditions" is wrong ({type(error).__name__}: {error})') from None
     return StressResults(content, scores, content.get("complete") is True)
-
-
-def _scores(entry: Any) -> ConditionScores:
-    errors = {str(name): math.nan if value is None else float(value) for name, value in entry["tp_errors"].items()}
-    aps = {str(name): float(value) for name, value in entry["mean_dist_aps"].items()}
-    numbers = float(entry["nd_score"]), float(entry["mean_ap"])
-    return ConditionScores(str(entry["corruption"]), str(entry["severity"]), *numbers, errors, aps)
