@@ -14,9 +14,10 @@ Metrics; they read no files:
     tracking            AMOTA and the numbers that come with it
     segmentation        IoU of BEV maps
     joint               scores of several drives together, from the matching of each
+    driving             lines of the map, forecasts and planned paths: `map_lines`, `motion`, `planning`
 
 Output:
     scores_report       scores as a dict for JSON and as tables for the terminal
     plots               precision and recall, errors by range, missed ground truth and false positives from above
-    export              boxes in the formats of other tools
+    formats             boxes in the formats of other tools
 """

@@ -1,18 +1,13 @@
 """BoxFormat: a format of another tool that boxes are exported in, found through `bevcli.box_formats`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from bevcli.errors import InputError
+from bevcli.evaluation.options import ExportOptions
 from bevcli.registry import entries, load
-
-if TYPE_CHECKING:
-    from bevcli.evaluation.options import ExportOptions
-    from bevcli.sequences.files.boxes_file import BoxesFile
+from bevcli.sequences.files.boxes_file import BoxesFile
 
 GROUP = "bevcli.box_formats"
 

@@ -32,6 +32,12 @@ class ClassRanges:
         """The same score without class ranges: the devkit's score of boxes without an ego pose."""
         return replace(self, class_ranges_m=dict.fromkeys(self.class_ranges_m, math.inf))
 
+    def for_frames(self, max_range_m: float | None, *, ego_pose_known: bool) -> Self:
+        """The score with the ranges that hold for frames: cut at max_range_m, if any; unlimited without ego poses."""
+        if max_range_m is not None:
+            return self.cut_at(max_range_m)
+        return self if ego_pose_known else self.unlimited()
+
 
 @dataclass(frozen=True)
 class DetectionConfig(ClassRanges):

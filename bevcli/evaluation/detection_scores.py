@@ -89,7 +89,7 @@ class ClassScores:
     @property
     def mean_ap(self) -> float:
         """AP averaged over the matching distances."""
-        return _mean(self.aps.values())
+        return known_mean(self.aps.values())
 
 
 @dataclass(frozen=True)
@@ -107,12 +107,12 @@ class ScoreTable:
     @property
     def mean_ap(self) -> float:
         """mAP: the mean over the classes."""
-        return _mean(scores.mean_ap for scores in self.classes.values())
+        return known_mean(scores.mean_ap for scores in self.classes.values())
 
     @property
     def errors(self) -> dict[str, float]:
         """The mean of each error over the classes for which it is defined; NaN without any."""
-        return {name: _mean(scores.errors[name] for scores in self.classes.values()) for name in ERRORS}
+        return {name: known_mean(scores.errors[name] for scores in self.classes.values()) for name in ERRORS}
 
     @property
     def error_scores(self) -> dict[str, float]:
@@ -167,7 +167,7 @@ class VisibilityRecall:
     @property
     def mean_recall(self) -> float:
         """The mean recall over the classes; NaN without any."""
-        return _mean(self.recalls.values())
+        return known_mean(self.recalls.values())
 
 
 @dataclass(frozen=True)
@@ -201,6 +201,7 @@ class DetectionScores:
         return sum(scores.ground_truth_count for scores in self.overall.classes.values())
 
 
-def _mean(values: Iterable[float]) -> float:
+def known_mean(values: Iterable[float]) -> float:
+    """The mean of the values that are not NaN; NaN without any."""
     known = [value for value in values if not math.isnan(value)]
     return sum(known) / len(known) if known else math.nan

@@ -1,6 +1,9 @@
-"""Scores of lines of the map, forecasts and planned paths of a run, from its files and the ground truth."""
+"""Scores of lines of the map, forecasts and planned paths of a run, from its files and the ground truth.
 
-from collections.abc import Iterator, Sequence
+The futures of true objects are the places where the same objects are in later frames of the ground truth.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -10,22 +13,63 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.evaluation.inputs import ScoredInput
 from bevcli.evaluation.map_lines import LineScores, evaluate_lines
-from bevcli.evaluation.motion import MotionScores, evaluate_motion
+from bevcli.evaluation.motion import MotionSums, evaluate_motion
 from bevcli.evaluation.pairing import FramePairs
 from bevcli.evaluation.planning import PlannedFrame, PlanScores, evaluate_plans
-from bevcli.evaluation.true_futures import Drives, with_true_futures
-from bevcli.frame import Plan
+from bevcli.frame import FrameStamp, Plan
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.files.json_fields import pose_from_json
-from bevcli.sequences.files.lines_file import LinesFile, LinesWriter, read_lines
+from bevcli.sequences.files.lines_file import LinesWriter, read_lines
 from bevcli.sequences.files.plan_file import PlanWriter, read_plans
 
 Scored = Literal["map", "motion", "plan"]
 DRIVING: tuple[Scored, ...] = ("map", "motion", "plan")
 TURN_M = 2.0  # a path that ends further to a side is one to the right or left, as in nuScenes' labels for VAD
+LATE_S = 0.1  # a frame this near counts as one at the time of a step
+
+
+class Drives:
+    """The frames of a ground truth by scene and time, with boxes in the world frame."""
+
+    def __init__(self, truth: Iterable[FrameBoxes]) -> None:
+        self._scenes: dict[str, list[FrameBoxes]] = {}
+        for frame in sorted(truth, key=lambda frame: frame.stamp.timestamp_ns):
+            self._scenes.setdefault(frame.stamp.scene, []).append(frame)
+        self._times = {
+            scene: np.array([frame.stamp.timestamp_ns for frame in frames]) for scene, frames in self._scenes.items()
+        }
+
+    def after(self, stamp: FrameStamp, seconds: float) -> FrameBoxes | None:
+        """The frame of the same scene so many seconds later; None where there is none within LATE_S."""
+        wanted = stamp.timestamp_ns + round(seconds * 1e9)
+        times = self._times[stamp.scene]
+        nearest = int(np.abs(times - wanted).argmin())
+        return self._scenes[stamp.scene][nearest] if abs(times[nearest] - wanted) <= LATE_S * 1e9 else None
+
+
+def with_true_futures(boxes: Boxes3D, stamp: FrameStamp, drives: Drives, times_s: Sequence[float] | Array) -> Boxes3D:
+    """Boxes in the world frame with one future each: NaN from the first step on in which the object is not there.
+
+    Raises InputError where the boxes have no identities.
+    """
+    if len(boxes) and boxes.instances is None:
+        raise InputError(f'frame {stamp.index}: true boxes have no "instance": futures need identities')
+    places = np.full((len(boxes), 1, len(times_s), 2), np.nan)
+    alive = np.ones(len(boxes), dtype=bool)
+    for step, seconds in enumerate(times_s):
+        frame = drives.after(stamp, seconds)
+        later = Boxes3D.empty() if frame is None else frame.boxes
+        names = () if later.instances is None else later.instances
+        row_of = {name: row for row, name in enumerate(names) if name}
+        for place, name in enumerate(() if boxes.instances is None else boxes.instances):
+            alive[place] &= name in row_of
+            if alive[place]:
+                places[place, 0, step] = later.centers[row_of[name], :2]
+    seconds = np.broadcast_to(np.asarray(times_s)[:, None], (*places.shape[:3], 1))
+    return replace(boxes, futures=np.concatenate([seconds, places], axis=-1))
 
 
 @dataclass(frozen=True)
@@ -33,7 +77,7 @@ class DrivingScores:
     """Scores that were asked for; the others are None. notes: what was assumed or left out."""
 
     lines: LineScores | None = None
-    motion: MotionScores | None = None
+    motion: Mapping[str, MotionSums] | None = None
     plan: PlanScores | None = None
     notes: tuple[str, ...] = ()
 
@@ -46,26 +90,16 @@ def evaluate_driving(
     predictions: a folder, or a file in it. Raises InputError where a side lacks what is asked for.
     """
     folder = predictions if predictions.is_dir() else predictions.parent
-    scores = DrivingScores()
-    if "map" in asked:
-        assert truth.lines is not None
-        scores = replace(scores, lines=_lines(read_lines(folder / LinesWriter.name), truth.lines(), pairs))
-    if "motion" in asked:
-        _require_world(pairs, "motion")
-        scores = replace(scores, motion=_motion(found, truth, pairs))
-    if "plan" in asked:
-        _require_world(pairs, "plan")
-        plan, notes = _plan(folder / PlanWriter.name, found, truth, pairs)
-        scores = replace(scores, plan=plan, notes=notes)
-    return scores
+    lines = _lines(folder / LinesWriter.name, truth, pairs) if "map" in asked else None
+    motion = _motion(found, truth, pairs) if "motion" in asked else None
+    plan, notes = _plan(folder / PlanWriter.name, found, truth, pairs) if "plan" in asked else (None, ())
+    return DrivingScores(lines, motion, plan, notes)
 
 
-def _require_world(pairs: FramePairs, option: str) -> None:
+def _drives(truth: ScoredInput, pairs: FramePairs, option: str) -> Drives:
+    """The drives of the ground truth, which an option needs in the world frame."""
     if pairs.frame_of_reference != "world":
         raise InputError(f"`{option}`: needs boxes in the world frame (found the {pairs.frame_of_reference} frame)")
-
-
-def _drives(truth: ScoredInput) -> Drives:
     if truth.boxes.frame_of_reference != "world":
         raise InputError(
             "forecasts and paths need ground truth in the world frame "
@@ -74,13 +108,15 @@ def _drives(truth: ScoredInput) -> Drives:
     return Drives(truth.boxes.frames)
 
 
-def _lines(found: LinesFile, true: LinesFile, pairs: FramePairs) -> LineScores:
+def _lines(file: Path, truth: ScoredInput, pairs: FramePairs) -> LineScores:
+    assert truth.lines is not None
+    found, true = read_lines(file), truth.lines()
     if found.frame_of_reference != true.frame_of_reference:
         raise InputError(
             f"`map`: predicted lines are in the {found.frame_of_reference} frame, true ones in the "
             f"{true.frame_of_reference} frame (expected the same)"
         )
-    found_of, true_of = ({frame.stamp: frame.lines for frame in file.frames} for file in (found, true))
+    found_of, true_of = ({frame.stamp: frame.lines for frame in side.frames} for side in (found, true))
     stamps = zip(pairs.prediction_stamps, pairs.ground_truth_stamps, strict=True)
     lines = [(found_of[one], true_of[other]) for one, other in stamps if one in found_of and other in true_of]
     if not lines:
@@ -88,49 +124,32 @@ def _lines(found: LinesFile, true: LinesFile, pairs: FramePairs) -> LineScores:
     return evaluate_lines(lines, true.classes)
 
 
-def _motion(found: ScoredInput, truth: ScoredInput, pairs: FramePairs) -> MotionScores:
-    drives = _drives(truth)
-    times = _times(pairs.predictions)
-    areas = _areas(found, pairs)
-    return evaluate_motion(
-        (inside(boxes, area), inside(with_true_futures(true, stamp, drives, times), area))
-        for boxes, true, stamp, area in zip(
-            pairs.predictions, pairs.ground_truth, pairs.ground_truth_stamps, areas, strict=True
-        )
-    )
+def _motion(found: ScoredInput, truth: ScoredInput, pairs: FramePairs) -> dict[str, MotionSums]:
+    """The scores of forecasts of the objects whose centre is in the area that the model sees."""
+    drives, times = _drives(truth, pairs, "motion"), _times(pairs.predictions)
+    ranges = [found.boxes.extras.get(key, [-np.inf, np.inf]) for key in ("x_range_m", "y_range_m")]
+    low, high = np.array(ranges, dtype=np.float64).T
+    of_stamp = {frame.stamp: frame for frame in found.boxes.frames}
+
+    def inside(boxes: Boxes3D, bev_from_world: Array) -> Boxes3D:
+        centers = apply(bev_from_world, boxes.centers)[:, :2]
+        return boxes[((centers >= low) & (centers <= high)).all(1)]
+
+    def scored(place: int) -> tuple[Boxes3D, Boxes3D]:
+        ego_from_bev = ego_from_bev_of(of_stamp[pairs.prediction_stamps[place]])
+        bev_from_world = inverse(pairs.reference_from_ego[place] @ ego_from_bev)
+        true = with_true_futures(pairs.ground_truth[place], pairs.ground_truth_stamps[place], drives, times)
+        return inside(pairs.predictions[place], bev_from_world), inside(true, bev_from_world)
+
+    return evaluate_motion(map(scored, range(len(pairs.predictions))))
 
 
 def _times(predictions: Sequence[Boxes3D]) -> Array:
     """(T,) seconds of the steps of the predicted futures."""
     for boxes in predictions:
         if boxes.futures is not None and len(boxes):
-            times: Array = boxes.futures[0, 0, :, 0]
-            return times
+            return np.asarray(boxes.futures[0, 0, :, 0])
     raise InputError('`motion`: the predictions have no "futures" (expected those of a model that forecasts)')
-
-
-@dataclass(frozen=True)
-class Area:
-    """The area that a model sees: bev_from_world (4, 4), and the ranges of x and y in the bev frame, metres."""
-
-    bev_from_world: Array
-    low: Array
-    high: Array
-
-
-def inside(boxes: Boxes3D, area: Area) -> Boxes3D:
-    """The boxes, in the world frame, whose centre is in the area."""
-    centers = apply(area.bev_from_world, boxes.centers)[:, :2]
-    return boxes[((centers >= area.low) & (centers <= area.high)).all(1)]
-
-
-def _areas(found: ScoredInput, pairs: FramePairs) -> Iterator[Area]:
-    extras = found.boxes.extras
-    ranges = [extras.get(key, [-np.inf, np.inf]) for key in ("x_range_m", "y_range_m")]
-    low, high = np.array(ranges, dtype=np.float64).T
-    of_stamp = {frame.stamp: frame for frame in found.boxes.frames}
-    for stamp, world_from_ego in zip(pairs.prediction_stamps, pairs.reference_from_ego, strict=True):
-        yield Area(inverse(world_from_ego @ ego_from_bev_of(of_stamp[stamp])), low, high)
 
 
 def ego_from_bev_of(frame: FrameBoxes) -> Array:
@@ -142,9 +161,9 @@ def ego_from_bev_of(frame: FrameBoxes) -> Array:
 
 
 def _plan(file: Path, found: ScoredInput, truth: ScoredInput, pairs: FramePairs) -> tuple[PlanScores, tuple[str, ...]]:
+    drives, frames, left_out, guessed, times = _drives(truth, pairs, "plan"), [], 0, 0, np.zeros(0)
     plans = {planned.stamp: planned for planned in read_plans(file)}
     of_stamp = {frame.stamp: frame for frame in found.boxes.frames}
-    drives, frames, left_out, guessed, times = _drives(truth), [], 0, 0, np.zeros(0)
     stamps = zip(pairs.prediction_stamps, pairs.ground_truth_stamps, pairs.reference_from_ego, strict=True)
     for stamp, true_stamp, world_from_ego in stamps:
         if stamp not in plans:
@@ -152,18 +171,18 @@ def _plan(file: Path, found: ScoredInput, truth: ScoredInput, pairs: FramePairs)
         if plans[stamp].frame_of_reference != "world":
             raise InputError(f"{file}: `plan`: needs paths in the world frame (found the ego frame)")
         plan, ego_from_bev = plans[stamp].plan, ego_from_bev_of(of_stamp[stamp])
-        later = [drives.after(true_stamp, seconds) for seconds in plan.times_s]
-        if any(frame is None for frame in later):
+        later = [frame for seconds in plan.times_s if (frame := drives.after(true_stamp, seconds)) is not None]
+        if len(later) < len(plan.times_s):
             left_out += 1
             continue
         times, guessed = plan.times_s, guessed + (not plan.command)
-        frames.append(_planned(plan, world_from_ego @ ego_from_bev, ego_from_bev, [f for f in later if f is not None]))
+        frames.append(_planned(plan, world_from_ego @ ego_from_bev, ego_from_bev, later))
     if not frames:
         raise InputError(f"{file}: `plan`: no frame has a planned path and {max(times, default=3):g} s of ground truth")
     notes = [f"{left_out} frames at the end of scenes have no whole driven path: left out"] if left_out else []
     if guessed:
         notes.append(f"{guessed} frames have no command: the path of the command that the driver followed is scored")
-    return evaluate_plans(frames, len(times), float(times[0])), tuple(notes)
+    return evaluate_plans(frames, float(times[0])), tuple(notes)
 
 
 def _planned(plan: Plan, world_from_bev: Array, ego_from_bev: Array, later: Sequence[FrameBoxes]) -> PlannedFrame:

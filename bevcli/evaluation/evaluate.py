@@ -5,16 +5,15 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
-from typing import Any, TypeVar
+from typing import Any
 
-from bevcli.evaluation.config import ClassRanges, DetectionConfig, TrackingConfig
+from bevcli.evaluation.config import DetectionConfig, TrackingConfig
 from bevcli.evaluation.detection import evaluate_detections
 from bevcli.evaluation.detection_scores import DetectionScores
 from bevcli.evaluation.driving import DrivingScores, Scored, evaluate_driving
-from bevcli.evaluation.driving_report import driving_tables, driving_to_dict
 from bevcli.evaluation.inputs import ScoredInput, open_ground_truth, open_predictions, without_cycles_in_racks
 from bevcli.evaluation.pairing import FramePairs, pair_frames
-from bevcli.evaluation.scores_report import finite, scores_table, scores_to_dict
+from bevcli.evaluation.scores_report import driving_tables, driving_to_dict, finite, scores_table, scores_to_dict
 from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmentation
 from bevcli.evaluation.tracking.scoring import TrackingScores, evaluate_tracking
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
@@ -22,7 +21,6 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass, are_nu
 from bevcli.sequences.files.class_names import ClassNames, count_classes
 from bevcli.sequences.nuscenes.format import NuScenesOptions
 
-Config = TypeVar("Config", bound=ClassRanges)
 OWN_CLASSES = (
     "the classes are not nuScenes' ten: the formulas are nuScenes', with the classes and ranges of the model, and the "
     "numbers are not comparable to nuScenes'"
@@ -119,18 +117,16 @@ def evaluate(
     pairs = without_cycles_in_racks(pairs, truth.bicycle_racks)
     model_range = _model_range_m(found, pairs, classes) if max_range is None else None
     limit = max_range if model_range is None else model_range
-    config = _config(DetectionConfig.of(classes), pairs, limit)
+    config = DetectionConfig.of(classes).for_frames(limit, ego_pose_known=pairs.ego_pose_known)
     predicted = _with_attributes(pairs.predictions, classes)
     detection = evaluate_detections(predicted, pairs.ground_truth, config, pairs.ego_xy)
     segmentation, map_notes = _score_maps(found, truth, pairs)
-    tracked = _config(TrackingConfig.of(classes), pairs, limit)
+    tracked = TrackingConfig.of(classes).for_frames(limit, ego_pose_known=pairs.ego_pose_known)
     tracks, track_notes = _score_tracks(pairs, tracked) if tracking else (None, [])
-    limits = _range_notes(max_range, model_range, pairs)
-    of_classes = [] if are_nuscenes(classes) else [OWN_CLASSES]
-    of_classes += _other_class_notes(pairs, classes)
     drives = evaluate_driving(driving, Path(predictions), found, truth, pairs)
-    notes = (*pairs.notes, *map_notes, *of_classes, *limits, *_detection_notes(detection), *track_notes)
-    return Scores(pairs, config, detection, segmentation, tracks, (*notes, *drives.notes), drives)
+    limits = _range_notes(max_range, model_range, pairs)
+    notes = (*pairs.notes, *map_notes, *_class_notes(pairs, classes), *limits, *_detection_notes(detection))
+    return Scores(pairs, config, detection, segmentation, tracks, (*notes, *track_notes, *drives.notes), drives)
 
 
 def _range_notes(max_range: float | None, model_range: float | None, pairs: FramePairs) -> Iterator[str]:
@@ -141,13 +137,6 @@ def _range_notes(max_range: float | None, model_range: float | None, pairs: Fram
             f"nothing beyond {model_range:g} m is scored: the BEV grid of the model that made the predictions ends "
             "there (`max_range=M` sets another limit)"
         )
-
-
-def _config(config: Config, pairs: FramePairs, max_range: float | None) -> Config:
-    """The parameters with the class ranges that hold for these frames."""
-    if max_range is not None:
-        return config.cut_at(max_range)
-    return config if pairs.ego_pose_known else config.unlimited()
 
 
 def _score_tracks(pairs: FramePairs, config: TrackingConfig) -> tuple[TrackingScores, list[str]]:
@@ -211,8 +200,10 @@ def _model_range_m(predictions: ScoredInput, pairs: FramePairs, classes: Mapping
     return float(stated)
 
 
-def _other_class_notes(pairs: FramePairs, classes: Mapping[str, ObjectClass]) -> Iterator[str]:
+def _class_notes(pairs: FramePairs, classes: Mapping[str, ObjectClass]) -> Iterator[str]:
     """Name the classes on each side that are not scored."""
+    if not are_nuscenes(classes):
+        yield OWN_CLASSES
     for side, frames in (("the ground truth", pairs.ground_truth), ("the predictions", pairs.predictions)):
         yield from ClassNames(classes=classes).note(count_classes(frames), side)
 

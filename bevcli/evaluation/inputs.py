@@ -22,7 +22,6 @@ from bevcli.sequences.format import formats
 from bevcli.sequences.nuscenes.cache import open_index
 from bevcli.sequences.nuscenes.choice import chosen_scenes, tables_of
 from bevcli.sequences.nuscenes.format import NuScenesOptions, is_nuscenes_root
-from bevcli.sequences.nuscenes.index import NuScenesIndex
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import SequenceOptions
 
@@ -127,8 +126,7 @@ def _lines_next_to(file: Path) -> LinesFile:
 def _lines_of(open_drive: Callable[[], Sequence], expected: str) -> LinesFile:
     """The true lines of a drive in the world frame. expected: what would have them."""
     drive, frames = open_drive(), []
-    for place in range(len(drive.stamps)):
-        frame = drive.ground_truth_frame(place)
+    for frame in map(drive.ground_truth_frame, range(len(drive.stamps))):
         if (lines := frame.ground_truth_lines) is None:
             where = f'scene "{frame.stamp.scene}"' if frame.stamp.scene else f"frame {frame.stamp.index}"
             raise InputError(f"{drive.name}: `map`: {where} has no true lines of the map (expected {expected})")
@@ -140,12 +138,16 @@ def _lines_of(open_drive: Callable[[], Sequence], expected: str) -> LinesFile:
 def _open_nuscenes(root: Path, options: NuScenesOptions, only: str | None, names: ClassNames) -> ScoredInput:
     tables = tables_of(root, options.version)
     index, _ = open_index(tables)
-    frames: list[FrameBoxes] = []
-    racks = {}
+    frames, racks, samples = list[FrameBoxes](), {}, index.samples
     for scene in chosen_scenes(index, tables, options.split, only):
         for sample in range(*index.scenes.first_sample[scene : scene + 2]):
-            frames.append(_nuscenes_frame(index, scene, sample, len(frames), tables, names))
-            racks[frames[-1].extras["sample_token"]] = index.bicycle_racks(sample)
+            boxes, token = index.ground_truth(sample), samples.tokens[sample].decode()
+            if boxes is None:
+                raise InputError(f"{tables}: has no annotations (expected for scoring): choose another split than test")
+            stamp = FrameStamp(len(frames), str(index.scenes.names[scene]), int(samples.times_us[sample]) * 1000)
+            pose = Pose(np.array(samples.translations[sample]), np.array(samples.quaternions[sample]))
+            frames.append(FrameBoxes(stamp, pose, names.renamed(boxes), {"sample_token": token}))
+            racks[token] = index.bicycle_racks(sample)
     drive = partial(open_sequence, root, scene=only, version=options.version, split=options.split)
     lines = partial(_lines_of, drive, f"the map expansion in {root / 'maps' / 'expansion'}")
     return ScoredInput(BoxesFile("world", tuple(frames)), bicycle_racks=racks, lines=lines)
@@ -153,30 +155,12 @@ def _open_nuscenes(root: Path, options: NuScenesOptions, only: str | None, names
 
 def _open_drive(path: Path, options: SequenceOptions) -> ScoredInput:
     drive = open_sequence(path, options)
-    frames = [drive.ground_truth_frame(place) for place in range(len(drive.stamps))]
-    found = [
-        FrameBoxes(
-            f.stamp, f.world_from_ego, f.ground_truth, {"sample_token": f.sample_token} if f.sample_token else {}
-        )
-        for f in frames
-        if f.ground_truth is not None
-    ]
+    found = []
+    for frame in map(drive.ground_truth_frame, range(len(drive.stamps))):
+        if frame.ground_truth is not None:
+            token = {"sample_token": frame.sample_token} if frame.sample_token else {}
+            found.append(FrameBoxes(frame.stamp, frame.world_from_ego, frame.ground_truth, token))
     if not found:
         raise InputError(f"{path}: has no ground truth (expected for scoring): score another drive")
     lines = partial(_lines_of, lambda: drive, "a drive that has them")
     return ScoredInput(BoxesFile("world", tuple(found)), lines=lines)
-
-
-def _nuscenes_frame(
-    index: NuScenesIndex, scene: int, sample: int, number: int, tables: Path, names: ClassNames
-) -> FrameBoxes:
-    boxes = index.ground_truth(sample)
-    if boxes is None:
-        raise InputError(f"{tables}: has no annotations (expected for scoring): choose another split than test")
-    samples = index.samples
-    return FrameBoxes(
-        FrameStamp(number, str(index.scenes.names[scene]), int(samples.times_us[sample]) * 1000),
-        Pose(np.array(samples.translations[sample]), np.array(samples.quaternions[sample])),
-        names.renamed(boxes),
-        {"sample_token": samples.tokens[sample].decode()},
-    )

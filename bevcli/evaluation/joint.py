@@ -11,7 +11,7 @@ from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import score_matches
 from bevcli.evaluation.detection_scores import DetectionScores
 from bevcli.evaluation.evaluate import Scores
-from bevcli.evaluation.matching import ClassMatches, ScoredBoxes
+from bevcli.evaluation.matching import ClassMatches, ScoredBoxes, with_all_columns
 from bevcli.evaluation.segmentation import SegmentationScores
 from bevcli.geometry.boxes import Boxes3D
 
@@ -75,9 +75,7 @@ def _merged(parts: Sequence[ClassMatches]) -> ClassMatches:
 
 def _concatenated(parts: Sequence[ScoredBoxes]) -> ScoredBoxes:
     """The boxes of all drives; their frames are not numbered anew."""
-    boxes = Boxes3D.concatenate([part.boxes for part in parts])
-    if not len(boxes):
-        return parts[0]
+    boxes = with_all_columns(Boxes3D.concatenate(part.boxes for part in parts))
     frames = np.concatenate([part.frames for part in parts])
     return ScoredBoxes(boxes, frames, np.concatenate([part.ranges_m for part in parts]))
 

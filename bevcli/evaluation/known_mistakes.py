@@ -4,8 +4,6 @@ from collections.abc import Mapping, Sequence
 from statistics import fmean
 from typing import Any
 
-from bevcli.evaluation.config import ERRORS
-
 # A class with less is found by chance, and its errors say nothing.
 SMALLEST_AP = 0.05
 # With length and width exchanged, a car of 4.6 x 1.9 m has an IoU of 0.26 with itself, and its heading is off by 90
@@ -25,8 +23,8 @@ def known_mistakes(metrics: Mapping[str, Any], *, temporal: bool = True) -> list
     """
     aps: Mapping[str, float | None] = metrics["mean_dist_aps"]
     present = [name for name in metrics["classes_with_ground_truth"]["classes"] if (aps[name] or 0.0) >= SMALLEST_AP]
-    means = {error: _mean(metrics["label_tp_errors"], present, error) for error in ERRORS}
-    scale, heading, velocity = (means[name] for name in ("scale_err", "orient_err", "vel_err"))
+    errors = metrics["label_tp_errors"]
+    scale, heading, velocity = (_mean(errors, present, name) for name in ("scale_err", "orient_err", "vel_err"))
     found = []
     if scale >= EXCHANGED_ASE and heading >= EXCHANGED_AOE:
         found.append(

@@ -116,9 +116,7 @@ def true_positives(scores: Array, similarities: Array, limit: float) -> NDArray[
 
 
 def _curves(lines: MapLines, name: str) -> list[_Curve]:
-    return [
-        _Curve(points[:, :2]) for points, of_class in zip(lines.points, lines.classes, strict=True) if of_class == name
-    ]
+    return [_Curve(line[:, :2]) for line, kind in zip(lines.points, lines.classes, strict=True) if kind == name]
 
 
 def _scores(lines: MapLines, name: str) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,16 +13,12 @@ from bevcli.evaluation.config import DetectionConfig
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
 
-_NOT_MATCHED = ("futures", "future_scores")  # scored on their own
-# Value of any other optional column in frames that do not have it.
-_UNKNOWN = {
-    "scores": np.float64(np.nan),
-    "attributes": np.str_(""),
-    "instances": np.str_(""),
-    "track_scores": np.float64(np.nan),
-    "duplicates": np.bool_(False),
-    "visibilities": np.float64(np.nan),
-    "num_points": np.int64(-1),
+# Value of an optional column in frames that do not have it. Futures are scored on their own.
+_UNKNOWN: dict[str, Any] = {
+    **dict.fromkeys(("scores", "track_scores", "visibilities"), np.nan),
+    **dict.fromkeys(("attributes", "instances"), ""),
+    "duplicates": False,
+    "num_points": -1,
 }
 
 
@@ -54,20 +50,17 @@ def gather(frames: Sequence[Boxes3D], ego_xy: Array) -> ScoredBoxes:
     ego_xy: (F, 2), the ego vehicle's position in the frame of reference of each frame's boxes, metres.
     """
     indices = np.repeat(np.arange(len(frames)), [len(boxes) for boxes in frames])
-    filled = [boxes for boxes in frames if len(boxes)] or [Boxes3D.empty()]
-    columns: dict[str, Any] = {
-        column.name: np.concatenate([_column(boxes, column.name) for boxes in filled])
-        for column in fields(Boxes3D)
-        if column.name not in _NOT_MATCHED
-    }
-    boxes = Boxes3D(**columns)
+    boxes = with_all_columns(Boxes3D.concatenate(map(with_all_columns, frames)))
     ranges = np.linalg.norm(boxes.centers[:, :2] - ego_xy[indices], axis=1)
     return ScoredBoxes(boxes, indices, ranges)
 
 
-def _column(boxes: Boxes3D, name: str) -> NDArray[Any]:
-    values = getattr(boxes, name)
-    return np.full(len(boxes), _UNKNOWN[name]) if values is None else values
+def with_all_columns(boxes: Boxes3D) -> Boxes3D:
+    """The boxes with all optional columns but futures."""
+    missing: dict[str, Any] = {
+        name: np.full(len(boxes), value) for name, value in _UNKNOWN.items() if getattr(boxes, name) is None
+    }
+    return replace(boxes, futures=None, future_scores=None, **missing)
 
 
 @dataclass(frozen=True)

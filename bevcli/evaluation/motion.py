@@ -5,7 +5,7 @@ A forecast counts only where its object was found: detections and true objects a
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,46 +49,26 @@ class MotionSums:
     ade_count: int = 0
 
     @property
-    def epa(self) -> float:
-        """End-to-end prediction accuracy; it may be negative."""
-        return _ratio(self.hits - FALSE_POSITIVE_SHARE * self.false_positives, self.truths)
-
-    @property
-    def min_ade(self) -> float:
-        """Metres."""
-        return _ratio(self.ade_m, self.ade_count)
-
-    @property
-    def min_fde(self) -> float:
-        """Metres."""
-        return _ratio(self.fde_m, self.hits + self.misses)
-
-    @property
-    def miss_rate(self) -> float:
-        """0 to 1."""
-        return _ratio(self.misses, self.hits + self.misses)
+    def metrics(self) -> dict[str, float]:
+        """EPA (end-to-end prediction accuracy, may be negative), minADE and minFDE (metres), MR (miss rate, 0 to 1)."""
+        return {
+            "EPA": _ratio(self.hits - FALSE_POSITIVE_SHARE * self.false_positives, self.truths),
+            "minADE": _ratio(self.ade_m, self.ade_count),
+            "minFDE": _ratio(self.fde_m, self.hits + self.misses),
+            "MR": _ratio(self.misses, self.hits + self.misses),
+        }
 
 
-@dataclass(frozen=True)
-class MotionScores:
-    """The scores of forecasts: sums by class, of `frame_count` frames."""
-
-    classes: Mapping[str, MotionSums] = field(default_factory=lambda: {name: MotionSums() for name in CLASSES})
-    frame_count: int = 0
-
-
-def evaluate_motion(pairs: Iterable[tuple[Boxes3D, Boxes3D]]) -> MotionScores:
-    """Score pairs of boxes (predictions, truth), one pair a frame, both with futures of the same steps.
+def evaluate_motion(pairs: Iterable[tuple[Boxes3D, Boxes3D]]) -> dict[str, MotionSums]:
+    """Class -> its scores, of pairs of boxes (predictions, truth), one pair a frame, with futures of the same steps.
 
     A true object has one future, NaN where it is not known.
     """
-    sums, count = {name: MotionSums() for name in CLASSES}, 0
+    sums = {name: MotionSums() for name in CLASSES}
     for predictions, truth in pairs:
         found = predictions.scored(MIN_SCORE)
-        matches = match(found, truth)
-        _count(found, truth, matches, sums)
-        count += 1
-    return MotionScores(sums, count)
+        _count(found, truth, match(found, truth), sums)
+    return sums
 
 
 def match(found: Boxes3D, truth: Boxes3D) -> NDArray[np.int64]:

@@ -39,11 +39,6 @@ class EvaluationOptions:
     )
 
 
-def _complete_format(incomplete: str) -> list[str]:
-    """The known formats of exported boxes that start with a text, for completion in a shell."""
-    return [name for name in entries("bevcli.box_formats") if name.startswith(incomplete)]
-
-
 @options()
 class ExportOptions:
     """The format of exported boxes and what it needs."""
@@ -55,7 +50,7 @@ class ExportOptions:
         "the format of an installed package.",
         flag="--format",
         metavar="NAME",
-        complete=_complete_format,
+        complete=lambda incomplete: list(entries("bevcli.box_formats")),
     )
     out: Path | None = option(
         default=None, help="Default: a name that depends on the format, such as boxes.csv, next to PREDICTIONS."

@@ -1,9 +1,7 @@
 """Pairs the frames of predictions and ground truth, and moves their boxes into one frame of reference."""
 
-from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -49,22 +47,15 @@ class FramePairs:
         return self.reference_from_ego[:, :2, 3]
 
 
-class _Key(NamedTuple):
-    """A key that identifies a frame."""
-
-    name: str
-    of: Callable[[FrameBoxes], Hashable]
-    is_reliable: bool
-
-
-# The most reliable first; the first one with common values is used.
-_KEYS = (
-    _Key("sample_token", lambda frame: frame.extras.get("sample_token"), True),
-    _Key("scene and timestamp_ns", lambda frame: (frame.stamp.scene, frame.stamp.timestamp_ns), True),
-    _Key("timestamp_ns", lambda frame: frame.stamp.timestamp_ns, False),
-    _Key("scene and frame index", lambda frame: (frame.stamp.scene, frame.stamp.index), False),
-    _Key("frame index", lambda frame: frame.stamp.index, False),
-)
+# Keys that identify a frame, the most reliable first; the first one with common values is used.
+_KEYS: dict[str, Callable[[FrameBoxes], Hashable]] = {
+    "sample_token": lambda frame: frame.extras.get("sample_token"),
+    "scene and timestamp_ns": lambda frame: (frame.stamp.scene, frame.stamp.timestamp_ns),
+    "timestamp_ns": lambda frame: frame.stamp.timestamp_ns,
+    "scene and frame index": lambda frame: (frame.stamp.scene, frame.stamp.index),
+    "frame index": lambda frame: frame.stamp.index,
+}
+_RELIABLE = ("sample_token", "scene and timestamp_ns")
 
 
 def pair_frames(predictions: BoxesFile, ground_truth: BoxesFile, *, count_missing: bool = False) -> FramePairs:
@@ -98,25 +89,26 @@ def pair_frames(predictions: BoxesFile, ground_truth: BoxesFile, *, count_missin
         prediction_stamps=tuple(prediction.stamp for prediction, _ in pairs),
         ground_truth_stamps=tuple(true.stamp for _, true in pairs),
         sample_tokens=tuple(true.extras.get("sample_token") for _, true in pairs),
-        matched_by=key.name,
+        matched_by=key,
         notes=notes,
     )
 
 
 def _common_frames(
     predictions: Sequence[FrameBoxes], ground_truth: Sequence[FrameBoxes]
-) -> tuple[_Key, list[tuple[FrameBoxes, FrameBoxes]]]:
+) -> tuple[str, list[tuple[FrameBoxes, FrameBoxes]]]:
+    """The name of the key, and the pairs."""
     for name, side in (("predictions", predictions), ("ground truth", ground_truth)):
         if not side:
             raise InputError(f"the {name} contain no frame (expected at least one)")
-    for key in _KEYS:
-        of_truth, of_predictions = ([key.of(frame) for frame in side] for side in (ground_truth, predictions))
+    for name, key in _KEYS.items():
+        of_truth, of_predictions = (list(map(key, side)) for side in (ground_truth, predictions))
         if _ambiguous(of_truth) or _ambiguous(of_predictions):
             continue
         truth = dict(zip(of_truth, ground_truth, strict=True))
         pairs = [(one, truth[k]) for one, k in zip(predictions, of_predictions, strict=True) if k in truth]
         if pairs:
-            return key, pairs
+            return name, pairs
     raise InputError(
         f"predictions and ground truth have no frame in common: predictions start with {_described(predictions[0])}, "
         f"ground truth with {_described(ground_truth[0])}: check that both belong to the same drive"
@@ -124,7 +116,7 @@ def _common_frames(
 
 
 def _ambiguous(keys: Sequence[Hashable]) -> bool:
-    return None in keys or max(Counter(keys).values()) > 1
+    return None in keys or len(set(keys)) < len(keys)
 
 
 def _described(frame: FrameBoxes) -> str:
@@ -168,10 +160,10 @@ def _reference_from_ego(reference: str, world_from_ego: Pose | None, ego_from_be
     return np.eye(4)
 
 
-def _notes(key: _Key, pairs: int, predictions: int, ground_truth: int, count_missing: bool) -> tuple[str, ...]:
+def _notes(key: str, pairs: int, predictions: int, ground_truth: int, count_missing: bool) -> tuple[str, ...]:
     notes = []
-    if not key.is_reliable:
-        notes.append(f"timestamps or scenes differ between the files: frames are matched by {key.name}")
+    if key not in _RELIABLE:
+        notes.append(f"timestamps or scenes differ between the files: frames are matched by {key}")
     if pairs < ground_truth:
         left_out = "left out (`count_missing=True` counts them)"
         treatment = "all their boxes count as missed" if count_missing else left_out

@@ -43,7 +43,7 @@ class PlannedFrame:
 
 @dataclass(frozen=True)
 class PlanScores:
-    """The scores of S planned paths of T steps.
+    """The scores of S planned paths of T steps, S > 0.
 
     Attributes:
         distances_m: (S, T), planned to driven.
@@ -63,21 +63,19 @@ class PlanScores:
 
     def averaged(self, values: NDArray[np.generic], seconds: float) -> float:
         """The mean over all steps up to a horizon, as ST-P3 and VAD state it. values: an attribute."""
-        return float(values[:, : self._steps(seconds)].mean()) if len(values) else float("nan")
+        return float(values[:, : self._steps(seconds)].mean())
 
     def at(self, values: NDArray[np.generic], seconds: float) -> float:
         """The mean of the step at a horizon, as UniAD states it. values: an attribute."""
-        return float(values[:, self._steps(seconds) - 1].mean()) if len(values) else float("nan")
+        return float(values[:, self._steps(seconds) - 1].mean())
 
     def _steps(self, seconds: float) -> int:
         return round(seconds / self.step_s)
 
 
-def evaluate_plans(frames: Iterable[PlannedFrame], steps: int, step_s: float) -> PlanScores:
-    """Score planned paths of `steps` steps."""
-    rows = [_score(frame) for frame in frames]
-    distances = np.array([row[0] for row in rows], dtype=np.float64).reshape(-1, steps)
-    hits, with_vehicles = (np.array([row[i] for row in rows], dtype=bool).reshape(-1, steps) for i in (1, 2))
+def evaluate_plans(frames: Iterable[PlannedFrame], step_s: float) -> PlanScores:
+    """Score planned paths, at least one, of steps of so many seconds."""
+    distances, hits, with_vehicles = map(np.array, zip(*map(_score, frames), strict=True))
     return PlanScores(distances, hits, with_vehicles, step_s)
 
 

@@ -12,7 +12,6 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
-from numpy.typing import NDArray
 
 from bevcli.evaluation.config import ERRORS, DetectionConfig
 from bevcli.evaluation.detection_scores import RECALLS, ClassScores, DetectionScores
@@ -25,8 +24,8 @@ from bevcli.writing import whole_file
 _PLOT_COLORS = (
     "#1f77b4", "#ff7f0e", "#bcbd22", "#9467bd", "#8c564b", "#7f7f7f", "#d62728", "#2ca02c", "#e377c2", "#17becf",
 )  # fmt: skip
-_GRID_COLOR = "#e6e6e6"
-_DISTANCE_COLORS = ("#b8c9e8", "#7d9fd3", "#3f6fb5", "#173e7a")  # from the shortest matching distance to the longest
+GRID_COLOR = "#e6e6e6"
+BLUES = ("#b8c9e8", "#7d9fd3", "#3f6fb5", "#173e7a")  # from the shortest matching distance to the longest
 _ERROR_TITLES = {
     "trans_err": "translation error (m)",
     "scale_err": "scale error (1 - IoU)",
@@ -92,7 +91,7 @@ def draw_errors_by_range(detection: DetectionScores) -> Figure:
         axes.set_title("AP" if error is None else _ERROR_TITLES[error], fontsize=11)
         axes.set_ylim(bottom=0)
         axes.set_xticks(sorted({end for part in bins for end in (part.low_m, part.high_m)}))
-        axes.grid(color=_GRID_COLOR)
+        axes.grid(color=GRID_COLOR)
     for axes in panels[-1]:
         axes.set_xlabel("distance from the ego vehicle (m)")
     handles, labels = panels[0, 0].get_legend_handles_labels()
@@ -102,11 +101,11 @@ def draw_errors_by_range(detection: DetectionScores) -> Figure:
 
 def _draw_precision_recall(axes: Axes, name: str, scores: ClassScores) -> None:
     axes.set_title(f"{name}  AP {scores.mean_ap:.2f}", fontsize=11, loc="left")
-    for (distance, curve), color in zip(scores.curves.items(), _DISTANCE_COLORS, strict=False):
+    for (distance, curve), color in zip(scores.curves.items(), BLUES, strict=False):
         reached = curve.score > 0
         axes.plot(RECALLS[reached], curve.precision[reached], color=color, linewidth=2, label=f"{distance:g} m")
     axes.set(xlim=(0, 1), ylim=(0, 1.02))
-    axes.grid(color=_GRID_COLOR)
+    axes.grid(color=GRID_COLOR)
     aps = " · ".join(f"{ap:.2f}" for ap in scores.aps.values())
     text = f"{scores.ground_truth_count} boxes, APs {aps}" if scores.ground_truth_count else "no ground truth"
     axes.text(0.98, 0.03, text, ha="right", va="bottom", fontsize=8, color="#555555", transform=axes.transAxes)
@@ -114,11 +113,9 @@ def _draw_precision_recall(axes: Axes, name: str, scores: ClassScores) -> None:
 
 def _value(scores: ClassScores | None, error: str | None) -> float:
     """AP (error None) or an error of a class in a bin; NaN without true positives."""
-    if scores is None:
+    if scores is None or (error is not None and not scores.recall > 0):
         return np.nan
-    if error is None:
-        return scores.mean_ap
-    return scores.errors[error] if scores.recall > 0 else np.nan
+    return scores.mean_ap if error is None else scores.errors[error]
 
 
 WORST_FRAMES = 4
@@ -127,11 +124,11 @@ _MISSED, _FALSE, _FOUND = "#d62728", "#ff9d1e", "#3a9a4b"
 
 
 class _Outcome(NamedTuple):
-    """One class above the score threshold with the largest F1: missed (G,) bool, false positives (P,) bool."""
+    """One class above the score threshold with the largest F1: ground truth found and missed, and false positives."""
 
-    matches: ClassMatches
-    missed: NDArray[np.bool_]
-    false_positives: NDArray[np.bool_]
+    found: ScoredBoxes
+    missed: ScoredBoxes
+    false: ScoredBoxes
 
 
 def draw_bev_sheet(detection: DetectionScores, config: DetectionConfig, pairs: FramePairs) -> Figure:
@@ -141,19 +138,19 @@ def draw_bev_sheet(detection: DetectionScores, config: DetectionConfig, pairs: F
     vehicle's forward direction is up.
     """
     row = config.distances_m.index(config.error_distance_m)
-    outcomes = [_best_outcome(matches, row) for matches in detection.matches]
+    outcomes = {matches.name: _best_outcome(matches, row) for matches in detection.matches}
     threshold = f"largest F1 of each class at {config.error_distance_m:g} m"
     subtitle = f"score threshold: {threshold}; forward is up, rings every 10 m"
     figure = titled_figure((12, 10), "Missed ground truth and false positives, seen from above", subtitle)
     grid = figure.add_gridspec(2, 2 * WORST_FRAMES, height_ratios=(2, 1.15))
     radius = _radius(detection)
-    missed = {matches.name: matches.ground_truth[chosen] for matches, chosen, _ in outcomes}
-    false = {matches.name: matches.predictions[chosen] for matches, _, chosen in outcomes}
+    missed = {name: outcome.missed for name, outcome in outcomes.items()}
+    false = {name: outcome.false for name, outcome in outcomes.items()}
     for place, (title, parts) in enumerate((("missed", missed), ("false positives", false))):
         axes = figure.add_subplot(grid[0, place * WORST_FRAMES : (place + 1) * WORST_FRAMES])
         _draw_dots(axes, title, parts, pairs.reference_from_ego, radius)
-    for place, frame in enumerate(_worst_frames(outcomes)):
-        _draw_frame(figure.add_subplot(grid[1, 2 * place : 2 * place + 2]), frame, outcomes, pairs, radius)
+    for place, frame in enumerate(_worst_frames(outcomes.values())):
+        _draw_frame(figure.add_subplot(grid[1, 2 * place : 2 * place + 2]), frame, outcomes.values(), pairs, radius)
     heading = {"title": "class: missed / false positives", "title_fontsize": 9}
     handles = _legend(missed, false)
     figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=9, frameon=False, **heading)
@@ -165,9 +162,10 @@ def _best_outcome(matches: ClassMatches, row: int) -> _Outcome:
     is_match = matches.matched[row] >= 0
     f1 = 2 * np.cumsum(is_match) / (np.arange(1, len(is_match) + 1) + len(matches.ground_truth))
     kept = np.arange(len(is_match)) < (int(f1.argmax()) + 1 if is_match.any() else 0)
-    missed = np.ones(len(matches.ground_truth), dtype=bool)
-    missed[matches.matched[row][kept & is_match]] = False
-    return _Outcome(matches, missed, kept & ~is_match)
+    found = np.zeros(len(matches.ground_truth), dtype=bool)
+    found[matches.matched[row][kept & is_match]] = True
+    truth = matches.ground_truth
+    return _Outcome(truth[found], truth[~found], matches.predictions[kept & ~is_match])
 
 
 def _legend(missed: Mapping[str, ScoredBoxes], false: Mapping[str, ScoredBoxes]) -> list[Line2D]:
@@ -187,11 +185,9 @@ def _radius(detection: DetectionScores) -> float:
     return min(10 * np.ceil(farthest / 10), 100.0)
 
 
-def _worst_frames(outcomes: list[_Outcome]) -> list[int]:
-    counts: Counter[int] = Counter()
-    for matches, missed, false_positives in outcomes:
-        counts.update(matches.ground_truth.frames[missed].tolist())
-        counts.update(matches.predictions.frames[false_positives].tolist())
+def _worst_frames(outcomes: Iterable[_Outcome]) -> list[int]:
+    mistakes = [part.frames for outcome in outcomes for part in (outcome.missed, outcome.false)]
+    counts = Counter(np.concatenate(mistakes).tolist())
     return [frame for frame, _ in counts.most_common(WORST_FRAMES)]
 
 
@@ -214,21 +210,18 @@ def _draw_dots(
     axes.set_title(f"{len(points)} {title}{thinned}", fontsize=12)
 
 
-def _draw_frame(axes: Axes, frame: int, outcomes: list[_Outcome], pairs: FramePairs, radius: float) -> None:
+def _draw_frame(axes: Axes, frame: int, outcomes: Iterable[_Outcome], pairs: FramePairs, radius: float) -> None:
     ego_from_reference = inverse(pairs.reference_from_ego[frame])
-    counts = [0, 0]
+    counts = np.zeros(3, dtype=int)
     for outcome in outcomes:
-        truth, found = outcome.matches.ground_truth, outcome.matches.predictions
-        truth_here, found_here = truth.frames == frame, found.frames == frame
-        _draw_boxes(axes, truth[truth_here & ~outcome.missed], ego_from_reference, _FOUND, "-")
-        _draw_boxes(axes, truth[truth_here & outcome.missed], ego_from_reference, _MISSED, "-")
-        _draw_boxes(axes, found[found_here & outcome.false_positives], ego_from_reference, _FALSE, "--")
-        counts[0] += int((truth_here & outcome.missed).sum())
-        counts[1] += int((found_here & outcome.false_positives).sum())
+        parts = [part[part.frames == frame] for part in outcome]
+        for part, color, style in zip(parts, (_FOUND, _MISSED, _FALSE), ("-", "-", "--"), strict=True):
+            _draw_boxes(axes, part, ego_from_reference, color, style)
+        counts += [len(part) for part in parts]
     _draw_ground(axes, radius)
     stamp = pairs.ground_truth_stamps[frame]
     scene = f"{stamp.scene} " if stamp.scene else ""
-    axes.set_title(f"{scene}frame {stamp.index}\n{counts[0]} missed, {counts[1]} false positives", fontsize=10)
+    axes.set_title(f"{scene}frame {stamp.index}\n{counts[1]} missed, {counts[2]} false positives", fontsize=10)
 
 
 def _draw_boxes(axes: Axes, part: ScoredBoxes, ego_from_reference: Array, color: str, style: str) -> None:

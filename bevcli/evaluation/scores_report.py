@@ -1,11 +1,14 @@
 """Scores as a dict for JSON, with the key names of the nuScenes devkit, and as a table for the terminal."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from bevcli.evaluation.config import ERRORS, DetectionConfig
 from bevcli.evaluation.detection_scores import DetectionScores, ScoreTable
+from bevcli.evaluation.driving import DrivingScores
+from bevcli.evaluation.map_lines import THRESHOLDS_M
+from bevcli.evaluation.planning import PlanScores
 from bevcli.evaluation.segmentation import SegmentationScores
 from bevcli.evaluation.tracking.scoring import METRICS, TrackingScores
 
@@ -137,17 +140,11 @@ def _maps(segmentation: SegmentationScores) -> str:
     return f"{aligned(rows)}\n({segmentation.frame_count} maps)"
 
 
-def aligned(rows: Iterable[Sequence[str]]) -> str:
+def aligned(rows: Sequence[Sequence[str]]) -> str:
     """Rows as aligned columns, the first to the left, the others to the right."""
-    lines = list(rows)
-    widths = [max(len(cell) for cell in column) for column in zip(*lines, strict=True)]
-    return "\n".join(
-        "  ".join(
-            cell.rjust(width) if place else cell.ljust(width)
-            for place, (cell, width) in enumerate(zip(line, widths, strict=True))
-        ).rstrip()
-        for line in lines
-    )
+    first, *others = (max(map(len, column)) for column in zip(*rows, strict=True))
+    lines = ("  ".join([row[0].ljust(first), *map(str.rjust, row[1:], others)]) for row in rows)
+    return "\n".join(map(str.rstrip, lines))
 
 
 def _number(value: float, digits: int = 3) -> str:
@@ -201,3 +198,59 @@ def _tracking_to_dict(scores: TrackingScores) -> dict[str, Any]:
             "min_recall": config.min_recall,
         },
     }
+
+
+def driving_to_dict(scores: DrivingScores) -> dict[str, Any]:
+    """The scores as a dict for JSON."""
+    content: dict[str, Any] = {}
+    if (lines := scores.lines) is not None:
+        aps = {name: {f"{limit:.1f}": ap for limit, ap in of_class.items()} for name, of_class in lines.ap.items()}
+        content["map"] = {
+            "mean_ap": lines.mean_ap,
+            "label_aps": aps,
+            "mean_dist_aps": lines.mean_by_class,
+            "ground_truth_lines": dict(lines.truth_count),
+            "frames": lines.frame_count,
+        }
+    if (motion := scores.motion) is not None:
+        content["motion"] = {name: {**sums.metrics, "ground_truth": sums.truths} for name, sums in motion.items()}
+    if (plan := scores.plan) is not None:
+        content["plan"] = {
+            "averaged_up_to_horizon": _horizons(plan, plan.averaged, plan.collisions),
+            "at_horizon": _horizons(plan, plan.at, plan.collisions_with_vehicles),
+            "frames": plan.frame_count,
+        }
+    return content
+
+
+def _horizons(plan: PlanScores, of: Callable[[Any, float], float], collisions: Any) -> dict[str, dict[str, float]]:
+    """Distances and shares of collisions by horizon, in one convention."""
+    seconds = [s for s in (1, 2, 3) if s <= plan.step_s * plan.distances_m.shape[1] + 1e-6]
+    return {
+        "L2": {f"{s}s": of(plan.distances_m, s) for s in seconds},
+        "collision": {f"{s}s": of(collisions, s) for s in seconds},
+    }
+
+
+def driving_tables(scores: DrivingScores) -> Iterator[str]:
+    """One table for each kind of scores that was asked for."""
+    if (lines := scores.lines) is not None:
+        rows = [("map line", "lines", "AP", *(f"AP@{limit:g}m" for limit in THRESHOLDS_M))]
+        for name, of_class in lines.ap.items():
+            numbers = (lines.mean_by_class[name], *of_class.values())
+            rows.append((name, str(lines.truth_count[name]), *map(_number, numbers)))
+        yield f"{aligned(rows)}\n\nmap mAP {_number(lines.mean_ap)} ({lines.frame_count} frames)"
+    if (motion := scores.motion) is not None:
+        rows = [("forecasts", "objects", "EPA", "minADE m", "minFDE m", "miss rate")]
+        for name, sums in motion.items():
+            rows.append((name, str(sums.truths), *map(_number, sums.metrics.values())))
+        yield aligned(rows)
+    if (plan := scores.plan) is not None:
+        averaged = _horizons(plan, plan.averaged, plan.collisions)
+        at = _horizons(plan, plan.at, plan.collisions_with_vehicles)
+        rows = [("planned path", *averaged["L2"], "", *averaged["L2"])]
+        for name, unit, factor in (("L2", "m", 1), ("collision", "%", 100)):
+            cells = [[_number(factor * value) for value in of[name].values()] for of in (averaged, at)]
+            rows.append((f"{name} {unit}", *cells[0], "", *cells[1]))
+        explained = "left: mean up to the horizon (ST-P3, VAD); right: at the horizon, vehicles only (UniAD)"
+        yield f"{aligned(rows)}\n({plan.frame_count} paths; {explained})"

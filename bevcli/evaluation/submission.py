@@ -92,8 +92,8 @@ def _objects(
     return [{"sample_token": sample_token, **dict(zip((*shared, *names), row, strict=True))} for row in rows]
 
 
-def write_submission(boxes: BoxesFile, path: Path, *, tracking: bool = False) -> None:
-    """Write a submission for the detection task, or for the tracking task.
+def write_submission(boxes: BoxesFile, path: Path, *, tracking: bool = False) -> int:
+    """Write a submission for the detection task, or for the tracking task; return the number of frames.
 
     Raises InputError if boxes are not in the world frame, frames have no sample token, or `tracking` and no box has a
     track.
@@ -112,6 +112,7 @@ def write_submission(boxes: BoxesFile, path: Path, *, tracking: bool = False) ->
     with SubmissionWriter(path, tracking=tracking) as writer:
         for frame in boxes.frames:
             writer.write(frame)
+    return len(boxes.frames)
 
 
 def is_submission(path: Path) -> bool:

@@ -68,6 +68,8 @@ def _figure(trace: Trace, attention: SceneAttention, chosen: int | None, title: 
         most = max(float(weights.max()), LEAST)
         scale = ScalarMappable(Normalize(0, most), WEIGHT_COLORS)
         draw(axes, attention)
+        if attention.attending is not None:
+            drawing.outline_boxes(axes, attention.objects[[attention.attending]], SECOND, width=2.6, halo=True)
         _draw_paths(axes, attention, chosen)
         bounds = axes.get_position()
         bar = drawing.color_bar(figure, scale, (bounds.x1 + 0.006, bounds.y0 + 0.02, 0.008, 0.22), (0, most / 2, most))
@@ -80,10 +82,8 @@ def _figure(trace: Trace, attention: SceneAttention, chosen: int | None, title: 
 
 def _draw_objects(axes: Axes, attention: SceneAttention) -> None:
     for place in np.argsort(attention.object_weights):  # the largest on top
-        color = _color(attention.object_weights, place)
-        drawing.outline_boxes(axes, attention.objects[[place]], color, width=_width(attention.object_weights, place))
-    if attention.attending is not None:
-        drawing.outline_boxes(axes, attention.objects[[attention.attending]], SECOND, width=2.6, halo=True)
+        color, width = _style(attention.object_weights, place)
+        drawing.outline_boxes(axes, attention.objects[[place]], color, width)
 
 
 def _draw_lines(axes: Axes, attention: SceneAttention) -> None:
@@ -91,22 +91,14 @@ def _draw_lines(axes: Axes, attention: SceneAttention) -> None:
     assert scores is not None
     for place in np.argsort(attention.line_weights):
         style = "-" if scores[place] >= SURE else (0, (3, 2))
-        color, width = _color(attention.line_weights, place), _width(attention.line_weights, place)
+        color, width = _style(attention.line_weights, place)
         axes.plot(*attention.lines.points[place].T, color=color, lw=width, ls=style, zorder=5)
-    if attention.attending is not None:
-        drawing.outline_boxes(axes, attention.objects[[attention.attending]], SECOND, width=2.6, halo=True)
 
 
-def _share(weights: Array, place: int) -> float:
-    return float(weights[place] / max(weights.max(), LEAST))
-
-
-def _color(weights: Array, place: int) -> str:
-    return str(to_hex(WEIGHT_COLORS(_share(weights, place))))
-
-
-def _width(weights: Array, place: int) -> float:
-    return 0.8 + 2.4 * _share(weights, place)
+def _style(weights: Array, place: int) -> tuple[str, float]:
+    """Colour and width of the line of a weight."""
+    share = float(weights[place] / max(weights.max(), LEAST))
+    return str(to_hex(WEIGHT_COLORS(share))), 0.8 + 2.4 * share
 
 
 def _draw_paths(axes: Axes, attention: SceneAttention, chosen: int | None) -> None:
@@ -118,9 +110,6 @@ def _draw_paths(axes: Axes, attention: SceneAttention, chosen: int | None) -> No
 
 def _draw_table(axes: Axes, attention: SceneAttention) -> None:
     """The largest weights of objects and of lines."""
-    rows = 2 * (LISTED + 2.5)
-    axes.set(xlim=(0, 10), ylim=(rows, -1))
-    axes.axis("off")
     boxes, lines = attention.objects, attention.lines
     assert boxes.scores is not None
     assert lines.scores is not None
@@ -134,7 +123,7 @@ def _draw_table(axes: Axes, attention: SceneAttention) -> None:
 
 
 def _draw_rows(axes: Axes, top: float, kind: str, rows: list[ROW]) -> None:
-    write = drawing.table_text(axes)
+    write = drawing.table_text(axes, -1, 2 * (LISTED + 2.5))
     largest = sorted((row for row in rows if row[0] > 0), key=lambda row: -row[0])[:LISTED]
     columns = ((1.6, "weight", "right"), (2.1, kind, "left"), (6.9, "score", "right"), (10, "at x, y in m", "right"))
     for x, name, align in columns:
@@ -153,8 +142,7 @@ def _draw_rows(axes: Axes, top: float, kind: str, rows: list[ROW]) -> None:
 
 
 def _left_out(part: str, trace: Trace) -> str:
-    is_finite = trace.prediction.results
-    return "" if part in trace.attentions and is_finite else f"the frame has no {part}"
+    return "" if part in trace.attentions and trace.prediction.results else f"the frame has no {part}"
 
 
 FIGURES = (

@@ -162,17 +162,16 @@ def _draw_row_and_column(axes: Axes, trace: Trace) -> None:
         label.set(bbox=drawing.paper(0.2, 0.9), zorder=12)
 
 
-# Name, unit, and how many of the 18 numbers it has.
+# Name, unit, how many of the 18 numbers it has, and colour.
 GROUPS = (
-    ("position change x, y, z (world)", "m", 3),
-    ("quaternion", "", 4),
-    ("acceleration x, y, z", "m/s²", 3),
-    ("rotation rate x, y, z", "rad/s", 3),
-    ("velocity x, y, z", "m/s", 3),
-    ("heading", "rad", 1),
-    ("heading change", "°", 1),
+    ("position change x, y, z (world)", "m", 3, ACCENT),
+    ("quaternion", "", 4, "#7b3ff2"),
+    ("acceleration x, y, z", "m/s²", 3, SECOND),
+    ("rotation rate x, y, z", "rad/s", 3, "#b7791f"),
+    ("velocity x, y, z", "m/s", 3, THIRD),
+    ("heading", "rad", 1, "#c2185b"),
+    ("heading change", "°", 1, "#0f766e"),
 )
-COLORS = (ACCENT, "#7b3ff2", SECOND, "#b7791f", THIRD, "#c2185b", "#0f766e")
 
 
 def can_bus(trace: Trace) -> Figure:
@@ -192,11 +191,9 @@ def can_bus(trace: Trace) -> Figure:
 
 def _draw_numbers(axes: Axes, trace: Trace) -> None:
     values = trace.inputs.can_bus[0].cpu().numpy()
-    axes.set(xlim=(0, 10), ylim=(len(values) + 0.1, -0.6))
-    axes.axis("off")
-    write = drawing.table_text(axes)
+    write = drawing.table_text(axes, -0.6, len(values) + 0.1)
     start = 0
-    for place, (name, unit, count) in enumerate(GROUPS):
+    for place, (name, unit, count, color) in enumerate(GROUPS):
         group = values[start : start + count]
         largest = max(float(np.abs(group).max()), 1e-9)
         if place % 2 == 0:
@@ -210,7 +207,7 @@ def _draw_numbers(axes: Axes, trace: Trace) -> None:
             write(6.1, row, f"{round(float(value), 3) + 0.0:.3f}", ha="right", family="monospace")
             write(6.25, row, unit, fontsize=11, color=GREY)
             width = 1.25 * float(value) / largest
-            axes.add_patch(Rectangle((8.5, row - 0.3), width, 0.6, fc=COLORS[place], ec="none", alpha=0.85))
+            axes.add_patch(Rectangle((8.5, row - 0.3), width, 0.6, fc=color, ec="none", alpha=0.85))
         start += count
     axes.plot([8.5, 8.5], [-0.5, len(values) - 0.5], color=GREY, lw=0.8)
 

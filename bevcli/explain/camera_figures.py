@@ -146,7 +146,7 @@ def _draw_camera_counts(axes: Axes, trace: Trace) -> None:
     bar.ax.tick_params(labelsize=11, colors=GREY, length=0)
 
 
-def _zoom_window(trace: Trace, name: str, samples: CameraSamples) -> tuple[float, float, float, float]:
+def _zoom_window(trace: Trace, name: str, samples: CameraSamples) -> drawing.Rect:
     """Left, top, width, height of the part that holds the most weight, in the image's aspect."""
     whole = np.array([trace.frame.rig[name].width, trace.frame.rig[name].height], dtype=np.float64)
     points, weights = _inside(samples, whole)

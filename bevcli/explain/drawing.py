@@ -1,6 +1,6 @@
 """Parts that the figures share: titles, BEV axes, camera images, boxes and feature colours."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -26,6 +26,7 @@ from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.recording.colors import Color, map_colors
 from bevcli.recording.log_bev import fit_colors
 
+Rect = tuple[float, float, float, float]  # left, bottom (in an image: top), width, height
 INK, GREY, FAINT = "#1f2430", "#6b7280", "#d7dae0"
 ACCENT, SECOND, THIRD, PALE = "#e4572e", "#1769aa", "#2a9d5c", "#9aa0ab"
 WIDTH_INCHES, DPI = 14.0, 100
@@ -46,6 +47,7 @@ OTHER_MAP_COLORS: tuple[Color, ...] = (
     (42, 157, 92), (142, 91, 181), (160, 90, 44), (214, 93, 177), (58, 63, 75), (127, 184, 0), (10, 165, 165),
     (125, 133, 151),
 )  # fmt: skip
+page_colors = partial(map_colors, named=MAP_COLORS, others=OTHER_MAP_COLORS)  # map classes -> colours on a white page
 
 
 def titled_figure(height_inches: float, title: str, subtitle: str, heading_inches: float = 1.55) -> Figure:
@@ -104,18 +106,8 @@ def show_map(axes: Axes, trace: Trace, bev_map: BevMap, **options: Any) -> None:
     axes.set(xlim=trace.grid.x_range_m, ylim=trace.grid.y_range_m)
 
 
-def page_colors(classes: Iterable[str]) -> dict[str, Color]:
-    """Map class -> colour on a white page, as `map_colors`."""
-    return map_colors(classes, MAP_COLORS, OTHER_MAP_COLORS)
-
-
-def color_bar(
-    figure: Figure,
-    image: ScalarMappable,
-    place: tuple[float, float, float, float],
-    ticks: tuple[float, ...] | None = None,
-) -> Colorbar:
-    """An upright colour bar at a place of the figure: left, bottom, width, height."""
+def color_bar(figure: Figure, image: ScalarMappable, place: Rect, ticks: Sequence[float] | None = None) -> Colorbar:
+    """An upright colour bar at a place of the figure."""
     bar = figure.colorbar(image, cax=figure.add_axes(place), ticks=ticks)
     bar.ax.tick_params(labelsize=10, colors=GREY)
     return bar
@@ -164,10 +156,8 @@ def mark_cell(axes: Axes, trace: Trace) -> None:
     outline(axes, (*(trace.cell_center - size / 2), *size), (4.5, 2.2), zorder=9)
 
 
-def outline(
-    axes: Axes, place: tuple[float, float, float, float], widths: tuple[float, float], zorder: float = 1
-) -> None:
-    """A rectangle with a white border. place: x, y, width, height. widths: of the white and of the coloured line."""
+def outline(axes: Axes, place: Rect, widths: tuple[float, float], zorder: float = 1) -> None:
+    """A rectangle with a white border. widths: of the white and of the coloured line."""
     for color, width, order in (("white", widths[0], zorder), (ACCENT, widths[1], zorder + 1)):
         axes.add_patch(Rectangle(place[:2], *place[2:], fc="none", ec=color, lw=width, zorder=order))
 
@@ -216,8 +206,10 @@ def show_camera(axes: Axes, frame: Frame, name: str, title: str | None = None) -
     axes.set_title(name if title is None else title, fontsize=12, color=INK, loc="left", pad=5)
 
 
-def table_text(axes: Axes) -> Callable[..., Text]:
-    """`axes.text` for the cells of a table: 12 points, centred about the line."""
+def table_text(axes: Axes, top: float, bottom: float) -> Callable[..., Text]:
+    """`axes.text` for the cells of a table on these axes: 12 points, centred about the line. Columns are 0 to 10."""
+    axes.set(xlim=(0, 10), ylim=(bottom, top))
+    axes.axis("off")
     return partial(axes.text, fontsize=12, color=INK, va="center")
 
 
@@ -246,5 +238,4 @@ def cosine_to(features: NDArray, cell: tuple[int, int]) -> NDArray:
     """(Y, X, C) -> (Y, X) cosine similarity with the cell's vector, after the mean of all cells is removed."""
     centered = features - features.reshape(-1, features.shape[-1]).mean(0)
     centered = centered / np.maximum(np.linalg.norm(centered, axis=-1, keepdims=True), 1e-9)
-    similarity: NDArray = centered @ centered[cell]
-    return similarity
+    return np.asarray(centered @ centered[cell])

@@ -18,8 +18,6 @@ from bevcli.model.box_coding import decode
 from bevcli.model.segmentation import STUFF_CLASSES, THING_CLASS
 from bevcli.model.step import ModelOutputs
 
-CODE_NAMES = ("cx", "cy", "log w", "log l", "cz", "log h", "sin", "cos", "vx", "vy")
-
 
 def decoder(trace: Trace) -> Figure:
     """The reference points of the object queries layer by layer, and the boxes."""
@@ -197,16 +195,14 @@ def _box_of(trace: Trace, layer: int, query: int) -> Boxes3D:
 
 
 def _draw_code_table(axes: Axes, codes: Array, scores: Array, name: str) -> None:
-    layers, write = len(codes), drawing.table_text(axes)
+    layers, write = len(codes), drawing.table_text(axes, -1.5, 11.3)
     shown = sorted({0, layers // 2, layers - 1})
-    axes.set(xlim=(0, 10), ylim=(11.3, -1.5))
-    axes.axis("off")
     columns = np.linspace(2.3, 2.3 + 1.35 * (len(shown) - 1), len(shown))
     for x, layer in zip(columns, shown, strict=True):
         write(x, -1.0, f"layer {layer + 1}", ha="right", color=GREY)
     meaning_x = float(columns[-1]) + 0.45
     write(meaning_x, -1.0, "meaning (last layer)", color=GREY)
-    for row, (code_name, meaning) in enumerate(zip(CODE_NAMES, _meanings(codes[-1]), strict=True)):
+    for row, (code_name, meaning) in enumerate(_meanings(codes[-1]).items()):
         if row % 2 == 0:
             axes.add_patch(Rectangle((0, row - 0.5), 10, 1, fc="#f5f6f8", ec="none"))
         write(0.15, row, code_name, fontsize=12.5, fontweight="bold")
@@ -221,18 +217,19 @@ def _draw_code_table(axes: Axes, codes: Array, scores: Array, name: str) -> None
     write(meaning_x, 10.4, f"sigmoid of the logit of class {name}")
 
 
-def _meanings(code: Array) -> list[str]:
+def _meanings(code: Array) -> dict[str, str]:
+    """The name of each number of a box code, and its meaning."""
     yaw = (np.degrees(-np.arctan2(code[6], code[7]) - np.pi / 2) + 180) % 360 - 180
     width, length, height = np.exp(code[[2, 3, 5]])
-    return [
-        f"centre at x = {code[0]:.1f} m",
-        f"centre at y = {code[1]:.1f} m",
-        f"width {width:.2f} m",
-        f"length {length:.2f} m",
-        f"centre at z = {code[4]:.2f} m",
-        f"height {height:.2f} m",
-        f"angle from -y, clockwise: yaw = {yaw:.0f}°",
-        "the same angle",
-        f"velocity in x {code[8]:+.2f} m/s",
-        f"velocity in y {code[9]:+.2f} m/s",
-    ]
+    return {
+        "cx": f"centre at x = {code[0]:.1f} m",
+        "cy": f"centre at y = {code[1]:.1f} m",
+        "log w": f"width {width:.2f} m",
+        "log l": f"length {length:.2f} m",
+        "cz": f"centre at z = {code[4]:.2f} m",
+        "log h": f"height {height:.2f} m",
+        "sin": f"angle from -y, clockwise: yaw = {yaw:.0f}°",
+        "cos": "the same angle",
+        "vx": f"velocity in x {code[8]:+.2f} m/s",
+        "vy": f"velocity in y {code[9]:+.2f} m/s",
+    }

@@ -111,7 +111,7 @@ def _flow(canvas: Axes, trace: Trace) -> None:
         _arrow(canvas, (0.864, 0.22), (0.873, 0.22))
 
 
-def _block(canvas: Axes, place: tuple[float, float, float, float], text: str, size: float = 12.5) -> None:
+def _block(canvas: Axes, place: drawing.Rect, text: str, size: float = 12.5) -> None:
     x, y, width, height = place
     style = "round,pad=0,rounding_size=0.012"
     canvas.add_patch(FancyBboxPatch((x, y), width, height, boxstyle=style, fc=BLOCK, ec=SECOND, lw=1.6))
@@ -125,8 +125,8 @@ def _arrow(canvas: Axes, start: tuple[float, float], end: tuple[float, float], c
 
 
 def _without_history(trace: Trace) -> str:
-    started_anew = trace.prediction.started_anew
-    return f"the frame has no history ({started_anew})" if started_anew else ""
+    reason = trace.prediction.started_anew
+    return f"the frame has no history ({reason})" if reason else ""
 
 
 def _without_earlier_frame(trace: Trace) -> str:

@@ -1,7 +1,7 @@
 """A trace: one frame through the model, with the intermediate results that the figures show."""
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -92,8 +92,7 @@ class Trace:
     @property
     def cell_center(self) -> Array:
         """(2,) x, y of the followed cell, metres, bev frame."""
-        center: Array = self.grid.cell_centers()[self.cell]
-        return center
+        return np.asarray(self.grid.cell_centers()[self.cell])
 
     def cell_map(self, tokens: Tensor) -> np.ndarray:
         """Tokens (Y·X, C) -> array (Y, X, C) float32, rows from the smallest y."""
@@ -214,9 +213,7 @@ def _seen(*modules: nn.Module) -> Iterator[tuple[dict, dict]]:
     def keep(module: nn.Module, positional: object, by_name: object, output: object) -> None:
         arguments[module], outputs[module] = (positional, by_name), output
 
-    handles = [module.register_forward_hook(keep, with_kwargs=True) for module in modules]
-    try:
+    with ExitStack() as hooks:
+        for module in modules:
+            hooks.enter_context(module.register_forward_hook(keep, with_kwargs=True))
         yield arguments, outputs
-    finally:
-        for handle in handles:
-            handle.remove()

@@ -1,5 +1,5 @@
 """The same drives with corrupted images, calibration, times and ego-motion, scored one by one.
 
-In the order of a test: `corruptions` (of images), `sequences` (which apply them, and other faults), `conditions` (all
-corruptions with their severities), `results` (stress.json), `report`, `stress` (the entry point).
+In the order of a test: `conditions` (all corruptions with their severities), `sequences` (which apply them), `stress`
+(the entry point), `results` (stress.json), `report`.
 """

@@ -22,7 +22,7 @@ from bevcli.calibration.result import CalibrationResult
 from bevcli.calibration.table import delay_text
 from bevcli.calibration.views import Views, read_views
 from bevcli.frame import DerivedSequence, Frame, Sequence
-from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array
 from bevcli.printing import say
 from bevcli.robustness.sequences import CalibrationNoise, Draws
@@ -112,12 +112,9 @@ def _with_noise(drive: Sequence, views: Views, level: int, seed: int) -> Views:
     if not level:
         return views
     stated = CalibrationNoise(drive, level, Draws(seed, "calibration_noise")).load(0).rig
-    return replace(views, stated=stated, rig=_with_poses(views.rig, stated))
-
-
-def _with_poses(rig: CameraRig, other: CameraRig) -> CameraRig:
-    pairs = zip(rig.cameras, other.cameras, strict=True)
-    return replace(rig, cameras=tuple(replace(a, ego_from_camera=b.ego_from_camera) for a, b in pairs))
+    pairs = zip(views.rig.cameras, stated.cameras, strict=True)
+    cameras = tuple(replace(camera, ego_from_camera=noisy.ego_from_camera) for camera, noisy in pairs)
+    return replace(views, stated=stated, rig=replace(views.rig, cameras=cameras))
 
 
 def _error(

@@ -12,7 +12,6 @@ from bevcli.robustness.options import LostImage, SeverityChoice
 from bevcli.robustness.sequences import Draws
 from bevcli.synth import corruptions
 
-CLEAN = "clean"
 # Makes of a scene what is run in its place, for a level: several sequences if they must not share a history.
 Apply = Callable[[Sequence, int, Draws, LostImage], Sequence | tuple[Sequence, ...]]
 
@@ -60,22 +59,20 @@ class Condition:
     """One corruption at one severity.
 
     Attributes:
-        corruption: None for clean drives.
-        severity: a key of `Corruption.levels`; "" for clean drives.
+        corruption: CLEAN for clean drives.
+        severity: a key of `Corruption.levels`.
     """
 
-    corruption: Corruption | None = None
-    severity: str = ""
+    corruption: Corruption
+    severity: str
 
     @property
     def name(self) -> str:
         """Name of the corruption, or "clean"."""
-        return CLEAN if self.corruption is None else self.corruption.name
+        return self.corruption.name
 
     def sequences(self, scene: Sequence, seed: int, kind: LostImage) -> tuple[Sequence, ...]:
         """The sequences that are run in place of a scene."""
-        if self.corruption is None:
-            return (scene,)
         made = self.corruption.apply(scene, self.corruption.levels[self.severity], Draws(seed, self.name), kind)
         return made if isinstance(made, tuple) else (made,)
 
@@ -92,6 +89,7 @@ def _unseen(name: str, corrupt: corruptions.ImageCorruption) -> Corruption:
     return Corruption(name, name.replace("_", " "), _severities(2, 4, 5), _images(corrupt), group=Group.UNSEEN)
 
 
+CLEAN = Corruption("clean", "no corruption", {"": 0}, lambda scene, *_: scene, Shown.NOTHING, Group.OTHER)
 # Levels of the first eight as published: RoboBEV, docs/CREATE.md.
 CORRUPTIONS = (
     Corruption("camera_crash", "camera crash", _severities(2, 4, 5), sequences.CameraCrash, Shown.CAMERAS),
@@ -146,4 +144,4 @@ def choose_conditions(severity: SeverityChoice = "all", only: Items[str] = ()) -
         for label in corruption.levels
         if severity in ("all", _GROUP_OF_LEVEL.get(label, label))
     ]
-    return (Condition(), *chosen)
+    return (Condition(CLEAN, ""), *chosen)

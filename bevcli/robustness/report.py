@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bevcli.evaluation.plots import titled_figure
+from bevcli.evaluation.plots import BLUES, GRID_COLOR, titled_figure
 from bevcli.evaluation.scores_report import aligned
 from bevcli.frame import Frame, Sequence
 from bevcli.geometry.transforms import inverse
@@ -20,7 +20,6 @@ from bevcli.robustness.results import ConditionScores, StressResults
 from bevcli.synth.corruptions import Pixels
 from bevcli.writing import write_whole
 
-SEVERITY_COLORS = ("#b8c9e8", "#7d9fd3", "#3f6fb5", "#173e7a")  # from the easiest severity to the hardest
 _OTHER_COLOR = "#d62728"
 
 
@@ -91,7 +90,7 @@ def draw_stress(results: StressResults, against: StressResults | None = None) ->
         if against is not None:
             _draw_bars(axes, against, label, color=_OTHER_COLOR, order=tested)
         axes.set(ylabel=label, ylim=(0, 1), axisbelow=True)
-        axes.grid(axis="y", color="#e6e6e6")
+        axes.grid(axis="y", color=GRID_COLOR)
     titles = [part.title.replace(" of the ", "\nof the ").replace(" by up to ", "\nby up to ") for part in tested]
     panels[1].set_xticks(range(len(tested)), titles, rotation=35, ha="right")
     return figure
@@ -104,7 +103,7 @@ def _draw_bars(
     for place, corruption in enumerate(results.tested() if order is None else order):
         severities = tuple(corruption.levels)
         width = 0.8 / len(severities)
-        colors = [SEVERITY_COLORS[i] for i in np.linspace(0, len(SEVERITY_COLORS) - 1, len(severities)).astype(int)]
+        colors = [BLUES[i] for i in np.linspace(0, len(BLUES) - 1, len(severities)).astype(int)]
         for severity, scores in results.of(corruption.name).items():
             index = severities.index(severity)
             x = place - 0.4 + width * (index + 0.5)
@@ -134,36 +133,37 @@ def write_contact_sheet(path: Path, scene: Sequence, conditions: Items[Condition
     place, rows = len(scene.stamps) // 2, dict[str, list[Pixels]]()
     for condition in conditions:
         corruption = condition.corruption
-        if corruption is None or corruption.shown is Shown.NOTHING:
+        if corruption.shown is Shown.NOTHING:
             continue
         if corruption.name not in rows:
-            clean = _tile(scene.load(place), corruption)
-            rows[corruption.name] = [_captioned(clean, f"{corruption.name}: clean")]
+            rows[corruption.name] = [_tile(scene.load(place), corruption, "clean")]
         (changed,) = condition.sequences(scene, options.seed, options.lost_images)
-        tile = _tile(changed.load(place), corruption)
-        rows[corruption.name].append(_captioned(tile, f"{corruption.name}: {condition.severity}"))
+        rows[corruption.name].append(_tile(changed.load(place), corruption, condition.severity))
     if not rows:
         return
     _, encoded = cv2.imencode(".png", _sheet(list(rows.values())))
     write_whole(path, encoded.tobytes())
 
 
-def _tile(frame: Frame, corruption: Corruption) -> Pixels:
-    if corruption.shown is Shown.CAMERAS:
-        return _mosaic(frame)
+def _tile(frame: Frame, corruption: Corruption, severity: str) -> Pixels:
+    """The part of a frame that shows a corruption, below its caption."""
     ahead = min(frame.rig.cameras, key=lambda camera: abs(camera.yaw)).name
-    return _camera_tile(frame, ahead, TILE_WIDTH, boxes=corruption.shown is Shown.BOXES)
+    if corruption.shown is Shown.CAMERAS:
+        tile = _mosaic(frame)
+    else:
+        tile = _camera_tile(frame, ahead, TILE_WIDTH, boxes=corruption.shown is Shown.BOXES)
+    top, text = np.full((CAPTION, TILE_WIDTH, 3), PAPER, dtype=np.uint8), f"{corruption.name}: {severity}"
+    cv2.putText(top, text, (2, CAPTION - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.45, INK, 1, cv2.LINE_AA)
+    return np.concatenate([top, tile])
 
 
 def _mosaic(frame: Frame) -> Pixels:
     """All cameras in rows of three, from left to right as they look."""
-    names = [camera.name for camera in sorted(frame.rig.cameras, key=lambda camera: -camera.yaw)]
-    tiles = [_camera_tile(frame, name, TILE_WIDTH // 3) for name in names]
+    cameras, cell = sorted(frame.rig.cameras, key=lambda camera: -camera.yaw), TILE_WIDTH // 3
+    tiles = [_camera_tile(frame, camera.name, cell) for camera in cameras]
     height = max(tile.shape[0] for tile in tiles)
-    tiles = [_padded(tile, TILE_WIDTH // 3, height) for tile in tiles]
-    tiles += [_padded(tiles[0][:0], TILE_WIDTH // 3, height)] * (-len(tiles) % 3)
-    rows = [np.concatenate(tiles[start : start + 3], axis=1) for start in range(0, len(tiles), 3)]
-    return _padded(np.concatenate(rows), TILE_WIDTH, height * len(rows))
+    rows = [_row(tiles[start : start + 3], cell, height, TILE_WIDTH) for start in range(0, len(tiles), 3)]
+    return np.concatenate(rows)
 
 
 def _camera_tile(frame: Frame, name: str, width: int, *, boxes: bool = False) -> Pixels:
@@ -189,21 +189,15 @@ def _draw_boxes(pixels: Pixels, frame: Frame, name: str) -> None:
         cv2.line(pixels, start.tolist(), end.tolist(), BOX, thickness, cv2.LINE_AA)
 
 
-def _captioned(tile: Pixels, text: str) -> Pixels:
-    top = np.full((CAPTION, tile.shape[1], 3), PAPER, dtype=np.uint8)
-    cv2.putText(top, text, (2, CAPTION - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.45, INK, 1, cv2.LINE_AA)
-    return np.concatenate([top, tile])
-
-
 def _sheet(rows: list[list[Pixels]]) -> Pixels:
-    columns = max(map(len, rows))
-    width = columns * (TILE_WIDTH + GAP) + GAP
-    lines = []
-    for row in rows:
-        height = max(tile.shape[0] for tile in row)
-        tiles = [_padded(tile, TILE_WIDTH + GAP, height + GAP) for tile in row]
-        lines.append(_padded(np.concatenate(tiles, axis=1), width, height + GAP))
-    return np.concatenate(lines)
+    cell = TILE_WIDTH + GAP
+    width = max(map(len, rows)) * cell + GAP
+    return np.concatenate([_row(row, cell, max(tile.shape[0] for tile in row) + GAP, width) for row in rows])
+
+
+def _row(tiles: list[Pixels], cell_width: int, height: int, width: int) -> Pixels:
+    """Tiles side by side, each in a cell, in a row of a height and a width."""
+    return _padded(np.concatenate([_padded(tile, cell_width, height) for tile in tiles], axis=1), width, height)
 
 
 def _padded(tile: Pixels, width: int, height: int) -> Pixels:

@@ -1,12 +1,15 @@
 """The result of a stress test: scores by condition, resilience rates, corruption errors, and the file stress.json."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
+import msgspec
+
 from bevcli.errors import InputError
+from bevcli.evaluation.detection_scores import known_mean
 from bevcli.evaluation.scores_report import finite
 from bevcli.parsing.documents import read_json
 from bevcli.robustness.conditions import CLEAN, CORRUPTIONS, Corruption, Group
@@ -16,34 +19,23 @@ FORMAT = "bevcli-stress/1"
 
 @dataclass(frozen=True)
 class ConditionScores:
-    """The scores under one condition, over the classes that have ground truth.
+    """The scores under one condition, over the classes that have ground truth: an entry of "conditions" in stress.json.
 
     Attributes:
         corruption: its name, or "clean".
         severity: "easy", "mid", "hard" or a level; "" for clean.
-        mean_ap: mAP, 0 to 1.
         nd_score: NDS, 0 to 1.
-        errors: true-positive errors by the devkit's names; NaN where undefined.
-        class_aps: class -> AP.
+        mean_ap: mAP, 0 to 1.
+        tp_errors: true-positive errors by the devkit's names; NaN, or None of a file, where undefined.
+        mean_dist_aps: class -> AP.
     """
 
     corruption: str
     severity: str
-    mean_ap: float
     nd_score: float
-    errors: Mapping[str, float]
-    class_aps: Mapping[str, float]
-
-    def to_dict(self) -> dict[str, Any]:
-        """The scores for JSON; undefined numbers are NaN."""
-        return {
-            "corruption": self.corruption,
-            "severity": self.severity,
-            "nd_score": self.nd_score,
-            "mean_ap": self.mean_ap,
-            "tp_errors": dict(self.errors),
-            "mean_dist_aps": dict(self.class_aps),
-        }
+    mean_ap: float
+    tp_errors: Mapping[str, float | None]
+    mean_dist_aps: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -63,7 +55,7 @@ class StressResults:
     @property
     def clean(self) -> ConditionScores | None:
         """The scores without corruption; None if they are not there yet."""
-        return next((scores for scores in self.scores if scores.corruption == CLEAN), None)
+        return next((scores for scores in self.scores if scores.corruption == CLEAN.name), None)
 
     def of(self, name: str) -> dict[str, ConditionScores]:
         """Severity -> scores of a corruption, in the order of the severities."""
@@ -89,11 +81,13 @@ class StressResults:
 
     def mean_resilience(self, group: Group = Group.ROBOBEV) -> float:
         """The mean resilience rate of a group's corruptions that were tested, RoboBEV's mRR; NaN without any."""
-        return _mean(self.resilience(part.name) for part in self.tested() if part.group is group)
+        return known_mean(self.resilience(part.name) for part in self.tested() if part.group is group)
 
     def mean_corruption_error(self, against: Self) -> float:
         """mCE: the mean corruption error of RoboBEV's corruptions that both runs have; NaN without any."""
-        return _mean(self.corruption_error(part.name, against) for part in self.tested() if part.group is Group.ROBOBEV)
+        return known_mean(
+            self.corruption_error(part.name, against) for part in self.tested() if part.group is Group.ROBOBEV
+        )
 
     def to_dict(self, against: Self | None = None) -> dict[str, Any]:
         """All of it for JSON; undefined numbers are None. docs/robustness.md explains the keys."""
@@ -102,7 +96,7 @@ class StressResults:
             "format": FORMAT,
             **self.header,
             "complete": self.is_complete,
-            "conditions": [scores.to_dict() for scores in self.scores],
+            "conditions": [vars(scores) for scores in self.scores],
             "resilience": {name: self.resilience(name) for name in names},
             "mRR": self.mean_resilience(),
             "mean_resilience_unseen": self.mean_resilience(Group.UNSEEN),
@@ -125,19 +119,7 @@ def read_results(path: Path) -> StressResults:
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(f'{path}: is no result of `bevcli stress` (expected "format": "{FORMAT}")')
     try:
-        scores = tuple(map(_scores, content["conditions"]))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        scores = msgspec.convert(content["conditions"], tuple[ConditionScores, ...])
+    except (KeyError, msgspec.ValidationError) as error:
         raise InputError(f'{path}: "conditions" is wrong ({type(error).__name__}: {error})') from None
     return StressResults(content, scores, content.get("complete") is True)
-
-
-def _scores(entry: Any) -> ConditionScores:
-    errors = {str(name): math.nan if value is None else float(value) for name, value in entry["tp_errors"].items()}
-    aps = {str(name): float(value) for name, value in entry["mean_dist_aps"].items()}
-    numbers = float(entry["mean_ap"]), float(entry["nd_score"])
-    return ConditionScores(str(entry["corruption"]), str(entry["severity"]), *numbers, errors, aps)
-
-
-def _mean(values: Iterable[float]) -> float:
-    known = [value for value in values if not math.isnan(value)]
-    return sum(known) / len(known) if known else math.nan

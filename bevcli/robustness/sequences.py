@@ -142,7 +142,8 @@ class LostImages(ChangedSequence):
         raise NotImplementedError
 
     def change(self, place: int, frame: Frame) -> Frame:
-        lost = [name for name in frame.images if name in self.lost(frame)]
+        all_lost = self.lost(frame)
+        lost = [name for name in frame.images if name in all_lost]
         if self._lost_images == "missing":
             kept = {name: image for name, image in frame.images.items() if name not in lost}
             dropped = {**frame.dropped, **dict.fromkeys(lost, "lost by bevcli stress")}
@@ -220,12 +221,11 @@ class EgoMotionLost(ChangedSequence):
 
     def change(self, place: int, frame: Frame) -> Frame:
         last = self._last_arrived(place)
-        if last == place:
-            self._arrived[place] = frame.world_from_ego, frame.kinematics
-            return frame
         if last not in self._arrived:
-            earlier = self.sequence.load(last)
+            earlier = frame if last == place else self.sequence.load(last)
             self._arrived[last] = earlier.world_from_ego, earlier.kinematics
+        if last == place:
+            return frame
         pose, kinematics = self._arrived[last]
         stated_from_world = pose.matrix @ inverse(frame.world_from_ego.matrix)
         truth = frame.ground_truth

@@ -27,6 +27,8 @@ from bevcli.training.validation import boxes_ego
 from bevcli.writing import write_whole
 
 RESULTS, SHEET, PLOT = "stress.json", "corruptions.png", "stress.png"
+# Predicted boxes and ground truth of each scored frame of a scene, in the ego frame.
+SceneBoxes = tuple[tuple[Boxes3D, Boxes3D], ...]
 _INPUT_FACTS = ("frames of the input", "calibration", "files of the input")
 
 
@@ -45,19 +47,6 @@ class StressState:
     def has(self, condition: Condition) -> bool:
         """True if a condition is finished."""
         return any((each.corruption, each.severity) == (condition.name, condition.severity) for each in self.scores)
-
-
-@dataclass(frozen=True)
-class SceneBoxes:
-    """The boxes of the F scored frames of a scene, in the ego frame.
-
-    Attributes:
-        predictions: F times the predicted boxes.
-        ground_truth: F times the ground truth.
-    """
-
-    predictions: tuple[Boxes3D, ...]
-    ground_truth: tuple[Boxes3D, ...]
 
 
 class _Stopped(Exception):
@@ -175,12 +164,11 @@ class _Test:
 
     def run(self, condition: Condition) -> ConditionScores:
         """The scores under a condition. Raises _Stopped."""
-        boxes = [self._scene_boxes(condition, place) for place in range(len(self.scenes))]
-        predictions = [frame for scene in boxes for frame in scene.predictions]
-        truths = [frame for scene in boxes for frame in scene.ground_truth]
+        frames = [frame for place in range(len(self.scenes)) for frame in self._scene_boxes(condition, place)]
+        predictions, truths = zip(*frames, strict=True)
         table = evaluate_detections(predictions, truths, self.metrics).overall.of_classes_with_ground_truth()
         aps = {name: scores.mean_ap for name, scores in table.classes.items()}
-        return ConditionScores(condition.name, condition.severity, table.mean_ap, table.nd_score, table.errors, aps)
+        return ConditionScores(condition.name, condition.severity, table.nd_score, table.mean_ap, table.errors, aps)
 
     def remove_boxes(self, condition: Condition) -> None:
         """Removes the stored boxes of a finished condition."""
@@ -196,12 +184,12 @@ class _Test:
         path = self._boxes_path(condition, place)
         if path.exists():
             return load_state(path, SceneBoxes)
-        scene, frames = self.scenes[place], list[tuple[Boxes3D, Boxes3D]]()
+        scene = self.scenes[place]
+        boxes: SceneBoxes = ()
         for part in condition.sequences(scene, self.options.seed, self.options.lost_images):
-            frames += self._run_sequence(_calibrated(part) if self.options.calibrate else part)
-        if not frames:
+            boxes += tuple(self._run_sequence(_calibrated(part) if self.options.calibrate else part))
+        if not boxes:
             raise InputError(f"{scene.name}: has no ground truth (expected boxes to score against)")
-        boxes = SceneBoxes(*zip(*frames, strict=True))
         self.folder.add(path)
         save_state(path, boxes)
         return boxes

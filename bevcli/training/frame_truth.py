@@ -5,8 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.evaluation.driving import followed
-from bevcli.evaluation.true_futures import LATE_S, Drives, with_true_futures
+from bevcli.evaluation.driving import LATE_S, Drives, followed, with_true_futures
 from bevcli.frame import Frame, MapLines, Plan, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, apply, inverse

@@ -131,6 +131,6 @@ def test_pedestrians_are_left_out_at_the_horizon() -> None:
     on_path = apply(rigid([0.0, 10.0, 0.0]), np.zeros((1, 3)))
     person = Boxes3D(on_path, np.ones((1, 3)), np.zeros(1), np.zeros((1, 2)), np.array(["pedestrian"]))
     frame = PlannedFrame(way + (0, 10), way, [person, person])
-    scores = evaluate_plans([frame], steps=2, step_s=0.5)
+    scores = evaluate_plans([frame], step_s=0.5)
     assert scores.averaged(scores.collisions, 1) == 1
     assert scores.at(scores.collisions_with_vehicles, 1) == 0

@@ -87,11 +87,10 @@ def test_metrics_of_forecasts_equal_vads(golden: dict[str, Any]) -> None:
     pairs = [motion_pair(sample) for sample in of_motion["samples"]]
     for (found, truth), expected in zip(pairs, of_motion["per_sample"], strict=True):
         assert match(found.scored(MIN_SCORE), truth).tolist() == expected["matched_prediction_of_each_gt"]
-    scores = evaluate_motion(pairs).classes
-    names = {"EPA": "epa", "minADE": "min_ade", "minFDE": "min_fde", "MR": "miss_rate"}
+    scores = evaluate_motion(pairs)
     for key, value in of_motion["final"].items():
         metric, _, kind = key.partition("_")
-        assert getattr(scores[kind], names[metric]) == pytest.approx(value, abs=1e-6), key
+        assert scores[kind].metrics[metric] == pytest.approx(value, abs=1e-6), key
 
 
 def planned(sample: dict[str, Any]) -> PlannedFrame:
@@ -125,7 +124,7 @@ def test_steps_of_planned_paths_equal_vads(golden: dict[str, Any]) -> None:
 
 def plan_scores(golden: dict[str, Any]) -> PlanScores:
     valid = [sample for sample in golden["planning"]["samples"] if sample["fut_valid_flag"]]
-    return evaluate_plans(map(planned, valid), 6, 0.5)
+    return evaluate_plans(map(planned, valid), 0.5)
 
 
 def test_planned_paths_in_vads_convention_equal_vads(golden: dict[str, Any]) -> None:

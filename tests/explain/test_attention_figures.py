@@ -8,10 +8,10 @@ import torch
 from memory_drive import MemorySequence
 
 from bevcli.errors import InputError
-from bevcli.explain import figures
+from bevcli.explain import step_figure as figures
 from bevcli.explain.attention_figures import FIGURES
-from bevcli.explain.figures import figures_of, write_figures
 from bevcli.explain.overview import FIGURES as OF_BEVFORMER
+from bevcli.explain.step_figure import figures_of, write_figures
 from bevcli.explain.trace import Trace, trace
 from bevcli.model.vad.vad import VAD
 

@@ -11,11 +11,11 @@ from command_line import command
 from memory_drive import MemorySequence, make_rig
 
 from bevcli.errors import InputError, OutputError
-from bevcli.explain import figures
+from bevcli.explain import step_figure as figures
 from bevcli.explain.drawing import project_bev
-from bevcli.explain.figures import check_figures, figures_of, write_figures
 from bevcli.explain.head_figures import reference_points
 from bevcli.explain.overview import FIGURES
+from bevcli.explain.step_figure import check_figures, figures_of, write_figures
 from bevcli.explain.trace import cell_at, trace
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner

@@ -17,10 +17,10 @@ DETR3D = (0.4224, 0.2859, 0.2604, 0.3177, 0.2661, 0.4002, 0.2786, 0.3912, 0.1913
 
 def results(nds: tuple[float, ...], model: str = "base") -> StressResults:
     """Three severities whose mean is the published one."""
-    scores = [ConditionScores("clean", "", 0.4, nds[0], {"trans_err": 0.5}, {"car": 0.6})]
+    scores = [ConditionScores("clean", "", nds[0], 0.4, {"trans_err": 0.5}, {"car": 0.6})]
     for name, value in zip(NAMES, nds[1:], strict=False):
         for severity, offset in (("easy", 0.05), ("mid", 0.01), ("hard", -0.06)):
-            scores.append(ConditionScores(name, severity, 0.2, value + offset, {"vel_err": float("nan")}, {"car": 0.3}))
+            scores.append(ConditionScores(name, severity, value + offset, 0.2, {"vel_err": float("nan")}, {"car": 0.3}))
     return StressResults({"model": model, "drives": []}, tuple(scores))
 
 

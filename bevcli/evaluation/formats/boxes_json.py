@@ -1,14 +1,6 @@
 """A boxes file, as predictions.json."""
 
-from pathlib import Path
-
 from bevcli.evaluation.box_format import BoxFormat
-from bevcli.evaluation.options import ExportOptions
-from bevcli.sequences.files.boxes_file import BoxesFile, write_boxes
+from bevcli.sequences.files.boxes_file import write_boxes
 
-
-def _write(boxes: BoxesFile, target: Path, options: ExportOptions, source: Path) -> str:
-    return f"{write_boxes(boxes, target)} boxes"
-
-
-FORMAT = BoxFormat("boxes.json", _write)
+FORMAT = BoxFormat("boxes.json", lambda boxes, target, *_: f"{write_boxes(boxes, target)} boxes")

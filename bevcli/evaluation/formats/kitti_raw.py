@@ -59,11 +59,11 @@ def tracklets(
     _values(listed, {"count": len(tracks), "item_version": 1})
     for number, track in enumerate(tracks):
         item = ElementTree.SubElement(listed, "item", _marks(1, 1) if number == 0 else {})
-        boxes = [frames[place.frame][[place.box]] for place in track]
+        boxes = [frames[frame][[box]] for frame, box in track]
         length, width, height = np.median([one.sizes_lwh[0] for one in boxes], axis=0).tolist()
         kind = kitti_type(str(boxes[0].classes[0]), classes)
-        _values(item, {"objectType": kind, "h": height, "w": width, "l": length, "first_frame": track[0].frame})
-        poses = [(place.frame, _pose(one)) for place, one in zip(track, boxes, strict=True)]
+        _values(item, {"objectType": kind, "h": height, "w": width, "l": length, "first_frame": track[0][0]})
+        poses = [(frame, _pose(box)) for (frame, _), box in zip(track, boxes, strict=True)]
         _add_poses(item, _filled(poses), is_first=number == 0)
         _values(item, {"finished": 1})
     return root

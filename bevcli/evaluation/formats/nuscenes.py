@@ -1,22 +1,9 @@
 """nuScenes submissions for detection and tracking."""
 
-from pathlib import Path
-
 from bevcli.evaluation.box_format import BoxFormat
-from bevcli.evaluation.options import ExportOptions
 from bevcli.evaluation.submission import write_submission
-from bevcli.sequences.files.boxes_file import BoxesFile
 
-
-def _write(boxes: BoxesFile, target: Path, options: ExportOptions, source: Path) -> str:
-    write_submission(boxes, target)
-    return f"{len(boxes.frames)} samples"
-
-
-def _write_tracking(boxes: BoxesFile, target: Path, options: ExportOptions, source: Path) -> str:
-    write_submission(boxes, target, tracking=True)
-    return f"{len(boxes.frames)} samples"
-
-
-DETECTION = BoxFormat("results_nusc.json", _write)
-TRACKING = BoxFormat("tracking_nusc.json", _write_tracking)
+DETECTION = BoxFormat("results_nusc.json", lambda boxes, target, *_: f"{write_submission(boxes, target)} samples")
+TRACKING = BoxFormat(
+    "tracking_nusc.json", lambda boxes, target, *_: f"{write_submission(boxes, target, tracking=True)} samples"
+)

@@ -18,8 +18,7 @@ from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 from bevcli.writing import write_whole
 
 Fields = dict[str, Any]
-NUMBERS = ("score", "track_score", "visibility")  # optional columns of boxes, by the names of their attributes
-COLUMNS = {"score": "scores", "track_score": "track_scores", "visibility": "visibilities"}
+COLUMNS = {"score": "scores", "track_score": "track_scores", "visibility": "visibilities"}  # by their attributes' names
 
 
 def _write(boxes: BoxesFile, target: Path, options: ExportOptions, source: Path) -> str:
@@ -43,7 +42,7 @@ def openlabel(boxes: BoxesFile) -> Fields:
     frames = {str(frame.stamp.index): {"frame_properties": _properties(frame), "objects": {}} for frame in boxes.frames}
     objects = {}
     for number, track in enumerate(tracks_of(boxes.frames)):
-        places = [(boxes.frames[place.frame], place.box) for place in track]
+        places = [(boxes.frames[frame], box) for frame, box in track]
         for frame, box in places:
             cuboid = _cuboid(frame.boxes, box, boxes.frame_of_reference)
             frames[str(frame.stamp.index)]["objects"][str(number)] = {"object_data": {"cuboid": [cuboid]}}
@@ -71,7 +70,7 @@ def _object(places: list[tuple[FrameBoxes, int]], number: int) -> Fields:
 def _cuboid(boxes: Boxes3D, box: int, frame_of_reference: str) -> Fields:
     half = boxes.yaws[box] / 2
     values = [*boxes.centers[box], 0, 0, np.sin(half), np.cos(half), *boxes.sizes_lwh[box]]
-    known = {name: getattr(boxes, COLUMNS[name]) for name in NUMBERS}
+    known = {name: getattr(boxes, column) for name, column in COLUMNS.items()}
     found = {name: float(column[box]) for name, column in known.items() if column is not None}
     found |= dict(zip(("vx", "vy"), boxes.velocities[box].tolist(), strict=True))
     attributes: Fields = {"num": [{"name": key, "val": value} for key, value in found.items() if np.isfinite(value)]}

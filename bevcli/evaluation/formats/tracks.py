@@ -1,17 +1,10 @@
 """Boxes by object instead of by frame, for formats that list tracks."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 from bevcli.sequences.files.boxes_file import FrameBoxes
 
-
-@dataclass(frozen=True)
-class Place:
-    """A box of a track. frame: its place among the frames. box: its index in the frame."""
-
-    frame: int
-    box: int
+Place = tuple[int, int]  # of a box: its frame's place among the frames, and its index in the frame
 
 
 def tracks_of(frames: Iterable[FrameBoxes]) -> list[list[Place]]:
@@ -28,5 +21,5 @@ def tracks_of(frames: Iterable[FrameBoxes]) -> list[list[Place]]:
         for box, name in enumerate(names):
             key = (frame.stamp.scene, name) if name and name not in seen else (place, box)
             seen.add(name)
-            found.setdefault(key, []).append(Place(place, box))
+            found.setdefault(key, []).append((place, box))
     return list(found.values())

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from bevcli.errors import InputError
+from bevcli.evaluation.matching import gather
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
@@ -63,8 +64,12 @@ def scored_tracks(
     twice.
     """
     places = time_order(stamps)
-    given = [_columns(frames[place], row, ego_xy[place], ranges_m) for row, place in enumerate(places)]
-    rows, names, classes, xy, scores = map(np.concatenate, zip(*given, strict=True))
+    given = gather([frames[place] for place in places], ego_xy[places])
+    assert given.boxes.instances is not None
+    limits = np.array([ranges_m.get(name, -1.0) for name in given.boxes.classes.tolist()])
+    kept = (given.ranges_m < limits) & (given.boxes.num_points != 0) & (given.boxes.instances != "")
+    rows, names = given.frames[kept], given.boxes.instances[kept]
+    scores = np.concatenate([_scores(frames[place]) for place in places])[kept]
     ordered = [stamps[place] for place in places]
     _, scenes = np.unique([stamp.scene for stamp in ordered], return_inverse=True)
     _, name_numbers = np.unique(names, return_inverse=True)
@@ -73,7 +78,8 @@ def scored_tracks(
     _require_unique(rows, tracks, names, ordered, side)
     scores = _means_of_tracks(tracks, scores)
     times = np.array([stamp.timestamp_ns for stamp in ordered], dtype=np.int64)
-    return _interpolated(TrackedBoxes(rows, tracks, xy, classes, scores), times)
+    boxes = TrackedBoxes(rows, tracks, given.boxes.centers[kept, :2], given.boxes.classes[kept], scores)
+    return _interpolated(boxes, times)
 
 
 def _means_of_tracks(tracks: Indices, scores: Array) -> Array:
@@ -93,20 +99,9 @@ def time_order(stamps: Sequence[FrameStamp]) -> list[int]:
     return sorted(range(len(stamps)), key=lambda place: (order[stamps[place].scene], stamps[place].timestamp_ns))
 
 
-def _columns(
-    boxes: Boxes3D, row: int, ego_xy: Array, ranges_m: Mapping[str, float]
-) -> tuple[Indices, NDArray[np.str_], NDArray[np.str_], Array, Array]:
-    """Frame, identity, class, position and score of the boxes of a frame that are scored."""
-    limits = np.array([ranges_m.get(str(name), -1.0) for name in boxes.classes])
-    kept = np.linalg.norm(boxes.centers[:, :2] - ego_xy, axis=1) < limits
-    if boxes.num_points is not None:
-        kept &= boxes.num_points != 0
-    names = np.full(len(boxes), "") if boxes.instances is None else boxes.instances
-    kept &= names != ""
+def _scores(boxes: Boxes3D) -> Array:
     scores = boxes.scores if boxes.track_scores is None else boxes.track_scores
-    scores = np.zeros(len(boxes)) if scores is None else scores
-    rows = np.full(int(kept.sum()), row, dtype=np.int64)
-    return rows, names[kept], boxes.classes[kept], boxes.centers[kept, :2], scores[kept]
+    return np.zeros(len(boxes)) if scores is None else scores
 
 
 def _require_unique(
@@ -139,8 +134,7 @@ def _interpolated(boxes: TrackedBoxes, times_ns: Indices) -> TrackedBoxes:
     weight = (times_ns[boxes.frames[right]] - times_ns[frames]) / span
     xy = (1 - weight)[:, None] * boxes.xy[left] + weight[:, None] * boxes.xy[right]
     scores = (1 - weight) * boxes.scores[left] + weight * boxes.scores[right]
-    first_appearance = np.full(int(boxes.tracks.max(initial=-1)) + 1, len(boxes))
-    np.minimum.at(first_appearance, boxes.tracks, np.arange(len(boxes)))
+    _, first_appearance = np.unique(boxes.tracks, return_index=True)
     added = TrackedBoxes(frames, boxes.tracks[right], xy, boxes.classes[right], scores)
     added = added[np.argsort(first_appearance[added.tracks], kind="stable")]
     both = TrackedBoxes(*map(np.concatenate, zip(vars(boxes).values(), vars(added).values(), strict=True)))
@@ -149,21 +143,7 @@ def _interpolated(boxes: TrackedBoxes, times_ns: Indices) -> TrackedBoxes:
 
 MISS, MATCH, SWITCH = 0, 1, 2
 Pair = tuple[int, int, float]  # box of the ground truth, box of the predictions, distance in metres
-
-
-@dataclass(frozen=True)
-class NearPairs:
-    """All pairs of a ground-truth box and a prediction of one frame that are close enough to match.
-
-    Attributes:
-        truths: (K,) indices into the ground truth, rising.
-        predictions: (K,) indices into the predictions.
-        distances: (K,) distance of the centres on the ground, metres.
-    """
-
-    truths: Indices
-    predictions: Indices
-    distances: Array
+Pairs = tuple[Indices, Indices, Array]  # the same of K pairs, (K,) each; the boxes of the ground truth rise
 
 
 @dataclass(frozen=True)
@@ -181,26 +161,23 @@ class Association:
     distances: Array
 
 
-def near_pairs(truth: TrackedBoxes, predictions: TrackedBoxes, limit_m: float) -> NearPairs:
+def near_pairs(truth: TrackedBoxes, predictions: TrackedBoxes, limit_m: float) -> Pairs:
     """The pairs of each frame whose centres are closer than the limit on the ground."""
     frame_count = int(max(truth.frames.max(initial=-1), predictions.frames.max(initial=-1))) + 1
     bounds = np.arange(frame_count + 1)
     of_truth, of_predictions = (np.searchsorted(side.frames, bounds) for side in (truth, predictions))
-    parts = []
+    parts = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))]
     for frame in np.flatnonzero((np.diff(of_truth) > 0) & (np.diff(of_predictions) > 0)):
         g, p = of_truth[frame], of_predictions[frame]
         offsets = truth.xy[g : of_truth[frame + 1], None] - predictions.xy[None, p : of_predictions[frame + 1]]
         distances = np.hypot(offsets[..., 0], offsets[..., 1])
         rows, columns = np.nonzero(distances < limit_m)
         parts.append((rows + g, columns + p, distances[rows, columns]))
-    if not parts:
-        return NearPairs(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
-    return NearPairs(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    truths, candidates, near = map(np.concatenate, zip(*parts, strict=True))
+    return truths, candidates, near
 
 
-def associate(
-    truth: TrackedBoxes, predictions: TrackedBoxes, pairs: NearPairs, threshold: float = -np.inf
-) -> Association:
+def associate(truth: TrackedBoxes, predictions: TrackedBoxes, pairs: Pairs, threshold: float = -np.inf) -> Association:
     """Matches the objects and the tracks of one class in the order of time.
 
     In each frame an object keeps the track that it was matched to last, if that is present and near. The other objects
@@ -209,8 +186,8 @@ def associate(
     truth: G boxes of one class. predictions: boxes of the same class. pairs: of `near_pairs`. threshold: predictions
     with a lower score are left out.
     """
-    alive = predictions.scores[pairs.predictions] >= threshold
-    truths, candidates, distances = pairs.truths[alive], pairs.predictions[alive], pairs.distances[alive]
+    alive = predictions.scores[pairs[1]] >= threshold
+    truths, candidates, distances = (column[alive] for column in pairs)
     starts = np.flatnonzero(np.diff(truth.frames[truths], prepend=-1))
     rows = list(zip(truths.tolist(), candidates.tolist(), distances.tolist(), strict=True))
     objects, tracks = truth.tracks.tolist(), predictions.tracks.tolist()
@@ -228,15 +205,13 @@ def associate(
 
 def _matches(pairs: list[Pair], objects: list[int], tracks: list[int], memory: dict[int, int]) -> list[Pair]:
     """The matches of one frame: first what is remembered, then the assignment of the rest."""
-    matches: list[Pair] = []
-    truths, predictions = set(), set()
+    kept: dict[int, Pair] = {}  # by the box of the predictions
     for g, p, distance in pairs:
-        if memory.get(objects[g]) == tracks[p] and p not in predictions:
-            matches.append((g, p, distance))
-            truths.add(g)
-            predictions.add(p)
-    rest = [pair for pair in pairs if pair[0] not in truths and pair[1] not in predictions]
-    return matches + _assignment(rest)
+        if memory.get(objects[g]) == tracks[p]:
+            kept.setdefault(p, (g, p, distance))
+    truths = {g for g, _, _ in kept.values()}
+    rest = [pair for pair in pairs if pair[0] not in truths and pair[1] not in kept]
+    return [*kept.values(), *_assignment(rest)]
 
 
 def _assignment(pairs: list[Pair]) -> list[Pair]:
