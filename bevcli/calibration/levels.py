@@ -103,20 +103,16 @@ def _best(unknowns: Unknowns, ties: EpipolarResiduals, x: Array, cameras: Indice
     mine = ties.where(np.asarray(np.isin(unknowns.groups[ties.group, 1:], cameras).any(-1)))
     columns = (OF_CAMERA * cameras[:, None] + POSITION).ravel()
     heights = OF_CAMERA * cameras + HEIGHT
-    before = _fitting(unknowns, mine, x)
+    before = _fits(unknowns, mine, x).sum()
     best, gain = x, 0.0
     for start in STARTS_M:
         moved = x.copy()
         moved[heights] += start
         moved = _positioned(unknowns, mine, moved, columns)
-        more = _fitting(unknowns, mine, moved) - (1 + LEAST_SHARE) * before - LEAST_GAIN
+        more = _fits(unknowns, mine, moved).sum() - (1 + LEAST_SHARE) * before - LEAST_GAIN
         if more > gain and np.abs(moved[heights] - x[heights]).min() >= LEAST_STEP_M:
             best, gain = moved, more
     return gain, best
-
-
-def _fitting(unknowns: Unknowns, ties: EpipolarResiduals, x: Array) -> int:
-    return int(_fits(unknowns, ties, x).sum())
 
 
 def _fits(unknowns: Unknowns, ties: EpipolarResiduals, x: Array) -> NDArray[np.bool_]:

@@ -5,7 +5,6 @@ over the road.
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -26,22 +25,7 @@ WINDOW = 21  # pixels
 MOST_BACK_PX = 0.5  # between a point and the flow there and back
 FEWEST = 12  # points of a pair of images; fewer are not used
 FULL_CONTRAST = 30.0  # mean squared gradient per pixel of a window, grey levels², from which a point counts fully
-
-
 AXES = np.eye(2)
-
-
-@dataclass(frozen=True)
-class Warp:
-    """The map from the first image of a pair to the second, over a flat road.
-
-    Attributes:
-        pixels: (h, w, 2) float32, in the second image; far outside where there is no road to compare.
-        inside: (h, w) the pixels of the first image with road.
-    """
-
-    pixels: NDArray[np.float32]
-    inside: NDArray[np.bool_]
 
 
 def road_residuals(views: Views, unknowns: Unknowns, x: Array, most_px: float) -> RoadResiduals:
@@ -62,11 +46,12 @@ def _points_of(
     pair, index, _ = (int(each) for each in unknowns.groups[group])
     camera = views.rig.cameras[index]
     first, second = (view.texture for view in views.sides((pair, index, index)))
-    warp = warp_of(camera, found, group)
+    warp = _warp(camera, found, group)
     if warp is None:
         return nothing
-    warped = sampled(second, warp.pixels)
-    inside = cv2.erode(warp.inside.astype(np.uint8), np.ones((WINDOW, WINDOW)))
+    field, road = warp
+    warped = sampled(second, field)
+    inside = cv2.erode(road.astype(np.uint8), np.ones((WINDOW, WINDOW)))
     at = np.argwhere(inside[::SPACING, ::SPACING] > 0)[:, ::-1].astype(np.float32) * SPACING
     if len(at) < FEWEST:
         return nothing
@@ -75,14 +60,18 @@ def _points_of(
     at, flow = at[kept], flow[kept]
     if len(at) < FEWEST:
         return nothing
-    target = _sample(warp.pixels, at + flow)
+    target = _sample(field, at + flow)
     rays_a, rays_b = camera.rays(at), camera.rays(target)
     beside = beside_way(points_of_road(found.ego_from_camera_a[group], rays_a), found.ego_b_from_ego_a[group])
-    return rays_a, rays_b, _weights(camera, first, warp, at, target), beside
+    return rays_a, rays_b, _weights(camera, first, field, at, target), beside
 
 
-def warp_of(camera: Camera, found: GroupGeometry, group: int) -> Warp | None:
-    """The map of a group; None where the two images share no road."""
+def _warp(camera: Camera, found: GroupGeometry, group: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]] | None:
+    """The map from the first image of a group to the second, over a flat road; None where they share no road.
+
+    Returns (h, w, 2) pixels in the second image, far outside where there is no road to compare, and (h, w) the pixels
+    of the first image with road.
+    """
     columns, rows = np.arange(0, camera.width + STRIDE, STRIDE), np.arange(0, camera.height + STRIDE, STRIDE)
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).astype(np.float64)
     rays = camera.rays(pixels.reshape(-1, 2))
@@ -99,12 +88,12 @@ def warp_of(camera: Camera, found: GroupGeometry, group: int) -> Warp | None:
     near = np.nan_to_num(target, nan=OUTSIDE).reshape(*shape, 2).astype(np.float32)
     size = (columns[-1] + STRIDE, rows[-1] + STRIDE)
     matrix = np.array([[1 / STRIDE, 0, 0], [0, 1 / STRIDE, 0]])
-    whole = cv2.warpAffine(near, matrix, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-    inside = cv2.warpAffine(
-        road.reshape(shape).astype(np.float32), matrix, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    whole, inside = (
+        cv2.warpAffine(each, matrix, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        for each in (near, road.reshape(shape).astype(np.float32))
     )
     cut = np.s_[: camera.height, : camera.width]
-    return Warp(np.ascontiguousarray(whole[cut]), inside[cut] > 0.999)
+    return np.ascontiguousarray(whole[cut]), inside[cut] > 0.999
 
 
 def points_of_road(pose: Array, rays: Array) -> Array:
@@ -149,11 +138,11 @@ def _sample(field: NDArray[np.float32], at: NDArray[Any]) -> Array:
     return sampled(field, at[:, None])[:, 0].astype(np.float64)
 
 
-def _weights(camera: Camera, first: NDArray[np.uint8], warp: Warp, at: NDArray[Any], target: Array) -> Array:
+def _weights(
+    camera: Camera, first: NDArray[np.uint8], field: NDArray[np.float32], at: NDArray[Any], target: Array
+) -> Array:
     """(n, 2, 3) from an error of a ray in the second image to pixels of the first, weighted by the contrast there."""
-    stretch = (
-        np.stack([_sample(warp.pixels, at + 2 * axis) - _sample(warp.pixels, at - 2 * axis) for axis in AXES], -1) / 4
-    )
+    stretch = np.stack([_sample(field, at + 2 * axis) - _sample(field, at - 2 * axis) for axis in AXES], -1) / 4
     back = np.linalg.pinv(np.nan_to_num(stretch))  # (n, 2, 2), pixels of the first image by those of the second
     along = np.stack([(camera.rays(target + axis) - camera.rays(target - axis)) / 2 for axis in AXES], -1)
     across = np.linalg.pinv(np.nan_to_num(along))  # (n, 2, 3), pixels of the second image by its rays

@@ -118,7 +118,7 @@ def report_text(name: str, rig: CameraRig, report: RigReport) -> str:
     if report.measures:
         rows = [("compared with nuScenes", "this rig", "nuScenes", "")]
         rows += [(m.name, m.value, m.reference, "" if m.is_near else "far") for m in report.measures]
-        parts += ["", *_table(rows, left={0, 3})]
+        parts += ["", *aligned(rows, left={0, 3})]
     return "\n".join(parts)
 
 
@@ -143,7 +143,7 @@ def _rig_lines(rig: CameraRig, coverage: Coverage) -> list[str]:
                 f"{coverage.shares[camera.name]:.0%}",
             )
         )
-    return _table([header, *rows], left={0, 9})
+    return aligned([header, *rows], left={0, 9})
 
 
 def _finding_lines(findings: Sequence[Finding]) -> list[str]:
@@ -164,7 +164,7 @@ def _finding_lines(findings: Sequence[Finding]) -> list[str]:
     return lines
 
 
-def _table(rows: Sequence[Sequence[str]], left: set[int]) -> list[str]:
+def aligned(rows: Sequence[Sequence[str]], left: set[int]) -> list[str]:
     """Rows as aligned columns. left: indices of the columns that are aligned to the left, all others to the right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [

@@ -102,11 +102,6 @@ class DetectionLoss:
     classes: Tensor
     boxes: Tensor
 
-    @property
-    def total(self) -> Tensor:
-        """() the sum of both."""
-        return self.classes + self.boxes
-
 
 def detection_loss(
     class_logits: Tensor,

@@ -6,6 +6,7 @@ A file is written under a temporary name and renamed: a kill leaves the old one 
 from __future__ import annotations
 
 import csv
+import importlib.util
 import io
 import math
 from collections.abc import Mapping
@@ -16,7 +17,7 @@ import safetensors.torch
 import torch
 from torch import Tensor, nn
 
-from bevcli.errors import InputError, WeightsError
+from bevcli.errors import BevcliError, InputError, WeightsError
 from bevcli.inference.training_rigs import weights_facts
 from bevcli.model.network import Network
 from bevcli.parsing.files import MIB, read_text
@@ -182,3 +183,26 @@ def _write(path: Path, rows: list[Row], mode: str, *, header: bool = True) -> No
             if header:
                 writer.writeheader()
             writer.writerows({name: f"{value:.6g}" for name, value in row.items()} for row in rows)
+
+
+def require_tensorboard() -> None:
+    """Raise BevcliError where the package tensorboard is not installed."""
+    if importlib.util.find_spec("tensorboard") is None:
+        raise BevcliError("`log=\"tensorboard\"` needs the package tensorboard: pip install 'bevcli[tensorboard]'")
+
+
+class TensorBoardLog:
+    """Event files in a folder: `tensorboard --logdir FOLDER` draws them, also while the training runs."""
+
+    def __init__(self, folder: Path, done: int) -> None:
+        """done: steps done. TensorBoard hides later ones, of an interrupted training."""
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._writer = SummaryWriter(str(folder), purge_step=done + 1 if done else None)
+
+    def add(self, step: int, group: str, numbers: Mapping[str, float]) -> None:
+        """Write the finite numbers of a step as curves group/name, to the file at once."""
+        for name, value in numbers.items():
+            if math.isfinite(value):
+                self._writer.add_scalar(f"{group}/{name}", value, step)
+        self._writer.flush()

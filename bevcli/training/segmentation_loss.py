@@ -148,11 +148,6 @@ class SegmentationLoss:
     masks: Tensor
     locations: Tensor
 
-    @property
-    def total(self) -> Tensor:
-        """() the sum of all."""
-        return self.classes + self.masks + self.locations
-
 
 @dataclass(frozen=True)
 class _Assignment:

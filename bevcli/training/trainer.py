@@ -21,12 +21,11 @@ from bevcli.model.kernels.onednn import use_onednn
 from bevcli.model.network import Network
 from bevcli.model.resnet import ResNet
 from bevcli.model.step import ModelOutputs
+from bevcli.training import files
 from bevcli.training.distillation import Teacher
-from bevcli.training.files import LearningCurve, draw_learning_curves, load_checkpoint, save_checkpoint, save_weights
 from bevcli.training.frame_losses import FrameLosses
 from bevcli.training.job import CHECKPOINT, OptimizerConfig, TrainingJob
 from bevcli.training.samples import Batch, draw_clips, load_batch
-from bevcli.training.tensorboard_log import TensorBoardLog
 from bevcli.training.validation import Validation, validate
 
 T = TypeVar("T")
@@ -153,7 +152,7 @@ class Trainer:
             self._average = {key: value.detach().clone() for key, value in job.model.state_dict().items()}
         self.done = 0
         if resume:
-            self.done = load_checkpoint(job.out / CHECKPOINT, self.trained, self.optimizer, self._average)
+            self.done = files.load_checkpoint(job.out / CHECKPOINT, self.trained, self.optimizer, self._average)
         choose_kernels(job.model, job.device, gradients=True)
         self._teacher: Teacher | None = None
         if job.config.distillation_loss.weight > 0:
@@ -163,9 +162,9 @@ class Trainer:
             dtype = torch.bfloat16 if computes_in_bfloat16(job.device) else torch.float32
             self._frozen = FrozenStages(job.model.backbone, job.config.frozen_stages, dtype)
         if job.group.leads:
-            self._loss_curve = LearningCurve(job.out / "loss.csv", self.done)
-            self._validation_curve = LearningCurve(job.out / "validation.csv", self.done)
-        self._log = TensorBoardLog(job.out / "tensorboard", self.done) if job.log and job.group.leads else None
+            self._loss_curve = files.LearningCurve(job.out / "loss.csv", self.done)
+            self._validation_curve = files.LearningCurve(job.out / "validation.csv", self.done)
+        self._log = files.TensorBoardLog(job.out / "tensorboard", self.done) if job.log and job.group.leads else None
 
     def run(
         self,
@@ -195,7 +194,9 @@ class Trainer:
                 if self.done % config.evaluate_every == 0 or last:
                     after_validation(self.done, self._validate())
                 if self.done % config.checkpoint_every == 0 or last or stopped:
-                    save_checkpoint(self.job.out / CHECKPOINT, self.done, self.trained, self.optimizer, self._average)
+                    files.save_checkpoint(
+                        self.job.out / CHECKPOINT, self.done, self.trained, self.optimizer, self._average
+                    )
                 after_step()
             if stopped:
                 break
@@ -284,8 +285,8 @@ class Trainer:
         self._validation_curve.add(self.done, scores.row())
         self._add_to_log("validation", scores.row())
         dtype = torch.float16 if job.config.weights_dtype == "float16" else torch.float32
-        save_weights(job.out / "weights.safetensors", model, dtype)
-        draw_learning_curves(self._loss_curve, self._validation_curve, job.out / "curves.png")
+        files.save_weights(job.out / "weights.safetensors", model, dtype)
+        files.draw_learning_curves(self._loss_curve, self._validation_curve, job.out / "curves.png")
         return scores
 
     def _add_to_log(self, group: str, row: Mapping[str, float]) -> None:
