@@ -9,8 +9,7 @@ In the order of the work:
     unknowns             what is estimated: one vector, and the geometry that follows from it
     residuals            matched points and road points against that geometry
     solve                robust least squares
-    heights              heights of the cameras, roughly, from the road
-    road                 points of the road in both frames of a pair
+    road                 the road in both frames of a pair: heights of the cameras, roughly, and points
     levels               whether a camera has measured its height from a pavement
     measure              all of it in rounds, and the part of the result that the drive shows, with its covariance
 

@@ -56,8 +56,7 @@ def _title(estimate: CameraEstimate) -> str:
 
 def _draw_image(axes: Axes, grey: Pixels | None, camera: Camera, matches: ShownMatches) -> None:
     """The image with the ground grid and the horizon, matched points, and pieces of their epipolar lines."""
-    axes.set_xticks([])
-    axes.set_yticks([])
+    axes.set(xticks=[], yticks=[])
     blank = np.full((camera.height, camera.width), 40, dtype=np.uint8)
     canvas = np.repeat((blank if grey is None else grey)[..., None], 3, axis=-1)
     draw_lines(canvas, ground_lines(camera), GROUND, 1)
@@ -80,8 +79,7 @@ def _draw_ellipse(axes: Axes, estimate: CameraEstimate) -> None:
     axes.plot([0, yaw], [0, pitch], color=INK, linewidth=1)
     axes.plot([0], [0], "+", color=INK)
     reach = 1.2 * max(abs(yaw), abs(pitch), width, height, 0.3)
-    axes.set_xlim(-reach, reach)
-    axes.set_ylim(-reach, reach)
+    axes.set(xlim=(-reach, reach), ylim=(-reach, reach))
     axes.set_xlabel("yaw, degrees", color=FAINT, fontsize=8, labelpad=1)
     axes.set_ylabel("pitch, degrees", color=FAINT, fontsize=8, labelpad=1)
     axes.tick_params(colors=FAINT, labelsize=7)

@@ -6,12 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bevcli.calibration.estimates import RigEstimate
-from bevcli.calibration.heights import search_heights
 from bevcli.calibration.levels import level_corrections, sees_road
 from bevcli.calibration.matches import PointMatches
 from bevcli.calibration.options import CalibrateOptions
 from bevcli.calibration.residuals import EpipolarResiduals, RoadResiduals, epipolar_residuals, values
-from bevcli.calibration.road import road_residuals
+from bevcli.calibration.road import road_residuals, search_heights
 from bevcli.calibration.solve import Solution, Term, solve, spread
 from bevcli.calibration.unknowns import HEIGHT, OF_CAMERA, OF_PAIR, OF_RIG, Unknowns
 from bevcli.calibration.views import Views

@@ -1,4 +1,4 @@
-"""Files of a training: resumable checkpoints, released weights, and learning curves.
+"""Files of a training: resumable checkpoints, released weights, and learning curves, for TensorBoard too.
 
 A file is written under a temporary name and renamed: a kill leaves the old one intact.
 """
@@ -124,11 +124,9 @@ class LearningCurve:
 
 def draw_learning_curves(loss: LearningCurve, validation: LearningCurve, path: Path) -> None:
     """Writes a PNG: smoothed losses on the left, scores on the right."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 4.5), layout="constrained")
-    FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
     _draw_rows(left, _smoothed(loss.rows), skipped=("step", "learning rate", "gradient norm"))
     _draw_rows(right, [_scores(row) for row in validation.rows], skipped=("step",), marker="o")

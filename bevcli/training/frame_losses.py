@@ -1,18 +1,25 @@
-"""All losses of a frame, and the auxiliary heads that exist in training only."""
+"""All losses of a frame, and what exists in training only: auxiliary heads, and a teacher.
+
+The teacher sees the images and the calibration before they were augmented.
+"""
 
 import contextlib
+import copy
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
+from bevcli.checkpoints import load_weights
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.decoder import BOX_CODE_SIZE
+from bevcli.model.kernels.choose import choose_kernels
 from bevcli.model.network import Network
-from bevcli.model.step import ModelInputs, ModelOutputs
+from bevcli.model.step import ClipInputs, ModelInputs, ModelOutputs
 from bevcli.training.detection_loss import (
     DetectionLoss,
     DetectionLossConfig,
@@ -21,10 +28,10 @@ from bevcli.training.detection_loss import (
     detection_loss,
     last_matches,
 )
-from bevcli.training.distillation import DistillationLossConfig
 from bevcli.training.perspective_loss import PerspectiveHead, PerspectiveLossConfig, perspective_loss
 from bevcli.training.samples import Targets
 from bevcli.training.segmentation_loss import SegmentationLossConfig, segmentation_loss
+from bevcli.weights.local import weights_file
 
 
 @dataclass(frozen=True)
@@ -98,6 +105,42 @@ def _positive_cells(cells: Tensor, objects: Tensor, reach_m: float) -> tuple[Ten
     distance, nearest = torch.cdist(cells, objects).min(dim=1)
     positive = (distance <= reach_m).nonzero()[:, 0]
     return positive, nearest[positive]
+
+
+@dataclass(frozen=True)
+class DistillationLossConfig:
+    """The [training.distillation_loss] table.
+
+    Attributes:
+        weight: of the mean squared difference of the BEV maps; 0 disables the loss.
+        teacher: weights of the same model, a file or a model's name.
+    """
+
+    weight: float = 0.0
+    teacher: str = ""
+
+    def __post_init__(self) -> None:
+        if self.weight < 0 or (self.weight > 0 and not self.teacher):
+            raise ValueError("weight must not be negative, and teacher must name weights where it is positive")
+
+
+class Teacher:
+    """A copy of a model with the teacher's weights, in evaluation mode."""
+
+    def __init__(self, model: Network, weights: str, device: torch.device) -> None:
+        """Raises WeightsError where the weights are missing or do not fit the model."""
+        self._network = copy.deepcopy(model)
+        load_weights(weights_file(Path(weights)), self._network)
+        self._network.eval().requires_grad_(False).to(device)
+        choose_kernels(self._network, device)
+
+    def bev_maps(self, clip: ClipInputs) -> Iterator[Tensor]:
+        """The BEV map (B, Y·X, C) of each frame of clips that are not augmented."""
+        memory: Any = None
+        for place in range(len(clip.inputs)):
+            with torch.no_grad():
+                outputs, memory = self._network.learn(clip, place, memory)
+            yield outputs.bev.float()
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,7 @@ from bevcli.model.network import Network
 from bevcli.model.resnet import ResNet
 from bevcli.model.step import ModelOutputs
 from bevcli.training import files
-from bevcli.training.distillation import Teacher
-from bevcli.training.frame_losses import FrameLosses
+from bevcli.training.frame_losses import FrameLosses, Teacher
 from bevcli.training.job import CHECKPOINT, OptimizerConfig, TrainingJob
 from bevcli.training.samples import Batch, draw_clips, load_batch
 from bevcli.training.validation import Validation, validate
@@ -181,26 +180,24 @@ class Trainer:
             stop: asked after each step; if it is true, a checkpoint is written and the training ends early.
             after_update: called after each update of the weights, with the loss.
         """
-        config = self.job.config
+        job, config = self.job, self.job.config
         remaining = range(self.done, config.steps)
         for batches in read_ahead(self._load, remaining, depth=config.loaders, threads=config.loaders):
             row = self._step(batches, after_update)
             trim_memory()
             self.done += 1
             last, stopped = self.done == config.steps, stop()
-            if self.job.group.leads:
+            if job.group.leads:
                 self._loss_curve.add(self.done, row)
                 self._add_to_log("training", row)
                 if self.done % config.evaluate_every == 0 or last:
                     after_validation(self.done, self._validate())
                 if self.done % config.checkpoint_every == 0 or last or stopped:
-                    files.save_checkpoint(
-                        self.job.out / CHECKPOINT, self.done, self.trained, self.optimizer, self._average
-                    )
+                    files.save_checkpoint(job.out / CHECKPOINT, self.done, self.trained, self.optimizer, self._average)
                 after_step()
             if stopped:
                 break
-        self.job.model.eval()
+        job.model.eval()
 
     @property
     def _learn_all(self) -> bool:
