@@ -89,9 +89,11 @@ def _estimate(index: int, evidence: Evidence, change: Array, covariance: Array) 
     solution = measurement.solution.x
     before, after = (_residual_px(measurement, index, x) * enlarged for x in (0 * solution, solution))
     road = measurement.unknowns.groups[measurement.road.group, 1] == index
+    fine = np.abs(change[:6]) <= np.maximum(FINE, FINE_DEVIATIONS * deviations[:6])
+    verdict = Verdict.FINE if fine.all() else Verdict.CORRECTED
     return CameraEstimate(
         camera=views.rig.names[index],
-        verdict=Verdict.NOT_MEASURABLE if reason else _verdict(change[:6], deviations[:6]),
+        verdict=Verdict.NOT_MEASURABLE if reason else verdict,
         reason=reason,
         rotation_deg=_yaw_pitch_roll(-np.degrees(change[:3])),
         rotation_deviation_deg=_yaw_pitch_roll(np.degrees(deviations[:3]) * [1, -1, 1]),
@@ -117,11 +119,6 @@ def _reason(matches: int, pairs: int, deviations_deg: Array) -> str:
     if deviations_deg.max() > WIDEST_DEG:
         return f"the drive shows its rotation to ±{deviations_deg.max():.1f}° only"
     return ""
-
-
-def _verdict(change: Array, deviations: Array) -> Verdict:
-    is_fine = np.abs(change) <= np.maximum(FINE, FINE_DEVIATIONS * deviations)
-    return Verdict.FINE if is_fine.all() else Verdict.CORRECTED
 
 
 def _residual_px(measurement: Measurement, index: int, x: Array) -> float:

@@ -29,13 +29,7 @@ DIFFERENCE_M = 1e-5  # for derivatives
 def level_corrections(unknowns: Unknowns, road: RoadResiduals, ties: EpipolarResiduals, x: Array) -> Array:
     """(P,) corrections of x (P,): of the positions of cameras on another level than their neighbours; 0 for most.
 
-    Cameras that see the road stay.
-
-    Args:
-        unknowns: the unknowns.
-        road: points of the road.
-        ties: points that two cameras share.
-        x: the present values.
+    Cameras that see the road stay. ties: points that two cameras share.
     """
     corrected, stays = x.copy(), sees_road(unknowns, road, ties, x)
     ties = ties.where(np.abs(values(unknowns, ties, x)[:, 0]) < MOST_PX)

@@ -93,9 +93,9 @@ def consistent(unknowns: Unknowns, points: EpipolarResiduals, x: Array) -> Epipo
     Repeated texture gives pairs whose matches fit a motion, but not that of the vehicle.
     """
     fits = np.abs(values(unknowns, points, x)[:, 0]) < CONSISTENT_PX
-    shares = np.bincount(points.group[fits], minlength=len(unknowns.groups)) / np.maximum(
-        np.bincount(points.group, minlength=len(unknowns.groups)), 1
-    )
+    count = len(unknowns.groups)
+    fitting, found = (np.bincount(each, minlength=count) for each in (points.group[fits], points.group))
+    shares = fitting / np.maximum(found, 1)
     return points.where(fits & (shares[points.group] >= CONSISTENT_SHARE))
 
 

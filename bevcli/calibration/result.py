@@ -82,18 +82,13 @@ class CalibrationResult:
 
 def corrected_rig(rig: CameraRig, cameras: Items[CameraEstimate]) -> CameraRig:
     """The rig with the changes of the cameras whose verdict is "corrected"."""
-    poses = moved(
-        np.stack([camera.ego_from_camera for camera in rig.cameras]),
-        np.stack([each.change * (each.verdict is Verdict.CORRECTED) for each in cameras]),
+    stated, changes = [camera.ego_from_camera for camera in rig.cameras], [each.change for each in cameras]
+    poses = moved(np.stack(stated), np.stack(changes))
+    corrected = (
+        replace(camera, ego_from_camera=pose) if each.verdict is Verdict.CORRECTED else camera
+        for camera, pose, each in zip(rig.cameras, poses, cameras, strict=True)
     )
-    kept = [each.verdict is not Verdict.CORRECTED for each in cameras]
-    return replace(
-        rig,
-        cameras=tuple(
-            camera if keep else replace(camera, ego_from_camera=pose)
-            for camera, pose, keep in zip(rig.cameras, poses, kept, strict=True)
-        ),
-    )
+    return replace(rig, cameras=tuple(corrected))
 
 
 class CorrectedDrive(DerivedSequence):

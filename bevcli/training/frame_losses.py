@@ -26,7 +26,7 @@ from bevcli.training.detection_loss import (
     DetectionTargets,
     assigned_loss,
     detection_loss,
-    last_matches,
+    layer_matches,
 )
 from bevcli.training.perspective_loss import PerspectiveHead, PerspectiveLossConfig, perspective_loss
 from bevcli.training.samples import Targets
@@ -237,7 +237,7 @@ class FrameLosses:
             difference = nn.functional.mse_loss(outputs.bev.float(), taught)
             losses |= {"distillation": self.configs.distillation_loss.weight * difference}
         if targets.truths:
-            matches = last_matches(logits, codes, targets.detection, weights)
+            matches = layer_matches(logits[-1], codes[-1], targets.detection, weights)
             losses |= self._head_losses(outputs, targets.truths, matches)
         if outputs.segmentation is not None:
             maps = segmentation_loss(outputs.segmentation, targets.segmentation, self.configs.segmentation_loss)

@@ -139,10 +139,7 @@ _QUICK: Mapping[str, Mapping[str, Any]] = {
     "training.optimizer": {"learning_rate": 2e-4, "warm_up_steps": 10, "average": 0.99},
     "training.perspective_loss": {"weight": 0.0},
 }
-_ONE_CLIP: Mapping[str, Mapping[str, Any]] = {
-    "training": {},
-    "training.clips": {"batch": 1},
-}  # as published, on each of eight GPUs
+_ONE_CLIP: Mapping[str, Mapping[str, Any]] = {"training.clips": {"batch": 1}}  # as published, on each of eight GPUs
 PRESETS: Mapping[Preset, PresetSettings] = {
     "quick": PresetSettings("demo", 384, _QUICK),
     "demo": PresetSettings("demo"),
