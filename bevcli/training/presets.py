@@ -121,19 +121,17 @@ class PresetSettings:
 
     Attributes:
         model: the known model whose file it starts from.
-        width_px: width of the network's input images; None for that of the model.
         changes: keys of its tables with new values; None removes a key.
     """
 
     model: str
-    width_px: int | None = None
     changes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
 
 # The demo model on smaller images and shorter clips, for a training that starts from its weights. The rate and the
 # average are those with which docs/fine-tune.md was measured.
 _QUICK: Mapping[str, Mapping[str, Any]] = {
-    "image": {"focal_px": None, "max_pixels": None},
+    "image": {"size": [384, 216], "focal_px": None, "max_pixels": None},
     "training": {"steps": 75, "evaluate_every": 15, "checkpoint_every": 5},
     "training.clips": {"frames": 8, "batch": 2, "in_turn": 2},
     "training.optimizer": {"learning_rate": 2e-4, "warm_up_steps": 10, "average": 0.99},
@@ -141,10 +139,10 @@ _QUICK: Mapping[str, Mapping[str, Any]] = {
 }
 _ONE_CLIP: Mapping[str, Mapping[str, Any]] = {"training.clips": {"batch": 1}}  # as published, on each of eight GPUs
 PRESETS: Mapping[Preset, PresetSettings] = {
-    "quick": PresetSettings("demo", 384, _QUICK),
+    "quick": PresetSettings("demo", _QUICK),
     "demo": PresetSettings("demo"),
-    "tiny": PresetSettings("tiny", None, _ONE_CLIP),
-    "base": PresetSettings("base", None, _ONE_CLIP),
+    "tiny": PresetSettings("tiny", _ONE_CLIP),
+    "base": PresetSettings("base", _ONE_CLIP),
 }
 
 
@@ -158,13 +156,14 @@ def model_table(name: str, preset: Preset, facts: DataFacts) -> dict[str, Any]:
     table = copy.deepcopy(read_model_file(chosen.model)[0])
     for path, changes in chosen.changes.items():
         _change(table, path, changes)
-    table |= {"name": name, "classes": ordered_classes(facts.class_counts), "cameras": list(facts.cameras)}
-    own = [name for name in table["classes"] if name not in NUSCENES_CLASSES]
+    known = [each for each in NUSCENES_CLASSES if each in facts.class_counts]
+    own = [each for each in facts.class_counts if each not in NUSCENES_CLASSES]  # the most frequent first
+    table |= {"name": name, "classes": known + own, "cameras": list(facts.cameras)}
     if own:
         table["class_settings"] = {name: {"like": class_of_size(*facts.class_sizes[name])} for name in own}
     table["rate_hz"] = rate_for(facts, table.get("rate_hz", 2.0))
     table["max_gap_s"] = max(table.get("max_gap_s", 2.0), round(2 / table["rate_hz"], 2))
-    table["image"]["size"] = _image_size(facts, chosen.width_px or table["image"]["size"][0])
+    table["image"]["size"] = _image_size(facts, table["image"]["size"][0])
     _set_range(table["bev_grid"], facts)
     table["training_rigs"] = rigs_of(facts.rigs)
     if facts.map_reach_m < table["bev_grid"]["x_range_m"][1]:
@@ -177,11 +176,6 @@ def model_table(name: str, preset: Preset, facts: DataFacts) -> dict[str, Any]:
     clips = training.setdefault("clips", {})
     clips["frames"] = min(clips.get("frames", TrainingConfig().clips.frames), facts.shortest(table["rate_hz"]))
     return table
-
-
-def ordered_classes(counts: Mapping[str, int]) -> list[str]:
-    """Classes of nuScenes in its order, then the others, the most frequent first."""
-    return [name for name in NUSCENES_CLASSES if name in counts] + [n for n in counts if n not in NUSCENES_CLASSES]
 
 
 def rate_for(facts: DataFacts, preset_hz: float) -> float:

@@ -153,9 +153,8 @@ class Trainer:
         if resume:
             self.done = files.load_checkpoint(job.out / CHECKPOINT, self.trained, self.optimizer, self._average)
         choose_kernels(job.model, job.device, gradients=True)
-        self._teacher: Teacher | None = None
-        if job.config.distillation_loss.weight > 0:
-            self._teacher = Teacher(job.model, job.config.distillation_loss.teacher, job.device)
+        taught = job.config.distillation_loss
+        self._teacher = Teacher(job.model, taught.teacher, job.device) if taught.weight > 0 else None
         self._frozen: FrozenStages | None = None
         if job.config.frozen_stages and job.config.freeze_batch_norm:
             dtype = torch.bfloat16 if computes_in_bfloat16(job.device) else torch.float32
