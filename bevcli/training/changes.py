@@ -15,10 +15,8 @@ T = TypeVar("T")
 def with_changes(config: T, changes: Mapping[str, str]) -> T:
     """The settings with some of them changed.
 
-    Args:
-        config: the dataclass of [training].
-        changes: values by key, such as {"optimizer.learning_rate": "1e-4"}, as in TOML; a text may lack its quotes.
-
+    config: the dataclass of [training].
+    changes: values by key, such as {"optimizer.learning_rate": "1e-4"}, as in TOML; a text may lack its quotes.
     Raises ConfigError for an unknown key, which names the nearest, or a wrong value.
     """
     table: dict[str, Any] = dataclasses.asdict(config)  # type: ignore[call-overload]

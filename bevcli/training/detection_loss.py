@@ -144,10 +144,7 @@ def matching_costs(
 ) -> Tensor:
     """(Q, G) focal cost plus L1 distance of the box codes without velocity.
 
-    Args:
-        class_logits: (Q, classes).
-        box_codes: (Q, 10).
-        truth: G boxes.
+    class_logits: (Q, classes). box_codes: (Q, 10). truth: G boxes.
     """
     classes = focal_cost(class_logits)[:, truth.labels]
     boxes = torch.cdist(box_codes[:, :VELOCITY_START], truth.codes[:, :VELOCITY_START], p=1)

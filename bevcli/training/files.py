@@ -43,9 +43,7 @@ def save_checkpoint(
 ) -> None:
     """Writes the state after `step` steps, to resume from. Random numbers are drawn from seed and step, not stored.
 
-    Args:
-        trained: the model and its auxiliary heads.
-        average: the running average of the model's weights, None without one.
+    trained: the model and its auxiliary heads. average: the running average of the model's weights, None without one.
     """
     contents = {"format": FORMAT, "step": step, "model": trained.state_dict(), "optimizer": optimizer.state_dict()}
     if average is not None:
@@ -105,10 +103,8 @@ class LearningCurve:
     def __init__(self, path: Path, done: int = 0) -> None:
         """Opens the file of a resumed training, or starts a new one.
 
+        done: steps done. Rows after them, of an interrupted run, are dropped; 0 starts a new file.
         Raises OutputError, and InputError for a damaged file.
-
-        Args:
-            done: steps done. Rows after them, of an interrupted run, are dropped; 0 starts a new file.
         """
         self.path = path
         self.rows: list[Row] = [row for row in _read(path) if row["step"] <= done] if done else []

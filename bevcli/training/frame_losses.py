@@ -82,10 +82,7 @@ def dense_loss(
 ) -> DetectionLoss:
     """Focal loss of all cells and L1 loss of the positive ones, divided by the number of positive cells.
 
-    Args:
-        bev: (B, Y·X, C).
-        targets: B.
-        detection: the weights of classes and boxes, as in the detection loss.
+    bev: (B, Y·X, C). targets: B. detection: the weights of classes and boxes, as in the detection loss.
     """
     logits, codes = head(bev)
     positives = [_positive_cells(head.centers, truth.codes[:, :2], config.reach_m) for truth in targets]
@@ -96,9 +93,7 @@ def dense_loss(
 def _positive_cells(cells: Tensor, objects: Tensor, reach_m: float) -> tuple[Tensor, Tensor]:
     """Indices (K,) of the cells within reach of an object, and (K,) of the nearest object of each.
 
-    Args:
-        cells: (Y·X, 2) cell centres, metres.
-        objects: (G, 2) object centres, metres.
+    cells: (Y·X, 2) cell centres, metres. objects: (G, 2) object centres, metres.
     """
     if not len(objects):
         return (torch.zeros(0, dtype=torch.int64, device=cells.device),) * 2
@@ -211,9 +206,8 @@ class FrameLosses:
     ) -> dict[str, Tensor]:
         """The weighted scalar losses by name; their sum is minimised.
 
-        taught: (B, Y·X, C), the BEV map of the teacher.
-
         Call it inside `watching`, right after the forward pass that made the outputs.
+        taught: (B, Y·X, C), the BEV map of the teacher.
         """
         logits, codes, weights = outputs.class_logits, outputs.box_codes, self.configs.detection_loss
         detection = detection_loss(logits, codes, targets.detection, weights, self._query_groups)

@@ -42,8 +42,7 @@ def write_model_file(
     Args:
         path: the file, which ends in .toml and does not exist.
         data: the drives, folders.
-        preset: the model that it starts from.
-        device: device to measure on.
+        device: to measure on.
         longest_s: time of the measurement, seconds.
 
     Raises BevcliError where the drives, or the path, are wrong; nothing is written then.

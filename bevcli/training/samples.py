@@ -99,8 +99,7 @@ class Clip:
 def draw_clips(drives: Drives, config: ClipConfig, random: np.random.Generator, *, with_gap: bool = True) -> list[Clip]:
     """The clips of one batch, all of the same length. Raises InputError if a drive is too short.
 
-    Args:
-        with_gap: with `learn` "last", leave out one of the earlier frames, as published for BEVFormer.
+    with_gap: with `learn` "last", leave out one of the earlier frames, as published for BEVFormer.
     """
     frames = config.frames
     if frames > 1 and random.random() < config.short_share:
@@ -131,8 +130,7 @@ def draw_frames(
 ) -> tuple[int, ...]:
     """Indices of a random frame and of `count` - 1 frames before it in its scene. Raises InputError if there are none.
 
-    Args:
-        with_gap: as published, take the `count` frames before it and leave out a random one.
+    with_gap: as published, take the `count` frames before it and leave out a random one.
     """
     scenes = list(scenes_of(sequence.stamps))
     candidates = [(scene, end) for scene in scenes for end in range(count - 1, len(scene))]
@@ -204,12 +202,8 @@ def load_batch(
 ) -> Batch:
     """Reads, augments and preprocesses the frames of clips of the same length.
 
-    Args:
-        learn_all: give targets for every frame, not for the last one only.
-        plain: give the clips before augmentation too.
-
-    Raises:
-        InputError: a frame to train on has no ground truth.
+    learn_all: give targets for every frame, not for the last one only. plain: give the clips before augmentation too.
+    Raises InputError where a frame to train on has no ground truth.
     """
     loaded = [[drives.open(clip.drive).load(index) for index in clip.frames] for clip in clips]
     augmented = (_augmented(of_clip, augmentation, random) for of_clip in loaded)

@@ -80,7 +80,6 @@ def forward_clip(
     with a window of frames, this applies to the image features of the earlier frames.
 
     Args:
-        batch: the clips.
         learn_all: yield the outputs for every frame. The model may be updated in between: history has no gradient.
         freeze_batch_norm: keep batch norms in evaluation mode, for fine-tuning.
     """
