@@ -64,6 +64,14 @@ class AugmentationConfig:
             )
 
 
+def augmented(clip: list[Frame], config: AugmentationConfig, random: np.random.Generator) -> list[Frame]:
+    """Copies of the frames of a clip with all changes but the grid mask, which is for the network's input."""
+    vary_images, vary_rig = ImageVariation(config, random), CalibrationVariation(config, random)
+    worsen = BadConditions(config, random)
+    frames = (vary_rig(worsen(vary_images(frame))) for frame in clip)
+    return [distort_images(frame, config.photometric, random) for frame in frames]
+
+
 class ImageVariation:
     """Exposure, white balance and noise of the cameras of one clip, drawn once; missing images."""
 

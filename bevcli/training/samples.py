@@ -24,14 +24,7 @@ from bevcli.model.step import ModelInputs, PreparedFrame, model_inputs
 from bevcli.model.truth import FrameTruth
 from bevcli.sequences.selection import scenes_of
 from bevcli.synth.drives import Drives, InputShape
-from bevcli.training.augmentation import (
-    AugmentationConfig,
-    BadConditions,
-    CalibrationVariation,
-    ImageVariation,
-    distort_images,
-    mask_images,
-)
+from bevcli.training.augmentation import AugmentationConfig, augmented, mask_images
 from bevcli.training.detection_loss import DetectionTargets, box_targets, detection_targets
 from bevcli.training.frame_truth import frame_truth
 from bevcli.training.segmentation_loss import SegmentationTargets, segmentation_targets
@@ -206,8 +199,7 @@ def load_batch(
     Raises InputError where a frame to train on has no ground truth.
     """
     loaded = [[drives.open(clip.drive).load(index) for index in clip.frames] for clip in clips]
-    augmented = (_augmented(of_clip, augmentation, random) for of_clip in loaded)
-    frames = _prepared(augmented, config)
+    frames = _prepared((augmented(of_clip, augmentation, random) for of_clip in loaded), config)
     inputs = _inputs(frames, config)
     for step in inputs:
         mask_images(step.images, augmentation.grid_mask, random)
@@ -247,13 +239,6 @@ def _targets(frames: list[Frame], places: list[tuple[Sequence, int]], config: Mo
     grid, classes = config.bev_grid, config.object_classes
     segmentation = (segmentation_targets(*pair, grid, classes) for pair in zip(boxes, maps, strict=True))
     return Targets(detection, perspective, tuple(segmentation), truths)
-
-
-def _augmented(clip: list[Frame], augmentation: AugmentationConfig, random: np.random.Generator) -> list[Frame]:
-    vary_images, vary_rig = ImageVariation(augmentation, random), CalibrationVariation(augmentation, random)
-    worsen = BadConditions(augmentation, random)
-    frames = (vary_rig(worsen(vary_images(frame))) for frame in clip)
-    return [distort_images(frame, augmentation.photometric, random) for frame in frames]
 
 
 def _prepared(clips: Iterable[list[Frame]], config: ModelConfig) -> list[tuple[PreparedFrame, ...]]:
