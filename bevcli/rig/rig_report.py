@@ -128,21 +128,11 @@ def _rig_lines(rig: CameraRig, coverage: Coverage) -> list[str]:
     for camera in rig.cameras:
         mounting = mounting_of(camera.ego_from_camera)
         x, y, z = mounting.position
-        rows.append(
-            (
-                camera.name,
-                f"{camera.width}x{camera.height}",
-                f"{seen_fov_deg(camera)[0]:.0f}°",
-                degrees_text(mounting.yaw_deg, 0),
-                degrees_text(mounting.pitch_deg),
-                degrees_text(mounting.roll_deg),
-                f"{x:.2f}",
-                f"{y:.2f}",
-                f"{z:.2f} m",
-                camera.distortion.model if camera.distortion else "pinhole",
-                f"{coverage.shares[camera.name]:.0%}",
-            )
-        )
+        size, fov = f"{camera.width}x{camera.height}", f"{seen_fov_deg(camera)[0]:.0f}°"
+        angles = (degrees_text(mounting.yaw_deg, 0), degrees_text(mounting.pitch_deg), degrees_text(mounting.roll_deg))
+        lens = camera.distortion.model if camera.distortion else "pinhole"
+        seen = f"{coverage.shares[camera.name]:.0%}"
+        rows.append((camera.name, size, fov, *angles, f"{x:.2f}", f"{y:.2f}", f"{z:.2f} m", lens, seen))
     return aligned([header, *rows], left={0, 9})
 
 
