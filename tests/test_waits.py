@@ -34,7 +34,6 @@ ALLOWED = {
     ("synth/workers.py", "connection.recv"): "the connection has something to read, or its process has ended",
     ("robustness/sequences.py", "ThreadPoolExecutor"): "the tasks only compute",
     ("calibration/matches.py", "ThreadPoolExecutor"): "the tasks only compute",
-    ("calibration/heights.py", "ThreadPoolExecutor"): "the tasks only compute",
     ("calibration/road.py", "ThreadPoolExecutor"): "the tasks only compute",
 }
 # Methods that wait: name -> the number of arguments without a limit, and the keywords that limit it.

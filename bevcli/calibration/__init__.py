@@ -1,7 +1,7 @@
 """A calibration that is measured from the drive itself.
 
 The entry point:
-    calibrate            reads a drive, measures, judges; the result is printed, written, or used
+    calibrate            reads a drive, measures, judges; the result is printed, written, used, or turned into findings
 
 In the order of the work:
     views                the frame pairs that are used, and their grey images
@@ -9,19 +9,13 @@ In the order of the work:
     unknowns             what is estimated: one vector, and the geometry that follows from it
     residuals            matched points and road points against that geometry
     solve                robust least squares
-    heights              heights of the cameras, roughly, from the road
-    road                 points of the road in both frames of a pair
+    road                 the road in both frames of a pair: heights of the cameras, roughly, and points
     levels               whether a camera has measured its height from a pavement
-    measure              all of it in rounds
-    observed             the part of the result that the drive shows, with its covariance
+    measure              all of it in rounds, and the part of the result that the drive shows, with its covariance
 
 Outputs:
-    estimates            what is said about each camera and the whole rig
-    result               the corrected rig, and the files
+    estimates            what is said about each camera and the whole rig, with the text for the terminal
+    result               the corrected rig, the drive with it, and the files
     evidence             the images and matches behind it
-    drawings             calibration.png
-    calibration_recording     recording.rrd
-    table                the text for the terminal
-    corrected_drive      the drive with the corrected rig
-    findings             what is found, for `bevcli project-debug`
+    drawings             calibration.png and recording.rrd
 """

@@ -1,20 +1,23 @@
-"""`calibrate`: a drive -> how far its calibration is off, from what its images show between two frames."""
+"""`calibrate`: a drive -> how far its calibration is off, from what its images show between two frames.
 
-from collections.abc import Callable
+`motion_findings`: the same in short, as findings for `bevcli project-debug`.
+"""
+
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
 
-from bevcli.calibration.estimates import CameraEstimate, RigEstimate, Verdict
+from bevcli.calibration.estimates import CameraEstimate, Verdict, change_text, delay_text, either_text
 from bevcli.calibration.evidence import Evidence
 from bevcli.calibration.matches import PointMatches, match_points
-from bevcli.calibration.measure import PARTS, Measurement, measure
-from bevcli.calibration.observed import Observed, observed
+from bevcli.calibration.measure import PARTS, Measurement, measure, observed
 from bevcli.calibration.options import CalibrateOptions
 from bevcli.calibration.residuals import values
 from bevcli.calibration.result import CalibrationResult, corrected_rig
 from bevcli.calibration.views import FEWEST_PAIRS, READING_STEPS, Views, read_views
 from bevcli.errors import InputError
+from bevcli.findings import Finding
 from bevcli.frame import Sequence
 from bevcli.geometry.transforms import Array
 from bevcli.options import gather
@@ -24,6 +27,7 @@ WIDEST_DEG = 0.3  # deviation of a rotation that counts as measured
 FINE = np.array([np.radians(0.2)] * 3 + [0.03, 0.03, 0.015])  # changes that are not worth a correction,
 FINE_DEVIATIONS = 4.0  # or less than this many standard deviations: where few pairs agree by chance, 3.6 were seen
 STEPS = READING_STEPS + 1 + PARTS  # of the work, for progress
+SHORT_PAIRS = 8  # of frames, for findings
 
 
 def calibrate(
@@ -66,19 +70,17 @@ def calibrate(
 
 def judge(drive: Sequence, views: Views, matches: PointMatches, measurement: Measurement) -> CalibrationResult:
     """The result of a measurement: what is observed, with a verdict for each camera."""
-    found, indices = observed(measurement), range(len(views.rig.names))
-    cameras = tuple(_estimate(index, views, matches, measurement, found) for index in indices)
-    rig = corrected_rig(views.stated, cameras)
+    changes, covariances, whole = observed(measurement)
     evidence = Evidence(views, matches, measurement)
-    return CalibrationResult(
-        drive.name, views.stated, rig, cameras, _whole(found), len(views.pairs), drive.facts, evidence
-    )
+    found = enumerate(zip(changes, covariances, strict=True))
+    cameras = tuple(_estimate(index, evidence, *each) for index, each in found)
+    rig = corrected_rig(views.stated, cameras)
+    return CalibrationResult(drive.name, views.stated, rig, cameras, whole, len(views.pairs), drive.facts, evidence)
 
 
-def _estimate(
-    index: int, views: Views, matches: PointMatches, measurement: Measurement, found: Observed
-) -> CameraEstimate:
-    change, covariance = found.changes[index], found.covariances[index]
+def _estimate(index: int, evidence: Evidence, change: Array, covariance: Array) -> CameraEstimate:
+    """The estimate of a camera. change, covariance: of `observed`, (7,) and (7, 7)."""
+    views, matches, measurement = evidence.views, evidence.points, evidence.measurement
     deviations = np.sqrt(np.diag(covariance))
     mine = matches.same & (matches.camera == index)
     count, pairs = int(mine.sum()), len(np.unique(matches.group[mine]))
@@ -87,9 +89,11 @@ def _estimate(
     solution = measurement.solution.x
     before, after = (_residual_px(measurement, index, x) * enlarged for x in (0 * solution, solution))
     road = measurement.unknowns.groups[measurement.road.group, 1] == index
+    fine = np.abs(change[:6]) <= np.maximum(FINE, FINE_DEVIATIONS * deviations[:6])
+    verdict = Verdict.FINE if fine.all() else Verdict.CORRECTED
     return CameraEstimate(
         camera=views.rig.names[index],
-        verdict=Verdict.NOT_MEASURABLE if reason else _verdict(change[:6], deviations[:6]),
+        verdict=Verdict.NOT_MEASURABLE if reason else verdict,
         reason=reason,
         rotation_deg=_yaw_pitch_roll(-np.degrees(change[:3])),
         rotation_deviation_deg=_yaw_pitch_roll(np.degrees(deviations[:3]) * [1, -1, 1]),
@@ -117,11 +121,6 @@ def _reason(matches: int, pairs: int, deviations_deg: Array) -> str:
     return ""
 
 
-def _verdict(change: Array, deviations: Array) -> Verdict:
-    is_fine = np.abs(change) <= np.maximum(FINE, FINE_DEVIATIONS * deviations)
-    return Verdict.FINE if is_fine.all() else Verdict.CORRECTED
-
-
 def _residual_px(measurement: Measurement, index: int, x: Array) -> float:
     """The median residual of a camera's matched points, in pixels of the reduced image."""
     mine = (measurement.unknowns.groups[measurement.points.group, 1:] == index).all(-1)
@@ -139,15 +138,27 @@ def _triple(values: Array) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _whole(found: Observed) -> RigEstimate:
-    scale, along, across = (float(value) for value in found.rig)
-    deviations = [float(value) for value in found.rig_deviations]
-    tilts = (float(np.degrees(along)), float(np.degrees(across)))
-    return RigEstimate(
-        scale,
-        deviations[0],
-        -found.height_m,
-        found.height_deviation_m,
-        tilts,
-        (float(np.degrees(deviations[1])), float(np.degrees(deviations[2]))),
-    )
+def motion_findings(drive: Sequence) -> tuple[Finding, ...]:
+    """Findings about the cameras whose calibration does not fit how the vehicle moves, measured from a few frames."""
+    try:
+        result = calibrate(drive, pairs=SHORT_PAIRS)
+    except InputError as error:
+        return (Finding("motion-not-measured", "info", None, f"the drive does not show its calibration: {error}"),)
+    return findings_of(result.cameras)
+
+
+def findings_of(cameras: Iterable[CameraEstimate]) -> tuple[Finding, ...]:
+    """A finding for each camera that is corrected, and for each whose capture times are off."""
+    found = []
+    for each in cameras:
+        if each.verdict is Verdict.CORRECTED:
+            message, advice = "does not fit how the vehicle moves", "measure it with `bevcli calibrate`"
+            found.append(Finding("calibration-off", "warning", each.camera, message, change_text(each), "", advice))
+        if delay_text(each):
+            late = f"{each.delay_ms:+.0f} ms ± {each.delay_deviation_ms:.0f} ms"
+            message, advice = "its images were taken at another time than stated", "correct its timestamps"
+            found.append(Finding("capture-times-off", "warning", each.camera, message, late, "0 ms", advice))
+        if either_text(each):
+            advice = "choose a part of the drive that turns and drives straight on"
+            found.append(Finding("capture-times-off", "warning", each.camera, either_text(each), "", "", advice))
+    return tuple(found)

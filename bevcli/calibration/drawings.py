@@ -1,22 +1,24 @@
-"""calibration.png: what each camera sees, with the stated and with the measured calibration."""
+"""calibration.png and recording.rrd: what each camera sees, with the stated and with the measured calibration."""
 
 from pathlib import Path
 
 import cv2
 import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
-from numpy.typing import NDArray
 
-from bevcli.calibration.estimates import CameraEstimate, Verdict
+from bevcli.calibration.estimates import CameraEstimate, Verdict, change_text
 from bevcli.calibration.evidence import Evidence, ShownMatches, epipolar_piece
-from bevcli.calibration.table import change_text
-from bevcli.geometry.cameras import Camera
-from bevcli.geometry.transforms import Array
+from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.recording import entities
+from bevcli.recording.layout import Layout
 from bevcli.rig.drawings import FAINT, INK, PAPER, save
 from bevcli.rig.mounting import horizon
-from bevcli.rig.overlay import GROUND, HORIZON, ground_lines, visible_runs
+from bevcli.rig.overlay import GROUND, HORIZON, Pixels, draw_lines, ground_lines, visible_runs
+from bevcli.rig.rig_recording import Lines, camera_views, log_image, log_lines, log_pose, rig_recording, rig_view
 
 ROW_INCHES, WIDTH_INCHES = 2.9, 15.0
 POINT, LINE = (255, 120, 90), (110, 200, 255)  # RGB
@@ -26,7 +28,7 @@ HEADINGS = (
     "measured: ground grid (green), horizon (yellow)",
     "stated minus measured, 3 deviations",
 )
-Pixels = NDArray[np.uint8]
+TABLE = "calibration"  # in the recording
 
 
 def write_sheet(path: Path, evidence: Evidence, cameras: tuple[CameraEstimate, ...]) -> None:
@@ -54,21 +56,15 @@ def _title(estimate: CameraEstimate) -> str:
 
 def _draw_image(axes: Axes, grey: Pixels | None, camera: Camera, matches: ShownMatches) -> None:
     """The image with the ground grid and the horizon, matched points, and pieces of their epipolar lines."""
-    axes.set_xticks([])
-    axes.set_yticks([])
+    axes.set(xticks=[], yticks=[])
     blank = np.full((camera.height, camera.width), 40, dtype=np.uint8)
     canvas = np.repeat((blank if grey is None else grey)[..., None], 3, axis=-1)
-    _lines(canvas, ground_lines(camera), GROUND, 1)
-    _lines(canvas, visible_runs(horizon(camera)), HORIZON, 2)
+    draw_lines(canvas, ground_lines(camera), GROUND, 1)
+    draw_lines(canvas, visible_runs(horizon(camera)), HORIZON, 2)
     for point, ray in zip(matches.pixels_b, matches.rays_a, strict=True):
-        _lines(canvas, epipolar_piece(camera, matches.camera_b_from_camera_a, ray, point), LINE, 2)
+        draw_lines(canvas, epipolar_piece(camera, matches.camera_b_from_camera_a, ray, point), LINE, 2)
         cv2.circle(canvas, (round(point[0]), round(point[1])), 4, POINT, -1, cv2.LINE_AA)
     axes.imshow(canvas)
-
-
-def _lines(canvas: NDArray[np.uint8], lines: list[Array], color: tuple[int, int, int], thickness: int) -> None:
-    points = [np.round(line * 16).astype(np.int32) for line in lines]
-    cv2.polylines(canvas, points, False, color, thickness, cv2.LINE_AA, 4)
 
 
 def _draw_ellipse(axes: Axes, estimate: CameraEstimate) -> None:
@@ -83,9 +79,61 @@ def _draw_ellipse(axes: Axes, estimate: CameraEstimate) -> None:
     axes.plot([0, yaw], [0, pitch], color=INK, linewidth=1)
     axes.plot([0], [0], "+", color=INK)
     reach = 1.2 * max(abs(yaw), abs(pitch), width, height, 0.3)
-    axes.set_xlim(-reach, reach)
-    axes.set_ylim(-reach, reach)
+    axes.set(xlim=(-reach, reach), ylim=(-reach, reach))
     axes.set_xlabel("yaw, degrees", color=FAINT, fontsize=8, labelpad=1)
     axes.set_ylabel("pitch, degrees", color=FAINT, fontsize=8, labelpad=1)
     axes.tick_params(colors=FAINT, labelsize=7)
     axes.grid(color=FAINT, alpha=0.25)
+
+
+def write_calibration_recording(path: Path, evidence: Evidence, table: str) -> None:
+    """Write the recording: frame 0 shows the stated calibration, frame 1 the measured one. Raises OutputError.
+
+    table: the text of the result.
+    """
+    rig = evidence.views.rig
+    with rig_recording(path, "bevcli-calibrate", rig, _layout(rig)) as stream:
+        text = rr.TextDocument(f"```\n{table}\n```", media_type="text/markdown")
+        stream.log(TABLE, text, static=True)
+        for index in range(len(rig.cameras)):
+            _log_image(stream, evidence, index)
+        for step in (0, 1):
+            stream.set_time(entities.FRAME_TIMELINE, sequence=step)
+            for index in range(len(rig.cameras)):
+                _log_camera(stream, evidence, index, measured=step == 1)
+
+
+def _log_image(stream: rr.RecordingStream, evidence: Evidence, index: int) -> None:
+    """What both calibrations share: the image and its matched points."""
+    name, pixels = evidence.views.rig.names[index], evidence.image(index)
+    if pixels is None:
+        return
+    log_image(stream, name, pixels)
+    points = evidence.matches(index, measured=True).pixels_b
+    dots = rr.Points2D(points, colors=POINT, radii=rr.Radius.ui_points(2.5), draw_order=30)
+    stream.log(entities.overlay(name, "matches"), dots, static=True)
+
+
+def _log_camera(stream: rr.RecordingStream, evidence: Evidence, index: int, *, measured: bool) -> None:
+    """Pose, epipolar lines, ground grid and horizon by one of the two calibrations."""
+    camera, matches = evidence.camera(index, measured=measured), evidence.matches(index, measured=measured)
+    log_pose(stream, camera, static=False)
+    motion = matches.camera_b_from_camera_a
+    pieces = [
+        piece
+        for ray, point in zip(matches.rays_a, matches.pixels_b, strict=True)
+        for piece in epipolar_piece(camera, motion, ray, point)
+    ]
+    lines: dict[str, Lines] = {
+        "epipolar_lines": (pieces, LINE, 1.2),
+        "ground_grid": (ground_lines(camera), GROUND, 0.6),
+        "horizon": (visible_runs(horizon(camera)), HORIZON, 1.0),
+    }
+    log_lines(stream, camera, lines, static=False)
+
+
+def _layout(rig: CameraRig) -> Layout:
+    scene = rig_view(rig, ("matches", "epipolar_lines", "ground_grid", "horizon"))
+    middle = rrb.Horizontal(scene, rrb.TextDocumentView(origin=TABLE, name="Calibration"), column_shares=[2, 5])
+    rows = camera_views(rig)
+    return Layout(rrb.Vertical(*rows[:1], middle, *rows[1:]), rrb.TimePanel(state="collapsed"))

@@ -29,13 +29,7 @@ DIFFERENCE_M = 1e-5  # for derivatives
 def level_corrections(unknowns: Unknowns, road: RoadResiduals, ties: EpipolarResiduals, x: Array) -> Array:
     """(P,) corrections of x (P,): of the positions of cameras on another level than their neighbours; 0 for most.
 
-    Cameras that see the road stay.
-
-    Args:
-        unknowns: the unknowns.
-        road: points of the road.
-        ties: points that two cameras share.
-        x: the present values.
+    Cameras that see the road stay. ties: points that two cameras share.
     """
     corrected, stays = x.copy(), sees_road(unknowns, road, ties, x)
     ties = ties.where(np.abs(values(unknowns, ties, x)[:, 0]) < MOST_PX)
@@ -103,20 +97,16 @@ def _best(unknowns: Unknowns, ties: EpipolarResiduals, x: Array, cameras: Indice
     mine = ties.where(np.asarray(np.isin(unknowns.groups[ties.group, 1:], cameras).any(-1)))
     columns = (OF_CAMERA * cameras[:, None] + POSITION).ravel()
     heights = OF_CAMERA * cameras + HEIGHT
-    before = _fitting(unknowns, mine, x)
+    before = _fits(unknowns, mine, x).sum()
     best, gain = x, 0.0
     for start in STARTS_M:
         moved = x.copy()
         moved[heights] += start
         moved = _positioned(unknowns, mine, moved, columns)
-        more = _fitting(unknowns, mine, moved) - (1 + LEAST_SHARE) * before - LEAST_GAIN
+        more = _fits(unknowns, mine, moved).sum() - (1 + LEAST_SHARE) * before - LEAST_GAIN
         if more > gain and np.abs(moved[heights] - x[heights]).min() >= LEAST_STEP_M:
             best, gain = moved, more
     return gain, best
-
-
-def _fitting(unknowns: Unknowns, ties: EpipolarResiduals, x: Array) -> int:
-    return int(_fits(unknowns, ties, x).sum())
 
 
 def _fits(unknowns: Unknowns, ties: EpipolarResiduals, x: Array) -> NDArray[np.bool_]:

@@ -1,18 +1,18 @@
-"""The measurement: rounds of rotations from points, heights from the road, and both together."""
+"""The measurement: rounds of rotations from points, heights from the road, and both together; what the drive shows."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bevcli.calibration.heights import search_heights
+from bevcli.calibration.estimates import RigEstimate
 from bevcli.calibration.levels import level_corrections, sees_road
 from bevcli.calibration.matches import PointMatches
 from bevcli.calibration.options import CalibrateOptions
 from bevcli.calibration.residuals import EpipolarResiduals, RoadResiduals, epipolar_residuals, values
-from bevcli.calibration.road import road_residuals
+from bevcli.calibration.road import road_residuals, search_heights
 from bevcli.calibration.solve import Solution, Term, solve, spread
-from bevcli.calibration.unknowns import HEIGHT, OF_CAMERA, OF_PAIR, Unknowns
+from bevcli.calibration.unknowns import HEIGHT, OF_CAMERA, OF_PAIR, OF_RIG, Unknowns
 from bevcli.calibration.views import Views
 from bevcli.geometry.transforms import Array
 
@@ -24,6 +24,9 @@ SMALLEST_TURN = np.radians(0.005)  # of it
 KERB_M = 0.09  # less than from the road to a pavement
 FLOWS_PX = (12.0, 8.0)  # largest distance of road points from where they are expected, round by round
 PARTS = 2 + 2 * len(FLOWS_PX)  # of the work, for progress
+LEAST_INFORMATION = 3.0  # of a direction, in that of the stated value: the deviation is then halved at least
+LEAST_FACTOR = 0.5  # of variances, by which the agreement of the pairs may make them smaller
+FINEST = np.array([np.radians(0.01)] * 3 + [0.001] * 3 + [0.001])  # errors of lens and images: radians, metres, seconds
 
 
 @dataclass(frozen=True)
@@ -90,9 +93,9 @@ def consistent(unknowns: Unknowns, points: EpipolarResiduals, x: Array) -> Epipo
     Repeated texture gives pairs whose matches fit a motion, but not that of the vehicle.
     """
     fits = np.abs(values(unknowns, points, x)[:, 0]) < CONSISTENT_PX
-    shares = np.bincount(points.group[fits], minlength=len(unknowns.groups)) / np.maximum(
-        np.bincount(points.group, minlength=len(unknowns.groups)), 1
-    )
+    count = len(unknowns.groups)
+    fitting, found = (np.bincount(each, minlength=count) for each in (points.group[fits], points.group))
+    shares = fitting / np.maximum(found, 1)
     return points.where(fits & (shares[points.group] >= CONSISTENT_SHARE))
 
 
@@ -110,3 +113,54 @@ def with_learned_turns(unknowns: Unknowns, solution: Solution) -> Unknowns:
     learned = np.maximum(np.sqrt(squares / np.maximum(determined, 1)), SMALLEST_TURN)
     deviations[turns] = np.minimum(deviations[turns], np.tile(learned, unknowns.pairs))
     return replace(unknowns, deviations=deviations)
+
+
+def observed(measurement: Measurement) -> tuple[Array, Array, RigEstimate]:
+    """The changes along directions that the drive shows, with their covariance; all else stays as it is stated.
+
+    Returns:
+        (C, 7) rotation, radians in the camera frame; position, metres in the ego frame; delay, seconds.
+        (C, 7, 7) covariances of them; a direction that is not observed has the deviation of the stated value.
+        The whole rig.
+    """
+    unknowns, solution = measurement.unknowns, measurement.solution
+    deviations, count = unknowns.deviations, OF_CAMERA * unknowns.cameras
+    covariance = _honest(unknowns, solution)
+    scale = deviations[:count]
+    marginal = np.linalg.inv(covariance[:count, :count] / np.outer(scale, scale)) - np.eye(count)
+    sizes, axes = np.linalg.eigh((marginal + marginal.T) / 2)
+    seen, unseen = axes[:, sizes >= LEAST_INFORMATION], axes[:, sizes < LEAST_INFORMATION]
+    change = scale * (seen @ (seen.T @ (solution.x[:count] / scale)))
+    within = seen @ np.diag(1 / (1 + sizes[sizes >= LEAST_INFORMATION])) @ seen.T + unseen @ unseen.T
+    whole = np.outer(scale, scale) * within + np.diag(np.tile(FINEST, unknowns.cameras) ** 2)
+    blocks = whole.reshape(unknowns.cameras, OF_CAMERA, unknowns.cameras, OF_CAMERA)
+    changes = unknowns.of_camera(change)
+    of_rig, of_rig_deviations = solution.x[-OF_RIG:], np.sqrt(np.diag(covariance)[-OF_RIG:])
+    (along, across), (along_deviation, across_deviation) = np.degrees([of_rig[1:], of_rig_deviations[1:]]).tolist()
+    rig = RigEstimate(
+        scale=float(of_rig[0]),
+        scale_deviation=float(of_rig_deviations[0]),
+        height_m=-float(changes[:, HEIGHT].mean()),
+        height_deviation_m=float(np.sqrt(blocks[:, HEIGHT, :, HEIGHT].sum()) / unknowns.cameras),
+        tilt_deg=(along, across),
+        tilt_deviation_deg=(along_deviation, across_deviation),
+    )
+    return changes, np.stack([blocks[c, :, c] for c in range(unknowns.cameras)]), rig
+
+
+def _honest(unknowns: Unknowns, solution: Solution) -> Array:
+    """The covariance (P, P), each unknown scaled by how well the frame pairs agree about it: the jackknife.
+
+    The result without a pair differs by what that pair pulls. So an unknown that a single pair tells is not believed,
+    however small its residuals are.
+    """
+    prior = np.diag(1 / unknowns.deviations**2)
+    matrix = solution.information + prior
+    covariance: Array = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+    pulls = []
+    for pair in range(unknowns.pairs):
+        groups = unknowns.groups[:, 0] == pair
+        pulls.append(np.linalg.solve(matrix - solution.information_of(groups), solution.gradient_of(groups)))
+    agreed = (np.square(pulls).sum(0) + np.diag(covariance @ prior @ covariance)) / np.diag(covariance)
+    factor = np.sqrt(np.maximum(agreed, LEAST_FACTOR))
+    return covariance * np.outer(factor, factor)

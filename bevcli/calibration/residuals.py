@@ -1,7 +1,8 @@
 """What is measured against what the unknowns predict: matched points, and points of the road."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
-from typing import Protocol
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,42 +16,40 @@ STEP = 1e-6  # of an unknown, for derivatives
 SHORTEST = 1e-9
 
 
-class Residuals(Protocol):
+@dataclass(frozen=True)
+class Residuals(ABC):
     """Measured points of groups, sorted by group.
 
     Attributes:
         group: (N,) the group of each.
-    """
-
-    @property
-    def group(self) -> Indices: ...
-
-    def of(self, geometry: GroupGeometry) -> Array:
-        """(N, D) residuals in pixels of the reduced images, for the geometry of all groups."""
-        ...
-
-
-@dataclass(frozen=True)
-class EpipolarResiduals:
-    """The distance of matched points from each other's epipolar lines: the angle between ray and epipolar plane.
-
-    This is Sampson's distance for rays, so that it holds for fisheyes too.
-
-    Attributes:
-        group: (N,).
         rays_a: (N, 3) unit directions in the camera frame of the first image.
-        rays_b: (N, 3) in that of the second one.
-        focal: (N,) pixels.
+        rays_b: (N, 3) of the same points in that of the second one.
     """
 
     group: Indices
     rays_a: Array
     rays_b: Array
-    focal: Array
 
-    def where(self, kept: NDArray[np.bool_]) -> "EpipolarResiduals":
+    def where(self, kept: NDArray[np.bool_]) -> Self:
         """Some of the points, by a mask (N,)."""
-        return EpipolarResiduals(*(getattr(self, field.name)[kept] for field in fields(self)))
+        return type(self)(*(getattr(self, field.name)[kept] for field in fields(self)))
+
+    @abstractmethod
+    def of(self, geometry: GroupGeometry) -> Array:
+        """(N, D) residuals in pixels of the reduced images, for the geometry of all groups."""
+
+
+@dataclass(frozen=True)
+class EpipolarResiduals(Residuals):
+    """The distance of matched points from each other's epipolar lines: the angle between ray and epipolar plane.
+
+    This is Sampson's distance for rays, so that it holds for fisheyes too.
+
+    Attributes:
+        focal: (N,) pixels.
+    """
+
+    focal: Array
 
     def of(self, geometry: GroupGeometry) -> Array:
         """(N, 1) pixels."""
@@ -74,27 +73,17 @@ class EpipolarResiduals:
 
 
 @dataclass(frozen=True)
-class RoadResiduals:
+class RoadResiduals(Residuals):
     """The distance of road points from where they would be on a flat road.
 
     Attributes:
-        group: (N,).
-        rays_a: (N, 3) unit directions in the camera frame of the first image.
-        rays_b: (N, 3) of the same points, found in the second image.
         weights: (N, 2, 3) from an error of a ray in the second image to pixels of the first one, less where the image
             shows no contrast along an axis.
         beside_m: (N,) distance of the points from the way of the vehicle.
     """
 
-    group: Indices
-    rays_a: Array
-    rays_b: Array
     weights: Array
     beside_m: Array
-
-    def where(self, kept: NDArray[np.bool_]) -> "RoadResiduals":
-        """Some of the points, by a mask (N,)."""
-        return RoadResiduals(*(getattr(self, field.name)[kept] for field in fields(self)))
 
     def of(self, geometry: GroupGeometry) -> Array:
         """(N, 2) pixels."""

@@ -1,4 +1,4 @@
-"""CalibrationResult: the estimates, the corrected rig, and the files."""
+"""CalibrationResult: the estimates, the corrected rig, the drive with it, and the files."""
 
 import json
 from collections.abc import Sequence as Items
@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from bevcli.calibration.estimates import CameraEstimate, RigEstimate, Verdict
+from bevcli.calibration.estimates import CameraEstimate, RigEstimate, Verdict, rig_text, table
 from bevcli.calibration.evidence import Evidence
-from bevcli.calibration.table import rig_text, table
 from bevcli.calibration.unknowns import moved
-from bevcli.frame import DriveFacts
+from bevcli.frame import DerivedSequence, DriveFacts, Frame, Sequence
 from bevcli.geometry.cameras import CameraRig
 from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.writing import write_whole
@@ -70,8 +69,7 @@ class CalibrationResult:
         Returns their paths. The folder is made where it is missing; existing files are overwritten. Raises OutputError.
         """
         # Only writing draws: matplotlib and rerun take a second to load.
-        from bevcli.calibration.calibration_recording import write_calibration_recording
-        from bevcli.calibration.drawings import write_sheet
+        from bevcli.calibration.drawings import write_calibration_recording, write_sheet
 
         folder = Path(folder)
         paths = [folder / name for name in ("calibration.json", "report.json", "calibration.png", "recording.rrd")]
@@ -84,15 +82,22 @@ class CalibrationResult:
 
 def corrected_rig(rig: CameraRig, cameras: Items[CameraEstimate]) -> CameraRig:
     """The rig with the changes of the cameras whose verdict is "corrected"."""
-    poses = moved(
-        np.stack([camera.ego_from_camera for camera in rig.cameras]),
-        np.stack([each.change * (each.verdict is Verdict.CORRECTED) for each in cameras]),
+    stated, changes = [camera.ego_from_camera for camera in rig.cameras], [each.change for each in cameras]
+    poses = moved(np.stack(stated), np.stack(changes))
+    corrected = (
+        replace(camera, ego_from_camera=pose) if each.verdict is Verdict.CORRECTED else camera
+        for camera, pose, each in zip(rig.cameras, poses, cameras, strict=True)
     )
-    kept = [each.verdict is not Verdict.CORRECTED for each in cameras]
-    return replace(
-        rig,
-        cameras=tuple(
-            camera if keep else replace(camera, ego_from_camera=pose)
-            for camera, pose, keep in zip(rig.cameras, poses, kept, strict=True)
-        ),
-    )
+    return replace(rig, cameras=tuple(corrected))
+
+
+class CorrectedDrive(DerivedSequence):
+    """The drive of a calibration, with its corrected rig in every frame."""
+
+    def __init__(self, sequence: Sequence, result: CalibrationResult) -> None:
+        super().__init__(sequence)
+        self.rig = result.rig
+
+    def load(self, place: int) -> Frame:
+        """The frame at a place, with the corrected rig."""
+        return replace(self.sequence.load(place), rig=self.rig)

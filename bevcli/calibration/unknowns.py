@@ -49,13 +49,9 @@ class Unknowns:
         rotation, tilt = np.radians(options.rotation_deg), np.radians(options.tilt_deg)
         camera_deviations = [rotation] * 3 + [options.position_m] * 3 + [options.delay_ms / 1000]
         cameras = len(views.rig.cameras)
-        deviations = np.concatenate(
-            [
-                np.tile(camera_deviations, cameras),
-                np.full(OF_PAIR * len(views.pairs), np.radians(options.turn_deg)),
-                [options.scale, tilt, tilt],
-            ]
-        )
+        of_cameras = np.tile(camera_deviations, cameras)
+        of_pairs = np.full(OF_PAIR * len(views.pairs), np.radians(options.turn_deg))
+        deviations = np.concatenate([of_cameras, of_pairs, [options.scale, tilt, tilt]])
         stated = np.stack([camera.ego_from_camera for camera in views.rig.cameras])
         return Unknowns(stated, poses, np.array(groups), len(views.pairs), deviations)
 

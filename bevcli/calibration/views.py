@@ -34,13 +34,11 @@ class View:
     Attributes:
         pixels: (h, w) uint8, grey, at most WIDTH wide.
         texture: (h, w) uint8, their fine structure with about the same contrast everywhere, without light and shade.
-        timestamp_ns: when it was taken.
-        poses: (25, 4, 4) world_from_ego at its time and each of DELAYS_S later.
+        poses: (25, 4, 4) world_from_ego at the time when it was taken and each of DELAYS_S later.
     """
 
     pixels: NDArray[np.uint8]
     texture: NDArray[np.uint8]
-    timestamp_ns: int
     poses: Array
 
 
@@ -176,8 +174,7 @@ def _view(frame: Frame, camera: Camera, motion: EgoMotion | None) -> View | None
     pixels = cv2.resize(grey, size, interpolation=filtering) if grey.shape[::-1] != size else grey
     if pixels.std() < DARKEST:
         return None
-    poses = _poses(frame, camera.name, motion)
-    return View(np.asarray(pixels, dtype=np.uint8), _texture(pixels), image.timestamp_ns, poses)
+    return View(np.asarray(pixels, dtype=np.uint8), _texture(pixels), _poses(frame, camera.name, motion))
 
 
 def _texture(pixels: NDArray[Any]) -> NDArray[np.uint8]:

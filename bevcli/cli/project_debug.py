@@ -66,7 +66,7 @@ def _with_motion(
     check: "CalibrationCheck", path: Path, allow_outside: bool, given: dict[str, Any]
 ) -> "CalibrationCheck":
     """The check with the findings of a calibration from motion, where `path` is a drive with ego-motion."""
-    from bevcli.calibration.findings import motion_findings
+    from bevcli.calibration.calibrate import motion_findings
     from bevcli.errors import InputError
     from bevcli.rig.rig_report import with_findings
     from bevcli.sequences.open import open_sequence

@@ -100,8 +100,8 @@ def run(
 def _calibrated(drive: "Sequence") -> "Sequence":
     """The drive with the rig that it shows; what is corrected is printed."""
     from bevcli.calibration.calibrate import STEPS, calibrate
-    from bevcli.calibration.corrected_drive import CorrectedDrive
-    from bevcli.calibration.table import change_text
+    from bevcli.calibration.estimates import change_text
+    from bevcli.calibration.result import CorrectedDrive
     from bevcli.cli.progress import Progress
 
     with Progress(STEPS, "steps of the calibration") as progress:

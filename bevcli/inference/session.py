@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from bevcli.errors import InputError
 from bevcli.frame import CameraImage, DriveFacts, Frame, FrameStamp, Prediction
 from bevcli.geometry.cameras import Camera, CameraRig
-from bevcli.geometry.ego_motion import Kinematics
-from bevcli.geometry.recent_poses import RecentPoses
+from bevcli.geometry.ego_motion import Kinematics, RecentPoses
 from bevcli.geometry.transforms import Pose
 from bevcli.inference.commands import one_command, read_commands
 from bevcli.inference.in_engine import in_engine

@@ -114,14 +114,11 @@ def _draw_camera(
     if image is not None and image.shape[:2] != (camera.height, camera.width):
         image = cv2.resize(image, (camera.width, camera.height)).astype(np.uint8)
     axes.imshow(draw_overlay(camera, rig.ego_from_bev, image, IMAGE_WIDTH))
-    axes.set_xticks([])
-    axes.set_yticks([])
+    axes.set(xticks=[], yticks=[])
     mounting = mounting_of(camera.ego_from_camera)
     mine = [finding for finding in report.findings if finding.camera == camera.name]
     color = SEVERITY_COLORS[mine[0].severity] if mine else FAINT
-    for spine in axes.spines.values():
-        spine.set_color(color)
-        spine.set_linewidth(2.5 if mine else 0.8)
+    axes.spines[:].set(color=color, linewidth=2.5 if mine else 0.8)
     axes.set_title(camera.name, loc="left", color=INK, fontsize=11)
     details = f"yaw {degrees_text(mounting.yaw_deg, 0)}  pitch {degrees_text(mounting.pitch_deg)}  "
     details += f"roll {degrees_text(mounting.roll_deg)}  height {mounting.height:.2f} m  "
@@ -156,14 +153,10 @@ def _write_findings(axes: Axes, height: float, findings: Sequence[Finding]) -> N
 def _write_legend(axes: Axes) -> None:
     axes.axis("off")
     axes.text(0.1, 1.0, "Legend", color=INK, fontsize=13, va="top", transform=axes.transAxes)
-    heights = PILLAR_GRID.pillar_heights()
-    colors = [tuple(color / 255) for color in height_colors()]
-    dots = [
-        Line2D(
-            [], [], color=color, marker="o", linestyle="none", label=f"pillar point {height:+.1f} m in the bev frame"
-        )
-        for color, height in zip(colors[::-1], heights[::-1], strict=True)
-    ]
+    texts = [f"pillar point {height:+.1f} m in the bev frame" for height in PILLAR_GRID.pillar_heights()[::-1]]
+    colors = [tuple(color / 255) for color in height_colors()[::-1]]
+    style: dict[str, Any] = {"marker": "o", "linestyle": "none"}
+    dots = [Line2D([], [], color=color, label=text, **style) for color, text in zip(colors, texts, strict=True)]
     lines = [
         Line2D([], [], color=tuple(np.array(HORIZON) / 255), label="horizon: infinitely far, at the camera's height"),
         Line2D([], [], color=tuple(np.array(GROUND) / 255), label="ground grid of 5 m: should lie on the road"),
@@ -192,13 +185,11 @@ def draw_coverage(axes: Axes, rig: CameraRig, coverage: Coverage) -> None:
     _draw_vehicle(axes, rig)
     for camera in rig.cameras:
         _draw_field_of_view(axes, camera, rig)
-    axes.set_xlim(*grid.x_range_m)
-    axes.set_ylim(*grid.y_range_m)
+    axes.set(xlim=grid.x_range_m, ylim=grid.y_range_m)
     axes.set_xlabel("x of the bev frame, m", color=FAINT, fontsize=9, labelpad=2)
     axes.set_ylabel("y of the bev frame, m", color=FAINT, fontsize=9, labelpad=1)
     axes.tick_params(colors=FAINT, labelsize=8)
-    for spine in axes.spines.values():
-        spine.set_color(FAINT)
+    axes.spines[:].set_color(FAINT)
 
 
 def save(figure: Figure, path: Path) -> None:

@@ -96,17 +96,23 @@ def draw_overlay(camera: Camera, ego_from_bev: Array, image_bgr: Pixels | None, 
     else:
         resized = cv2.resize(image_bgr, (shown.width, shown.height), interpolation=cv2.INTER_AREA)
         canvas = (resized[..., ::-1] * 0.85).astype(np.uint8)  # a little darker, so that the overlay stands out
-    _draw_lines(canvas, ground_lines(shown), GROUND, 0.55)
-    _draw_lines(canvas, visible_runs(horizon(shown)), HORIZON, 0.9, thickness=2)
-    _draw_lines(canvas, pillar_lines(shown, ego_from_bev), PILLAR, 0.35)
+    _blend_lines(canvas, ground_lines(shown), GROUND, 0.55)
+    _blend_lines(canvas, visible_runs(horizon(shown)), HORIZON, 0.9, thickness=2)
+    _blend_lines(canvas, pillar_lines(shown, ego_from_bev), PILLAR, 0.35)
     _draw_pillars(canvas, pillars_in(shown, ego_from_bev))
     _draw_distances(canvas, shown)
     return canvas
 
 
-def _draw_lines(canvas: Pixels, lines: list[Array], color: Color, opacity: float, thickness: int = 1) -> None:
-    layer, points = canvas.copy(), [np.round(line * 16).astype(np.int32) for line in lines]
-    cv2.polylines(layer, points, False, color, thickness, cv2.LINE_AA, 4)
+def draw_lines(canvas: Pixels, lines: list[Array], color: Color, thickness: int) -> None:
+    """Draw lines (P, 2) in pixels on an image (H, W, 3), in place."""
+    points = [np.round(line * 16).astype(np.int32) for line in lines]
+    cv2.polylines(canvas, points, False, color, thickness, cv2.LINE_AA, 4)
+
+
+def _blend_lines(canvas: Pixels, lines: list[Array], color: Color, opacity: float, thickness: int = 1) -> None:
+    layer = canvas.copy()
+    draw_lines(layer, lines, color, thickness)
     cv2.addWeighted(layer, opacity, canvas, 1 - opacity, 0, dst=canvas)
 
 

@@ -118,7 +118,7 @@ def report_text(name: str, rig: CameraRig, report: RigReport) -> str:
     if report.measures:
         rows = [("compared with nuScenes", "this rig", "nuScenes", "")]
         rows += [(m.name, m.value, m.reference, "" if m.is_near else "far") for m in report.measures]
-        parts += ["", *_table(rows, left={0, 3})]
+        parts += ["", *aligned(rows, left={0, 3})]
     return "\n".join(parts)
 
 
@@ -128,22 +128,12 @@ def _rig_lines(rig: CameraRig, coverage: Coverage) -> list[str]:
     for camera in rig.cameras:
         mounting = mounting_of(camera.ego_from_camera)
         x, y, z = mounting.position
-        rows.append(
-            (
-                camera.name,
-                f"{camera.width}x{camera.height}",
-                f"{seen_fov_deg(camera)[0]:.0f}°",
-                degrees_text(mounting.yaw_deg, 0),
-                degrees_text(mounting.pitch_deg),
-                degrees_text(mounting.roll_deg),
-                f"{x:.2f}",
-                f"{y:.2f}",
-                f"{z:.2f} m",
-                camera.distortion.model if camera.distortion else "pinhole",
-                f"{coverage.shares[camera.name]:.0%}",
-            )
-        )
-    return _table([header, *rows], left={0, 9})
+        size, fov = f"{camera.width}x{camera.height}", f"{seen_fov_deg(camera)[0]:.0f}°"
+        angles = (degrees_text(mounting.yaw_deg, 0), degrees_text(mounting.pitch_deg), degrees_text(mounting.roll_deg))
+        lens = camera.distortion.model if camera.distortion else "pinhole"
+        seen = f"{coverage.shares[camera.name]:.0%}"
+        rows.append((camera.name, size, fov, *angles, f"{x:.2f}", f"{y:.2f}", f"{z:.2f} m", lens, seen))
+    return aligned([header, *rows], left={0, 9})
 
 
 def _finding_lines(findings: Sequence[Finding]) -> list[str]:
@@ -164,7 +154,7 @@ def _finding_lines(findings: Sequence[Finding]) -> list[str]:
     return lines
 
 
-def _table(rows: Sequence[Sequence[str]], left: set[int]) -> list[str]:
+def aligned(rows: Sequence[Sequence[str]], left: set[int]) -> list[str]:
     """Rows as aligned columns. left: indices of the columns that are aligned to the left, all others to the right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [

@@ -1,7 +1,7 @@
 """Checks of a sequence: ego-motion (units, jumps, axes) and the timestamps of the cameras' images."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -66,7 +66,7 @@ class _Drive:
 
 def check_ego_motion(ego_motion: EgoMotion) -> tuple[Finding, ...]:
     """Findings about the poses of one scene, or else about its stated velocities; none for a single row."""
-    drive = _drive(ego_motion, ego_motion.translations, ego_motion.quaternions)
+    drive = _drive(ego_motion)
     if len(drive.steps) == 0:
         return ()
     cause = None if drive.is_plausible() else _mistake(drive, ego_motion) or _units(drive)
@@ -99,10 +99,9 @@ def _split_by_scene(ego_motion: EgoMotion, stamps: Sequence[FrameStamp]) -> list
     return [ego_motion.of_rows(part) for part in rows if len(part) > 1]
 
 
-def _drive(ego_motion: EgoMotion, translations: Array, quaternions: Array) -> _Drive:
-    rotations = np.stack([rotation_from_quaternion(quaternion) for quaternion in quaternions])
-    seconds = np.diff(ego_motion.timestamps_ns) / 1e9
-    return _Drive(rotations, np.diff(translations, axis=0), seconds)
+def _drive(ego_motion: EgoMotion) -> _Drive:
+    rotations = np.stack([rotation_from_quaternion(quaternion) for quaternion in ego_motion.quaternions])
+    return _Drive(rotations, np.diff(ego_motion.translations, axis=0), np.diff(ego_motion.timestamps_ns) / 1e9)
 
 
 def _units(drive: _Drive) -> Finding | None:
@@ -130,8 +129,16 @@ def _jump(drive: _Drive, ego_motion: EgoMotion) -> Finding | None:
 
 def _mistake(drive: _Drive, ego_motion: EgoMotion) -> Finding | None:
     """The common mistake whose undoing gives a plausible drive."""
-    for code, message, advice, undone in _undone(ego_motion):
-        if undone.is_plausible():
+    quaternions = ego_motion.quaternions
+    inverted = -np.einsum("tji,tj->ti", drive.rotations, ego_motion.translations)
+    order = ("ego-quaternion-order", "the quaternions are not in the order w, x, y, z", "put qw first")
+    for (code, message, advice), undone in (
+        (order, replace(ego_motion, quaternions=np.roll(quaternions, 1, axis=1))),
+        (order, replace(ego_motion, quaternions=np.roll(quaternions, -1, axis=1))),
+        (("ego-inverted", "the poses are ego_from_world, the inverse", "invert them"),
+         replace(ego_motion, translations=inverted, quaternions=quaternions * [1, -1, -1, -1])),
+    ):  # fmt: skip
+        if _drive(undone).is_plausible():
             return _error(code, message, _motion_text(drive), "level, driving forward", advice)
     return None
 
@@ -161,21 +168,6 @@ def _motion_text(drive: _Drive) -> str:
         return tilt
     middle = float(np.degrees(np.angle(np.exp(1j * np.radians(headings)).mean())))
     return f"moves {middle:.0f}° from forward over {drive.distance_m():.0f} m, {tilt}"
-
-
-def _undone(ego_motion: EgoMotion) -> list[tuple[str, str, str, _Drive]]:
-    """Code, message, advice and corrected drive of each common mistake."""
-    translations, quaternions = ego_motion.translations, ego_motion.quaternions
-    conjugated = quaternions * [1, -1, -1, -1]
-    turned = np.stack([rotation_from_quaternion(q) for q in quaternions])
-    inverted = -np.einsum("tji,tj->ti", turned, translations)
-    order, advice = "the quaternions are not in the order w, x, y, z", "put qw first"
-    return [
-        ("ego-quaternion-order", order, advice, _drive(ego_motion, translations, np.roll(quaternions, 1, axis=1))),
-        ("ego-quaternion-order", order, advice, _drive(ego_motion, translations, np.roll(quaternions, -1, axis=1))),
-        ("ego-inverted", "the poses are ego_from_world, the inverse", "invert them",
-         _drive(ego_motion, inverted, conjugated)),
-    ]  # fmt: skip
 
 
 def _stated_speed(drive: _Drive, ego_motion: EgoMotion) -> Finding | None:

@@ -14,12 +14,11 @@ import cv2
 import numpy as np
 
 from bevcli.calibration.calibrate import judge
-from bevcli.calibration.estimates import CameraEstimate, Verdict
+from bevcli.calibration.estimates import CameraEstimate, Verdict, delay_text
 from bevcli.calibration.matches import match_points
 from bevcli.calibration.measure import measure
 from bevcli.calibration.options import CalibrateOptions
 from bevcli.calibration.result import CalibrationResult
-from bevcli.calibration.table import delay_text
 from bevcli.calibration.views import Views, read_views
 from bevcli.frame import DerivedSequence, Frame, Sequence
 from bevcli.geometry.cameras import Camera

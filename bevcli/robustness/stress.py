@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from bevcli.calibration.calibrate import calibrate
-from bevcli.calibration.corrected_drive import CorrectedDrive
+from bevcli.calibration.result import CorrectedDrive
 from bevcli.errors import InputError, OutputError
 from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import evaluate_detections

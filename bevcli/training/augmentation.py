@@ -14,21 +14,8 @@ from torch import Tensor
 from bevcli.frame import CameraImage, Frame
 from bevcli.geometry.cameras import Camera, CameraRig, camera_pose_noise
 from bevcli.geometry.transforms import Array
-from bevcli.synth.corruptions import (
-    BRIGHTNESS,
-    FOG,
-    LOW_LIGHT,
-    MOTION_BLUR,
-    SNOW,
-    ImageCorruption,
-    Pixels,
-    brightness,
-    color_quantisation,
-    fog,
-    low_light,
-    motion_blur,
-    snow,
-)
+from bevcli.synth import corruptions
+from bevcli.synth.corruptions import ImageCorruption, Pixels
 
 MAX_BRIGHTNESS = 32.0  # added to pixel values of 0 to 255
 CONTRAST_RANGE = SATURATION_RANGE = (0.5, 1.5)  # factors
@@ -66,22 +53,23 @@ class AugmentationConfig:
     lost_cameras_share: float = 0.0
 
     def __post_init__(self) -> None:
-        shares = (
-            "photometric",
-            "grid_mask",
-            "drop_image",
-            "calibration_share",
-            "corrupted_share",
-            "lost_cameras_share",
-        )
-        wrong = [name for name in shares if not 0 <= getattr(self, name) <= 1]
+        amounts = ("exposure", "white_balance", "noise", "calibration_noise")
+        wrong = [name for name, share in vars(self).items() if name not in amounts and not 0 <= share <= 1]
         if wrong:
             raise ValueError(f"{wrong[0]} is a probability, from 0 to 1")
-        if min(self.exposure, self.white_balance, self.noise, self.calibration_noise) < 0 or self.white_balance >= 1:
+        if min(vars(self)[name] for name in amounts) < 0 or self.white_balance >= 1:
             raise ValueError(
                 "exposure, white_balance, noise and calibration_noise must not be negative, and white_balance must be "
                 "below 1"
             )
+
+
+def augmented(clip: list[Frame], config: AugmentationConfig, random: np.random.Generator) -> list[Frame]:
+    """Copies of the frames of a clip with all changes but the grid mask, which is for the network's input."""
+    vary_images, vary_rig = ImageVariation(config, random), CalibrationVariation(config, random)
+    worsen = BadConditions(config, random)
+    frames = (vary_rig(worsen(vary_images(frame))) for frame in clip)
+    return [distort_images(frame, config.photometric, random) for frame in frames]
 
 
 class ImageVariation:
@@ -122,12 +110,12 @@ class ImageVariation:
 
 # Corruptions to train on, and their levels. The others of `bevcli.synth.corruptions` are kept for scores.
 TRAINED_CORRUPTIONS: tuple[tuple[ImageCorruption, tuple[int, ...]], ...] = (
-    (low_light, tuple(LOW_LIGHT)),
-    (fog, tuple(FOG)),
-    (snow, tuple(SNOW)),
-    (brightness, tuple(BRIGHTNESS)),
-    (motion_blur, tuple(MOTION_BLUR)),
-    (color_quantisation, (1, 2, 3)),
+    (corruptions.low_light, tuple(corruptions.LOW_LIGHT)),
+    (corruptions.fog, tuple(corruptions.FOG)),
+    (corruptions.snow, tuple(corruptions.SNOW)),
+    (corruptions.brightness, tuple(corruptions.BRIGHTNESS)),
+    (corruptions.motion_blur, tuple(corruptions.MOTION_BLUR)),
+    (corruptions.color_quantisation, (1, 2, 3)),
 )
 MOST_LOST_CAMERAS = 4
 

@@ -15,18 +15,16 @@ T = TypeVar("T")
 def with_changes(config: T, changes: Mapping[str, str]) -> T:
     """The settings with some of them changed.
 
-    Args:
-        config: the dataclass of [training].
-        changes: values by key, such as {"optimizer.learning_rate": "1e-4"}, as in TOML; a text may lack its quotes.
-
+    config: the dataclass of [training].
+    changes: values by key, such as {"optimizer.learning_rate": "1e-4"}, as in TOML; a text may lack its quotes.
     Raises ConfigError for an unknown key, which names the nearest, or a wrong value.
     """
     table: dict[str, Any] = dataclasses.asdict(config)  # type: ignore[call-overload]
-    known = dict(_keys(config))
+    known = list(_keys(config))
     for key, text in changes.items():
         key = key.removeprefix(f"{TRAINING}.")
         if key not in known:
-            raise ConfigError(f'`changes`: unknown key "{key:.100}"; {_nearest(key, list(known))}')
+            raise ConfigError(f'`changes`: unknown key "{key:.100}"; {_nearest(key, known)}')
         *tables, name = key.split(".")
         inner = table
         for each in tables:
@@ -35,14 +33,13 @@ def with_changes(config: T, changes: Mapping[str, str]) -> T:
     return settings_of_table({TRAINING: table}, TRAINING, type(config), "`changes`")
 
 
-def _keys(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """The keys of a dataclass with the names of their tables, as "clips.batch", and their values."""
-    for field in dataclasses.fields(config):
-        value = getattr(config, field.name)
+def _keys(config: Any, prefix: str = "") -> Iterator[str]:
+    """The keys of a dataclass with the names of their tables, as "clips.batch"."""
+    for name, value in vars(config).items():
         if dataclasses.is_dataclass(value):
-            yield from _keys(value, f"{prefix}{field.name}.")
+            yield from _keys(value, f"{prefix}{name}.")
         else:
-            yield prefix + field.name, value
+            yield prefix + name
 
 
 def _value(text: str) -> Any:

@@ -102,11 +102,6 @@ class DetectionLoss:
     classes: Tensor
     boxes: Tensor
 
-    @property
-    def total(self) -> Tensor:
-        """() the sum of both."""
-        return self.classes + self.boxes
-
 
 def detection_loss(
     class_logits: Tensor,
@@ -125,20 +120,23 @@ def detection_loss(
             loss is the mean over the groups.
     """
     logits, codes = (_groups_as_layers(tensor, groups) for tensor in (class_logits, box_codes))
-    layers = [_layer_loss(*layer, targets, config) for layer in zip(logits, codes, strict=True)]
+    layers = [
+        assigned_loss(*layer, targets, layer_matches(*layer, targets, config), config)
+        for layer in zip(logits, codes, strict=True)
+    ]
     classes, boxes = torch.stack(layers).sum(0) / groups
     return DetectionLoss(classes, boxes)
 
 
-def last_matches(
+def layer_matches(
     class_logits: Tensor, box_codes: Tensor, targets: Sequence[DetectionTargets], config: DetectionLossConfig
 ) -> list[tuple[Tensor, Tensor]]:
-    """The queries of each of B frames that the last layer matches to boxes, and the indices of these, both (K,) int64.
+    """The queries of each of B frames that a layer matches to boxes, and the indices of these, both (K,) int64.
 
-    class_logits: (L, B, Q, classes). box_codes: (L, B, Q, 10).
+    class_logits: (B, Q, classes). box_codes: (B, Q, 10).
     """
-    last = zip(class_logits[-1], box_codes[-1], targets, strict=True)
-    return [hungarian_matching(matching_costs(*element, config)) for element in last]
+    layer = zip(class_logits, box_codes, targets, strict=True)
+    return [hungarian_matching(matching_costs(*element, config)) for element in layer]
 
 
 def matching_costs(
@@ -146,10 +144,7 @@ def matching_costs(
 ) -> Tensor:
     """(Q, G) focal cost plus L1 distance of the box codes without velocity.
 
-    Args:
-        class_logits: (Q, classes).
-        box_codes: (Q, 10).
-        truth: G boxes.
+    class_logits: (Q, classes). box_codes: (Q, 10). truth: G boxes.
     """
     classes = focal_cost(class_logits)[:, truth.labels]
     boxes = torch.cdist(box_codes[:, :VELOCITY_START], truth.codes[:, :VELOCITY_START], p=1)
@@ -179,15 +174,6 @@ def box_loss(predicted: Tensor, truth: Tensor, config: DetectionLossConfig) -> T
 def _groups_as_layers(tensor: Tensor, groups: int) -> Tensor:
     """(L, B, groups · Q, ...) -> (L · groups, B, Q, ...)."""
     return tensor.unflatten(2, (groups, -1)).movedim(2, 1).flatten(0, 1)
-
-
-def _layer_loss(
-    class_logits: Tensor, box_codes: Tensor, targets: Sequence[DetectionTargets], config: DetectionLossConfig
-) -> Tensor:
-    """(2,) class loss and box loss of one decoder layer."""
-    layer = zip(class_logits, box_codes, targets, strict=True)
-    matches = [hungarian_matching(matching_costs(*element, config)) for element in layer]
-    return assigned_loss(class_logits, box_codes, targets, matches, config)
 
 
 def assigned_loss(

@@ -21,13 +21,7 @@ def check_training_drives(
 ) -> tuple[str, ...]:
     """Notes about the drives of a training, each set once. Renders no drive.
 
-    Args:
-        data: the choice of the drives.
-        drives: to train on.
-        held_out: to score on; None for the same drives.
-        clips: the clips that are drawn.
-        config: of the model.
-
+    drives: to train on. held_out: to score on; None for the same drives.
     Raises InputError where a frame to train on has no ground truth or a drive is shorter than a clip, and as
     `check_classes`.
     """
@@ -59,7 +53,6 @@ def check_classes(drives: Drives, where: str, use: str, config: ModelConfig) -> 
         drives: folders; opens each of them, and reads the frames of a format that has no table of its boxes.
         where: the set of drives, for messages, such as "the 4 held-out drives".
         use: what happens to boxes of known classes: "trained on" or "scored".
-        config: of the model.
 
     Raises InputError where no box has a class of the model.
     """

@@ -1,4 +1,4 @@
-"""Files of a training: resumable checkpoints, released weights, and learning curves.
+"""Files of a training: resumable checkpoints, released weights, and learning curves, for TensorBoard too.
 
 A file is written under a temporary name and renamed: a kill leaves the old one intact.
 """
@@ -6,6 +6,7 @@ A file is written under a temporary name and renamed: a kill leaves the old one 
 from __future__ import annotations
 
 import csv
+import importlib.util
 import io
 import math
 from collections.abc import Mapping
@@ -16,7 +17,7 @@ import safetensors.torch
 import torch
 from torch import Tensor, nn
 
-from bevcli.errors import InputError, WeightsError
+from bevcli.errors import BevcliError, InputError, WeightsError
 from bevcli.inference.training_rigs import weights_facts
 from bevcli.model.network import Network
 from bevcli.parsing.files import MIB, read_text
@@ -42,9 +43,7 @@ def save_checkpoint(
 ) -> None:
     """Writes the state after `step` steps, to resume from. Random numbers are drawn from seed and step, not stored.
 
-    Args:
-        trained: the model and its auxiliary heads.
-        average: the running average of the model's weights, None without one.
+    trained: the model and its auxiliary heads. average: the running average of the model's weights, None without one.
     """
     contents = {"format": FORMAT, "step": step, "model": trained.state_dict(), "optimizer": optimizer.state_dict()}
     if average is not None:
@@ -104,10 +103,8 @@ class LearningCurve:
     def __init__(self, path: Path, done: int = 0) -> None:
         """Opens the file of a resumed training, or starts a new one.
 
+        done: steps done. Rows after them, of an interrupted run, are dropped; 0 starts a new file.
         Raises OutputError, and InputError for a damaged file.
-
-        Args:
-            done: steps done. Rows after them, of an interrupted run, are dropped; 0 starts a new file.
         """
         self.path = path
         self.rows: list[Row] = [row for row in _read(path) if row["step"] <= done] if done else []
@@ -123,11 +120,9 @@ class LearningCurve:
 
 def draw_learning_curves(loss: LearningCurve, validation: LearningCurve, path: Path) -> None:
     """Writes a PNG: smoothed losses on the left, scores on the right."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 4.5), layout="constrained")
-    FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
     _draw_rows(left, _smoothed(loss.rows), skipped=("step", "learning rate", "gradient norm"))
     _draw_rows(right, [_scores(row) for row in validation.rows], skipped=("step",), marker="o")
@@ -182,3 +177,26 @@ def _write(path: Path, rows: list[Row], mode: str, *, header: bool = True) -> No
             if header:
                 writer.writeheader()
             writer.writerows({name: f"{value:.6g}" for name, value in row.items()} for row in rows)
+
+
+def require_tensorboard() -> None:
+    """Raise BevcliError where the package tensorboard is not installed."""
+    if importlib.util.find_spec("tensorboard") is None:
+        raise BevcliError("`log=\"tensorboard\"` needs the package tensorboard: pip install 'bevcli[tensorboard]'")
+
+
+class TensorBoardLog:
+    """Event files in a folder: `tensorboard --logdir FOLDER` draws them, also while the training runs."""
+
+    def __init__(self, folder: Path, done: int) -> None:
+        """done: steps done. TensorBoard hides later ones, of an interrupted training."""
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._writer = SummaryWriter(str(folder), purge_step=done + 1 if done else None)
+
+    def add(self, step: int, group: str, numbers: Mapping[str, float]) -> None:
+        """Write the finite numbers of a step as curves group/name, to the file at once."""
+        for name, value in numbers.items():
+            if math.isfinite(value):
+                self._writer.add_scalar(f"{group}/{name}", value, step)
+        self._writer.flush()

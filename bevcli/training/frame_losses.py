@@ -1,30 +1,37 @@
-"""All losses of a frame, and the auxiliary heads that exist in training only."""
+"""All losses of a frame, and what exists in training only: auxiliary heads, and a teacher.
+
+The teacher sees the images and the calibration before they were augmented.
+"""
 
 import contextlib
+import copy
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
+from bevcli.checkpoints import load_weights
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.decoder import BOX_CODE_SIZE
+from bevcli.model.kernels.choose import choose_kernels
 from bevcli.model.network import Network
-from bevcli.model.step import ModelInputs, ModelOutputs
+from bevcli.model.step import ClipInputs, ModelInputs, ModelOutputs
 from bevcli.training.detection_loss import (
     DetectionLoss,
     DetectionLossConfig,
     DetectionTargets,
     assigned_loss,
     detection_loss,
-    last_matches,
+    layer_matches,
 )
-from bevcli.training.distillation import DistillationLossConfig
 from bevcli.training.perspective_loss import PerspectiveHead, PerspectiveLossConfig, perspective_loss
 from bevcli.training.samples import Targets
 from bevcli.training.segmentation_loss import SegmentationLossConfig, segmentation_loss
+from bevcli.weights.local import weights_file
 
 
 @dataclass(frozen=True)
@@ -75,10 +82,7 @@ def dense_loss(
 ) -> DetectionLoss:
     """Focal loss of all cells and L1 loss of the positive ones, divided by the number of positive cells.
 
-    Args:
-        bev: (B, Y·X, C).
-        targets: B.
-        detection: the weights of classes and boxes, as in the detection loss.
+    bev: (B, Y·X, C). targets: B. detection: the weights of classes and boxes, as in the detection loss.
     """
     logits, codes = head(bev)
     positives = [_positive_cells(head.centers, truth.codes[:, :2], config.reach_m) for truth in targets]
@@ -89,15 +93,49 @@ def dense_loss(
 def _positive_cells(cells: Tensor, objects: Tensor, reach_m: float) -> tuple[Tensor, Tensor]:
     """Indices (K,) of the cells within reach of an object, and (K,) of the nearest object of each.
 
-    Args:
-        cells: (Y·X, 2) cell centres, metres.
-        objects: (G, 2) object centres, metres.
+    cells: (Y·X, 2) cell centres, metres. objects: (G, 2) object centres, metres.
     """
     if not len(objects):
         return (torch.zeros(0, dtype=torch.int64, device=cells.device),) * 2
     distance, nearest = torch.cdist(cells, objects).min(dim=1)
     positive = (distance <= reach_m).nonzero()[:, 0]
     return positive, nearest[positive]
+
+
+@dataclass(frozen=True)
+class DistillationLossConfig:
+    """The [training.distillation_loss] table.
+
+    Attributes:
+        weight: of the mean squared difference of the BEV maps; 0 disables the loss.
+        teacher: weights of the same model, a file or a model's name.
+    """
+
+    weight: float = 0.0
+    teacher: str = ""
+
+    def __post_init__(self) -> None:
+        if self.weight < 0 or (self.weight > 0 and not self.teacher):
+            raise ValueError("weight must not be negative, and teacher must name weights where it is positive")
+
+
+class Teacher:
+    """A copy of a model with the teacher's weights, in evaluation mode."""
+
+    def __init__(self, model: Network, weights: str, device: torch.device) -> None:
+        """Raises WeightsError where the weights are missing or do not fit the model."""
+        self._network = copy.deepcopy(model)
+        load_weights(weights_file(Path(weights)), self._network)
+        self._network.eval().requires_grad_(False).to(device)
+        choose_kernels(self._network, device)
+
+    def bev_maps(self, clip: ClipInputs) -> Iterator[Tensor]:
+        """The BEV map (B, Y·X, C) of each frame of clips that are not augmented."""
+        memory: Any = None
+        for place in range(len(clip.inputs)):
+            with torch.no_grad():
+                outputs, memory = self._network.learn(clip, place, memory)
+            yield outputs.bev.float()
 
 
 @dataclass(frozen=True)
@@ -168,9 +206,8 @@ class FrameLosses:
     ) -> dict[str, Tensor]:
         """The weighted scalar losses by name; their sum is minimised.
 
-        taught: (B, Y·X, C), the BEV map of the teacher.
-
         Call it inside `watching`, right after the forward pass that made the outputs.
+        taught: (B, Y·X, C), the BEV map of the teacher.
         """
         logits, codes, weights = outputs.class_logits, outputs.box_codes, self.configs.detection_loss
         detection = detection_loss(logits, codes, targets.detection, weights, self._query_groups)
@@ -194,7 +231,7 @@ class FrameLosses:
             difference = nn.functional.mse_loss(outputs.bev.float(), taught)
             losses |= {"distillation": self.configs.distillation_loss.weight * difference}
         if targets.truths:
-            matches = last_matches(logits, codes, targets.detection, weights)
+            matches = layer_matches(logits[-1], codes[-1], targets.detection, weights)
             losses |= self._head_losses(outputs, targets.truths, matches)
         if outputs.segmentation is not None:
             maps = segmentation_loss(outputs.segmentation, targets.segmentation, self.configs.segmentation_loss)

@@ -21,12 +21,7 @@ NO_LINES = MapLines((), np.zeros(0, dtype=np.str_))
 def frame_truth(frame: Frame, sequence: Sequence, place: int, config: ModelConfig) -> FrameTruth:
     """The truth of a frame that a model trains on.
 
-    Args:
-        frame: with ground truth boxes, and the rig that the model sees.
-        sequence: its drive.
-        place: of the frame in the drive.
-        config: of the model.
-
+    frame: with ground truth boxes, and the rig that the model sees; at `place` of its drive, `sequence`.
     Raises InputError where the frame has no true lines but the model finds lines, or its objects have no identities.
     """
     assert frame.ground_truth is not None

@@ -21,10 +21,10 @@ from bevcli.synth.splits import split_of, training_drives, write_split
 from bevcli.training.augmentation import AugmentationConfig
 from bevcli.training.changes import with_changes
 from bevcli.training.drive_checks import check_training_drives
+from bevcli.training.files import require_tensorboard
 from bevcli.training.frame_losses import LossConfigs
 from bevcli.training.options import Log, TrainOptions
 from bevcli.training.samples import ClipConfig
-from bevcli.training.tensorboard_log import require_tensorboard
 from bevcli.training.warm_start import WarmStart, warm_start
 from bevcli.weights.local import weights_file
 

@@ -1,15 +1,21 @@
 """A new model file for a data set, with what its training costs on this machine."""
 
+import contextlib
 import json
 import re
+import sys
 import tempfile
+import time
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from bevcli.config import config_of_table, read_model_file
+from bevcli.duration import duration
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import Sequence
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
@@ -17,12 +23,13 @@ from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import SequenceOptions
 from bevcli.synth.options import DriveOptions
 from bevcli.synth.splits import read_split
-from bevcli.training.cost import LONGEST_S, Cost, measure_cost
-from bevcli.training.data_facts import INSIDE_PERCENT, DataFacts, look_at
-from bevcli.training.job import prepare_training
+from bevcli.training.job import TrainingConfig, TrainingJob, prepare_training
 from bevcli.training.options import Preset, TrainOptions
-from bevcli.training.presets import PRESETS, model_table
+from bevcli.training.presets import INSIDE_PERCENT, PRESETS, DataFacts, look_at, model_table
+from bevcli.training.trainer import Trainer
 from bevcli.writing import write_whole
+
+LONGEST_S = 10.0  # of the measurement of the cost; an update that takes longer is still finished
 
 
 def write_model_file(
@@ -35,8 +42,7 @@ def write_model_file(
     Args:
         path: the file, which ends in .toml and does not exist.
         data: the drives, folders.
-        preset: the model that it starts from.
-        device: device to measure on.
+        device: to measure on.
         longest_s: time of the measurement, seconds.
 
     Raises BevcliError where the drives, or the path, are wrong; nothing is written then.
@@ -53,8 +59,9 @@ def write_model_file(
         trial.write_text(_toml(table), encoding="utf-8")
         job = prepare_training(str(trial), device, data, TrainOptions(out=Path(folder) / "out"))
         cost = measure_cost(job, longest_s)
-    lines += _cost_lines(cost)
-    write_whole(path, _commented(lines, table).encode(), parents=True)
+    lines += [f"Cost, measured on this machine: {cost}.", f"In this file {cost.config.clips}."]
+    text = "\n".join([*(f"# {line}" for line in lines), _toml(table)])
+    write_whole(path, text.encode(), parents=True)
     return lines
 
 
@@ -91,19 +98,9 @@ def _facts_lines(facts: DataFacts, table: Mapping[str, Any]) -> Iterator[str]:
         yield f"Maps reach {facts.map_reach_m:g} m only, less than the grid: the model has no segmentation head."
 
 
-def _cost_lines(cost: Cost) -> Iterator[str]:
-    yield f"Cost, measured on this machine: {cost}."
-    yield f"In this file {cost.config.clips}."
-
-
-def _commented(lines: list[str], table: Mapping[str, Any]) -> str:
-    """The text of the file, with lines as comments at its top."""
-    return "\n".join([*(f"# {line}" for line in lines), _toml(table)])
-
-
 def _toml(table: Mapping[str, Any], prefix: str = "") -> str:
     """A table as TOML: its values first, then the tables in it."""
-    lines = [f"{_key(key)} = {_value(value)}" for key, value in table.items() if not isinstance(value, Mapping)]
+    lines = [f"{_key(key)} = {_json(value)}" for key, value in table.items() if not isinstance(value, Mapping)]
     for key, value in table.items():
         if isinstance(value, Mapping):
             name = f"{prefix}{_key(key)}"
@@ -111,10 +108,87 @@ def _toml(table: Mapping[str, Any], prefix: str = "") -> str:
     return "\n".join(lines) + "\n"
 
 
-def _value(value: Any) -> str:
+def _json(value: Any) -> str:
     """A text, number, truth value or list in TOML, which writes these as JSON does."""
     return json.dumps(value, ensure_ascii=False)
 
 
 def _key(name: str) -> str:
-    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name, ensure_ascii=False)
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _json(name)
+
+
+class _EnoughMeasured(Exception):
+    """Ends the training that is measured."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """The cost of a training.
+
+    Attributes:
+        config: its settings.
+        machine: the device, in words.
+        update_s: time of an update of the weights, while another thread reads the next batch.
+        reading_s: time until the first batch was read, at most.
+        memory_bytes: the largest memory, of the process or of a GPU.
+    """
+
+    config: TrainingConfig
+    machine: str
+    update_s: float
+    reading_s: float
+    memory_bytes: int
+
+    @property
+    def step_s(self) -> float:
+        """Time of a step: of its updates, or of reading its batches where this takes longer."""
+        clips = self.config.clips
+        return max(clips.updates * self.update_s, clips.in_turn * self.reading_s / self.config.loaders)
+
+    def __str__(self) -> str:
+        """The cost on one line."""
+        steps, updates = self.config.steps, self.config.clips.updates
+        step = f"{self.update_s:.2g} s an update"
+        if updates > 1:
+            step += f", {duration(self.step_s)} a step of {updates}"
+        whole = f"{duration(steps * self.step_s)} for {steps} steps without scoring"
+        return f"{self.machine}: {step}, {whole}; memory {self.memory_bytes / 1e9:.1f} GB"
+
+
+def measure_cost(job: TrainingJob, longest_s: float = LONGEST_S) -> Cost:
+    """Train for some seconds, at least one update. Changes the job's model; writes curves into its folder.
+
+    Raises BevcliError as the training would.
+    """
+    times = [time.perf_counter()]
+
+    def after_update(loss: float) -> None:
+        times.append(time.perf_counter())
+        if times[-1] - times[0] >= longest_s:
+            raise _EnoughMeasured
+
+    config = replace(job.config, steps=10**6, evaluate_every=10**6, checkpoint_every=10**6)
+    config = replace(config, clips=replace(config.clips, in_turn=1, short_share=0.0))
+    if job.device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(job.device)
+    with contextlib.suppress(_EnoughMeasured):
+        Trainer(replace(job, config=config)).run(after_update=after_update)
+    spans = [later - earlier for earlier, later in pairwise(times)]
+    update_s = sum(spans[1:]) / len(spans[1:]) if len(spans) > 1 else spans[0]
+    reading_s = max(spans[0] - update_s, 0.0)
+    return Cost(job.config, _machine(job.device), update_s, reading_s, _peak_bytes(job.device))
+
+
+def _machine(device: torch.device) -> str:
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    return f"{device.type}, {torch.get_num_threads()} threads"
+
+
+def _peak_bytes(device: torch.device) -> int:
+    """The largest memory so far: of a GPU's tensors, or of this process."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

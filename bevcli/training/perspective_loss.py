@@ -88,9 +88,7 @@ def feature_locations(
 ) -> FeatureLocations:
     """The locations of feature maps that all cover the whole image, as the encoder samples them.
 
-    Args:
-        shapes: rows and columns of each map.
-        image_size: (height, width) of the network's input, pixels.
+    shapes: rows and columns of each map. image_size: (height, width) of the network's input, pixels.
     """
     pixels, strides, levels = [], [], []
     for level, (rows, columns) in enumerate(shapes):
@@ -232,11 +230,8 @@ class PerspectiveHead(nn.Module):
     def forward(self, feature_maps: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         """Classes and boxes at the S locations of P images, level by level from fine to coarse, row by row.
 
-        Args:
-            feature_maps: (P, C, H_l, W_l) of each level.
-
-        Returns:
-            Class logits (P, S, classes) and box numbers (P, S, 8), as `PerspectiveTargets` describes them.
+        feature_maps: (P, C, H_l, W_l) of each level.
+        Returns class logits (P, S, classes) and box numbers (P, S, 8), as `PerspectiveTargets` describes them.
         """
         logits, boxes = (
             torch.cat([branch(features).flatten(2).movedim(1, -1) for features in feature_maps], 1)

@@ -24,14 +24,7 @@ from bevcli.model.step import ModelInputs, PreparedFrame, model_inputs
 from bevcli.model.truth import FrameTruth
 from bevcli.sequences.selection import scenes_of
 from bevcli.synth.drives import Drives, InputShape
-from bevcli.training.augmentation import (
-    AugmentationConfig,
-    BadConditions,
-    CalibrationVariation,
-    ImageVariation,
-    distort_images,
-    mask_images,
-)
+from bevcli.training.augmentation import AugmentationConfig, augmented, mask_images
 from bevcli.training.detection_loss import DetectionTargets, box_targets, detection_targets
 from bevcli.training.frame_truth import frame_truth
 from bevcli.training.segmentation_loss import SegmentationTargets, segmentation_targets
@@ -99,8 +92,7 @@ class Clip:
 def draw_clips(drives: Drives, config: ClipConfig, random: np.random.Generator, *, with_gap: bool = True) -> list[Clip]:
     """The clips of one batch, all of the same length. Raises InputError if a drive is too short.
 
-    Args:
-        with_gap: with `learn` "last", leave out one of the earlier frames, as published for BEVFormer.
+    with_gap: with `learn` "last", leave out one of the earlier frames, as published for BEVFormer.
     """
     frames = config.frames
     if frames > 1 and random.random() < config.short_share:
@@ -131,8 +123,7 @@ def draw_frames(
 ) -> tuple[int, ...]:
     """Indices of a random frame and of `count` - 1 frames before it in its scene. Raises InputError if there are none.
 
-    Args:
-        with_gap: as published, take the `count` frames before it and leave out a random one.
+    with_gap: as published, take the `count` frames before it and leave out a random one.
     """
     scenes = list(scenes_of(sequence.stamps))
     candidates = [(scene, end) for scene in scenes for end in range(count - 1, len(scene))]
@@ -204,16 +195,11 @@ def load_batch(
 ) -> Batch:
     """Reads, augments and preprocesses the frames of clips of the same length.
 
-    Args:
-        learn_all: give targets for every frame, not for the last one only.
-        plain: give the clips before augmentation too.
-
-    Raises:
-        InputError: a frame to train on has no ground truth.
+    learn_all: give targets for every frame, not for the last one only. plain: give the clips before augmentation too.
+    Raises InputError where a frame to train on has no ground truth.
     """
     loaded = [[drives.open(clip.drive).load(index) for index in clip.frames] for clip in clips]
-    augmented = (_augmented(of_clip, augmentation, random) for of_clip in loaded)
-    frames = _prepared(augmented, config)
+    frames = _prepared((augmented(of_clip, augmentation, random) for of_clip in loaded), config)
     inputs = _inputs(frames, config)
     for step in inputs:
         mask_images(step.images, augmentation.grid_mask, random)
@@ -253,13 +239,6 @@ def _targets(frames: list[Frame], places: list[tuple[Sequence, int]], config: Mo
     grid, classes = config.bev_grid, config.object_classes
     segmentation = (segmentation_targets(*pair, grid, classes) for pair in zip(boxes, maps, strict=True))
     return Targets(detection, perspective, tuple(segmentation), truths)
-
-
-def _augmented(clip: list[Frame], augmentation: AugmentationConfig, random: np.random.Generator) -> list[Frame]:
-    vary_images, vary_rig = ImageVariation(augmentation, random), CalibrationVariation(augmentation, random)
-    worsen = BadConditions(augmentation, random)
-    frames = (vary_rig(worsen(vary_images(frame))) for frame in clip)
-    return [distort_images(frame, augmentation.photometric, random) for frame in frames]
 
 
 def _prepared(clips: Iterable[list[Frame]], config: ModelConfig) -> list[tuple[PreparedFrame, ...]]:

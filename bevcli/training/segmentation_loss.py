@@ -53,8 +53,7 @@ def segmentation_targets(
 ) -> SegmentationTargets:
     """Masks on the BEV grid. Raises InputError if the map does not cover the grid, or has none of STUFF_CLASSES.
 
-    Args:
-        boxes: the frame's ground truth boxes, bev frame.
+    boxes: the frame's ground truth boxes, bev frame.
     """
     names = [name for name, one in classes.items() if one.vehicle]
     vehicles = boxes[np.isin(boxes.classes, names) & has_points(boxes)]
@@ -148,11 +147,6 @@ class SegmentationLoss:
     masks: Tensor
     locations: Tensor
 
-    @property
-    def total(self) -> Tensor:
-        """() the sum of all."""
-        return self.classes + self.masks + self.locations
-
 
 @dataclass(frozen=True)
 class _Assignment:
@@ -174,13 +168,10 @@ class _Assignment:
 def segmentation_loss(
     outputs: SegmentationOutputs, targets: Sequence[SegmentationTargets], config: SegmentationLossConfig
 ) -> SegmentationLoss:
-    """The loss of all layers. Things are matched once, by the outputs of the last layer.
+    """The loss of all layers for B frames. Things are matched once, by the outputs of the last layer.
 
     The losses of things are divided by the number of things in the batch, those of stuff by the number of stuff masks,
     so that many vehicles do not outweigh the road. A frame without a map trains no stuff query.
-
-    Args:
-        targets: B.
     """
     assignments = [_assign(outputs, element, truth, config) for element, truth in enumerate(targets)]
     things = sum(len(assigned.things) for assigned in assignments)
@@ -214,9 +205,7 @@ def matching_costs(
 def dice_loss(logits: Tensor, targets: Tensor) -> Tensor:
     """(...) dice loss with squared sums (V-Net), about 0 for equal masks and 1 for disjoint ones.
 
-    Args:
-        logits: (..., cells).
-        targets: (..., cells), 0 or 1.
+    logits: (..., cells). targets: (..., cells), 0 or 1.
     """
     masks = logits.sigmoid()
     return _dice((masks * targets).sum(-1), masks.square().sum(-1) + targets.square().sum(-1))
@@ -225,9 +214,7 @@ def dice_loss(logits: Tensor, targets: Tensor) -> Tensor:
 def dice_costs(logits: Tensor, targets: Tensor) -> Tensor:
     """(Q, G) dice loss of each predicted mask against each target mask.
 
-    Args:
-        logits: (Q, cells).
-        targets: (G, cells), 0 or 1.
+    logits: (Q, cells). targets: (G, cells), 0 or 1.
     """
     masks = logits.sigmoid()
     return _dice(masks @ targets.T, masks.square().sum(-1)[:, None] + targets.square().sum(-1))

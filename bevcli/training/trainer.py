@@ -21,12 +21,10 @@ from bevcli.model.kernels.onednn import use_onednn
 from bevcli.model.network import Network
 from bevcli.model.resnet import ResNet
 from bevcli.model.step import ModelOutputs
-from bevcli.training.distillation import Teacher
-from bevcli.training.files import LearningCurve, draw_learning_curves, load_checkpoint, save_checkpoint, save_weights
-from bevcli.training.frame_losses import FrameLosses
+from bevcli.training import files
+from bevcli.training.frame_losses import FrameLosses, Teacher
 from bevcli.training.job import CHECKPOINT, OptimizerConfig, TrainingJob
 from bevcli.training.samples import Batch, draw_clips, load_batch
-from bevcli.training.tensorboard_log import TensorBoardLog
 from bevcli.training.validation import Validation, validate
 
 T = TypeVar("T")
@@ -82,7 +80,6 @@ def forward_clip(
     with a window of frames, this applies to the image features of the earlier frames.
 
     Args:
-        batch: the clips.
         learn_all: yield the outputs for every frame. The model may be updated in between: history has no gradient.
         freeze_batch_norm: keep batch norms in evaluation mode, for fine-tuning.
     """
@@ -153,19 +150,18 @@ class Trainer:
             self._average = {key: value.detach().clone() for key, value in job.model.state_dict().items()}
         self.done = 0
         if resume:
-            self.done = load_checkpoint(job.out / CHECKPOINT, self.trained, self.optimizer, self._average)
+            self.done = files.load_checkpoint(job.out / CHECKPOINT, self.trained, self.optimizer, self._average)
         choose_kernels(job.model, job.device, gradients=True)
-        self._teacher: Teacher | None = None
-        if job.config.distillation_loss.weight > 0:
-            self._teacher = Teacher(job.model, job.config.distillation_loss.teacher, job.device)
+        taught = job.config.distillation_loss
+        self._teacher = Teacher(job.model, taught.teacher, job.device) if taught.weight > 0 else None
         self._frozen: FrozenStages | None = None
         if job.config.frozen_stages and job.config.freeze_batch_norm:
             dtype = torch.bfloat16 if computes_in_bfloat16(job.device) else torch.float32
             self._frozen = FrozenStages(job.model.backbone, job.config.frozen_stages, dtype)
         if job.group.leads:
-            self._loss_curve = LearningCurve(job.out / "loss.csv", self.done)
-            self._validation_curve = LearningCurve(job.out / "validation.csv", self.done)
-        self._log = TensorBoardLog(job.out / "tensorboard", self.done) if job.log and job.group.leads else None
+            self._loss_curve = files.LearningCurve(job.out / "loss.csv", self.done)
+            self._validation_curve = files.LearningCurve(job.out / "validation.csv", self.done)
+        self._log = files.TensorBoardLog(job.out / "tensorboard", self.done) if job.log and job.group.leads else None
 
     def run(
         self,
@@ -182,24 +178,24 @@ class Trainer:
             stop: asked after each step; if it is true, a checkpoint is written and the training ends early.
             after_update: called after each update of the weights, with the loss.
         """
-        config = self.job.config
+        job, config = self.job, self.job.config
         remaining = range(self.done, config.steps)
         for batches in read_ahead(self._load, remaining, depth=config.loaders, threads=config.loaders):
             row = self._step(batches, after_update)
             trim_memory()
             self.done += 1
             last, stopped = self.done == config.steps, stop()
-            if self.job.group.leads:
+            if job.group.leads:
                 self._loss_curve.add(self.done, row)
                 self._add_to_log("training", row)
                 if self.done % config.evaluate_every == 0 or last:
                     after_validation(self.done, self._validate())
                 if self.done % config.checkpoint_every == 0 or last or stopped:
-                    save_checkpoint(self.job.out / CHECKPOINT, self.done, self.trained, self.optimizer, self._average)
+                    files.save_checkpoint(job.out / CHECKPOINT, self.done, self.trained, self.optimizer, self._average)
                 after_step()
             if stopped:
                 break
-        self.job.model.eval()
+        job.model.eval()
 
     @property
     def _learn_all(self) -> bool:
@@ -284,8 +280,8 @@ class Trainer:
         self._validation_curve.add(self.done, scores.row())
         self._add_to_log("validation", scores.row())
         dtype = torch.float16 if job.config.weights_dtype == "float16" else torch.float32
-        save_weights(job.out / "weights.safetensors", model, dtype)
-        draw_learning_curves(self._loss_curve, self._validation_curve, job.out / "curves.png")
+        files.save_weights(job.out / "weights.safetensors", model, dtype)
+        files.draw_learning_curves(self._loss_curve, self._validation_curve, job.out / "curves.png")
         return scores
 
     def _add_to_log(self, group: str, row: Mapping[str, float]) -> None:

@@ -105,7 +105,6 @@ def validate(
     Args:
         max_range_m: ignore boxes beyond this distance, metres; by default beyond the nearest side of the BEV grid.
         tracker: parameters of the tracker whose tracks are scored; None scores no tracks.
-        after_frame: called after each frame.
         each_drive: score each drive alone too.
     """
     range_m = runner.config.bev_grid.nearest_side_m if max_range_m is None else max_range_m

@@ -13,10 +13,9 @@ from planted import BlackImages, ThroughLens, WrongRig, angle_deg, distance_m, w
 from typer.testing import CliRunner
 
 import bevcli
-from bevcli.calibration.corrected_drive import CorrectedDrive
-from bevcli.calibration.estimates import Verdict
+from bevcli.calibration.estimates import Verdict, either_text
 from bevcli.calibration.matches import match_points
-from bevcli.calibration.table import either_text
+from bevcli.calibration.result import CorrectedDrive
 from bevcli.calibration.views import read_views
 from bevcli.cli import bridge
 from bevcli.cli.calibrate import calibrate

@@ -25,7 +25,7 @@ def pose_after(seconds: float) -> np.ndarray:
 
 
 def view(seconds: float) -> View:
-    return View(BLANK, BLANK, 0, np.stack([pose_after(seconds + delay) for delay in DELAYS_S]))
+    return View(BLANK, BLANK, np.stack([pose_after(seconds + delay) for delay in DELAYS_S]))
 
 
 @pytest.fixture(scope="module")

@@ -23,8 +23,8 @@ from mistakes import (
 from test_project_debug import calibration, write_drive, write_motion
 
 import bevcli
+from bevcli.calibration.calibrate import findings_of, motion_findings
 from bevcli.calibration.estimates import CameraEstimate, Verdict
-from bevcli.calibration.findings import findings_of, motion_findings
 from bevcli.rig.check_calibration import check_calibration
 from bevcli.rig.sequence_checks import check_ego_motion
 

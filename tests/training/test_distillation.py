@@ -14,8 +14,8 @@ from painted_drives import CONFIG, PaintedDrives
 from bevcli.errors import WeightsError
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.training.augmentation import AugmentationConfig
-from bevcli.training.distillation import DistillationLossConfig, Teacher
 from bevcli.training.files import save_weights
+from bevcli.training.frame_losses import DistillationLossConfig, Teacher
 from bevcli.training.job import TrainingConfig, TrainingJob
 from bevcli.training.samples import Batch, Clip, ClipConfig, load_batch
 from bevcli.training.trainer import Trainer, forward_clip

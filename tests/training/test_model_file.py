@@ -17,11 +17,9 @@ from bevcli.errors import BevcliError, InputError
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, NUSCENES_SIZES, class_of_size
 from bevcli.model.config import BevFrameConfig
 from bevcli.synth.options import DriveOptions
-from bevcli.training.cost import Cost
-from bevcli.training.data_facts import look_at
 from bevcli.training.job import TrainingConfig
-from bevcli.training.model_file import _toml, write_model_file
-from bevcli.training.presets import PRESETS, model_table
+from bevcli.training.model_file import Cost, _toml, write_model_file
+from bevcli.training.presets import PRESETS, look_at, model_table
 from bevcli.training.samples import ClipConfig
 
 CPU = torch.device("cpu")
