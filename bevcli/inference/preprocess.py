@@ -16,9 +16,7 @@ from bevcli.errors import InputError
 from bevcli.frame import Frame, Sequence
 from bevcli.geometry.cameras import Camera, CameraRig, level_rig
 from bevcli.geometry.transforms import Array, inverse
-from bevcli.inference.auto_levels import auto_levels
-from bevcli.inference.defog import defogged
-from bevcli.inference.denoise import denoised
+from bevcli.inference.image_repair import repaired
 from bevcli.jit import njit
 from bevcli.model.camera_assignment import CameraAssignment, assign_cameras
 from bevcli.model.config import ImageConfig, ModelConfig
@@ -129,16 +127,6 @@ def network_from_image(camera: Camera, image: ImageConfig) -> Array:
 def resize_shift(scale: float, image: ImageConfig) -> float:
     """Pixels of the resized image that are added to scaled pixel coordinates: see `ImageConfig.half_pixel_shift`."""
     return (scale - 1) / 2 if image.half_pixel_shift else 0.0
-
-
-def repaired(pixels_bgr: NDArray[np.uint8], image: ImageConfig) -> NDArray[np.uint8]:
-    """(H, W, 3) without fog, with ordinary grey levels and without strong noise, as far as the model asks for it."""
-    levels = auto_levels if image.auto_levels else np.asarray
-    pixels_bgr = defogged(pixels_bgr) if image.defog else pixels_bgr
-    if not image.denoise:
-        return levels(pixels_bgr)
-    height, width = pixels_bgr.shape[:2]
-    return denoised(pixels_bgr, min(image.size[0] / width, image.size[1] / height), levels)
 
 
 def write_network_image(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: NDArray[np.float32]) -> None:
