@@ -23,8 +23,7 @@ from bevcli.errors import InputError
 from bevcli.frame import Frame, FrameStamp, Sequence
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Pose
-from bevcli.inference.engine_choice import EngineChoice
-from bevcli.inference.engine_speeds import fastest_engine
+from bevcli.inference.engine_choice import EngineChoice, fastest_engine
 from bevcli.inference.load import Model
 from bevcli.inference.options import TORCH
 from bevcli.inference.paired_steps import paired_steps
