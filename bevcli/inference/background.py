@@ -46,16 +46,11 @@ def write_behind(work: Callable[[S], T], items: Iterable[S]) -> Iterator[tuple[S
     pending: tuple[S, Future[T]] | None = None
     try:
         while True:
-            made: list[S] = []
-            failure: BaseException | None = None
             try:
-                made.extend(islice(source, 1))
-            except BaseException as error:
-                failure = error
-            if pending is not None:
-                yield pending[0], result_within(pending[1], WRITING_TIMEOUT_S, "writing a frame")
-            if failure is not None:
-                raise failure
+                made = list(islice(source, 1))
+            finally:
+                if pending is not None:
+                    yield pending[0], result_within(pending[1], WRITING_TIMEOUT_S, "writing a frame")
             if not made:
                 return
             pending = made[0], pool.submit(work, made[0])

@@ -26,8 +26,8 @@ from bevcli.geometry.transforms import Pose
 from bevcli.inference.engine_choice import EngineChoice, fastest_engine
 from bevcli.inference.load import Model
 from bevcli.inference.options import TORCH
-from bevcli.inference.paired_steps import paired_steps
 from bevcli.inference.preprocess import Preprocessor, calibration_images
+from bevcli.inference.runner import paired_steps
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.pillar_projection import Pillars
 from bevcli.model.prepare import prepare_for_inference
