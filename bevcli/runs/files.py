@@ -4,6 +4,7 @@ import contextlib
 import hashlib
 import json
 import sys
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,22 +16,22 @@ from bevcli.config import as_table
 from bevcli.errors import InputError, OutputError
 from bevcli.evaluation.boxes_csv import CsvWriter
 from bevcli.evaluation.submission import SubmissionWriter
-from bevcli.frame import Frame, Prediction, Sequence
+from bevcli.frame import Frame, MapLines, Plan, Prediction, Sequence
 from bevcli.geometry.boxes import attributes_by_speed
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Pose
 from bevcli.inference.load import Model
-from bevcli.model.config import ModelConfig
 from bevcli.parsing.files import open_regular
 from bevcli.recording.writer import LiveSink, Recording, RecordingState
 from bevcli.runs.folder import RunFolder
 from bevcli.runs.options import RunOptions
-from bevcli.runs.result_files import RESULT_WRITERS, ResultWriter
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.calibration_file import CALIBRATION, write_calibration
 from bevcli.sequences.files.incremental_json import partial_path
 from bevcli.sequences.files.json_fields import pose_to_json
+from bevcli.sequences.files.lines_file import LinesWriter
 from bevcli.sequences.files.map_folder import map_path, write_map
+from bevcli.sequences.files.plan_file import PlanWriter
 from bevcli.viewer.recording_file import restore_index
 from bevcli.writing import whole_file, write_whole
 
@@ -38,6 +39,8 @@ BEV = "BEV features"
 RECORDING, PREDICTIONS, SUBMISSION = "recording.rrd", "predictions.json", "results_nusc.json"
 TRACKS, SEGMENTATION = "tracks.csv", "segmentation"
 BLOCK = 1 << 20  # bytes
+ResultWriter = LinesWriter | PlanWriter
+RESULT_WRITERS: Mapping[type, type[ResultWriter]] = {MapLines: LinesWriter, Plan: PlanWriter}  # by the type of results
 
 
 @dataclass(frozen=True)
@@ -132,10 +135,8 @@ class RunFiles:
         self._reference = "world" if sequence.has_ego_motion else "ego"
         self._classes = model.config.object_classes
         self._is_complete = done == len(sequence.stamps)
-        self._results: dict[type, ResultWriter] = {}
-        names = [RESULT_WRITERS[kind].name for kind in model.config.results]
-        names += [RECORDING, PREDICTIONS, TRACKS, SUBMISSION, SEGMENTATION, BEV]
-        self._growing = {name: _Growing() for name in names}
+        self._results: dict[type[Any], ResultWriter] = {}
+        self._growing: defaultdict[str, _Growing] = defaultdict(_Growing)  # by the names of `FilesState.kept`
         self._map_frames = [] if resume is None else list(resume.map_frames)
         self._bev_frames = [] if resume is None else list(resume.bev_frames)
         if resume is not None:
@@ -147,16 +148,16 @@ class RunFiles:
             self._folder.add(out / name)
         past = None if resume is None else resume.recording
         recording = Recording(out / RECORDING, sequence, model, self._options.recording, self._live, past)
+        config, grid = model.config, model.config.bev_grid
+        settings = as_table(config)["class_settings"]  # of classes of the model's own
         extras = {
             "model": model.name,
             "untrained": model.untrained,
-            "classes": list(model.config.classes),
-            **_class_settings(model.config),
-            "range_m": model.config.bev_grid.nearest_side_m,
+            "classes": list(config.classes),
+            **({"class_settings": settings} if settings else {}),
+            "range_m": grid.nearest_side_m,
+            **({"x_range_m": list(grid.x_range_m), "y_range_m": list(grid.y_range_m)} if config.results else {}),
         }
-        if model.config.results:
-            grid = model.config.bev_grid
-            extras |= {"x_range_m": list(grid.x_range_m), "y_range_m": list(grid.y_range_m)}
         boxes_at, tracks_at = (None, None) if resume is None else (resume.predictions, resume.tracks)
         boxes = BoxesWriter(out / PREDICTIONS, self._reference, extras, resume_at=boxes_at)
         with self._stack:  # closes what is open if the next one cannot be opened
@@ -251,12 +252,10 @@ class RunFiles:
         """Open the file of each type of further results that the model has."""
         for kind, names in self._model.config.results.items():
             write = RESULT_WRITERS[kind]
-            self._folder.add(self._out / write.name)
-            resume_at = None if self._resume is None else self._resume.results[write.name]
-            of_file = {**extras, "classes": list(names)}
-            writer = write(self._out / write.name, self._reference, of_file, resume_at)
-            self._stack.callback(writer.close)
-            self._results[kind] = writer
+            path, resume_at = self._out / write.name, None if self._resume is None else self._resume.results[write.name]
+            self._folder.add(path)
+            self._results[kind] = write(path, self._reference, {**extras, "classes": list(names)}, resume_at)
+            self._stack.callback(self._results[kind].close)
 
     def _open_submission(self, resume_at: int | None = None) -> SubmissionWriter:
         self._folder.add(self._out / SUBMISSION)
@@ -274,12 +273,6 @@ class RunFiles:
         paths = [self._out / name for name in (RECORDING, PREDICTIONS, TRACKS, SUBMISSION, SEGMENTATION, CALIBRATION)]
         paths += [self._out / writer.name for writer in self._results.values()]
         return tuple(path for path in (*paths, self._options.save_bev) if path is not None and path.exists())
-
-
-def _class_settings(config: ModelConfig) -> dict[str, object]:
-    """The settings of a model's own classes, for the head of predictions.json; empty without any."""
-    settings = as_table(config)["class_settings"]
-    return {"class_settings": settings} if settings else {}
 
 
 def frame_boxes(
