@@ -14,9 +14,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bevcli.batch.drives import Drive
-from bevcli.batch.job import ATTEMPTS, FAILED, READING_THREADS, RESULTS, Job, Record
+from bevcli.batch.job import ATTEMPTS, FAILED, READING_THREADS, RECORD, RESULTS, Job, Record, read_record
 from bevcli.batch.ray_workers import Workers, run_on_ray
-from bevcli.batch.record import RECORD, read_record
 from bevcli.batch.report import write_report
 from bevcli.batch.storage import LocalFolder, Storage, open_storage
 from bevcli.batch.worker import MATCHES, StoppedError, Worker
