@@ -8,7 +8,6 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
 import torch
 
 from bevcli._version import __version__
@@ -136,7 +135,8 @@ class _Making:
         """The file in a precision, from the cache or made now, and its facts."""
         file = EngineFile(self._key(precision, CALIBRATION_FRAMES))  # perhaps of an earlier, longer drive
         if not file.stamp:
-            file = EngineFile(self._key(precision, self.calibration_frames))
+            frames = CALIBRATION_FRAMES if self.first_frames is None else len(self.first_frames.stamps)
+            file = EngineFile(self._key(precision, frames))  # of a short drive, which longer ones do not use
         network, facts = _load(file, self.engine, file.stamp) or self._make(file, precision)
         is_new = self.engine not in facts.differences and precision == self.choice.precision
         if is_new and self.first_frames is not None:
@@ -187,11 +187,6 @@ class _Making:
         return None if drive is None else select_range(drive, slice(0, CALIBRATION_FRAMES))
 
     @property
-    def calibration_frames(self) -> int:
-        """Number of frames that calibrate INT8; fewer for a short drive, whose file is not used for longer ones."""
-        return CALIBRATION_FRAMES if self.first_frames is None else len(self.first_frames.stamps)
-
-    @property
     def total(self) -> int:
         """The steps of the work: the export, each frame that is compared, each that calibrates, and the INT8 file."""
         frames = 0 if self.first_frames is None else len(self.first_frames.stamps)
@@ -224,7 +219,7 @@ def _load(file: EngineFile, engine: str, stamp: object) -> tuple[ExportedModel, 
 
 def _frame_of(rig: CameraRig) -> Frame:
     """A frame without images of a vehicle that stands."""
-    pose = Pose(np.zeros(3), np.array([1.0, 0, 0, 0]))
+    pose = Pose.identity()
     return Frame(FrameStamp(0, "", 0), rig, {}, pose, dict.fromkeys(rig.names, pose), AT_REST)
 
 
