@@ -264,5 +264,4 @@ def _one_line(where: str, kind: type[BevcliError]) -> Iterator[None]:
     except (BevcliError, ImportError):
         raise
     except Exception as error:
-        reason = reason_of(error)
-        raise kind(f"{where}: the storage cannot be used ({reason:.200})") from None
+        raise kind(f"{where}: the storage cannot be used ({reason_of(error):.200})") from None
