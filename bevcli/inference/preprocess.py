@@ -117,10 +117,8 @@ def network_scale(camera: Camera, image: ImageConfig) -> float:
 def network_from_image(camera: Camera, image: ImageConfig) -> Array:
     """(4, 4) float64: homogeneous pixels (u·d, v·d, d, 1) of the camera's image to those of the network's input."""
     scale = network_scale(camera, image)
-    left, top = image.crop_box[:2]
     matrix = np.diag([scale, scale, 1.0, 1.0])
-    shift = resize_shift(scale, image)
-    matrix[:2, 2] = shift - left, shift - top
+    matrix[:2, 2] = resize_shift(scale, image) - np.array(image.crop_box[:2])
     return matrix
 
 

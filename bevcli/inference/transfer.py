@@ -50,14 +50,14 @@ def read_back(outputs: ModelOutputs, images: Tensor) -> tuple[ModelOutputs, bool
     checked = [last.bev, last.class_logits, last.box_codes, *([images] if last.bev.device.type == "cpu" else [])]
     sums = torch.stack([tensor.sum(dtype=torch.float32) for tensor in checked])  # NaN and infinity stay in a sum
     moved = {part.name: getattr(last, part.name) for part in fields(last) if part.name not in last.stay_on_device}
-    sums, *copies = _on_cpu([sums, *(tensor for _, tensor in _tensors(list(moved.values()), ""))])
+    sums, *copies = _on_cpu([sums, *(tensor for _, tensor in tensors_in(list(moved.values())))])
     source = iter(copies)
     on_cpu = replace(last, **{name: _exchanged(value, source) for name, value in moved.items()})
     return on_cpu, bool(torch.isfinite(sums).all())
 
 
 def _exchanged(value: Any, tensors: Iterator[Tensor]) -> Any:
-    """The value with other tensors in the place of its own, in the order of `_tensors`."""
+    """The value with other tensors in the place of its own, in the order of `tensors_in`."""
     if isinstance(value, Tensor):
         return next(tensors)
     if isinstance(value, tuple | list):
@@ -85,7 +85,7 @@ def origin(model: nn.Module, step: Callable[[], object]) -> str:
     found: list[str] = []
 
     def check(value: object, place: str = "") -> None:
-        tensors = [(name, tensor) for name, tensor in _tensors(value, "history") if tensor.is_floating_point()]
+        tensors = [(name, tensor) for name, tensor in tensors_in(value, "history") if tensor.is_floating_point()]
         bad = [name for name, tensor in tensors if not torch.isfinite(tensor).all()]
         if bad and not found:
             found.append(place or f"input {bad[0]}")
@@ -107,13 +107,13 @@ def describe(name: str) -> str:
     return part if part == name else f"{part} ({name})"
 
 
-def _tensors(value: object, name: str) -> Iterator[tuple[str, Tensor]]:
+def tensors_in(value: object, name: str = "") -> Iterator[tuple[str, Tensor]]:
     """The tensors in lists and dataclasses, with the name of the field that holds them, `name` outside of one."""
     if isinstance(value, Tensor):
         yield name, value
     elif isinstance(value, tuple | list):
         for part in value:
-            yield from _tensors(part, name)
+            yield from tensors_in(part, name)
     elif is_dataclass(value) and not isinstance(value, type):
         for field in fields(value):
-            yield from _tensors(getattr(value, field.name), field.name)
+            yield from tensors_in(getattr(value, field.name), field.name)
