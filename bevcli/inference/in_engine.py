@@ -124,7 +124,9 @@ class _Making:
         self.sized = self.model.for_rig(self.rig)
         kind: type[Engine] = load("bevcli.engines", self.engine)
         deformable = any(isinstance(each, ModulatedDeformableConvolution) for each in self.model.network.modules())
-        frame = Preprocessor(self.sized.config)(_frame_of(self.rig))
+        pose = Pose.identity()
+        still = Frame(FrameStamp(0, "", 0), self.rig, {}, pose, dict.fromkeys(self.rig.names, pose), AT_REST)
+        frame = Preprocessor(self.sized.config)(still)  # without images
         self.options = OnnxOptions(
             deformable_convolution=kind.deformable_convolution if deformable else OnnxOptions.deformable_convolution,
             cameras=frame.images.shape[1],
@@ -215,12 +217,6 @@ class _Making:
 def _load(file: EngineFile, engine: str, stamp: object) -> tuple[ExportedModel, FileFacts] | None:
     """A file of the cache in an engine; the last one is kept for the next drive. stamp: of the file."""
     return file.load(engine)
-
-
-def _frame_of(rig: CameraRig) -> Frame:
-    """A frame without images of a vehicle that stands."""
-    pose = Pose.identity()
-    return Frame(FrameStamp(0, "", 0), rig, {}, pose, dict.fromkeys(rig.names, pose), AT_REST)
 
 
 def _cameras_per_cell(frame: PreparedFrame, model: Model) -> int:

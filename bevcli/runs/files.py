@@ -158,16 +158,16 @@ class RunFiles:
             "range_m": grid.nearest_side_m,
             **({"x_range_m": list(grid.x_range_m), "y_range_m": list(grid.y_range_m)} if config.results else {}),
         }
-        boxes_at, tracks_at = (None, None) if resume is None else (resume.predictions, resume.tracks)
-        boxes = BoxesWriter(out / PREDICTIONS, self._reference, extras, resume_at=boxes_at)
+        sizes = {} if resume is None else resume.sizes
+        boxes = BoxesWriter(out / PREDICTIONS, self._reference, extras, resume_at=sizes.get(PREDICTIONS))
         with self._stack:  # closes what is open if the next one cannot be opened
             self._recording = self._stack.enter_context(recording)
             self._boxes = self._stack.enter_context(boxes)
             if self._options.track:
-                self._tracks = self._stack.enter_context(CsvWriter(out / TRACKS, tracks_at))
+                self._tracks = self._stack.enter_context(CsvWriter(out / TRACKS, sizes.get(TRACKS)))
             self._open_results(extras)
-            if resume is not None and resume.submission is not None:
-                self._open_submission(resume.submission)
+            if sizes.get(SUBMISSION) is not None:
+                self._open_submission(sizes[SUBMISSION])
             if len({stamp.scene for stamp in sequence.stamps}) == 1:  # scenes may have rigs of their own
                 self._folder.add(out / CALIBRATION)
                 write_calibration(out / CALIBRATION, sequence.rig, sequence.facts, regular=True)
