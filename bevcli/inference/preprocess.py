@@ -175,9 +175,9 @@ def calibration_images(config: ModelConfig, cameras: int, drives: Items[Sequence
     empty = True
     places = [(drive, place) for drive in drives for place in range(len(drive.stamps))]
     chosen = np.linspace(0, len(places) - 1, min(frames, len(places))).round().astype(int)
-    preprocessors = {id(drive): Preprocessor(config) for drive in drives}
+    preprocess = Preprocessor(config)
     for drive, place in (places[index] for index in chosen):
-        prepared = preprocessors[id(drive)](drive.load(place))
+        prepared = preprocess(drive.load(place))
         if len(prepared.assignment.cameras) != cameras:
             raise InputError(f"{drive.name}: has {len(prepared.assignment.cameras)} cameras (the file takes {cameras})")
         if prepared.frame.images:

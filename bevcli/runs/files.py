@@ -18,7 +18,6 @@ from bevcli.evaluation.boxes_csv import CsvWriter
 from bevcli.evaluation.submission import SubmissionWriter
 from bevcli.frame import Frame, MapLines, Plan, Prediction, Sequence
 from bevcli.geometry.boxes import attributes_by_speed
-from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Pose
 from bevcli.inference.load import Model
 from bevcli.parsing.files import open_regular
@@ -133,7 +132,6 @@ class RunFiles:
         self._submission: SubmissionWriter | None = None
         self._tracks: CsvWriter | None = None
         self._reference = "world" if sequence.has_ego_motion else "ego"
-        self._classes = model.config.object_classes
         self._is_complete = done == len(sequence.stamps)
         self._results: dict[type[Any], ResultWriter] = {}
         self._growing: defaultdict[str, _Growing] = defaultdict(_Growing)  # by the names of `FilesState.kept`
@@ -194,7 +192,7 @@ class RunFiles:
             self._bev_frames.append(frame.stamp.index)
             self._add_bev(frame.stamp.index)
         self._recording.log(frame, prediction)
-        boxes = frame_boxes(frame, prediction, world=self._sequence.has_ego_motion, classes=self._classes)
+        boxes = self._boxes_of(frame, prediction)
         if self._tracks is not None:
             instances = boxes.boxes.instances
             tracked = boxes if instances is None else replace(boxes, boxes=boxes.boxes[instances != ""])
@@ -207,6 +205,20 @@ class RunFiles:
         self._boxes.write(boxes)  # last: a frame in predictions.json is in the other files too
         self._check_that_files_exist()
         self._is_complete = frame.stamp == self._sequence.stamps[-1]
+
+    def _boxes_of(self, frame: Frame, prediction: Prediction) -> FrameBoxes:
+        """A prediction as predictions.json holds it: all boxes, with attributes, in the world or the ego frame."""
+        extras: dict[str, object] = {"skipped": True} if prediction.skipped else {}
+        if prediction.not_finite:
+            extras["not_finite"] = prediction.not_finite
+        if prediction.results:
+            extras["ego_from_bev"] = pose_to_json(Pose.from_matrix(prediction.ego_from_bev))
+        if frame.sample_token is not None:
+            extras["sample_token"] = frame.sample_token
+        world = self._sequence.has_ego_motion
+        boxes = prediction.boxes_world if world else prediction.boxes_ego
+        boxes = replace(boxes, attributes=attributes_by_speed(boxes, self._model.config.object_classes))
+        return FrameBoxes(frame.stamp, frame.world_from_ego if world else None, boxes, extras)
 
     def state(self) -> FilesState | None:
         """The state with which later RunFiles go on after the last frame; None as long as they cannot."""
@@ -273,22 +285,6 @@ class RunFiles:
         paths = [self._out / name for name in (RECORDING, PREDICTIONS, TRACKS, SUBMISSION, SEGMENTATION, CALIBRATION)]
         paths += [self._out / writer.name for writer in self._results.values()]
         return tuple(path for path in (*paths, self._options.save_bev) if path is not None and path.exists())
-
-
-def frame_boxes(
-    frame: Frame, prediction: Prediction, *, world: bool, classes: Mapping[str, ObjectClass] = NUSCENES_CLASSES
-) -> FrameBoxes:
-    """A prediction as predictions.json holds it: all boxes, with attributes, in the world frame or the ego frame."""
-    extras: dict[str, object] = {"skipped": True} if prediction.skipped else {}
-    if prediction.not_finite:
-        extras["not_finite"] = prediction.not_finite
-    if prediction.results:
-        extras["ego_from_bev"] = pose_to_json(Pose.from_matrix(prediction.ego_from_bev))
-    if frame.sample_token is not None:
-        extras["sample_token"] = frame.sample_token
-    boxes = prediction.boxes_world if world else prediction.boxes_ego
-    boxes = replace(boxes, attributes=attributes_by_speed(boxes, classes))
-    return FrameBoxes(frame.stamp, frame.world_from_ego if world else None, boxes, extras)
 
 
 def _save_bev(folder: Path, prediction: Prediction, model: Model) -> None:
