@@ -17,7 +17,7 @@ from bevcli.inference.commands import Commands
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.stage_clock import StageClock
 from bevcli.inference.tracking import without_identities
-from bevcli.inference.transfer import ImageUploader, origin, read_back
+from bevcli.inference.transfer import image_uploader, origin, read_back
 from bevcli.model.prepare import DTYPES, Precision
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import Memory, TemporalModel
@@ -144,7 +144,7 @@ class Runner:
 
     def preparation(self, preprocessor: Preprocessor) -> Callable[[Frame], PreparedFrame]:
         """The function from a frame to the input of `step`, its images on the device. To call before the first step."""
-        upload_images = ImageUploader(self.device)
+        upload_images = image_uploader(self.device)
         return lambda frame: upload_images(preprocessor(frame))
 
     @property

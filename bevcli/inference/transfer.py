@@ -13,29 +13,25 @@ from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.upload import upload
 
 
-class ImageUploader:
-    """Uploads the images of frames to a CUDA GPU on a stream of its own. Does nothing for other devices.
+def image_uploader(device: torch.device) -> Callable[[PreparedFrame], PreparedFrame]:
+    """A function that gives frames their images on a device: those for a CUDA GPU are uploaded on a stream of its own.
 
-    The thread that reads frames ahead calls it; this thread waits for the copy, and the model does not.
+    To call in the thread that runs the model. The thread that reads frames ahead calls the function: it waits for the
+    copy, and the model does not.
     """
+    if device.type != "cuda":
+        return lambda prepared: prepared
+    stream, of_model = torch.cuda.Stream(device), torch.cuda.current_stream(device)
 
-    def __init__(self, device: torch.device) -> None:
-        """To call in the thread that runs the model."""
-        self._device = device
-        on_gpu = device.type == "cuda"
-        self._stream = torch.cuda.Stream(device) if on_gpu else None
-        self._of_model = torch.cuda.current_stream(device) if on_gpu else None
-
-    def __call__(self, prepared: PreparedFrame) -> PreparedFrame:
-        """The frame with its images on the device."""
-        if self._stream is None or self._of_model is None:
-            return prepared
-        with torch.cuda.stream(self._stream):
-            images = upload(prepared.images, self._device)
+    def uploaded(prepared: PreparedFrame) -> PreparedFrame:
+        with torch.cuda.stream(stream):
+            images = upload(prepared.images, device)
         # The allocator must not give the memory away while the model's stream may still read it.
-        images.record_stream(self._of_model)
-        self._stream.synchronize()
+        images.record_stream(of_model)
+        stream.synchronize()
         return replace(prepared, images=images)
+
+    return uploaded
 
 
 def read_back(outputs: ModelOutputs, images: Tensor) -> tuple[ModelOutputs, bool]:
