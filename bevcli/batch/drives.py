@@ -63,8 +63,7 @@ def read_list(path: Path) -> list[str]:
 
 
 def find_drives(
-    texts: Sequence[str],
-    options: NuScenesOptions = NuScenesOptions(),
+    texts: Sequence[str], options: NuScenesOptions = NuScenesOptions()
 ) -> tuple[list[Drive], tuple[str, ...]]:
     """All drives of arguments in order, each input once, and notes for the user.
 

@@ -87,7 +87,6 @@ class SimilarFrame:
 
     result: str
     frame: int
-    timestamp_ns: int
     similarity: float
 
 
@@ -169,18 +168,15 @@ def find_like(
     similarity = _similarity(query.vector, vectors)
     owners = np.repeat(np.arange(len(comparable)), [len(found.frames) for _, found in comparable])
     frames = np.concatenate([found.frames for _, found in comparable])
-    times = np.concatenate([found.timestamps_ns for _, found in comparable])
     chosen: list[SimilarFrame] = []
     taken: Counter[str] = Counter()
     for place in np.argsort(-similarity, kind="stable"):
         result, frame = comparable[owners[place]][0], int(frames[place])
         is_own = query.recording is None and result == query.result
-        if is_own and (not same_drive or frame == query.frame):
-            continue
-        if taken[result] >= per_drive:
+        if taken[result] >= per_drive or (is_own and (not same_drive or frame == query.frame)):
             continue
         taken[result] += 1
-        chosen.append(SimilarFrame(result, frame, int(times[place]), float(similarity[place])))
+        chosen.append(SimilarFrame(result, frame, float(similarity[place])))
         if len(chosen) == count:
             break
     return chosen

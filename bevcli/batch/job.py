@@ -1,4 +1,4 @@
-"""Job: the model and the options that every drive of a batch is run with."""
+"""Job: the model and the options that every drive of a batch is run with. And the record of a drive that was run."""
 
 import contextlib
 import hashlib
@@ -6,7 +6,10 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, NotRequired, TypedDict, TypeVar
+
+import msgspec
+from msgspec import Meta
 
 from bevcli._version import __version__
 from bevcli.batch.drives import Drive
@@ -25,7 +28,10 @@ from bevcli.weights.cache import weights_folder
 RESULTS, FAILED, ATTEMPTS = "drives", "failed", ".bevcli/attempts"  # folders of a batch
 SCORE_BINS = 20  # of the histogram of a drive's scores, from 0 to 1
 READING_THREADS = 16  # small files of a batch
+RECORD = "drive.json"  # in the folder of a drive's results: its record. A folder with it is whole.
 Record = dict[str, Any]  # of a drive after it was run; a row of batch.parquet
+_Count = Annotated[int, Meta(ge=0, le=1 << 62)]
+_Number = Annotated[float, Meta(ge=-1e12, le=1e12)]
 Own = TypeVar("Own", bound=FormatOptions)
 
 
@@ -116,3 +122,49 @@ def _fact(value: object) -> str:
     if isinstance(value, Path) and value.is_file():
         return hashlib.sha256(value.read_bytes()).hexdigest()
     return repr(value)
+
+
+class _Run(TypedDict):
+    drive: str
+    source: str
+    scene: str | None
+    result: str
+    attempts: _Count
+    error: str
+
+
+class _Scores(TypedDict):
+    ground_truth_boxes: _Count
+
+
+class _Done(_Run):
+    frames: _Count
+    boxes: _Count
+    boxes_by_class: dict[str, _Count]
+    tracks: _Count | None
+    dropped_images: _Count
+    skipped_frames: _Count
+    not_finite_frames: _Count
+    seconds: _Number
+    frames_per_second: _Number
+    fetch_seconds: _Number
+    output_bytes: _Count
+    score_histogram: Annotated[list[_Count], Meta(min_length=SCORE_BINS, max_length=SCORE_BINS)]
+    scores: dict[str, _Number | None] | None
+    not_scored: str
+    input_errors: NotRequired[str]
+
+
+def read_record(content: bytes | None, result: str) -> Record | None:
+    """A stored record, which may be damaged; None if there is none, or it is broken: its drive is then run again.
+
+    result: name of the folder of the drive's results.
+    """
+    try:
+        record: Record = msgspec.json.decode(content or b"")
+        msgspec.convert(record, _Run if record["error"] else _Done)
+        if record.get("scores"):
+            msgspec.convert(record["scores"], _Scores)
+    except (msgspec.MsgspecError, LookupError, TypeError, ValueError, RecursionError):
+        return None
+    return record if record["result"] == result else None

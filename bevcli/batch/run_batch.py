@@ -14,9 +14,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bevcli.batch.drives import Drive
-from bevcli.batch.job import ATTEMPTS, FAILED, READING_THREADS, RESULTS, Job, Record
+from bevcli.batch.job import ATTEMPTS, FAILED, READING_THREADS, RECORD, RESULTS, Job, Record, read_record
 from bevcli.batch.ray_workers import Workers, run_on_ray
-from bevcli.batch.record import RECORD, read_record
 from bevcli.batch.report import write_report
 from bevcli.batch.storage import LocalFolder, Storage, open_storage
 from bevcli.batch.worker import MATCHES, StoppedError, Worker
@@ -37,19 +36,7 @@ from bevcli.runs.state import load_state
 PARQUET, CSV, METRICS, REPORT = "batch.parquet", "batch.csv", "metrics.json", "report.html"
 DESCRIPTION = "batch.json"  # says that a folder is a batch
 
-_CLASSES = "boxes_CLASS"  # stands for a column of each class
 _COUNTS = ("attempts", "frames", "boxes", "tracks", "dropped_images", "skipped_frames", "not_finite_frames")
-_COLUMNS: dict[str, pa.DataType] = {
-    **dict.fromkeys(("drive", "source", "scene", "result", "error"), pa.string()),
-    **dict.fromkeys(_COUNTS, pa.int64()),
-    **dict.fromkeys(("seconds", "frames_per_second", "fetch_seconds"), pa.float64()),
-    "output_bytes": pa.int64(),
-    _CLASSES: pa.int64(),
-    **dict.fromkeys(("mean_ap", "nd_score", *ERRORS, *(f"iou_{name}" for name in MAP_CLASSES)), pa.float64()),
-    "ground_truth_boxes": pa.int64(),
-    "not_scored": pa.string(),
-    "input_errors": pa.string(),
-}
 
 
 @dataclass(frozen=True)
@@ -215,11 +202,16 @@ def _write_tables(out: Storage, records: Sequence[Record], model: Model) -> tupl
 
 def columns(classes: Iterable[str]) -> dict[str, pa.DataType]:
     """The columns of the tables and their types. classes: of the model, a column each."""
-    of_classes = {f"boxes_{name}": pa.int64() for name in classes}
-    made: dict[str, pa.DataType] = {}
-    for name, kind in _COLUMNS.items():
-        made |= of_classes if name == _CLASSES else {name: kind}
-    return made
+    return {
+        **dict.fromkeys(("drive", "source", "scene", "result", "error"), pa.string()),
+        **dict.fromkeys(_COUNTS, pa.int64()),
+        **dict.fromkeys(("seconds", "frames_per_second", "fetch_seconds"), pa.float64()),
+        "output_bytes": pa.int64(),
+        **{f"boxes_{name}": pa.int64() for name in classes},
+        **dict.fromkeys(("mean_ap", "nd_score", *ERRORS, *(f"iou_{name}" for name in MAP_CLASSES)), pa.float64()),
+        "ground_truth_boxes": pa.int64(),
+        **dict.fromkeys(("not_scored", "input_errors"), pa.string()),
+    }
 
 
 def row(record: Record, names: Iterable[str]) -> dict[str, Any]:

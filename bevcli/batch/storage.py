@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from bevcli.errors import BevcliError, InputError, OutputError
 from bevcli.parsing.files import read_bytes
 from bevcli.printing import reason_of
-from bevcli.writing import write_whole
+from bevcli.writing import remove_parts, write_whole
 
 _URL = re.compile(r"(?P<protocol>[a-z][a-z0-9+.-]+)://", re.IGNORECASE)
 # The packages that fsspec needs for a protocol.
@@ -108,16 +108,11 @@ class LocalFolder:
 
     def remove(self, name: str) -> None:
         """Remove a file or a subfolder, if it is there. Raises OutputError."""
-        path = self.path / name
         try:
-            if path.is_dir() and not path.is_symlink():
-                shutil.rmtree(path)
-            else:
-                path.unlink(missing_ok=True)
-        except FileNotFoundError:
-            pass
+            with contextlib.suppress(FileNotFoundError):
+                remove_parts(self.path, [name])
         except OSError as error:
-            raise OutputError(f"{path}: cannot be removed ({error.strerror})") from None
+            raise OutputError(f"{self.path / name}: cannot be removed ({error.strerror})") from None
 
     def land(self, folder: Path, name: str, last: str) -> None:
         """Move a local folder to a name on the same file system, in place of a damaged one. Raises OutputError.
@@ -148,20 +143,15 @@ class RemoteFolder:
         return sorted(_described(name[len(self._root) + 1 :] or own_name, facts) for name, facts in found.items())
 
     def names(self, folder: str) -> set[str]:
-        with _one_line(f"{self.where}/{folder}", InputError):
-            try:
-                self._system.invalidate_cache()
-                found = self._system.ls(self._path(folder), detail=False)
-            except FileNotFoundError:
-                return set()
-        return {PurePosixPath(name).name for name in found}
+        with _one_line(f"{self.where}/{folder}", InputError), contextlib.suppress(FileNotFoundError):
+            self._system.invalidate_cache()
+            return {PurePosixPath(name).name for name in self._system.ls(self._path(folder), detail=False)}
+        return set()
 
     def read(self, name: str) -> bytes | None:
-        with _one_line(f"{self.where}/{name}", InputError):
-            try:
-                return bytes(self._system.cat_file(self._path(name)))
-            except FileNotFoundError:
-                return None
+        with _one_line(f"{self.where}/{name}", InputError), contextlib.suppress(FileNotFoundError):
+            return bytes(self._system.cat_file(self._path(name)))
+        return None
 
     @contextlib.contextmanager
     def copied(self, name: str) -> Iterator[Path]:
@@ -264,5 +254,4 @@ def _one_line(where: str, kind: type[BevcliError]) -> Iterator[None]:
     except (BevcliError, ImportError):
         raise
     except Exception as error:
-        reason = reason_of(error)
-        raise kind(f"{where}: the storage cannot be used ({reason:.200})") from None
+        raise kind(f"{where}: the storage cannot be used ({reason_of(error):.200})") from None

@@ -18,8 +18,7 @@ import torch
 
 from bevcli.batch.drives import Drive, fetch_scene
 from bevcli.batch.find_like import FramePooling
-from bevcli.batch.job import ATTEMPTS, FAILED, RESULTS, SCORE_BINS, Job, Record
-from bevcli.batch.record import RECORD, read_record
+from bevcli.batch.job import ATTEMPTS, FAILED, RECORD, RESULTS, SCORE_BINS, Job, Record, read_record
 from bevcli.batch.storage import LocalFolder, RemoteFolder, is_url, open_storage
 from bevcli.errors import BevcliError
 from bevcli.evaluation.evaluate import Scores, evaluate

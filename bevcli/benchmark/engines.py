@@ -1,8 +1,7 @@
 """`compare_engines`: PyTorch and the engines side by side, alternating in one process."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
+from itertools import product
 from statistics import median
 from typing import Any
 
@@ -13,8 +12,7 @@ from bevcli.benchmark.measure import WARM_UP_FRAMES
 from bevcli.benchmark.versions import Version, difference, largest_differences
 from bevcli.engines.engine import installed_engines
 from bevcli.errors import BevcliError
-from bevcli.inference.engine_choice import EngineChoice
-from bevcli.inference.engine_speeds import describe_machine, remember_speeds
+from bevcli.inference.engine_choice import EngineChoice, describe_machine, remember_speeds
 from bevcli.inference.in_engine import CALIBRATION_FRAMES, Report, in_engine
 from bevcli.inference.load import Model
 from bevcli.inference.options import TORCH
@@ -99,12 +97,13 @@ def compare_engines(config: ModelConfig, frames: int, report: Report = lambda do
         report: of the export, see `in_engine`.
     """
     versions: dict[EngineRow, Version] = {}
-    failed = []
-    for row, make in _versions(made_up_model(config), report):
+    failed: list[EngineRow] = []
+    network = made_up_model(config)
+    for engine, precision in [*product([TORCH], ("fp32", "bf16")), *product(installed_engines(), ("fp32", "int8"))]:
         try:
-            versions[row] = make()
+            versions[EngineRow(engine, precision)] = _version(network, engine, precision, report)
         except BevcliError as error:
-            failed.append(EngineRow(row.engine, row.precision, problem=str(error)))
+            failed.append(EngineRow(engine, precision, problem=str(error)))
     drive, preprocess = MadeUpDrive(config.past_frames + WARM_UP_FRAMES + frames), Preprocessor(config)
     reference = next(iter(versions.values()))
     found: dict[EngineRow, list[Any]] = {row: [] for row in versions}
@@ -124,21 +123,10 @@ def compare_engines(config: ModelConfig, frames: int, report: Report = lambda do
     return EngineTable(config.name, describe_machine(CPU), (*rows, *failed))
 
 
-def _versions(network: Network, report: Report) -> Iterator[tuple[EngineRow, partial[Version]]]:
-    """Each engine and precision, and what makes it."""
-    for precision in ("fp32", "bf16"):
-        yield EngineRow(TORCH, precision), partial(_in_torch, network, precision)
-    for engine in installed_engines():
-        for choice in (EngineChoice(engine, "fp32"), EngineChoice(engine, "int8")):
-            yield EngineRow(engine, choice.precision), partial(_in_engine, Model(network, choice=choice), report)
-
-
-def _in_torch(network: Network, precision: Any) -> Version:
-    return Version(prepare_for_inference(network, CPU, precision), CPU)
-
-
-def _in_engine(model: Model, report: Report) -> Version:
-    drive = MadeUpDrive(CALIBRATION_FRAMES)
+def _version(network: Network, engine: str, precision: Any, report: Report) -> Version:
+    if engine == TORCH:
+        return Version(prepare_for_inference(network, CPU, precision), CPU)
+    model, drive = Model(network, choice=EngineChoice(engine, precision)), MadeUpDrive(CALIBRATION_FRAMES)
     return Version(in_engine(model, drive.rig, drive, report=report).prepared, CPU)
 
 

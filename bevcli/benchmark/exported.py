@@ -11,8 +11,8 @@ from bevcli.engines.box_differences import CENTER, NEAR_M
 from bevcli.engines.exported import ExportedModel, ExportedOutputs, load_exported
 from bevcli.frame import Sequence
 from bevcli.inference.load import Model
-from bevcli.inference.paired_steps import paired_steps
 from bevcli.inference.preprocess import Preprocessor
+from bevcli.inference.runner import paired_steps
 from bevcli.model.export_form import ExportForm
 from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.segmentation import SegmentationOutputs

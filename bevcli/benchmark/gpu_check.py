@@ -23,11 +23,11 @@ import torch
 
 from bevcli._version import __version__
 from bevcli.benchmark.made_up import MadeUpDrive, made_up_model
-from bevcli.benchmark.measure import describe_machine
 from bevcli.benchmark.result import markdown_table, measure
 from bevcli.benchmark.versions import Version, difference, largest_differences, textbook_version
 from bevcli.config import known_models, load_config
 from bevcli.errors import BevcliError
+from bevcli.inference.engine_choice import describe_machine
 from bevcli.inference.load import choose_device
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.prepare import Precision, prepare_for_inference
@@ -51,13 +51,7 @@ class CheckFailed(Exception):
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the report.
-
-    Attributes:
-        title: of the part.
-        passed: whether everything in it was as it should be.
-        text: Markdown.
-    """
+    """A part of the report. passed: everything in it was as it should be. text: Markdown."""
 
     title: str
     passed: bool
@@ -200,10 +194,8 @@ def train(device: torch.device, model: str = TRAINED_MODEL) -> str:
     with tempfile.TemporaryDirectory(prefix="bevcli-gpu-check-") as folder:
         out = Path(folder) / "train"
         options = ["--data", str(drive), "--held-out", "0", "--steps", str(TRAINED_STEPS), "--out", str(out)]
-        _run(
-            [sys.executable, "-m", "bevcli", "train", "--model", model, *options, "--device", str(device)],
-            "the training",
-        )
+        command = [sys.executable, "-m", "bevcli", "train", "--model", model, *options, "--device", str(device)]
+        _run(command, "the training")
         with (out / "loss.csv").open(newline="") as file:
             losses = [float(row["loss"]) for row in csv.DictReader(file)]
     text = f"Losses of {model}: {', '.join(f'{loss:.3g}' for loss in losses)}."

@@ -14,20 +14,18 @@ READING_TIMEOUT_S = 1800.0  # of all images of a frame, or of a training step
 WRITING_TIMEOUT_S = 120.0  # of one frame
 
 
-def read_ahead(
-    work: Callable[[S], T], items: Iterable[S], depth: int = 2, threads: int = 1, timeout_s: float = READING_TIMEOUT_S
-) -> Iterator[T]:
+def read_ahead(work: Callable[[S], T], items: Iterable[S], depth: int = 2, threads: int = 1) -> Iterator[T]:
     """Yields work(item) for every item, in order, computed in background threads up to `depth` items ahead.
 
     An exception in `work` is raised when its item is due. If the caller stops early, the items that have not begun
-    are cancelled. Raises WaitError if an item is not there `timeout_s` seconds after it is due.
+    are cancelled. Raises WaitError if an item is not there READING_TIMEOUT_S after it is due.
     """
     source = iter(items)
     pool = ThreadPoolExecutor(threads, thread_name_prefix="read-ahead")
     pending: deque[Future[T]] = deque(pool.submit(work, item) for item in islice(source, depth))
     try:
         while pending:
-            result = result_within(pending.popleft(), timeout_s, "reading and preparing a frame")
+            result = result_within(pending.popleft(), READING_TIMEOUT_S, "reading and preparing a frame")
             pending.extend(pool.submit(work, item) for item in islice(source, 1))
             yield result
     finally:
@@ -46,16 +44,11 @@ def write_behind(work: Callable[[S], T], items: Iterable[S]) -> Iterator[tuple[S
     pending: tuple[S, Future[T]] | None = None
     try:
         while True:
-            made: list[S] = []
-            failure: BaseException | None = None
             try:
-                made.extend(islice(source, 1))
-            except BaseException as error:
-                failure = error
-            if pending is not None:
-                yield pending[0], result_within(pending[1], WRITING_TIMEOUT_S, "writing a frame")
-            if failure is not None:
-                raise failure
+                made = list(islice(source, 1))
+            finally:
+                if pending is not None:
+                    yield pending[0], result_within(pending[1], WRITING_TIMEOUT_S, "writing a frame")
             if not made:
                 return
             pending = made[0], pool.submit(work, made[0])

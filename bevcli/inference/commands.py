@@ -19,13 +19,10 @@ class Commands:
 
     since: tuple[tuple[int, str], ...] = ()
 
-    def at(self, frame: int) -> str:
-        """The command at a frame, "" for none."""
-        return next((command for first, command in reversed(self.since) if first <= frame), "")
-
     def given_to(self, results: tuple[FrameResult, ...], frame: int) -> tuple[FrameResult, ...]:
-        """The results, plans with the command at a frame."""
-        return tuple(replace(r, command=self.at(frame)) if isinstance(r, Plan) else r for r in results)
+        """The results, plans with the command at a frame, "" for none."""
+        command = next((command for first, command in reversed(self.since) if first <= frame), "")
+        return tuple(replace(each, command=command) if isinstance(each, Plan) else each for each in results)
 
 
 def read_commands(command: str | None, config: ModelConfig) -> Commands:

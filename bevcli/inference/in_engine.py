@@ -8,7 +8,6 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
 import torch
 
 from bevcli._version import __version__
@@ -23,12 +22,11 @@ from bevcli.errors import InputError
 from bevcli.frame import Frame, FrameStamp, Sequence
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Pose
-from bevcli.inference.engine_choice import EngineChoice
-from bevcli.inference.engine_speeds import fastest_engine
+from bevcli.inference.engine_choice import EngineChoice, fastest_engine
 from bevcli.inference.load import Model
 from bevcli.inference.options import TORCH
-from bevcli.inference.paired_steps import paired_steps
 from bevcli.inference.preprocess import Preprocessor, calibration_images
+from bevcli.inference.runner import paired_steps
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.pillar_projection import Pillars
 from bevcli.model.prepare import prepare_for_inference
@@ -126,7 +124,9 @@ class _Making:
         self.sized = self.model.for_rig(self.rig)
         kind: type[Engine] = load("bevcli.engines", self.engine)
         deformable = any(isinstance(each, ModulatedDeformableConvolution) for each in self.model.network.modules())
-        frame = Preprocessor(self.sized.config)(_frame_of(self.rig))
+        pose = Pose.identity()
+        still = Frame(FrameStamp(0, "", 0), self.rig, {}, pose, dict.fromkeys(self.rig.names, pose), AT_REST)
+        frame = Preprocessor(self.sized.config)(still)  # without images
         self.options = OnnxOptions(
             deformable_convolution=kind.deformable_convolution if deformable else OnnxOptions.deformable_convolution,
             cameras=frame.images.shape[1],
@@ -137,7 +137,8 @@ class _Making:
         """The file in a precision, from the cache or made now, and its facts."""
         file = EngineFile(self._key(precision, CALIBRATION_FRAMES))  # perhaps of an earlier, longer drive
         if not file.stamp:
-            file = EngineFile(self._key(precision, self.calibration_frames))
+            frames = CALIBRATION_FRAMES if self.first_frames is None else len(self.first_frames.stamps)
+            file = EngineFile(self._key(precision, frames))  # of a short drive, which longer ones do not use
         network, facts = _load(file, self.engine, file.stamp) or self._make(file, precision)
         is_new = self.engine not in facts.differences and precision == self.choice.precision
         if is_new and self.first_frames is not None:
@@ -188,11 +189,6 @@ class _Making:
         return None if drive is None else select_range(drive, slice(0, CALIBRATION_FRAMES))
 
     @property
-    def calibration_frames(self) -> int:
-        """Number of frames that calibrate INT8; fewer for a short drive, whose file is not used for longer ones."""
-        return CALIBRATION_FRAMES if self.first_frames is None else len(self.first_frames.stamps)
-
-    @property
     def total(self) -> int:
         """The steps of the work: the export, each frame that is compared, each that calibrates, and the INT8 file."""
         frames = 0 if self.first_frames is None else len(self.first_frames.stamps)
@@ -221,12 +217,6 @@ class _Making:
 def _load(file: EngineFile, engine: str, stamp: object) -> tuple[ExportedModel, FileFacts] | None:
     """A file of the cache in an engine; the last one is kept for the next drive. stamp: of the file."""
     return file.load(engine)
-
-
-def _frame_of(rig: CameraRig) -> Frame:
-    """A frame without images of a vehicle that stands."""
-    pose = Pose(np.zeros(3), np.array([1.0, 0, 0, 0]))
-    return Frame(FrameStamp(0, "", 0), rig, {}, pose, dict.fromkeys(rig.names, pose), AT_REST)
 
 
 def _cameras_per_cell(frame: PreparedFrame, model: Model) -> int:

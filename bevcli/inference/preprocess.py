@@ -16,9 +16,7 @@ from bevcli.errors import InputError
 from bevcli.frame import Frame, Sequence
 from bevcli.geometry.cameras import Camera, CameraRig, level_rig
 from bevcli.geometry.transforms import Array, inverse
-from bevcli.inference.auto_levels import auto_levels
-from bevcli.inference.defog import defogged
-from bevcli.inference.denoise import denoised
+from bevcli.inference.image_repair import repaired
 from bevcli.jit import njit
 from bevcli.model.camera_assignment import CameraAssignment, assign_cameras
 from bevcli.model.config import ImageConfig, ModelConfig
@@ -119,26 +117,14 @@ def network_scale(camera: Camera, image: ImageConfig) -> float:
 def network_from_image(camera: Camera, image: ImageConfig) -> Array:
     """(4, 4) float64: homogeneous pixels (u·d, v·d, d, 1) of the camera's image to those of the network's input."""
     scale = network_scale(camera, image)
-    left, top = image.crop_box[:2]
     matrix = np.diag([scale, scale, 1.0, 1.0])
-    shift = resize_shift(scale, image)
-    matrix[:2, 2] = shift - left, shift - top
+    matrix[:2, 2] = resize_shift(scale, image) - np.array(image.crop_box[:2])
     return matrix
 
 
 def resize_shift(scale: float, image: ImageConfig) -> float:
     """Pixels of the resized image that are added to scaled pixel coordinates: see `ImageConfig.half_pixel_shift`."""
     return (scale - 1) / 2 if image.half_pixel_shift else 0.0
-
-
-def repaired(pixels_bgr: NDArray[np.uint8], image: ImageConfig) -> NDArray[np.uint8]:
-    """(H, W, 3) without fog, with ordinary grey levels and without strong noise, as far as the model asks for it."""
-    levels = auto_levels if image.auto_levels else np.asarray
-    pixels_bgr = defogged(pixels_bgr) if image.defog else pixels_bgr
-    if not image.denoise:
-        return levels(pixels_bgr)
-    height, width = pixels_bgr.shape[:2]
-    return denoised(pixels_bgr, min(image.size[0] / width, image.size[1] / height), levels)
 
 
 def write_network_image(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: NDArray[np.float32]) -> None:
@@ -189,9 +175,9 @@ def calibration_images(config: ModelConfig, cameras: int, drives: Items[Sequence
     empty = True
     places = [(drive, place) for drive in drives for place in range(len(drive.stamps))]
     chosen = np.linspace(0, len(places) - 1, min(frames, len(places))).round().astype(int)
-    preprocessors = {id(drive): Preprocessor(config) for drive in drives}
+    preprocess = Preprocessor(config)
     for drive, place in (places[index] for index in chosen):
-        prepared = preprocessors[id(drive)](drive.load(place))
+        prepared = preprocess(drive.load(place))
         if len(prepared.assignment.cameras) != cameras:
             raise InputError(f"{drive.name}: has {len(prepared.assignment.cameras)} cameras (the file takes {cameras})")
         if prepared.frame.images:

@@ -3,14 +3,13 @@
 import contextlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence as Items
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import islice
-from typing import Literal
+from typing import Any, Literal
 
 import torch
-from torch import Tensor
 
-from bevcli.frame import AttentionView, BevMap, Frame, FrameStamp, NewStart, Prediction, Sequence, StartReason
+from bevcli.frame import Frame, FrameStamp, NewStart, Prediction, Sequence, StartReason
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.inference.attention import AttentionProbe, attention_view, probe_cells
 from bevcli.inference.background import read_ahead
@@ -18,9 +17,9 @@ from bevcli.inference.commands import Commands
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.stage_clock import StageClock
 from bevcli.inference.tracking import without_identities
-from bevcli.inference.transfer import ImageUploader, origin, read_back
+from bevcli.inference.transfer import image_uploader, origin, read_back
 from bevcli.model.prepare import DTYPES, Precision
-from bevcli.model.step import PreparedFrame
+from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import Memory, TemporalModel
 
 
@@ -87,7 +86,7 @@ class Runner:
         if started_anew:
             state = self._restarted(state)
         if not frame.images:
-            return state, self._prediction(prepared, started_anew, Boxes3D.empty(), None)
+            return state, self._prediction(prepared, started_anew, skipped=True)
         probe = self._probe()
         with self.clock:
             with self._autocast(), probe or contextlib.nullcontext():
@@ -96,8 +95,7 @@ class Runner:
                 found, is_finite = read_back(outputs, prepared.images)
                 if not is_finite:
                     where = origin(self.model.observed, lambda: self.model.step(prepared, before, later))
-                    lost = self._prediction(prepared, started_anew, Boxes3D.empty(), None, not_finite=where)
-                    return self._restarted(state), lost
+                    return self._restarted(state), self._prediction(prepared, started_anew, not_finite=where)
             boxes = self.model.decode_boxes(found)
             if self.config.has_tracks and not self.tracks:
                 boxes = without_identities(boxes)
@@ -106,9 +104,16 @@ class Runner:
             segmentation = self.model.decode_map(found)
             if segmentation is not None:
                 self.clock.mark("map_merging")
-        view = None if probe is None else attention_view(probe, prepared, self.config)
-        prediction = self._prediction(prepared, started_anew, boxes, outputs.bev[0], view, segmentation)
-        prediction = replace(prediction, results=results)
+        prediction = self._prediction(
+            prepared,
+            started_anew,
+            boxes=boxes,
+            bev=outputs.bev[0],
+            segmentation=segmentation,
+            attention=None if probe is None else attention_view(probe, prepared, self.config),
+            stage_seconds=self.clock.read(),
+            results=results,
+        )
         return BevState(memory, frame.stamp), prediction
 
     def run(
@@ -130,11 +135,16 @@ class Runner:
         prepare: of `preparation`.
         """
         ahead = self.config.later_frames if self.options.temporal else 0
-        return with_upcoming(read_ahead(lambda place: prepare(sequence.load(place)), places), ahead)
+        source = read_ahead(lambda place: prepare(sequence.load(place)), places)
+        waiting = deque(islice(source, ahead + 1))
+        while waiting:
+            frame = waiting.popleft()
+            yield frame, tuple(waiting)
+            waiting.extend(islice(source, 1))
 
     def preparation(self, preprocessor: Preprocessor) -> Callable[[Frame], PreparedFrame]:
         """The function from a frame to the input of `step`, its images on the device. To call before the first step."""
-        upload_images = ImageUploader(self.device)
+        upload_images = image_uploader(self.device)
         return lambda frame: upload_images(preprocessor(frame))
 
     @property
@@ -186,41 +196,35 @@ class Runner:
             return contextlib.nullcontext()
         return torch.autocast(self.device.type, DTYPES[self.options.precision])
 
-    def _prediction(
-        self,
-        prepared: PreparedFrame,
-        started_anew: NewStart | None,
-        boxes: Boxes3D,
-        bev: Tensor | None,
-        attention: AttentionView | None = None,
-        segmentation: BevMap | None = None,
-        not_finite: str = "",
-    ) -> Prediction:
+    def _prediction(self, prepared: PreparedFrame, started_anew: NewStart | None, **found: Any) -> Prediction:
+        """The prediction for a frame. found: the fields that the model computed; by default it has no boxes."""
         frame, assignment = prepared.frame, prepared.assignment
         return Prediction(
             stamp=frame.stamp,
-            boxes=boxes,
             ego_from_bev=frame.rig.ego_from_bev,
             world_from_ego=frame.world_from_ego,
             grid=self.config.bev_grid,
-            bev=bev,
             started_anew=started_anew,
             camera_embeddings=dict(zip(assignment.cameras, assignment.embeddings, strict=True)),
-            skipped=bev is None and not not_finite,
-            not_finite=not_finite,
-            segmentation=segmentation,
-            attention=attention,
-            stage_seconds={} if bev is None else self.clock.read(),
+            **{"boxes": Boxes3D.empty(), "bev": None, **found},
         )
 
 
-def with_upcoming(
-    frames: Iterable[PreparedFrame], count: int
-) -> Iterator[tuple[PreparedFrame, tuple[PreparedFrame, ...]]]:
-    """Each frame with the next ones, up to `count`; fewer at the end."""
-    source = iter(frames)
-    waiting = deque(islice(source, count + 1))
-    while waiting:
-        frame = waiting.popleft()
-        yield frame, tuple(waiting)
-        waiting.extend(islice(source, 1))
+def paired_steps(
+    one: TemporalModel, other: TemporalModel, frames: Iterable[PreparedFrame]
+) -> Iterator[tuple[PreparedFrame, ModelOutputs, ModelOutputs]]:
+    """Step two versions of a model on the CPU over the same frames, each with its own history.
+
+    Yields each frame that has an image, and the outputs of both.
+    """
+    runners = [Runner(network, torch.device("cpu")) for network in (one, other)]
+    states: list[BevState | None] = [None, None]
+    outputs: dict[Runner, ModelOutputs] = {}  # of the last step of each
+    with contextlib.ExitStack() as hooks:
+        for runner in runners:
+            hook = runner.model.observed.register_forward_hook(lambda *call, of=runner: outputs.update({of: call[2]}))
+            hooks.enter_context(hook)
+        for prepared in frames:
+            if prepared.frame.images:
+                states = [runner.step(state, prepared)[0] for runner, state in zip(runners, states, strict=True)]
+                yield prepared, outputs[runners[0]], outputs[runners[1]]

@@ -123,9 +123,8 @@ class Session:
         stamp = self._next_stamp(timestamp_ns)
         pose = _pose(world_from_ego, "`world_from_ego`")
         poses = self._poses.with_pose(stamp.timestamp_ns, pose)
-        at = {
-            name: _pose(one, f"`world_from_ego_at`: camera {name}") for name, one in (world_from_ego_at or {}).items()
-        }
+        given = (world_from_ego_at or {}).items()
+        at = {name: _pose(one, f"`world_from_ego_at`: camera {name}") for name, one in given}
         self._check_cameras(at, "world_from_ego_at")
         frame = Frame(
             stamp=stamp,
@@ -137,7 +136,8 @@ class Session:
             dropped={name: "not given" for name in self.rig.names if name not in images},
         )
         if command is not None:
-            self._commanded(command)
+            runner = self._steps.runner
+            runner.options = replace(runner.options, commands=one_command(command, runner.config))
         self._state, prediction = self._steps.step(self._state, self._steps.prepare(frame))
         self.frame, self._poses, self._last_ns = frame, poses, stamp.timestamp_ns
         return prediction
@@ -146,11 +146,6 @@ class Session:
         """Forget the history: the next frame begins a new drive, at any time and place. Its number goes on."""
         self._state, self._poses = RunnerState(), RecentPoses()
         self._drive, self._last_ns = self._drive + 1, None
-
-    def _commanded(self, command: str) -> None:
-        """Take a command in place of all others."""
-        runner = self._steps.runner
-        runner.options = replace(runner.options, commands=one_command(command, runner.config))
 
     def _next_stamp(self, timestamp_ns: int) -> FrameStamp:
         time = index(timestamp_ns)

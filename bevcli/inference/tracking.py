@@ -144,9 +144,9 @@ def step(
 ) -> tuple[TrackerState, Boxes3D]:
     """The state after a frame, and its boxes with their identities.
 
-    The boxes have the same order and the columns `instances` ("" for a box without a track), `track_scores` (NaN
-    without a track) and `duplicates`. Tracks start anew with a new scene, and where the time does not advance or
-    advances by more than `coast_s` after the last box.
+    The boxes have the same order and the columns `instances` ("" for a box without a track), `track_scores` (the mean
+    score of the track's boxes, NaN without a track) and `duplicates`. Tracks start anew with a new scene, and where the
+    time does not advance or advances by more than `coast_s` after the last box.
 
     Args:
         config: the parameters.
@@ -165,11 +165,12 @@ def step(
     matches[born] = len(tracks) + np.arange(len(born))
     tracks = _with_births(tracks, boxes, born, number)
     owned = np.flatnonzero(matches >= 0)
-    tracks = _updated(tracks, boxes, scores, owned, matches[owned], stamp)
+    owners = matches[owned]
+    _add_boxes(tracks, owners, boxes[owned], scores[owned], stamp)
     instances = np.full(len(boxes), "", dtype="<U20")
-    instances[owned] = tracks.numbers[matches[owned]].astype("<U20")
+    instances[owned] = tracks.numbers[owners].astype("<U20")
     track_scores = np.full(len(boxes), np.nan)
-    track_scores[owned] = track_score(tracks[matches[owned]])
+    track_scores[owned] = tracks.score_sums[owners] / tracks.frames[owners]
     tracked = replace(boxes, instances=instances, track_scores=track_scores, duplicates=duplicates)
     unseen = tracks.seen_ns != stamp.timestamp_ns
     tracks = tracks[~(unseen & (tracks.frames < config.confirm_frames))]
@@ -179,11 +180,6 @@ def step(
 def without_identities(boxes: Boxes3D) -> Boxes3D:
     """The boxes without the columns that tracking adds."""
     return replace(boxes, instances=None, track_scores=None, duplicates=None)
-
-
-def track_score(tracks: Tracks) -> Array:
-    """(T,) 0 to 1: the mean score of a track's boxes."""
-    return tracks.score_sums / tracks.frames
 
 
 def find_duplicates(boxes: Boxes3D, order: NDArray[np.int64], widths: float) -> NDArray[np.bool_]:
@@ -240,23 +236,13 @@ def _with_births(tracks: Tracks, boxes: Boxes3D, born: NDArray[np.int64], number
     count = len(born)
     nothing, nowhere = np.zeros(count, dtype=np.int64), np.zeros((count, 2))
     new = Tracks(number + np.arange(count), boxes.classes[born], nowhere, nowhere, nothing, nothing, np.zeros(count))
-    columns = (np.concatenate([getattr(tracks, c.name), getattr(new, c.name)]) for c in fields(Tracks))
-    return Tracks(*columns)
+    return Tracks(*(np.concatenate([getattr(tracks, c.name), getattr(new, c.name)]) for c in fields(Tracks)))
 
 
-def _updated(
-    tracks: Tracks,
-    boxes: Boxes3D,
-    scores: Array,
-    owned: NDArray[np.int64],
-    owners: NDArray[np.int64],
-    stamp: FrameStamp,
-) -> Tracks:
-    """The tracks after the boxes `owned` (K,) were added to the tracks `owners` (K,)."""
-    tracks = tracks[np.arange(len(tracks))]  # a copy
-    tracks.centers_xy[owners] = boxes.centers[owned, :2]
-    tracks.velocities[owners] = boxes.velocities[owned]
+def _add_boxes(tracks: Tracks, owners: NDArray[np.int64], boxes: Boxes3D, scores: Array, stamp: FrameStamp) -> None:
+    """Add K boxes to the tracks `owners` (K,), in place."""
+    tracks.centers_xy[owners] = boxes.centers[:, :2]
+    tracks.velocities[owners] = boxes.velocities
     tracks.seen_ns[owners] = stamp.timestamp_ns
     tracks.frames[owners] += 1
-    tracks.score_sums[owners] += scores[owned]
-    return tracks
+    tracks.score_sums[owners] += scores

@@ -59,7 +59,7 @@ def facts_notes(facts: Mapping[str, str], config: ModelConfig) -> Iterator[str]:
     """Warnings where the model's file contradicts the bev frame or the classes that the weights file states."""
     own = weights_facts(config)
     if facts.get("classes", own["classes"]) != own["classes"]:
-        names = (_plain(facts["classes"]), _plain(own["classes"]))
+        names = [listed.strip("[]").replace('"', "") for listed in (facts["classes"], own["classes"])]
         yield "the weights were trained for the classes {}, but the model's file names {}".format(*names)
     expected = own["bev_frame"]
     stated = facts.get("bev_frame", expected)
@@ -68,11 +68,6 @@ def facts_notes(facts: Mapping[str, str], config: ModelConfig) -> Iterator[str]:
             f'the weights were trained with a bev frame "{stated}", but the model\'s file gives them one "{expected}": '
             "set [bev_frame] in the model's file"
         )
-
-
-def _plain(names: str) -> str:
-    """The names of a JSON list, for a sentence."""
-    return names.strip("[]").replace('"', "")
 
 
 def _cameras_note(rig: CameraRig, config: ModelConfig) -> Iterator[str]:

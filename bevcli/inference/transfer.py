@@ -13,29 +13,25 @@ from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.upload import upload
 
 
-class ImageUploader:
-    """Uploads the images of frames to a CUDA GPU on a stream of its own. Does nothing for other devices.
+def image_uploader(device: torch.device) -> Callable[[PreparedFrame], PreparedFrame]:
+    """A function that gives frames their images on a device: those for a CUDA GPU are uploaded on a stream of its own.
 
-    The thread that reads frames ahead calls it; this thread waits for the copy, and the model does not.
+    To call in the thread that runs the model. The thread that reads frames ahead calls the function: it waits for the
+    copy, and the model does not.
     """
+    if device.type != "cuda":
+        return lambda prepared: prepared
+    stream, of_model = torch.cuda.Stream(device), torch.cuda.current_stream(device)
 
-    def __init__(self, device: torch.device) -> None:
-        """To call in the thread that runs the model."""
-        self._device = device
-        on_gpu = device.type == "cuda"
-        self._stream = torch.cuda.Stream(device) if on_gpu else None
-        self._of_model = torch.cuda.current_stream(device) if on_gpu else None
-
-    def __call__(self, prepared: PreparedFrame) -> PreparedFrame:
-        """The frame with its images on the device."""
-        if self._stream is None or self._of_model is None:
-            return prepared
-        with torch.cuda.stream(self._stream):
-            images = upload(prepared.images, self._device)
+    def uploaded(prepared: PreparedFrame) -> PreparedFrame:
+        with torch.cuda.stream(stream):
+            images = upload(prepared.images, device)
         # The allocator must not give the memory away while the model's stream may still read it.
-        images.record_stream(self._of_model)
-        self._stream.synchronize()
+        images.record_stream(of_model)
+        stream.synchronize()
         return replace(prepared, images=images)
+
+    return uploaded
 
 
 def read_back(outputs: ModelOutputs, images: Tensor) -> tuple[ModelOutputs, bool]:
@@ -50,14 +46,14 @@ def read_back(outputs: ModelOutputs, images: Tensor) -> tuple[ModelOutputs, bool
     checked = [last.bev, last.class_logits, last.box_codes, *([images] if last.bev.device.type == "cpu" else [])]
     sums = torch.stack([tensor.sum(dtype=torch.float32) for tensor in checked])  # NaN and infinity stay in a sum
     moved = {part.name: getattr(last, part.name) for part in fields(last) if part.name not in last.stay_on_device}
-    sums, *copies = _on_cpu([sums, *(tensor for _, tensor in _tensors(list(moved.values()), ""))])
+    sums, *copies = _on_cpu([sums, *(tensor for _, tensor in tensors_in(list(moved.values())))])
     source = iter(copies)
     on_cpu = replace(last, **{name: _exchanged(value, source) for name, value in moved.items()})
     return on_cpu, bool(torch.isfinite(sums).all())
 
 
 def _exchanged(value: Any, tensors: Iterator[Tensor]) -> Any:
-    """The value with other tensors in the place of its own, in the order of `_tensors`."""
+    """The value with other tensors in the place of its own, in the order of `tensors_in`."""
     if isinstance(value, Tensor):
         return next(tensors)
     if isinstance(value, tuple | list):
@@ -85,7 +81,7 @@ def origin(model: nn.Module, step: Callable[[], object]) -> str:
     found: list[str] = []
 
     def check(value: object, place: str = "") -> None:
-        tensors = [(name, tensor) for name, tensor in _tensors(value, "history") if tensor.is_floating_point()]
+        tensors = [(name, tensor) for name, tensor in tensors_in(value, "history") if tensor.is_floating_point()]
         bad = [name for name, tensor in tensors if not torch.isfinite(tensor).all()]
         if bad and not found:
             found.append(place or f"input {bad[0]}")
@@ -107,13 +103,13 @@ def describe(name: str) -> str:
     return part if part == name else f"{part} ({name})"
 
 
-def _tensors(value: object, name: str) -> Iterator[tuple[str, Tensor]]:
+def tensors_in(value: object, name: str = "") -> Iterator[tuple[str, Tensor]]:
     """The tensors in lists and dataclasses, with the name of the field that holds them, `name` outside of one."""
     if isinstance(value, Tensor):
         yield name, value
     elif isinstance(value, tuple | list):
         for part in value:
-            yield from _tensors(part, name)
+            yield from tensors_in(part, name)
     elif is_dataclass(value) and not isinstance(value, type):
         for field in fields(value):
-            yield from _tensors(getattr(value, field.name), field.name)
+            yield from tensors_in(getattr(value, field.name), field.name)

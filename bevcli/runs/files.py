@@ -4,6 +4,7 @@ import contextlib
 import hashlib
 import json
 import sys
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,22 +16,21 @@ from bevcli.config import as_table
 from bevcli.errors import InputError, OutputError
 from bevcli.evaluation.boxes_csv import CsvWriter
 from bevcli.evaluation.submission import SubmissionWriter
-from bevcli.frame import Frame, Prediction, Sequence
+from bevcli.frame import Frame, MapLines, Plan, Prediction, Sequence
 from bevcli.geometry.boxes import attributes_by_speed
-from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Pose
 from bevcli.inference.load import Model
-from bevcli.model.config import ModelConfig
 from bevcli.parsing.files import open_regular
 from bevcli.recording.writer import LiveSink, Recording, RecordingState
 from bevcli.runs.folder import RunFolder
 from bevcli.runs.options import RunOptions
-from bevcli.runs.result_files import RESULT_WRITERS, ResultWriter
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.calibration_file import CALIBRATION, write_calibration
 from bevcli.sequences.files.incremental_json import partial_path
 from bevcli.sequences.files.json_fields import pose_to_json
+from bevcli.sequences.files.lines_file import LinesWriter
 from bevcli.sequences.files.map_folder import map_path, write_map
+from bevcli.sequences.files.plan_file import PlanWriter
 from bevcli.viewer.recording_file import restore_index
 from bevcli.writing import whole_file, write_whole
 
@@ -38,6 +38,8 @@ BEV = "BEV features"
 RECORDING, PREDICTIONS, SUBMISSION = "recording.rrd", "predictions.json", "results_nusc.json"
 TRACKS, SEGMENTATION = "tracks.csv", "segmentation"
 BLOCK = 1 << 20  # bytes
+ResultWriter = LinesWriter | PlanWriter
+RESULT_WRITERS: Mapping[type, type[ResultWriter]] = {MapLines: LinesWriter, Plan: PlanWriter}  # by the type of results
 
 
 @dataclass(frozen=True)
@@ -130,12 +132,9 @@ class RunFiles:
         self._submission: SubmissionWriter | None = None
         self._tracks: CsvWriter | None = None
         self._reference = "world" if sequence.has_ego_motion else "ego"
-        self._classes = model.config.object_classes
         self._is_complete = done == len(sequence.stamps)
-        self._results: dict[type, ResultWriter] = {}
-        names = [RESULT_WRITERS[kind].name for kind in model.config.results]
-        names += [RECORDING, PREDICTIONS, TRACKS, SUBMISSION, SEGMENTATION, BEV]
-        self._growing = {name: _Growing() for name in names}
+        self._results: dict[type[Any], ResultWriter] = {}
+        self._growing: defaultdict[str, _Growing] = defaultdict(_Growing)  # by the names of `FilesState.kept`
         self._map_frames = [] if resume is None else list(resume.map_frames)
         self._bev_frames = [] if resume is None else list(resume.bev_frames)
         if resume is not None:
@@ -147,26 +146,26 @@ class RunFiles:
             self._folder.add(out / name)
         past = None if resume is None else resume.recording
         recording = Recording(out / RECORDING, sequence, model, self._options.recording, self._live, past)
+        config, grid = model.config, model.config.bev_grid
+        settings = as_table(config)["class_settings"]  # of classes of the model's own
         extras = {
             "model": model.name,
             "untrained": model.untrained,
-            "classes": list(model.config.classes),
-            **_class_settings(model.config),
-            "range_m": model.config.bev_grid.nearest_side_m,
+            "classes": list(config.classes),
+            **({"class_settings": settings} if settings else {}),
+            "range_m": grid.nearest_side_m,
+            **({"x_range_m": list(grid.x_range_m), "y_range_m": list(grid.y_range_m)} if config.results else {}),
         }
-        if model.config.results:
-            grid = model.config.bev_grid
-            extras |= {"x_range_m": list(grid.x_range_m), "y_range_m": list(grid.y_range_m)}
-        boxes_at, tracks_at = (None, None) if resume is None else (resume.predictions, resume.tracks)
-        boxes = BoxesWriter(out / PREDICTIONS, self._reference, extras, resume_at=boxes_at)
+        sizes = {} if resume is None else resume.sizes
+        boxes = BoxesWriter(out / PREDICTIONS, self._reference, extras, resume_at=sizes.get(PREDICTIONS))
         with self._stack:  # closes what is open if the next one cannot be opened
             self._recording = self._stack.enter_context(recording)
             self._boxes = self._stack.enter_context(boxes)
             if self._options.track:
-                self._tracks = self._stack.enter_context(CsvWriter(out / TRACKS, tracks_at))
+                self._tracks = self._stack.enter_context(CsvWriter(out / TRACKS, sizes.get(TRACKS)))
             self._open_results(extras)
-            if resume is not None and resume.submission is not None:
-                self._open_submission(resume.submission)
+            if sizes.get(SUBMISSION) is not None:
+                self._open_submission(sizes[SUBMISSION])
             if len({stamp.scene for stamp in sequence.stamps}) == 1:  # scenes may have rigs of their own
                 self._folder.add(out / CALIBRATION)
                 write_calibration(out / CALIBRATION, sequence.rig, sequence.facts, regular=True)
@@ -193,7 +192,7 @@ class RunFiles:
             self._bev_frames.append(frame.stamp.index)
             self._add_bev(frame.stamp.index)
         self._recording.log(frame, prediction)
-        boxes = frame_boxes(frame, prediction, world=self._sequence.has_ego_motion, classes=self._classes)
+        boxes = self._boxes_of(frame, prediction)
         if self._tracks is not None:
             instances = boxes.boxes.instances
             tracked = boxes if instances is None else replace(boxes, boxes=boxes.boxes[instances != ""])
@@ -206,6 +205,20 @@ class RunFiles:
         self._boxes.write(boxes)  # last: a frame in predictions.json is in the other files too
         self._check_that_files_exist()
         self._is_complete = frame.stamp == self._sequence.stamps[-1]
+
+    def _boxes_of(self, frame: Frame, prediction: Prediction) -> FrameBoxes:
+        """A prediction as predictions.json holds it: all boxes, with attributes, in the world or the ego frame."""
+        extras: dict[str, object] = {"skipped": True} if prediction.skipped else {}
+        if prediction.not_finite:
+            extras["not_finite"] = prediction.not_finite
+        if prediction.results:
+            extras["ego_from_bev"] = pose_to_json(Pose.from_matrix(prediction.ego_from_bev))
+        if frame.sample_token is not None:
+            extras["sample_token"] = frame.sample_token
+        world = self._sequence.has_ego_motion
+        boxes = prediction.boxes_world if world else prediction.boxes_ego
+        boxes = replace(boxes, attributes=attributes_by_speed(boxes, self._model.config.object_classes))
+        return FrameBoxes(frame.stamp, frame.world_from_ego if world else None, boxes, extras)
 
     def state(self) -> FilesState | None:
         """The state with which later RunFiles go on after the last frame; None as long as they cannot."""
@@ -251,12 +264,10 @@ class RunFiles:
         """Open the file of each type of further results that the model has."""
         for kind, names in self._model.config.results.items():
             write = RESULT_WRITERS[kind]
-            self._folder.add(self._out / write.name)
-            resume_at = None if self._resume is None else self._resume.results[write.name]
-            of_file = {**extras, "classes": list(names)}
-            writer = write(self._out / write.name, self._reference, of_file, resume_at)
-            self._stack.callback(writer.close)
-            self._results[kind] = writer
+            path, resume_at = self._out / write.name, None if self._resume is None else self._resume.results[write.name]
+            self._folder.add(path)
+            self._results[kind] = write(path, self._reference, {**extras, "classes": list(names)}, resume_at)
+            self._stack.callback(self._results[kind].close)
 
     def _open_submission(self, resume_at: int | None = None) -> SubmissionWriter:
         self._folder.add(self._out / SUBMISSION)
@@ -274,28 +285,6 @@ class RunFiles:
         paths = [self._out / name for name in (RECORDING, PREDICTIONS, TRACKS, SUBMISSION, SEGMENTATION, CALIBRATION)]
         paths += [self._out / writer.name for writer in self._results.values()]
         return tuple(path for path in (*paths, self._options.save_bev) if path is not None and path.exists())
-
-
-def _class_settings(config: ModelConfig) -> dict[str, object]:
-    """The settings of a model's own classes, for the head of predictions.json; empty without any."""
-    settings = as_table(config)["class_settings"]
-    return {"class_settings": settings} if settings else {}
-
-
-def frame_boxes(
-    frame: Frame, prediction: Prediction, *, world: bool, classes: Mapping[str, ObjectClass] = NUSCENES_CLASSES
-) -> FrameBoxes:
-    """A prediction as predictions.json holds it: all boxes, with attributes, in the world frame or the ego frame."""
-    extras: dict[str, object] = {"skipped": True} if prediction.skipped else {}
-    if prediction.not_finite:
-        extras["not_finite"] = prediction.not_finite
-    if prediction.results:
-        extras["ego_from_bev"] = pose_to_json(Pose.from_matrix(prediction.ego_from_bev))
-    if frame.sample_token is not None:
-        extras["sample_token"] = frame.sample_token
-    boxes = prediction.boxes_world if world else prediction.boxes_ego
-    boxes = replace(boxes, attributes=attributes_by_speed(boxes, classes))
-    return FrameBoxes(frame.stamp, frame.world_from_ego if world else None, boxes, extras)
 
 
 def _save_bev(folder: Path, prediction: Prediction, model: Model) -> None:

@@ -2,14 +2,14 @@
 
 import contextlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from bevcli.errors import BevcliError, OutputError
 from bevcli.frame import Frame, Prediction, Sequence
 from bevcli.inference.background import write_behind
-from bevcli.inference.commands import Commands, read_commands
+from bevcli.inference.commands import read_commands
 from bevcli.inference.in_engine import in_engine
 from bevcli.inference.load import Model
 from bevcli.inference.run import RunnerState, run_steps
@@ -63,12 +63,21 @@ def run_into_folder(
     """
     options = RunOptions() if options is None else options
     model = in_engine(model, sequence.rig, sequence, parts="`probes`" if options.recording.probes else "")
-    commands = read_commands(options.command, model.config)
+    asked = StepOptions(
+        model.precision,
+        options.temporal,
+        ask_attention=options.recording.shows_internals,
+        probes=tuple(options.recording.probes),
+        commands=read_commands(options.command, model.config),
+    )
     if force and resume:
         raise OutputError("`force` and `resume` exclude each other: pass one of them")
     with RunFolder(out, force=force, resume=resume) as folder:
-        facts = run_facts(model, sequence, options) | {"commands": str(commands.since)}
-        state = _state_to_resume(folder, facts, model_class(model.config).memory_type) if resume else None
+        facts = run_facts(model, sequence, options) | {"commands": str(asked.commands.since)}
+        memory = model_class(model.config).memory_type
+        state = saved_state(folder, facts, RunState[memory]) if resume else None  # type: ignore[valid-type]
+        if resume and state is None and folder.has_files():
+            raise OutputError(f"{out}: `resume`: its run saved no state; {START_ANEW}")
         if state is not None and state.files is not None:
             resumed(state.frames)
         else:
@@ -81,7 +90,7 @@ def run_into_folder(
         files = RunFiles(folder, sequence, model, options, live, state.files, done=state.frames)
         began_at = state.frames
         try:
-            _run_from(state, model, sequence, options, commands, folder, files, summary, after_frame, should_stop)
+            _run_from(state, model, sequence, options, asked, folder, files, summary, after_frame, should_stop)
         except BaseException as error:
             with contextlib.suppress(OutputError):  # the first error is the one to report
                 summary.write(out, files.written())
@@ -95,20 +104,12 @@ def run_into_folder(
     return summary
 
 
-def _state_to_resume(folder: RunFolder, facts: Mapping[str, str], memory_type: type) -> RunState[Any] | None:
-    """The state to go on from, None if the folder has no run. Raises OutputError, see `saved_state`."""
-    state = saved_state(folder, facts, RunState[memory_type])  # type: ignore[valid-type]
-    if state is None and folder.has_files():
-        raise OutputError(f"{folder.path}: `resume`: its run saved no state; {START_ANEW}")
-    return state
-
-
 def _run_from(
     state: RunState[Any],
     model: Model,
     sequence: Sequence,
     options: RunOptions,
-    commands: Commands,
+    asked: StepOptions,
     folder: RunFolder,
     files: RunFiles,
     summary: RunSummary,
@@ -116,15 +117,6 @@ def _run_from(
     should_stop: Callable[[], bool],
 ) -> None:
     """Run the frames after a state, write them, and save the state."""
-    recording = options.recording
-    asks = recording.shows_internals
-    asked = StepOptions(
-        model.precision,
-        options.temporal,
-        ask_attention=asks,
-        probes=tuple(recording.probes),
-        commands=commands,
-    )
     saver = StateSaver(folder.state_path)
     start, runner, is_whole = state.frames, state.runner, True
 

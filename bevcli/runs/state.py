@@ -25,6 +25,7 @@ from bevcli.inference.load import Model
 from bevcli.inference.run import RunnerState
 from bevcli.inference.runner import BevState
 from bevcli.inference.tracking import TrackerState
+from bevcli.inference.transfer import tensors_in
 from bevcli.parsing.files import read_bytes
 from bevcli.parsing.pth import read_safetensors
 from bevcli.runs.files import FilesState
@@ -135,7 +136,7 @@ class StateSaver:
 
     def is_due(self, runner: RunnerState) -> bool:
         """Time has been long enough for another save."""
-        assumed_s = ASSUMED_S + _bytes(runner) / ASSUMED_BYTES_PER_S
+        assumed_s = ASSUMED_S + sum(tensor.nbytes for _, tensor in tensors_in(runner)) / ASSUMED_BYTES_PER_S
         next_s = assumed_s if self._longest_s is None else self._longest_s
         return self._spent_s + next_s <= SHARE * (time.perf_counter() - self._began)
 
@@ -147,14 +148,6 @@ class StateSaver:
         self.saved_frames = state.frames
         self._spent_s += took
         self._longest_s = max(self._longest_s or 0.0, took)
-
-
-def _bytes(tree: Any) -> int:
-    if isinstance(tree, Tensor):
-        return tree.nbytes
-    if isinstance(tree, tuple):
-        return sum(map(_bytes, tree))
-    return sum(map(_bytes, vars(tree).values())) if hasattr(tree, "__dataclass_fields__") else 0
 
 
 def _file_facts(path: Path) -> tuple[str, int, str]:

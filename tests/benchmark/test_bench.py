@@ -19,7 +19,7 @@ from bevcli.cli.main import app
 from bevcli.config import load_config
 from bevcli.engines.engine import installed_engines
 from bevcli.errors import BevcliError
-from bevcli.inference.engine_speeds import fastest_engine
+from bevcli.inference.engine_choice import fastest_engine
 from bevcli.inference.preprocess import Preprocessor
 
 RESULT = BenchmarkResult(

@@ -21,8 +21,7 @@ from bevcli.engines.exported import load_exported
 from bevcli.engines.file_cache import EngineFile, engines_folder
 from bevcli.errors import BevcliError, InputError
 from bevcli.inference import in_engine as module
-from bevcli.inference.engine_choice import EngineChoice
-from bevcli.inference.engine_speeds import fastest_engine, remember_speeds
+from bevcli.inference.engine_choice import EngineChoice, fastest_engine, remember_speeds
 from bevcli.inference.in_engine import in_engine
 from bevcli.inference.load import Model, load_model
 from bevcli.inference.run import run

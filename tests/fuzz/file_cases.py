@@ -19,7 +19,7 @@ from PIL import Image
 from run_cases import CAMERAS, TRACKER
 from small_model import small_inputs, small_model, step_of_file
 
-from bevcli.batch.record import read_record
+from bevcli.batch.job import read_record
 from bevcli.batch.report import write_report
 from bevcli.batch.run_batch import BatchSummary, to_csv, to_parquet
 from bevcli.config import as_table

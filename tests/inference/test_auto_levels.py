@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from bevcli.inference.auto_levels import auto_levels
+from bevcli.inference.image_repair import auto_levels
 
 
 def scene() -> np.ndarray:

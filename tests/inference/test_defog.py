@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bevcli.inference.auto_levels import auto_levels
-from bevcli.inference.defog import defogged
+from bevcli.inference.image_repair import auto_levels, defogged
 from bevcli.synth import corruptions
 
 LEVELS = (2, 4, 5)

@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bevcli.inference.auto_levels import auto_levels
-from bevcli.inference.denoise import denoised, measure_noise
+from bevcli.inference.image_repair import auto_levels, denoised, measure_noise
 
 RANDOM = np.random.default_rng(0)
 
