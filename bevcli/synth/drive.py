@@ -15,17 +15,16 @@ from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid, rotation_about_z
 from bevcli.synth.assets.catalog import Assets, Body
 from bevcli.synth.assets.triangles import TriangleSoup
-from bevcli.synth.render.ground import GroundTexture, MapWindow, draw_map, paint_ground
+from bevcli.synth.render.ground import GroundTexture, MapWindow, draw_map, paint_ground, true_lines
 from bevcli.synth.render.lens import lens_parts
-from bevcli.synth.render.line_truth import true_lines
 from bevcli.synth.render.rasteriser import ShadowMap
 from bevcli.synth.render.renderer import RenderedView, WorldSnapshot, render_through_lens, render_view
 from bevcli.synth.rig import nuscenes_like_rig
 from bevcli.synth.world.city import CityPlan
 from bevcli.synth.world.ground_plan import GroundPlan
-from bevcli.synth.world.scenery import Scenery, signal_meshes
-from bevcli.synth.world.simulation import Simulation
-from bevcli.synth.world.traffic import Actor, ActorState
+from bevcli.synth.world.scenery import Scenery
+from bevcli.synth.world.simulation import Actor, Simulation
+from bevcli.synth.world.traffic import ActorState
 from bevcli.synth.world.weather import WEATHER_NAMES, make_weather
 
 ANNOTATED_M = 60.0  # boxes are kept within this distance of the origin of the bev frame
@@ -120,7 +119,7 @@ class RenderedDrive:
         self._texels_m = texel_sizes(max(camera.width for camera in self.rig.cameras) * supersampling)
         self._scenery = Scenery(self._city, self._assets.furniture)
         self._around = lru_cache(maxsize=1)(self._make_surroundings)
-        self._templates: dict[tuple[str, int], TriangleSoup] = {}
+        self._template = lru_cache(maxsize=None)(self._make_template)
         self._placed: dict[tuple[str, int], tuple[TriangleSoup, tuple[float, ...]]] = {}
 
     def time_s(self, index: int) -> float:
@@ -198,7 +197,7 @@ class RenderedDrive:
         scenery, ground, shadows = self._around(*(float(np.round(at / SNAP_M) * SNAP_M) for at in here))
         near_first = np.argsort([np.hypot(*(state.position[:2] - here)) for state in states], kind="stable")
         actors = [self._place(states[k]) for k in near_first]
-        signals = signal_meshes(self._city, self.simulation.signals, self._assets.furniture, here, time_s)
+        signals = self._scenery.signals_around(here, self.simulation.signals, time_s)
         moving = TriangleSoup.gather([*actors, *signals], [*near_first.tolist(), *[-1] * len(signals)])
         shadows = shadows.with_shadows_of([moving.corners, self._ego_corners(world_from_ego)])
         snapshot = WorldSnapshot(TriangleSoup.gather([scenery, moving]), len(actors), ground, shadows, self.weather)
@@ -231,13 +230,10 @@ class RenderedDrive:
             self._placed[key] = (self._template(state.body, state.pose).placed((x, y, z), state.yaw), here)
         return self._placed[key][0]
 
-    def _template(self, body: Body, pose: int) -> TriangleSoup:
+    def _make_template(self, body: Body, pose: int) -> TriangleSoup:
         """The mesh of a body in its size and colours."""
-        key = (body.instance, pose)
-        if key not in self._templates:
-            mesh = body.variant.poses[pose % len(body.variant.poses)].fitted(body.size_lwh)
-            self._templates[key] = TriangleSoup.from_mesh(mesh).painted(body.paint, body.dye)
-        return self._templates[key]
+        mesh = body.variant.poses[pose % len(body.variant.poses)].fitted(body.size_lwh)
+        return TriangleSoup.from_mesh(mesh).painted(body.paint, body.dye)
 
     def _ego_corners(self, world_from_ego: Pose) -> NDArray[np.float32]:
         """(T, 3, 3) triangles of the ego vehicle, for its shadow. Its middle is 1.4 m in front of the rear axle."""

@@ -1,6 +1,6 @@
 """The catalog of annotated objects: the variants of each class, and a drawn individual of a variant."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,7 +35,7 @@ class Variant:
     dyes: tuple[Color, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Body:
     """An individual of a variant, with its own size and colours.
 
@@ -93,10 +93,9 @@ class Catalog:
         walking, standing = ([_person(name, *strides) for name in people.PERSON_NAMES] for strides in ((1, -1), (0,)))
         self.by_class["pedestrian"] = (*walking, *standing)
 
-    def draw(self, class_name: str, rng: np.random.Generator, names: Iterable[str] | None = None) -> Variant:
+    def draw(self, class_name: str, rng: np.random.Generator, names: Collection[str] | None = None) -> Variant:
         """Draw a variant of a class. names: draw from these variants only."""
-        allowed = None if names is None else set(names)
-        choices = [v for v in self.by_class[class_name] if allowed is None or v.name in allowed]
+        choices = [v for v in self.by_class[class_name] if names is None or v.name in names]
         return choices[int(rng.integers(len(choices)))]
 
 

@@ -1,6 +1,6 @@
 """Annotated objects that stand still: parked vehicles, road works, building sites, standing people."""
 
-from collections.abc import Iterable
+from collections.abc import Collection
 from functools import lru_cache
 
 import numpy as np
@@ -8,7 +8,7 @@ import numpy as np
 from bevcli.geometry.transforms import Array
 from bevcli.synth.assets.catalog import Body, Catalog, draw_body
 from bevcli.synth.assets.people import PERSON_NAMES
-from bevcli.synth.world.city import KERB_M, STOP_LINE_M, CityPlan, Street
+from bevcli.synth.world.city import KERB_M, STOP_LINE_M, CityPlan, Street, side_of
 from bevcli.synth.world.traffic import StandingActor
 
 PARKED_MIX = {"car": 0.78, "truck": 0.09, "trailer": 0.05, "motorcycle": 0.05, "bus": 0.03}
@@ -47,7 +47,7 @@ class Roadside:
         rng: np.random.Generator,
         instance: str,
         spread: float = 0.05,
-        names: Iterable[str] | None = None,
+        names: Collection[str] | None = None,
     ) -> Body:
         """Draw a look, of those with these names, and an individual of it."""
         return draw_body(self.catalog.draw(class_name, rng, names), rng, instance, spread)
@@ -136,7 +136,7 @@ class Roadside:
         rng = self.city.stream("pavement", column, row)
         land, made = self.city.block(column, row), []
         for side in range(4):
-            start, way, inward, length = land.side(side)
+            start, way, inward, length = side_of(land.low, land.high, side)
             depth, name = land.sidewalks[side] - 1.0, f"{column}.{row}.{side}"
             for group in range(int(rng.poisson(0.7))):
                 # Racks do not overlap: each has a quarter of the side for itself.
@@ -149,7 +149,7 @@ class Roadside:
                     made.append(self._stand_on_land(body, point, yaw, "cycle.without_rider"))
             for group in range(int(rng.poisson(0.5))):
                 middle = start + way * rng.uniform(8, length - 8) + inward * depth
-                if self._nearer(made, middle, 2.6):
+                if (self._distances(made, middle) < 2.6).any():
                     continue
                 for k in range(int(rng.integers(1, 4))):
                     names = [f"{n}_standing" for n in PERSON_NAMES if n != "worker"]
@@ -160,10 +160,10 @@ class Roadside:
                     made.append(self._stand_on_land(body, point, facing, "pedestrian.standing"))
         return made
 
-    def _nearer(self, made: list[StandingActor], point: Array, distance: float) -> bool:
-        """True where an actor stands within a distance (metres) of a plan point (2,)."""
+    def _distances(self, made: list[StandingActor], point: Array) -> Array:
+        """(M,) distances of the actors from a plan point (2,), metres."""
         x, y = self.city.bend(point)
-        return any(np.hypot(m.position[0] - x, m.position[1] - y) < distance for m in made)
+        return np.array([np.hypot(m.position[0] - x, m.position[1] - y) for m in made])
 
     def _stand_on_land(self, body: Body, point: Array, yaw: float, attribute: str) -> StandingActor:
         x, y = self.city.bend(point)
@@ -179,14 +179,10 @@ class Roadside:
         trailers = [("trailer", ("flatbed", "container", "utility"))]
         for k, (class_name, names) in enumerate([*machines, *trucks, *trailers]):
             body = self._body(class_name, rng, f"site-{name}.{k}", names=names)
+            lengths = np.array([m.body.size_lwh[0] for m in made]) + body.size_lwh[0]
             for _ in range(12):
                 point = low + 8 + rng.random(2) * (high - low - 16)
-                x, y = self.city.bend(point)
-                clear = all(
-                    np.hypot(m.position[0] - x, m.position[1] - y) > (m.body.size_lwh[0] + body.size_lwh[0]) / 2
-                    for m in made
-                )
-                if clear:
+                if (self._distances(made, point) > lengths / 2).all():
                     made.append(self._stand_on_land(body, point, float(rng.uniform(0, 6.3)), "vehicle.parked"))
                     break
         for k in range(8):
@@ -202,11 +198,8 @@ class Roadside:
     def _fence(self, low: Array, high: Array, rng: np.random.Generator, name: str) -> list[StandingActor]:
         """Barriers along the edges of a rectangle of the plan, with gaps."""
         barrier, made = self.catalog.draw("barrier", rng), []
-        corners = [low, np.array([high[0], low[1]]), high, np.array([low[0], high[1]])]
         for side in range(4):
-            start, end = corners[side], corners[(side + 1) % 4]
-            length = float(np.hypot(*(end - start)))
-            way = (end - start) / length
+            start, way, _, length = side_of(low, high, side)
             for k, at in enumerate(np.arange(1.8, length - 1.5, 4.2)):
                 if rng.random() >= 0.12:
                     body = draw_body(barrier, rng, f"fence-{name}.{side}.{k}", 0.02)

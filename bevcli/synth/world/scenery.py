@@ -12,7 +12,7 @@ from bevcli.synth.assets.mesh import Mesh, from_faces, joined, prism
 from bevcli.synth.assets.paint import Color, Finish, Material, darker, linear
 from bevcli.synth.assets.street_furniture import TREE_KINDS, StreetFurniture
 from bevcli.synth.assets.triangles import TriangleSoup
-from bevcli.synth.world.city import CORNER_M, KERB_M, Block, CityPlan, rounded_rectangle
+from bevcli.synth.world.city import CORNER_M, KERB_M, Block, CityPlan, rounded_rectangle, side_of
 from bevcli.synth.world.route import DIRECTIONS, node_center, right_of, street_of
 from bevcli.synth.world.traffic import Signals
 
@@ -215,7 +215,7 @@ class Scenery:
 
     def _side(self, land: Block, side: int, rng: np.random.Generator) -> list[TriangleSoup]:
         """The pavement on one side of a block: trees, lamps and signs near the kerb, benches and bins between them."""
-        start, way, inward, length = land.side(side)
+        start, way, inward, length = side_of(land.low, land.high, side)
         street = self.city.street(side % 2, (land.row, land.column + 1, land.row + 1, land.column)[side])
         outward = self.city.heading(start, -inward)
         meshes, at = [], CORNER_M + 3.0
@@ -244,20 +244,16 @@ class Scenery:
         x, y = self.city.bend(point)
         return template.placed((float(x), float(y), KERB_M), yaw)
 
+    def signals_around(self, here: ArrayLike, signals: Signals, time_s: float) -> list[TriangleSoup]:
+        """Traffic signals around a world point (2,), with their lights at a time in seconds.
 
-def signal_meshes(
-    city: CityPlan, signals: Signals, furniture: StreetFurniture, here: ArrayLike, time_s: float
-) -> list[TriangleSoup]:
-    """Traffic signals around a world point (2,), with their lights at a time in seconds.
-
-    Each junction has one signal for each approach, behind the junction on the right.
-    """
-    meshes = []
-    for node, direction in product(city.around(here, SIGNALS_REACH_M).nodes, range(4)):
-        street, cross = street_of(city, node, direction), street_of(city, node, direction + 1)
-        ahead = DIRECTIONS[direction] * (cross.half_width + 0.9)
-        spot = node_center(city, node) + ahead + right_of(direction) * (street.half_width + 0.9)
-        template = furniture.signals[signals.light(node, direction % 2, time_s)]
-        x, y = city.bend(spot)
-        meshes.append(template.placed((float(x), float(y), KERB_M), city.heading(spot, -DIRECTIONS[direction])))
-    return meshes
+        Each junction has one signal for each approach, behind the junction on the right.
+        """
+        city, meshes = self.city, []
+        for node, direction in product(city.around(here, SIGNALS_REACH_M).nodes, range(4)):
+            street, cross = street_of(city, node, direction), street_of(city, node, direction + 1)
+            ahead = DIRECTIONS[direction] * (cross.half_width + 0.9)
+            spot = node_center(city, node) + ahead + right_of(direction) * (street.half_width + 0.9)
+            template = self.furniture.signals[signals.light(node, direction % 2, time_s)]
+            meshes.append(self._put(template, spot, city.heading(spot, -DIRECTIONS[direction])))
+        return meshes

@@ -11,20 +11,21 @@ from bevcli.geometry.ego_motion import GRAVITY
 from bevcli.geometry.transforms import Array
 from bevcli.synth.assets.catalog import Catalog, draw_body
 from bevcli.synth.world.city import STOP_LINE_M, CityPlan
-from bevcli.synth.world.pedestrians import crossers, strollers
+from bevcli.synth.world.pedestrians import Walker, crossers, strollers
 from bevcli.synth.world.roadside import Roadside
-from bevcli.synth.world.route import (
-    DIRECTIONS,
-    LaneStart,
-    Route,
-    build_route,
-    lane_offset,
-    node_center,
-    right_of,
-    street_of,
+from bevcli.synth.world.route import DIRECTIONS, Route, build_route, node_center, right_of, street_of
+from bevcli.synth.world.traffic import (
+    STEP_S,
+    DrivingActor,
+    Signals,
+    StandingActor,
+    Unit,
+    Vehicle,
+    interpolated_track,
+    step,
 )
-from bevcli.synth.world.traffic import STEP_S, Actor, DrivingActor, Signals, Unit, Vehicle, interpolated_track, step
 
+Actor = DrivingActor | StandingActor | Walker  # an annotated object over the time of a drive
 TRAFFIC_MIX = {
     "car": 0.54, "truck": 0.12, "bus": 0.09, "train": 0.09, "motorcycle": 0.10, "construction_vehicle": 0.06,
 }  # fmt: skip
@@ -50,9 +51,8 @@ class VehicleSpawner:
         direction = int(rng.integers(4))
         lane = int(rng.integers(street_of(self.city, (0, 0), direction).lanes))
         edge = street_of(self.city, (0, 0), direction + 1).half_width + STOP_LINE_M
-        start = LaneStart((0, 0), direction, lane, edge + rng.uniform(18, 78))
-        speed = float(rng.uniform(8.0, 12.0))
-        route = build_route(self.city, start, rng, self.route_m, speed, straight_on=0.4)
+        before, speed = edge + rng.uniform(18, 78), float(rng.uniform(8.0, 12.0))
+        route = build_route(self.city, rng, (0, 0), direction, lane, before, self.route_m, speed, straight_on=0.4)
         return Vehicle(route, units, 8.0, speed * 0.6, 1.0)
 
     def spawn(self, around: Array, near_m: float, far_m: float, taken: Array, bicycle: bool) -> Vehicle | None:
@@ -68,10 +68,11 @@ class VehicleSpawner:
         streets = self.city.streets_between(axis, across - far_m, across + far_m)
         if not streets:
             return None
-        street = streets[int(rng.integers(len(streets)))]
+        street = self.city.street(axis, streets[int(rng.integers(len(streets)))])
         at = lengthwise + rng.uniform(-far_m, far_m)
         direction = axis + 2 * int(rng.integers(2))
-        node = self._next_node(axis, street.index, at, direction)
+        following = self.city.below(1 - axis, at) + (direction < 2)
+        node = (following, street.index) if axis == 0 else (street.index, following)
         before = float((node_center(self.city, node) - street.point(at)) @ DIRECTIONS[direction])
         lane = int(rng.integers(street.lanes))
         units = self._units(bicycle)
@@ -79,7 +80,7 @@ class VehicleSpawner:
         cross = street_of(self.city, node, direction + 1)
         if before < cross.half_width + STOP_LINE_M + 1:
             return None
-        point = street.point(at) + right_of(direction) * lane_offset(street, lane, bicycle)
+        point = street.point(at) + right_of(direction) * street.lane_offset(lane, bicycle)
         front = self.city.bend(point)
         if not near_m <= np.hypot(*(front - around)) <= far_m:
             return None
@@ -87,19 +88,10 @@ class VehicleSpawner:
         gaps = self.city.bend(point + reach)[:, None] - taken
         if np.sqrt((gaps**2).sum(-1).min()) < (1.6 if bicycle else 2.2):
             return None
-        start = LaneStart(node, direction, lane, before + length + 2)
         speed = float(rng.uniform(3.5, 6.0) if bicycle else rng.uniform(7.5, 12.5))
-        route = build_route(self.city, start, rng, self.route_m * speed / 12 + length, speed, bicycle=bicycle)
+        route_m, before = self.route_m * speed / 12 + length, before + length + 2
+        route = build_route(self.city, rng, node, direction, lane, before, route_m, speed, bicycle=bicycle)
         return Vehicle(route, units, length + 2, speed * 0.7, float(rng.uniform(0.7, 1.25)), bicycle)
-
-    def _next_node(self, axis: int, index: int, at: float, direction: int) -> tuple[int, int]:
-        nearest = self.city.nearest(1 - axis, at)
-        position = self.city.street(1 - axis, nearest).position
-        if direction < 2 and position < at:
-            nearest += 1
-        if direction >= 2 and position > at:
-            nearest -= 1
-        return (nearest, index) if axis == 0 else (index, nearest)
 
     def _units(self, bicycle: bool) -> tuple[Unit, ...]:
         rng, draw = self._rng, self.catalog.draw
@@ -238,12 +230,7 @@ class Simulation:
     def _people_on_roads(self, vehicles: list[Vehicle], time_s: float) -> Array:
         """(H, 2) world points of people on the road at the junctions that vehicles approach."""
         nodes = sorted({p.node for v in vehicles if (p := v.next_pass()) is not None})
-        points = [
-            w.plan_at(time_s)
-            for node in nodes
-            for w in self._crossers(node)
-            if w.times[0] < time_s < w.times[-1] and w.on_road(time_s)
-        ]
+        points = [w.plan_at(time_s) for node in nodes for w in self._crossers(node) if w.on_road(time_s)]
         return self.city.bend(np.array(points).reshape(-1, 2))
 
 

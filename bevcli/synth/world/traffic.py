@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -262,14 +262,6 @@ class ActorState:
     pose: int = 0
 
 
-class Actor(Protocol):
-    """An annotated object over the time of a drive."""
-
-    def state(self, time_s: float) -> ActorState | None:
-        """The state at a time in seconds since the start of the drive, or None while it is not there."""
-        ...
-
-
 class StandingActor(ActorState):
     """An actor that never moves."""
 
@@ -294,7 +286,7 @@ class DrivingActor:
     track: Array
 
     def state(self, time_s: float) -> ActorState | None:
-        """The state, or None before the vehicle appears and after it leaves."""
+        """The state at a time of the drive in seconds; None before the vehicle appears and after it leaves."""
         first, last = self.track[0, 0], self.track[0, -1]
         if not first <= time_s <= last:
             return None
