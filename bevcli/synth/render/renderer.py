@@ -114,8 +114,6 @@ def render_through_lens(
 
 def _supersampled(camera: Camera, factor: int) -> Camera:
     """The camera with each pixel divided into factor x factor equal parts."""
-    if factor == 1:
-        return camera
     scaled = camera.scaled(factor)
     shift = np.array([[1.0, 0, (factor - 1) / 2], [0, 1.0, (factor - 1) / 2], [0, 0, 1.0]])
     return replace(scaled, intrinsics=shift @ scaled.intrinsics)

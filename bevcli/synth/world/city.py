@@ -18,7 +18,7 @@ from bevcli.geometry.transforms import Array
 
 KERB_M = 0.15  # height of kerbs
 CORNER_M = 5.0  # radius of the kerb at a junction
-CROSSING_FROM_M, CROSSING_TO_M = 1.5, 5.0  # extent of a pedestrian crossing, measured from the edge of the junction
+CROSSING_M = (1.5, 5.0)  # extent of a pedestrian crossing, measured from the edge of the junction
 STOP_LINE_M = 6.2  # from the edge of the junction to the stop line
 BICYCLE_OFFSET_M = 0.5  # from the edge of the outermost lane to the line that bicycles follow
 SIDE_STEP_M, LINE_STEP_M = 6.0, 4.0  # distances between the points of outlines and lines, so that they can be bent

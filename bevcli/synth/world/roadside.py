@@ -7,18 +7,14 @@ import numpy as np
 
 from bevcli.geometry.transforms import Array
 from bevcli.synth.assets.catalog import Body, Catalog, draw_body
-from bevcli.synth.assets.people import PERSON_NAMES
+from bevcli.synth.assets.people import CYCLES, PERSON_NAMES
 from bevcli.synth.world.city import KERB_M, STOP_LINE_M, CityPlan, Street, side_of
 from bevcli.synth.world.traffic import StandingActor
 
 PARKED_MIX = {"car": 0.78, "truck": 0.09, "trailer": 0.05, "motorcycle": 0.05, "bus": 0.03}
 FILLED = 0.55  # share of parking spaces that are taken
 WORKS_SHARE = 0.27  # share of parking lanes (one side of a stretch) with road works
-WITHOUT_RIDER = {
-    "motorcycle": ("sport", "cruiser", "scooter"),
-    "bicycle": ("city", "racer", "cargo", "mountain"),
-}
-PARKED_LOOKS = {**WITHOUT_RIDER, "bus": ("mini", "shuttle")}
+PARKED_LOOKS = {**CYCLES, "bus": ("mini", "shuttle")}
 
 
 class Roadside:
@@ -128,7 +124,7 @@ class Roadside:
         plan, forward = street.point(at, offset), float(-np.sign(offset) if street.axis == 0 else np.sign(offset))
         direction = (forward, 0.0) if street.axis == 0 else (0.0, forward)
         x, y = self.city.bend(plan)
-        attribute = "cycle.without_rider" if body.variant.class_name in WITHOUT_RIDER else attribute
+        attribute = "cycle.without_rider" if body.variant.class_name in CYCLES else attribute
         return StandingActor(body, np.array([x, y, 0.0]), self.city.heading(plan, direction) + turn, attribute)
 
     def _on_pavement(self, column: int, row: int) -> list[StandingActor]:
@@ -143,7 +139,7 @@ class Roadside:
                 at = 9 + (length - 22) * (group + rng.random()) / 4
                 for k in range(int(rng.integers(1, 4)) if group < 4 else 0):
                     class_name = "bicycle" if rng.random() < 0.75 else "motorcycle"
-                    body = self._body(class_name, rng, f"rack-{name}.{group}.{k}", 0.03, WITHOUT_RIDER[class_name])
+                    body = self._body(class_name, rng, f"rack-{name}.{group}.{k}", 0.03, CYCLES[class_name])
                     point = start + way * (at + 0.85 * k) + inward * depth
                     yaw = self.city.heading(point, inward)
                     made.append(self._stand_on_land(body, point, yaw, "cycle.without_rider"))

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from bevcli.geometry.transforms import Array
-from bevcli.synth.world.city import CROSSING_TO_M, STOP_LINE_M, CityPlan, Street
+from bevcli.synth.world.city import CROSSING_M, STOP_LINE_M, CityPlan, Street
 
 STEP_M = 0.25  # distance between the points of a route
 SMOOTHING_M = 1.2  # standard deviation of the smoothing, so that yaw rates change gradually
@@ -52,11 +52,6 @@ class Route:
     yaws: Array
     speed_limits: Array
     passes: tuple[JunctionPass, ...]
-
-    @property
-    def length(self) -> float:
-        """Length of the route, metres."""
-        return float(self.positions[-1])
 
     def at(self, position: ArrayLike) -> Array:
         """World points (..., 2) at positions (...,) in metres along the route."""
@@ -129,7 +124,7 @@ def build_route(
         begin, end = corner - DIRECTIONS[direction] * radius, corner + DIRECTIONS[after] * radius
         stop = _lane_point(center, direction, offset, -(cross.half_width + STOP_LINE_M))
         across = street_of(city, node, after + 1)
-        leave = _lane_point(center, after, new_offset, across.half_width + CROSSING_TO_M)
+        leave = _lane_point(center, after, new_offset, across.half_width + CROSSING_M[1])
         marks.append((node, direction, turn, stop, leave))
         piece = _arc(begin, corner, end) if turn != 0 else np.stack([begin, end])
         corners.append(piece)

@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 from bevcli.geometry.ego_motion import GRAVITY
 from bevcli.geometry.transforms import Array
 from bevcli.synth.assets.catalog import Catalog, draw_body
+from bevcli.synth.assets.people import RIDDEN
 from bevcli.synth.world.city import STOP_LINE_M, CityPlan
 from bevcli.synth.world.pedestrians import Walker, crossers, strollers
 from bevcli.synth.world.roadside import Roadside
@@ -29,11 +30,7 @@ Actor = DrivingActor | StandingActor | Walker  # an annotated object over the ti
 TRAFFIC_MIX = {
     "car": 0.54, "truck": 0.12, "bus": 0.09, "train": 0.09, "motorcycle": 0.10, "construction_vehicle": 0.06,
 }  # fmt: skip
-RIDERS = {
-    "motorcycle": ("sport_rider", "cruiser_rider", "scooter_rider"),
-    "bicycle": ("city_rider", "racer_rider", "cargo_rider", "mountain_rider"),
-}
-DRIVING_MACHINES = ("loader", "backhoe", "crane", "mixer")
+MOVING_LOOKS = {**RIDDEN, "construction_vehicle": ("loader", "backhoe", "crane", "mixer")}
 SEMITRAILERS = ("box", "curtain", "container", "tanker", "flatbed")
 
 
@@ -105,10 +102,7 @@ class VehicleSpawner:
             tractor, towed = draw_body(first, rng, name), draw_body(second, rng, f"{name}-trailer")
             lag = float(tractor.size_lwh[0]) + (0.35 if not heavy else 0.25)
             return Unit(tractor, 0.0), Unit(towed, lag)
-        names = RIDERS.get(class_name)
-        if class_name == "construction_vehicle":
-            names = DRIVING_MACHINES
-        return (Unit(draw_body(draw(class_name, rng, names), rng, name), 0.0),)
+        return (Unit(draw_body(draw(class_name, rng, MOVING_LOOKS.get(class_name)), rng, name), 0.0),)
 
 
 WARM_UP_S = 6.0  # simulated time before the first frame, in which queues form
@@ -178,13 +172,11 @@ class Simulation:
         return found
 
     def _run(self) -> None:
-        vehicles = [self._ego]
-        self._populate(vehicles, 0.0)
-        steps = int(np.ceil((self.span_s[1] - self.span_s[0]) / STEP_S)) + 2
+        vehicles, start = [self._ego], self.span_s[0] - STEP_S
         gone: list[Vehicle] = []
-        start = self.span_s[0] - STEP_S
-        for vehicle in vehicles:
-            vehicle.track.append((start, vehicle.front, vehicle.speed))
+        steps = int(np.ceil((self.span_s[1] - self.span_s[0]) / STEP_S)) + 2
+        self._ego.track.append((start, self._ego.front, self._ego.speed))
+        self._populate(vehicles, 0.0, start)
         for k in range(steps):
             time_s = start + k * STEP_S
             step(vehicles, self._people_on_roads(vehicles, time_s), self.signals, time_s)
@@ -193,20 +185,18 @@ class Simulation:
         seen = [vehicle for vehicle in [*gone, *vehicles[1:]] if len(vehicle.track) > 1]
         self._driving = [DrivingActor(v, unit, np.array(v.track).T) for v in seen for unit in v.units]
 
-    def _populate(self, vehicles: list[Vehicle], near_m: float) -> None:
+    def _populate(self, vehicles: list[Vehicle], near_m: float, time_s: float) -> None:
         """Spawn vehicles around the ego vehicle, at least `near_m` metres away, until there are enough."""
-        ego = self._ego
+        around = self._ego.route.at(self._ego.front + 25.0)
         taken = [vehicle.body_points() for vehicle in vehicles]
         for attempt in range(6 * (VEHICLES + BICYCLES)):
             bicycles = sum(v.bicycle for v in vehicles)
-            if len(vehicles) >= VEHICLES + BICYCLES:
-                return
             wants_bicycle = bicycles < BICYCLES and attempt % 4 == 0
             if not wants_bicycle and len(vehicles) - bicycles >= VEHICLES:
                 continue
-            around = ego.route.at(ego.front + 25.0)
             new = self.spawner.spawn(around, near_m, REACH_M, np.concatenate(taken), wants_bicycle)
             if new is not None:
+                new.track.append((time_s, new.front, new.speed))
                 vehicles.append(new)
                 taken.append(new.body_points())
 
@@ -216,15 +206,12 @@ class Simulation:
         gone = [
             vehicle
             for vehicle in vehicles[1:]
-            if vehicle.front > vehicle.route.length - 15
+            if vehicle.front > vehicle.route.positions[-1] - 15
             or np.hypot(*(vehicle.route.at(vehicle.front) - here)) > REACH_M + 30
         ]
         for vehicle in gone:
             vehicles.remove(vehicle)
-        count = len(vehicles)
-        self._populate(vehicles, 58.0)
-        for vehicle in vehicles[count:]:
-            vehicle.track.append((time_s, vehicle.front, vehicle.speed))
+        self._populate(vehicles, 58.0, time_s)
         return gone
 
     def _people_on_roads(self, vehicles: list[Vehicle], time_s: float) -> Array:
