@@ -151,12 +151,8 @@ class RenderedDrive:
     def _actors(self, index: int) -> list[tuple[Actor, ActorState]]:
         """The annotated objects around the vehicle at a frame, with their states."""
         origin = self.world_from_ego(self.time_s(index)).translation[:2]
-        found = []
-        for actor in self.simulation.actors_near(origin, ACTORS_M):
-            state = actor.state(self.time_s(index))
-            if state is not None and np.hypot(*(state.position[:2] - origin)) < ACTORS_M:
-                found.append((actor, state))
-        return found
+        seen = ((actor, actor.state(self.time_s(index))) for actor in self.simulation.actors_near(origin, ACTORS_M))
+        return [(a, state) for a, state in seen if state and np.hypot(*(state.position[:2] - origin)) < ACTORS_M]
 
     def frame(self, index: int) -> RenderedFrame:
         """Render a frame. index: 0 to frames - 1."""
@@ -195,7 +191,7 @@ class RenderedDrive:
         near_first = np.argsort([np.hypot(*(state.position[:2] - here)) for state in states], kind="stable")
         near = [states[k] for k in near_first]
         actors = [self._placed(state.body, state.pose, *state.position.tolist(), state.yaw) for state in near]
-        signals = self._scenery.signals_around(here, self.simulation.signals, time_s)
+        signals = list(self._scenery.signals_around(here, self.simulation.signals, time_s))
         moving = TriangleSoup.gather([*actors, *signals], [*near_first.tolist(), *[-1] * len(signals)])
         shadows = shadows.with_shadows_of([moving.corners, self._ego_corners(world_from_ego)])
         snapshot = WorldSnapshot(TriangleSoup.gather([scenery, moving]), len(actors), ground, shadows, self.weather)
