@@ -10,7 +10,7 @@ from bevcli.geometry.transforms import Array
 from bevcli.synth.assets.catalog import Body, Catalog, draw_body
 from bevcli.synth.assets.people import CYCLES, PERSON_NAMES
 from bevcli.synth.world.city import KERB_M, STOP_LINE_M, CityPlan, Street, side_of
-from bevcli.synth.world.traffic import StandingActor
+from bevcli.synth.world.traffic import ActorState
 
 PARKED_MIX = {"car": 0.78, "truck": 0.09, "trailer": 0.05, "motorcycle": 0.05, "bus": 0.03}
 FILLED = 0.55  # share of parking spaces that are taken
@@ -20,6 +20,14 @@ ATTRIBUTES = {
     "bicycle": "cycle.without_rider", "motorcycle": "cycle.without_rider", "pedestrian": "pedestrian.standing",
     "barrier": "", "traffic_cone": "",
 }  # of classes other than vehicles, which are parked  # fmt: skip
+
+
+class StandingActor(ActorState):
+    """An actor that never moves."""
+
+    def state(self, time_s: float) -> ActorState:
+        """The same state at all times."""
+        return self
 
 
 class Roadside:

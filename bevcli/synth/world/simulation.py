@@ -13,18 +13,9 @@ from bevcli.synth.assets.catalog import Catalog, draw_body
 from bevcli.synth.assets.people import RIDDEN
 from bevcli.synth.world.city import STOP_LINE_M, CityPlan
 from bevcli.synth.world.pedestrians import Walker, crossers, strollers
-from bevcli.synth.world.roadside import Roadside
+from bevcli.synth.world.roadside import Roadside, StandingActor
 from bevcli.synth.world.route import DIRECTIONS, Route, build_route, node_center, right_of, street_of
-from bevcli.synth.world.traffic import (
-    STEP_S,
-    DrivingActor,
-    Signals,
-    StandingActor,
-    Unit,
-    Vehicle,
-    interpolated_track,
-    step,
-)
+from bevcli.synth.world.traffic import STEP_S, DrivingActor, Signals, Unit, Vehicle, interpolated_track, step
 
 Actor = DrivingActor | StandingActor | Walker  # an annotated object over the time of a drive
 TRAFFIC_MIX = {

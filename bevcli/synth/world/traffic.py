@@ -252,14 +252,6 @@ class ActorState:
     pose: int = 0
 
 
-class StandingActor(ActorState):
-    """An actor that never moves."""
-
-    def state(self, time_s: float) -> ActorState:
-        """The same state at all times."""
-        return self
-
-
 @dataclass(frozen=True)
 class DrivingActor:
     """One unit of a driving vehicle. Its axles are on the route.
