@@ -47,7 +47,8 @@ class Walker:
 
     def plan_at(self, time_s: ArrayLike) -> Array:
         """Plan points (..., 2) at times (...,) in seconds."""
-        return points_at(np.interp(time_s, self.times, self.places), self.path, self.positions)
+        places = np.interp(np.asarray(time_s, dtype=np.float64), self.times, self.places)
+        return points_at(places, self.path, self.positions)
 
     def on_road(self, time_s: float) -> bool:
         """True while the person walks and is on the road, so that vehicles must stop."""

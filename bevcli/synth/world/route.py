@@ -59,7 +59,7 @@ class Route:
 
     def yaw_at(self, position: ArrayLike) -> Array:
         """Heading (...,) in radians."""
-        return np.interp(position, self.positions, self.yaws)
+        return np.interp(np.asarray(position, dtype=np.float64), self.positions, self.yaws)
 
 
 def street_of(city: CityPlan, node: tuple[int, int], direction: int) -> Street:
@@ -177,7 +177,8 @@ def distances_along(points: Array) -> Array:
 
 def points_at(places: ArrayLike, points: Array, positions: Array) -> Array:
     """Points (..., 2) of a line at places (...,) along it. points: (P, 2) with positions (P,) along the line."""
-    return np.stack([np.interp(places, positions, points[:, k]) for k in (0, 1)], -1)
+    at = np.asarray(places, dtype=np.float64)
+    return np.stack([np.interp(at, positions, points[:, k]) for k in (0, 1)], -1)
 
 
 def _speed_limits(positions: Array, yaws: Array, speed: float) -> NDArray[np.float64]:
