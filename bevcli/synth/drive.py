@@ -15,17 +15,16 @@ from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid, rotation_about_z
 from bevcli.synth.assets.catalog import Assets, Body
 from bevcli.synth.assets.triangles import TriangleSoup
-from bevcli.synth.render.ground import GroundTexture, MapWindow, draw_map, paint_ground
+from bevcli.synth.render.ground import GroundTexture, MapWindow, draw_map, paint_ground, true_lines
 from bevcli.synth.render.lens import lens_parts
-from bevcli.synth.render.line_truth import true_lines
 from bevcli.synth.render.rasteriser import ShadowMap
 from bevcli.synth.render.renderer import RenderedView, WorldSnapshot, render_through_lens, render_view
 from bevcli.synth.rig import nuscenes_like_rig
 from bevcli.synth.world.city import CityPlan
 from bevcli.synth.world.ground_plan import GroundPlan
-from bevcli.synth.world.scenery import Scenery, signal_meshes
-from bevcli.synth.world.simulation import Simulation
-from bevcli.synth.world.traffic import Actor, ActorState
+from bevcli.synth.world.scenery import Scenery
+from bevcli.synth.world.simulation import Actor, Simulation
+from bevcli.synth.world.traffic import ActorState
 from bevcli.synth.world.weather import WEATHER_NAMES, make_weather
 
 ANNOTATED_M = 60.0  # boxes are kept within this distance of the origin of the bev frame
@@ -120,17 +119,12 @@ class RenderedDrive:
         self._texels_m = texel_sizes(max(camera.width for camera in self.rig.cameras) * supersampling)
         self._scenery = Scenery(self._city, self._assets.furniture)
         self._around = lru_cache(maxsize=1)(self._make_surroundings)
-        self._templates: dict[tuple[str, int], TriangleSoup] = {}
-        self._placed: dict[tuple[str, int], tuple[TriangleSoup, tuple[float, ...]]] = {}
+        self._template = lru_cache(maxsize=None)(self._make_template)
+        self._placed = lru_cache(maxsize=500)(self._make_placed)  # an actor that stands still is placed once
 
     def time_s(self, index: int) -> float:
         """Time of a frame, seconds since the start of the drive."""
         return index / self.rate_hz
-
-    def stamp(self, index: int) -> FrameStamp:
-        """Index, scene and timestamp of a frame."""
-        timestamp_ns = FIRST_TIMESTAMP_NS + round(index * 1e9 / self.rate_hz)
-        return FrameStamp(index, f"rendered-{self.seed}", timestamp_ns)
 
     def world_from_ego(self, time_s: float) -> Pose:
         """Pose of the ego vehicle, seconds after the start of the drive."""
@@ -157,16 +151,14 @@ class RenderedDrive:
     def _actors(self, index: int) -> list[tuple[Actor, ActorState]]:
         """The annotated objects around the vehicle at a frame, with their states."""
         origin = self.world_from_ego(self.time_s(index)).translation[:2]
-        found = []
-        for actor in self.simulation.actors_near(origin, ACTORS_M):
-            state = actor.state(self.time_s(index))
-            if state is not None and np.hypot(*(state.position[:2] - origin)) < ACTORS_M:
-                found.append((actor, state))
-        return found
+        seen = ((actor, actor.state(self.time_s(index))) for actor in self.simulation.actors_near(origin, ACTORS_M))
+        return [(a, state) for a, state in seen if state and np.hypot(*(state.position[:2] - origin)) < ACTORS_M]
 
     def frame(self, index: int) -> RenderedFrame:
         """Render a frame. index: 0 to frames - 1."""
-        actors, time_s, stamp = self._actors(index), self.time_s(index), self.stamp(index)
+        actors, time_s = self._actors(index), self.time_s(index)
+        timestamp_ns = FIRST_TIMESTAMP_NS + round(index * 1e9 / self.rate_hz)
+        stamp = FrameStamp(index, f"rendered-{self.seed}", timestamp_ns)
         states = [state for _, state in actors]
         pose = self.world_from_ego(time_s)
         delays = {name: self._delays_s.get(name, 0.0) for name in self.rig.names}
@@ -184,7 +176,7 @@ class RenderedDrive:
         pieces = self._ground.pieces_around(pose.translation[:2], self.map_window.half_extent_m * 1.5)
         bev_map = draw_map(pieces, boxes, bev_from_world, self.map_window)
         poses = {name: self.world_from_ego(time_s + delay) for name, delay in delays.items()}
-        times = {name: stamp.timestamp_ns + round(delay * 1e9) for name, delay in delays.items()}
+        times = {name: timestamp_ns + round(delay * 1e9) for name, delay in delays.items()}
         return RenderedFrame(stamp, views, pose, poses, times, boxes, bev_map, true_lines(pieces, bev_from_world))
 
     def _render_views(
@@ -197,8 +189,9 @@ class RenderedDrive:
         # Those of the nearest point of a grid with SNAP_M spacing, so that they are rarely made again.
         scenery, ground, shadows = self._around(*(float(np.round(at / SNAP_M) * SNAP_M) for at in here))
         near_first = np.argsort([np.hypot(*(state.position[:2] - here)) for state in states], kind="stable")
-        actors = [self._place(states[k]) for k in near_first]
-        signals = signal_meshes(self._city, self.simulation.signals, self._assets.furniture, here, time_s)
+        near = [states[k] for k in near_first]
+        actors = [self._placed(state.body, state.pose, *state.position.tolist(), state.yaw) for state in near]
+        signals = list(self._scenery.signals_around(here, self.simulation.signals, time_s))
         moving = TriangleSoup.gather([*actors, *signals], [*near_first.tolist(), *[-1] * len(signals)])
         shadows = shadows.with_shadows_of([moving.corners, self._ego_corners(world_from_ego)])
         snapshot = WorldSnapshot(TriangleSoup.gather([scenery, moving]), len(actors), ground, shadows, self.weather)
@@ -222,28 +215,19 @@ class RenderedDrive:
         shadows = ShadowMap.of(scenery.corners, self.weather.to_sun, center, extent, shadow_m)
         return scenery, texture, shadows
 
-    def _place(self, state: ActorState) -> TriangleSoup:
-        """The mesh of an actor in the world; kept while the actor stands still."""
-        key = (state.body.instance, state.pose)
-        x, y, z = (float(c) for c in state.position)
-        here = (x, y, z, state.yaw)
-        if key not in self._placed or self._placed[key][1] != here:
-            self._placed[key] = (self._template(state.body, state.pose).placed((x, y, z), state.yaw), here)
-        return self._placed[key][0]
+    def _make_placed(self, body: Body, pose: int, x: float, y: float, z: float, yaw: float) -> TriangleSoup:
+        """The mesh of a body in the world."""
+        return self._template(body, pose).placed((x, y, z), yaw)
 
-    def _template(self, body: Body, pose: int) -> TriangleSoup:
+    def _make_template(self, body: Body, pose: int) -> TriangleSoup:
         """The mesh of a body in its size and colours."""
-        key = (body.instance, pose)
-        if key not in self._templates:
-            mesh = body.variant.poses[pose % len(body.variant.poses)].fitted(body.size_lwh)
-            self._templates[key] = TriangleSoup.from_mesh(mesh).painted(body.paint, body.dye)
-        return self._templates[key]
+        mesh = body.variant.poses[pose % len(body.variant.poses)].fitted(body.size_lwh)
+        return TriangleSoup.from_mesh(mesh).painted(body.paint, body.dye)
 
     def _ego_corners(self, world_from_ego: Pose) -> NDArray[np.float32]:
         """(T, 3, 3) triangles of the ego vehicle, for its shadow. Its middle is 1.4 m in front of the rear axle."""
         x, y, _ = apply(world_from_ego.matrix, (1.4, 0.0, 0.0))
-        template = self._template(self.simulation.ego_body, 0)
-        return template.placed((x, y, 0.0), world_from_ego.yaw).corners
+        return self._placed(self.simulation.ego_body, 0, x, y, 0.0, world_from_ego.yaw).corners
 
     def _boxes(self, states: list[ActorState], views: Mapping[str, RenderedView], pose: Pose) -> Boxes3D:
         """Ground truth boxes in the world frame, within ANNOTATED_M of the origin of the bev frame."""

@@ -32,7 +32,7 @@ class Drives(Protocol):
 
     Attributes:
         input_shapes: of each drive, the number of cameras, and height and width of the network's input in pixels; None
-            where all drives have the same.
+            where any of them may share a batch.
     """
 
     @property
@@ -88,6 +88,7 @@ class RenderedDrives(FolderDrives):
         name = f"{width}x{height}"
         if isinstance(rig, RigDistribution):
             self._rigs = [_enlarged(draw_rig(rig, seed, image.size), image) for seed in seeds]
+            self.input_shapes = tuple(_input_shape(drawn.rig, image) for drawn in self._rigs)
             name += f"-rigs-{rig.digest}"
             name += "" if image.focal_px is None else f"-{image.focal_px:g}px-{image.max_pixels}"
         else:
@@ -95,7 +96,6 @@ class RenderedDrives(FolderDrives):
             self._rigs = [DrawnRig(found)] * len(seeds)
             name += "" if rig is None else f"-rig-{_digest(found)}"
         super().__init__([cache / name / f"{seed:06d}" for seed in seeds], config, class_map)
-        self.input_shapes = _if_different(tuple(_input_shape(drawn.rig, image) for drawn in self._rigs))
         self._seeds, self._config = tuple(seeds), config
         self._rendering = threading.Lock()
         self._assets: Assets | None = None
@@ -155,17 +155,13 @@ def _digest(rig: CameraRig) -> str:
     return hashlib.sha256(repr((parts, rig.ego_from_bev.tolist())).encode()).hexdigest()[:8]
 
 
-def _if_different(shapes: tuple[InputShape, ...]) -> tuple[InputShape, ...] | None:
-    return shapes if len(set(shapes)) > 1 else None
-
-
 class _Subset:
     """Some of the drives."""
 
     def __init__(self, drives: Drives, indices: range) -> None:
         self._drives, self._indices = drives, indices
         shapes = drives.input_shapes
-        self.input_shapes = None if shapes is None else _if_different(tuple(shapes[index] for index in indices))
+        self.input_shapes = None if shapes is None else tuple(shapes[index] for index in indices)
 
     def __len__(self) -> int:
         return len(self._indices)

@@ -72,11 +72,12 @@ def render(
     chosen = gather(RenderOptions, options, changes)
     rig = rig_for_rendering(chosen.rig, chosen.resolution)
     drive = _drive_of(chosen, rig, THREADS)
+    export = partial(export_drive, drive, Path(out), force=chosen.force, quality=chosen.quality, progress=progress)
     if chosen.workers == 1:
-        export_drive(drive, Path(out), force=chosen.force, quality=chosen.quality, progress=progress)
+        export()
     else:
         with shared_out(partial(_frames_of, chosen, rig), chosen.frames, chosen.workers) as frames:
-            _write(drive, frames, Path(out), force=chosen.force, progress=progress)
+            export(frames=frames)
     return RenderSummary(Path(out), chosen.seed, chosen.frames, rig.names, drive.weather.name)
 
 
@@ -102,26 +103,16 @@ def export_drive(
     force: bool = False,
     quality: int = JPEG_QUALITY,
     progress: Callable[[Frame], None] | None = None,
+    frames: Iterable[Frame] | None = None,
 ) -> None:
     """Render all frames of a drive and write them, with ego-motion at EGO_MOTION_HZ, ground truth boxes and maps.
 
     folder: the sequence folder. force: whether to replace a sequence in it. quality: JPEG quality, 1 to 100.
-    progress: called with each frame after it is written.
+    progress: called with each frame after it is written. frames: those of the drive, if they are rendered elsewhere.
     Raises OutputError where the folder contains a sequence and `force` is false, or cannot be written.
     """
-    _write(drive, _encoded(drive, range(drive.frames), quality), folder, force=force, progress=progress)
-
-
-def _write(
-    drive: RenderedDrive,
-    frames: Iterable[Frame],
-    folder: Path,
-    *,
-    force: bool,
-    progress: Callable[[Frame], None] | None,
-) -> None:
     with NativeWriter(folder, with_ego_motion=True, force=force, facts=DriveFacts(rendered=True)) as writer:
-        for frame in frames:
+        for frame in _encoded(drive, range(drive.frames), quality) if frames is None else frames:
             writer.write(frame)
             if progress is not None:
                 progress(frame)

@@ -187,8 +187,9 @@ def _random_rig(distribution: RigDistribution, size: tuple[int, int], coarse: fl
     count = int(random.integers(distribution.cameras[0], distribution.cameras[1] + 1))
     aspect = float(random.choice(distribution.aspects))
     ahead_only = random.random() < distribution.front_share
-    yaws, arc_deg = _yaws_deg(count, ahead_only, distribution, random)
-    fov_deg = _field_of_view_deg(count, arc_deg, distribution, random)
+    yaws, spacing_deg = _yaws_deg(count, ahead_only, distribution, random)
+    low, high = distribution.fov_deg
+    fov_deg = random.uniform(min(max(low, spacing_deg), high), high)
     height, radius = random.uniform(*distribution.height_m), random.uniform(*distribution.radius_m)
     coefficients = _lens(distribution, random)
     width_px = min(size[0], size[1] * aspect) * coarse
@@ -199,9 +200,9 @@ def _random_rig(distribution: RigDistribution, size: tuple[int, int], coarse: fl
         own_fov = float(np.clip(fov_deg * (1 + distribution.fov_spread) ** spread, *distribution.fov_deg))
         intrinsics = _intrinsics(image_size, own_fov, distribution, random)
         place = _place(yaw_deg, radius, height, distribution, random)
-        tilt = np.radians(random.uniform(-1, 1, 2) * distribution.tilt_deg)
-        rotation = rotation_about_z(np.radians(yaw_deg)) @ _tilt(*tilt) @ EGO_AXES_FROM_CAMERA
-        distortion = _fitting(coefficients, intrinsics, image_size)
+        tilt = _tilt(distribution.tilt_deg, random)
+        rotation = rotation_about_z(np.radians(yaw_deg)) @ tilt @ EGO_AXES_FROM_CAMERA
+        distortion = None if coefficients is None else _fitting(coefficients, intrinsics, image_size)
         cameras.append(Camera(f"CAM_{index}", *image_size, intrinsics, rigid(place, rotation), distortion))
     return CameraRig(tuple(cameras), _ego_from_bev(distribution, random))
 
@@ -209,21 +210,14 @@ def _random_rig(distribution: RigDistribution, size: tuple[int, int], coarse: fl
 def _yaws_deg(
     count: int, ahead_only: bool, distribution: RigDistribution, random: Generator
 ) -> tuple[list[float], float]:
-    """Yaw of each camera, and the angle that their axes span, 360 for all around; degrees."""
+    """Yaw of each camera, and the angle between the axes of neighbours; degrees."""
     jitter = random.uniform(-1, 1, count) * distribution.yaw_jitter_deg
     if ahead_only:
         arc = random.uniform(140, 220)
-        return [float(yaw) for yaw in np.linspace(-arc / 2, arc / 2, count) + jitter], float(arc)
+        return [float(yaw) for yaw in np.linspace(-arc / 2, arc / 2, count) + jitter], arc / max(count - 1, 1)
     # A camera looks straight ahead, or two look past it.
     first = 0.0 if random.random() < 0.75 else 180 / count
-    return [float(yaw) for yaw in first + np.arange(count) * 360 / count + jitter], 360.0
-
-
-def _field_of_view_deg(count: int, arc_deg: float, distribution: RigDistribution, random: Generator) -> float:
-    """The horizontal field of view about which those of the cameras lie, degrees."""
-    low, high = distribution.fov_deg
-    spacing = arc_deg / count if arc_deg == 360 else arc_deg / max(count - 1, 1)
-    return float(random.uniform(min(max(low, spacing), high), high))
+    return [float(yaw) for yaw in first + np.arange(count) * 360 / count + jitter], 360 / count
 
 
 def _intrinsics(size: tuple[int, int], fov_deg: float, distribution: RigDistribution, random: Generator) -> Array:
@@ -250,10 +244,8 @@ def _lens(distribution: RigDistribution, random: Generator) -> tuple[float, ...]
     return tuple(float(k) for k in drawn) if random.random() < distribution.distorted_share else None
 
 
-def _fitting(coefficients: tuple[float, ...] | None, intrinsics: Array, size: tuple[int, int]) -> Distortion | None:
+def _fitting(coefficients: tuple[float, ...], intrinsics: Array, size: tuple[int, int]) -> Distortion:
     """The distortion, weaker for wide lenses: as at a field of view of 70 degrees in the corner of the image."""
-    if coefficients is None:
-        return None
     corner = np.hypot(size[0] / intrinsics[0, 0], size[1] / intrinsics[1, 1]) / 2
     weaker = min(1.0, (0.7 / corner) ** 2)
     k1, k2, p1, p2 = coefficients
@@ -261,8 +253,9 @@ def _fitting(coefficients: tuple[float, ...] | None, intrinsics: Array, size: tu
     return Distortion("brown_conrady", tuple(float(k) for k in scaled))
 
 
-def _tilt(pitch: float, roll: float) -> Array:
-    """(3, 3) rotation by `pitch` radians about y and `roll` radians about x, in a frame with x forward."""
+def _tilt(largest_deg: float, random: Generator) -> Array:
+    """(3, 3) rotation by a pitch about y and a roll about x, in a frame with x forward."""
+    pitch, roll = np.radians(random.uniform(-1, 1, 2) * largest_deg)
     about_y = np.array([[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]])
     about_x = np.array([[1, 0, 0], [0, np.cos(roll), -np.sin(roll)], [0, np.sin(roll), np.cos(roll)]])
     return np.asarray(about_y @ about_x)
@@ -270,7 +263,7 @@ def _tilt(pitch: float, roll: float) -> Array:
 
 def _ego_from_bev(distribution: RigDistribution, random: Generator) -> Array:
     """(4, 4): x right, y forward, tilted, at a random height near the middle of the vehicle."""
-    tilt = np.radians(random.uniform(-1, 1, 2) * distribution.bev_tilt_deg)
+    tilt = _tilt(distribution.bev_tilt_deg, random)
     origin = (random.uniform(0.5, 1.5), random.uniform(-0.1, 0.1), random.uniform(*distribution.bev_height_m))
     heading = rotation_about_z(-np.pi / 2 + np.radians(random.uniform(-1, 1)))
-    return rigid(origin, _tilt(*tilt) @ heading)
+    return rigid(origin, tilt @ heading)

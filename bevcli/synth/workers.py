@@ -7,21 +7,19 @@ from contextlib import closing, contextmanager, suppress
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
-from typing import Any, TypeVar
+from typing import Any
 
 from bevcli.errors import BevcliError, OutputError
 
-Made = TypeVar("Made")
+Make = Callable[[Sequence[int]], Iterable[Any]]  # makes the items at some indices
 BLOCK = 4  # at most; neighbouring frames that a process makes: they share the scenery around the vehicle
 
 
 @contextmanager
-def shared_out(
-    make: Callable[[Sequence[int]], Iterable[Made]], count: int, workers: int
-) -> Generator[Iterator[Made], None, None]:
+def shared_out(make: Make, count: int, workers: int) -> Generator[Iterator[Any], None, None]:
     """The items 0 to count - 1, in order, made in `workers` processes, which end with the `with` block.
 
-    make: makes the items at some indices; a function that can be pickled. What it raises is raised here.
+    make: can be pickled. What it raises is raised here.
     Raises OutputError where a process ends before its items are made.
     """
     block = min(BLOCK, -(-count // workers))
@@ -49,9 +47,7 @@ def _blocked_interrupts() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _started(
-    make: Callable[[Sequence[int]], Iterable[Made]], part: Sequence[int], processes: list[SpawnProcess]
-) -> Connection:
+def _started(make: Make, part: Sequence[int], processes: list[SpawnProcess]) -> Connection:
     """Start a process that sends its items, and append it to `processes`. Returns the connection to read from."""
     context = multiprocessing.get_context("spawn")
     reader, writer = context.Pipe(duplex=False)
@@ -88,7 +84,7 @@ def _received(connection: Connection) -> Any:
     return item
 
 
-def _send_all(connection: Connection, make: Callable[[Sequence[int]], Iterable[Made]], part: Sequence[int]) -> None:
+def _send_all(connection: Connection, make: Make, part: Sequence[int]) -> None:
     with suppress(BrokenPipeError):  # the process that reads has ended
         try:
             for item in make(part):

@@ -4,8 +4,7 @@ import pytest
 
 from bevcli.synth.assets.catalog import Assets
 from bevcli.synth.world.city import STOP_LINE_M, CityPlan
-from bevcli.synth.world.roadside import Roadside
-from bevcli.synth.world.traffic import StandingActor
+from bevcli.synth.world.roadside import Roadside, StandingActor
 
 WORKS = ("barrier-", "cone-", "machine-", "worker-")
 

@@ -1,6 +1,6 @@
 """The catalog of annotated objects: the variants of each class, and a drawn individual of a variant."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from bevcli.synth.assets import people, roadworks, vehicles
 from bevcli.synth.assets.mesh import Mesh, joined
 from bevcli.synth.assets.paint import BUS_PAINTS, CAR_PAINTS, CLOTHES, MACHINE_PAINTS, TRUCK_PAINTS, Color, linear
+from bevcli.synth.assets.people import CYCLES, RIDDEN
 from bevcli.synth.assets.street_furniture import StreetFurniture
 
-YELLOW_ONLY: tuple[Color, ...] = ((238, 190, 30),)  # paint of taxis and school buses
+OWN_PAINTS: dict[str, tuple[Color, ...]] = dict.fromkeys(("taxi", "school"), ((238, 190, 30),))  # by look
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class Variant:
     dyes: tuple[Color, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Body:
     """An individual of a variant, with its own size and colours.
 
@@ -75,8 +76,8 @@ _CLASSES: dict[str, tuple[Iterable[str], Callable[[str], list[Mesh]], tuple[Colo
     "bus": (vehicles.BUSES, vehicles.bus, BUS_PAINTS, BUS_PAINTS),
     "trailer": (vehicles.TRAILER_NAMES, vehicles.trailer, TRUCK_PAINTS, TRUCK_PAINTS),
     "barrier": (roadworks.BARRIER_NAMES, roadworks.barrier, CAR_PAINTS, CLOTHES),
-    "motorcycle": (people.MOTORCYCLE_NAMES, people.motorcycle, CAR_PAINTS, CLOTHES),
-    "bicycle": (people.BICYCLE_NAMES, people.bicycle, CAR_PAINTS, CLOTHES),
+    "motorcycle": (CYCLES["motorcycle"] + RIDDEN["motorcycle"], people.motorcycle, CAR_PAINTS, CLOTHES),
+    "bicycle": (CYCLES["bicycle"] + RIDDEN["bicycle"], people.bicycle, CAR_PAINTS, CLOTHES),
     "traffic_cone": (roadworks.CONE_NAMES, roadworks.traffic_cone, CAR_PAINTS, CLOTHES),
 }
 
@@ -85,18 +86,20 @@ class Catalog:
     """All variants by class. It does not depend on the drive."""
 
     def __init__(self) -> None:
-        self.by_class: dict[str, tuple[Variant, ...]] = {
-            name: tuple(_variant(name, look, make, paints, dyes) for look in looks)
-            for name, (looks, make, paints, dyes) in _CLASSES.items()
-        }
+        self.by_class: dict[str, tuple[Variant, ...]] = {}
+        for name, (looks, make, paints, dyes) in _CLASSES.items():
+            meshes = {look: joined(make(look)) for look in looks}
+            self.by_class[name] = tuple(
+                Variant(name, look, (mesh,), mesh.extents, OWN_PAINTS.get(look, paints), dyes)
+                for look, mesh in meshes.items()
+            )
         # A walking person has two mirrored strides of the same size.
         walking, standing = ([_person(name, *strides) for name in people.PERSON_NAMES] for strides in ((1, -1), (0,)))
         self.by_class["pedestrian"] = (*walking, *standing)
 
-    def draw(self, class_name: str, rng: np.random.Generator, names: Iterable[str] | None = None) -> Variant:
+    def draw(self, class_name: str, rng: np.random.Generator, names: Collection[str] | None = None) -> Variant:
         """Draw a variant of a class. names: draw from these variants only."""
-        allowed = None if names is None else set(names)
-        choices = [v for v in self.by_class[class_name] if allowed is None or v.name in allowed]
+        choices = [v for v in self.by_class[class_name] if names is None or v.name in names]
         return choices[int(rng.integers(len(choices)))]
 
 
@@ -116,14 +119,6 @@ class Assets:
     def build() -> "Assets":
         """Build every mesh. This takes about half a second."""
         return Assets(Catalog(), StreetFurniture())
-
-
-def _variant(
-    class_name: str, look: str, make: Callable[[str], list[Mesh]], paints: tuple[Color, ...], dyes: tuple[Color, ...]
-) -> Variant:
-    mesh = joined(make(look))
-    chosen = YELLOW_ONLY if look in ("taxi", "school") else paints
-    return Variant(class_name, look, (mesh,), mesh.extents, chosen, dyes)
 
 
 def _person(name: str, *strides: int) -> Variant:

@@ -12,8 +12,8 @@ TROUSERS: tuple[Color, ...] = ((44, 52, 76), (52, 50, 50), (112, 98, 78), (78, 8
 PERSON_NAMES = ("man", "woman", "worker", "child", "backpack", "coat")
 RUBBER: Color = (24, 24, 26)
 CHROME: Color = (176, 178, 182)
-BICYCLE_NAMES = ("city", "racer", "cargo", "mountain", "city_rider", "racer_rider", "cargo_rider", "mountain_rider")
-MOTORCYCLE_NAMES = ("sport", "cruiser", "scooter", "sport_rider", "cruiser_rider", "scooter_rider")
+CYCLES = {"bicycle": ("city", "racer", "cargo", "mountain"), "motorcycle": ("sport", "cruiser", "scooter")}
+RIDDEN = {kind: tuple(f"{name}_rider" for name in names) for kind, names in CYCLES.items()}
 Place = tuple[float, float]  # x and z, metres
 
 
@@ -116,7 +116,7 @@ def _thin_wheel(x: float, radius: float, width: float) -> list[Mesh]:
 
 
 def bicycle(name: str) -> list[Mesh]:
-    """The parts of a bicycle. name: one of BICYCLE_NAMES; with the suffix "_rider" a person sits on it."""
+    """The parts of a bicycle. name: of CYCLES, or of RIDDEN, on which a person sits."""
     kind = name.removesuffix("_rider")
     reach = {"city": 1.05, "racer": 1.0, "cargo": 1.35, "mountain": 1.08}[kind]
     radius, seat_z, bar_z = 0.34, 0.92, {"city": 1.08, "racer": 0.95, "cargo": 1.05, "mountain": 1.02}[kind]
@@ -150,7 +150,7 @@ def bicycle(name: str) -> list[Mesh]:
 
 
 def motorcycle(name: str) -> list[Mesh]:
-    """The parts of a motorcycle. name: one of MOTORCYCLE_NAMES; with the suffix "_rider" a person sits on it."""
+    """The parts of a motorcycle. name: of CYCLES, or of RIDDEN, on which a person sits."""
     kind = name.removesuffix("_rider")
     radius, reach = (0.24, 1.25) if kind == "scooter" else (0.32, 1.45)
     back, front = -reach / 2, reach / 2

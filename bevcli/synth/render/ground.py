@@ -1,4 +1,4 @@
-"""The painted ground: as a texture with mip levels, and as the ground truth map."""
+"""The painted ground: as a texture with mip levels, as the ground truth map, and as true lines."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -6,11 +6,14 @@ from functools import lru_cache
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from shapely import LineString, Polygon, union_all
+from shapely.geometry.base import BaseGeometry
 
-from bevcli.frame import MAP_CLASSES, BevMap
+from bevcli.frame import LINE_CLASSES, MAP_CLASSES, BevMap, MapLines
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import VEHICLE_CLASSES
 from bevcli.geometry.transforms import Array, apply
+from bevcli.sequences.true_lines import lines_in_area
 from bevcli.synth.assets.paint import linear
 from bevcli.synth.world.ground_plan import ASPHALT, GroundPiece
 from bevcli.synth.world.weather import tiling_noise
@@ -138,3 +141,21 @@ def draw_map(pieces: list[GroundPiece], boxes_world: Boxes3D, bev_from_world: Ar
     cells = sum((layer * MAP_CLASSES[name] for name, layer in layers.items()), np.zeros_like(layers["vehicle"]))
     extent = (-window.half_extent_m, window.half_extent_m)
     return BevMap(cells.astype(np.uint8), extent, extent)
+
+
+GAP_M = 0.05  # roads so near to each other are one
+DIVIDER, CROSSING, BOUNDARY = LINE_CLASSES
+
+
+def true_lines(pieces: list[GroundPiece], bev_from_world: Array) -> MapLines:
+    """Lane dividers, pedestrian crossings (closed) and road boundaries, as by `lines_in_area`, bev frame."""
+
+    def moved(points: Array) -> Array:
+        return apply(bev_from_world, np.pad(points, ((0, 0), (0, 1))))[:, :2]
+
+    roads = union_all([Polygon(moved(road)).buffer(GAP_M) for piece in pieces for road in piece.roads]).buffer(-GAP_M)
+    found: list[tuple[str, BaseGeometry]] = [(BOUNDARY, roads.boundary)]
+    for piece in pieces:
+        found += [(DIVIDER, LineString(moved(line))) for line in piece.lane_boundaries]
+        found += [(CROSSING, Polygon(moved(outline)).boundary) for outline in piece.crossings]
+    return lines_in_area(found)

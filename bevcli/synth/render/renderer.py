@@ -114,8 +114,6 @@ def render_through_lens(
 
 def _supersampled(camera: Camera, factor: int) -> Camera:
     """The camera with each pixel divided into factor x factor equal parts."""
-    if factor == 1:
-        return camera
     scaled = camera.scaled(factor)
     shift = np.array([[1.0, 0, (factor - 1) / 2], [0, 1.0, (factor - 1) / 2], [0, 0, 1.0]])
     return replace(scaled, intrinsics=shift @ scaled.intrinsics)
@@ -142,7 +140,6 @@ def shade(
     camera: the buffer's camera; its distortion is ignored. world_from_camera: (4, 4). needed: as in `render_view`.
     """
     soup, ground, shadows, w = snapshot.soup, snapshot.ground, snapshot.shadows, snapshot.weather
-    light = np.stack([w.sun, w.sky, w.bounce, w.zenith, w.horizon, w.haze, w.cloud_color]).astype(np.float64)
     ray_from_image = world_from_camera[:3, :3] @ np.linalg.inv(camera.intrinsics)
     image = np.zeros((*buffer.triangles.shape, 3), np.uint8)
     shade_pixels(
@@ -150,7 +147,7 @@ def shade(
         (soup.normals, soup.albedo, soup.material, soup.facade, soup.facades),
         (ground.texels, ground.offsets, ground.rough, *ground.origin, ground.texel_m, ground.size),
         (shadows.heights, *shadows.origin, shadows.texel_m, *shadows.shear, w.shadow_softness_m),
-        (light, w.to_sun, w.clouds, w.haze_m, w.lamps),
+        (w.light, w.to_sun, w.clouds, w.haze_m, w.lamps),
         (ray_from_image, np.ascontiguousarray(world_from_camera[:3, 3]), 1.0 / camera.intrinsics[0, 0]),
         _display_table(),
         needed,

@@ -18,11 +18,13 @@ from bevcli.geometry.transforms import Array
 
 KERB_M = 0.15  # height of kerbs
 CORNER_M = 5.0  # radius of the kerb at a junction
-CROSSING_FROM_M, CROSSING_TO_M = 1.5, 5.0  # extent of a pedestrian crossing, measured from the edge of the junction
+CROSSING_M = (1.5, 5.0)  # extent of a pedestrian crossing, measured from the edge of the junction
 STOP_LINE_M = 6.2  # from the edge of the junction to the stop line
+BICYCLE_OFFSET_M = 0.5  # from the edge of the outermost lane to the line that bicycles follow
 SIDE_STEP_M, LINE_STEP_M = 6.0, 4.0  # distances between the points of outlines and lines, so that they can be bent
 
 Landuse = Literal["houses", "park", "site"]
+Corner = Array | tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -62,9 +64,9 @@ class Street:
         """Plan point at a position along the street, `offset` metres from its centre line (towards +y or +x)."""
         return (position, self.position + offset) if self.axis == 0 else (self.position + offset, position)
 
-    def lane_offset(self, lane: int) -> float:
-        """From the centre line to the middle of a lane, metres. Lane 0 is the innermost."""
-        return self.lane_m * (lane + 0.5)
+    def lane_offset(self, lane: int, bicycle: bool = False) -> float:
+        """From the centre line to the middle of a lane, or to the line of bicycles, metres. Lane 0 is the innermost."""
+        return self.lanes * self.lane_m + BICYCLE_OFFSET_M if bicycle else self.lane_m * (lane + 0.5)
 
 
 @dataclass(frozen=True)
@@ -85,17 +87,6 @@ class Block:
     high: tuple[float, float]
     sidewalks: tuple[float, float, float, float]
 
-    def side(self, side: int) -> tuple[Array, Array, Array, float]:
-        """Start (2,), unit vector along it (2,), inward unit vector (2,) and length of a side, plan coordinates.
-
-        side: 0 south, 1 east, 2 north, 3 west.
-        """
-        (x0, y0), (x1, y1) = self.low, self.high
-        start, end = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)], dtype=np.float64)[[side, (side + 1) % 4]]
-        length = float(np.hypot(*(end - start)))
-        inward = np.array([(0, 1), (-1, 0), (0, -1), (1, 0)][side], dtype=np.float64)
-        return start, (end - start) / length, inward, length
-
     def inside(self, margin: float = 0.0) -> tuple[Array, Array]:
         """South-west and north-east corner (2,) of the land behind the pavements, `margin` metres from them."""
         south, east, north, west = self.sidewalks
@@ -106,34 +97,15 @@ class Neighbourhood(NamedTuple):
     """A part of the city.
 
     Attributes:
-        columns: its streets of axis 1, in order.
-        rows: its streets of axis 0, in order.
-        block_columns: columns of its blocks.
-        block_rows: rows of its blocks.
+        blocks: column and row of each block.
+        nodes: column and row of each junction.
+        stretches: axis and index of the street of each stretch, and index of the street that crosses it at the
+            beginning.
     """
 
-    columns: list[Street]
-    rows: list[Street]
-    block_columns: range
-    block_rows: range
-
-    @property
-    def blocks(self) -> list[tuple[int, int]]:
-        """Column and row of each block."""
-        return list(product(self.block_columns, self.block_rows))
-
-    @property
-    def nodes(self) -> list[tuple[int, int]]:
-        """Column and row of each junction."""
-        return [(column.index, row.index) for column, row in product(self.columns, self.rows)]
-
-    @property
-    def stretches(self) -> list[tuple[int, int, int]]:
-        """Axis and index of the street of each stretch, and index of the street that crosses it at the beginning."""
-        return [
-            *((1, column.index, k) for column in self.columns for k in self.block_rows),
-            *((0, row.index, k) for row in self.rows for k in self.block_columns),
-        ]
+    blocks: list[tuple[int, int]]
+    nodes: list[tuple[int, int]]
+    stretches: list[tuple[int, int, int]]
 
 
 class CityPlan:
@@ -215,36 +187,26 @@ class CityPlan:
             return "park"
         return "site" if share < 0.30 else "houses"
 
-    def streets_between(self, axis: int, low: float, high: float) -> list[Street]:
-        """The streets of an axis that overlap the interval from low to high (plan coordinates, metres), in order."""
-        index = self.nearest(axis, low) - 1
-        found: list[Street] = []
-        while (street := self.street(axis, index)).position - street.half_width <= high:
-            if street.position + street.half_width >= low:
-                found.append(street)
-            index += 1
-        return found
+    def streets_between(self, axis: int, low: float, high: float) -> range:
+        """Indices of the streets of an axis that overlap the interval from low to high (plan coordinates, metres)."""
+        first, last = self.street(axis, self.below(axis, low)), self.street(axis, self.below(axis, high) + 1)
+        start = first.index if first.position + first.half_width >= low else first.index + 1
+        return range(start, last.index + 1 if last.position - last.half_width <= high else last.index)
 
     def around(self, center: ArrayLike, reach_m: float) -> Neighbourhood:
         """The streets and blocks within `reach_m` metres, along x and y, of a world point (2,)."""
         x, y = self.unbend(center)
         columns = self.streets_between(1, x - reach_m, x + reach_m)
         rows = self.streets_between(0, y - reach_m, y + reach_m)
-        return Neighbourhood(columns, rows, self._gaps(columns, 1, x), self._gaps(rows, 0, y))
+        block_columns, block_rows = (range(streets.start - 1, streets.stop) for streets in (columns, rows))
+        return Neighbourhood(
+            list(product(block_columns, block_rows)),
+            list(product(columns, rows)),
+            [*product((1,), columns, block_rows), *product((0,), rows, block_columns)],
+        )
 
-    def _gaps(self, streets: list[Street], axis: int, position: float) -> range:
-        """Index of the street before each block; without streets, of the one before the position."""
-        if streets:
-            return range(streets[0].index - 1, streets[-1].index + 1)
-        return range(below := self._below(axis, position), below + 1)
-
-    def nearest(self, axis: int, position: float) -> int:
-        """Index of the street of an axis whose centre line is nearest to a plan coordinate in metres."""
-        index = self._below(axis, position)
-        before, after = self._position(axis, index), self._position(axis, index + 1)
-        return index if position - before <= after - position else index + 1
-
-    def _below(self, axis: int, position: float) -> int:
+    def below(self, axis: int, position: float) -> int:
+        """Index of the last street of an axis whose centre line is not beyond a plan coordinate in metres."""
         index = round(position / 85)
         while self._position(axis, index) > position:
             index -= 1
@@ -253,7 +215,19 @@ class CityPlan:
         return index
 
 
-def rounded_rectangle(low: Array | tuple[float, float], high: Array | tuple[float, float], radius: float) -> Array:
+def side_of(low: Corner, high: Corner, side: int) -> tuple[Array, Array, Array, float]:
+    """Start (2,), unit vector along it (2,), inward unit vector (2,) and length of a side of a rectangle.
+
+    low, high: its south-west and north-east corner. side: 0 south, 1 east, 2 north, 3 west.
+    """
+    (x0, y0), (x1, y1) = low, high
+    start, end = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)], dtype=np.float64)[[side, (side + 1) % 4]]
+    length = float(np.hypot(*(end - start)))
+    inward = np.array([(0, 1), (-1, 0), (0, -1), (1, 0)][side], dtype=np.float64)
+    return start, (end - start) / length, inward, length
+
+
+def rounded_rectangle(low: Corner, high: Corner, radius: float) -> Array:
     """(P, 2) counter-clockwise outline with round corners and with points about every SIDE_STEP_M on its sides."""
     (x0, y0), (x1, y1) = low, high
     radius = min(radius, (x1 - x0) / 2, (y1 - y0) / 2)

@@ -12,16 +12,7 @@ from numpy.typing import ArrayLike
 
 from bevcli.geometry.transforms import Array
 from bevcli.synth.assets.paint import Color
-from bevcli.synth.world.city import (
-    CORNER_M,
-    CROSSING_FROM_M,
-    CROSSING_TO_M,
-    STOP_LINE_M,
-    CityPlan,
-    Street,
-    along,
-    rounded_rectangle,
-)
+from bevcli.synth.world.city import CORNER_M, CROSSING_M, STOP_LINE_M, CityPlan, Street, along, rounded_rectangle
 
 WHITE: Color = (222, 222, 216)
 YELLOW: Color = (214, 170, 54)
@@ -95,9 +86,9 @@ class GroundPlan:
         south, east, north, west = block.sidewalks
         x, y = np.arange(x0 + 1, x1 - 1, 1.5), np.arange(y0 + 1, y1 - 1, 1.5)
         for low, high in ((y0 + 0.3, y0 + south), (y1 - north, y1 - 0.3)):
-            paints += self._bars(_pairs(x, low), _pairs(x, high), 0.04, JOINT)
+            paints += self._bars([(at, low) for at in x], [(at, high) for at in x], 0.04, JOINT)
         for low, high in ((x0 + 0.3, x0 + west), (x1 - east, x1 - 0.3)):
-            paints += self._bars(_pairs(y, low)[:, ::-1], _pairs(y, high)[:, ::-1], 0.04, JOINT)
+            paints += self._bars([(low, at) for at in y], [(high, at) for at in y], 0.04, JOINT)
         yard = city.bend(rounded_rectangle(*block.inside(), 0.5))
         paints.append(GroundPaint(yard, YARD[city.landuse(column, row)]))
         return GroundPiece(tuple(paints))
@@ -111,10 +102,10 @@ class GroundPlan:
         crossings = []
         for street, across, sign in ((a, b, 1), (a, b, -1), (b, a, 1), (b, a, -1)):
             edge = (y if street is a else x) + sign * across.half_width
-            crossings.append(self._band(street, edge + sign * CROSSING_FROM_M, edge + sign * CROSSING_TO_M))
+            near, far = (edge + sign * distance for distance in CROSSING_M)
+            crossings.append(self._band(street, near, far))
             offsets = np.arange(-street.half_width + 0.75, street.half_width - 0.05, 1.1)
-            start = [street.point(edge + sign * CROSSING_FROM_M, offset) for offset in offsets]
-            end = [street.point(edge + sign * CROSSING_TO_M, offset) for offset in offsets]
+            start, end = ([street.point(at, offset) for offset in offsets] for at in (near, far))
             paints += self._bars(start, end, 0.55, WHITE)
             side, stop = _approach_side(street, sign), edge + sign * STOP_LINE_M
             kerb = side * (street.lanes * street.lane_m + street.bike_m)
@@ -208,11 +199,6 @@ def _approach_side(street: Street, sign: int) -> int:
     sign: +1 where the stretch begins at the junction, -1 where it ends there, along the street's axis.
     """
     return sign if street.axis == 0 else -sign
-
-
-def _pairs(varying: Array, fixed: float) -> Array:
-    """(L, 2) points with first coordinates (L,) and one second coordinate."""
-    return np.stack([varying, np.full(len(varying), fixed)], -1)
 
 
 def _junction_outline(x: float, y: float, reach_x: float, reach_y: float) -> Array:

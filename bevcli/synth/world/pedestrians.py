@@ -1,15 +1,16 @@
 """People who walk: along the pavements, and over the streets at junctions."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from bevcli.geometry.transforms import Array
 from bevcli.synth.assets.catalog import Body, Catalog, draw_body
 from bevcli.synth.assets.people import PERSON_NAMES
 from bevcli.synth.world.city import KERB_M, CityPlan, along, rounded_rectangle
-from bevcli.synth.world.route import DIRECTIONS, distances_along, node_center, street_of
+from bevcli.synth.world.route import DIRECTIONS, distances_along, node_center, points_at, street_of
 from bevcli.synth.world.traffic import MOVING_M_S, ActorState, Signals
 
 STRIDE_M = 0.72  # distance after which the pose changes
@@ -27,7 +28,6 @@ class Walker:
         city: the plan that the path belongs to.
         body: size and looks.
         path: (P, 2) plan points, metres.
-        positions: (P,) position of each point along the path, metres.
         times: (K,) seconds; between them the person moves evenly.
         places: (K,) position along the path at these times, metres.
         road: start and end of the part of the path that is on a road, metres; negative for none.
@@ -36,29 +36,31 @@ class Walker:
     city: CityPlan
     body: Body
     path: Array
-    positions: Array
-    times: NDArray[np.float64]
-    places: NDArray[np.float64]
+    times: Array
+    places: Array
     road: tuple[float, float]
+
+    @cached_property
+    def positions(self) -> Array:
+        """(P,) position of each point along the path, metres."""
+        return distances_along(self.path)
 
     def plan_at(self, time_s: ArrayLike) -> Array:
         """Plan points (..., 2) at times (...,) in seconds."""
         places = np.interp(np.asarray(time_s, dtype=np.float64), self.times, self.places)
-        return np.stack([np.interp(places, self.positions, self.path[:, k]) for k in (0, 1)], -1)
-
-    def _place(self, time_s: float) -> float:
-        """Position along the path at a time in seconds, metres."""
-        return float(np.interp(time_s, self.times, self.places))
+        return points_at(places, self.path, self.positions)
 
     def on_road(self, time_s: float) -> bool:
-        """True while the person is on the road, so that vehicles must stop."""
-        return self.road[0] - 0.3 < self._place(time_s) < self.road[1] + 0.3
+        """True while the person walks and is on the road, so that vehicles must stop."""
+        walks = self.times[0] < time_s < self.times[-1]
+        return bool(walks and self.road[0] - 0.3 < np.interp(time_s, self.times, self.places) < self.road[1] + 0.3)
 
     def state(self, time_s: float) -> ActorState | None:
         """The state, or None before the walk begins and after it ends."""
         if not self.times[0] <= time_s <= self.times[-1]:
             return None
-        place, plan = self._place(time_s), self.plan_at([time_s - 0.02, time_s, time_s + 0.02])
+        place = float(np.interp(time_s, self.times, self.places))
+        plan = self.plan_at([time_s - 0.02, time_s, time_s + 0.02])
         before, here, after = self.city.bend(plan)
         velocity = (after - before) / 0.04
         moving = float(np.hypot(*velocity)) > MOVING_M_S
@@ -72,12 +74,6 @@ class Walker:
         position = np.array([here[0], here[1], KERB_M * float(np.clip(0.5 - inside / 0.3, 0, 1))])
         attribute = "pedestrian.moving" if moving else "pedestrian.standing"
         return ActorState(self.body, position, yaw, attribute, velocity, int(place / STRIDE_M) % 2)
-
-
-def _make(
-    city: CityPlan, body: Body, path: Array, times: list[float], places: list[float], road: tuple[float, float]
-) -> Walker:
-    return Walker(city, body, path, distances_along(path), np.array(times), np.array(places), road)
 
 
 def strollers(city: CityPlan, catalog: Catalog, span_s: tuple[float, float], column: int, row: int) -> list[Walker]:
@@ -96,7 +92,7 @@ def strollers(city: CityPlan, catalog: Catalog, span_s: tuple[float, float], col
         walked = (span_s[1] - span_s[0]) * speed
         path = np.concatenate([ring] * (int(np.ceil(walked / lap)) + 1) + [ring[:1]])
         body = _person(catalog, rng, f"stroller-{column}-{row}-{k}")
-        walkers.append(_make(city, body, path, list(span_s), [0.0, walked], (-1.0, -1.0)))
+        walkers.append(Walker(city, body, path, np.array(span_s), np.array([0.0, walked]), (-1.0, -1.0)))
     return walkers
 
 
@@ -143,8 +139,8 @@ def _crosser(
     start += rng.uniform(0, 1.0) if start > arrival else 0.0
     end = start + (2 * reach - kerb) / speed
     body = _person(catalog, rng, name)
-    return _make(city, body, path, [begin, arrival, start, end], [0.0, kerb, kerb, 2 * reach],
-                 (ALONG_PAVEMENT_M, far))  # fmt: skip
+    times, places = np.array([begin, arrival, start, end]), np.array([0.0, kerb, kerb, 2 * reach])
+    return Walker(city, body, path, times, places, (ALONG_PAVEMENT_M, far))
 
 
 def _person(catalog: Catalog, rng: np.random.Generator, name: str) -> Body:

@@ -1,24 +1,33 @@
 """Annotated objects that stand still: parked vehicles, road works, building sites, standing people."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterator
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from bevcli.geometry.transforms import Array
 from bevcli.synth.assets.catalog import Body, Catalog, draw_body
-from bevcli.synth.assets.people import PERSON_NAMES
-from bevcli.synth.world.city import KERB_M, STOP_LINE_M, CityPlan, Street
-from bevcli.synth.world.traffic import StandingActor
+from bevcli.synth.assets.people import CYCLES, PERSON_NAMES
+from bevcli.synth.world.city import KERB_M, STOP_LINE_M, CityPlan, Street, side_of
+from bevcli.synth.world.traffic import ActorState
 
 PARKED_MIX = {"car": 0.78, "truck": 0.09, "trailer": 0.05, "motorcycle": 0.05, "bus": 0.03}
 FILLED = 0.55  # share of parking spaces that are taken
 WORKS_SHARE = 0.27  # share of parking lanes (one side of a stretch) with road works
-WITHOUT_RIDER = {
-    "motorcycle": ("sport", "cruiser", "scooter"),
-    "bicycle": ("city", "racer", "cargo", "mountain"),
-}
-PARKED_LOOKS = {**WITHOUT_RIDER, "bus": ("mini", "shuttle")}
+PARKED_LOOKS = {**CYCLES, "bus": ("mini", "shuttle")}
+ATTRIBUTES = {
+    "bicycle": "cycle.without_rider", "motorcycle": "cycle.without_rider", "pedestrian": "pedestrian.standing",
+    "barrier": "", "traffic_cone": "",
+}  # of classes other than vehicles, which are parked  # fmt: skip
+
+
+class StandingActor(ActorState):
+    """An actor that never moves."""
+
+    def state(self, time_s: float) -> ActorState:
+        """The same state at all times."""
+        return self
 
 
 class Roadside:
@@ -47,7 +56,7 @@ class Roadside:
         rng: np.random.Generator,
         instance: str,
         spread: float = 0.05,
-        names: Iterable[str] | None = None,
+        names: Collection[str] | None = None,
     ) -> Body:
         """Draw a look, of those with these names, and an individual of it."""
         return draw_body(self.catalog.draw(class_name, rng, names), rng, instance, spread)
@@ -80,136 +89,121 @@ class Roadside:
             free = at + length + 1 < closed[0] or at > closed[1] + 1
             if free and rng.random() < FILLED:
                 offset = street.half_width - 0.18 - body.size_lwh[1] / 2
-                made.append(self._stand(street, body, at + length / 2, side * offset, "vehicle.parked"))
+                made.append(self._stand(street, body, at + length / 2, side * offset))
             at = at + length + rng.uniform(0.6, 1.3) if not (at <= closed[1] and not free) else closed[1] + 1.2
         return made
 
     def _works(
         self, street: Street, side: int, closed: tuple[float, float], rng: np.random.Generator, name: str
-    ) -> list[StandingActor]:
+    ) -> Iterator[StandingActor]:
         """Road works on a part of the parking lane: barriers along the traffic, cones, a machine and workers.
 
         closed: start and end along the street, plan coordinates, metres.
         """
         start, end = closed
-        made = []
         edge, middle = street.half_width - 3.05, street.half_width - 1.4
         barrier = self.catalog.draw("barrier", rng)
         for k, at in enumerate(np.arange(start + 4.0, end - 3.9, rng.choice([2.65, 2.65, 4.0]))):
             body = draw_body(barrier, rng, f"barrier-{name}-{k}", 0.02)
-            made.append(self._stand(street, body, float(at), side * edge, "", np.pi / 2))
+            yield self._stand(street, body, float(at), side * edge, np.pi / 2)
         cone = self.catalog.draw("traffic_cone", rng)
         across = np.linspace(street.half_width - 0.3, edge + 0.1, 4)
         along = [*(start + 0.75 * np.arange(4)), *(end - 0.75 * np.arange(4))]
         for k, (at, offset) in enumerate(zip(along, [*across, *across], strict=True)):
             body = draw_body(cone, rng, f"cone-{name}-{k}", 0.03)
-            made.append(self._stand(street, body, at, side * offset, ""))
+            yield self._stand(street, body, at, side * offset)
         machines = [(v.name, v.size_lwh) for v in self.catalog.by_class["construction_vehicle"]]
         small = [look for look, size in machines if size[0] < end - start - 8 and size[1] < 2.72]
         machine = self._body("construction_vehicle", rng, f"machine-{name}", names=small)
         space = (start + 4 + machine.size_lwh[0] / 2, end - 4 - machine.size_lwh[0] / 2)
         at = float(rng.uniform(*space)) if space[1] > space[0] else (start + end) / 2
         turned = np.pi if rng.random() < 0.3 else 0.0
-        made.append(self._stand(street, machine, at, side * middle, "vehicle.parked", turned))
+        yield self._stand(street, machine, at, side * middle, turned)
         for k in range(int(rng.integers(1, 4))):
             body = self._body("pedestrian", rng, f"worker-{name}-{k}", 0.03, ["worker_standing"])
             at = start + 2.9 if k == 0 else end - 2.1 - 0.8 * k
             offset = side * (street.half_width - (0.6, 0.7, 1.5)[k])
-            made.append(self._stand(street, body, at, offset, "pedestrian.standing", float(rng.uniform(0, 6.3))))
-        return made
+            yield self._stand(street, body, at, offset, float(rng.uniform(0, 6.3)))
 
-    def _stand(
-        self, street: Street, body: Body, at: float, offset: float, attribute: str, turn: float = 0.0
-    ) -> StandingActor:
+    def _stand(self, street: Street, body: Body, at: float, offset: float, turn: float = 0.0) -> StandingActor:
         """An actor on a street that faces in the direction of the traffic on its side, turned by `turn` radians.
 
         at: position along the street; offset: from its centre line; metres, plan coordinates.
         """
         plan, forward = street.point(at, offset), float(-np.sign(offset) if street.axis == 0 else np.sign(offset))
         direction = (forward, 0.0) if street.axis == 0 else (0.0, forward)
-        x, y = self.city.bend(plan)
-        attribute = "cycle.without_rider" if body.variant.class_name in WITHOUT_RIDER else attribute
-        return StandingActor(body, np.array([x, y, 0.0]), self.city.heading(plan, direction) + turn, attribute)
+        return self._stand_on_land(body, plan, self.city.heading(plan, direction) + turn, 0.0)
 
     def _on_pavement(self, column: int, row: int) -> list[StandingActor]:
         """Parked bicycles and motorcycles, and groups of standing people."""
         rng = self.city.stream("pavement", column, row)
         land, made = self.city.block(column, row), []
         for side in range(4):
-            start, way, inward, length = land.side(side)
+            start, way, inward, length = side_of(land.low, land.high, side)
             depth, name = land.sidewalks[side] - 1.0, f"{column}.{row}.{side}"
             for group in range(int(rng.poisson(0.7))):
                 # Racks do not overlap: each has a quarter of the side for itself.
                 at = 9 + (length - 22) * (group + rng.random()) / 4
                 for k in range(int(rng.integers(1, 4)) if group < 4 else 0):
                     class_name = "bicycle" if rng.random() < 0.75 else "motorcycle"
-                    body = self._body(class_name, rng, f"rack-{name}.{group}.{k}", 0.03, WITHOUT_RIDER[class_name])
+                    body = self._body(class_name, rng, f"rack-{name}.{group}.{k}", 0.03, CYCLES[class_name])
                     point = start + way * (at + 0.85 * k) + inward * depth
-                    yaw = self.city.heading(point, inward)
-                    made.append(self._stand_on_land(body, point, yaw, "cycle.without_rider"))
+                    made.append(self._stand_on_land(body, point, self.city.heading(point, inward)))
             for group in range(int(rng.poisson(0.5))):
                 middle = start + way * rng.uniform(8, length - 8) + inward * depth
-                if self._nearer(made, middle, 2.6):
+                if (self._distances(made, middle) < 2.6).any():
                     continue
                 for k in range(int(rng.integers(1, 4))):
                     names = [f"{n}_standing" for n in PERSON_NAMES if n != "worker"]
                     body = self._body("pedestrian", rng, f"standing-{name}.{group}.{k}", 0.03, names)
                     angle = 2.1 * k + rng.uniform(-0.3, 0.3)
                     point = middle + 0.55 * np.array([np.cos(angle), np.sin(angle)])
-                    facing = self.city.heading(point, middle - point)
-                    made.append(self._stand_on_land(body, point, facing, "pedestrian.standing"))
+                    made.append(self._stand_on_land(body, point, self.city.heading(point, middle - point)))
         return made
 
-    def _nearer(self, made: list[StandingActor], point: Array, distance: float) -> bool:
-        """True where an actor stands within a distance (metres) of a plan point (2,)."""
+    def _distances(self, made: list[StandingActor], point: Array) -> Array:
+        """(M,) distances of the actors from a plan point (2,), metres."""
         x, y = self.city.bend(point)
-        return any(np.hypot(m.position[0] - x, m.position[1] - y) < distance for m in made)
+        return np.array([np.hypot(m.position[0] - x, m.position[1] - y) for m in made])
 
-    def _stand_on_land(self, body: Body, point: Array, yaw: float, attribute: str) -> StandingActor:
-        x, y = self.city.bend(point)
-        return StandingActor(body, np.array([x, y, KERB_M]), yaw, attribute)
+    def _stand_on_land(self, body: Body, point: ArrayLike, yaw: float, height: float = KERB_M) -> StandingActor:
+        """An actor at a plan point (2,). height: of the ground, metres."""
+        attribute = ATTRIBUTES.get(body.variant.class_name, "vehicle.parked")
+        return StandingActor(body, np.array([*self.city.bend(point), height]), yaw, attribute)
 
     def _site(self, column: int, row: int) -> list[StandingActor]:
         """A building site on a block: barriers around machines, trucks, trailers, cones and workers."""
         rng = self.city.stream("site", column, row)
         name, (low, high) = f"{column}.{row}", self.city.block(column, row).inside(0.4)
-        made = self._fence(low, high, rng, name)
+        made = list(self._fence(low, high, rng, name))
         machines = [("construction_vehicle", None)] * int(rng.integers(4, 7))
         trucks = [("truck", ("dumper", "flatbed"))] * 2
         trailers = [("trailer", ("flatbed", "container", "utility"))]
         for k, (class_name, names) in enumerate([*machines, *trucks, *trailers]):
             body = self._body(class_name, rng, f"site-{name}.{k}", names=names)
+            lengths = np.array([m.body.size_lwh[0] for m in made]) + body.size_lwh[0]
             for _ in range(12):
                 point = low + 8 + rng.random(2) * (high - low - 16)
-                x, y = self.city.bend(point)
-                clear = all(
-                    np.hypot(m.position[0] - x, m.position[1] - y) > (m.body.size_lwh[0] + body.size_lwh[0]) / 2
-                    for m in made
-                )
-                if clear:
-                    made.append(self._stand_on_land(body, point, float(rng.uniform(0, 6.3)), "vehicle.parked"))
+                if (self._distances(made, point) > lengths / 2).all():
+                    made.append(self._stand_on_land(body, point, float(rng.uniform(0, 6.3))))
                     break
         for k in range(8):
             point = low + 1.4 + rng.random(2) * (high - low - 2.8)
             if rng.random() < 0.5:
                 body = self._body("pedestrian", rng, f"siteworker-{name}.{k}", 0.03, ["worker_standing"])
-                made.append(self._stand_on_land(body, point, float(rng.uniform(0, 6.3)), "pedestrian.standing"))
+                made.append(self._stand_on_land(body, point, float(rng.uniform(0, 6.3))))
             else:
                 body = self._body("traffic_cone", rng, f"sitecone-{name}.{k}", 0.03)
-                made.append(self._stand_on_land(body, point, 0.0, ""))
+                made.append(self._stand_on_land(body, point, 0.0))
         return made
 
-    def _fence(self, low: Array, high: Array, rng: np.random.Generator, name: str) -> list[StandingActor]:
+    def _fence(self, low: Array, high: Array, rng: np.random.Generator, name: str) -> Iterator[StandingActor]:
         """Barriers along the edges of a rectangle of the plan, with gaps."""
-        barrier, made = self.catalog.draw("barrier", rng), []
-        corners = [low, np.array([high[0], low[1]]), high, np.array([low[0], high[1]])]
+        barrier = self.catalog.draw("barrier", rng)
         for side in range(4):
-            start, end = corners[side], corners[(side + 1) % 4]
-            length = float(np.hypot(*(end - start)))
-            way = (end - start) / length
+            start, way, _, length = side_of(low, high, side)
             for k, at in enumerate(np.arange(1.8, length - 1.5, 4.2)):
                 if rng.random() >= 0.12:
                     body = draw_body(barrier, rng, f"fence-{name}.{side}.{k}", 0.02)
                     yaw = self.city.heading(start + way * at, way) + np.pi / 2
-                    made.append(self._stand_on_land(body, start + way * at, yaw, ""))
-        return made
+                    yield self._stand_on_land(body, start + way * at, yaw)

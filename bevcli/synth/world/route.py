@@ -7,14 +7,13 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from bevcli.geometry.transforms import Array
-from bevcli.synth.world.city import CROSSING_TO_M, STOP_LINE_M, CityPlan, Street
+from bevcli.synth.world.city import CROSSING_M, STOP_LINE_M, CityPlan, Street
 
 STEP_M = 0.25  # distance between the points of a route
 SMOOTHING_M = 1.2  # standard deviation of the smoothing, so that yaw rates change gradually
 LATERAL_ACCELERATION = 2.2  # m/s², limit in curves
 BRAKING = 1.7  # m/s², deceleration before curves
 DIRECTIONS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)], dtype=np.float64)  # east, north, west, south
-BICYCLE_OFFSET_M = 0.5  # from the edge of the outermost lane to the line that bicycles follow
 
 
 @dataclass(frozen=True)
@@ -54,36 +53,13 @@ class Route:
     speed_limits: Array
     passes: tuple[JunctionPass, ...]
 
-    @property
-    def length(self) -> float:
-        """Length of the route, metres."""
-        return float(self.positions[-1])
-
     def at(self, position: ArrayLike) -> Array:
         """World points (..., 2) at positions (...,) in metres along the route."""
-        s = np.asarray(position, dtype=np.float64)
-        return np.stack([np.interp(s, self.positions, self.points[:, k]) for k in (0, 1)], -1)
+        return points_at(position, self.points, self.positions)
 
     def yaw_at(self, position: ArrayLike) -> Array:
         """Heading (...,) in radians."""
         return np.interp(np.asarray(position, dtype=np.float64), self.positions, self.yaws)
-
-
-@dataclass(frozen=True)
-class LaneStart:
-    """Start of a route.
-
-    Attributes:
-        node: column and row of the first junction ahead.
-        direction: index into DIRECTIONS of the approach to it.
-        lane: lane of the street, 0 the innermost.
-        before: distance to the centre of the junction, metres.
-    """
-
-    node: tuple[int, int]
-    direction: int
-    lane: int
-    before: float
 
 
 def street_of(city: CityPlan, node: tuple[int, int], direction: int) -> Street:
@@ -112,8 +88,11 @@ def _draw_turn(rng: np.random.Generator, street: Street, lane: int, straight_on:
 
 def build_route(
     city: CityPlan,
-    start: LaneStart,
     rng: np.random.Generator,
+    node: tuple[int, int],
+    direction: int,
+    lane: int,
+    before: float,
     length: float,
     speed: float,
     straight_on: float = 0.6,
@@ -121,13 +100,14 @@ def build_route(
 ) -> Route:
     """Build a route with random turns.
 
+    node: the first junction ahead. direction: index into DIRECTIONS of the approach to it. lane: of the street, 0 the
+    innermost. before: distance from the start to the centre of the junction, metres.
     length: least length, metres. speed: limit on straight road, m/s. straight_on: share of junctions without a turn,
     where it is not a bicycle. bicycle: whether it keeps right of the lanes, and never turns left.
     """
-    node, direction, lane = start.node, start.direction, start.lane
     street = street_of(city, node, direction)
-    offset = lane_offset(street, lane, bicycle)
-    at = node_center(city, node) - DIRECTIONS[direction] * start.before + right_of(direction) * offset
+    offset = street.lane_offset(lane, bicycle)
+    at = node_center(city, node) - DIRECTIONS[direction] * before + right_of(direction) * offset
     corners, marks, travelled = [at[None]], [], 0.0
     while travelled < length:
         turn = _draw_turn(rng, street, lane, straight_on, bicycle)
@@ -136,7 +116,7 @@ def build_route(
         following = (node[0] + int(DIRECTIONS[after][0]), node[1] + int(DIRECTIONS[after][1]))
         street = street_of(city, following, after)
         lane = min(lane, street.lanes - 1) if turn == 0 else (0 if turn > 0 else street.lanes - 1)
-        new_offset = lane_offset(street, lane, bicycle)
+        new_offset = street.lane_offset(lane, bicycle)
         corner = center + right_of(direction) * offset
         if turn != 0:
             corner = corner + DIRECTIONS[direction] * (right_of(after) @ DIRECTIONS[direction]) * new_offset
@@ -144,7 +124,7 @@ def build_route(
         begin, end = corner - DIRECTIONS[direction] * radius, corner + DIRECTIONS[after] * radius
         stop = _lane_point(center, direction, offset, -(cross.half_width + STOP_LINE_M))
         across = street_of(city, node, after + 1)
-        leave = _lane_point(center, after, new_offset, across.half_width + CROSSING_TO_M)
+        leave = _lane_point(center, after, new_offset, across.half_width + CROSSING_M[1])
         marks.append((node, direction, turn, stop, leave))
         piece = _arc(begin, corner, end) if turn != 0 else np.stack([begin, end])
         corners.append(piece)
@@ -157,11 +137,6 @@ def build_route(
 def _lane_point(center: Array, direction: int, offset: float, ahead: float) -> Array:
     """Plan point on a lane at a junction: `offset` metres right of its centre and `ahead` metres behind it."""
     return center + right_of(direction) * offset + DIRECTIONS[direction] * ahead
-
-
-def lane_offset(street: Street, lane: int, bicycle: bool) -> float:
-    """Offset of a vehicle to the right of the street's centre line, metres."""
-    return street.lanes * street.lane_m + BICYCLE_OFFSET_M if bicycle else street.lane_offset(lane)
 
 
 def _arc(begin: Array, corner: Array, end: Array) -> Array:
@@ -178,7 +153,7 @@ def _finish(city: CityPlan, corners: Array, marks: list, speed: float) -> Route:
     """
     along_corners = distances_along(corners)
     samples = np.arange(0, along_corners[-1], STEP_M)
-    plan = np.stack([np.interp(samples, along_corners, corners[:, k]) for k in (0, 1)], -1)
+    plan = points_at(samples, corners, along_corners)
     points = gaussian_filter1d(city.bend(plan), SMOOTHING_M / STEP_M, axis=0, mode="nearest")
     positions = distances_along(points)
     way = np.gradient(points, axis=0)
@@ -198,6 +173,12 @@ def _finish(city: CityPlan, corners: Array, marks: list, speed: float) -> Route:
 def distances_along(points: Array) -> Array:
     """(P,) distance of each point (P, 2) of a line from its start, along the line."""
     return np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+
+
+def points_at(places: ArrayLike, points: Array, positions: Array) -> Array:
+    """Points (..., 2) of a line at places (...,) along it. points: (P, 2) with positions (P,) along the line."""
+    at = np.asarray(places, dtype=np.float64)
+    return np.stack([np.interp(at, positions, points[:, k]) for k in (0, 1)], -1)
 
 
 def _speed_limits(positions: Array, yaws: Array, speed: float) -> NDArray[np.float64]:

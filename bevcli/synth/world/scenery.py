@@ -1,5 +1,6 @@
 """Objects without annotations: houses, kerbs, trees, street furniture and traffic signals."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
@@ -12,7 +13,7 @@ from bevcli.synth.assets.mesh import Mesh, from_faces, joined, prism
 from bevcli.synth.assets.paint import Color, Finish, Material, darker, linear
 from bevcli.synth.assets.street_furniture import TREE_KINDS, StreetFurniture
 from bevcli.synth.assets.triangles import TriangleSoup
-from bevcli.synth.world.city import CORNER_M, KERB_M, Block, CityPlan, rounded_rectangle
+from bevcli.synth.world.city import CORNER_M, KERB_M, Block, CityPlan, rounded_rectangle, side_of
 from bevcli.synth.world.route import DIRECTIONS, node_center, right_of, street_of
 from bevcli.synth.world.traffic import Signals
 
@@ -50,19 +51,17 @@ class FacadeStyle:
     seed: int
 
 
-def houses(city: CityPlan, land: Block) -> list[TriangleSoup]:
+def houses(city: CityPlan, land: Block) -> Iterator[TriangleSoup]:
     """Row houses along the four sides of a block, with some gaps: of each house its walls, and the rest of it."""
     rng = city.stream("houses", land.column, land.row)
     (x0, y0), (x1, y1) = land.inside()
     depth = min(14.0, (x1 - x0) / 2 - 2, (y1 - y0) / 2 - 2)
-    built: list[TriangleSoup] = []
     for low, high in ((y0, y0 + depth), (y1 - depth, y1)):
         for a, b in _lots(rng, x0, x1):
-            built += _house(city, rng, (a, low), (b, high))
+            yield from _house(city, rng, (a, low), (b, high))
     for low, high in ((x0, x0 + depth), (x1 - depth, x1)):
         for a, b in _lots(rng, y0 + depth + 0.5, y1 - depth - 0.5):
-            built += _house(city, rng, (low, a), (high, b))
-    return built
+            yield from _house(city, rng, (low, a), (high, b))
 
 
 def _lots(rng: np.random.Generator, start: float, end: float) -> list[tuple[float, float]]:
@@ -138,10 +137,9 @@ def _roof(ground: Array, height: float, style: FacadeStyle) -> Mesh:
     return prism(rings, darker(style.wall, 0.8) if style.band else ROOF)
 
 
-def _awnings(rng: np.random.Generator, ground: Array) -> list[Mesh]:
+def _awnings(rng: np.random.Generator, ground: Array) -> Iterator[Mesh]:
     """Slanted awnings over some of the shop fronts."""
     colors: tuple[Color, ...] = ((164, 44, 40), (42, 92, 66), (44, 66, 120), (206, 196, 176), (198, 138, 44))
-    parts = []
     for k in range(4):
         start, end = ground[k], ground[(k + 1) % 4]
         length = np.hypot(*(end - start))
@@ -153,8 +151,7 @@ def _awnings(rng: np.random.Generator, ground: Array) -> list[Mesh]:
         b = a + way * 4.0
         footprint = np.array([a, a + out * 1.3, b + out * 1.3, b])
         rings = [np.column_stack([footprint, (h, e, e, h)]) for h, e in ((3.15, 2.65), (3.3, 2.72))]
-        parts.append(prism(rings, colors[int(rng.integers(len(colors)))]))
-    return parts
+        yield prism(rings, colors[int(rng.integers(len(colors)))])
 
 
 def kerb_slab(city: CityPlan, outline: Array) -> Mesh:
@@ -203,61 +200,52 @@ class Scenery:
             meshes += self._side(land, side, rng)
         return meshes
 
-    def _park(self, land: Block, rng: np.random.Generator) -> list[TriangleSoup]:
+    def _park(self, land: Block, rng: np.random.Generator) -> Iterator[TriangleSoup]:
         """Trees and bushes all over a block."""
         low, high = land.inside(1.5)
         count = int(np.prod(high - low) / 75)
-        meshes = []
         for point in low + rng.random((count, 2)) * (high - low):
             kinds = self.furniture.trees if rng.random() < 0.7 else self.furniture.bushes
-            meshes.append(self._put(kinds[int(rng.integers(len(kinds)))], point, rng.uniform(0, 6.3)))
-        return meshes
+            yield self._put(kinds[int(rng.integers(len(kinds)))], point, rng.uniform(0, 6.3))
 
-    def _side(self, land: Block, side: int, rng: np.random.Generator) -> list[TriangleSoup]:
+    def _side(self, land: Block, side: int, rng: np.random.Generator) -> Iterator[TriangleSoup]:
         """The pavement on one side of a block: trees, lamps and signs near the kerb, benches and bins between them."""
-        start, way, inward, length = land.side(side)
+        start, way, inward, length = side_of(land.low, land.high, side)
         street = self.city.street(side % 2, (land.row, land.column + 1, land.row + 1, land.column)[side])
         outward = self.city.heading(start, -inward)
-        meshes, at = [], CORNER_M + 3.0
-        lamp_next = bool(rng.random() < 0.5)
+        at, lamp_next = CORNER_M + 3.0, bool(rng.random() < 0.5)
         while at < length - CORNER_M - 3:
             point = start + way * at + inward * 0.75
             if lamp_next:
-                meshes.append(self._put(self.furniture.lamp, point, outward))
+                yield self._put(self.furniture.lamp, point, outward)
             elif street.trees and rng.random() < 0.8:
                 kind = (street.index * 5 + side * 3 + int(rng.integers(3))) % TREE_KINDS
-                meshes.append(self._put(self.furniture.trees[kind], point, rng.uniform(0, 6.3)))
+                yield self._put(self.furniture.trees[kind], point, rng.uniform(0, 6.3))
             elif rng.random() < 0.5:
                 sign = self.furniture.signs[int(rng.integers(6))]
-                meshes.append(self._put(sign, point, self.city.heading(point, -way)))
+                yield self._put(sign, point, self.city.heading(point, -way))
             if rng.random() < 0.3:
                 extra = self.furniture.small[int(rng.integers(3))]
-                meshes.append(self._put(extra, point + way * rng.uniform(1.5, 3), outward + np.pi))
+                yield self._put(extra, point + way * rng.uniform(1.5, 3), outward + np.pi)
             lamp_next = not lamp_next if rng.random() < 0.6 else False
             at += rng.uniform(6.5, 9.5)
         if rng.random() < 0.25:
             spot = start + way * length * rng.uniform(0.3, 0.7) + inward * 1.9
-            meshes.append(self._put(self.furniture.shelter, spot, outward))
-        return meshes
+            yield self._put(self.furniture.shelter, spot, outward)
 
     def _put(self, template: TriangleSoup, point: Array, yaw: float) -> TriangleSoup:
         x, y = self.city.bend(point)
         return template.placed((float(x), float(y), KERB_M), yaw)
 
+    def signals_around(self, here: ArrayLike, signals: Signals, time_s: float) -> Iterator[TriangleSoup]:
+        """Traffic signals around a world point (2,), with their lights at a time in seconds.
 
-def signal_meshes(
-    city: CityPlan, signals: Signals, furniture: StreetFurniture, here: ArrayLike, time_s: float
-) -> list[TriangleSoup]:
-    """Traffic signals around a world point (2,), with their lights at a time in seconds.
-
-    Each junction has one signal for each approach, behind the junction on the right.
-    """
-    meshes = []
-    for node, direction in product(city.around(here, SIGNALS_REACH_M).nodes, range(4)):
-        street, cross = street_of(city, node, direction), street_of(city, node, direction + 1)
-        ahead = DIRECTIONS[direction] * (cross.half_width + 0.9)
-        spot = node_center(city, node) + ahead + right_of(direction) * (street.half_width + 0.9)
-        template = furniture.signals[signals.light(node, direction % 2, time_s)]
-        x, y = city.bend(spot)
-        meshes.append(template.placed((float(x), float(y), KERB_M), city.heading(spot, -DIRECTIONS[direction])))
-    return meshes
+        Each junction has one signal for each approach, behind the junction on the right.
+        """
+        city = self.city
+        for node, direction in product(city.around(here, SIGNALS_REACH_M).nodes, range(4)):
+            street, cross = street_of(city, node, direction), street_of(city, node, direction + 1)
+            ahead = DIRECTIONS[direction] * (cross.half_width + 0.9)
+            spot = node_center(city, node) + ahead + right_of(direction) * (street.half_width + 0.9)
+            template = self.furniture.signals[signals.light(node, direction % 2, time_s)]
+            yield self._put(template, spot, city.heading(spot, -DIRECTIONS[direction]))

@@ -10,29 +10,18 @@ from scipy.ndimage import gaussian_filter1d
 from bevcli.geometry.ego_motion import GRAVITY
 from bevcli.geometry.transforms import Array
 from bevcli.synth.assets.catalog import Catalog, draw_body
+from bevcli.synth.assets.people import RIDDEN
 from bevcli.synth.world.city import STOP_LINE_M, CityPlan
-from bevcli.synth.world.pedestrians import crossers, strollers
-from bevcli.synth.world.roadside import Roadside
-from bevcli.synth.world.route import (
-    DIRECTIONS,
-    LaneStart,
-    Route,
-    build_route,
-    lane_offset,
-    node_center,
-    right_of,
-    street_of,
-)
-from bevcli.synth.world.traffic import STEP_S, Actor, DrivingActor, Signals, Unit, Vehicle, interpolated_track, step
+from bevcli.synth.world.pedestrians import Walker, crossers, strollers
+from bevcli.synth.world.roadside import Roadside, StandingActor
+from bevcli.synth.world.route import DIRECTIONS, Route, build_route, node_center, right_of, street_of
+from bevcli.synth.world.traffic import STEP_S, DrivingActor, Signals, Unit, Vehicle, interpolated_track, step
 
+Actor = DrivingActor | StandingActor | Walker  # an annotated object over the time of a drive
 TRAFFIC_MIX = {
     "car": 0.54, "truck": 0.12, "bus": 0.09, "train": 0.09, "motorcycle": 0.10, "construction_vehicle": 0.06,
 }  # fmt: skip
-RIDERS = {
-    "motorcycle": ("sport_rider", "cruiser_rider", "scooter_rider"),
-    "bicycle": ("city_rider", "racer_rider", "cargo_rider", "mountain_rider"),
-}
-DRIVING_MACHINES = ("loader", "backhoe", "crane", "mixer")
+MOVING_LOOKS = {**RIDDEN, "construction_vehicle": ("loader", "backhoe", "crane", "mixer")}
 SEMITRAILERS = ("box", "curtain", "container", "tanker", "flatbed")
 
 
@@ -50,9 +39,8 @@ class VehicleSpawner:
         direction = int(rng.integers(4))
         lane = int(rng.integers(street_of(self.city, (0, 0), direction).lanes))
         edge = street_of(self.city, (0, 0), direction + 1).half_width + STOP_LINE_M
-        start = LaneStart((0, 0), direction, lane, edge + rng.uniform(18, 78))
-        speed = float(rng.uniform(8.0, 12.0))
-        route = build_route(self.city, start, rng, self.route_m, speed, straight_on=0.4)
+        before, speed = edge + rng.uniform(18, 78), float(rng.uniform(8.0, 12.0))
+        route = build_route(self.city, rng, (0, 0), direction, lane, before, self.route_m, speed, straight_on=0.4)
         return Vehicle(route, units, 8.0, speed * 0.6, 1.0)
 
     def spawn(self, around: Array, near_m: float, far_m: float, taken: Array, bicycle: bool) -> Vehicle | None:
@@ -68,10 +56,11 @@ class VehicleSpawner:
         streets = self.city.streets_between(axis, across - far_m, across + far_m)
         if not streets:
             return None
-        street = streets[int(rng.integers(len(streets)))]
+        street = self.city.street(axis, streets[int(rng.integers(len(streets)))])
         at = lengthwise + rng.uniform(-far_m, far_m)
         direction = axis + 2 * int(rng.integers(2))
-        node = self._next_node(axis, street.index, at, direction)
+        following = self.city.below(1 - axis, at) + (direction < 2)
+        node = (following, street.index) if axis == 0 else (street.index, following)
         before = float((node_center(self.city, node) - street.point(at)) @ DIRECTIONS[direction])
         lane = int(rng.integers(street.lanes))
         units = self._units(bicycle)
@@ -79,7 +68,7 @@ class VehicleSpawner:
         cross = street_of(self.city, node, direction + 1)
         if before < cross.half_width + STOP_LINE_M + 1:
             return None
-        point = street.point(at) + right_of(direction) * lane_offset(street, lane, bicycle)
+        point = street.point(at) + right_of(direction) * street.lane_offset(lane, bicycle)
         front = self.city.bend(point)
         if not near_m <= np.hypot(*(front - around)) <= far_m:
             return None
@@ -87,19 +76,10 @@ class VehicleSpawner:
         gaps = self.city.bend(point + reach)[:, None] - taken
         if np.sqrt((gaps**2).sum(-1).min()) < (1.6 if bicycle else 2.2):
             return None
-        start = LaneStart(node, direction, lane, before + length + 2)
         speed = float(rng.uniform(3.5, 6.0) if bicycle else rng.uniform(7.5, 12.5))
-        route = build_route(self.city, start, rng, self.route_m * speed / 12 + length, speed, bicycle=bicycle)
+        route_m, before = self.route_m * speed / 12 + length, before + length + 2
+        route = build_route(self.city, rng, node, direction, lane, before, route_m, speed, bicycle=bicycle)
         return Vehicle(route, units, length + 2, speed * 0.7, float(rng.uniform(0.7, 1.25)), bicycle)
-
-    def _next_node(self, axis: int, index: int, at: float, direction: int) -> tuple[int, int]:
-        nearest = self.city.nearest(1 - axis, at)
-        position = self.city.street(1 - axis, nearest).position
-        if direction < 2 and position < at:
-            nearest += 1
-        if direction >= 2 and position > at:
-            nearest -= 1
-        return (nearest, index) if axis == 0 else (index, nearest)
 
     def _units(self, bicycle: bool) -> tuple[Unit, ...]:
         rng, draw = self._rng, self.catalog.draw
@@ -113,10 +93,7 @@ class VehicleSpawner:
             tractor, towed = draw_body(first, rng, name), draw_body(second, rng, f"{name}-trailer")
             lag = float(tractor.size_lwh[0]) + (0.35 if not heavy else 0.25)
             return Unit(tractor, 0.0), Unit(towed, lag)
-        names = RIDERS.get(class_name)
-        if class_name == "construction_vehicle":
-            names = DRIVING_MACHINES
-        return (Unit(draw_body(draw(class_name, rng, names), rng, name), 0.0),)
+        return (Unit(draw_body(draw(class_name, rng, MOVING_LOOKS.get(class_name)), rng, name), 0.0),)
 
 
 WARM_UP_S = 6.0  # simulated time before the first frame, in which queues form
@@ -186,13 +163,11 @@ class Simulation:
         return found
 
     def _run(self) -> None:
-        vehicles = [self._ego]
-        self._populate(vehicles, 0.0)
-        steps = int(np.ceil((self.span_s[1] - self.span_s[0]) / STEP_S)) + 2
+        vehicles, start = [self._ego], self.span_s[0] - STEP_S
         gone: list[Vehicle] = []
-        start = self.span_s[0] - STEP_S
-        for vehicle in vehicles:
-            vehicle.track.append((start, vehicle.front, vehicle.speed))
+        steps = int(np.ceil((self.span_s[1] - self.span_s[0]) / STEP_S)) + 2
+        self._ego.track.append((start, self._ego.front, self._ego.speed))
+        self._populate(vehicles, 0.0, start)
         for k in range(steps):
             time_s = start + k * STEP_S
             step(vehicles, self._people_on_roads(vehicles, time_s), self.signals, time_s)
@@ -201,20 +176,18 @@ class Simulation:
         seen = [vehicle for vehicle in [*gone, *vehicles[1:]] if len(vehicle.track) > 1]
         self._driving = [DrivingActor(v, unit, np.array(v.track).T) for v in seen for unit in v.units]
 
-    def _populate(self, vehicles: list[Vehicle], near_m: float) -> None:
+    def _populate(self, vehicles: list[Vehicle], near_m: float, time_s: float) -> None:
         """Spawn vehicles around the ego vehicle, at least `near_m` metres away, until there are enough."""
-        ego = self._ego
+        around = self._ego.route.at(self._ego.front + 25.0)
         taken = [vehicle.body_points() for vehicle in vehicles]
         for attempt in range(6 * (VEHICLES + BICYCLES)):
             bicycles = sum(v.bicycle for v in vehicles)
-            if len(vehicles) >= VEHICLES + BICYCLES:
-                return
             wants_bicycle = bicycles < BICYCLES and attempt % 4 == 0
             if not wants_bicycle and len(vehicles) - bicycles >= VEHICLES:
                 continue
-            around = ego.route.at(ego.front + 25.0)
             new = self.spawner.spawn(around, near_m, REACH_M, np.concatenate(taken), wants_bicycle)
             if new is not None:
+                new.track.append((time_s, new.front, new.speed))
                 vehicles.append(new)
                 taken.append(new.body_points())
 
@@ -224,26 +197,18 @@ class Simulation:
         gone = [
             vehicle
             for vehicle in vehicles[1:]
-            if vehicle.front > vehicle.route.length - 15
+            if vehicle.front > vehicle.route.positions[-1] - 15
             or np.hypot(*(vehicle.route.at(vehicle.front) - here)) > REACH_M + 30
         ]
         for vehicle in gone:
             vehicles.remove(vehicle)
-        count = len(vehicles)
-        self._populate(vehicles, 58.0)
-        for vehicle in vehicles[count:]:
-            vehicle.track.append((time_s, vehicle.front, vehicle.speed))
+        self._populate(vehicles, 58.0, time_s)
         return gone
 
     def _people_on_roads(self, vehicles: list[Vehicle], time_s: float) -> Array:
         """(H, 2) world points of people on the road at the junctions that vehicles approach."""
         nodes = sorted({p.node for v in vehicles if (p := v.next_pass()) is not None})
-        points = [
-            w.plan_at(time_s)
-            for node in nodes
-            for w in self._crossers(node)
-            if w.times[0] < time_s < w.times[-1] and w.on_road(time_s)
-        ]
+        points = [w.plan_at(time_s) for node in nodes for w in self._crossers(node) if w.on_road(time_s)]
         return self.city.bend(np.array(points).reshape(-1, 2))
 
 

@@ -3,14 +3,15 @@
 import math
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.geometry.transforms import Array
 from bevcli.jit import njit
-from bevcli.synth.assets.catalog import Body, Variant
+from bevcli.synth.assets.catalog import Body
+from bevcli.synth.assets.people import RIDDEN
 from bevcli.synth.world.city import CityPlan
 from bevcli.synth.world.route import JunctionPass, Route
 
@@ -115,15 +116,9 @@ class Vehicle:
 
 def step(vehicles: list[Vehicle], people: Array, signals: Signals, time_s: float) -> None:
     """Advance all vehicles by STEP_S. people: (H, 2) world points of people on the road."""
-    bodies = [vehicle.body_points() for vehicle in vehicles]
-    owners = np.repeat(np.arange(len(bodies)), [len(b) for b in bodies])
-    obstacles = np.concatenate([*bodies, people.reshape(-1, 2)])
-    owners = np.concatenate([owners, np.full(len(people), -1)])
-    speeds = np.array([v.speed for v in vehicles] + [0.0])
-    accelerations = [
-        _acceleration(index, vehicle, vehicles, obstacles, owners, speeds, signals, time_s)
-        for index, vehicle in enumerate(vehicles)
-    ]
+    parts = [*(vehicle.body_points() for vehicle in vehicles), people]
+    obstacles, owners = np.concatenate(parts), np.repeat([*range(len(vehicles)), -1], [len(part) for part in parts])
+    accelerations = [_acceleration(k, vehicles, obstacles, owners, signals, time_s) for k in range(len(vehicles))]
     for vehicle, acceleration in zip(vehicles, accelerations, strict=True):
         faster = max(vehicle.speed + acceleration * STEP_S, 0.0)
         vehicle.front += (vehicle.speed + faster) / 2 * STEP_S
@@ -132,11 +127,10 @@ def step(vehicles: list[Vehicle], people: Array, signals: Signals, time_s: float
 
 
 def _acceleration(
-    index: int, vehicle: Vehicle, vehicles: list[Vehicle], obstacles: Array, owners: NDArray, speeds: Array,
-    signals: Signals, time_s: float,
-) -> float:  # fmt: skip
+    index: int, vehicles: list[Vehicle], obstacles: Array, owners: NDArray, signals: Signals, time_s: float
+) -> float:
     """Acceleration in m/s² by the Intelligent Driver Model (IDM): the smallest of free road, obstacle and signal."""
-    route = vehicle.route
+    vehicle, route = vehicles[index], vehicles[index].route
     limit = float(np.interp(vehicle.front, route.positions, route.speed_limits))
     speed, strongest = vehicle.speed, 1.6 * vehicle.liveliness
     free = strongest * (1 - (speed / max(limit, 0.3)) ** 4) if speed <= limit else max(-2.2, (limit - speed) * 2.0)
@@ -144,7 +138,7 @@ def _acceleration(
     gap, other = _nearest_in_way(route.points, route.positions, vehicle.front, obstacles, owners, index, corridor)
     wanted = free
     if gap < np.inf:
-        lead = float(speeds[other]) if _same_way(vehicle, vehicles, other) else 0.0
+        lead = vehicles[other].speed if other >= 0 and _same_way(vehicle, vehicles[other]) else 0.0
         wanted = min(wanted, _follow(speed, limit, strongest, gap, lead))
     crossing = vehicle.next_pass()
     if crossing is not None and vehicle.front < crossing.stop + 0.5:
@@ -161,13 +155,9 @@ def _follow(speed: float, limit: float, strongest: float, gap: float, lead_speed
     return strongest * (1 - (speed / max(limit, 0.3)) ** 4 - (desired / max(gap, 0.1)) ** 2)
 
 
-def _same_way(vehicle: Vehicle, vehicles: list[Vehicle], other: int) -> bool:
+def _same_way(vehicle: Vehicle, other: Vehicle) -> bool:
     """True where the other vehicle drives in about the same direction (within 60 degrees)."""
-    if other < 0:
-        return False
-    mine = vehicle.route.yaw_at(vehicle.front)
-    theirs = vehicles[other].route.yaw_at(vehicles[other].front)
-    return bool(np.cos(mine - theirs) > 0.5)
+    return bool(np.cos(vehicle.route.yaw_at(vehicle.front) - other.route.yaw_at(other.front)) > 0.5)
 
 
 def _may_enter(
@@ -262,22 +252,6 @@ class ActorState:
     pose: int = 0
 
 
-class Actor(Protocol):
-    """An annotated object over the time of a drive."""
-
-    def state(self, time_s: float) -> ActorState | None:
-        """The state at a time in seconds since the start of the drive, or None while it is not there."""
-        ...
-
-
-class StandingActor(ActorState):
-    """An actor that never moves."""
-
-    def state(self, time_s: float) -> ActorState:
-        """The same state at all times."""
-        return self
-
-
 @dataclass(frozen=True)
 class DrivingActor:
     """One unit of a driving vehicle. Its axles are on the route.
@@ -294,15 +268,16 @@ class DrivingActor:
     track: Array
 
     def state(self, time_s: float) -> ActorState | None:
-        """The state, or None before the vehicle appears and after it leaves."""
+        """The state at a time of the drive in seconds; None before the vehicle appears and after it leaves."""
         first, last = self.track[0, 0], self.track[0, -1]
         if not first <= time_s <= last:
             return None
         center, yaw = self._pose(time_s)
         early, late = max(time_s - _DIFFERENCE_S, first), min(time_s + _DIFFERENCE_S, last)
         velocity = (self._pose(late)[0] - self._pose(early)[0]) / max(late - early, 1e-9)
-        moving = float(np.hypot(*velocity)) > MOVING_M_S
-        attribute = driving_attribute(self.unit.body.variant, moving)
+        attribute = "vehicle.moving" if float(np.hypot(*velocity)) > MOVING_M_S else "vehicle.stopped"
+        if self.unit.body.variant.class_name in RIDDEN:
+            attribute = "cycle.with_rider"
         return ActorState(self.unit.body, np.array([*center, 0.0]), yaw, attribute, velocity)
 
     def _pose(self, time_s: float) -> tuple[Array, float]:
@@ -327,10 +302,3 @@ def interpolated_track(track: Array, time_s: float) -> float:
     return float(
         (2 * u**3 - 3 * u**2 + 1) * a + (u**3 - 2 * u**2 + u) * m + (3 * u**2 - 2 * u**3) * b + (u**3 - u**2) * n
     )
-
-
-def driving_attribute(variant: Variant, moving: bool) -> str:
-    """The nuScenes attribute of a vehicle or cycle in traffic."""
-    if variant.class_name in ("bicycle", "motorcycle"):
-        return "cycle.with_rider" if variant.name.endswith("_rider") else "cycle.without_rider"
-    return "vehicle.moving" if moving else "vehicle.stopped"

@@ -1,6 +1,7 @@
 """Weather: the light of the sun and the sky, the clouds and the haze of one drive."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -14,18 +15,14 @@ Range = tuple[float, float]  # lowest and highest value
 
 @dataclass(frozen=True)
 class Weather:
-    """The light of a drive. Colours are linear RGB; 1 is about the brightness of a white surface in full sun.
+    """The light of a drive.
 
     Attributes:
         name: one of WEATHER_NAMES.
         to_sun: (3,) unit vector towards the sun, world.
-        sun: (3,) light from the sun.
-        sky: (3,) light from above.
-        bounce: (3,) light from below, reflected by the ground.
-        zenith: (3,) colour of the sky overhead.
-        horizon: (3,) colour of the sky at the horizon.
-        haze: (3,) colour of the haze.
-        cloud_color: (3,) colour of the clouds.
+        light: (7, 3) linear RGB; 1 is about the brightness of a white surface in full sun. The rows are the light from
+            the sun, from above and, reflected by the ground, from below; the colours of the sky overhead and at the
+            horizon; the colours of the haze and of the clouds.
         clouds: (512, 512) cloud cover, 0 to 1, on a horizontal plane; it repeats in both directions.
         haze_m: distance after which about 63 % of the light comes from the haze, metres.
         lamps: brightness of lamps and lit windows, relative.
@@ -34,41 +31,24 @@ class Weather:
 
     name: str
     to_sun: NDArray[np.float64]
-    sun: NDArray[np.float32]
-    sky: NDArray[np.float32]
-    bounce: NDArray[np.float32]
-    zenith: NDArray[np.float32]
-    horizon: NDArray[np.float32]
-    haze: NDArray[np.float32]
-    cloud_color: NDArray[np.float32]
+    light: NDArray[np.float64]
     clouds: NDArray[np.float32]
     haze_m: float
     lamps: float
     shadow_softness_m: float
 
 
-@dataclass(frozen=True)
-class _Kind:
-    """The numbers of one kind of weather. A range is drawn uniformly; a number is taken as it is.
+class _Kind(NamedTuple):
+    """The numbers of one kind of weather. A range is drawn uniformly; a number is taken as it is."""
 
-    Attributes:
-        elevation: of the sun, radians.
-        sun: colour of the sunlight, linear RGB.
-        strength: of the sunlight.
-        sky: light from above, linear RGB.
-        zenith, horizon, cloud: sRGB colours.
-        cloud_threshold: noise above it is cloud, 0 to 1.
-        haze_m, lamps, shadow_softness_m: as in `Weather`.
-    """
-
-    elevation: Range | float
-    sun: tuple[float, float, float]
-    strength: float
-    sky: tuple[float, float, float]
+    elevation: Range | float  # of the sun, radians
+    sun: tuple[float, float, float]  # colour of the sunlight, linear RGB
+    strength: float  # of the sunlight
+    sky: tuple[float, float, float]  # light from above, linear RGB
     zenith: Color
     horizon: Color
     cloud: Color
-    cloud_threshold: Range | float
+    cloud_threshold: Range | float  # noise above it is cloud, 0 to 1
     haze_m: float
     lamps: float
     shadow_softness_m: float
@@ -99,20 +79,16 @@ def make_weather(name: str, rng: np.random.Generator) -> Weather:
     azimuth, elevation = rng.uniform(0, 2 * np.pi), _drawn(kind.elevation, rng)
     sun = (np.array(kind.sun) * kind.strength).astype(np.float32)
     sky, horizon = np.array(kind.sky, np.float32), linear(kind.horizon)
+    bounce = (0.22 * (sun * np.sin(elevation) + sky) + 0.25 * sky).astype(np.float32)
+    haze = horizon * np.float32(0.95)
     return Weather(
-        name=name,
-        to_sun=np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]),
-        sun=sun,
-        sky=sky,
-        bounce=(0.22 * (sun * np.sin(elevation) + sky) + 0.25 * sky).astype(np.float32),
-        zenith=linear(kind.zenith),
-        horizon=horizon,
-        haze=horizon * np.float32(0.95),
-        cloud_color=linear(kind.cloud),
-        clouds=_clouds(rng, _drawn(kind.cloud_threshold, rng)),
-        haze_m=kind.haze_m,
-        lamps=kind.lamps,
-        shadow_softness_m=kind.shadow_softness_m,
+        name,
+        np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]),
+        np.array([sun, sky, bounce, linear(kind.zenith), horizon, haze, linear(kind.cloud)], np.float64),
+        _clouds(rng, _drawn(kind.cloud_threshold, rng)),
+        kind.haze_m,
+        kind.lamps,
+        kind.shadow_softness_m,
     )
 
 
