@@ -14,6 +14,7 @@ from bevcli.sequences.nuscenes import cache as nuscenes_cache, json_tables as nu
 from bevcli.sequences.nuscenes.build import build_index
 from bevcli.sequences.nuscenes.choice import MINI_VAL, TEST, VAL, numbers, split_of
 from bevcli.sequences.nuscenes.format import NuScenesOptions
+from bevcli.sequences.nuscenes.index import NUSCENES
 from bevcli.sequences.nuscenes.scene import read_can_bus
 from bevcli.sequences.nuscenes.sequence import NuScenesSequence
 from bevcli.sequences.open import open_sequence
@@ -74,15 +75,15 @@ def test_velocity_is_unknown_over_a_long_gap(root):
         return [{**row, "timestamp": 2 * row["timestamp"] - sample_time(0, 0)} for row in rows]
 
     edit_table(root, "sample", stretch)
-    velocities = build_index(root / "v1.0-trainval").ground_truth(1).velocities
+    velocities = build_index(root / "v1.0-trainval", NUSCENES).ground_truth(1).velocities
     np.testing.assert_allclose(velocities, [[0, 1.0]] * len(velocities))
     edit_table(root, "sample", stretch)
-    assert np.isnan(build_index(root / "v1.0-trainval").ground_truth(1).velocities).all()
+    assert np.isnan(build_index(root / "v1.0-trainval", NUSCENES).ground_truth(1).velocities).all()
 
 
 def test_single_annotation_has_no_velocity(root):
     edit_table(root, "sample_annotation", lambda rows: [{**rows[0], "prev": "", "next": ""}])
-    assert np.isnan(build_index(root / "v1.0-trainval").ground_truth(0).velocities).all()
+    assert np.isnan(build_index(root / "v1.0-trainval", NUSCENES).ground_truth(0).velocities).all()
 
 
 @pytest.mark.parametrize("remove", [False, True])
@@ -97,10 +98,10 @@ def test_without_annotations_there_is_no_ground_truth(tmp_path, remove):
 
 
 def test_order_of_rows_does_not_matter(root, tmp_path):
-    plain = build_index(root / "v1.0-trainval")
+    plain = build_index(root / "v1.0-trainval", NUSCENES)
     for name in ("sample", "sample_data", "ego_pose", "calibrated_sensor", "sample_annotation"):
         edit_table(root, name, lambda rows: rows[::-1])
-    reversed_rows = build_index(root / "v1.0-trainval")
+    reversed_rows = build_index(root / "v1.0-trainval", NUSCENES)
     assert plain.samples.tokens.tolist() == reversed_rows.samples.tokens.tolist()
     assert plain.images.files.tolist() == reversed_rows.images.files.tolist()
     np.testing.assert_array_equal(plain.images.translations, reversed_rows.images.translations)

@@ -1,9 +1,7 @@
 """Builds a NuScenesIndex from nuScenes' JSON tables: joins them by token and sorts rows by scene and time."""
 
 import re
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +9,11 @@ from numpy.typing import NDArray
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.documents import without_garbage_collection
-from bevcli.sequences.nuscenes.dialect import NUSCENES, Dialect
-from bevcli.sequences.nuscenes.index import Annotations, Images, Ints, NuScenesIndex, Samples, Scenes, Sensors
+from bevcli.sequences.nuscenes.index import Annotations, Dialect, Images, Ints, NuScenesIndex, Samples, Scenes, Sensors
 from bevcli.sequences.nuscenes.json_tables import (
     Row,
     array_of,
+    by_token,
     column,
     integers,
     places_of,
@@ -28,67 +26,49 @@ from bevcli.sequences.nuscenes.json_tables import (
 )
 from bevcli.sequences.tracks import velocities_between
 
-
-@dataclass(frozen=True)
-class _SensorData:
-    """Columns of sample_data.json for images, and for LIDAR_TOP at keyframes. Samples and sensors are rows."""
-
-    samples: Ints
-    sensors: Ints
-    poses: NDArray[np.bytes_]
-    times_us: Ints
-    keys: NDArray[np.bool_]
-    sizes: Ints
-    files: NDArray[np.bytes_]
-
-    def __getitem__(self, rows: NDArray) -> Self:
-        return replace(self, **{name: values[rows] for name, values in vars(self).items()})
+Columns = dict[str, NDArray]  # the columns of a table by name, as many rows each
 
 
-def build_index(tables: Path, dialect: Dialect = NUSCENES) -> NuScenesIndex:
+def build_index(tables: Path, dialect: Dialect) -> NuScenesIndex:
     """Read the folder with one version's tables. Raises InputError if one is missing, invalid or inconsistent."""
     with without_garbage_collection():
         sensor_tokens, sensors = _read_sensors(tables)
         names, sample_tokens, sample_times, sample_scenes = _read_samples(tables)
         data = _read_sensor_data(tables, sample_tokens, sensor_tokens, sensors, dialect)
-        translations, quaternions = _read_poses(tables, data.poses)
-        lidar = np.isin(sensors.channels[data.sensors], dialect.lidars)
-        lidar_rows = _lidar_of_samples(tables, data.samples, np.flatnonzero(lidar), sample_tokens, dialect)
+        data["translations"], data["quaternions"] = _read_poses(tables, data.pop("poses"))
+        lidar = np.isin(sensors.channels[data["sensors"]], dialect.lidars)
+        lidar_rows = _lidar_of_samples(tables, data["samples"], np.flatnonzero(lidar), sample_tokens, dialect)
         image_rows = np.flatnonzero(~lidar)
-        image_rows = image_rows[np.lexsort((data.times_us[image_rows], sample_scenes[data.samples[image_rows]]))]
+        owners, times = sample_scenes[data["samples"][image_rows]], data["times_us"][image_rows]
+        images = Images(**_rows(data, image_rows[np.lexsort((times, owners))]))
         annotations, first_annotation = read_annotations(tables, sample_tokens, sample_times, dialect)
-    images = data[image_rows]
     return NuScenesIndex(
         Scenes(names, _starts(sample_scenes, len(names)), _starts(sample_scenes[images.samples], len(names))),
         sensors,
         Samples(
             sample_tokens,
             sample_times,
-            translations[lidar_rows],
-            quaternions[lidar_rows],
-            data.sensors[lidar_rows],
+            data["translations"][lidar_rows],
+            data["quaternions"][lidar_rows],
+            data["sensors"][lidar_rows],
             first_annotation,
         ),
-        Images(
-            images.samples,
-            images.sensors,
-            images.times_us,
-            images.keys,
-            images.sizes,
-            translations[image_rows],
-            quaternions[image_rows],
-            images.files,
-        ),
+        images,
         annotations,
     )
 
 
+def _rows(columns: Columns, rows: Ints) -> Columns:
+    return {name: values[rows] for name, values in columns.items()}
+
+
+def _joined(parts: list[Columns]) -> Columns:
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
 def _read_sensors(tables: Path) -> tuple[NDArray[np.bytes_], Sensors]:
     path = tables / "calibrated_sensor.json"
-    sensor_path = tables / "sensor.json"
-    sensor_rows = read_rows(sensor_path)
-    names = texts(sensor_rows, "channel", sensor_path)
-    channels = dict(zip(texts(sensor_rows, "token", sensor_path), names, strict=True))
+    channels = by_token(tables / "sensor.json", "channel")
     rows = read_rows(path)
     sensors = Sensors(
         np.array([channels.get(token, "") for token in texts(rows, "sensor_token", path)], dtype=np.str_),
@@ -139,7 +119,8 @@ def _read_sensor_data(
     sensor_tokens: NDArray[np.bytes_],
     sensors: Sensors,
     dialect: Dialect,
-) -> _SensorData:
+) -> Columns:
+    """Columns of sample_data.json for images, and for lidars at keyframes. Samples and sensors are rows."""
     path = tables / "sample_data.json"
     lidars = {token.decode() for token in sensor_tokens[np.isin(sensors.channels, dialect.lidars)]}
     cameras = {token.decode() for token in sensor_tokens[np.isfinite(sensors.intrinsics).all((1, 2))]}
@@ -155,23 +136,22 @@ def _read_sensor_data(
             parts.append(_sensor_data_of(needed, path, sample_tokens, sensor_tokens))
     if not parts:
         raise InputError(f"{path}: no row belongs to a camera (expected camera images)")
-    return _SensorData(**{name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])})
+    return _joined(parts)
 
 
 def _sensor_data_of(
     rows: list[Row], path: Path, sample_tokens: NDArray[np.bytes_], sensor_tokens: NDArray[np.bytes_]
-) -> _SensorData:
-    return _SensorData(
-        samples=places_of(tokens(rows, "sample_token", path), sample_tokens, path.with_name("sample.json")),
-        sensors=places_of(
-            tokens(rows, "calibrated_sensor_token", path), sensor_tokens, path.with_name("calibrated_sensor.json")
-        ),
-        poses=tokens(rows, "ego_pose_token", path),
-        times_us=integers(rows, "timestamp", path),
-        keys=integers(rows, "is_key_frame", path).astype(bool),
-        sizes=np.stack([integers(rows, "width", path), integers(rows, "height", path)], axis=1),
-        files=np.array([name.encode("utf-8", "surrogatepass") for name in texts(rows, "filename", path)]),
-    )
+) -> Columns:
+    own_sensors = tokens(rows, "calibrated_sensor_token", path)
+    return {
+        "samples": places_of(tokens(rows, "sample_token", path), sample_tokens, path.with_name("sample.json")),
+        "sensors": places_of(own_sensors, sensor_tokens, path.with_name("calibrated_sensor.json")),
+        "poses": tokens(rows, "ego_pose_token", path),
+        "times_us": integers(rows, "timestamp", path),
+        "keys": integers(rows, "is_key_frame", path).astype(bool),
+        "sizes": np.stack([integers(rows, "width", path), integers(rows, "height", path)], axis=1),
+        "files": np.array([name.encode("utf-8", "surrogatepass") for name in texts(rows, "filename", path)]),
+    }
 
 
 def _read_poses(tables: Path, wanted: NDArray[np.bytes_]) -> tuple[Array, Array]:
@@ -221,45 +201,44 @@ def read_annotations(
     """
     path = tables / "sample_annotation.json"
     names = _Names(tables, dialect)
-    parts = [_columns(batch, path, names) for batch in (read_batches(path) if path.is_file() else [[]])]
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    columns = _joined([_columns(batch, path, names) for batch in (read_batches(path) if path.is_file() else [[]])])
     samples = places_of(columns.pop("samples"), sample_tokens, tables / "sample.json")
-    own, earlier, later = columns.pop("tokens"), columns.pop("prev"), columns.pop("next")
-    velocities = _velocities(own, earlier, later, columns["centers"], sample_times_us[samples], path)
+    own, times_us = columns.pop("tokens"), sample_times_us[samples]
+    first, last = (_linked(columns.pop(name), own, path) for name in ("prev", "next"))
+    seconds = (times_us - times_us[:1]).astype(np.float64) * 1e-6
+    columns["velocities"] = velocities_between(columns["centers"], seconds, first, last)[:, :2]
     order = np.argsort(samples, kind="stable")
-    annotations = Annotations(
-        **{name: values[order] for name, values in columns.items()}, velocities=velocities[order, :2]
-    )
-    return annotations, np.searchsorted(samples[order], np.arange(len(sample_tokens) + 1))
+    return Annotations(**_rows(columns, order)), _starts(samples[order], len(sample_tokens))
+
+
+def _linked(wanted: NDArray[np.bytes_], own: NDArray[np.bytes_], path: Path) -> Ints:
+    """(A,) rows of the annotations with the wanted tokens (A,); the own row for an empty one. own: (A,) tokens."""
+    rows, stated = np.arange(len(own)), wanted != b""
+    rows[stated] = places_of(wanted[stated], own, path)
+    return rows
 
 
 class _Names:
     """The names behind the tokens in an annotation."""
 
     def __init__(self, tables: Path, dialect: Dialect) -> None:
-        categories = _texts(tables / "category.json", "name")
+        categories = _optional(tables / "category.json", "name")
         path = tables / "instance.json"
-        instances = _optional_rows(path)
-        owners, own = texts(instances, "category_token", path), texts(instances, "token", path)
-        for token in owners:
+        owners = _optional(path, "category_token")
+        for token in owners.values():
             if token not in categories:
                 raise InputError(f'{path}: category "{token}" is missing in category.json')
-        self.category = {token: categories[owner].encode() for token, owner in zip(own, owners, strict=True)}
-        attributes = _texts(tables / "attribute.json", "name") if dialect.has_attributes else {}
+        self.category = {token: categories[owner].encode() for token, owner in owners.items()}
+        attributes = _optional(tables / "attribute.json", "name") if dialect.has_attributes else {}
         self.attribute = {token: name.encode() for token, name in attributes.items()}
         self.visibility = {
             token: dialect.visibilities.get(level) or _middle(level, tables)
-            for token, level in _texts(tables / "visibility.json", "level").items()
+            for token, level in _optional(tables / "visibility.json", "level").items()
         }
 
 
-def _optional_rows(path: Path) -> list[Row]:
-    return read_rows(path) if path.is_file() else []
-
-
-def _texts(path: Path, name: str) -> dict[str, str]:
-    rows = _optional_rows(path)
-    return dict(zip(texts(rows, "token", path), texts(rows, name, path), strict=True))
+def _optional(path: Path, name: str) -> dict[str, str]:
+    return by_token(path, name) if path.is_file() else {}
 
 
 def _middle(level: str, tables: Path) -> float:
@@ -290,19 +269,3 @@ def _columns(rows: list[Row], path: Path, names: _Names) -> dict[str, NDArray]:
         "visibilities": np.array([names.visibility.get(token, np.nan) for token in visibilities]),
         "num_points": integers(rows, "num_lidar_pts", path) + integers(rows, "num_radar_pts", path),
     }
-
-
-def _velocities(
-    own: NDArray[np.bytes_],
-    earlier: NDArray[np.bytes_],
-    later: NDArray[np.bytes_],
-    centers: Array,
-    times_us: Ints,
-    path: Path,
-) -> Array:
-    """(A, 3) m/s in the world frame, NaN if unknown, see `velocities_between`."""
-    first, last = np.arange(len(own)), np.arange(len(own))
-    has_earlier, has_later = earlier != b"", later != b""
-    first[has_earlier] = places_of(earlier[has_earlier], own, path)
-    last[has_later] = places_of(later[has_later], own, path)
-    return velocities_between(centers, (times_us - times_us[:1]).astype(np.float64) * 1e-6, first, last)

@@ -16,8 +16,7 @@ from typing import Any, get_type_hints
 import numpy as np
 
 from bevcli.sequences.nuscenes.build import build_index
-from bevcli.sequences.nuscenes.dialect import NUSCENES, Dialect
-from bevcli.sequences.nuscenes.index import NuScenesIndex
+from bevcli.sequences.nuscenes.index import NUSCENES, Dialect, NuScenesIndex
 from bevcli.user_folders import user_cache
 
 FORMAT = 2  # version of the cached arrays; increase it when the index changes

@@ -1,7 +1,7 @@
-"""The contents of nuScenes' tables that bevcli needs, as arrays ordered by scene and time."""
+"""The contents of nuScenes' tables that bevcli needs, as arrays ordered by scene and time, and dialects of them."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,29 @@ CLASS_OF_CATEGORY = {
     "vehicle.truck": "truck",
 }
 BICYCLE_RACK = "static_object.bicycle_rack"
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """The reading of tables that differ from nuScenes' own in some points.
+
+    Attributes:
+        lidars: channels of which each sample has a keyframe, whose ego pose is that of the frame.
+        class_of: a category -> its class, None for a category that is left out.
+        visibilities: names of visibility levels -> visible fraction, besides names such as "v40-60".
+        has_attributes: whether the attributes are those of nuScenes, which are scored.
+        ego_from_bev: (4, 4) metres; None for the frame of the lidar.
+    """
+
+    lidars: tuple[str, ...]
+    class_of: Callable[[str], str | None]
+    visibilities: Mapping[str, float] = field(default_factory=dict)
+    has_attributes: bool = True
+    ego_from_bev: Array | None = None
+
+
+# The published models predict in the frame of LIDAR_TOP.
+NUSCENES = Dialect(("LIDAR_TOP",), CLASS_OF_CATEGORY.get)
 
 
 @dataclass(frozen=True)

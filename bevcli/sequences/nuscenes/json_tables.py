@@ -95,6 +95,12 @@ def texts(rows: list[Row], name: str, path: Path) -> list[str]:
     return values
 
 
+def by_token(path: Path, name: str) -> dict[str, str]:
+    """The texts of a column of a table by the token of their row. Raises InputError as `read_rows` and `texts`."""
+    rows = read_rows(path)
+    return dict(zip(texts(rows, "token", path), texts(rows, name, path), strict=True))
+
+
 def tokens(rows: list[Row], name: str, path: Path) -> NDArray[np.bytes_]:
     """(N,) tokens of a column, as bytes. Raises InputError for anything but ASCII texts."""
     try:

@@ -10,8 +10,7 @@ from bevcli.errors import InputError
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig, same_rig
 from bevcli.geometry.transforms import Pose
-from bevcli.sequences.nuscenes.dialect import NUSCENES
-from bevcli.sequences.nuscenes.index import CLASS_OF_CATEGORY
+from bevcli.sequences.nuscenes.index import CLASS_OF_CATEGORY, NUSCENES
 
 (LIDAR,) = NUSCENES.lidars  # its pose is that of the bev frame
 Row = dict[str, Any]

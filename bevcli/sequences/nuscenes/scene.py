@@ -12,8 +12,7 @@ from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics, motion_of_keyframes
 from bevcli.geometry.transforms import Array, Pose
 from bevcli.sequences.files.calibration_file import LARGEST_SIZE, is_file_name
-from bevcli.sequences.nuscenes.dialect import Dialect
-from bevcli.sequences.nuscenes.index import NuScenesIndex
+from bevcli.sequences.nuscenes.index import Dialect, NuScenesIndex
 from bevcli.sequences.nuscenes.json_tables import integers, read_rows, vectors
 
 # The order of nuScenes' cameras in a rig. Other cameras follow, sorted by name.

@@ -13,9 +13,8 @@ from bevcli.geometry.transforms import Pose, inverse
 from bevcli.sequences.images import ImageReader, ImageSource
 from bevcli.sequences.nuscenes.cache import open_index
 from bevcli.sequences.nuscenes.choice import chosen_scenes, keyframes, sweep_frames, tables_of
-from bevcli.sequences.nuscenes.dialect import NUSCENES, Dialect
 from bevcli.sequences.nuscenes.format import NuScenesOptions
-from bevcli.sequences.nuscenes.index import Images, Ints, Samples
+from bevcli.sequences.nuscenes.index import NUSCENES, Dialect, Images, Ints, Samples
 from bevcli.sequences.nuscenes.map_expansion import MapExpansion
 from bevcli.sequences.nuscenes.scene import read_scene_facts, scene_rig
 from bevcli.sequences.options import SequenceOptions
@@ -77,13 +76,12 @@ class TableSequence(Sequence):
     def class_counts(self) -> Mapping[str, int]:
         first, categories = self.index.samples.first_annotation, self.index.annotations.categories
         found: Counter[bytes] = Counter()
-        for sample in (entry.sample for entry in self._frames if len(categories)):
-            if sample is not None:
-                found.update(categories[first[sample] : first[sample + 1]].tolist())
+        for sample in (entry.sample for entry in self._frames if entry.sample is not None):
+            found.update(categories[first[sample] : first[sample + 1]].tolist())
         counts: Counter[str] = Counter()
         for category, count in found.items():
-            name = self.dialect.class_of(category.decode())
-            counts.update({name: count} if name else {})
+            if name := self.dialect.class_of(category.decode()):
+                counts[name] += count
         return counts
 
     def image_files(self, place: int) -> tuple[Path, ...]:
