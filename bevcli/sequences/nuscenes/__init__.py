@@ -3,6 +3,6 @@
 sequence: NuScenesSequence, the dataset as a Sequence, and TableSequence, for formats with the same tables.
 choice: version, split, scenes and frames of a dataset root.
 scene: rig, poses and CAN bus data of one scene.
-index: the tables' contents as arrays, and dialects of the tables. build makes it of json_tables; cache keeps it on disk.
+index: the contents of tables as arrays, and dialects. build makes it of json_tables; cache keeps it on disk.
 writer: NuScenesWriter, a drive as a nuScenes root.
 """
