@@ -3,20 +3,19 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_ego_from_bev
+from bevcli.geometry.cameras import Camera, brown_conrady
 from bevcli.geometry.transforms import Array, Pose
 from bevcli.parsing.documents import LARGEST_INTEGER, read_json
 from bevcli.sequences.files.calibration_file import LARGEST_SIZE, is_file_name
 
 LARGEST_NUMBER = 1e12  # metres or pixels
 SHORTEST_QUATERNION = 1e-3
-BOXES_3D = "1"  # the number of 3D boxes among DGP's kinds of annotations
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 PINHOLE = ("fx", "fy", "cx", "cy")
 BROWN_CONRADY = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -103,25 +102,19 @@ def read_record(path: Path) -> Record:
     return Record(read_json(path), str(path))
 
 
-def inside(name: str, where: str, *, allow_outside: bool) -> PurePosixPath:
-    """A file name relative to the scene. Raises InputError if it leads out of it."""
-    path = PurePosixPath(name)
-    if not allow_outside and (path.is_absolute() or ".." in path.parts):
-        raise InputError(f"{where}: {name:.100}: leads out of the folder: pass `allow_outside=True` to read it")
-    return path
-
-
-def nanoseconds(times: list[datetime]) -> tuple[list[int], bool]:
+def nanoseconds(times: list[datetime], where: str) -> tuple[list[int], bool]:
     """The times since 1970 in ns, and whether they were divided by ten. Raises InputError beyond any year.
 
     DDAD's files state tenths of microseconds as microseconds: a drive of 2019 seems to be of the year 2463, with one
-    frame per second in place of ten.
+    frame per second in place of ten. where: start of a message.
     """
     found = [(time - EPOCH) // timedelta(microseconds=1) * 1000 for time in times]
     tenfold = max(found) > LARGEST_INTEGER
     found = [time // 10 for time in found] if tenfold else found
     if not 0 <= min(found) <= max(found) <= LARGEST_INTEGER:
-        raise InputError(f"the times {min(times)} to {max(times)} are impossible (expected years from 1970 on)")
+        raise InputError(
+            f"{where}: the times {min(times)} to {max(times)} are impossible (expected years from 1970 on)"
+        )
     return found, tenfold
 
 
@@ -137,12 +130,8 @@ class Calibration:
     ego_from: Mapping[str, Pose]
     lenses: Mapping[str, Record]
 
-    def rig(self, sizes: Mapping[str, tuple[int, int]]) -> CameraRig:
-        """The cameras with their image sizes (width, height), in this order. Raises InputError."""
-        cameras = tuple(self._camera(name, size) for name, size in sizes.items())
-        return CameraRig(cameras, default_ego_from_bev(), ego_from_bev_assumed=True)
-
-    def _camera(self, name: str, size: tuple[int, int]) -> Camera:
+    def camera(self, name: str, size: tuple[int, int]) -> Camera:
+        """A camera with the size of its image (width, height). Raises InputError."""
         lens = self.lenses[name]
         fx, fy, cx, cy = lens.numbers(PINHOLE)
         if not (is_file_name(name) and 0 < min(size) <= max(size) <= LARGEST_SIZE and min(fx, fy) > 0):

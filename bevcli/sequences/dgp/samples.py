@@ -2,12 +2,14 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from bevcli.errors import InputError
+from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import PoseTable
 from bevcli.geometry.transforms import Pose, inverse
 from bevcli.sequences.dgp.records import Calibration, Record, nanoseconds, read_calibration
@@ -52,6 +54,14 @@ class Sample:
             datum.world_from_sensor.matrix @ inverse(self.calibration.ego_from[datum.sensor].matrix)
         )
 
+    def rig(self) -> CameraRig:
+        """The cameras that have an image, in the order of the calibration. Raises InputError."""
+        images = {datum.sensor: datum.content for datum in self.data if datum.is_image}
+        names = [name for name in self.calibration.ego_from if name in images]
+        sizes = [(images[name].integer("width"), images[name].integer("height")) for name in names]
+        cameras = tuple(map(self.calibration.camera, names, sizes))
+        return CameraRig(cameras, default_ego_from_bev(), ego_from_bev_assumed=True)
+
 
 def read_samples(path: Path, scene: Record) -> tuple[tuple[Sample, ...], bool]:
     """The samples in order of time, and whether the times were divided by ten, see `nanoseconds`. Raises InputError.
@@ -63,25 +73,16 @@ def read_samples(path: Path, scene: Record) -> tuple[tuple[Sample, ...], bool]:
     if not samples:
         raise InputError(f"{scene.where}: has no samples (expected at least one)")
     owners = [*records.values(), *samples]
-    times, tenfold = _times(owners, scene.where)
+    times, tenfold = nanoseconds([owner.record("id").timestamp() for owner in owners], scene.where)
     data = {key: _datum(record, time) for (key, record), time in zip(records.items(), times, strict=False)}
-    calibrations: dict[str, Calibration] = {}
+    calibration_of = cache(lambda key: read_calibration(path / "calibration" / f"{key}.json"))
     found = []
     for sample, time in zip(samples, times[len(records) :], strict=True):
-        key = sample.text("calibration_key")
-        if key not in calibrations:
-            calibrations[key] = read_calibration(path / "calibration" / f"{key}.json")
-        found.append(Sample(time, _data_of(sample, data, calibrations[key]), calibrations[key]))
+        calibration = calibration_of(sample.text("calibration_key"))
+        found.append(Sample(time, _data_of(sample, data, calibration), calibration))
     if any(later.time_ns <= earlier.time_ns for earlier, later in pairwise(found)):
         raise InputError(f"{scene.where}: two samples have the same time (expected increasing times)")
     return tuple(found), tenfold
-
-
-def _times(owners: list[Record], where: str) -> tuple[list[int], bool]:
-    try:
-        return nanoseconds([owner.record("id").timestamp() for owner in owners])
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
 
 
 def _data_of(sample: Record, data: dict[str, Datum | None], calibration: Calibration) -> tuple[Datum, ...]:
@@ -110,16 +111,6 @@ def _datum(record: Record, time_ns: int) -> Datum | None:
     content = contents.record(kind)
     pose = content.record("pose").pose()
     return Datum(record.record("id").text("name"), kind == "image", content, time_ns, pose)
-
-
-def sizes(sample: Sample) -> dict[str, tuple[int, int]]:
-    """(width, height) of each camera's image in a sample, in the order of the calibration. Raises InputError."""
-    images = {datum.sensor: datum.content for datum in sample.data if datum.is_image}
-    return {
-        name: (images[name].integer("width"), images[name].integer("height"))
-        for name in sample.calibration.ego_from
-        if name in images
-    }
 
 
 def poses(samples: Iterable[Sample], *, keys: bool) -> PoseTable:
