@@ -112,7 +112,7 @@ def test_batches_contain_all_rows_of_a_table(root, monkeypatch):
     monkeypatch.setattr(nuscenes_json, "BATCH_BYTES", 10_000)
     batches = list(nuscenes_json.read_batches(path))
     assert len(batches) > 10
-    assert [row for batch in batches for row in batch] == json.loads(path.read_text())
+    assert [row for batch in batches for row in batch.rows] == json.loads(path.read_text())
 
 
 def test_can_bus_is_the_first_message_after_the_time(tmp_path):

@@ -10,20 +10,7 @@ from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.documents import without_garbage_collection
 from bevcli.sequences.nuscenes.index import Annotations, Dialect, Images, Ints, NuScenesIndex, Samples, Scenes, Sensors
-from bevcli.sequences.nuscenes.json_tables import (
-    Row,
-    array_of,
-    by_token,
-    column,
-    integers,
-    places_of,
-    quaternions,
-    read_batches,
-    read_rows,
-    texts,
-    tokens,
-    vectors,
-)
+from bevcli.sequences.nuscenes.json_tables import Row, Rows, array_of, places_of, read_batches, read_rows
 from bevcli.sequences.tracks import velocities_between
 
 Columns = dict[str, NDArray]  # the columns of a table by name, as many rows each
@@ -68,16 +55,16 @@ def _joined(parts: list[Columns]) -> Columns:
 
 def _read_sensors(tables: Path) -> tuple[NDArray[np.bytes_], Sensors]:
     path = tables / "calibrated_sensor.json"
-    channels = by_token(tables / "sensor.json", "channel")
-    rows = read_rows(path)
+    channels = read_rows(tables / "sensor.json").by_token("channel")
+    table = read_rows(path)
     sensors = Sensors(
-        np.array([channels.get(token, "") for token in texts(rows, "sensor_token", path)], dtype=np.str_),
-        vectors(rows, "translation", path, 3),
-        quaternions(rows, "rotation", path),
-        np.array([_intrinsics(row, path) for row in rows], dtype=np.float64).reshape(-1, 3, 3),
-        np.array([_distortion(row, path) for row in rows], dtype=np.float64).reshape(-1, 8),
+        np.array([channels.get(token, "") for token in table.texts("sensor_token")], dtype=np.str_),
+        table.vectors("translation", 3),
+        table.quaternions("rotation"),
+        np.array([_intrinsics(row, path) for row in table.rows], dtype=np.float64).reshape(-1, 3, 3),
+        np.array([_distortion(row, path) for row in table.rows], dtype=np.float64).reshape(-1, 8),
     )
-    return tokens(rows, "token", path), sensors
+    return table.tokens("token"), sensors
 
 
 def _intrinsics(row: Row, path: Path) -> Array:
@@ -102,15 +89,15 @@ def _distortion(row: Row, path: Path) -> Array:
 
 def _read_samples(tables: Path) -> tuple[NDArray[np.str_], NDArray[np.bytes_], Ints, Ints]:
     """Scene names (S,), and the tokens, times in us and scenes of samples (N,), ordered by scene and time."""
-    scene_path, path = tables / "scene.json", tables / "sample.json"
-    scenes, rows = read_rows(scene_path), read_rows(path)
-    if not scenes or not rows:
-        raise InputError(f"{path if scenes else scene_path}: the table has no rows (expected at least one)")
-    in_scene = places_of(tokens(rows, "scene_token", path), tokens(scenes, "token", scene_path), scene_path)
-    times = integers(rows, "timestamp", path)
+    scenes, samples = read_rows(tables / "scene.json"), read_rows(tables / "sample.json")
+    for table in (scenes, samples):
+        if not len(table):
+            raise InputError(f"{table.path}: the table has no rows (expected at least one)")
+    in_scene = places_of(samples.tokens("scene_token"), scenes.tokens("token"), scenes.path)
+    times = samples.integers("timestamp")
     order = np.lexsort((times, in_scene))
-    names = np.array(texts(scenes, "name", scene_path), dtype=np.str_)
-    return names, tokens(rows, "token", path)[order], times[order], in_scene[order]
+    names = np.array(scenes.texts("name"), dtype=np.str_)
+    return names, samples.tokens("token")[order], times[order], in_scene[order]
 
 
 def _read_sensor_data(
@@ -126,31 +113,28 @@ def _read_sensor_data(
     cameras = {token.decode() for token in sensor_tokens[np.isfinite(sensors.intrinsics).all((1, 2))]}
     parts = []
     for batch in read_batches(path):
-        owners, keys = texts(batch, "calibrated_sensor_token", path), column(batch, "is_key_frame", path)
-        needed = [
-            row
-            for row, owner, key in zip(batch, owners, keys, strict=True)
-            if (owner in cameras and row.get("is_valid") is not False) or (key and owner in lidars)
-        ]
-        if needed:
-            parts.append(_sensor_data_of(needed, path, sample_tokens, sensor_tokens))
+        facts = zip(batch.rows, batch.texts("calibrated_sensor_token"), batch.column("is_key_frame"), strict=True)
+        needed = batch.where(
+            (owner in cameras and row.get("is_valid") is not False) or (key and owner in lidars)
+            for row, owner, key in facts
+        )
+        if len(needed):
+            parts.append(_sensor_data_of(needed, sample_tokens, sensor_tokens))
     if not parts:
         raise InputError(f"{path}: no row belongs to a camera (expected camera images)")
     return _joined(parts)
 
 
-def _sensor_data_of(
-    rows: list[Row], path: Path, sample_tokens: NDArray[np.bytes_], sensor_tokens: NDArray[np.bytes_]
-) -> Columns:
-    own_sensors = tokens(rows, "calibrated_sensor_token", path)
+def _sensor_data_of(rows: Rows, sample_tokens: NDArray[np.bytes_], sensor_tokens: NDArray[np.bytes_]) -> Columns:
+    of_samples, of_sensors = (rows.path.with_name(name) for name in ("sample.json", "calibrated_sensor.json"))
     return {
-        "samples": places_of(tokens(rows, "sample_token", path), sample_tokens, path.with_name("sample.json")),
-        "sensors": places_of(own_sensors, sensor_tokens, path.with_name("calibrated_sensor.json")),
-        "poses": tokens(rows, "ego_pose_token", path),
-        "times_us": integers(rows, "timestamp", path),
-        "keys": integers(rows, "is_key_frame", path).astype(bool),
-        "sizes": np.stack([integers(rows, "width", path), integers(rows, "height", path)], axis=1),
-        "files": np.array([name.encode("utf-8", "surrogatepass") for name in texts(rows, "filename", path)]),
+        "samples": places_of(rows.tokens("sample_token"), sample_tokens, of_samples),
+        "sensors": places_of(rows.tokens("calibrated_sensor_token"), sensor_tokens, of_sensors),
+        "poses": rows.tokens("ego_pose_token"),
+        "times_us": rows.integers("timestamp"),
+        "keys": rows.integers("is_key_frame").astype(bool),
+        "sizes": np.stack([rows.integers("width"), rows.integers("height")], axis=1),
+        "files": np.array([name.encode("utf-8", "surrogatepass") for name in rows.texts("filename")]),
     }
 
 
@@ -158,16 +142,14 @@ def _read_poses(tables: Path, wanted: NDArray[np.bytes_]) -> tuple[Array, Array]
     """Translations (P, 3), metres, and quaternions (P, 4) of world_from_ego for the pose tokens (P,)."""
     path = tables / "ego_pose.json"
     needed = {token.decode() for token in wanted}
-    found, translations, rotations = [], [], []
+    parts = []
     for batch in read_batches(path):
-        rows = [row for row, token in zip(batch, texts(batch, "token", path), strict=True) if token in needed]
-        if rows:
-            found.append(tokens(rows, "token", path))
-            translations.append(vectors(rows, "translation", path, 3))
-            rotations.append(quaternions(rows, "rotation", path))
-    places = places_of(wanted, np.concatenate(found) if found else np.zeros(0, "S32"), path)
-    chosen = np.concatenate(rotations)[places]
-    return np.concatenate(translations)[places], chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
+        rows = batch.where(token in needed for token in batch.texts("token"))
+        parts.append((rows.tokens("token"), rows.vectors("translation", 3), rows.quaternions("rotation")))
+    found, translations, rotations = map(np.concatenate, zip(*parts, strict=True))
+    places = places_of(wanted, found, path)
+    chosen = rotations[places]
+    return translations[places], chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
 
 
 def _lidar_of_samples(
@@ -201,7 +183,8 @@ def read_annotations(
     """
     path = tables / "sample_annotation.json"
     names = _Names(tables, dialect)
-    columns = _joined([_columns(batch, path, names) for batch in (read_batches(path) if path.is_file() else [[]])])
+    batches = read_batches(path) if path.is_file() else [Rows(path, [])]
+    columns = _joined([_columns(batch, names) for batch in batches])
     samples = places_of(columns.pop("samples"), sample_tokens, tables / "sample.json")
     own, times_us = columns.pop("tokens"), sample_times_us[samples]
     first, last = (_linked(columns.pop(name), own, path) for name in ("prev", "next"))
@@ -238,7 +221,7 @@ class _Names:
 
 
 def _optional(path: Path, name: str) -> dict[str, str]:
-    return by_token(path, name) if path.is_file() else {}
+    return read_rows(path).by_token(name) if path.is_file() else {}
 
 
 def _middle(level: str, tables: Path) -> float:
@@ -249,23 +232,21 @@ def _middle(level: str, tables: Path) -> float:
     return (int(found[1]) + int(found[2])) / 200
 
 
-def _columns(rows: list[Row], path: Path, names: _Names) -> dict[str, NDArray]:
-    instances = texts(rows, "instance_token", path)
-    attributes = column(rows, "attribute_tokens", path)
-    visibilities = texts(rows, "visibility_token", path)
+def _columns(rows: Rows, names: _Names) -> Columns:
+    attributes = rows.column("attribute_tokens")
     if not all(type(own) is list and all(type(token) is str for token in own) for own in attributes):
-        raise InputError(f'{path}: "attribute_tokens": expected a list of tokens in every row')
+        raise InputError(f'{rows.path}: "attribute_tokens": expected a list of tokens in every row')
     return {
-        "tokens": tokens(rows, "token", path),
-        "samples": tokens(rows, "sample_token", path),
-        "prev": tokens(rows, "prev", path),
-        "next": tokens(rows, "next", path),
-        "categories": np.array([names.category.get(token, b"") for token in instances], dtype="S"),
+        "tokens": rows.tokens("token"),
+        "samples": rows.tokens("sample_token"),
+        "prev": rows.tokens("prev"),
+        "next": rows.tokens("next"),
+        "categories": np.array([names.category.get(token, b"") for token in rows.texts("instance_token")], dtype="S"),
         "attributes": np.array([names.attribute.get(own[0], b"") if own else b"" for own in attributes], dtype="S"),
-        "instances": tokens(rows, "instance_token", path),
-        "centers": vectors(rows, "translation", path, 3),
-        "sizes_wlh": vectors(rows, "size", path, 3),
-        "quaternions": quaternions(rows, "rotation", path),
-        "visibilities": np.array([names.visibility.get(token, np.nan) for token in visibilities]),
-        "num_points": integers(rows, "num_lidar_pts", path) + integers(rows, "num_radar_pts", path),
+        "instances": rows.tokens("instance_token"),
+        "centers": rows.vectors("translation", 3),
+        "sizes_wlh": rows.vectors("size", 3),
+        "quaternions": rows.quaternions("rotation"),
+        "visibilities": np.array([names.visibility.get(token, np.nan) for token in rows.texts("visibility_token")]),
+        "num_points": rows.integers("num_lidar_pts") + rows.integers("num_radar_pts"),
     }

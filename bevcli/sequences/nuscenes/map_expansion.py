@@ -15,7 +15,7 @@ from bevcli.errors import InputError
 from bevcli.frame import LINE_CLASSES, MapLines
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.parsing.documents import read_json
-from bevcli.sequences.nuscenes.json_tables import by_token, read_rows, texts
+from bevcli.sequences.nuscenes.json_tables import read_rows
 from bevcli.sequences.true_lines import AREA, lines_in_area
 
 DIVIDER, CROSSING, BOUNDARY = LINE_CLASSES
@@ -47,9 +47,9 @@ class MapExpansion:
     @cached_property
     def _locations(self) -> Mapping[str, str]:
         """Name of a scene -> its location, such as "boston-seaport"."""
-        scenes, logs = self.tables / "scene.json", self.tables / "log.json"
-        rows, locations = read_rows(scenes), by_token(logs, "location")
-        pairs = zip(texts(rows, "name", scenes), texts(rows, "log_token", scenes), strict=True)
+        scenes = read_rows(self.tables / "scene.json")
+        locations = read_rows(self.tables / "log.json").by_token("location")
+        pairs = zip(scenes.texts("name"), scenes.texts("log_token"), strict=True)
         return {name: locations[log] for name, log in pairs if log in locations}
 
 

@@ -13,7 +13,7 @@ from bevcli.geometry.ego_motion import EgoMotion, Kinematics, motion_of_keyframe
 from bevcli.geometry.transforms import Array, Pose
 from bevcli.sequences.files.calibration_file import LARGEST_SIZE, is_file_name
 from bevcli.sequences.nuscenes.index import Dialect, NuScenesIndex
-from bevcli.sequences.nuscenes.json_tables import integers, read_rows, vectors
+from bevcli.sequences.nuscenes.json_tables import read_rows
 
 # The order of nuScenes' cameras in a rig. Other cameras follow, sorted by name.
 CAMERAS = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT")
@@ -101,8 +101,8 @@ def read_can_bus(root: Path, scene: str) -> CanBus | None:
     rows = read_rows(path)
     if not rows:
         return None
-    times = integers(rows, "utime", path)
-    quantities = [vectors(rows, name, path, 3) for name in ("accel", "rotation_rate", "vel")]
+    times = rows.integers("utime")
+    quantities = [rows.vectors(name, 3) for name in ("accel", "rotation_rate", "vel")]
     order = np.argsort(times, kind="stable")
     return CanBus(times[order], *(values[order] for values in quantities))
 
