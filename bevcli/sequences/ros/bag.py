@@ -5,9 +5,8 @@ import re
 import threading
 from collections.abc import Iterator, Sequence as Indices
 from contextlib import contextmanager
-from itertools import groupby
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,10 @@ from bevcli.parsing.documents import read_yaml
 from bevcli.parsing.files import MIB, decompressed
 from bevcli.printing import reason_of
 from bevcli.sequences.ros.format import METADATA, SUFFIXES
-from bevcli.sequences.ros.messages import Decode, Topic, decoder
+from bevcli.sequences.ros.messages import Decode, decoder
+
+if TYPE_CHECKING:
+    from bevcli.sequences.ros.storage import McapFile, SqliteFile
 
 SPLIT_NUMBER = re.compile(r"_\d+$")  # rosbag2 numbers the files of a recording: drive_0.mcap, drive_1.mcap
 LARGEST_MESSAGE = 256 * MIB  # bytes after decompression
@@ -34,21 +36,6 @@ def _broken_files_refused(path: Path) -> Iterator[None]:
         if isinstance(error, BevcliError):
             raise type(error)(reason) from None
         raise InputError(f"{path}: is damaged ({reason:.200})") from None
-
-
-class BagFile(Protocol):
-    """One file of a bag: `McapFile` or `SqliteFile`. topics: by name. notes: for the user about the file."""
-
-    topics: dict[str, Topic]
-    notes: tuple[str, ...]
-
-    def times(self, topic: str) -> NDArray[np.int64]:
-        """(N,) log times of a topic's messages in order, ns."""
-        ...
-
-    def read(self, topic: str, index: int) -> bytes:
-        """The bytes of a message."""
-        ...
 
 
 class Bag:
@@ -137,21 +124,18 @@ def _metadata(path: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def _open_file(path: Path) -> BagFile:
-    if not all(map(_is_installed, PACKAGES)):
+def _open_file(path: Path) -> "McapFile | SqliteFile":
+    try:
+        installed = all(map(importlib.util.find_spec, PACKAGES))
+    except ModuleNotFoundError:  # the package around one of them
+        installed = False
+    if not installed:
         raise InputError(f"{path}: ROS bags need the packages of an extra: run pip install 'bevcli[ros]'")
     from bevcli.sequences.ros.storage import McapFile, SqliteFile
 
     if not path.stat().st_size:
         raise InputError(f"{path}: the file is empty")
     return McapFile(path) if path.suffix == ".mcap" else SqliteFile(path)
-
-
-def _is_installed(name: str) -> bool:
-    try:
-        return importlib.util.find_spec(name) is not None
-    except ModuleNotFoundError:  # the package around it
-        return False
 
 
 def _number(file: Path) -> tuple[int, str]:
@@ -161,4 +145,5 @@ def _number(file: Path) -> tuple[int, str]:
 
 def spread(count: int, wanted: int) -> Indices[int]:
     """Up to `wanted` different indices below `count`, evenly spread, with the first and the last."""
-    return [key for key, _ in groupby(np.linspace(0, count - 1, min(count, wanted)).astype(int).tolist())]
+    indices: list[int] = np.unique(np.linspace(0, count - 1, min(count, wanted)).astype(int)).tolist()
+    return indices

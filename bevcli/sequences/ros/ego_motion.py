@@ -13,7 +13,7 @@ from bevcli.geometry.ego_motion import EgoMotion, Kinematics, derive_kinematics
 from bevcli.geometry.geographic import GeoOrigin
 from bevcli.geometry.transforms import Array, Pose, interpolate, inverse, rigid
 from bevcli.sequences.ros.bag import Bag, spread
-from bevcli.sequences.ros.messages import Transform, pose_of, short_type, timestamp_ns, transforms_of
+from bevcli.sequences.ros.messages import Transform, pose_of, timestamp_ns, transforms_of
 
 SAMPLED_MESSAGES = 200  # from the start of each topic with transforms: enough to see every frame once
 Sample = tuple[int, Pose]  # time ns, pose at that time
@@ -221,10 +221,8 @@ def _at(samples: list[Sample], time: int) -> Pose:
     """The pose of one link at a time; outside of its samples, the nearest."""
     times = [stamp for stamp, _ in samples]
     later = bisect_left(times, time)
-    if later == len(times):
-        return samples[-1][1]
-    if later == 0 or times[later] == time:
-        return samples[later][1]
+    if later in (0, len(times)) or times[later] == time:
+        return samples[min(later, len(times) - 1)][1]
     earlier = later - 1
     fraction = (time - times[earlier]) / (times[later] - times[earlier])
     return interpolate(samples[earlier][1], samples[later][1], fraction)
@@ -276,9 +274,7 @@ def find_geo_origin(bag: Bag, motion: EgoMotion | BagEgoMotion | None) -> GeoOri
     as the vehicle's origin. None without poses, without a valid position, or if the vehicle is too far from the
     world's origin.
     """
-    topics = [
-        name for name, topic in bag.topics.items() if short_type(topic.type_name) in FIX_TYPES and len(bag.times(name))
-    ]
+    topics = [name for name, topic in bag.topics.items() if topic.short_type in FIX_TYPES and len(bag.times(name))]
     if motion is None or not topics:
         return None
     times = bag.times(topics[0])

@@ -1,7 +1,7 @@
 """A ROS 2 bag or an MCAP file as a Sequence."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -65,20 +65,19 @@ class RosSequence(Sequence):
         tree = TransformTree([*static, *changing])
         reader = _VehicleReader(self._bag, finder, stated, tree)
         self.rig = reader.rig() if rig is None else rig
-        motion = reader.motion(common.ego_motion, file)
-        self._motion = motion.poses
-        self.has_ego_motion = motion.poses is not None
-        self.facts = replace(facts, geo_origin=facts.geo_origin or find_geo_origin(self._bag, motion.poses))
+        self._motion, source, motion_notes = reader.motion(common.ego_motion, file)
+        self.has_ego_motion = self._motion is not None
+        self.facts = replace(facts, geo_origin=facts.geo_origin or find_geo_origin(self._bag, self._motion))
         self._entries, gaps = _covered(_entries(self._bag, finder.cameras), self._motion, path)
         self.stamps = tuple(entry.stamp for entry in self._entries)
         self.notes = (
-            finder.table(motion.source),
+            finder.table(source),
             *self._bag.notes,
             *beside,
             *reader.notes,
             *(f"{name} is not used: no CameraInfo belongs to it" for name in finder.left_out),
             *rig_notes(self.rig, "the calibration" if rig else "a bag"),
-            *motion.notes,
+            *motion_notes,
             *gaps,
         )
         self._images = ImageReader(strict=common.strict)
@@ -105,15 +104,6 @@ def _files_beside(
         file = folder / EGO_MOTION_FILE
         notes.append(f"{file} is used in place of the poses in the bag")
     return found if rig is None else rig, facts, file, notes
-
-
-@dataclass(frozen=True)
-class _Motion:
-    """The poses and their origin. poses: None without any. source: the topic, "" if it is none."""
-
-    poses: EgoMotion | BagEgoMotion | None
-    source: str
-    notes: tuple[str, ...] = ()
 
 
 class _VehicleReader:
@@ -185,12 +175,17 @@ class _VehicleReader:
         lens = None if topics.is_rectified else info.distortion
         return Camera(topics.camera, info.width, info.height, info.intrinsics, ego_from_camera, lens)
 
-    def motion(self, use: EgoMotionUse, file: Path | None) -> _Motion:
-        """The poses of a file, a topic or the transforms. Raises InputError if they are required and not found."""
+    def motion(
+        self, use: EgoMotionUse, file: Path | None
+    ) -> tuple[EgoMotion | BagEgoMotion | None, str, tuple[str, ...]]:
+        """The poses of a file, a topic or the transforms, None without any; their topic, "" for none; and notes.
+
+        Raises InputError if poses are required and not found.
+        """
         if use == "static":
-            return _Motion(None, "", ("the vehicle is assumed to stand still (poses in the bag are not read)",))
+            return None, "", ("the vehicle is assumed to stand still (poses in the bag are not read)",)
         if file is not None:
-            return _Motion(read_ego_motion(file), "")
+            return read_ego_motion(file), "", ()
         ego_frame = self.ego_frame or next((name for name in EGO_FRAMES if name in self._tree.frames), EGO_FRAMES[0])
         topic = self._finder.pose_topic()
         if topic is not None:
@@ -199,20 +194,19 @@ class _VehicleReader:
             notes: tuple[str, ...] = ()
             if child and child != ego_frame and child_from_ego is None:
                 notes = (f'{topic} has poses of "{child}", which are taken as those of "{ego_frame}"',)
-            return _Motion(motion_from_poses(self._bag, topic, child_from_ego), topic, notes)
+            return motion_from_poses(self._bag, topic, child_from_ego), topic, notes
         changing = [name for name in self._finder.of_kind("transforms") if not is_static(name)]
         path = self._moving_path(ego_frame, changing)
         if len(path) > 1:
             child_from_ego = None if path[0] == ego_frame else self._tree.between(path[0], ego_frame)
-            poses = motion_from_transforms(self._bag, changing, path[::-1], child_from_ego)
-            return _Motion(poses, changing[0])
+            return motion_from_transforms(self._bag, changing, path[::-1], child_from_ego), changing[0], ()
         if use == "required":
             raise InputError(
                 f"{self._bag.path}: has no poses of the vehicle: no Odometry or PoseStamped, and no transform that "
                 f'moves "{ego_frame}" ({self._finder.seen()}): pass `ego_motion_file=FILE`, `ego_motion="static"` if '
                 "the vehicle stands, or `temporal=False` to run without history"
             )
-        return _Motion(None, "", ("the bag has no poses of the vehicle: boxes are in the ego frame",))
+        return None, "", ("the bag has no poses of the vehicle: boxes are in the ego frame",)
 
     def _moving_path(self, ego_frame: str, topics: list[str]) -> list[str]:
         """Frames from the vehicle's to the world's, with links that move; a single one if there are none."""

@@ -25,18 +25,19 @@ from bevcli.sequences.ros.messages import Topic
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence number, log time, publish time
-CACHE_BYTES = 256 * 2**20  # of decompressed chunks
-LARGEST_CHUNK = 512 * 2**20  # bytes after decompression
+CACHE_BYTES = 256 * MIB  # of decompressed chunks
+LARGEST_CHUNK = 512 * MIB  # bytes after decompression
 NO_CHUNK = -1  # the message lies outside of chunks
-Entries = list[tuple[int, int, int]]  # log time ns, start of the chunk in the file or NO_CHUNK, offset
 TABLES = ("topics", "messages", "message_definitions", "sqlite_master")
 BUSY_TIMEOUT_S = 5.0
 VFS_WITHOUT_LOCKS = "win32-none" if os.name == "nt" else "unix-none"
 LARGEST_VALUE = 512 * MIB  # bytes of a message
+# What damaged bytes raise.
+DAMAGES = (McapError, ValueError, EOFError, struct.error, RuntimeError)
 
 
 class McapFile:
-    """An MCAP file, see `BagFile`.
+    """An MCAP file. topics: by name. notes: for the user about the file.
 
     Opening it reads the summary at its end. A file without one (its recording was cut off) is scanned up to its end.
     Raises InputError if it is not an MCAP file.
@@ -53,7 +54,8 @@ class McapFile:
             raise InputError(f"{path}: is not an MCAP file (its first bytes are different)")
         self._chunks: OrderedDict[int, bytes] = OrderedDict()
         self._chunk_indexes: list[ChunkIndex] = []
-        self._scanned: dict[int, Entries] | None = None  # by channel, if the file has no index
+        # By channel, if the file has no index: log time in ns, start of the chunk in the file or NO_CHUNK, and offset.
+        self._scanned: dict[int, list[tuple[int, int, int]]] = {}
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         summary = self._summary()
@@ -62,7 +64,11 @@ class McapFile:
         else:
             self._schemas, self._channels = summary.schemas, summary.channels
             self._chunk_indexes = sorted(summary.chunk_indexes, key=lambda chunk: chunk.chunk_start_offset)
-        self.topics = {topic.name: topic for topic in self._topics()}
+        self.topics = {
+            one.topic: Topic(one.topic, schema.name, one.message_encoding, schema.encoding, schema.data)
+            for one in self._channels.values()
+            if (schema := self._schemas.get(one.schema_id))
+        }
         self._references: dict[str, NDArray[np.int64]] = {}
 
     def times(self, topic: str) -> NDArray[np.int64]:
@@ -74,7 +80,7 @@ class McapFile:
         _, chunk, offset = (int(number) for number in self._references_of(topic)[index])
         try:
             return self._message(chunk, offset)
-        except (McapError, ValueError, EOFError, struct.error, RuntimeError) as error:
+        except DAMAGES as error:
             raise InputError(f"{self.path}: {topic}: message {index} is broken ({error})") from None
 
     def _summary(self) -> Summary | None:
@@ -87,25 +93,18 @@ class McapFile:
             return None
         return summary if all(chunk.message_index_length for chunk in summary.chunk_indexes) else None
 
-    def _topics(self) -> Iterator[Topic]:
-        for channel in self._channels.values():
-            schema = self._schemas.get(channel.schema_id)
-            if schema is not None:
-                yield Topic(channel.topic, schema.name, channel.message_encoding, schema.encoding, schema.data)
-
     def _references_of(self, topic: str) -> NDArray[np.int64]:
         """(N, 3) log time, start of the chunk or NO_CHUNK, and offset of a topic's messages, in order of time."""
         if topic not in self._references:
             channels = [number for number, channel in self._channels.items() if channel.topic == topic]
-            if self._scanned is not None:
-                parts = [np.array(self._scanned.get(n, []), dtype=np.int64).reshape(-1, 3) for n in channels]
-            else:
-                parts = [part for n in channels for part in self._indexed(n)]
+            parts = [part for number in channels for part in self._references_in(number)]
             rows = np.concatenate([np.zeros((0, 3), dtype=np.int64), *parts])
             self._references[topic] = rows[np.argsort(rows[:, 0], kind="stable")]
         return self._references[topic]
 
-    def _indexed(self, channel: int) -> Iterator[NDArray[np.int64]]:
+    def _references_in(self, channel: int) -> Iterator[NDArray[np.int64]]:
+        if channel in self._scanned:
+            yield np.array(self._scanned[channel], dtype=np.int64)
         for chunk in self._chunk_indexes:
             if channel not in chunk.message_index_offsets:
                 continue
@@ -144,34 +143,26 @@ class McapFile:
 
     def _scan(self) -> None:
         """Find schemas, channels and messages by reading the file from its start, as far as its records are whole."""
-        self._scanned = {}
         end = self.path.stat().st_size
         position = len(MAGIC)
-        is_whole = False
         while position + RECORD_HEAD.size <= end:
             self._file.seek(position)
             opcode, length = RECORD_HEAD.unpack(self._file.read(RECORD_HEAD.size))
             if opcode in (Opcode.DATA_END, Opcode.FOOTER):
-                is_whole = True
+                return
+            if position + RECORD_HEAD.size + length > end:
                 break
-            if position + RECORD_HEAD.size + length > end or not self._scan_record(opcode, length, position):
-                break
+            if opcode == Opcode.CHUNK:
+                try:
+                    content = _decompressed(self._file.read(length))
+                except DAMAGES:
+                    break
+                self._scan_chunk(content, position)
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+                self._note(opcode, self._file.read(length), NO_CHUNK, position)
             position += RECORD_HEAD.size + length
-        if not is_whole:
-            share = f"{position / 2**20:.1f} of {end / 2**20:.1f} MiB"
-            self.notes = (f"{self.path.name} is cut off: its first {share} are read",)
-
-    def _scan_record(self, opcode: int, length: int, position: int) -> bool:
-        """Note what a record has; False if it is damaged."""
-        if opcode == Opcode.CHUNK:
-            try:
-                content = _decompressed(self._file.read(length))
-            except (McapError, ValueError, EOFError, struct.error, RuntimeError):
-                return False
-            self._scan_chunk(content, position)
-        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
-            self._note(opcode, self._file.read(length), NO_CHUNK, position)
-        return True
+        share = f"{position / MIB:.1f} of {end / MIB:.1f} MiB"
+        self.notes = (f"{self.path.name} is cut off: its first {share} are read",)
 
     def _scan_chunk(self, content: bytes, chunk: int) -> None:
         offset = 0
@@ -183,7 +174,6 @@ class McapFile:
 
     def _note(self, opcode: int, content: bytes, chunk: int, offset: int) -> None:
         """Keep a schema, a channel, or the place of a message."""
-        assert self._scanned is not None
         stream = ReadDataStream(BytesIO(content))
         if opcode == Opcode.SCHEMA:
             schema = Schema.read(stream)
@@ -208,8 +198,9 @@ def _decompressed(content: bytes) -> bytes:
 
 
 class SqliteFile:
-    """A .db3 file, see `BagFile`. Opening it reads the list of topics; a damaged file is read up to the damage.
+    """A .db3 file, with the attributes of `McapFile`.
 
+    Opening it reads the list of topics; a damaged file is read up to the damage.
     Raises InputError if it is not a rosbag2 database.
     """
 
