@@ -120,7 +120,7 @@ def test_can_bus_is_the_first_message_after_the_time(tmp_path):
     rows = [{"utime": t, "accel": [t, 0, 9.8], "rotation_rate": [0, 0, t], "vel": [t, 0, 0]} for t in (10, 20, 30)]
     (tmp_path / "can_bus" / "scene-0001_pose.json").write_text(json.dumps(rows))
     can_bus = read_can_bus(tmp_path, "scene-0001")
-    found = {time: can_bus.kinematics_at(time).velocity[0] for time in (5, 10, 15, 20, 30, 40)}
+    found = {time: can_bus.kinematics_at(time * 1000).velocity[0] for time in (5, 10, 15, 20, 30, 40)}
     assert found == {5: 10, 10: 20, 15: 20, 20: 30, 30: 30, 40: 30}
     assert read_can_bus(tmp_path, "scene-0002") is None
 

@@ -28,21 +28,11 @@ def build_index(tables: Path, dialect: Dialect) -> NuScenesIndex:
         image_rows = np.flatnonzero(~lidar)
         owners, times = sample_scenes[data["samples"][image_rows]], data["times_us"][image_rows]
         images = Images(**_rows(data, image_rows[np.lexsort((times, owners))]))
-        annotations, first_annotation = read_annotations(tables, sample_tokens, sample_times, dialect)
-    return NuScenesIndex(
-        Scenes(names, _starts(sample_scenes, len(names)), _starts(sample_scenes[images.samples], len(names))),
-        sensors,
-        Samples(
-            sample_tokens,
-            sample_times,
-            data["translations"][lidar_rows],
-            data["quaternions"][lidar_rows],
-            data["sensors"][lidar_rows],
-            first_annotation,
-        ),
-        images,
-        annotations,
-    )
+        annotations, first_annotation = _read_annotations(tables, sample_tokens, sample_times, dialect)
+    scenes = Scenes(names, _starts(sample_scenes, len(names)), _starts(sample_scenes[images.samples], len(names)))
+    translations, quaternions, lidars = (data[name][lidar_rows] for name in ("translations", "quaternions", "sensors"))
+    samples = Samples(sample_tokens, sample_times, translations, quaternions, lidars, first_annotation)
+    return NuScenesIndex(scenes, sensors, samples, images, annotations)
 
 
 def _rows(columns: Columns, rows: Ints) -> Columns:
@@ -171,16 +161,10 @@ def _starts(sorted_owners: Ints, count: int) -> Ints:
     return np.searchsorted(sorted_owners, np.arange(count + 1))
 
 
-def read_annotations(
+def _read_annotations(
     tables: Path, sample_tokens: NDArray[np.bytes_], sample_times_us: Ints, dialect: Dialect
 ) -> tuple[Annotations, Ints]:
-    """The annotations ordered by sample, and the row of each sample's first annotation (N + 1,).
-
-    A version without annotations, such as the test split, gives zero rows.
-
-    sample_tokens: (N,). sample_times_us: (N,) microseconds.
-    Raises InputError if the tables are inconsistent.
-    """
+    """The annotations ordered by sample, none without a table, and the row of each sample's first one (N + 1,)."""
     path = tables / "sample_annotation.json"
     names = _Names(tables, dialect)
     batches = read_batches(path) if path.is_file() else [Rows(path, [])]

@@ -200,11 +200,12 @@ class NuScenesIndex:
 
     def _boxes(self, rows: Ints, classes: list[str]) -> Boxes3D:
         a = self.annotations
-        rotations = [rotation_from_quaternion(q) for q in a.quaternions[rows]]
         return Boxes3D(
             centers=np.array(a.centers[rows]),
             sizes_lwh=np.array(a.sizes_wlh[rows][:, [1, 0, 2]]),
-            yaws=np.array([yaw_of_rotation(rotation) for rotation in rotations], dtype=np.float64),
+            yaws=np.array(
+                [yaw_of_rotation(rotation_from_quaternion(q)) for q in a.quaternions[rows]], dtype=np.float64
+            ),
             velocities=np.array(a.velocities[rows]),
             classes=np.array(classes, dtype=np.str_),
             attributes=a.attributes[rows].astype(np.str_),

@@ -35,9 +35,9 @@ class CanBus:
     angular_rates: Array
     velocities: Array
 
-    def kinematics_at(self, time_us: int) -> Kinematics:
+    def kinematics_at(self, timestamp_ns: int) -> Kinematics:
         """The first message after a time, or the last message. The published models were trained this way."""
-        row = min(int(np.searchsorted(self.times_us, time_us, side="right")), len(self.times_us) - 1)
+        row = min(int(np.searchsorted(self.times_us, timestamp_ns // 1000, side="right")), len(self.times_us) - 1)
         return Kinematics(self.accelerations[row], self.angular_rates[row], self.velocities[row])
 
 
@@ -45,26 +45,21 @@ class CanBus:
 class SceneFacts:
     """Calibration and motion of one scene.
 
-    sensor_names: camera of each calibrated sensor, by its row in the index. can_bus: None without CAN bus data.
+    sensor_names: camera of each calibrated sensor, by its row in the index. kinematics: from the CAN bus data, or from
+    the poses if there is none.
     """
 
     rig: CameraRig
     sensor_names: Mapping[int, str]
     motion: EgoMotion
-    can_bus: CanBus | None
-
-    def kinematics_at(self, timestamp_ns: int) -> Kinematics:
-        """Kinematics at a time from the CAN bus data, or from the poses if there is none."""
-        if self.can_bus is None:
-            return self.motion.kinematics_at(timestamp_ns)
-        return self.can_bus.kinematics_at(timestamp_ns // 1000)
+    kinematics: CanBus | EgoMotion
 
 
 def read_scene_facts(index: NuScenesIndex, root: Path, dialect: Dialect, scene: int) -> SceneFacts:
     """The facts of a scene, given by its row in the index. Raises InputError."""
     rig, sensor_names = scene_rig(index, dialect, scene)
-    can_bus = read_can_bus(root, str(index.scenes.names[scene]))
-    return SceneFacts(rig, sensor_names, scene_motion(index, scene), can_bus)
+    motion = scene_motion(index, scene)
+    return SceneFacts(rig, sensor_names, motion, read_can_bus(root, str(index.scenes.names[scene])) or motion)
 
 
 def scene_rig(index: NuScenesIndex, dialect: Dialect, scene: int) -> tuple[CameraRig, dict[int, str]]:

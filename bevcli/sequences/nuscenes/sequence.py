@@ -38,8 +38,7 @@ class TableSequence(Sequence):
         tables: the folder with the tables.
         common: the options of every format.
         dialect: the points in which the tables differ from nuScenes' own.
-        split: only the scenes of this split. None: all.
-        sweeps: whether images between the keyframes make frames too.
+        own: only the scenes of its split; whether images between the keyframes make frames too.
 
     Raises InputError if a table is missing or invalid, or the choice contains no scene.
     """
@@ -47,21 +46,14 @@ class TableSequence(Sequence):
     has_ego_motion = True
 
     def __init__(
-        self,
-        root: Path,
-        tables: Path,
-        common: SequenceOptions,
-        dialect: Dialect,
-        *,
-        split: str | None = None,
-        sweeps: bool = False,
+        self, root: Path, tables: Path, common: SequenceOptions, dialect: Dialect, own: NuScenesOptions
     ) -> None:
         common.refuse_static(root)
         self.root, self.tables, self.dialect = root, tables, dialect
         self.index, note = open_index(tables, dialect)
-        self.scenes = chosen_scenes(self.index, tables, split, common.scene)
+        self.scenes = chosen_scenes(self.index, tables, own.split, common.scene)
         self.rig = scene_rig(self.index, dialect, self.scenes[0])[0]
-        self._frames = tuple(self._find_frames(self.scenes, sweeps))
+        self._frames = tuple(self._find_frames(own.sweeps))
         self.stamps = tuple(entry.stamp for entry in self._frames)
         self._images = ImageReader(strict=common.strict, inside=None if common.allow_outside else root)
         self._facts = lru_cache(maxsize=2)(partial(read_scene_facts, self.index, root, dialect))
@@ -107,15 +99,15 @@ class TableSequence(Sequence):
             images=images,
             world_from_ego=pose,
             world_from_ego_at={n: _pose_of(index.images, rows[n]) if n in rows else pose for n in facts.rig.names},
-            kinematics=facts.kinematics_at(entry.stamp.timestamp_ns),
+            kinematics=facts.kinematics.kinematics_at(entry.stamp.timestamp_ns),
             dropped=dropped,
             ground_truth=None if sample is None else index.ground_truth(sample, self.dialect.class_of),
             sample_token=None if sample is None else index.samples.tokens[sample].decode(),
         )
 
-    def _find_frames(self, scenes: Iterable[int], sweeps: bool) -> Iterable[_FrameEntry]:
+    def _find_frames(self, sweeps: bool) -> Iterable[_FrameEntry]:
         number = 0
-        for scene in scenes:
+        for scene in self.scenes:
             found = sweep_frames(self.index, scene) if sweeps else keyframes(self.index, scene)
             name = str(self.index.scenes.names[scene])
             for time_us, sample, rows in found:
@@ -139,7 +131,7 @@ class NuScenesSequence(TableSequence):
         self, root: Path, common: SequenceOptions = SequenceOptions(), own: NuScenesOptions = NuScenesOptions()
     ) -> None:
         tables = tables_of(root, own.version)
-        super().__init__(root, tables, common, NUSCENES, split=own.split, sweeps=own.sweeps)
+        super().__init__(root, tables, common, NUSCENES, own)
         self.name = common.scene or own.split or tables.name
         self._maps = MapExpansion(root, tables) if common.ground_truth else None
         note = self._can_bus_note()

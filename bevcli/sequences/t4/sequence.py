@@ -5,6 +5,7 @@ from pathlib import Path
 from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.sequences.files.class_names import ClassNames
 from bevcli.sequences.native.folder import rig_notes
+from bevcli.sequences.nuscenes.format import NuScenesOptions
 from bevcli.sequences.nuscenes.index import Dialect
 from bevcli.sequences.nuscenes.sequence import TableSequence
 from bevcli.sequences.options import FormatOptions, SequenceOptions
@@ -61,6 +62,6 @@ class T4Sequence(TableSequence):
         dialect = Dialect(
             LIDARS, names.__getitem__, VISIBILITIES, has_attributes=False, ego_from_bev=default_ego_from_bev()
         )
-        super().__init__(path, path / "annotation", common, dialect)
+        super().__init__(path, path / "annotation", common, dialect, NuScenesOptions())
         self.name = path.resolve().name
         self.notes = (*self.notes, *rig_notes(self.rig, "a T4 dataset"))
