@@ -198,17 +198,16 @@ def _entries(
             f"{path / 'sensors/cameras'}: has no images (expected {rig.names[0]}/TIMESTAMP_NS.jpg and others)"
         )
     times = annotated if len(annotated) else leading
-    found = [_sources(path / "sensors/cameras", images, int(time)) for time in times]
-    kept = [(index, sources) for index, sources in enumerate(found) if sources]
-    if not kept:
-        raise InputError(f"{path}: no image is within {NEAR_NS / 1e6:.0f} ms of a time that has boxes in {ANNOTATIONS}")
+    near = f"within {NEAR_NS / 1e6:.0f} ms"
     entries = []
-    for index, sources in kept:
-        reason = f"has no image within {NEAR_NS / 1e6:.0f} ms of the frame"
-        dropped = {name: reason for name in rig.names if name not in sources}
-        entries.append(FrameEntry(FrameStamp(index, "", int(times[index])), sources, dropped, str(path)))
-    note = f"{len(times) - len(kept)} of {len(times)} frames have no image and are left out"
-    return tuple(entries), (note,) if len(kept) < len(times) else ()
+    for index, time in enumerate(times.tolist()):
+        if sources := _sources(path / "sensors/cameras", images, time):
+            dropped = {name: f"has no image {near} of the frame" for name in rig.names if name not in sources}
+            entries.append(FrameEntry(FrameStamp(index, "", time), sources, dropped, str(path)))
+    if not entries:
+        raise InputError(f"{path}: no image is {near} of a time that has boxes in {ANNOTATIONS}")
+    note = f"{len(times) - len(entries)} of {len(times)} frames have no image and are left out"
+    return tuple(entries), (note,) if len(entries) < len(times) else ()
 
 
 def _sources(folder: Path, images: Mapping[str, Times], time: int) -> dict[str, ImageSource]:

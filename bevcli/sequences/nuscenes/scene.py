@@ -1,6 +1,5 @@
 """One nuScenes scene: its rig, its poses, and the data of the CAN bus expansion."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,36 +44,33 @@ class CanBus:
 class SceneFacts:
     """Calibration and motion of one scene.
 
-    sensor_names: camera of each calibrated sensor, by its row in the index. kinematics: from the CAN bus data, or from
-    the poses if there is none.
+    kinematics: from the CAN bus data, or from the poses if there is none.
     """
 
     rig: CameraRig
-    sensor_names: Mapping[int, str]
     motion: EgoMotion
     kinematics: CanBus | EgoMotion
 
 
 def read_scene_facts(index: NuScenesIndex, root: Path, dialect: Dialect, scene: int) -> SceneFacts:
     """The facts of a scene, given by its row in the index. Raises InputError."""
-    rig, sensor_names = scene_rig(index, dialect, scene)
     motion = scene_motion(index, scene)
-    return SceneFacts(rig, sensor_names, motion, read_can_bus(root, str(index.scenes.names[scene])) or motion)
+    kinematics = read_can_bus(root, str(index.scenes.names[scene])) or motion
+    return SceneFacts(scene_rig(index, dialect, scene), motion, kinematics)
 
 
-def scene_rig(index: NuScenesIndex, dialect: Dialect, scene: int) -> tuple[CameraRig, dict[int, str]]:
-    """The rig of a scene, and the camera name of each of its calibrated sensors."""
+def scene_rig(index: NuScenesIndex, dialect: Dialect, scene: int) -> CameraRig:
+    """The rig of a scene. Raises InputError."""
     first, last = index.scenes.first_image[scene : scene + 2]
     sensors, rows = np.unique(index.images.sensors[first:last], return_index=True)
     cameras = [_camera(index, int(sensor), first + row) for sensor, row in zip(sensors, rows, strict=True)]
     cameras.sort(key=lambda camera: (CAMERAS.index(camera.name) if camera.name in CAMERAS else 99, camera.name))
-    names = {int(sensor): str(index.sensors.channels[sensor]) for sensor in sensors}
     if len({camera.name for camera in cameras}) < len(cameras):
         raise InputError(f"scene {index.scenes.names[scene]}: a camera changes its calibration within the scene")
     if dialect.ego_from_bev is not None:
-        return CameraRig(tuple(cameras), dialect.ego_from_bev, ego_from_bev_assumed=True), names
+        return CameraRig(tuple(cameras), dialect.ego_from_bev, ego_from_bev_assumed=True)
     lidar = int(index.samples.lidars[index.scenes.first_sample[scene]])
-    return CameraRig(tuple(cameras), _sensor_pose(index, lidar).matrix), names
+    return CameraRig(tuple(cameras), _sensor_pose(index, lidar).matrix)
 
 
 def scene_motion(index: NuScenesIndex, scene: int) -> EgoMotion:

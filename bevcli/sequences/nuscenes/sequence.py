@@ -52,7 +52,7 @@ class TableSequence(Sequence):
         self.root, self.tables, self.dialect = root, tables, dialect
         self.index, note = open_index(tables, dialect)
         self.scenes = chosen_scenes(self.index, tables, own.split, common.scene)
-        self.rig = scene_rig(self.index, dialect, self.scenes[0])[0]
+        self.rig = scene_rig(self.index, dialect, self.scenes[0])
         self._frames = tuple(self._find_frames(own.sweeps))
         self.stamps = tuple(entry.stamp for entry in self._frames)
         self._images = ImageReader(strict=common.strict, inside=None if common.allow_outside else root)
@@ -87,7 +87,8 @@ class TableSequence(Sequence):
 
     def _frame(self, entry: _FrameEntry, *, with_images: bool) -> Frame:
         facts = self._facts(entry.scene)
-        rows = {facts.sensor_names[int(self.index.images.sensors[row])]: int(row) for row in entry.rows}
+        names = self.index.sensors.channels[self.index.images.sensors[entry.rows]]
+        rows = {str(name): int(row) for name, row in zip(names, entry.rows, strict=True)}
         dropped = {name: "no image in sample_data.json" for name in facts.rig.names if name not in rows}
         sources = {name: self._source(rows[name]) for name in facts.rig.names if name in rows and with_images}
         images, dropped = self._images.read(sources, facts.rig, dropped)

@@ -5,6 +5,7 @@ import re
 import threading
 from collections.abc import Iterator, Sequence as Indices
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ from bevcli.parsing.documents import read_yaml
 from bevcli.parsing.files import MIB, decompressed
 from bevcli.printing import reason_of
 from bevcli.sequences.ros.format import METADATA, SUFFIXES
-from bevcli.sequences.ros.messages import Decode, decoder
+from bevcli.sequences.ros.messages import decoder
 
 if TYPE_CHECKING:
     from bevcli.sequences.ros.storage import McapFile, SqliteFile
@@ -52,7 +53,7 @@ class Bag:
             self.file_paths = tuple(self._file_paths())
             self._files = [_open_file(file) for file in self.file_paths]
         self.topics = {name: topic for file in self._files for name, topic in sorted(file.topics.items())}
-        self._decoders: dict[str, Decode] = {}
+        self._decoder = cache(lambda topic: decoder(self.topics[topic]))
         self._times: dict[str, NDArray[np.int64]] = {}
 
     @property
@@ -70,12 +71,8 @@ class Bag:
 
     def message(self, topic: str, index: int) -> Any:
         """Message `index` of a topic, from 0. Raises InputError if it is broken."""
-        with _broken_files_refused(self.path):
-            data = self._bytes(topic, index)
         with self._lock, _broken_files_refused(self.path):
-            if topic not in self._decoders:
-                self._decoders[topic] = decoder(self.topics[topic])
-            decode = self._decoders[topic]
+            data, decode = self._bytes(topic, index), self._decoder(topic)
         try:
             return decode(data)
         except Exception as error:  # the decoders of the packages raise errors of many types for broken bytes
@@ -83,13 +80,12 @@ class Bag:
             raise InputError(f"{self.path}: {topic}: message {index} cannot be decoded ({reason:.200})") from None
 
     def _bytes(self, topic: str, index: int) -> bytes:
-        with self._lock:
-            for file in self._files:
-                count = len(file.times(topic)) if topic in file.topics else 0
-                if index < count:
-                    data = file.read(topic, index)
-                    return decompressed("zstd", data, LARGEST_MESSAGE) if self._compression == "message" else data
-                index -= count
+        for file in self._files:
+            count = len(file.times(topic)) if topic in file.topics else 0
+            if index < count:
+                data = file.read(topic, index)
+                return decompressed("zstd", data, LARGEST_MESSAGE) if self._compression == "message" else data
+            index -= count
         raise IndexError(f"{topic} has no message {index}")
 
     def _file_paths(self) -> list[Path]:

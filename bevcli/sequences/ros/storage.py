@@ -7,7 +7,6 @@ from collections import OrderedDict
 from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
@@ -19,7 +18,7 @@ from mcap.summary import Summary
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.parsing.files import MIB, decompressed
+from bevcli.parsing.files import MIB, decompressed, open_regular
 from bevcli.sequences.ros.messages import Topic
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -46,10 +45,7 @@ class McapFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.notes: tuple[str, ...] = ()
-        try:
-            self._file: BinaryIO = path.open("rb")
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+        self._file = open_regular(path)
         if self._file.read(len(MAGIC)) != MAGIC:
             raise InputError(f"{path}: is not an MCAP file (its first bytes are different)")
         self._chunks: OrderedDict[int, bytes] = OrderedDict()

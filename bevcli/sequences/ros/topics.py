@@ -39,16 +39,9 @@ GOALS = re.compile(r"goal|target|initial|waypoint|planning|planner|prediction|pe
 
 @dataclass(frozen=True)
 class StatedTopics:
-    """Statements of the user about the topics of a bag. "" and missing cameras: to be found.
+    """Statements of the user about a bag, by the keys of the TOML above. "" and missing cameras: to be found.
 
-    Attributes:
-        ego_frame: name of the vehicle's frame.
-        world_frame: name of the frame that poses refer to, for poses from transforms.
-        ego_motion: topic of the vehicle's poses.
-        cameras: camera -> image topic; if there are any, only these cameras are used.
-        calibration: camera -> topic of its calibration.
-        frames: camera -> name of its optical frame.
-        renamed: camera -> image topic, as `topics` states it; other cameras are still found.
+    renamed: camera -> image topic, as `topics` states it; other cameras are still found.
     """
 
     ego_frame: str = ""
@@ -119,23 +112,19 @@ class TopicFinder:
             CameraTopics(name, images, self._calibration_of(name, images), self._kinds[images] == "video")
             for name, images in found.items()
         ]
-        self.left_out: tuple[str, ...] = ()
-        if calibrated is None:
-            explicit = {*stated.cameras, *stated.renamed}
-            without = [one for one in cameras if one.calibration is None]
-            for one in without:
-                if one.camera in explicit or len(without) == len(cameras):
-                    raise InputError(
-                        f"{bag.path}: camera {one.camera}: no CameraInfo belongs to {one.images}: pass "
-                        f"`calibration=FILE`, or name the topic with `topics_file=FILE.toml` ({self.seen()})"
-                    )
-            cameras = [one for one in cameras if one.calibration is not None]
-            self.left_out = tuple(one.images for one in without)
-        if not cameras:
+        without = [one for one in cameras if one.calibration is None and calibrated is None]
+        for one in without:
+            if one.camera in (*stated.cameras, *stated.renamed) or len(without) == len(cameras):
+                raise InputError(
+                    f"{bag.path}: camera {one.camera}: no CameraInfo belongs to {one.images}: pass "
+                    f"`calibration=FILE`, or name the topic with `topics_file=FILE.toml` ({self.seen()})"
+                )
+        self.left_out = tuple(one.images for one in without)
+        self.cameras = tuple(one for one in cameras if one not in without)
+        if not self.cameras:
             raise InputError(
                 f"{bag.path}: has no image topic ({self.seen()}): name them with `topics={{'CAMERA': '/TOPIC'}}`"
             )
-        self.cameras = tuple(cameras)
 
     def of_kind(self, kind: Kind) -> list[str]:
         """Names of the topics of a kind that have messages."""
