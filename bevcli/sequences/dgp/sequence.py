@@ -10,8 +10,7 @@ from bevcli.frame import Frame, FrameStamp, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.ego_motion import motion_of_keyframes
 from bevcli.geometry.transforms import Array, yaw_of_rotation
-from bevcli.sequences.dgp.records import Record, read_record
-from bevcli.sequences.dgp.samples import Sample, poses, read_samples
+from bevcli.sequences.dgp.records import Record, Sample, poses, read_record, read_samples
 from bevcli.sequences.files.class_names import ClassNames, count_classes
 from bevcli.sequences.images import FrameEntry, ImageReader, ImageSource, read_frame
 from bevcli.sequences.native.folder import rig_notes
