@@ -40,23 +40,15 @@ class CanBus:
         return Kinematics(self.accelerations[row], self.angular_rates[row], self.velocities[row])
 
 
-@dataclass(frozen=True)
-class SceneFacts:
-    """Calibration and motion of one scene.
+def read_scene(
+    index: NuScenesIndex, root: Path, dialect: Dialect, scene: int
+) -> tuple[CameraRig, EgoMotion, CanBus | EgoMotion]:
+    """The rig and the poses of a scene, and its kinematics: from the CAN bus data, or from the poses without any.
 
-    kinematics: from the CAN bus data, or from the poses if there is none.
+    scene: its row in the index. Raises InputError.
     """
-
-    rig: CameraRig
-    motion: EgoMotion
-    kinematics: CanBus | EgoMotion
-
-
-def read_scene_facts(index: NuScenesIndex, root: Path, dialect: Dialect, scene: int) -> SceneFacts:
-    """The facts of a scene, given by its row in the index. Raises InputError."""
-    motion = scene_motion(index, scene)
-    kinematics = read_can_bus(root, str(index.scenes.names[scene])) or motion
-    return SceneFacts(scene_rig(index, dialect, scene), motion, kinematics)
+    rig, motion = scene_rig(index, dialect, scene), scene_motion(index, scene)
+    return rig, motion, read_can_bus(root, str(index.scenes.names[scene])) or motion
 
 
 def scene_rig(index: NuScenesIndex, dialect: Dialect, scene: int) -> CameraRig:

@@ -16,7 +16,7 @@ from bevcli.sequences.nuscenes.choice import chosen_scenes, keyframes, sweep_fra
 from bevcli.sequences.nuscenes.format import NuScenesOptions
 from bevcli.sequences.nuscenes.index import NUSCENES, Dialect, Images, Ints, Samples
 from bevcli.sequences.nuscenes.map_expansion import MapExpansion
-from bevcli.sequences.nuscenes.scene import read_scene_facts, scene_rig
+from bevcli.sequences.nuscenes.scene import read_scene, scene_rig
 from bevcli.sequences.options import SequenceOptions
 
 
@@ -56,7 +56,7 @@ class TableSequence(Sequence):
         self._frames = tuple(self._find_frames(own.sweeps))
         self.stamps = tuple(entry.stamp for entry in self._frames)
         self._images = ImageReader(strict=common.strict, inside=None if common.allow_outside else root)
-        self._facts = lru_cache(maxsize=2)(partial(read_scene_facts, self.index, root, dialect))
+        self._scene = lru_cache(maxsize=2)(partial(read_scene, self.index, root, dialect))
         self.notes = (note,) if note else ()
 
     @property
@@ -86,21 +86,21 @@ class TableSequence(Sequence):
         return self._frame(self._frames[place], with_images=True)
 
     def _frame(self, entry: _FrameEntry, *, with_images: bool) -> Frame:
-        facts = self._facts(entry.scene)
+        rig, motion, kinematics = self._scene(entry.scene)
         names = self.index.sensors.channels[self.index.images.sensors[entry.rows]]
         rows = {str(name): int(row) for name, row in zip(names, entry.rows, strict=True)}
-        dropped = {name: "no image in sample_data.json" for name in facts.rig.names if name not in rows}
-        sources = {name: self._source(rows[name]) for name in facts.rig.names if name in rows and with_images}
-        images, dropped = self._images.read(sources, facts.rig, dropped)
+        dropped = {name: "no image in sample_data.json" for name in rig.names if name not in rows}
+        sources = {name: self._source(rows[name]) for name in rig.names if name in rows and with_images}
+        images, dropped = self._images.read(sources, rig, dropped)
         sample, index = entry.sample, self.index
-        pose = facts.motion.pose_at(entry.stamp.timestamp_ns) if sample is None else _pose_of(index.samples, sample)
+        pose = motion.pose_at(entry.stamp.timestamp_ns) if sample is None else _pose_of(index.samples, sample)
         return Frame(
             stamp=entry.stamp,
-            rig=facts.rig,
+            rig=rig,
             images=images,
             world_from_ego=pose,
-            world_from_ego_at={n: _pose_of(index.images, rows[n]) if n in rows else pose for n in facts.rig.names},
-            kinematics=facts.kinematics.kinematics_at(entry.stamp.timestamp_ns),
+            world_from_ego_at={n: _pose_of(index.images, rows[n]) if n in rows else pose for n in rig.names},
+            kinematics=kinematics.kinematics_at(entry.stamp.timestamp_ns),
             dropped=dropped,
             ground_truth=None if sample is None else index.ground_truth(sample, self.dialect.class_of),
             sample_token=None if sample is None else index.samples.tokens[sample].decode(),

@@ -61,9 +61,7 @@ class RosSequence(Sequence):
         self._bag = Bag(path)
         rig, facts, file, beside = _files_beside(path.parent if path.is_file() else path, rig, common, own)
         finder = TopicFinder(self._bag, stated, rig.names if rig else None)
-        static, changing = sampled_transforms(self._bag, finder.of_kind("transforms"))
-        tree = TransformTree([*static, *changing])
-        reader = _VehicleReader(self._bag, finder, stated, tree)
+        reader = _VehicleReader(self._bag, finder, stated)
         self.rig = reader.rig() if rig is None else rig
         self._motion, source, motion_notes = reader.motion(common.ego_motion, file)
         self.has_ego_motion = self._motion is not None
@@ -109,8 +107,10 @@ def _files_beside(
 class _VehicleReader:
     """Reads the rig of a bag, from CameraInfo and the transforms to the vehicle, and the vehicle's poses."""
 
-    def __init__(self, bag: Bag, finder: TopicFinder, stated: StatedTopics, tree: TransformTree) -> None:
-        self._bag, self._finder, self._stated, self._tree = bag, finder, stated, tree
+    def __init__(self, bag: Bag, finder: TopicFinder, stated: StatedTopics) -> None:
+        self._bag, self._finder, self._stated = bag, finder, stated
+        static, changing = sampled_transforms(bag, finder.of_kind("transforms"))
+        self._tree, self._moving = TransformTree([*static, *changing]), {one.child for one in changing}
         self.notes: list[str] = []
         self.ego_frame = stated.ego_frame
 
@@ -190,14 +190,14 @@ class _VehicleReader:
         topic = self._finder.pose_topic()
         if topic is not None:
             child = pose_of(self._bag.message(topic, 0)).child
-            child_from_ego = self._tree.between(child, ego_frame) if child and child != ego_frame else None
-            notes: tuple[str, ...] = ()
-            if child and child != ego_frame and child_from_ego is None:
-                notes = (f'{topic} has poses of "{child}", which are taken as those of "{ego_frame}"',)
+            is_other = child not in ("", ego_frame)
+            child_from_ego = self._tree.between(child, ego_frame) if is_other else None
+            note = f'{topic} has poses of "{child}", which are taken as those of "{ego_frame}"'
+            notes = (note,) if is_other and child_from_ego is None else ()
             return motion_from_poses(self._bag, topic, child_from_ego), topic, notes
-        changing = [name for name in self._finder.of_kind("transforms") if not is_static(name)]
-        path = self._moving_path(ego_frame, changing)
+        path = self._moving_path(ego_frame)
         if len(path) > 1:
+            changing = [name for name in self._finder.of_kind("transforms") if not is_static(name)]
             child_from_ego = None if path[0] == ego_frame else self._tree.between(path[0], ego_frame)
             return motion_from_transforms(self._bag, changing, path[::-1], child_from_ego), changing[0], ()
         if use == "required":
@@ -208,17 +208,18 @@ class _VehicleReader:
             )
         return None, "", ("the bag has no poses of the vehicle: boxes are in the ego frame",)
 
-    def _moving_path(self, ego_frame: str, topics: list[str]) -> list[str]:
+    def _moving_path(self, ego_frame: str) -> list[str]:
         """Frames from the vehicle's to the world's, with links that move; a single one if there are none."""
-        moving = {one.child for one in sampled_transforms(self._bag, topics)[1]}
         path = self._tree.path_up(ego_frame)
         if self._stated.world_frame in path:
             path = path[: path.index(self._stated.world_frame) + 1]
-        while len(path) > 1 and path[-2] not in moving:  # static links above the topmost moving one only move the world
+        while (
+            len(path) > 1 and path[-2] not in self._moving
+        ):  # static links above the topmost moving one only move the world
             path.pop()
-        while len(path) > 1 and path[0] not in moving:  # static links below the lowest moving one
+        while len(path) > 1 and path[0] not in self._moving:  # static links below the lowest moving one
             path.pop(0)
-        return path if all(frame in moving for frame in path[:-1]) else path[:1]
+        return path if all(frame in self._moving for frame in path[:-1]) else path[:1]
 
 
 def _entries(bag: Bag, cameras: tuple[CameraTopics, ...]) -> tuple[FrameEntry, ...]:

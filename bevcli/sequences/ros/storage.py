@@ -5,6 +5,7 @@ import sqlite3
 import struct
 from collections import OrderedDict
 from collections.abc import Iterator
+from functools import cache, cached_property
 from io import BytesIO
 from pathlib import Path
 
@@ -65,15 +66,15 @@ class McapFile:
             for one in self._channels.values()
             if (schema := self._schemas.get(one.schema_id))
         }
-        self._references: dict[str, NDArray[np.int64]] = {}
+        self._references = cache(self._read_references)
 
     def times(self, topic: str) -> NDArray[np.int64]:
         """(N,) log times of a topic's messages in order, ns. Only the index is read."""
-        return self._references_of(topic)[:, 0]
+        return self._references(topic)[:, 0]
 
     def read(self, topic: str, index: int) -> bytes:
         """The bytes of message `index` of a topic. Raises InputError if they are broken."""
-        _, chunk, offset = (int(number) for number in self._references_of(topic)[index])
+        _, chunk, offset = (int(number) for number in self._references(topic)[index])
         try:
             return self._message(chunk, offset)
         except DAMAGES as error:
@@ -89,14 +90,12 @@ class McapFile:
             return None
         return summary if all(chunk.message_index_length for chunk in summary.chunk_indexes) else None
 
-    def _references_of(self, topic: str) -> NDArray[np.int64]:
+    def _read_references(self, topic: str) -> NDArray[np.int64]:
         """(N, 3) log time, start of the chunk or NO_CHUNK, and offset of a topic's messages, in order of time."""
-        if topic not in self._references:
-            channels = [number for number, channel in self._channels.items() if channel.topic == topic]
-            parts = [part for number in channels for part in self._references_in(number)]
-            rows = np.concatenate([np.zeros((0, 3), dtype=np.int64), *parts])
-            self._references[topic] = rows[np.argsort(rows[:, 0], kind="stable")]
-        return self._references[topic]
+        channels = [number for number, channel in self._channels.items() if channel.topic == topic]
+        parts = [part for number in channels for part in self._references_in(number)]
+        rows = np.concatenate([np.zeros((0, 3), dtype=np.int64), *parts])
+        return rows[np.argsort(rows[:, 0], kind="stable")]
 
     def _references_in(self, channel: int) -> Iterator[NDArray[np.int64]]:
         if channel in self._scanned:
@@ -224,15 +223,14 @@ class SqliteFile:
         for number, name, kind, serialization in rows:
             self._ids.setdefault(name, []).append(number)
             self.topics[name] = Topic(name, kind, serialization, *definitions.get(kind, ("", b"")))
-        self._references: dict[str, NDArray[np.int64]] = {}
 
     def times(self, topic: str) -> NDArray[np.int64]:
         """(N,) log times of a topic's messages in order, ns. The messages themselves are not read."""
-        return self._references_of(topic)[:, 0]
+        return self._references[topic][:, 0]
 
     def read(self, topic: str, index: int) -> bytes:
         """The bytes of message `index` of a topic. Raises InputError if they are broken."""
-        row = int(self._references_of(topic)[index, 1])
+        row = int(self._references[topic][index, 1])
         try:
             found = self._database.execute("SELECT data FROM messages WHERE id = ?", (row,)).fetchone()[0]
             if not isinstance(found, bytes):
@@ -241,14 +239,12 @@ class SqliteFile:
         except (sqlite3.Error, TypeError) as error:
             raise InputError(f"{self.path}: {topic}: message {index} is broken ({error})") from None
 
-    def _references_of(self, topic: str) -> NDArray[np.int64]:
-        """(N, 2) log time and row of a topic's messages, in order of time."""
-        if not self._references:
-            self._read_index()
-        return self._references.get(topic, np.zeros((0, 2), dtype=np.int64))
+    @cached_property
+    def _references(self) -> dict[str, NDArray[np.int64]]:
+        """(N, 2) log time and row of each topic's messages, in order of time.
 
-    def _read_index(self) -> None:
-        """Read time, topic and row of every message in one pass, because the table has no index by topic."""
+        They are read in one pass, because the table has no index by topic.
+        """
         rows: list[tuple[int, int, int]] = []
         try:
             for row in self._database.execute("SELECT timestamp, id, topic_id FROM messages"):
@@ -256,9 +252,8 @@ class SqliteFile:
         except sqlite3.Error as error:
             self.notes = (f"{self.path.name} is damaged ({error}): its first {len(rows)} messages are read",)
         table = np.array(rows, dtype=np.int64).reshape(-1, 3)
-        for name, numbers in self._ids.items():
-            part = table[np.isin(table[:, 2], numbers), :2]
-            self._references[name] = part[np.argsort(part[:, 0], kind="stable")]
+        table = table[np.argsort(table[:, 0], kind="stable")]
+        return {name: table[np.isin(table[:, 2], numbers), :2] for name, numbers in self._ids.items()}
 
     def _check_tables(self) -> None:
         """Raises sqlite3.Error unless the tables of the bag hold plain values: code in a file can compute for ever."""
