@@ -15,8 +15,7 @@ from bevcli.sequences.nuscenes.build import build_index
 from bevcli.sequences.nuscenes.choice import MINI_VAL, TEST, VAL, numbers, split_of
 from bevcli.sequences.nuscenes.format import NuScenesOptions
 from bevcli.sequences.nuscenes.index import NUSCENES
-from bevcli.sequences.nuscenes.scene import read_can_bus
-from bevcli.sequences.nuscenes.sequence import NuScenesSequence
+from bevcli.sequences.nuscenes.sequence import NuScenesSequence, read_can_bus
 from bevcli.sequences.open import open_sequence
 
 SMALL = Size(scenes=3, samples=4, objects=8)

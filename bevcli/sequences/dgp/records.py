@@ -162,15 +162,7 @@ def read_calibration(path: Path) -> Calibration:
 
 @dataclass(frozen=True)
 class Datum:
-    """One image or point cloud.
-
-    Attributes:
-        sensor: the camera or lidar.
-        is_image: whether it is an image.
-        content: the object "image" or "point_cloud" in the file.
-        time_ns: its own time.
-        world_from_sensor: at its own time.
-    """
+    """One image or point cloud, with the pose at its own time. content: the object "image" or "point_cloud"."""
 
     sensor: str
     is_image: bool
@@ -181,13 +173,7 @@ class Datum:
 
 @dataclass(frozen=True)
 class Sample:
-    """The images and point clouds of one moment.
-
-    Attributes:
-        time_ns: of the moment.
-        data: at least one image among them.
-        calibration: of their sensors.
-    """
+    """The images and point clouds of one moment, at least one image among them. calibration: of their sensors."""
 
     time_ns: int
     data: tuple[Datum, ...]

@@ -110,8 +110,6 @@ class Bag:
 
 def _metadata(path: Path) -> dict[str, Any]:
     """The statements of metadata.yaml; empty without the file, which a recording that was cut off does not have."""
-    if not path.is_file():
-        return {}
     try:
         document = read_yaml(path)
     except InputError:
