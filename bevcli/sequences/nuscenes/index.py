@@ -75,8 +75,7 @@ class Sensors:
 
     Attributes:
         channels: (K,) such as "CAM_FRONT".
-        translations: (K, 3) of ego_from_sensor, metres.
-        quaternions: (K, 4) of ego_from_sensor, w, x, y, z.
+        translations, quaternions: (K, 3) metres and (K, 4) w, x, y, z of ego_from_sensor.
         intrinsics: (K, 3, 3) pixels; NaN for other sensors than cameras.
         distortions: (K, 8) Brown-Conrady coefficients k1 k2 p1 p2 k3 k4 k5 k6; 0 without distortion.
     """
@@ -95,8 +94,7 @@ class Samples:
     Attributes:
         tokens: (N,) nuScenes' identifiers.
         times_us: (N,) microseconds.
-        translations: (N, 3) of world_from_ego at the time of LIDAR_TOP, metres.
-        quaternions: (N, 4) of world_from_ego at the time of LIDAR_TOP, w, x, y, z.
+        translations, quaternions: (N, 3) metres and (N, 4) w, x, y, z of world_from_ego at the time of LIDAR_TOP.
         lidars: (N,) row of the sample's LIDAR_TOP in Sensors.
         first_annotation: (N + 1,) row of each sample's first annotation.
     """
@@ -119,8 +117,7 @@ class Images:
         times_us: (P,) microseconds.
         keys: (P,) bool, whether the image belongs to a keyframe.
         sizes: (P, 2) width and height, pixels.
-        translations: (P, 3) of world_from_ego at the image's time, metres.
-        quaternions: (P, 4) of world_from_ego at the image's time, w, x, y, z.
+        translations, quaternions: (P, 3) metres and (P, 4) w, x, y, z of world_from_ego at the image's time.
         files: (P,) paths relative to the dataset root.
     """
 

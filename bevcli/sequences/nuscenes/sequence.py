@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -19,13 +19,35 @@ from bevcli.sequences.images import ImageReader, ImageSource
 from bevcli.sequences.nuscenes.cache import open_index
 from bevcli.sequences.nuscenes.choice import chosen_scenes, keyframes, sweep_frames, tables_of
 from bevcli.sequences.nuscenes.format import NuScenesOptions
-from bevcli.sequences.nuscenes.index import NUSCENES, Dialect, Images, Ints, NuScenesIndex, Samples
+from bevcli.sequences.nuscenes.index import NUSCENES, Dialect, Images, Ints, NuScenesIndex, Samples, Sensors
 from bevcli.sequences.nuscenes.json_tables import read_rows
 from bevcli.sequences.nuscenes.map_expansion import MapExpansion
 from bevcli.sequences.options import SequenceOptions
 
 # The order of nuScenes' cameras in a rig. Other cameras follow, sorted by name.
 CAMERAS = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT")
+
+
+@dataclass(frozen=True)
+class CanBus:
+    """The T pose messages of a scene in the CAN bus expansion.
+
+    Attributes:
+        times_us: (T,) microseconds, increasing.
+        accelerations: (T, 3) m/s² with gravity, ego frame.
+        angular_rates: (T, 3) rad/s, ego frame.
+        velocities: (T, 3) m/s, ego frame.
+    """
+
+    times_us: NDArray[np.int64]
+    accelerations: Array
+    angular_rates: Array
+    velocities: Array
+
+    def kinematics_at(self, timestamp_ns: int) -> Kinematics:
+        """The first message after a time, or the last message. The published models were trained this way."""
+        row = min(int(np.searchsorted(self.times_us, timestamp_ns // 1000, side="right")), len(self.times_us) - 1)
+        return Kinematics(self.accelerations[row], self.angular_rates[row], self.velocities[row])
 
 
 @dataclass(frozen=True)
@@ -64,7 +86,7 @@ class TableSequence(Sequence):
         self._frames = tuple(self._find_frames(own.sweeps))
         self.stamps = tuple(entry.stamp for entry in self._frames)
         self._images = ImageReader(strict=common.strict, inside=None if common.allow_outside else root)
-        self._scene = lru_cache(maxsize=2)(partial(read_scene, self.index, root, dialect))
+        self._scene = lru_cache(maxsize=2)(self._read_scene)
         self.notes = (note,) if note else ()
 
     @property
@@ -114,6 +136,11 @@ class TableSequence(Sequence):
             sample_token=None if sample is None else index.samples.tokens[sample].decode(),
         )
 
+    def _read_scene(self, scene: int) -> tuple[CameraRig, EgoMotion, CanBus | EgoMotion]:
+        """Rig, poses and kinematics of a scene, by its row in the index; kinematics of the CAN bus, or of the poses."""
+        rig, motion = scene_rig(self.index, self.dialect, scene), scene_motion(self.index, scene)
+        return rig, motion, read_can_bus(self.root, str(self.index.scenes.names[scene])) or motion
+
     def _find_frames(self, sweeps: bool) -> Iterable[_FrameEntry]:
         number = 0
         for scene in self.scenes:
@@ -162,41 +189,8 @@ class NuScenesSequence(TableSequence):
         return f"{which}: no CAN bus data in {self.root / 'can_bus'}; kinematics are derived from the poses"
 
 
-def _pose_of(table: Images | Samples, row: int) -> Pose:
+def _pose_of(table: Images | Samples | Sensors, row: int) -> Pose:
     return Pose(np.array(table.translations[row]), np.array(table.quaternions[row]))
-
-
-@dataclass(frozen=True)
-class CanBus:
-    """The T pose messages of a scene in the CAN bus expansion.
-
-    Attributes:
-        times_us: (T,) microseconds, increasing.
-        accelerations: (T, 3) m/s² with gravity, ego frame.
-        angular_rates: (T, 3) rad/s, ego frame.
-        velocities: (T, 3) m/s, ego frame.
-    """
-
-    times_us: NDArray[np.int64]
-    accelerations: Array
-    angular_rates: Array
-    velocities: Array
-
-    def kinematics_at(self, timestamp_ns: int) -> Kinematics:
-        """The first message after a time, or the last message. The published models were trained this way."""
-        row = min(int(np.searchsorted(self.times_us, timestamp_ns // 1000, side="right")), len(self.times_us) - 1)
-        return Kinematics(self.accelerations[row], self.angular_rates[row], self.velocities[row])
-
-
-def read_scene(
-    index: NuScenesIndex, root: Path, dialect: Dialect, scene: int
-) -> tuple[CameraRig, EgoMotion, CanBus | EgoMotion]:
-    """The rig and the poses of a scene, and its kinematics: from the CAN bus data, or from the poses without any.
-
-    scene: its row in the index. Raises InputError.
-    """
-    rig, motion = scene_rig(index, dialect, scene), scene_motion(index, scene)
-    return rig, motion, read_can_bus(root, str(index.scenes.names[scene])) or motion
 
 
 def scene_rig(index: NuScenesIndex, dialect: Dialect, scene: int) -> CameraRig:
@@ -210,7 +204,7 @@ def scene_rig(index: NuScenesIndex, dialect: Dialect, scene: int) -> CameraRig:
     if dialect.ego_from_bev is not None:
         return CameraRig(tuple(cameras), dialect.ego_from_bev, ego_from_bev_assumed=True)
     lidar = int(index.samples.lidars[index.scenes.first_sample[scene]])
-    return CameraRig(tuple(cameras), _sensor_pose(index, lidar).matrix)
+    return CameraRig(tuple(cameras), _pose_of(index.sensors, lidar).matrix)
 
 
 def scene_motion(index: NuScenesIndex, scene: int) -> EgoMotion:
@@ -246,8 +240,4 @@ def _camera(index: NuScenesIndex, sensor: int, image: int) -> Camera:
             f'camera "{name:.60}": expected a name without a slash and an image size, found {width}x{height}'
         )
     intrinsics, lens = np.array(index.sensors.intrinsics[sensor]), brown_conrady(index.sensors.distortions[sensor])
-    return Camera(name, width, height, intrinsics, _sensor_pose(index, sensor).matrix, lens)
-
-
-def _sensor_pose(index: NuScenesIndex, sensor: int) -> Pose:
-    return Pose(index.sensors.translations[sensor], index.sensors.quaternions[sensor])
+    return Camera(name, width, height, intrinsics, _pose_of(index.sensors, sensor).matrix, lens)

@@ -235,11 +235,9 @@ def _entries(bag: Bag, cameras: tuple[CameraTopics, ...]) -> tuple[FrameEntry, .
     }
     topics = {one.camera: one.images for one in cameras}
     entries: list[FrameEntry] = []
-    last = None
     for place, time in enumerate(times[leading].tolist()):
-        if last is not None and time <= last:
+        if entries and time <= entries[-1].stamp.timestamp_ns:
             continue  # a message that was recorded twice
-        last = time
         sources: dict[str, Source] = {}
         dropped = {}
         for name, own in times.items():
