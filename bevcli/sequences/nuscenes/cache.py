@@ -54,10 +54,9 @@ def _save(index: NuScenesIndex, folder: Path, fingerprint: str) -> None:
     unfinished = folder.with_name(f"{folder.name}.{os.getpid()}")
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)
-    for part in fields(index):
-        for column in fields(getattr(index, part.name)):
-            values = getattr(getattr(index, part.name), column.name)
-            np.save(unfinished / f"{part.name}.{column.name}.npy", values, allow_pickle=False)
+    for part, table in vars(index).items():
+        for name, values in vars(table).items():
+            np.save(unfinished / f"{part}.{name}.npy", values, allow_pickle=False)
     (unfinished / FINGERPRINT).write_text(fingerprint)
     shutil.rmtree(folder, ignore_errors=True)
     unfinished.rename(folder)

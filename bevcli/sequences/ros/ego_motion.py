@@ -45,25 +45,22 @@ class TransformTree:
 
     def path_up(self, frame: str) -> list[str]:
         """A frame and its ancestors, the root last."""
-        path = [frame]
-        while path[-1] in self._parents and self._parents[path[-1]][0] not in path:
-            path.append(self._parents[path[-1]][0])
-        return path
+        return list(self._up(frame))
 
     def between(self, a: str, b: str) -> Array | None:
         """(4, 4) a_from_b in metres, None if the tree does not connect the frames."""
-        up_a, up_b = self.path_up(a), self.path_up(b)
+        up_a, up_b = self._up(a), self._up(b)
         common = next((frame for frame in up_b if frame in up_a), None)
-        if common is None:
-            return None
-        return inverse(self._down(up_a[: up_a.index(common)])) @ self._down(up_b[: up_b.index(common)])
+        return None if common is None else inverse(up_a[common]) @ up_b[common]
 
-    def _down(self, frames: list[str]) -> Array:
-        """(4, 4) ancestor_from_frame along frames, of which each is the child of the next."""
-        matrix = rigid()
-        for frame in frames:
-            matrix = self._parents[frame][1] @ matrix
-        return matrix
+    def _up(self, frame: str) -> dict[str, Array]:
+        """(4, 4) ancestor_from_frame of a frame and of its ancestors, the root last."""
+        found = {frame: rigid()}
+        while frame in self._parents and self._parents[frame][0] not in found:
+            parent, parent_from_child = self._parents[frame]
+            found[parent] = parent_from_child @ found[frame]
+            frame = parent
+        return found
 
 
 def read_transforms(bag: Bag, topic: str, indices: Iterable[int]) -> list[Transform]:
