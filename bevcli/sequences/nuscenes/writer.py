@@ -4,7 +4,6 @@ import hashlib
 import json
 from collections.abc import Iterable
 from contextlib import ExitStack
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Self
 
@@ -214,8 +213,6 @@ class NewTables:
 
     def finish(self, map_file: str) -> None:
         """Add the rows that need all samples. map_file: image of the map."""
-        for chain in (*self._samples.values(), *self._streams.values(), *self._objects.values()):
-            _link(chain)
         for row in self.rows["instance"]:
             found = self._objects[row["token"]]
             row["nbr_annotations"] = len(found)
@@ -239,7 +236,10 @@ class NewTables:
             self._share("calibrated_sensor", own, sensor_token=sensor, camera_intrinsic=intrinsics, **pose)
 
     def _add(self, table: str, row: Row, chain: list[Row]) -> None:
-        """Add a row to a table, and to the rows that are linked with it."""
+        """Add a row to a table, linked with the last one of a chain in order of time, which it extends."""
+        row |= {"prev": chain[-1]["token"] if chain else "", "next": ""}
+        if chain:
+            chain[-1]["next"] = row["token"]
         self.rows[table].append(row)
         chain.append(row)
 
@@ -254,14 +254,6 @@ class NewTables:
 def token(*parts: object) -> str:
     """32 hexadecimal digits that stand for these parts."""
     return hashlib.sha256("\0".join(map(str, parts)).encode()).hexdigest()[:32]
-
-
-def _link(rows: list[Row]) -> None:
-    """Give rows in order of time the tokens of their neighbours."""
-    for row in rows:
-        row["prev"] = row["next"] = ""
-    for one, other in pairwise(rows):
-        one["next"], other["prev"] = other["token"], one["token"]
 
 
 def _visibility(fraction: float | None) -> str:

@@ -227,8 +227,7 @@ def _for_calibration(found: Mapping[str, str], names: tuple[str, ...], bag: Bag)
     for name in names:
         lower = name.lower()
         same = [topic for camera, topic in found.items() if camera.lower() == lower]
-        inside = [topic for topic in found.values() if lower in topic.lower().split("/")]
-        chosen = same or inside
+        chosen = same or [topic for topic in found.values() if lower in topic.lower().split("/")]
         if len(chosen) != 1:
             offered = ", ".join(found.values()) or "none"
             raise InputError(
