@@ -44,15 +44,14 @@ def _joined(parts: list[Columns]) -> Columns:
 
 
 def _read_sensors(tables: Path) -> tuple[NDArray[np.bytes_], Sensors]:
-    path = tables / "calibrated_sensor.json"
     channels = read_rows(tables / "sensor.json").by_token("channel")
-    table = read_rows(path)
+    table = read_rows(tables / "calibrated_sensor.json")
     sensors = Sensors(
         np.array([channels.get(token, "") for token in table.texts("sensor_token")], dtype=np.str_),
         table.vectors("translation", 3),
         table.quaternions("rotation"),
-        np.array([_intrinsics(row, path) for row in table.rows], dtype=np.float64).reshape(-1, 3, 3),
-        np.array([_distortion(row, path) for row in table.rows], dtype=np.float64).reshape(-1, 8),
+        np.array([_intrinsics(row, table.path) for row in table.rows], dtype=np.float64).reshape(-1, 3, 3),
+        np.array([_distortion(row, table.path) for row in table.rows], dtype=np.float64).reshape(-1, 8),
     )
     return table.tokens("token"), sensors
 

@@ -46,7 +46,6 @@ LENSES = {
     "kannala_brandt": "kannala_brandt",
     "fisheye": "kannala_brandt",
 }
-PREFERENCE = {name: place for place, name in enumerate(KINDS)}
 Decode = Callable[[bytes], Any]
 
 

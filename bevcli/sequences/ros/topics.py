@@ -22,7 +22,7 @@ from bevcli.errors import InputError
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import read_text
 from bevcli.sequences.ros.bag import Bag
-from bevcli.sequences.ros.messages import KINDS, PREFERENCE, Kind, frame_of
+from bevcli.sequences.ros.messages import KINDS, Kind, frame_of
 
 # Parts of a topic's name that do not name a camera.
 GENERIC = re.compile(
@@ -191,7 +191,7 @@ class TopicFinder:
         return {**self._stated.renamed, **dict(_named(best))}
 
     def _preference(self, name: str) -> int:
-        return PREFERENCE[self._bag.topics[name].short_type]
+        return list(KINDS).index(self._bag.topics[name].short_type)
 
     def _calibration_of(self, camera: str, images: str) -> str | None:
         """The calibration topic in the nearest namespace around the images, or else with the same frame."""
