@@ -54,7 +54,6 @@ class Bag:
             self._files = [_open_file(file) for file in self.file_paths]
         self.topics = {name: topic for file in self._files for name, topic in sorted(file.topics.items())}
         self._decoder = cache(lambda topic: decoder(self.topics[topic]))
-        self._times: dict[str, NDArray[np.int64]] = {}
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -63,11 +62,9 @@ class Bag:
 
     def times(self, topic: str) -> NDArray[np.int64]:
         """(N,) log times of a topic's messages, ns. They come from the index."""
-        if topic not in self._times:
-            with self._lock, _broken_files_refused(self.path):
-                parts = [file.times(topic) for file in self._files if topic in file.topics]
-            self._times[topic] = np.concatenate([np.zeros(0, dtype=np.int64), *parts])
-        return self._times[topic]
+        with self._lock, _broken_files_refused(self.path):
+            parts = [file.times(topic) for file in self._files if topic in file.topics]
+        return np.concatenate([np.zeros(0, dtype=np.int64), *parts])
 
     def message(self, topic: str, index: int) -> Any:
         """Message `index` of a topic, from 0. Raises InputError if it is broken."""

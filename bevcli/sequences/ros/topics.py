@@ -178,10 +178,9 @@ class TopicFinder:
         """Camera -> image topic: the stated ones, and one for each other group of topics."""
         if self._stated.cameras:
             return {**self._stated.cameras, **self._stated.renamed}
-        images = [*self.of_kind("image"), *self.of_kind("video")]
         taken = {_camera_path(name) for name in self._stated.renamed.values()}
         groups: dict[tuple[str, ...], list[str]] = {}
-        for name in sorted(images):
+        for name in sorted([*self.of_kind("image"), *self.of_kind("video")]):
             if not NOT_A_CAMERA.search(name.lower()) and _camera_path(name) not in taken:
                 groups.setdefault(_camera_path(name), []).append(name)
         best = {
