@@ -213,13 +213,10 @@ class _VehicleReader:
         path = self._tree.path_up(ego_frame)
         if self._stated.world_frame in path:
             path = path[: path.index(self._stated.world_frame) + 1]
-        while (
-            len(path) > 1 and path[-2] not in self._moving
-        ):  # static links above the topmost moving one only move the world
-            path.pop()
-        while len(path) > 1 and path[0] not in self._moving:  # static links below the lowest moving one
-            path.pop(0)
-        return path if all(frame in self._moving for frame in path[:-1]) else path[:1]
+        moving = [place for place, frame in enumerate(path[:-1]) if frame in self._moving]
+        # Static links above the topmost moving one only move the world; those below the lowest belong to the vehicle.
+        path = path[moving[0] : moving[-1] + 2] if moving else path[:1]
+        return path if len(path) == len(moving) + 1 else path[:1]
 
 
 def _entries(bag: Bag, cameras: tuple[CameraTopics, ...]) -> tuple[FrameEntry, ...]:
