@@ -14,8 +14,8 @@ from bevcli.sequences.nuscenes import cache as nuscenes_cache, json_tables as nu
 from bevcli.sequences.nuscenes.build import build_index
 from bevcli.sequences.nuscenes.choice import MINI_VAL, TEST, VAL, numbers, split_of
 from bevcli.sequences.nuscenes.format import NuScenesOptions
-from bevcli.sequences.nuscenes.scene import read_can_bus
-from bevcli.sequences.nuscenes.sequence import NuScenesSequence
+from bevcli.sequences.nuscenes.index import NUSCENES
+from bevcli.sequences.nuscenes.sequence import NuScenesSequence, read_can_bus
 from bevcli.sequences.open import open_sequence
 
 SMALL = Size(scenes=3, samples=4, objects=8)
@@ -74,15 +74,15 @@ def test_velocity_is_unknown_over_a_long_gap(root):
         return [{**row, "timestamp": 2 * row["timestamp"] - sample_time(0, 0)} for row in rows]
 
     edit_table(root, "sample", stretch)
-    velocities = build_index(root / "v1.0-trainval").ground_truth(1).velocities
+    velocities = build_index(root / "v1.0-trainval", NUSCENES).ground_truth(1).velocities
     np.testing.assert_allclose(velocities, [[0, 1.0]] * len(velocities))
     edit_table(root, "sample", stretch)
-    assert np.isnan(build_index(root / "v1.0-trainval").ground_truth(1).velocities).all()
+    assert np.isnan(build_index(root / "v1.0-trainval", NUSCENES).ground_truth(1).velocities).all()
 
 
 def test_single_annotation_has_no_velocity(root):
     edit_table(root, "sample_annotation", lambda rows: [{**rows[0], "prev": "", "next": ""}])
-    assert np.isnan(build_index(root / "v1.0-trainval").ground_truth(0).velocities).all()
+    assert np.isnan(build_index(root / "v1.0-trainval", NUSCENES).ground_truth(0).velocities).all()
 
 
 @pytest.mark.parametrize("remove", [False, True])
@@ -97,10 +97,10 @@ def test_without_annotations_there_is_no_ground_truth(tmp_path, remove):
 
 
 def test_order_of_rows_does_not_matter(root, tmp_path):
-    plain = build_index(root / "v1.0-trainval")
+    plain = build_index(root / "v1.0-trainval", NUSCENES)
     for name in ("sample", "sample_data", "ego_pose", "calibrated_sensor", "sample_annotation"):
         edit_table(root, name, lambda rows: rows[::-1])
-    reversed_rows = build_index(root / "v1.0-trainval")
+    reversed_rows = build_index(root / "v1.0-trainval", NUSCENES)
     assert plain.samples.tokens.tolist() == reversed_rows.samples.tokens.tolist()
     assert plain.images.files.tolist() == reversed_rows.images.files.tolist()
     np.testing.assert_array_equal(plain.images.translations, reversed_rows.images.translations)
@@ -111,7 +111,7 @@ def test_batches_contain_all_rows_of_a_table(root, monkeypatch):
     monkeypatch.setattr(nuscenes_json, "BATCH_BYTES", 10_000)
     batches = list(nuscenes_json.read_batches(path))
     assert len(batches) > 10
-    assert [row for batch in batches for row in batch] == json.loads(path.read_text())
+    assert [row for batch in batches for row in batch.rows] == json.loads(path.read_text())
 
 
 def test_can_bus_is_the_first_message_after_the_time(tmp_path):
@@ -119,7 +119,7 @@ def test_can_bus_is_the_first_message_after_the_time(tmp_path):
     rows = [{"utime": t, "accel": [t, 0, 9.8], "rotation_rate": [0, 0, t], "vel": [t, 0, 0]} for t in (10, 20, 30)]
     (tmp_path / "can_bus" / "scene-0001_pose.json").write_text(json.dumps(rows))
     can_bus = read_can_bus(tmp_path, "scene-0001")
-    found = {time: can_bus.kinematics_at(time).velocity[0] for time in (5, 10, 15, 20, 30, 40)}
+    found = {time: can_bus.kinematics_at(time * 1000).velocity[0] for time in (5, 10, 15, 20, 30, 40)}
     assert found == {5: 10, 10: 20, 15: 20, 20: 30, 30: 30, 40: 30}
     assert read_can_bus(tmp_path, "scene-0002") is None
 

@@ -1,7 +1,5 @@
 """A log of the Argoverse 2 sensor dataset as an input format."""
 
-from pathlib import Path
-
 from bevcli.options import option, options
 from bevcli.sequences.format import Format
 from bevcli.sequences.options import FormatOptions
@@ -25,15 +23,10 @@ class Argoverse2Options(FormatOptions):
     )
 
 
-def is_argoverse2_log(path: Path) -> bool:
-    """True if a folder contains poses or calibration of an Argoverse 2 log."""
-    return any((path / marker).exists() for marker in MARKERS)
-
-
 FORMAT = Format(
     name="an Argoverse 2 log",
     expected="city_SE3_egovehicle.feather",
-    recognises=is_argoverse2_log,
+    recognises=lambda path: any((path / marker).exists() for marker in MARKERS),
     opener="bevcli.sequences.argoverse2.sequence:Argoverse2Sequence",
     options=Argoverse2Options,
     annotated=True,

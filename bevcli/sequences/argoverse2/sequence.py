@@ -1,4 +1,7 @@
-"""An Argoverse 2 log as a Sequence."""
+"""An Argoverse 2 log as a Sequence.
+
+Argoverse's egovehicle frame is at the rear axle, above the ground. The ego frame here is below it, on the ground.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,23 +12,50 @@ from numpy.typing import NDArray
 from bevcli.errors import InputError
 from bevcli.frame import Frame, FrameStamp, Sequence
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.cameras import CameraRig
-from bevcli.geometry.ego_motion import EgoMotion
-from bevcli.geometry.transforms import rotation_from_quaternion, yaw_of_rotation
+from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_ego_from_bev
+from bevcli.geometry.ego_motion import EgoMotion, motion_of_keyframes
+from bevcli.geometry.transforms import Array, Pose, rigid, rotation_from_quaternion, yaw_of_rotation
 from bevcli.parsing.documents import LARGEST_INTEGER
-from bevcli.sequences.argoverse2.classes import CLASS_OF_CATEGORY
 from bevcli.sequences.argoverse2.feather import QUATERNION, TRANSLATION, FeatherTable
 from bevcli.sequences.argoverse2.format import Argoverse2Options
-from bevcli.sequences.argoverse2.rig import read_motion, read_rig
+from bevcli.sequences.files.calibration_file import LARGEST_SIZE
 from bevcli.sequences.files.class_names import ClassNames, count_classes
 from bevcli.sequences.images import FrameEntry, ImageReader, ImageSource, read_frame
 from bevcli.sequences.native.folder import rig_notes
 from bevcli.sequences.options import SequenceOptions
 from bevcli.sequences.tracks import with_track_velocities
 
+RING = (
+    "ring_front_center", "ring_front_right", "ring_front_left", "ring_side_right", "ring_side_left",
+    "ring_rear_right", "ring_rear_left",
+)  # fmt: skip
+STEREO = ("stereo_front_left", "stereo_front_right")
+LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3")
+SPACING_NS = 100_000_000  # time between the poses that kinematics are derived from; the table has some 5 µs apart
 NEAR_NS = 26_000_000  # half the time between two images of a camera, which has 20 per second, and some jitter
 SIZE = ("length_m", "width_m", "height_m")
 ANNOTATIONS = "annotations.feather"
+# Class names; docs/other-inputs.md says what is lost. Names are compared without case; others, such as BOLLARD, SIGN
+# and STROLLER, stay as they are, and are not scored.
+CLASS_OF_CATEGORY = {
+    "REGULAR_VEHICLE": "car",
+    "LARGE_VEHICLE": "truck",
+    "BOX_TRUCK": "truck",
+    "TRUCK": "truck",
+    "TRUCK_CAB": "truck",
+    "BUS": "bus",
+    "SCHOOL_BUS": "bus",
+    "ARTICULATED_BUS": "bus",
+    "VEHICULAR_TRAILER": "trailer",
+    "MESSAGE_BOARD_TRAILER": "trailer",
+    "TRAFFIC_LIGHT_TRAILER": "trailer",
+    "MOTORCYCLE": "motorcycle",
+    "BICYCLE": "bicycle",
+    "PEDESTRIAN": "pedestrian",
+    "OFFICIAL_SIGNALER": "pedestrian",
+    "CONSTRUCTION_CONE": "traffic_cone",
+    "CONSTRUCTION_BARREL": "traffic_cone",
+}
 Times = NDArray[np.int64]
 
 
@@ -43,8 +73,8 @@ class Argoverse2Sequence(Sequence):
     ) -> None:
         common.refuse_static(path)
         self.path, self.name = path, path.resolve().name
-        self.rig = read_rig(path / "calibration", own)
-        self.ego_motion = read_motion(path / "city_SE3_egovehicle.feather", own.axle_height_m)
+        self.rig = _read_rig(path / "calibration", own)
+        self.ego_motion = _read_motion(path / "city_SE3_egovehicle.feather", own.axle_height_m)
         images = {name: _image_times(path / "sensors/cameras" / name) for name in self.rig.names}
         annotated = (path / ANNOTATIONS).exists()
         names = ClassNames.of_format(CLASS_OF_CATEGORY, common.class_map)
@@ -77,6 +107,55 @@ class Argoverse2Sequence(Sequence):
     def _frame(self, entry: FrameEntry) -> Frame:
         truth = self._truth.get(entry.stamp.timestamp_ns)
         return read_frame(entry, self.rig, self._images, self.ego_motion, truth)
+
+
+def _read_motion(path: Path, axle_height_m: float) -> EgoMotion:
+    """The poses in city_SE3_egovehicle.feather, as those of the frame below the axle. Raises InputError."""
+    table = FeatherTable(path, ("timestamp_ns", *QUATERNION, *TRANSLATION))
+    if not len(table):
+        raise InputError(f"{path}: has no poses (expected at least one)")
+    times, first = np.unique(table.integers("timestamp_ns"), return_index=True)
+    axles, quaternions = (column[first] for column in table.poses())
+    up = np.stack([rotation_from_quaternion(q)[:, 2] for q in quaternions])
+    poses = (times, axles - axle_height_m * up, quaternions)
+    rows = np.unique(np.searchsorted(times, np.arange(times[0], times[-1] + 1, SPACING_NS)))
+    return motion_of_keyframes((times[rows], poses[1][rows], quaternions[rows]), poses)
+
+
+def _read_rig(folder: Path, own: Argoverse2Options) -> CameraRig:
+    """The cameras of a log's calibration folder. Raises InputError."""
+    path, poses_path = folder / "intrinsics.feather", folder / "egovehicle_SE3_sensor.feather"
+    table = FeatherTable(path, ("sensor_name", *LENS, "width_px", "height_px"))
+    lenses = dict(zip(table.texts("sensor_name"), table.numbers(LENS), strict=True))
+    sizes = np.stack([table.integers("width_px"), table.integers("height_px")], axis=1)
+    size_of = dict(zip(lenses, sizes.tolist(), strict=True)) if len(lenses) == len(table) else {}
+    poses = FeatherTable(poses_path, ("sensor_name", *QUATERNION, *TRANSLATION))
+    axle_from = dict(zip(poses.texts("sensor_name"), map(Pose, *poses.poses()), strict=True))
+    names = [name for name in RING if name in lenses] + (list(STEREO) if own.stereo else [])
+    if not names:
+        raise InputError(f"{path}: has none of the ring cameras (expected {RING[0]} and others)")
+    for name in names:
+        for known, file in ((lenses, path), (size_of, path), (axle_from, poses_path)):
+            if name not in known:
+                raise InputError(f"{file}: has no row of {name}, or two of one camera (expected one)")
+    ego_from_axle = rigid((0, 0, own.axle_height_m))
+    ego_from = {name: ego_from_axle @ axle_from[name].matrix for name in names}
+    cameras = [_camera(name, size_of[name], lenses[name], ego_from[name], path, own) for name in names]
+    return CameraRig(tuple(cameras), default_ego_from_bev(), ego_from_bev_assumed=True)
+
+
+def _camera(
+    name: str, size: list[int], lens: Array, ego_from_camera: Array, path: Path, own: Argoverse2Options
+) -> Camera:
+    width, height = size
+    fx, fy, cx, cy, k1, k2, k3 = lens
+    if not (0 < min(size) <= max(size) <= LARGEST_SIZE and min(fx, fy) > 0):
+        raise InputError(
+            f"{path}: {name}: expected an image size and focal lengths above 0, found {width}x{height}, {fx:g}, {fy:g}"
+        )
+    intrinsics = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    distortion = brown_conrady((k1, k2, 0, 0, k3, 0, 0, 0)) if own.distorted else None
+    return Camera(name, width, height, intrinsics, ego_from_camera, distortion)
 
 
 def _image_times(folder: Path) -> Times:
@@ -119,17 +198,16 @@ def _entries(
             f"{path / 'sensors/cameras'}: has no images (expected {rig.names[0]}/TIMESTAMP_NS.jpg and others)"
         )
     times = annotated if len(annotated) else leading
-    found = [_sources(path / "sensors/cameras", images, int(time)) for time in times]
-    kept = [(index, sources) for index, sources in enumerate(found) if sources]
-    if not kept:
-        raise InputError(f"{path}: no image is within {NEAR_NS / 1e6:.0f} ms of a time that has boxes in {ANNOTATIONS}")
+    near = f"within {NEAR_NS / 1e6:.0f} ms"
     entries = []
-    for index, sources in kept:
-        reason = f"has no image within {NEAR_NS / 1e6:.0f} ms of the frame"
-        dropped = {name: reason for name in rig.names if name not in sources}
-        entries.append(FrameEntry(FrameStamp(index, "", int(times[index])), sources, dropped, str(path)))
-    note = f"{len(times) - len(kept)} of {len(times)} frames have no image and are left out"
-    return tuple(entries), (note,) if len(kept) < len(times) else ()
+    for index, time in enumerate(times.tolist()):
+        if sources := _sources(path / "sensors/cameras", images, time):
+            dropped = {name: f"has no image {near} of the frame" for name in rig.names if name not in sources}
+            entries.append(FrameEntry(FrameStamp(index, "", time), sources, dropped, str(path)))
+    if not entries:
+        raise InputError(f"{path}: no image is {near} of a time that has boxes in {ANNOTATIONS}")
+    note = f"{len(times) - len(entries)} of {len(times)} frames have no image and are left out"
+    return tuple(entries), (note,) if len(entries) < len(times) else ()
 
 
 def _sources(folder: Path, images: Mapping[str, Times], time: int) -> dict[str, ImageSource]:

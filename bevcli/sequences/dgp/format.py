@@ -1,19 +1,13 @@
 """A scene in the DGP format, such as one of DDAD, as an input format."""
 
-from pathlib import Path
-
 from bevcli.sequences.format import Format
 
-
-def is_dgp_scene(path: Path) -> bool:
-    """True if a folder contains the file of a DGP scene, or all but that."""
-    return any(path.glob("scene_*.json")) or all((path / part).is_dir() for part in ("calibration", "ontology", "rgb"))
-
+FOLDERS = ("calibration", "ontology", "rgb")  # a folder with these is a scene that lacks its file
 
 FORMAT = Format(
     name="a DGP scene",
     expected="scene_*.json",
-    recognises=is_dgp_scene,
+    recognises=lambda path: any(path.glob("scene_*.json")) or all((path / name).is_dir() for name in FOLDERS),
     opener="bevcli.sequences.dgp.sequence:DgpSequence",
     annotated=True,
 )

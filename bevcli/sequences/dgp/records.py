@@ -1,22 +1,24 @@
-"""The JSON files of a DGP scene: the scene with its data and samples, and calibrations."""
+"""The JSON files of a DGP scene: its samples with images and point clouds, each with a pose, and calibrations."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from pathlib import Path, PurePosixPath
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_ego_from_bev
-from bevcli.geometry.transforms import Array, Pose
+from bevcli.geometry.ego_motion import PoseTable
+from bevcli.geometry.transforms import Array, Pose, inverse
 from bevcli.parsing.documents import LARGEST_INTEGER, read_json
 from bevcli.sequences.files.calibration_file import LARGEST_SIZE, is_file_name
 
 LARGEST_NUMBER = 1e12  # metres or pixels
 SHORTEST_QUATERNION = 1e-3
-BOXES_3D = "1"  # the number of 3D boxes among DGP's kinds of annotations
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 PINHOLE = ("fx", "fy", "cx", "cy")
 BROWN_CONRADY = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -103,46 +105,31 @@ def read_record(path: Path) -> Record:
     return Record(read_json(path), str(path))
 
 
-def inside(name: str, where: str, *, allow_outside: bool) -> PurePosixPath:
-    """A file name relative to the scene. Raises InputError if it leads out of it."""
-    path = PurePosixPath(name)
-    if not allow_outside and (path.is_absolute() or ".." in path.parts):
-        raise InputError(f"{where}: {name:.100}: leads out of the folder: pass `allow_outside=True` to read it")
-    return path
-
-
-def nanoseconds(times: list[datetime]) -> tuple[list[int], bool]:
+def nanoseconds(times: list[datetime], where: str) -> tuple[list[int], bool]:
     """The times since 1970 in ns, and whether they were divided by ten. Raises InputError beyond any year.
 
     DDAD's files state tenths of microseconds as microseconds: a drive of 2019 seems to be of the year 2463, with one
-    frame per second in place of ten.
+    frame per second in place of ten. where: start of a message.
     """
     found = [(time - EPOCH) // timedelta(microseconds=1) * 1000 for time in times]
     tenfold = max(found) > LARGEST_INTEGER
     found = [time // 10 for time in found] if tenfold else found
     if not 0 <= min(found) <= max(found) <= LARGEST_INTEGER:
-        raise InputError(f"the times {min(times)} to {max(times)} are impossible (expected years from 1970 on)")
+        raise InputError(
+            f"{where}: the times {min(times)} to {max(times)} are impossible (expected years from 1970 on)"
+        )
     return found, tenfold
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """The poses of all sensors, and the lenses of the cameras among them.
-
-    Attributes:
-        ego_from: by sensor.
-        lenses: by sensor.
-    """
+    """The poses of all sensors, and the lenses of the cameras among them, by sensor."""
 
     ego_from: Mapping[str, Pose]
     lenses: Mapping[str, Record]
 
-    def rig(self, sizes: Mapping[str, tuple[int, int]]) -> CameraRig:
-        """The cameras with their image sizes (width, height), in this order. Raises InputError."""
-        cameras = tuple(self._camera(name, size) for name, size in sizes.items())
-        return CameraRig(cameras, default_ego_from_bev(), ego_from_bev_assumed=True)
-
-    def _camera(self, name: str, size: tuple[int, int]) -> Camera:
+    def camera(self, name: str, size: tuple[int, int]) -> Camera:
+        """A camera with the size of its image (width, height). Raises InputError."""
         lens = self.lenses[name]
         fx, fy, cx, cy = lens.numbers(PINHOLE)
         if not (is_file_name(name) and 0 < min(size) <= max(size) <= LARGEST_SIZE and min(fx, fy) > 0):
@@ -171,3 +158,98 @@ def read_calibration(path: Path) -> Calibration:
     return Calibration(
         dict(zip(names, (pose.pose() for pose in poses), strict=True)), dict(zip(names, lenses, strict=True))
     )
+
+
+@dataclass(frozen=True)
+class Datum:
+    """One image or point cloud, with the pose at its own time. content: the object "image" or "point_cloud"."""
+
+    sensor: str
+    is_image: bool
+    content: Record
+    time_ns: int
+    world_from_sensor: Pose
+
+
+@dataclass(frozen=True)
+class Sample:
+    """The images and point clouds of one moment, at least one image among them. calibration: of their sensors."""
+
+    time_ns: int
+    data: tuple[Datum, ...]
+    calibration: Calibration
+
+    def ego_pose(self, datum: Datum) -> Pose:
+        """world_from_ego at the time of one of its data."""
+        return Pose.from_matrix(
+            datum.world_from_sensor.matrix @ inverse(self.calibration.ego_from[datum.sensor].matrix)
+        )
+
+    def rig(self) -> CameraRig:
+        """The cameras that have an image, in the order of the calibration. Raises InputError."""
+        images = {datum.sensor: datum.content for datum in self.data if datum.is_image}
+        names = [name for name in self.calibration.ego_from if name in images]
+        sizes = [(images[name].integer("width"), images[name].integer("height")) for name in names]
+        cameras = tuple(map(self.calibration.camera, names, sizes))
+        return CameraRig(cameras, default_ego_from_bev(), ego_from_bev_assumed=True)
+
+
+def read_samples(path: Path, scene: Record) -> tuple[tuple[Sample, ...], bool]:
+    """The samples in order of time, and whether the times were divided by ten, see `nanoseconds`. Raises InputError.
+
+    path: the folder of the scene. scene: the contents of its file.
+    """
+    records = {record.text("key"): record for record in scene.records("data")}
+    samples = sorted(scene.records("samples"), key=lambda sample: sample.record("id").timestamp())
+    if not samples:
+        raise InputError(f"{scene.where}: has no samples (expected at least one)")
+    owners = [*records.values(), *samples]
+    times, tenfold = nanoseconds([owner.record("id").timestamp() for owner in owners], scene.where)
+    data = {key: _datum(record, time) for (key, record), time in zip(records.items(), times, strict=False)}
+    calibration_of = cache(lambda key: read_calibration(path / "calibration" / f"{key}.json"))
+    found = []
+    for sample, time in zip(samples, times[len(records) :], strict=True):
+        calibration = calibration_of(sample.text("calibration_key"))
+        found.append(Sample(time, _data_of(sample, data, calibration), calibration))
+    if any(later.time_ns <= earlier.time_ns for earlier, later in pairwise(found)):
+        raise InputError(f"{scene.where}: two samples have the same time (expected increasing times)")
+    return tuple(found), tenfold
+
+
+def _data_of(sample: Record, data: dict[str, Datum | None], calibration: Calibration) -> tuple[Datum, ...]:
+    """The images and point clouds of a sample. Raises InputError for one that is missing."""
+    found = []
+    for key in sample.texts("datum_keys"):
+        if key not in data:
+            raise InputError(f'{sample.where}: datum "{key:.40}" is missing in "data"')
+        datum = data[key]
+        if datum is None:
+            continue
+        if datum.sensor not in calibration.ego_from:
+            raise InputError(f'{sample.where}: its calibration has no sensor "{datum.sensor}"')
+        found.append(datum)
+    if not any(datum.is_image for datum in found):
+        raise InputError(f"{sample.where}: has no image (expected at least one)")
+    return tuple(found)
+
+
+def _datum(record: Record, time_ns: int) -> Datum | None:
+    """The image or point cloud of a record; None for radar and other data."""
+    contents = record.record("datum")
+    kind = next((name for name in ("image", "point_cloud") if name in contents.value), None)
+    if kind is None:
+        return None
+    content = contents.record(kind)
+    pose = content.record("pose").pose()
+    return Datum(record.record("id").text("name"), kind == "image", content, time_ns, pose)
+
+
+def poses(samples: Iterable[Sample], *, keys: bool) -> PoseTable:
+    """The poses at the times of all data; or only the one of each sample that is nearest to its time, at that time."""
+    rows = []
+    for sample in samples:
+        nearest = min(sample.data, key=lambda datum: abs(datum.time_ns - sample.time_ns))
+        data = [(sample.time_ns, nearest)] if keys else [(datum.time_ns, datum) for datum in sample.data]
+        rows += [(time, sample.ego_pose(datum)) for time, datum in data]
+    times = np.array([time for time, _ in rows], dtype=np.int64)
+    return times, np.stack([pose.translation for _, pose in rows]), np.stack([pose.quaternion for _, pose in rows])

@@ -1,8 +1,8 @@
 """nuScenes datasets, read without the official devkit (which needs an old NumPy).
 
-sequence: NuScenesSequence, the dataset as a Sequence, and TableSequence, for formats with the same tables.
-dialect: the points in which tables differ from nuScenes'.
+sequence: NuScenesSequence, the dataset as a Sequence, and TableSequence, for formats with the same tables; rig, poses
+and CAN bus data of one scene.
 choice: version, split, scenes and frames of a dataset root.
-scene: rig, poses and CAN bus data of one scene.
-index: the tables' contents as arrays. It is built by build, annotations and json_tables, and kept on disk by cache.
+index: the contents of tables as arrays, and dialects. build makes it of json_tables; cache keeps it on disk.
+writer: NuScenesWriter, a drive as a nuScenes root.
 """

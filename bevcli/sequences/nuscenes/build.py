@@ -1,9 +1,7 @@
 """Builds a NuScenesIndex from nuScenes' JSON tables: joins them by token and sorts rows by scene and time."""
 
 import re
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,93 +9,51 @@ from numpy.typing import NDArray
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.documents import without_garbage_collection
-from bevcli.sequences.nuscenes.dialect import NUSCENES, Dialect
-from bevcli.sequences.nuscenes.index import Annotations, Images, Ints, NuScenesIndex, Samples, Scenes, Sensors
-from bevcli.sequences.nuscenes.json_tables import (
-    Row,
-    array_of,
-    column,
-    integers,
-    places_of,
-    quaternions,
-    read_batches,
-    read_rows,
-    texts,
-    tokens,
-    vectors,
-)
+from bevcli.sequences.nuscenes.index import Annotations, Dialect, Images, Ints, NuScenesIndex, Samples, Scenes, Sensors
+from bevcli.sequences.nuscenes.json_tables import Row, Rows, array_of, places_of, read_batches, read_rows
 from bevcli.sequences.tracks import velocities_between
 
-
-@dataclass(frozen=True)
-class _SensorData:
-    """Columns of sample_data.json for images, and for LIDAR_TOP at keyframes. Samples and sensors are rows."""
-
-    samples: Ints
-    sensors: Ints
-    poses: NDArray[np.bytes_]
-    times_us: Ints
-    keys: NDArray[np.bool_]
-    sizes: Ints
-    files: NDArray[np.bytes_]
-
-    def __getitem__(self, rows: NDArray) -> Self:
-        return replace(self, **{name: values[rows] for name, values in vars(self).items()})
+Columns = dict[str, NDArray]  # the columns of a table by name, as many rows each
 
 
-def build_index(tables: Path, dialect: Dialect = NUSCENES) -> NuScenesIndex:
+def build_index(tables: Path, dialect: Dialect) -> NuScenesIndex:
     """Read the folder with one version's tables. Raises InputError if one is missing, invalid or inconsistent."""
     with without_garbage_collection():
         sensor_tokens, sensors = _read_sensors(tables)
         names, sample_tokens, sample_times, sample_scenes = _read_samples(tables)
         data = _read_sensor_data(tables, sample_tokens, sensor_tokens, sensors, dialect)
-        translations, quaternions = _read_poses(tables, data.poses)
-        lidar = np.isin(sensors.channels[data.sensors], dialect.lidars)
-        lidar_rows = _lidar_of_samples(tables, data.samples, np.flatnonzero(lidar), sample_tokens, dialect)
+        data["translations"], data["quaternions"] = _read_poses(tables, data.pop("poses"))
+        lidar = np.isin(sensors.channels[data["sensors"]], dialect.lidars)
+        lidar_rows = _lidar_of_samples(tables, data["samples"], np.flatnonzero(lidar), sample_tokens, dialect)
         image_rows = np.flatnonzero(~lidar)
-        image_rows = image_rows[np.lexsort((data.times_us[image_rows], sample_scenes[data.samples[image_rows]]))]
-        annotations, first_annotation = read_annotations(tables, sample_tokens, sample_times, dialect)
-    images = data[image_rows]
-    return NuScenesIndex(
-        Scenes(names, _starts(sample_scenes, len(names)), _starts(sample_scenes[images.samples], len(names))),
-        sensors,
-        Samples(
-            sample_tokens,
-            sample_times,
-            translations[lidar_rows],
-            quaternions[lidar_rows],
-            data.sensors[lidar_rows],
-            first_annotation,
-        ),
-        Images(
-            images.samples,
-            images.sensors,
-            images.times_us,
-            images.keys,
-            images.sizes,
-            translations[image_rows],
-            quaternions[image_rows],
-            images.files,
-        ),
-        annotations,
-    )
+        owners, times = sample_scenes[data["samples"][image_rows]], data["times_us"][image_rows]
+        images = Images(**_rows(data, image_rows[np.lexsort((times, owners))]))
+        annotations, first_annotation = _read_annotations(tables, sample_tokens, sample_times, dialect)
+    scenes = Scenes(names, _starts(sample_scenes, len(names)), _starts(sample_scenes[images.samples], len(names)))
+    translations, quaternions, lidars = (data[name][lidar_rows] for name in ("translations", "quaternions", "sensors"))
+    samples = Samples(sample_tokens, sample_times, translations, quaternions, lidars, first_annotation)
+    return NuScenesIndex(scenes, sensors, samples, images, annotations)
+
+
+def _rows(columns: Columns, rows: Ints) -> Columns:
+    return {name: values[rows] for name, values in columns.items()}
+
+
+def _joined(parts: list[Columns]) -> Columns:
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def _read_sensors(tables: Path) -> tuple[NDArray[np.bytes_], Sensors]:
-    path = tables / "calibrated_sensor.json"
-    sensor_path = tables / "sensor.json"
-    sensor_rows = read_rows(sensor_path)
-    names = texts(sensor_rows, "channel", sensor_path)
-    channels = dict(zip(texts(sensor_rows, "token", sensor_path), names, strict=True))
-    rows = read_rows(path)
+    channels = read_rows(tables / "sensor.json").by_token("channel")
+    table = read_rows(tables / "calibrated_sensor.json")
     sensors = Sensors(
-        np.array([channels.get(token, "") for token in texts(rows, "sensor_token", path)], dtype=np.str_),
-        vectors(rows, "translation", path, 3),
-        quaternions(rows, "rotation", path),
-        np.array([_intrinsics(row, path) for row in rows], dtype=np.float64).reshape(-1, 3, 3),
-        np.array([_distortion(row, path) for row in rows], dtype=np.float64).reshape(-1, 8),
+        np.array([channels.get(token, "") for token in table.texts("sensor_token")], dtype=np.str_),
+        table.vectors("translation", 3),
+        table.quaternions("rotation"),
+        np.array([_intrinsics(row, table.path) for row in table.rows], dtype=np.float64).reshape(-1, 3, 3),
+        np.array([_distortion(row, table.path) for row in table.rows], dtype=np.float64).reshape(-1, 8),
     )
-    return tokens(rows, "token", path), sensors
+    return table.tokens("token"), sensors
 
 
 def _intrinsics(row: Row, path: Path) -> Array:
@@ -122,15 +78,15 @@ def _distortion(row: Row, path: Path) -> Array:
 
 def _read_samples(tables: Path) -> tuple[NDArray[np.str_], NDArray[np.bytes_], Ints, Ints]:
     """Scene names (S,), and the tokens, times in us and scenes of samples (N,), ordered by scene and time."""
-    scene_path, path = tables / "scene.json", tables / "sample.json"
-    scenes, rows = read_rows(scene_path), read_rows(path)
-    if not scenes or not rows:
-        raise InputError(f"{path if scenes else scene_path}: the table has no rows (expected at least one)")
-    in_scene = places_of(tokens(rows, "scene_token", path), tokens(scenes, "token", scene_path), scene_path)
-    times = integers(rows, "timestamp", path)
+    scenes, samples = read_rows(tables / "scene.json"), read_rows(tables / "sample.json")
+    for table in (scenes, samples):
+        if not len(table):
+            raise InputError(f"{table.path}: the table has no rows (expected at least one)")
+    in_scene = places_of(samples.tokens("scene_token"), scenes.tokens("token"), scenes.path)
+    times = samples.integers("timestamp")
     order = np.lexsort((times, in_scene))
-    names = np.array(texts(scenes, "name", scene_path), dtype=np.str_)
-    return names, tokens(rows, "token", path)[order], times[order], in_scene[order]
+    names = np.array(scenes.texts("name"), dtype=np.str_)
+    return names, samples.tokens("token")[order], times[order], in_scene[order]
 
 
 def _read_sensor_data(
@@ -139,55 +95,50 @@ def _read_sensor_data(
     sensor_tokens: NDArray[np.bytes_],
     sensors: Sensors,
     dialect: Dialect,
-) -> _SensorData:
+) -> Columns:
+    """Columns of sample_data.json for images, and for lidars at keyframes. Samples and sensors are rows."""
     path = tables / "sample_data.json"
     lidars = {token.decode() for token in sensor_tokens[np.isin(sensors.channels, dialect.lidars)]}
     cameras = {token.decode() for token in sensor_tokens[np.isfinite(sensors.intrinsics).all((1, 2))]}
     parts = []
     for batch in read_batches(path):
-        owners, keys = texts(batch, "calibrated_sensor_token", path), column(batch, "is_key_frame", path)
-        needed = [
-            row
-            for row, owner, key in zip(batch, owners, keys, strict=True)
-            if (owner in cameras and row.get("is_valid") is not False) or (key and owner in lidars)
-        ]
-        if needed:
-            parts.append(_sensor_data_of(needed, path, sample_tokens, sensor_tokens))
+        facts = zip(batch.rows, batch.texts("calibrated_sensor_token"), batch.column("is_key_frame"), strict=True)
+        needed = batch.where(
+            (owner in cameras and row.get("is_valid") is not False) or (key and owner in lidars)
+            for row, owner, key in facts
+        )
+        if len(needed):
+            parts.append(_sensor_data_of(needed, sample_tokens, sensor_tokens))
     if not parts:
         raise InputError(f"{path}: no row belongs to a camera (expected camera images)")
-    return _SensorData(**{name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])})
+    return _joined(parts)
 
 
-def _sensor_data_of(
-    rows: list[Row], path: Path, sample_tokens: NDArray[np.bytes_], sensor_tokens: NDArray[np.bytes_]
-) -> _SensorData:
-    return _SensorData(
-        samples=places_of(tokens(rows, "sample_token", path), sample_tokens, path.with_name("sample.json")),
-        sensors=places_of(
-            tokens(rows, "calibrated_sensor_token", path), sensor_tokens, path.with_name("calibrated_sensor.json")
-        ),
-        poses=tokens(rows, "ego_pose_token", path),
-        times_us=integers(rows, "timestamp", path),
-        keys=integers(rows, "is_key_frame", path).astype(bool),
-        sizes=np.stack([integers(rows, "width", path), integers(rows, "height", path)], axis=1),
-        files=np.array([name.encode("utf-8", "surrogatepass") for name in texts(rows, "filename", path)]),
-    )
+def _sensor_data_of(rows: Rows, sample_tokens: NDArray[np.bytes_], sensor_tokens: NDArray[np.bytes_]) -> Columns:
+    of_samples, of_sensors = (rows.path.with_name(name) for name in ("sample.json", "calibrated_sensor.json"))
+    return {
+        "samples": places_of(rows.tokens("sample_token"), sample_tokens, of_samples),
+        "sensors": places_of(rows.tokens("calibrated_sensor_token"), sensor_tokens, of_sensors),
+        "poses": rows.tokens("ego_pose_token"),
+        "times_us": rows.integers("timestamp"),
+        "keys": rows.integers("is_key_frame").astype(bool),
+        "sizes": np.stack([rows.integers("width"), rows.integers("height")], axis=1),
+        "files": np.array([name.encode("utf-8", "surrogatepass") for name in rows.texts("filename")]),
+    }
 
 
 def _read_poses(tables: Path, wanted: NDArray[np.bytes_]) -> tuple[Array, Array]:
     """Translations (P, 3), metres, and quaternions (P, 4) of world_from_ego for the pose tokens (P,)."""
     path = tables / "ego_pose.json"
     needed = {token.decode() for token in wanted}
-    found, translations, rotations = [], [], []
+    parts = []
     for batch in read_batches(path):
-        rows = [row for row, token in zip(batch, texts(batch, "token", path), strict=True) if token in needed]
-        if rows:
-            found.append(tokens(rows, "token", path))
-            translations.append(vectors(rows, "translation", path, 3))
-            rotations.append(quaternions(rows, "rotation", path))
-    places = places_of(wanted, np.concatenate(found) if found else np.zeros(0, "S32"), path)
-    chosen = np.concatenate(rotations)[places]
-    return np.concatenate(translations)[places], chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
+        rows = batch.where(token in needed for token in batch.texts("token"))
+        parts.append((rows.tokens("token"), rows.vectors("translation", 3), rows.quaternions("rotation")))
+    found, translations, rotations = map(np.concatenate, zip(*parts, strict=True))
+    places = places_of(wanted, found, path)
+    chosen = rotations[places]
+    return translations[places], chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
 
 
 def _lidar_of_samples(
@@ -209,57 +160,51 @@ def _starts(sorted_owners: Ints, count: int) -> Ints:
     return np.searchsorted(sorted_owners, np.arange(count + 1))
 
 
-def read_annotations(
+def _read_annotations(
     tables: Path, sample_tokens: NDArray[np.bytes_], sample_times_us: Ints, dialect: Dialect
 ) -> tuple[Annotations, Ints]:
-    """The annotations ordered by sample, and the row of each sample's first annotation (N + 1,).
-
-    A version without annotations, such as the test split, gives zero rows.
-
-    sample_tokens: (N,). sample_times_us: (N,) microseconds.
-    Raises InputError if the tables are inconsistent.
-    """
+    """The annotations ordered by sample, none without a table, and the row of each sample's first one (N + 1,)."""
     path = tables / "sample_annotation.json"
     names = _Names(tables, dialect)
-    parts = [_columns(batch, path, names) for batch in (read_batches(path) if path.is_file() else [[]])]
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    batches = read_batches(path) if path.is_file() else [Rows(path, [])]
+    columns = _joined([_columns(batch, names) for batch in batches])
     samples = places_of(columns.pop("samples"), sample_tokens, tables / "sample.json")
-    own, earlier, later = columns.pop("tokens"), columns.pop("prev"), columns.pop("next")
-    velocities = _velocities(own, earlier, later, columns["centers"], sample_times_us[samples], path)
+    own, times_us = columns.pop("tokens"), sample_times_us[samples]
+    first, last = (_linked(columns.pop(name), own, path) for name in ("prev", "next"))
+    seconds = (times_us - times_us[:1]).astype(np.float64) * 1e-6
+    columns["velocities"] = velocities_between(columns["centers"], seconds, first, last)[:, :2]
     order = np.argsort(samples, kind="stable")
-    annotations = Annotations(
-        **{name: values[order] for name, values in columns.items()}, velocities=velocities[order, :2]
-    )
-    return annotations, np.searchsorted(samples[order], np.arange(len(sample_tokens) + 1))
+    return Annotations(**_rows(columns, order)), _starts(samples[order], len(sample_tokens))
+
+
+def _linked(wanted: NDArray[np.bytes_], own: NDArray[np.bytes_], path: Path) -> Ints:
+    """(A,) rows of the annotations with the wanted tokens (A,); the own row for an empty one. own: (A,) tokens."""
+    rows, stated = np.arange(len(own)), wanted != b""
+    rows[stated] = places_of(wanted[stated], own, path)
+    return rows
 
 
 class _Names:
     """The names behind the tokens in an annotation."""
 
     def __init__(self, tables: Path, dialect: Dialect) -> None:
-        categories = _texts(tables / "category.json", "name")
+        categories = _optional(tables / "category.json", "name")
         path = tables / "instance.json"
-        instances = _optional_rows(path)
-        owners, own = texts(instances, "category_token", path), texts(instances, "token", path)
-        for token in owners:
+        owners = _optional(path, "category_token")
+        for token in owners.values():
             if token not in categories:
                 raise InputError(f'{path}: category "{token}" is missing in category.json')
-        self.category = {token: categories[owner].encode() for token, owner in zip(own, owners, strict=True)}
-        attributes = _texts(tables / "attribute.json", "name") if dialect.has_attributes else {}
+        self.category = {token: categories[owner].encode() for token, owner in owners.items()}
+        attributes = _optional(tables / "attribute.json", "name") if dialect.has_attributes else {}
         self.attribute = {token: name.encode() for token, name in attributes.items()}
         self.visibility = {
             token: dialect.visibilities.get(level) or _middle(level, tables)
-            for token, level in _texts(tables / "visibility.json", "level").items()
+            for token, level in _optional(tables / "visibility.json", "level").items()
         }
 
 
-def _optional_rows(path: Path) -> list[Row]:
-    return read_rows(path) if path.is_file() else []
-
-
-def _texts(path: Path, name: str) -> dict[str, str]:
-    rows = _optional_rows(path)
-    return dict(zip(texts(rows, "token", path), texts(rows, name, path), strict=True))
+def _optional(path: Path, name: str) -> dict[str, str]:
+    return read_rows(path).by_token(name) if path.is_file() else {}
 
 
 def _middle(level: str, tables: Path) -> float:
@@ -270,39 +215,21 @@ def _middle(level: str, tables: Path) -> float:
     return (int(found[1]) + int(found[2])) / 200
 
 
-def _columns(rows: list[Row], path: Path, names: _Names) -> dict[str, NDArray]:
-    instances = texts(rows, "instance_token", path)
-    attributes = column(rows, "attribute_tokens", path)
-    visibilities = texts(rows, "visibility_token", path)
+def _columns(rows: Rows, names: _Names) -> Columns:
+    attributes = rows.column("attribute_tokens")
     if not all(type(own) is list and all(type(token) is str for token in own) for own in attributes):
-        raise InputError(f'{path}: "attribute_tokens": expected a list of tokens in every row')
+        raise InputError(f'{rows.path}: "attribute_tokens": expected a list of tokens in every row')
     return {
-        "tokens": tokens(rows, "token", path),
-        "samples": tokens(rows, "sample_token", path),
-        "prev": tokens(rows, "prev", path),
-        "next": tokens(rows, "next", path),
-        "categories": np.array([names.category.get(token, b"") for token in instances], dtype="S"),
+        "tokens": rows.tokens("token"),
+        "samples": rows.tokens("sample_token"),
+        "prev": rows.tokens("prev"),
+        "next": rows.tokens("next"),
+        "categories": np.array([names.category.get(token, b"") for token in rows.texts("instance_token")], dtype="S"),
         "attributes": np.array([names.attribute.get(own[0], b"") if own else b"" for own in attributes], dtype="S"),
-        "instances": tokens(rows, "instance_token", path),
-        "centers": vectors(rows, "translation", path, 3),
-        "sizes_wlh": vectors(rows, "size", path, 3),
-        "quaternions": quaternions(rows, "rotation", path),
-        "visibilities": np.array([names.visibility.get(token, np.nan) for token in visibilities]),
-        "num_points": integers(rows, "num_lidar_pts", path) + integers(rows, "num_radar_pts", path),
+        "instances": rows.tokens("instance_token"),
+        "centers": rows.vectors("translation", 3),
+        "sizes_wlh": rows.vectors("size", 3),
+        "quaternions": rows.quaternions("rotation"),
+        "visibilities": np.array([names.visibility.get(token, np.nan) for token in rows.texts("visibility_token")]),
+        "num_points": rows.integers("num_lidar_pts") + rows.integers("num_radar_pts"),
     }
-
-
-def _velocities(
-    own: NDArray[np.bytes_],
-    earlier: NDArray[np.bytes_],
-    later: NDArray[np.bytes_],
-    centers: Array,
-    times_us: Ints,
-    path: Path,
-) -> Array:
-    """(A, 3) m/s in the world frame, NaN if unknown, see `velocities_between`."""
-    first, last = np.arange(len(own)), np.arange(len(own))
-    has_earlier, has_later = earlier != b"", later != b""
-    first[has_earlier] = places_of(earlier[has_earlier], own, path)
-    last[has_later] = places_of(later[has_later], own, path)
-    return velocities_between(centers, (times_us - times_us[:1]).astype(np.float64) * 1e-6, first, last)

@@ -16,8 +16,7 @@ from typing import Any, get_type_hints
 import numpy as np
 
 from bevcli.sequences.nuscenes.build import build_index
-from bevcli.sequences.nuscenes.dialect import NUSCENES, Dialect
-from bevcli.sequences.nuscenes.index import NuScenesIndex
+from bevcli.sequences.nuscenes.index import NUSCENES, Dialect, NuScenesIndex
 from bevcli.user_folders import user_cache
 
 FORMAT = 2  # version of the cached arrays; increase it when the index changes
@@ -55,10 +54,9 @@ def _save(index: NuScenesIndex, folder: Path, fingerprint: str) -> None:
     unfinished = folder.with_name(f"{folder.name}.{os.getpid()}")
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)
-    for part in fields(index):
-        for column in fields(getattr(index, part.name)):
-            values = getattr(getattr(index, part.name), column.name)
-            np.save(unfinished / f"{part.name}.{column.name}.npy", values, allow_pickle=False)
+    for part, table in vars(index).items():
+        for name, values in vars(table).items():
+            np.save(unfinished / f"{part}.{name}.npy", values, allow_pickle=False)
     (unfinished / FINGERPRINT).write_text(fingerprint)
     shutil.rmtree(folder, ignore_errors=True)
     unfinished.rename(folder)

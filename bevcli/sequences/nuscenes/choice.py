@@ -32,10 +32,9 @@ def tables_of(root: Path, version: str | None) -> Path:
 
 def choose_version(root: object, versions: Sequence[str], version: str | None) -> str:
     """The version with a name, or the only one. root: for messages. Raises InputError as `tables_of`."""
-    if version is None and len(versions) == 1:
-        return versions[0]
-    if version is not None and version in versions:
-        return version
+    chosen = [one for one in versions if version in (None, one)]
+    if len(chosen) == 1:
+        return chosen[0]
     found = ", ".join(versions) or "none"
     wanted = f'has no version "{version}"' if version else "has several versions"
     raise InputError(f"{root}: {wanted} (found: {found}): choose one with `version`")

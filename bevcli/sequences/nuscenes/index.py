@@ -1,7 +1,7 @@
-"""The contents of nuScenes' tables that bevcli needs, as arrays ordered by scene and time."""
+"""The contents of nuScenes' tables that bevcli needs, as arrays ordered by scene and time, and dialects of them."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,29 @@ BICYCLE_RACK = "static_object.bicycle_rack"
 
 
 @dataclass(frozen=True)
+class Dialect:
+    """The reading of tables that differ from nuScenes' own in some points.
+
+    Attributes:
+        lidars: channels of which each sample has a keyframe, whose ego pose is that of the frame.
+        class_of: a category -> its class, None for a category that is left out.
+        visibilities: names of visibility levels -> visible fraction, besides names such as "v40-60".
+        has_attributes: whether the attributes are those of nuScenes, which are scored.
+        ego_from_bev: (4, 4) metres; None for the frame of the lidar.
+    """
+
+    lidars: tuple[str, ...]
+    class_of: Callable[[str], str | None]
+    visibilities: Mapping[str, float] = field(default_factory=dict)
+    has_attributes: bool = True
+    ego_from_bev: Array | None = None
+
+
+# The published models predict in the frame of LIDAR_TOP.
+NUSCENES = Dialect(("LIDAR_TOP",), CLASS_OF_CATEGORY.get)
+
+
+@dataclass(frozen=True)
 class Scenes:
     """S scenes.
 
@@ -52,8 +75,7 @@ class Sensors:
 
     Attributes:
         channels: (K,) such as "CAM_FRONT".
-        translations: (K, 3) of ego_from_sensor, metres.
-        quaternions: (K, 4) of ego_from_sensor, w, x, y, z.
+        translations, quaternions: (K, 3) metres and (K, 4) w, x, y, z of ego_from_sensor.
         intrinsics: (K, 3, 3) pixels; NaN for other sensors than cameras.
         distortions: (K, 8) Brown-Conrady coefficients k1 k2 p1 p2 k3 k4 k5 k6; 0 without distortion.
     """
@@ -72,8 +94,7 @@ class Samples:
     Attributes:
         tokens: (N,) nuScenes' identifiers.
         times_us: (N,) microseconds.
-        translations: (N, 3) of world_from_ego at the time of LIDAR_TOP, metres.
-        quaternions: (N, 4) of world_from_ego at the time of LIDAR_TOP, w, x, y, z.
+        translations, quaternions: (N, 3) metres and (N, 4) w, x, y, z of world_from_ego at the time of LIDAR_TOP.
         lidars: (N,) row of the sample's LIDAR_TOP in Sensors.
         first_annotation: (N + 1,) row of each sample's first annotation.
     """
@@ -96,8 +117,7 @@ class Images:
         times_us: (P,) microseconds.
         keys: (P,) bool, whether the image belongs to a keyframe.
         sizes: (P, 2) width and height, pixels.
-        translations: (P, 3) of world_from_ego at the image's time, metres.
-        quaternions: (P, 4) of world_from_ego at the image's time, w, x, y, z.
+        translations, quaternions: (P, 3) metres and (P, 4) w, x, y, z of world_from_ego at the image's time.
         files: (P,) paths relative to the dataset root.
     """
 
@@ -177,11 +197,12 @@ class NuScenesIndex:
 
     def _boxes(self, rows: Ints, classes: list[str]) -> Boxes3D:
         a = self.annotations
-        rotations = [rotation_from_quaternion(q) for q in a.quaternions[rows]]
         return Boxes3D(
             centers=np.array(a.centers[rows]),
             sizes_lwh=np.array(a.sizes_wlh[rows][:, [1, 0, 2]]),
-            yaws=np.array([yaw_of_rotation(rotation) for rotation in rotations], dtype=np.float64),
+            yaws=np.array(
+                [yaw_of_rotation(rotation_from_quaternion(q)) for q in a.quaternions[rows]], dtype=np.float64
+            ),
             velocities=np.array(a.velocities[rows]),
             classes=np.array(classes, dtype=np.str_),
             attributes=a.attributes[rows].astype(np.str_),

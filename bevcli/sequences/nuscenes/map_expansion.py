@@ -1,7 +1,6 @@
 """nuScenes' map expansion: the lines of the map around a pose, from maps/expansion/LOCATION.json below a root."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from bevcli.errors import InputError
 from bevcli.frame import LINE_CLASSES, MapLines
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.parsing.documents import read_json
-from bevcli.sequences.nuscenes.json_tables import read_rows, texts
+from bevcli.sequences.nuscenes.json_tables import read_rows
 from bevcli.sequences.true_lines import AREA, lines_in_area
 
 DIVIDER, CROSSING, BOUNDARY = LINE_CLASSES
@@ -42,44 +41,36 @@ class MapExpansion:
         if not self.folder.is_dir():
             return None
         file = self.folder / f"{self._locations.get(scene)}.json"
-        return self._map(file).lines(bev_from_world) if file.is_file() else None
+        return lines_around(self._map(file), bev_from_world) if file.is_file() else None
 
     @cached_property
     def _locations(self) -> Mapping[str, str]:
         """Name of a scene -> its location, such as "boston-seaport"."""
-        scenes, logs = self.tables / "scene.json", self.tables / "log.json"
-        rows, of_log = read_rows(scenes), read_rows(logs)
-        locations = dict(zip(texts(of_log, "token", logs), texts(of_log, "location", logs), strict=True))
-        pairs = zip(texts(rows, "name", scenes), texts(rows, "log_token", scenes), strict=True)
+        scenes = read_rows(self.tables / "scene.json")
+        locations = read_rows(self.tables / "log.json").by_token("location")
+        pairs = zip(scenes.texts("name"), scenes.texts("log_token"), strict=True)
         return {name: locations[log] for name, log in pairs if log in locations}
 
 
-@dataclass(frozen=True)
-class VectorMap:
-    """The shapes of one location in the world frame, each kind in a search tree.
+def lines_around(shapes: Mapping[str, STRtree], bev_from_world: Array) -> MapLines:
+    """The lines of `lines_in_area`. Crossings that touch are one; boundaries are those of all roads together."""
+    area = affine_transform(AREA, _on_the_ground(inverse(bev_from_world)))
+    found: list[tuple[str, BaseGeometry]] = []
+    for name, tree in shapes.items():
+        near = list(tree.geometries[tree.query(area, predicate="intersects")])
+        if name == DIVIDER or not near:
+            found += [(name, line) for line in near]
+        else:
+            found.append((name, union_all(near).boundary))
+    return lines_in_area((name, affine_transform(shape, _on_the_ground(bev_from_world))) for name, shape in found)
 
-    Attributes:
-        dividers: lines between lanes and between directions.
-        crossings: polygons of pedestrian crossings.
-        roads: polygons of road segments and lanes.
+
+def read_map(file: Path) -> dict[str, STRtree]:
+    """Read the map of one location (versions 1.0 to 1.3). Raises InputError.
+
+    Returns, by class of lines, search trees of shapes in the world frame: lines between lanes and between directions,
+    and polygons of pedestrian crossings and of roads.
     """
-
-    dividers: STRtree
-    crossings: STRtree
-    roads: STRtree
-
-    def lines(self, bev_from_world: Array) -> MapLines:
-        """The lines of `lines_in_area`. Crossings that touch are one; boundaries are those of all roads together."""
-        area = affine_transform(AREA, _on_the_ground(inverse(bev_from_world)))
-        found = [(DIVIDER, line) for line in _near(self.dividers, area)]
-        for name, tree in ((CROSSING, self.crossings), (BOUNDARY, self.roads)):
-            if polygons := _near(tree, area):
-                found.append((name, union_all(polygons).boundary))
-        return lines_in_area((name, affine_transform(shape, _on_the_ground(bev_from_world))) for name, shape in found)
-
-
-def read_map(file: Path) -> VectorMap:
-    """Read the map of one location (versions 1.0 to 1.3). Raises InputError."""
     content = read_json(file, largest=LARGEST_BYTES)
     try:
         nodes = {row["token"]: (float(row["x"]), float(row["y"])) for row in content["node"]}
@@ -90,11 +81,11 @@ def read_map(file: Path) -> VectorMap:
             name: [polygons[row["polygon_token"]] for row in content[name]]
             for name in ("ped_crossing", "road_segment", "lane")
         }
-        return VectorMap(
-            STRtree([LineString(points) for points in dividers if len(points) > 1]),
-            STRtree(shapes["ped_crossing"]),
-            STRtree(shapes["road_segment"] + shapes["lane"]),
-        )
+        return {
+            DIVIDER: STRtree([LineString(points) for points in dividers if len(points) > 1]),
+            CROSSING: STRtree(shapes["ped_crossing"]),
+            BOUNDARY: STRtree(shapes["road_segment"] + shapes["lane"]),
+        }
     except (KeyError, TypeError, ValueError, GEOSException) as error:
         raise InputError(
             f"{file}: {error!r:.80} (expected a map of nuScenes' map expansion): download it again"
@@ -110,10 +101,6 @@ def _polygon(row: Mapping[str, Any], nodes: Mapping[str, tuple[float, float]]) -
     holes = [_points(hole["node_tokens"], nodes) for hole in row["holes"] if len(hole["node_tokens"]) > 2]
     shape = Polygon(_points(row["exterior_node_tokens"], nodes), holes)
     return shape if shape.is_valid else shape.buffer(0)
-
-
-def _near(tree: STRtree, area: BaseGeometry) -> list[BaseGeometry]:
-    return list(tree.geometries[tree.query(area, predicate="intersects")])
 
 
 def _on_the_ground(transform: Array) -> Array:

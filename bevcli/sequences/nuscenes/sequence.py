@@ -1,24 +1,53 @@
-"""A nuScenes dataset root as a Sequence."""
+"""A nuScenes dataset root as a Sequence, with the rig, the poses and the CAN bus data of each scene."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from bevcli.errors import InputError
 from bevcli.frame import Frame, FrameStamp, Sequence
-from bevcli.geometry.transforms import Pose, inverse
+from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady
+from bevcli.geometry.ego_motion import EgoMotion, Kinematics, motion_of_keyframes
+from bevcli.geometry.transforms import Array, Pose, inverse
+from bevcli.sequences.files.calibration_file import LARGEST_SIZE, is_file_name
 from bevcli.sequences.images import ImageReader, ImageSource
 from bevcli.sequences.nuscenes.cache import open_index
 from bevcli.sequences.nuscenes.choice import chosen_scenes, keyframes, sweep_frames, tables_of
-from bevcli.sequences.nuscenes.dialect import NUSCENES, Dialect
 from bevcli.sequences.nuscenes.format import NuScenesOptions
-from bevcli.sequences.nuscenes.index import Images, Ints, Samples
+from bevcli.sequences.nuscenes.index import NUSCENES, Dialect, Images, Ints, NuScenesIndex, Samples, Sensors
+from bevcli.sequences.nuscenes.json_tables import read_rows
 from bevcli.sequences.nuscenes.map_expansion import MapExpansion
-from bevcli.sequences.nuscenes.scene import read_scene_facts, scene_rig
 from bevcli.sequences.options import SequenceOptions
+
+# The order of nuScenes' cameras in a rig. Other cameras follow, sorted by name.
+CAMERAS = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT")
+
+
+@dataclass(frozen=True)
+class CanBus:
+    """The T pose messages of a scene in the CAN bus expansion.
+
+    Attributes:
+        times_us: (T,) microseconds, increasing.
+        accelerations: (T, 3) m/s² with gravity, ego frame.
+        angular_rates: (T, 3) rad/s, ego frame.
+        velocities: (T, 3) m/s, ego frame.
+    """
+
+    times_us: NDArray[np.int64]
+    accelerations: Array
+    angular_rates: Array
+    velocities: Array
+
+    def kinematics_at(self, timestamp_ns: int) -> Kinematics:
+        """The first message after a time, or the last message. The published models were trained this way."""
+        row = min(int(np.searchsorted(self.times_us, timestamp_ns // 1000, side="right")), len(self.times_us) - 1)
+        return Kinematics(self.accelerations[row], self.angular_rates[row], self.velocities[row])
 
 
 @dataclass(frozen=True)
@@ -39,8 +68,7 @@ class TableSequence(Sequence):
         tables: the folder with the tables.
         common: the options of every format.
         dialect: the points in which the tables differ from nuScenes' own.
-        split: only the scenes of this split. None: all.
-        sweeps: whether images between the keyframes make frames too.
+        own: only the scenes of its split; whether images between the keyframes make frames too.
 
     Raises InputError if a table is missing or invalid, or the choice contains no scene.
     """
@@ -48,24 +76,17 @@ class TableSequence(Sequence):
     has_ego_motion = True
 
     def __init__(
-        self,
-        root: Path,
-        tables: Path,
-        common: SequenceOptions,
-        dialect: Dialect,
-        *,
-        split: str | None = None,
-        sweeps: bool = False,
+        self, root: Path, tables: Path, common: SequenceOptions, dialect: Dialect, own: NuScenesOptions
     ) -> None:
         common.refuse_static(root)
         self.root, self.tables, self.dialect = root, tables, dialect
         self.index, note = open_index(tables, dialect)
-        self.scenes = chosen_scenes(self.index, tables, split, common.scene)
-        self.rig = scene_rig(self.index, dialect, self.scenes[0])[0]
-        self._frames = tuple(self._find_frames(self.scenes, sweeps))
+        self.scenes = chosen_scenes(self.index, tables, own.split, common.scene)
+        self.rig = scene_rig(self.index, dialect, self.scenes[0])
+        self._frames = tuple(self._find_frames(own.sweeps))
         self.stamps = tuple(entry.stamp for entry in self._frames)
         self._images = ImageReader(strict=common.strict, inside=None if common.allow_outside else root)
-        self._facts = lru_cache(maxsize=2)(partial(read_scene_facts, self.index, root, dialect))
+        self._scene = lru_cache(maxsize=2)(self._read_scene)
         self.notes = (note,) if note else ()
 
     @property
@@ -77,13 +98,12 @@ class TableSequence(Sequence):
     def class_counts(self) -> Mapping[str, int]:
         first, categories = self.index.samples.first_annotation, self.index.annotations.categories
         found: Counter[bytes] = Counter()
-        for sample in (entry.sample for entry in self._frames if len(categories)):
-            if sample is not None:
-                found.update(categories[first[sample] : first[sample + 1]].tolist())
+        for sample in (entry.sample for entry in self._frames if entry.sample is not None):
+            found.update(categories[first[sample] : first[sample + 1]].tolist())
         counts: Counter[str] = Counter()
         for category, count in found.items():
-            name = self.dialect.class_of(category.decode())
-            counts.update({name: count} if name else {})
+            if name := self.dialect.class_of(category.decode()):
+                counts[name] += count
         return counts
 
     def image_files(self, place: int) -> tuple[Path, ...]:
@@ -96,28 +116,34 @@ class TableSequence(Sequence):
         return self._frame(self._frames[place], with_images=True)
 
     def _frame(self, entry: _FrameEntry, *, with_images: bool) -> Frame:
-        facts = self._facts(entry.scene)
-        rows = {facts.sensor_names[int(self.index.images.sensors[row])]: int(row) for row in entry.rows}
-        dropped = {name: "no image in sample_data.json" for name in facts.rig.names if name not in rows}
-        sources = {name: self._source(rows[name]) for name in facts.rig.names if name in rows and with_images}
-        images, dropped = self._images.read(sources, facts.rig, dropped)
+        rig, motion, kinematics = self._scene(entry.scene)
+        names = self.index.sensors.channels[self.index.images.sensors[entry.rows]]
+        rows = {str(name): int(row) for name, row in zip(names, entry.rows, strict=True)}
+        dropped = {name: "no image in sample_data.json" for name in rig.names if name not in rows}
+        sources = {name: self._source(rows[name]) for name in rig.names if name in rows and with_images}
+        images, dropped = self._images.read(sources, rig, dropped)
         sample, index = entry.sample, self.index
-        pose = facts.motion.pose_at(entry.stamp.timestamp_ns) if sample is None else _pose_of(index.samples, sample)
+        pose = motion.pose_at(entry.stamp.timestamp_ns) if sample is None else _pose_of(index.samples, sample)
         return Frame(
             stamp=entry.stamp,
-            rig=facts.rig,
+            rig=rig,
             images=images,
             world_from_ego=pose,
-            world_from_ego_at={n: _pose_of(index.images, rows[n]) if n in rows else pose for n in facts.rig.names},
-            kinematics=facts.kinematics_at(entry.stamp.timestamp_ns),
+            world_from_ego_at={n: _pose_of(index.images, rows[n]) if n in rows else pose for n in rig.names},
+            kinematics=kinematics.kinematics_at(entry.stamp.timestamp_ns),
             dropped=dropped,
             ground_truth=None if sample is None else index.ground_truth(sample, self.dialect.class_of),
             sample_token=None if sample is None else index.samples.tokens[sample].decode(),
         )
 
-    def _find_frames(self, scenes: Iterable[int], sweeps: bool) -> Iterable[_FrameEntry]:
+    def _read_scene(self, scene: int) -> tuple[CameraRig, EgoMotion, CanBus | EgoMotion]:
+        """Rig, poses and kinematics of a scene, by its row in the index; kinematics of the CAN bus, or of the poses."""
+        rig, motion = scene_rig(self.index, self.dialect, scene), scene_motion(self.index, scene)
+        return rig, motion, read_can_bus(self.root, str(self.index.scenes.names[scene])) or motion
+
+    def _find_frames(self, sweeps: bool) -> Iterable[_FrameEntry]:
         number = 0
-        for scene in scenes:
+        for scene in self.scenes:
             found = sweep_frames(self.index, scene) if sweeps else keyframes(self.index, scene)
             name = str(self.index.scenes.names[scene])
             for time_us, sample, rows in found:
@@ -141,7 +167,7 @@ class NuScenesSequence(TableSequence):
         self, root: Path, common: SequenceOptions = SequenceOptions(), own: NuScenesOptions = NuScenesOptions()
     ) -> None:
         tables = tables_of(root, own.version)
-        super().__init__(root, tables, common, NUSCENES, split=own.split, sweeps=own.sweeps)
+        super().__init__(root, tables, common, NUSCENES, own)
         self.name = common.scene or own.split or tables.name
         self._maps = MapExpansion(root, tables) if common.ground_truth else None
         note = self._can_bus_note()
@@ -163,5 +189,55 @@ class NuScenesSequence(TableSequence):
         return f"{which}: no CAN bus data in {self.root / 'can_bus'}; kinematics are derived from the poses"
 
 
-def _pose_of(table: Images | Samples, row: int) -> Pose:
+def _pose_of(table: Images | Samples | Sensors, row: int) -> Pose:
     return Pose(np.array(table.translations[row]), np.array(table.quaternions[row]))
+
+
+def scene_rig(index: NuScenesIndex, dialect: Dialect, scene: int) -> CameraRig:
+    """The rig of a scene. Raises InputError."""
+    first, last = index.scenes.first_image[scene : scene + 2]
+    sensors, rows = np.unique(index.images.sensors[first:last], return_index=True)
+    cameras = [_camera(index, int(sensor), first + row) for sensor, row in zip(sensors, rows, strict=True)]
+    cameras.sort(key=lambda camera: (CAMERAS.index(camera.name) if camera.name in CAMERAS else 99, camera.name))
+    if len({camera.name for camera in cameras}) < len(cameras):
+        raise InputError(f"scene {index.scenes.names[scene]}: a camera changes its calibration within the scene")
+    if dialect.ego_from_bev is not None:
+        return CameraRig(tuple(cameras), dialect.ego_from_bev, ego_from_bev_assumed=True)
+    lidar = int(index.samples.lidars[index.scenes.first_sample[scene]])
+    return CameraRig(tuple(cameras), _pose_of(index.sensors, lidar).matrix)
+
+
+def scene_motion(index: NuScenesIndex, scene: int) -> EgoMotion:
+    """A scene's poses at the times of its keyframes and images, see `motion_of_keyframes`."""
+    samples, images = index.samples, index.images
+    keys = slice(*index.scenes.first_sample[scene : scene + 2])
+    rows = slice(*index.scenes.first_image[scene : scene + 2])
+    return motion_of_keyframes(
+        (samples.times_us[keys] * 1000, samples.translations[keys], samples.quaternions[keys]),
+        (images.times_us[rows] * 1000, images.translations[rows], images.quaternions[rows]),
+    )
+
+
+def read_can_bus(root: Path, scene: str) -> CanBus | None:
+    """A scene's messages, None if the expansion does not have them. Raises InputError for an invalid file."""
+    path = root / "can_bus" / f"{scene}_pose.json"
+    if not path.is_file():
+        return None
+    rows = read_rows(path)
+    if not rows:
+        return None
+    times = rows.integers("utime")
+    quantities = [rows.vectors(name, 3) for name in ("accel", "rotation_rate", "vel")]
+    order = np.argsort(times, kind="stable")
+    return CanBus(times[order], *(values[order] for values in quantities))
+
+
+def _camera(index: NuScenesIndex, sensor: int, image: int) -> Camera:
+    width, height = (int(value) for value in index.images.sizes[image])
+    name = str(index.sensors.channels[sensor])
+    if not is_file_name(name) or not 0 < min(width, height) <= max(width, height) <= LARGEST_SIZE:
+        raise InputError(
+            f'camera "{name:.60}": expected a name without a slash and an image size, found {width}x{height}'
+        )
+    intrinsics, lens = np.array(index.sensors.intrinsics[sensor]), brown_conrady(index.sensors.distortions[sensor])
+    return Camera(name, width, height, intrinsics, _pose_of(index.sensors, sensor).matrix, lens)

@@ -1,23 +1,25 @@
 """Writes a drive as a nuScenes root."""
 
+import hashlib
 import json
 from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import cv2
 import numpy as np
 
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import CameraImage, Frame, Sequence
-from bevcli.geometry.cameras import Camera
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.cameras import Camera, CameraRig, same_rig
 from bevcli.geometry.ego_motion import Kinematics
-from bevcli.geometry.transforms import Pose
+from bevcli.geometry.transforms import Array, Pose
 from bevcli.sequences.files.calibration_file import is_file_name
 from bevcli.sequences.nuscenes.format import versions_in
-from bevcli.sequences.nuscenes.new_tables import LIDAR, NewTables, Row
+from bevcli.sequences.nuscenes.index import CLASS_OF_CATEGORY, NUSCENES
+from bevcli.sequences.nuscenes.json_tables import Row
 from bevcli.sequences.options import WriteOptions
 from bevcli.writing import remove_parts, whole_folder, write_whole
 
@@ -25,6 +27,15 @@ VERSION = "v1.0-custom"
 PARTS = (VERSION, "samples", "maps", "can_bus")  # what the writer creates and `force` removes
 MAP_FILE = "maps/empty.png"
 SUFFIXES = {"image/jpeg": "jpg", "image/png": "png"}
+(LIDAR,) = NUSCENES.lidars  # its pose is that of the bev frame
+# scene.json is the last: it makes a folder a nuScenes root.
+TABLES = (
+    "attribute", "calibrated_sensor", "category", "ego_pose", "instance", "log", "map", "sample", "sample_annotation",
+    "sample_data", "sensor", "visibility", "scene",
+)  # fmt: skip
+CATEGORY_OF_CLASS = {name: category for category, name in reversed(CLASS_OF_CATEGORY.items())}
+VISIBILITIES = {"v0-40": 0.4, "v40-60": 0.6, "v60-80": 0.8, "v80-100": 1.0}  # level -> its upper end
+NO_POINTS_KNOWN = -1
 
 
 class NuScenesWriter:
@@ -72,10 +83,8 @@ class NuScenesWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._open.__exit__(kind, error, trace)
+    def __exit__(self, *error: Any) -> None:
+        self._open.__exit__(*error)
 
     def _write_image(self, sample: str, camera: Camera, image: CameraImage) -> str:
         """Write an image; returns its path relative to the root."""
@@ -124,3 +133,135 @@ def _make_room(root: Path, force: bool) -> None:
             way = "choose another folder" if others else "choose another folder, or pass `force=True` to replace it"
             raise OutputError(f"{root}: exists already: {way}")
         remove_parts(root, PARTS)
+
+
+class NewTables:
+    """Collects the rows of the tables of a root that is written. Tokens are the same for the same drive.
+
+    Attributes:
+        rows: table -> rows, in the order of TABLES; complete after `finish`.
+    """
+
+    def __init__(self, log: str) -> None:
+        """log: name of the drive."""
+        self.rows: dict[str, list[Row]] = {name: [] for name in TABLES}
+        self._log = log
+        self._known: set[str] = set()  # tokens of rows that several frames share
+        self._rigs: dict[str, CameraRig] = {}  # by scene
+        self._samples: dict[str, list[Row]] = {}  # by scene
+        self._streams: dict[tuple[str, str], list[Row]] = {}  # sample_data by scene and channel
+        self._objects: dict[str, list[Row]] = {}  # annotations by instance
+
+    def add_sample(self, scene: str, time_us: int, rig: CameraRig) -> str:
+        """Add a sample, and return its token. Raises InputError for another rig or a time that is not later."""
+        samples = self._samples.setdefault(scene, [])
+        if samples and time_us <= samples[-1]["timestamp"]:
+            raise InputError(f"scene {scene}: a frame at {time_us} us is not later than the one before it")
+        if not same_rig(self._rigs.setdefault(scene, rig), rig):
+            raise InputError(
+                f"scene {scene}: the calibration of the frame at {time_us} us differs from the first one's"
+            )
+        sample = token("sample", scene, time_us)
+        row = {"token": sample, "timestamp": time_us, "scene_token": token("scene", scene)}
+        self._add("sample", row, samples)
+        return sample
+
+    def add_data(self, scene: str, sample: str, file: str, time_us: int, pose: Pose, camera: Camera | None) -> None:
+        """Add a file of a sample, taken with the vehicle at a pose. camera: None for LIDAR_TOP."""
+        channel = LIDAR if camera is None else camera.name
+        own = token("data", sample, channel)
+        self.rows["ego_pose"].append({"token": own, "timestamp": time_us, **_pose_of(pose)})
+        row = {
+            "token": own,
+            "sample_token": sample,
+            "ego_pose_token": own,
+            "calibrated_sensor_token": token("calibrated", scene, channel),
+            "timestamp": time_us,
+            "fileformat": "pcd" if camera is None else file.rpartition(".")[2],
+            "is_key_frame": True,
+            "height": 0 if camera is None else camera.height,
+            "width": 0 if camera is None else camera.width,
+            "filename": file,
+        }
+        self._add("sample_data", row, self._streams.setdefault((scene, channel), []))
+
+    def add_annotations(self, scene: str, sample: str, boxes: Boxes3D) -> None:
+        """Add the boxes of a sample, in the world frame."""
+        identities = [""] * len(boxes) if boxes.instances is None else boxes.instances.tolist()
+        for k, identity in enumerate(identities):
+            name = str(boxes.classes[k])
+            category = CATEGORY_OF_CLASS.get(name, name)
+            instance = token("instance", scene, identity or f"{sample} {k}", category)
+            group = self._share("category", token("category", category), name=category, description=name)
+            self._share("instance", instance, category_token=group)
+            attribute = "" if boxes.attributes is None else str(boxes.attributes[k])
+            if attribute:
+                self._share("attribute", token("attribute", attribute), name=attribute, description="")
+            row = {
+                "token": token("annotation", sample, k),
+                "sample_token": sample,
+                "instance_token": instance,
+                "visibility_token": _visibility(None if boxes.visibilities is None else boxes.visibilities[k]),
+                "attribute_tokens": [token("attribute", attribute)] if attribute else [],
+                "translation": boxes.centers[k].tolist(),
+                "size": boxes.sizes_lwh[k][[1, 0, 2]].tolist(),
+                "rotation": [float(np.cos(boxes.yaws[k] / 2)), 0.0, 0.0, float(np.sin(boxes.yaws[k] / 2))],
+                "num_lidar_pts": NO_POINTS_KNOWN if boxes.num_points is None else int(boxes.num_points[k]),
+                "num_radar_pts": 0,
+            }
+            self._add("sample_annotation", row, self._objects.setdefault(instance, []))
+
+    def finish(self, map_file: str) -> None:
+        """Add the rows that need all samples. map_file: image of the map."""
+        for row in self.rows["instance"]:
+            found = self._objects[row["token"]]
+            row["nbr_annotations"] = len(found)
+            row["first_annotation_token"], row["last_annotation_token"] = found[0]["token"], found[-1]["token"]
+        for number, level in enumerate(VISIBILITIES, 1):
+            self._share("visibility", str(number), level=level, description="visible share in percent")
+        log = self._share("log", token("log", self._log), logfile="", vehicle="", date_captured="", location=self._log)
+        self._share("map", token("map", self._log), category="", filename=map_file, log_tokens=[log])
+        for scene, samples in self._samples.items():
+            first, last = samples[0]["token"], samples[-1]["token"]
+            ends = {"first_sample_token": first, "last_sample_token": last, "nbr_samples": len(samples)}
+            self._share("scene", token("scene", scene), log_token=log, name=scene, description="", **ends)
+            self._add_sensors(scene, self._rigs[scene])
+
+    def _add_sensors(self, scene: str, rig: CameraRig) -> None:
+        sensors: list[tuple[str, str, Array, list[Any]]] = [(LIDAR, "lidar", rig.ego_from_bev, [])]
+        sensors += [(one.name, "camera", one.ego_from_camera, one.intrinsics.tolist()) for one in rig.cameras]
+        for channel, modality, ego_from_sensor, intrinsics in sensors:
+            sensor = self._share("sensor", token("sensor", channel), channel=channel, modality=modality)
+            own, pose = token("calibrated", scene, channel), _pose_of(Pose.from_matrix(ego_from_sensor))
+            self._share("calibrated_sensor", own, sensor_token=sensor, camera_intrinsic=intrinsics, **pose)
+
+    def _add(self, table: str, row: Row, chain: list[Row]) -> None:
+        """Add a row to a table, linked with the last one of a chain in order of time, which it extends."""
+        row |= {"prev": chain[-1]["token"] if chain else "", "next": ""}
+        if chain:
+            chain[-1]["next"] = row["token"]
+        self.rows[table].append(row)
+        chain.append(row)
+
+    def _share(self, table: str, own: str, **columns: Any) -> str:
+        """Add a row that several frames refer to once; returns its token."""
+        if own not in self._known:
+            self._known.add(own)
+            self.rows[table].append({"token": own, **columns})
+        return own
+
+
+def token(*parts: object) -> str:
+    """32 hexadecimal digits that stand for these parts."""
+    return hashlib.sha256("\0".join(map(str, parts)).encode()).hexdigest()[:32]
+
+
+def _visibility(fraction: float | None) -> str:
+    """The token of a visible fraction's level, "" if it is unknown."""
+    if fraction is None or np.isnan(fraction):
+        return ""
+    return next(str(number) for number, end in enumerate(VISIBILITIES.values(), 1) if fraction <= end)
+
+
+def _pose_of(pose: Pose) -> Row:
+    return {"rotation": pose.quaternion.tolist(), "translation": pose.translation.tolist()}

@@ -5,9 +5,9 @@ import re
 import threading
 from collections.abc import Iterator, Sequence as Indices
 from contextlib import contextmanager
-from itertools import groupby
+from functools import cache
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,10 @@ from bevcli.parsing.documents import read_yaml
 from bevcli.parsing.files import MIB, decompressed
 from bevcli.printing import reason_of
 from bevcli.sequences.ros.format import METADATA, SUFFIXES
-from bevcli.sequences.ros.messages import Decode, Topic, decoder
+from bevcli.sequences.ros.messages import decoder
+
+if TYPE_CHECKING:
+    from bevcli.sequences.ros.storage import McapFile, SqliteFile
 
 SPLIT_NUMBER = re.compile(r"_\d+$")  # rosbag2 numbers the files of a recording: drive_0.mcap, drive_1.mcap
 LARGEST_MESSAGE = 256 * MIB  # bytes after decompression
@@ -36,21 +39,6 @@ def _broken_files_refused(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: is damaged ({reason:.200})") from None
 
 
-class BagFile(Protocol):
-    """One file of a bag: `McapFile` or `SqliteFile`. topics: by name. notes: for the user about the file."""
-
-    topics: dict[str, Topic]
-    notes: tuple[str, ...]
-
-    def times(self, topic: str) -> NDArray[np.int64]:
-        """(N,) log times of a topic's messages in order, ns."""
-        ...
-
-    def read(self, topic: str, index: int) -> bytes:
-        """The bytes of a message."""
-        ...
-
-
 class Bag:
     """A recording of one or more files. Messages are numbered by topic, in order of time. Safe to use from threads.
 
@@ -65,8 +53,7 @@ class Bag:
             self.file_paths = tuple(self._file_paths())
             self._files = [_open_file(file) for file in self.file_paths]
         self.topics = {name: topic for file in self._files for name, topic in sorted(file.topics.items())}
-        self._decoders: dict[str, Decode] = {}
-        self._times: dict[str, NDArray[np.int64]] = {}
+        self._decoder = cache(lambda topic: decoder(self.topics[topic]))
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -75,20 +62,14 @@ class Bag:
 
     def times(self, topic: str) -> NDArray[np.int64]:
         """(N,) log times of a topic's messages, ns. They come from the index."""
-        if topic not in self._times:
-            with self._lock, _broken_files_refused(self.path):
-                parts = [file.times(topic) for file in self._files if topic in file.topics]
-            self._times[topic] = np.concatenate([np.zeros(0, dtype=np.int64), *parts])
-        return self._times[topic]
+        with self._lock, _broken_files_refused(self.path):
+            parts = [file.times(topic) for file in self._files if topic in file.topics]
+        return np.concatenate([np.zeros(0, dtype=np.int64), *parts])
 
     def message(self, topic: str, index: int) -> Any:
         """Message `index` of a topic, from 0. Raises InputError if it is broken."""
-        with _broken_files_refused(self.path):
-            data = self._bytes(topic, index)
         with self._lock, _broken_files_refused(self.path):
-            if topic not in self._decoders:
-                self._decoders[topic] = decoder(self.topics[topic])
-            decode = self._decoders[topic]
+            data, decode = self._bytes(topic, index), self._decoder(topic)
         try:
             return decode(data)
         except Exception as error:  # the decoders of the packages raise errors of many types for broken bytes
@@ -96,13 +77,12 @@ class Bag:
             raise InputError(f"{self.path}: {topic}: message {index} cannot be decoded ({reason:.200})") from None
 
     def _bytes(self, topic: str, index: int) -> bytes:
-        with self._lock:
-            for file in self._files:
-                count = len(file.times(topic)) if topic in file.topics else 0
-                if index < count:
-                    data = file.read(topic, index)
-                    return decompressed("zstd", data, LARGEST_MESSAGE) if self._compression == "message" else data
-                index -= count
+        for file in self._files:
+            count = len(file.times(topic)) if topic in file.topics else 0
+            if index < count:
+                data = file.read(topic, index)
+                return decompressed("zstd", data, LARGEST_MESSAGE) if self._compression == "message" else data
+            index -= count
         raise IndexError(f"{topic} has no message {index}")
 
     def _file_paths(self) -> list[Path]:
@@ -127,8 +107,6 @@ class Bag:
 
 def _metadata(path: Path) -> dict[str, Any]:
     """The statements of metadata.yaml; empty without the file, which a recording that was cut off does not have."""
-    if not path.is_file():
-        return {}
     try:
         document = read_yaml(path)
     except InputError:
@@ -137,21 +115,18 @@ def _metadata(path: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def _open_file(path: Path) -> BagFile:
-    if not all(map(_is_installed, PACKAGES)):
+def _open_file(path: Path) -> "McapFile | SqliteFile":
+    try:
+        installed = all(map(importlib.util.find_spec, PACKAGES))
+    except ModuleNotFoundError:  # the package around one of them
+        installed = False
+    if not installed:
         raise InputError(f"{path}: ROS bags need the packages of an extra: run pip install 'bevcli[ros]'")
     from bevcli.sequences.ros.storage import McapFile, SqliteFile
 
     if not path.stat().st_size:
         raise InputError(f"{path}: the file is empty")
     return McapFile(path) if path.suffix == ".mcap" else SqliteFile(path)
-
-
-def _is_installed(name: str) -> bool:
-    try:
-        return importlib.util.find_spec(name) is not None
-    except ModuleNotFoundError:  # the package around it
-        return False
 
 
 def _number(file: Path) -> tuple[int, str]:
@@ -161,4 +136,5 @@ def _number(file: Path) -> tuple[int, str]:
 
 def spread(count: int, wanted: int) -> Indices[int]:
     """Up to `wanted` different indices below `count`, evenly spread, with the first and the last."""
-    return [key for key, _ in groupby(np.linspace(0, count - 1, min(count, wanted)).astype(int).tolist())]
+    indices: list[int] = np.unique(np.linspace(0, count - 1, min(count, wanted)).astype(int)).tolist()
+    return indices

@@ -13,7 +13,7 @@ from bevcli.geometry.ego_motion import EgoMotion, Kinematics, derive_kinematics
 from bevcli.geometry.geographic import GeoOrigin
 from bevcli.geometry.transforms import Array, Pose, interpolate, inverse, rigid
 from bevcli.sequences.ros.bag import Bag, spread
-from bevcli.sequences.ros.messages import Transform, pose_of, short_type, timestamp_ns, transforms_of
+from bevcli.sequences.ros.messages import Transform, pose_of, timestamp_ns, transforms_of
 
 SAMPLED_MESSAGES = 200  # from the start of each topic with transforms: enough to see every frame once
 Sample = tuple[int, Pose]  # time ns, pose at that time
@@ -45,25 +45,22 @@ class TransformTree:
 
     def path_up(self, frame: str) -> list[str]:
         """A frame and its ancestors, the root last."""
-        path = [frame]
-        while path[-1] in self._parents and self._parents[path[-1]][0] not in path:
-            path.append(self._parents[path[-1]][0])
-        return path
+        return list(self._up(frame))
 
     def between(self, a: str, b: str) -> Array | None:
         """(4, 4) a_from_b in metres, None if the tree does not connect the frames."""
-        up_a, up_b = self.path_up(a), self.path_up(b)
+        up_a, up_b = self._up(a), self._up(b)
         common = next((frame for frame in up_b if frame in up_a), None)
-        if common is None:
-            return None
-        return inverse(self._down(up_a[: up_a.index(common)])) @ self._down(up_b[: up_b.index(common)])
+        return None if common is None else inverse(up_a[common]) @ up_b[common]
 
-    def _down(self, frames: list[str]) -> Array:
-        """(4, 4) ancestor_from_frame along frames, of which each is the child of the next."""
-        matrix = rigid()
-        for frame in frames:
-            matrix = self._parents[frame][1] @ matrix
-        return matrix
+    def _up(self, frame: str) -> dict[str, Array]:
+        """(4, 4) ancestor_from_frame of a frame and of its ancestors, the root last."""
+        found = {frame: rigid()}
+        while frame in self._parents and self._parents[frame][0] not in found:
+            parent, parent_from_child = self._parents[frame]
+            found[parent] = parent_from_child @ found[frame]
+            frame = parent
+        return found
 
 
 def read_transforms(bag: Bag, topic: str, indices: Iterable[int]) -> list[Transform]:
@@ -221,10 +218,8 @@ def _at(samples: list[Sample], time: int) -> Pose:
     """The pose of one link at a time; outside of its samples, the nearest."""
     times = [stamp for stamp, _ in samples]
     later = bisect_left(times, time)
-    if later == len(times):
-        return samples[-1][1]
-    if later == 0 or times[later] == time:
-        return samples[later][1]
+    if later in (0, len(times)) or times[later] == time:
+        return samples[min(later, len(times) - 1)][1]
     earlier = later - 1
     fraction = (time - times[earlier]) / (times[later] - times[earlier])
     return interpolate(samples[earlier][1], samples[later][1], fraction)
@@ -276,9 +271,7 @@ def find_geo_origin(bag: Bag, motion: EgoMotion | BagEgoMotion | None) -> GeoOri
     as the vehicle's origin. None without poses, without a valid position, or if the vehicle is too far from the
     world's origin.
     """
-    topics = [
-        name for name, topic in bag.topics.items() if short_type(topic.type_name) in FIX_TYPES and len(bag.times(name))
-    ]
+    topics = [name for name, topic in bag.topics.items() if topic.short_type in FIX_TYPES and len(bag.times(name))]
     if motion is None or not topics:
         return None
     times = bag.times(topics[0])

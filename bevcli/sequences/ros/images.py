@@ -6,6 +6,7 @@ OpenCV decodes files only. So the packets from a keyframe to the next are writte
 import struct
 import tempfile
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +65,7 @@ def _read_message(bag: Bag, topic: str, index: int, time_ns: int, name: str) -> 
         raise UnreadableImage(str(error)) from None
     time, data = timestamp_ns(message) or time_ns, payload(message)
     if hasattr(message, "encoding"):
-        return CameraImage(time, raw_pixels(message, data, name))
+        return CameraImage(time, _raw_pixels(message, data, name))
     pixels = decode(data)
     if pixels is None:
         raise UnreadableImage(f"{name} is not a complete image")
@@ -72,7 +73,7 @@ def _read_message(bag: Bag, topic: str, index: int, time_ns: int, name: str) -> 
     return CameraImage(time, pixels, data if media_type else None, media_type)
 
 
-def raw_pixels(message: Any, data: bytes, where: str) -> NDArray[np.uint8]:
+def _raw_pixels(message: Any, data: bytes, where: str) -> NDArray[np.uint8]:
     """(H, W, 3) uint8 BGR of a sensor_msgs/Image or foxglove.RawImage.
 
     Raises InputError for an encoding that is not supported, and UnreadableImage if bytes are missing.
@@ -158,7 +159,7 @@ def is_keyframe(packet: bytes, video_format: str) -> bool:
     if video_format == "vp9":
         return bool(packet) and _is_vp9_keyframe(packet[0])
     if video_format == "av1":
-        return bool(packet) and any(kind == 1 for kind in _av1_units(packet))  # a sequence header
+        return 1 in _av1_units(packet)  # a sequence header
     heads = [unit[0] for unit in packet.split(b"\x00\x00\x01")[1:] if unit]  # first bytes of NAL units in Annex B
     if video_format == "h264":
         return any(head & 0x1F == 7 for head in heads)  # a parameter set, as for H.265
@@ -172,13 +173,12 @@ def _is_vp9_keyframe(first: int) -> bool:
     return not (first >> shift) & 1 and not (first >> (shift - 1)) & 1
 
 
-def _av1_units(packet: bytes) -> list[int]:
+def _av1_units(packet: bytes) -> Iterator[int]:
     """The types of the open bitstream units of an AV1 packet."""
-    kinds = []
     at = 0
     while at < len(packet):
         head = packet[at]
-        kinds.append((head >> 3) & 0xF)
+        yield (head >> 3) & 0xF
         at += 2 if head & 4 else 1
         if not head & 2:
             break
@@ -190,7 +190,6 @@ def _av1_units(packet: bytes) -> list[int]:
             if not packet[at - 1] & 0x80:
                 break
         at += size
-    return kinds
 
 
 def _file_of(packets: list[bytes], video_format: str) -> bytes:

@@ -20,7 +20,8 @@ from bevcli.parsing.documents import parse_json
 from bevcli.sequences.files.calibration_file import COEFFICIENT_COUNTS
 
 Kind = Literal["image", "video", "calibration", "transforms", "pose"]
-# The types by what they are used for; names without "msg/", and "foxglove" for foxglove_msgs, too.
+# The types by what they are used for, of each kind the preferred one first. Names without "msg/", and "foxglove" for
+# foxglove_msgs, too.
 KINDS: dict[str, Kind] = {
     "sensor_msgs/CompressedImage": "image",
     "foxglove/CompressedImage": "image",
@@ -34,9 +35,9 @@ KINDS: dict[str, Kind] = {
     "foxglove/FrameTransform": "transforms",
     "foxglove/FrameTransforms": "transforms",
     "nav_msgs/Odometry": "pose",
-    "geometry_msgs/PoseStamped": "pose",
-    "geometry_msgs/PoseWithCovarianceStamped": "pose",
     "foxglove/PoseInFrame": "pose",
+    "geometry_msgs/PoseWithCovarianceStamped": "pose",
+    "geometry_msgs/PoseStamped": "pose",
 }
 LENSES = {
     "plumb_bob": "brown_conrady",
@@ -65,6 +66,12 @@ class Topic:
     encoding: str
     schema: str = ""
     definition: bytes = b""
+
+    @property
+    def short_type(self) -> str:
+        """The name of the type as in KINDS: "sensor_msgs/msg/Image" -> "sensor_msgs/Image"."""
+        name = self.type_name.replace("/msg/", "/").replace("foxglove_msgs/", "foxglove/")
+        return name.replace("foxglove.", "foxglove/")
 
 
 def decoder(topic: Topic) -> Decode:
@@ -114,11 +121,6 @@ def _protobuf(topic: Topic) -> Decode:
     except (DecodeError, KeyError, TypeError) as error:
         raise InputError(f"{topic.name}: the definition of {topic.type_name} cannot be read ({error})") from None
     return message.FromString
-
-
-def short_type(name: str) -> str:
-    """The name of a type as in KINDS: "sensor_msgs/msg/Image" -> "sensor_msgs/Image"."""
-    return name.replace("/msg/", "/").replace("foxglove_msgs/", "foxglove/").replace("foxglove.", "foxglove/")
 
 
 @dataclass(frozen=True)

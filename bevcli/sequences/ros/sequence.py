@@ -1,7 +1,7 @@
 """A ROS 2 bag or an MCAP file as a Sequence."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -61,24 +61,21 @@ class RosSequence(Sequence):
         self._bag = Bag(path)
         rig, facts, file, beside = _files_beside(path.parent if path.is_file() else path, rig, common, own)
         finder = TopicFinder(self._bag, stated, rig.names if rig else None)
-        static, changing = sampled_transforms(self._bag, finder.of_kind("transforms"))
-        tree = TransformTree([*static, *changing])
-        reader = _VehicleReader(self._bag, finder, stated, tree)
+        reader = _VehicleReader(self._bag, finder, stated)
         self.rig = reader.rig() if rig is None else rig
-        motion = reader.motion(common.ego_motion, file)
-        self._motion = motion.poses
-        self.has_ego_motion = motion.poses is not None
-        self.facts = replace(facts, geo_origin=facts.geo_origin or find_geo_origin(self._bag, motion.poses))
+        self._motion, source, motion_notes = reader.motion(common.ego_motion, file)
+        self.has_ego_motion = self._motion is not None
+        self.facts = replace(facts, geo_origin=facts.geo_origin or find_geo_origin(self._bag, self._motion))
         self._entries, gaps = _covered(_entries(self._bag, finder.cameras), self._motion, path)
         self.stamps = tuple(entry.stamp for entry in self._entries)
         self.notes = (
-            finder.table(motion.source),
+            finder.table(source),
             *self._bag.notes,
             *beside,
             *reader.notes,
             *(f"{name} is not used: no CameraInfo belongs to it" for name in finder.left_out),
             *rig_notes(self.rig, "the calibration" if rig else "a bag"),
-            *motion.notes,
+            *motion_notes,
             *gaps,
         )
         self._images = ImageReader(strict=common.strict)
@@ -107,20 +104,13 @@ def _files_beside(
     return found if rig is None else rig, facts, file, notes
 
 
-@dataclass(frozen=True)
-class _Motion:
-    """The poses and their origin. poses: None without any. source: the topic, "" if it is none."""
-
-    poses: EgoMotion | BagEgoMotion | None
-    source: str
-    notes: tuple[str, ...] = ()
-
-
 class _VehicleReader:
     """Reads the rig of a bag, from CameraInfo and the transforms to the vehicle, and the vehicle's poses."""
 
-    def __init__(self, bag: Bag, finder: TopicFinder, stated: StatedTopics, tree: TransformTree) -> None:
-        self._bag, self._finder, self._stated, self._tree = bag, finder, stated, tree
+    def __init__(self, bag: Bag, finder: TopicFinder, stated: StatedTopics) -> None:
+        self._bag, self._finder, self._stated = bag, finder, stated
+        static, changing = sampled_transforms(bag, finder.of_kind("transforms"))
+        self._tree, self._moving = TransformTree([*static, *changing]), {one.child for one in changing}
         self.notes: list[str] = []
         self.ego_frame = stated.ego_frame
 
@@ -185,46 +175,48 @@ class _VehicleReader:
         lens = None if topics.is_rectified else info.distortion
         return Camera(topics.camera, info.width, info.height, info.intrinsics, ego_from_camera, lens)
 
-    def motion(self, use: EgoMotionUse, file: Path | None) -> _Motion:
-        """The poses of a file, a topic or the transforms. Raises InputError if they are required and not found."""
+    def motion(
+        self, use: EgoMotionUse, file: Path | None
+    ) -> tuple[EgoMotion | BagEgoMotion | None, str, tuple[str, ...]]:
+        """The poses of a file, a topic or the transforms, None without any; their topic, "" for none; and notes.
+
+        Raises InputError if poses are required and not found.
+        """
         if use == "static":
-            return _Motion(None, "", ("the vehicle is assumed to stand still (poses in the bag are not read)",))
+            return None, "", ("the vehicle is assumed to stand still (poses in the bag are not read)",)
         if file is not None:
-            return _Motion(read_ego_motion(file), "")
+            return read_ego_motion(file), "", ()
         ego_frame = self.ego_frame or next((name for name in EGO_FRAMES if name in self._tree.frames), EGO_FRAMES[0])
         topic = self._finder.pose_topic()
         if topic is not None:
             child = pose_of(self._bag.message(topic, 0)).child
-            child_from_ego = self._tree.between(child, ego_frame) if child and child != ego_frame else None
-            notes: tuple[str, ...] = ()
-            if child and child != ego_frame and child_from_ego is None:
-                notes = (f'{topic} has poses of "{child}", which are taken as those of "{ego_frame}"',)
-            return _Motion(motion_from_poses(self._bag, topic, child_from_ego), topic, notes)
-        changing = [name for name in self._finder.of_kind("transforms") if not is_static(name)]
-        path = self._moving_path(ego_frame, changing)
+            is_other = child not in ("", ego_frame)
+            child_from_ego = self._tree.between(child, ego_frame) if is_other else None
+            note = f'{topic} has poses of "{child}", which are taken as those of "{ego_frame}"'
+            notes = (note,) if is_other and child_from_ego is None else ()
+            return motion_from_poses(self._bag, topic, child_from_ego), topic, notes
+        path = self._moving_path(ego_frame)
         if len(path) > 1:
+            changing = [name for name in self._finder.of_kind("transforms") if not is_static(name)]
             child_from_ego = None if path[0] == ego_frame else self._tree.between(path[0], ego_frame)
-            poses = motion_from_transforms(self._bag, changing, path[::-1], child_from_ego)
-            return _Motion(poses, changing[0])
+            return motion_from_transforms(self._bag, changing, path[::-1], child_from_ego), changing[0], ()
         if use == "required":
             raise InputError(
                 f"{self._bag.path}: has no poses of the vehicle: no Odometry or PoseStamped, and no transform that "
                 f'moves "{ego_frame}" ({self._finder.seen()}): pass `ego_motion_file=FILE`, `ego_motion="static"` if '
                 "the vehicle stands, or `temporal=False` to run without history"
             )
-        return _Motion(None, "", ("the bag has no poses of the vehicle: boxes are in the ego frame",))
+        return None, "", ("the bag has no poses of the vehicle: boxes are in the ego frame",)
 
-    def _moving_path(self, ego_frame: str, topics: list[str]) -> list[str]:
+    def _moving_path(self, ego_frame: str) -> list[str]:
         """Frames from the vehicle's to the world's, with links that move; a single one if there are none."""
-        moving = {one.child for one in sampled_transforms(self._bag, topics)[1]}
         path = self._tree.path_up(ego_frame)
         if self._stated.world_frame in path:
             path = path[: path.index(self._stated.world_frame) + 1]
-        while len(path) > 1 and path[-2] not in moving:  # static links above the topmost moving one only move the world
-            path.pop()
-        while len(path) > 1 and path[0] not in moving:  # static links below the lowest moving one
-            path.pop(0)
-        return path if all(frame in moving for frame in path[:-1]) else path[:1]
+        moving = [place for place, frame in enumerate(path[:-1]) if frame in self._moving]
+        # Static links above the topmost moving one only move the world; those below the lowest belong to the vehicle.
+        path = path[moving[0] : moving[-1] + 2] if moving else path[:1]
+        return path if len(path) == len(moving) + 1 else path[:1]
 
 
 def _entries(bag: Bag, cameras: tuple[CameraTopics, ...]) -> tuple[FrameEntry, ...]:
@@ -240,11 +232,9 @@ def _entries(bag: Bag, cameras: tuple[CameraTopics, ...]) -> tuple[FrameEntry, .
     }
     topics = {one.camera: one.images for one in cameras}
     entries: list[FrameEntry] = []
-    last = None
     for place, time in enumerate(times[leading].tolist()):
-        if last is not None and time <= last:
+        if entries and time <= entries[-1].stamp.timestamp_ns:
             continue  # a message that was recorded twice
-        last = time
         sources: dict[str, Source] = {}
         dropped = {}
         for name, own in times.items():

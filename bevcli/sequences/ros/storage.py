@@ -5,9 +5,9 @@ import sqlite3
 import struct
 from collections import OrderedDict
 from collections.abc import Iterator
+from functools import cache, cached_property
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
@@ -19,24 +19,25 @@ from mcap.summary import Summary
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.parsing.files import MIB, decompressed
+from bevcli.parsing.files import MIB, decompressed, open_regular
 from bevcli.sequences.ros.messages import Topic
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence number, log time, publish time
-CACHE_BYTES = 256 * 2**20  # of decompressed chunks
-LARGEST_CHUNK = 512 * 2**20  # bytes after decompression
+CACHE_BYTES = 256 * MIB  # of decompressed chunks
+LARGEST_CHUNK = 512 * MIB  # bytes after decompression
 NO_CHUNK = -1  # the message lies outside of chunks
-Entries = list[tuple[int, int, int]]  # log time ns, start of the chunk in the file or NO_CHUNK, offset
 TABLES = ("topics", "messages", "message_definitions", "sqlite_master")
 BUSY_TIMEOUT_S = 5.0
 VFS_WITHOUT_LOCKS = "win32-none" if os.name == "nt" else "unix-none"
 LARGEST_VALUE = 512 * MIB  # bytes of a message
+# What damaged bytes raise.
+DAMAGES = (McapError, ValueError, EOFError, struct.error, RuntimeError)
 
 
 class McapFile:
-    """An MCAP file, see `BagFile`.
+    """An MCAP file. topics: by name. notes: for the user about the file.
 
     Opening it reads the summary at its end. A file without one (its recording was cut off) is scanned up to its end.
     Raises InputError if it is not an MCAP file.
@@ -45,15 +46,13 @@ class McapFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.notes: tuple[str, ...] = ()
-        try:
-            self._file: BinaryIO = path.open("rb")
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+        self._file = open_regular(path)
         if self._file.read(len(MAGIC)) != MAGIC:
             raise InputError(f"{path}: is not an MCAP file (its first bytes are different)")
         self._chunks: OrderedDict[int, bytes] = OrderedDict()
         self._chunk_indexes: list[ChunkIndex] = []
-        self._scanned: dict[int, Entries] | None = None  # by channel, if the file has no index
+        # By channel, if the file has no index: log time in ns, start of the chunk in the file or NO_CHUNK, and offset.
+        self._scanned: dict[int, list[tuple[int, int, int]]] = {}
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         summary = self._summary()
@@ -62,19 +61,23 @@ class McapFile:
         else:
             self._schemas, self._channels = summary.schemas, summary.channels
             self._chunk_indexes = sorted(summary.chunk_indexes, key=lambda chunk: chunk.chunk_start_offset)
-        self.topics = {topic.name: topic for topic in self._topics()}
-        self._references: dict[str, NDArray[np.int64]] = {}
+        self.topics = {
+            one.topic: Topic(one.topic, schema.name, one.message_encoding, schema.encoding, schema.data)
+            for one in self._channels.values()
+            if (schema := self._schemas.get(one.schema_id))
+        }
+        self._references = cache(self._read_references)
 
     def times(self, topic: str) -> NDArray[np.int64]:
         """(N,) log times of a topic's messages in order, ns. Only the index is read."""
-        return self._references_of(topic)[:, 0]
+        return self._references(topic)[:, 0]
 
     def read(self, topic: str, index: int) -> bytes:
         """The bytes of message `index` of a topic. Raises InputError if they are broken."""
-        _, chunk, offset = (int(number) for number in self._references_of(topic)[index])
+        _, chunk, offset = (int(number) for number in self._references(topic)[index])
         try:
             return self._message(chunk, offset)
-        except (McapError, ValueError, EOFError, struct.error, RuntimeError) as error:
+        except DAMAGES as error:
             raise InputError(f"{self.path}: {topic}: message {index} is broken ({error})") from None
 
     def _summary(self) -> Summary | None:
@@ -87,25 +90,16 @@ class McapFile:
             return None
         return summary if all(chunk.message_index_length for chunk in summary.chunk_indexes) else None
 
-    def _topics(self) -> Iterator[Topic]:
-        for channel in self._channels.values():
-            schema = self._schemas.get(channel.schema_id)
-            if schema is not None:
-                yield Topic(channel.topic, schema.name, channel.message_encoding, schema.encoding, schema.data)
-
-    def _references_of(self, topic: str) -> NDArray[np.int64]:
+    def _read_references(self, topic: str) -> NDArray[np.int64]:
         """(N, 3) log time, start of the chunk or NO_CHUNK, and offset of a topic's messages, in order of time."""
-        if topic not in self._references:
-            channels = [number for number, channel in self._channels.items() if channel.topic == topic]
-            if self._scanned is not None:
-                parts = [np.array(self._scanned.get(n, []), dtype=np.int64).reshape(-1, 3) for n in channels]
-            else:
-                parts = [part for n in channels for part in self._indexed(n)]
-            rows = np.concatenate([np.zeros((0, 3), dtype=np.int64), *parts])
-            self._references[topic] = rows[np.argsort(rows[:, 0], kind="stable")]
-        return self._references[topic]
+        channels = [number for number, channel in self._channels.items() if channel.topic == topic]
+        parts = [part for number in channels for part in self._references_in(number)]
+        rows = np.concatenate([np.zeros((0, 3), dtype=np.int64), *parts])
+        return rows[np.argsort(rows[:, 0], kind="stable")]
 
-    def _indexed(self, channel: int) -> Iterator[NDArray[np.int64]]:
+    def _references_in(self, channel: int) -> Iterator[NDArray[np.int64]]:
+        if channel in self._scanned:
+            yield np.array(self._scanned[channel], dtype=np.int64)
         for chunk in self._chunk_indexes:
             if channel not in chunk.message_index_offsets:
                 continue
@@ -144,34 +138,26 @@ class McapFile:
 
     def _scan(self) -> None:
         """Find schemas, channels and messages by reading the file from its start, as far as its records are whole."""
-        self._scanned = {}
         end = self.path.stat().st_size
         position = len(MAGIC)
-        is_whole = False
         while position + RECORD_HEAD.size <= end:
             self._file.seek(position)
             opcode, length = RECORD_HEAD.unpack(self._file.read(RECORD_HEAD.size))
             if opcode in (Opcode.DATA_END, Opcode.FOOTER):
-                is_whole = True
+                return
+            if position + RECORD_HEAD.size + length > end:
                 break
-            if position + RECORD_HEAD.size + length > end or not self._scan_record(opcode, length, position):
-                break
+            if opcode == Opcode.CHUNK:
+                try:
+                    content = _decompressed(self._file.read(length))
+                except DAMAGES:
+                    break
+                self._scan_chunk(content, position)
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+                self._note(opcode, self._file.read(length), NO_CHUNK, position)
             position += RECORD_HEAD.size + length
-        if not is_whole:
-            share = f"{position / 2**20:.1f} of {end / 2**20:.1f} MiB"
-            self.notes = (f"{self.path.name} is cut off: its first {share} are read",)
-
-    def _scan_record(self, opcode: int, length: int, position: int) -> bool:
-        """Note what a record has; False if it is damaged."""
-        if opcode == Opcode.CHUNK:
-            try:
-                content = _decompressed(self._file.read(length))
-            except (McapError, ValueError, EOFError, struct.error, RuntimeError):
-                return False
-            self._scan_chunk(content, position)
-        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
-            self._note(opcode, self._file.read(length), NO_CHUNK, position)
-        return True
+        share = f"{position / MIB:.1f} of {end / MIB:.1f} MiB"
+        self.notes = (f"{self.path.name} is cut off: its first {share} are read",)
 
     def _scan_chunk(self, content: bytes, chunk: int) -> None:
         offset = 0
@@ -183,7 +169,6 @@ class McapFile:
 
     def _note(self, opcode: int, content: bytes, chunk: int, offset: int) -> None:
         """Keep a schema, a channel, or the place of a message."""
-        assert self._scanned is not None
         stream = ReadDataStream(BytesIO(content))
         if opcode == Opcode.SCHEMA:
             schema = Schema.read(stream)
@@ -208,8 +193,9 @@ def _decompressed(content: bytes) -> bytes:
 
 
 class SqliteFile:
-    """A .db3 file, see `BagFile`. Opening it reads the list of topics; a damaged file is read up to the damage.
+    """A .db3 file, with the attributes of `McapFile`.
 
+    Opening it reads the list of topics; a damaged file is read up to the damage.
     Raises InputError if it is not a rosbag2 database.
     """
 
@@ -237,15 +223,14 @@ class SqliteFile:
         for number, name, kind, serialization in rows:
             self._ids.setdefault(name, []).append(number)
             self.topics[name] = Topic(name, kind, serialization, *definitions.get(kind, ("", b"")))
-        self._references: dict[str, NDArray[np.int64]] = {}
 
     def times(self, topic: str) -> NDArray[np.int64]:
         """(N,) log times of a topic's messages in order, ns. The messages themselves are not read."""
-        return self._references_of(topic)[:, 0]
+        return self._references[topic][:, 0]
 
     def read(self, topic: str, index: int) -> bytes:
         """The bytes of message `index` of a topic. Raises InputError if they are broken."""
-        row = int(self._references_of(topic)[index, 1])
+        row = int(self._references[topic][index, 1])
         try:
             found = self._database.execute("SELECT data FROM messages WHERE id = ?", (row,)).fetchone()[0]
             if not isinstance(found, bytes):
@@ -254,14 +239,12 @@ class SqliteFile:
         except (sqlite3.Error, TypeError) as error:
             raise InputError(f"{self.path}: {topic}: message {index} is broken ({error})") from None
 
-    def _references_of(self, topic: str) -> NDArray[np.int64]:
-        """(N, 2) log time and row of a topic's messages, in order of time."""
-        if not self._references:
-            self._read_index()
-        return self._references.get(topic, np.zeros((0, 2), dtype=np.int64))
+    @cached_property
+    def _references(self) -> dict[str, NDArray[np.int64]]:
+        """(N, 2) log time and row of each topic's messages, in order of time.
 
-    def _read_index(self) -> None:
-        """Read time, topic and row of every message in one pass, because the table has no index by topic."""
+        They are read in one pass, because the table has no index by topic.
+        """
         rows: list[tuple[int, int, int]] = []
         try:
             for row in self._database.execute("SELECT timestamp, id, topic_id FROM messages"):
@@ -269,9 +252,8 @@ class SqliteFile:
         except sqlite3.Error as error:
             self.notes = (f"{self.path.name} is damaged ({error}): its first {len(rows)} messages are read",)
         table = np.array(rows, dtype=np.int64).reshape(-1, 3)
-        for name, numbers in self._ids.items():
-            part = table[np.isin(table[:, 2], numbers), :2]
-            self._references[name] = part[np.argsort(part[:, 0], kind="stable")]
+        table = table[np.argsort(table[:, 0], kind="stable")]
+        return {name: table[np.isin(table[:, 2], numbers), :2] for name, numbers in self._ids.items()}
 
     def _check_tables(self) -> None:
         """Raises sqlite3.Error unless the tables of the bag hold plain values: code in a file can compute for ever."""

@@ -15,7 +15,6 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -23,7 +22,7 @@ from bevcli.errors import InputError
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import read_text
 from bevcli.sequences.ros.bag import Bag
-from bevcli.sequences.ros.messages import KINDS, Kind, frame_of, short_type
+from bevcli.sequences.ros.messages import KINDS, Kind, frame_of
 
 # Parts of a topic's name that do not name a camera.
 GENERIC = re.compile(
@@ -33,30 +32,16 @@ GENERIC = re.compile(
 NOT_A_CAMERA = re.compile(
     r"depth|disparity|confidence|mask|semantic|segment|label|debug|overlay|annotat|detect|infra|thermal|theora|bev|map"
 )
-RECTIFIED = re.compile(r"(^|_)rect(ified)?(_|$)")
-# The preferred one of several image topics of a camera comes first.
-IMAGE_TYPES = (
-    "sensor_msgs/CompressedImage", "foxglove/CompressedImage", "sensor_msgs/Image", "foxglove/RawImage",
-    "foxglove/CompressedVideo",
-)  # fmt: skip
-POSE_TYPES = ("nav_msgs/Odometry", "foxglove/PoseInFrame", "geometry_msgs/PoseWithCovarianceStamped",
-              "geometry_msgs/PoseStamped")  # fmt: skip
+RECTIFIED = re.compile(r"(^|[/_])rect(ified)?([/_]|$)")
 PREFERRED_POSES = ("/localization/kinematic_state", "/localization/pose_twist_fusion_filter/kinematic_state")
 GOALS = re.compile(r"goal|target|initial|waypoint|planning|planner|prediction|perception|object")  # not the ego pose
 
 
 @dataclass(frozen=True)
 class StatedTopics:
-    """Statements of the user about the topics of a bag. "" and missing cameras: to be found.
+    """Statements of the user about a bag, by the keys of the TOML above. "" and missing cameras: to be found.
 
-    Attributes:
-        ego_frame: name of the vehicle's frame.
-        world_frame: name of the frame that poses refer to, for poses from transforms.
-        ego_motion: topic of the vehicle's poses.
-        cameras: camera -> image topic; if there are any, only these cameras are used.
-        calibration: camera -> topic of its calibration.
-        frames: camera -> name of its optical frame.
-        renamed: camera -> image topic, as `topics` states it; other cameras are still found.
+    renamed: camera -> image topic, as `topics` states it; other cameras are still found.
     """
 
     ego_frame: str = ""
@@ -80,16 +65,12 @@ def read_topics_file(path: Path | None, topics: Mapping[str, str]) -> StatedTopi
     for key, value in stated.items():
         if key not in known:
             raise InputError(f'{path}: unknown key "{key}" (known: {", ".join(known)})')
-        _check(path, key, value)
-    return StatedTopics(**stated, renamed=topics)
-
-
-def _check(path: Path, key: str, value: Any) -> None:
-    if key in ("cameras", "calibration", "frames"):
-        if not isinstance(value, dict) or not all(isinstance(entry, str) for entry in value.values()):
+        is_table = key in ("cameras", "calibration", "frames")
+        if is_table and not (isinstance(value, dict) and all(isinstance(entry, str) for entry in value.values())):
             raise InputError(f'{path}: "{key}": expected a table of names, such as CAM_FRONT = "..."')
-    elif not isinstance(value, str):
-        raise InputError(f'{path}: "{key}": expected a name, found {value!r:.40}')
+        if not (is_table or isinstance(value, str)):
+            raise InputError(f'{path}: "{key}": expected a name, found {value!r:.40}')
+    return StatedTopics(**stated, renamed=topics)
 
 
 @dataclass(frozen=True)
@@ -104,7 +85,7 @@ class CameraTopics:
     @property
     def is_rectified(self) -> bool:
         """True if the name of the topic says that lens distortion was removed from the images."""
-        return any(RECTIFIED.search(part) for part in self.images.split("/"))
+        return RECTIFIED.search(self.images) is not None
 
 
 class TopicFinder:
@@ -119,9 +100,9 @@ class TopicFinder:
         """calibrated: the cameras of a calibration file, which all must be found. None: the bag is the calibration."""
         self._bag, self._stated = bag, stated
         self._kinds = {
-            name: KINDS[short_type(topic.type_name)]
+            name: KINDS[topic.short_type]
             for name, topic in bag.topics.items()
-            if short_type(topic.type_name) in KINDS and len(bag.times(name))
+            if topic.short_type in KINDS and len(bag.times(name))
         }
         for name in (*stated.cameras.values(), *stated.renamed.values(), *stated.calibration.values()):
             self._check_exists(name)
@@ -131,23 +112,19 @@ class TopicFinder:
             CameraTopics(name, images, self._calibration_of(name, images), self._kinds[images] == "video")
             for name, images in found.items()
         ]
-        self.left_out: tuple[str, ...] = ()
-        if calibrated is None:
-            explicit = {*stated.cameras, *stated.renamed}
-            without = [one for one in cameras if one.calibration is None]
-            for one in without:
-                if one.camera in explicit or len(without) == len(cameras):
-                    raise InputError(
-                        f"{bag.path}: camera {one.camera}: no CameraInfo belongs to {one.images}: pass "
-                        f"`calibration=FILE`, or name the topic with `topics_file=FILE.toml` ({self.seen()})"
-                    )
-            cameras = [one for one in cameras if one.calibration is not None]
-            self.left_out = tuple(one.images for one in without)
-        if not cameras:
+        without = [one for one in cameras if one.calibration is None and calibrated is None]
+        for one in without:
+            if one.camera in (*stated.cameras, *stated.renamed) or len(without) == len(cameras):
+                raise InputError(
+                    f"{bag.path}: camera {one.camera}: no CameraInfo belongs to {one.images}: pass "
+                    f"`calibration=FILE`, or name the topic with `topics_file=FILE.toml` ({self.seen()})"
+                )
+        self.left_out = tuple(one.images for one in without)
+        self.cameras = tuple(one for one in cameras if one not in without)
+        if not self.cameras:
             raise InputError(
                 f"{bag.path}: has no image topic ({self.seen()}): name them with `topics={{'CAMERA': '/TOPIC'}}`"
             )
-        self.cameras = tuple(cameras)
 
     def of_kind(self, kind: Kind) -> list[str]:
         """Names of the topics of a kind that have messages."""
@@ -160,16 +137,11 @@ class TopicFinder:
             self._check_exists(stated)
             return stated if self._kinds[stated] == "pose" else None
         poses = [name for name in self.of_kind("pose") if not GOALS.search(name)]
-
-        def rank(name: str) -> tuple[bool, int, str]:
-            kind = short_type(self._bag.topics[name].type_name)
-            return (name not in PREFERRED_POSES, POSE_TYPES.index(kind), name)
-
-        return min(poses, key=rank, default=None)
+        return min(poses, key=lambda name: (name not in PREFERRED_POSES, self._preference(name), name), default=None)
 
     def seen(self) -> str:
         """The topics of the bag, for an error message."""
-        names = [f"{name} ({short_type(topic.type_name)})" for name, topic in self._bag.topics.items()]
+        names = [f"{name} ({topic.short_type})" for name, topic in self._bag.topics.items()]
         return "topics: " + (", ".join(names[:12]) + (", ..." if len(names) > 12 else "") if names else "none")
 
     def table(self, pose: str) -> str:
@@ -192,13 +164,13 @@ class TopicFinder:
         times = self._bag.times(name)
         rate = f", {1e9 / np.median(np.diff(times)):.3g} Hz" if len(times) > 2 and np.median(np.diff(times)) else ""
         count = "1 message" if len(times) == 1 else f"{len(times)} messages"
-        return short_type(self._bag.topics[name].type_name), count + rate
+        return self._bag.topics[name].short_type, count + rate
 
     def _check_exists(self, name: str) -> None:
         if name not in self._bag.topics:
             raise InputError(f"{self._bag.path}: has no topic {name} ({self.seen()})")
         if name not in self._kinds:
-            kind = short_type(self._bag.topics[name].type_name)
+            kind = self._bag.topics[name].short_type
             problem = f"type {kind} cannot be used" if len(self._bag.times(name)) else "has no messages"
             raise InputError(f"{self._bag.path}: topic {name}: {problem} ({self.seen()})")
 
@@ -206,18 +178,19 @@ class TopicFinder:
         """Camera -> image topic: the stated ones, and one for each other group of topics."""
         if self._stated.cameras:
             return {**self._stated.cameras, **self._stated.renamed}
-        images = [*self.of_kind("image"), *self.of_kind("video")]
         taken = {_camera_path(name) for name in self._stated.renamed.values()}
         groups: dict[tuple[str, ...], list[str]] = {}
-        for name in sorted(images):
+        for name in sorted([*self.of_kind("image"), *self.of_kind("video")]):
             if not NOT_A_CAMERA.search(name.lower()) and _camera_path(name) not in taken:
                 groups.setdefault(_camera_path(name), []).append(name)
-        best = {path: min(topics, key=self._image_rank) for path, topics in groups.items()}
+        best = {
+            path: min(topics, key=lambda name: (self._preference(name), not RECTIFIED.search(name), name))
+            for path, topics in groups.items()
+        }
         return {**self._stated.renamed, **dict(_named(best))}
 
-    def _image_rank(self, name: str) -> tuple[int, bool, str]:
-        rectified = any(RECTIFIED.search(part) for part in name.split("/"))
-        return (IMAGE_TYPES.index(short_type(self._bag.topics[name].type_name)), not rectified, name)
+    def _preference(self, name: str) -> int:
+        return list(KINDS).index(self._bag.topics[name].short_type)
 
     def _calibration_of(self, camera: str, images: str) -> str | None:
         """The calibration topic in the nearest namespace around the images, or else with the same frame."""
@@ -253,8 +226,7 @@ def _for_calibration(found: Mapping[str, str], names: tuple[str, ...], bag: Bag)
     for name in names:
         lower = name.lower()
         same = [topic for camera, topic in found.items() if camera.lower() == lower]
-        inside = [topic for topic in found.values() if lower in topic.lower().split("/")]
-        chosen = same or inside
+        chosen = same or [topic for topic in found.values() if lower in topic.lower().split("/")]
         if len(chosen) != 1:
             offered = ", ".join(found.values()) or "none"
             raise InputError(

@@ -5,14 +5,47 @@ from pathlib import Path
 from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.sequences.files.class_names import ClassNames
 from bevcli.sequences.native.folder import rig_notes
-from bevcli.sequences.nuscenes.dialect import Dialect
+from bevcli.sequences.nuscenes.format import NuScenesOptions
+from bevcli.sequences.nuscenes.index import Dialect
 from bevcli.sequences.nuscenes.sequence import TableSequence
 from bevcli.sequences.options import FormatOptions, SequenceOptions
-from bevcli.sequences.t4.classes import CLASS_OF_CATEGORY
 
 LIDARS = ("LIDAR_CONCAT", "LIDAR_TOP")
 # The documented meaning: not occluded, by less than half, by more than half, and by 90 to 100 %.
 VISIBILITIES = {"full": 1.0, "most": 0.75, "partial": 0.3, "none": 0.05}
+
+# Class names; docs/other-inputs.md says what is lost. Older datasets have the longer names. Names are compared without
+# case; others stay as they are, and are not scored.
+CLASS_OF_CATEGORY = {
+    "vehicle.car": "car",
+    "police_car": "car",
+    "vehicle.police": "car",
+    "vehicle.emergency (ambulance & police)": "car",
+    "ambulance": "truck",
+    "vehicle.ambulance": "truck",
+    "fire_truck": "truck",
+    "vehicle.fire": "truck",
+    "vehicle.truck": "truck",
+    "forklift": "construction_vehicle",
+    "vehicle.construction": "construction_vehicle",
+    "vehicle.bus": "bus",
+    "vehicle.bus (bendy & rigid)": "bus",
+    "vehicle.trailer": "trailer",
+    "semi_trailer": "trailer",
+    "motorbike": "motorcycle",
+    "vehicle.motorbike": "motorcycle",
+    "vehicle.motorcycle": "motorcycle",
+    "vehicle.bicycle": "bicycle",
+    "construction_worker": "pedestrian",
+    "police_officer": "pedestrian",
+    "pedestrian.adult": "pedestrian",
+    "pedestrian.child": "pedestrian",
+    "pedestrian.construction_worker": "pedestrian",
+    "pedestrian.police_officer": "pedestrian",
+    "movable_object.barrier": "barrier",
+    "movable_object.trafficcone": "traffic_cone",
+    "movable_object.traffic_cone": "traffic_cone",
+}
 
 
 class T4Sequence(TableSequence):
@@ -29,6 +62,6 @@ class T4Sequence(TableSequence):
         dialect = Dialect(
             LIDARS, names.__getitem__, VISIBILITIES, has_attributes=False, ego_from_bev=default_ego_from_bev()
         )
-        super().__init__(path, path / "annotation", common, dialect)
+        super().__init__(path, path / "annotation", common, dialect, NuScenesOptions())
         self.name = path.resolve().name
         self.notes = (*self.notes, *rig_notes(self.rig, "a T4 dataset"))
