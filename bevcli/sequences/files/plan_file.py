@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from bevcli.frame import FrameStamp, Ground, Plan
-from bevcli.parsing.csv_cells import cell_of
-from bevcli.parsing.csv_tables import CsvRow, read_csv
+from bevcli.parsing.csv_tables import CsvRow, cell_of, read_csv
 from bevcli.sequences.files.incremental_json import GrowingFile
 
 COLUMNS = (
@@ -66,7 +65,7 @@ class PlanWriter:
 
 def read_plans(path: Path) -> tuple[FramePlan, ...]:
     """The plans in plan.csv, in its order; frames without one are left out. Raises InputError."""
-    rows = read_csv(path, COLUMNS).rows
+    rows = read_csv(path, COLUMNS)
     of_frames = groupby(rows, key=lambda row: (row.cells["frame"], row.cells["scene"], row.cells["timestamp_ns"]))
     return tuple(_frame_plan(list(group)) for _, group in of_frames)
 

@@ -16,7 +16,7 @@ from bevcli.frame import LINE_CLASSES, CameraImage, DriveFacts, Frame, Ground, M
 from bevcli.geometry.cameras import CameraRig, same_rig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
 from bevcli.geometry.transforms import Pose
-from bevcli.parsing.csv_cells import cell_of
+from bevcli.parsing.csv_tables import cell_of
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.sequences.files.lines_file import TRUE_LINES, LinesWriter
