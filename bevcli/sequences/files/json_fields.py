@@ -71,7 +71,7 @@ def parse_numbers(owner: Mapping[str, Any], name: str, shape: tuple[int, ...], r
     if value is None:
         report.missing(name, expected)
         return None
-    array = _array_of_numbers(value)
+    array = array_of_numbers(value)
     if array is None:
         report.error("wrong-shape", name, "is not an array of numbers", expected=expected, found=value)
         return None
@@ -85,12 +85,13 @@ def parse_numbers(owner: Mapping[str, Any], name: str, shape: tuple[int, ...], r
     return array
 
 
-def _array_of_numbers(value: object) -> Array | None:
+def array_of_numbers(value: object) -> Array | None:
+    """The float64 array of a number or of nested lists of numbers; None for anything else."""
     try:
         array = np.array(value)
     except (ValueError, OverflowError):  # rows of different lengths
         return None
-    return array.astype(np.float64) if array.dtype.kind in "iuf" else None
+    return array.astype(np.float64, copy=False) if array.dtype.kind in "iuf" else None
 
 
 def parse_transform(owner: Mapping[str, Any], name: str, report: Report) -> Array | None:
