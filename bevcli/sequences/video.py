@@ -17,7 +17,7 @@ CONTAINERS = (
     (0, b"\x1a\x45\xdf\xa3"),
     (0, b"\x00\x00\x00\x01"), (0, b"\x00\x00\x01"), (0, b"DKIF"),
 )  # fmt: skip
-MOST_PIXELS = 1 << 26
+MOST_PIXELS = 1 << 26  # of an image in a video or a bag
 SMALLEST_IMAGE = 8  # bytes of a container for each of its images, at least
 
 
