@@ -3,7 +3,7 @@
 `bevcli run` stops at the first finding; `bevcli project-debug` shows all of them.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -56,12 +56,17 @@ class Report:
         """Add an error for a missing key."""
         self.error("missing-key", name, "is missing", expected=expected)
 
-    def require(self, value: _Value | None, where: Path | str) -> _Value:
-        """The value that was read. Raises InputError with the first finding. where: start of the message."""
-        for finding in self.findings:
-            raise InputError(f"{where}: {finding.line}")
-        assert value is not None
-        return value
+
+def require(
+    parse: Callable[..., _Value | None], *arguments: Any, where: Path | str, camera: str | None = None
+) -> _Value:
+    """The value that `parse(*arguments, report)` reads. Raises InputError with the first finding, after `where`."""
+    report = Report(camera)
+    value = parse(*arguments, report)
+    for finding in report.findings:
+        raise InputError(f"{where}: {finding.line}")
+    assert value is not None
+    return value
 
 
 def parse_numbers(owner: Mapping[str, Any], name: str, shape: tuple[int, ...], report: Report) -> Array | None:
@@ -125,8 +130,7 @@ def pose_from_json(value: Any, name: str, where: str) -> Pose:
     name: the key of the value. where: start of an error message, such as "boxes.json: frame 3".
     Raises InputError for a transform that is missing or invalid.
     """
-    report = Report()
-    matrix = report.require(parse_transform({name: value}, name, report), where)
+    matrix = require(parse_transform, {name: value}, name, where=where)
     if "rotation_wxyz" not in value:
         return Pose.from_matrix(matrix)
     return Pose(matrix[:3, 3], np.array(value["rotation_wxyz"], dtype=np.float64))

@@ -10,7 +10,7 @@ from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.parsing.documents import read_json, read_yaml
 from bevcli.sequences.files.calibration_file import parse_camera
-from bevcli.sequences.files.json_fields import Report, parse_numbers, parse_transform, transform_to_json
+from bevcli.sequences.files.json_fields import parse_numbers, parse_transform, require, transform_to_json
 
 Fields = dict[str, Any]  # the fields of one camera, as in calibration.json
 YAML_SUFFIXES = (".yaml", ".yml")
@@ -38,8 +38,7 @@ def read_rig(intrinsics: Path | None, extrinsics: Path | None) -> CameraRig | No
     rig_cameras = tuple(_camera(name, fields, poses.get(name), extrinsics) for name, fields in cameras.items())
     if "ego_from_bev" not in document:
         return CameraRig(rig_cameras, default_ego_from_bev(), ego_from_bev_assumed=True)
-    report = Report()
-    return CameraRig(rig_cameras, report.require(parse_transform(document, "ego_from_bev", report), extrinsics))
+    return CameraRig(rig_cameras, require(parse_transform, document, "ego_from_bev", where=extrinsics))
 
 
 def _read_intrinsics(path: Path) -> Iterator[tuple[str, Fields]]:
@@ -87,8 +86,7 @@ def _kalibr_fields(entry: Any, where: str) -> Fields:
         ),
     }
     if "T_cn_cnm1" in entry:
-        report = Report()
-        fields[CHAIN] = report.require(parse_numbers(entry, "T_cn_cnm1", (4, 4), report), where)
+        fields[CHAIN] = require(parse_numbers, entry, "T_cn_cnm1", (4, 4), where=where)
     return fields
 
 
@@ -112,8 +110,7 @@ def _data(document: Mapping[str, Any], name: str) -> Any:
 
 
 def _numbers(owner: Mapping[str, Any], name: str, count: int, where: str) -> list[float]:
-    report = Report()
-    return report.require(parse_numbers(owner, name, (count,), report), where).tolist()
+    return require(parse_numbers, owner, name, (count,), where=where).tolist()
 
 
 def _lens(model: object, coefficients: object, known: Mapping[str, str], where: str) -> Fields:
@@ -142,9 +139,8 @@ def _poses(stated: Mapping[str, Any], cameras: Mapping[str, Fields], path: Path)
             raise InputError(f"{path}: camera {name}: has no intrinsics (found those of {', '.join(cameras)})")
     poses: dict[str, Array] = {}
     for name, entry in stated.items():
-        report = Report(camera=name)
-        pose = parse_transform(entry if isinstance(entry, dict) else {}, "ego_from_camera", report)
-        poses[name] = report.require(pose, path)
+        owner = entry if isinstance(entry, dict) else {}
+        poses[name] = require(parse_transform, owner, "ego_from_camera", where=path, camera=name)
     order = list(cameras)
     for earlier, name in pairwise(order):  # along the chain
         if name not in poses and earlier in poses and CHAIN in cameras[name]:
@@ -158,7 +154,6 @@ def _poses(stated: Mapping[str, Any], cameras: Mapping[str, Fields], path: Path)
 def _camera(name: str, fields: Fields, ego_from_camera: Array | None, path: Path) -> Camera:
     if ego_from_camera is None:
         raise InputError(f'{path}: camera {name}: "ego_from_camera" is missing: add the camera\'s pose')
-    report = Report(camera=name)
     own = {key: value for key, value in fields.items() if key != CHAIN}
-    camera = parse_camera(name, {**own, "ego_from_camera": transform_to_json(ego_from_camera)}, report)
-    return report.require(camera, path)
+    own["ego_from_camera"] = transform_to_json(ego_from_camera)
+    return require(parse_camera, name, own, where=path, camera=name)

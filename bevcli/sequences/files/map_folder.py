@@ -38,9 +38,8 @@ class MapFolder:
     def load(self, frame: int) -> BevMap:
         """The map of a frame. Raises InputError if it is missing, unreadable or has an unknown bit."""
         path = map_path(self.path, frame)
-        if not path.is_file():
-            raise InputError(f"{path}: the map of frame {frame} is missing")
-        cells = decode_image(read_bytes(path, LARGEST_BYTES), cv2.IMREAD_UNCHANGED, LARGEST_CELLS)
+        encoded = read_bytes(path, LARGEST_BYTES, missing=f"the map of frame {frame} is missing")
+        cells = decode_image(encoded, cv2.IMREAD_UNCHANGED, LARGEST_CELLS)
         if cells is None or cells.ndim != 2 or cells.dtype != np.uint8:
             found = "an unreadable image" if cells is None else f"{cells.dtype} of shape {cells.shape}"
             raise InputError(f"{path}: expected an 8-bit image with one channel, found {found}")

@@ -18,7 +18,6 @@ GROUP = "bevcli.label_formats"
 FIRST_BYTES = 4096
 LARGEST_BYTES = 1024 * MIB
 _Struct = TypeVar("_Struct")
-FrameOfReference = Literal["world", "ego", "bev"]
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ class Labels:
         notes: what was assumed, for the user.
     """
 
-    frame_of_reference: FrameOfReference
+    frame_of_reference: Literal["world", "ego", "bev"]
     frames: tuple[LabelledFrame, ...]
     lists_empty: bool
     notes: tuple[str, ...] = ()
