@@ -33,12 +33,10 @@ def read_bytes(
             raise error(f"{path}: cannot be read ({failure.strerror})") from None
 
 
-def read_text(
-    path: Path, largest: int, *, missing: str = "the file is missing", error: type[BevcliError] = InputError
-) -> str:
+def read_text(path: Path, largest: int, *, error: type[BevcliError] = InputError) -> str:
     """The contents of a UTF-8 file, see `read_bytes`."""
     try:
-        return read_bytes(path, largest, missing=missing, error=error).decode()
+        return read_bytes(path, largest, error=error).decode()
     except UnicodeDecodeError as failure:
         raise error(f"{path}: cannot be read as text ({failure})") from None
 

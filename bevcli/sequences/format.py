@@ -50,8 +50,7 @@ class Format:
     def open(self, path: Path, common: SequenceOptions, own: FormatOptions) -> Sequence:
         """A path of this format as a Sequence. Raises InputError."""
         opener = resolve_name(self.opener) if isinstance(self.opener, str) else self.opener
-        opened: Sequence = opener(path, common, own)
-        return opened
+        return opener(path, common, own)
 
 
 def formats() -> tuple[Format, ...]:

@@ -89,24 +89,20 @@ def read_entries(path: Path, tail: str, *, missing: str = "the file is missing")
     if file.suffix == PARTIAL:
         if not content:
             raise InputError(f"{file}: is empty: the run ended before its first frame")
-        content = _without_cut_entry(content) + tail.encode()
+        content = _without_cut_entry(content, tail[:1].encode()) + tail.encode()
     return parse_json(content, path)
 
 
-def _without_cut_entry(content: bytes) -> bytes:
+def _without_cut_entry(content: bytes, closing: bytes) -> bytes:
+    """closing: the bracket after the last entry, of a list or of an object."""
     lines = content.rstrip(b",\n")
     kept, newline, last = lines.rpartition(b"\n")
-    if not newline or _is_entry(last):
-        return lines
-    return kept.rstrip(b",")
-
-
-def _is_entry(line: bytes) -> bool:
-    for text in (line, b"{" + line + b"}"):  # an entry of a list, or a member of an object
-        with contextlib.suppress(ValueError):
-            json.loads(text)
-            return True
-    return False
+    try:
+        if newline:
+            json.loads((b"[" if closing == b"]" else b"{") + last + closing)
+    except ValueError:
+        return kept.rstrip(b",")
+    return lines
 
 
 class IncrementalJson(GrowingFile):

@@ -32,7 +32,7 @@ def read_rig(intrinsics: Path | None, extrinsics: Path | None) -> CameraRig | No
         return None
     if intrinsics is None or extrinsics is None:
         raise InputError("`intrinsics` and `extrinsics` must be given together: pass both, or write a calibration.json")
-    cameras = dict(_read_intrinsics(intrinsics))
+    cameras = _read_intrinsics(intrinsics)
     document = _read_extrinsics(extrinsics)
     poses = _poses(document.get("cameras", {}), cameras, extrinsics)
     rig_cameras = tuple(_camera(name, fields, poses.get(name), extrinsics) for name, fields in cameras.items())
@@ -41,20 +41,20 @@ def read_rig(intrinsics: Path | None, extrinsics: Path | None) -> CameraRig | No
     return CameraRig(rig_cameras, require(parse_transform, document, "ego_from_bev", where=extrinsics))
 
 
-def _read_intrinsics(path: Path) -> Iterator[tuple[str, Fields]]:
-    """Name and fields of every camera in a file or in the files of a folder."""
+def _read_intrinsics(path: Path) -> dict[str, Fields]:
+    """The fields of every camera in a file or in the files of a folder, by name."""
     files = [path]
     if path.is_dir():
         files = [file for file in sorted(path.iterdir()) if file.suffix.lower() in YAML_SUFFIXES]
         if not files:
             raise InputError(f"{path}: the folder has no .yaml file (expected Kalibr or ROS intrinsics)")
-    seen: set[str] = set()
+    cameras: dict[str, Fields] = {}
     for file in files:
         for name, fields in _cameras_in(file):
-            if name in seen:
+            if name in cameras:
                 raise InputError(f"{file}: camera {name} is in another file too: keep one")
-            seen.add(name)
-            yield name, fields
+            cameras[name] = fields
+    return cameras
 
 
 def _cameras_in(path: Path) -> Iterator[tuple[str, Fields]]:
@@ -134,11 +134,10 @@ def _read_extrinsics(path: Path) -> Mapping[str, Any]:
 
 def _poses(stated: Mapping[str, Any], cameras: Mapping[str, Fields], path: Path) -> dict[str, Array]:
     """ego_from_camera (4, 4) by camera: as stated, otherwise along Kalibr's chain in the file's order."""
-    for name in stated:
-        if name not in cameras:
-            raise InputError(f"{path}: camera {name}: has no intrinsics (found those of {', '.join(cameras)})")
     poses: dict[str, Array] = {}
     for name, entry in stated.items():
+        if name not in cameras:
+            raise InputError(f"{path}: camera {name}: has no intrinsics (found those of {', '.join(cameras)})")
         owner = entry if isinstance(entry, dict) else {}
         poses[name] = require(parse_transform, owner, "ego_from_camera", where=path, camera=name)
     order = list(cameras)

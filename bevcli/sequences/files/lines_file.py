@@ -57,18 +57,18 @@ class LinesWriter:
 
     def write(self, ground: Ground, lines: MapLines | None) -> None:
         """Append a frame. lines: in the bev frame; None where the model was not run."""
-        found: list[dict[str, Any]] = []
-        for place, points in enumerate(() if lines is None else lines.points):
-            assert lines is not None
-            line: dict[str, Any] = {"class": str(lines.classes[place])}
-            if lines.scores is not None:
-                line["score"] = float(lines.scores[place])
-            found.append(line | {"points": ground.points(points).round(DECIMALS).tolist()})
+        found = [] if lines is None else [_line(ground, lines, place) for place in range(len(lines))]
         self.file.add({**stamp_to_json(ground.stamp), "lines": found}, f"frame {ground.stamp.index}")
 
     def close(self) -> None:
         """Complete the file."""
         self.file.close()
+
+
+def _line(ground: Ground, lines: MapLines, place: int) -> dict[str, Any]:
+    score = {} if lines.scores is None else {"score": float(lines.scores[place])}
+    points = ground.points(lines.points[place]).round(DECIMALS)
+    return {"class": str(lines.classes[place]), **score, "points": points.tolist()}
 
 
 def read_lines(path: Path) -> LinesFile:

@@ -68,7 +68,13 @@ def write_map(folder: Path, frame: int, bev_map: BevMap) -> None:
     other classes.
     """
     if not (folder / LEGEND).exists():
-        write_whole(folder / LEGEND, f"{json.dumps(_legend(bev_map), indent=1)}\n".encode(), parents=True, regular=True)
+        legend = {
+            "format": FORMAT,
+            "x_range_m": bev_map.x_range_m,
+            "y_range_m": bev_map.y_range_m,
+            "classes": {str(bit): name for name, bit in bev_map.classes.items()},
+        }
+        write_whole(folder / LEGEND, f"{json.dumps(legend, indent=1)}\n".encode(), parents=True, regular=True)
     _check_legend(open_maps(folder), bev_map)
     write_whole(map_path(folder, frame), cv2.imencode(".png", bev_map.cells)[1].tobytes(), regular=True)
 
@@ -90,15 +96,6 @@ def _check_legend(folder: MapFolder, bev_map: BevMap) -> None:
 def map_path(folder: Path, frame: int) -> Path:
     """The file of a frame's map in a folder of maps."""
     return folder / f"{frame:06d}.png"
-
-
-def _legend(bev_map: BevMap) -> dict[str, Any]:
-    return {
-        "format": FORMAT,
-        "x_range_m": list(bev_map.x_range_m),
-        "y_range_m": list(bev_map.y_range_m),
-        "classes": {str(bit): name for name, bit in bev_map.classes.items()},
-    }
 
 
 def _range(legend: dict[str, Any], key: str, path: Path) -> tuple[float, float]:

@@ -44,9 +44,10 @@ class PlanWriter:
 
     def write(self, ground: Ground, plan: Plan | None) -> None:
         """Append a frame. plan: in the bev frame; None where the model was not run."""
+        if plan is None:
+            return
         stamp, rows = ground.stamp, []
-        for command, path in () if plan is None else zip(plan.commands, ground.points(plan.paths), strict=True):
-            assert plan is not None
+        for command, path in zip(plan.commands, ground.points(plan.paths), strict=True):
             given = "true" if command == plan.command else "false"
             head = (stamp.index, cell_of(stamp.scene), stamp.timestamp_ns, self._reference, cell_of(command), given)
             for seconds, point in zip(plan.times_s, path, strict=True):

@@ -54,7 +54,6 @@ class _Frame(msgspec.Struct):
 
 class _Object(msgspec.Struct):
     type: str
-    name: str = ""
 
 
 class _Content(msgspec.Struct):

@@ -150,10 +150,7 @@ def rig_notes(rig: CameraRig, source: str = "calibration.json") -> tuple[str, ..
 class FolderGroundTruth:
     """ground_truth.json and ground_truth_lines.json, read at once, and ground_truth_map/, read frame by frame.
 
-    Each may be missing. is_read: whether they are read at all.
-
-    Attributes:
-        class_counts: number of boxes by class.
+    Each may be missing. is_read: whether they are read at all. class_counts: number of boxes by class.
     """
 
     def __init__(self, folder: Path, *, is_read: bool = True) -> None:
