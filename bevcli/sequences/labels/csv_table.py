@@ -51,13 +51,12 @@ def read_csv_labels(path: Path) -> Labels:
 
 def _text(path: Path) -> tuple[str, list[str]]:
     """The text, and the marks of a spreadsheet in it."""
-    content, found = read_bytes(path, LARGEST_BYTES), []
-    if content.startswith(codecs.BOM_UTF8):
-        content, found = content.removeprefix(codecs.BOM_UTF8), ["a byte order mark"]
+    content = read_bytes(path, LARGEST_BYTES)
     try:
-        text = content.decode()
+        text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(f'{path}: is not UTF-8: save it as "CSV UTF-8"') from None
+    found = ["a byte order mark"] if content.startswith(codecs.BOM_UTF8) else []
     return text, found + (["lines that end with CRLF"] if "\r\n" in text else [])
 
 
