@@ -77,12 +77,10 @@ def parse_numbers(owner: Mapping[str, Any], name: str, shape: tuple[int, ...], r
         report.missing(name, expected)
         return None
     array = array_of_numbers(value)
-    if array is None:
-        report.error("wrong-shape", name, "is not an array of numbers", expected=expected, found=value)
-        return None
-    if array.shape != shape:
-        found = "x".join(map(str, array.shape)) or value
-        report.error("wrong-shape", name, "has the wrong shape", expected=expected, found=found)
+    if array is None or array.shape != shape:
+        message = "is not an array of numbers" if array is None else "has the wrong shape"
+        found = value if array is None else "x".join(map(str, array.shape)) or value
+        report.error("wrong-shape", name, message, expected=expected, found=found)
         return None
     if not (np.abs(array) < LARGEST_NUMBER).all():
         report.error("not-finite", name, "contains NaN or infinity", expected="finite numbers below 1e12", found=value)

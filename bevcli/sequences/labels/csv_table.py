@@ -44,9 +44,9 @@ def read_csv_labels(path: Path) -> Labels:
     notes += [f"columns without meaning here are ignored: {', '.join(others)}"] if others else []
     if "frame_of_reference" not in columns:
         notes.append('there is no column frame_of_reference: the boxes are taken to be in the "ego" frame')
-    boxes, reference = _boxes(rows, columns), _frame_of_reference(path, rows)
-    frames = tuple(LabelledFrame(*moment, boxes[places]) for moment, places in _moments(path, rows).items())
-    return Labels(reference, frames, lists_empty=False, notes=tuple(notes))
+    moments, boxes = _moments(path, rows), _boxes(rows, columns)
+    frames = tuple(LabelledFrame(*moment, boxes[places]) for moment, places in moments.items())
+    return Labels(_frame_of_reference(path, rows), frames, lists_empty=False, notes=tuple(notes))
 
 
 def _text(path: Path) -> tuple[str, list[str]]:
@@ -73,7 +73,7 @@ def _rows(path: Path, text: str, separator: str) -> tuple[list[str], list[CsvRow
     for line, cells in lines:
         if len(cells) > len(columns):
             raise InputError(f"{path}: line {line}: has more cells than the {len(columns)} columns of the first line")
-        stated = zip_longest(columns, (name_of(cell.strip()) for cell in cells), fillvalue="")
+        stated = zip_longest(columns, map(str.strip, cells), fillvalue="")
         rows.append(CsvRow(path, line, {**dict.fromkeys(OPTIONAL, ""), **dict(stated)}))
     return columns, rows
 
@@ -130,7 +130,7 @@ def _optional(rows: list[CsvRow], column: str) -> Array:
 
 
 def _names(rows: list[CsvRow], column: str) -> Any:
-    return np.array([row.cells[column] for row in rows], dtype=np.str_)
+    return np.array([name_of(row.cells[column]) for row in rows], dtype=np.str_)
 
 
 def _frame_of_reference(path: Path, rows: list[CsvRow]) -> Any:

@@ -44,8 +44,7 @@ class FolderSequence(Sequence):
     ) -> None:
         if not path.is_dir():
             raise InputError(f"{path}: the sequence folder is missing")
-        self.path = path
-        self.name = path.resolve().name
+        self.path, self.name = path, path.resolve().name
         rig = own.rig() if rig is None else rig
         calibration = path / "calibration.json"
         self.rig, self.facts = read_rig_and_facts(calibration) if rig is None else (rig, DriveFacts())
