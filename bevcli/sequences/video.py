@@ -79,10 +79,7 @@ def open_capture(path: Path) -> cv2.VideoCapture:
 
 
 def count_and_rate(path: Path) -> tuple[int, float]:
-    """Number of images and images per second of a video, as its container states them.
-
-    Raises InputError if it cannot be opened or does not state them.
-    """
+    """Number of images and images per second, as the container states them. Raises InputError where it does not."""
     capture = open_capture(path)
     count, rate = float(capture.get(cv2.CAP_PROP_FRAME_COUNT)), float(capture.get(cv2.CAP_PROP_FPS))
     capture.release()

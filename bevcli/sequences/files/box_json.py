@@ -1,7 +1,4 @@
-"""Conversion between Boxes3D and JSON, one object per box. All boxes of a frame are checked at once, for speed.
-
-The futures of a box are M modes of T steps, each x and y, with the times of the steps.
-"""
+"""Conversion between Boxes3D and JSON, one object per box. All boxes of a frame are checked at once, for speed."""
 
 import math
 from collections.abc import Sequence
@@ -16,12 +13,10 @@ from bevcli.geometry.transforms import Array
 from bevcli.sequences.files.class_names import ClassNames
 from bevcli.sequences.files.json_fields import array_of_numbers
 
-KEYS = frozenset(
-    (
-        "class", "center", "size_lwh", "yaw", "velocity", "score", "attribute", "instance", "track_score", "duplicate",
-        "visibility", "num_points", "futures", "future_times_s", "future_scores",
-    )
-)  # fmt: skip
+KEYS = frozenset((
+    "class", "center", "size_lwh", "yaw", "velocity", "score", "attribute", "instance", "track_score", "duplicate",
+    "visibility", "num_points", "futures", "future_times_s", "future_scores",
+))  # fmt: skip
 # Keys of optional columns: type, value where a box has none, and a text for messages.
 PLAIN: dict[str, tuple[Any, Any, str]] = {
     "attribute": (str, "", "a string"),
@@ -169,7 +164,7 @@ def _plain(objects: Sequence[dict[str, Any]], key: str, where: str) -> NDArray[A
 
 
 def _add_futures(objects: Sequence[dict[str, Any]], boxes: Boxes3D) -> None:
-    """Add the futures of N boxes to their N JSON objects; unknown places become null."""
+    """Add futures to N JSON objects: M modes of T steps, each x and y, null if unknown; and the times of the steps."""
     if boxes.futures is None:
         return
     for place, box in enumerate(objects):

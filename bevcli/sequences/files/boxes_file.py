@@ -1,7 +1,4 @@
-"""ground_truth.json and predictions.json ("bevcli-boxes/1"): boxes by frame.
-
-A file is read as a whole and written frame by frame.
-"""
+"""ground_truth.json and predictions.json ("bevcli-boxes/1"): boxes by frame, read whole, written frame by frame."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace

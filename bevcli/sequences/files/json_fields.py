@@ -1,7 +1,4 @@
-"""Reads numbers from JSON objects and collects what is wrong as findings.
-
-`bevcli run` stops at the first finding; `bevcli project-debug` shows all of them.
-"""
+"""Reads numbers from JSON and collects mistakes as findings: `run` stops at the first, `project-debug` shows all."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
