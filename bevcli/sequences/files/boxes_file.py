@@ -83,9 +83,9 @@ def read_boxes(
     """
     with without_garbage_collection():
         content = read_frames(path, FORMAT, "a boxes file", FRAMES_OF_REFERENCE)
-        stated = _stated_classes(content, path)
-        reference, names = content["frame_of_reference"], ClassNames(class_map, classes or stated or NUSCENES_CLASSES)
-        frames = tuple(_frame(path, place, row, reference, names) for place, row in enumerate(content["frames"]))
+        reference, rows, stated = content["frame_of_reference"], content["frames"], _stated_classes(content, path)
+        names = ClassNames(class_map, classes or stated or NUSCENES_CLASSES)
+        frames = tuple(_frame(path, place, row, reference, names) for place, row in enumerate(rows))
     _check_unique(path, frames)
     ego_from_bev = content.get("ego_from_bev")
     return BoxesFile(

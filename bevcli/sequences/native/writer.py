@@ -52,7 +52,7 @@ class NativeWriter:
     """
 
     def __init__(
-        self, folder: Path, *, with_ego_motion: bool, force: bool = False, facts: DriveFacts | None = None
+        self, folder: Path, *, with_ego_motion: bool, force: bool = False, facts: DriveFacts = DriveFacts()
     ) -> None:
         self.folder, self._facts = folder, facts
         _make_room(folder, force)
