@@ -17,7 +17,6 @@ from bevcli.sequences.files.incremental_json import GrowingFile
 COLUMNS = (
     "frame", "scene", "timestamp_ns", "frame_of_reference", "command", "given", "seconds", "x", "y", "z",
 )  # fmt: skip
-FLAGS = {"true": True, "false": False}
 
 
 @dataclass(frozen=True)
@@ -83,9 +82,9 @@ def _frame_plan(rows: list[CsvRow]) -> FramePlan:
         path = list(steps)
         if [row.number("seconds") for row in path] != times:
             raise path[0].error("seconds", "expected the same steps for every command of a frame")
-        if path[0].cells["given"] not in FLAGS:
+        if path[0].cells["given"] not in ("true", "false"):
             raise path[0].error("given", f'expected true or false, found "{path[0].cells["given"]:.40}"')
-        given = command if FLAGS[path[0].cells["given"]] else given
+        given = command if path[0].cells["given"] == "true" else given
         commands.append(command)
         paths.append([[row.number(axis) for axis in "xyz"] for row in path])
     return FramePlan(stamp, reference, Plan(tuple(commands), np.array(paths), np.array(times), given))
