@@ -81,7 +81,11 @@ def write_calibration(path: Path, rig: CameraRig, facts: DriveFacts = DriveFacts
 
     A default `ego_from_bev` is left out, so that a reader also knows it as the default. regular: see `whole_file`.
     """
-    document: dict[str, Any] = {"format": FORMAT, **_facts_to_json(facts)}
+    document: dict[str, Any] = {"format": FORMAT}
+    if facts.rendered:
+        document["rendered"] = True
+    if facts.geo_origin is not None:
+        document["geo_origin"] = dict(zip(ORIGIN_LIMITS, astuple(facts.geo_origin), strict=True))
     if not rig.ego_from_bev_assumed:
         document["ego_from_bev"] = transform_to_json(rig.ego_from_bev)
     document["cameras"] = {camera.name: _camera_to_json(camera) for camera in rig.cameras}
@@ -136,13 +140,6 @@ def _parse_geo_origin(document: Mapping[str, Any], report: Report) -> GeoOrigin 
         elif number is not None:
             numbers.append(float(number[0]))
     return GeoOrigin(*numbers) if len(numbers) == len(ORIGIN_LIMITS) else None
-
-
-def _facts_to_json(facts: DriveFacts) -> dict[str, Any]:
-    document: dict[str, Any] = {"rendered": True} if facts.rendered else {}
-    if facts.geo_origin is not None:
-        document["geo_origin"] = dict(zip(ORIGIN_LIMITS, astuple(facts.geo_origin), strict=True))
-    return document
 
 
 def _camera_to_json(camera: Camera) -> dict[str, Any]:
