@@ -52,9 +52,9 @@ class NativeWriter:
     """
 
     def __init__(
-        self, folder: Path, *, with_ego_motion: bool, force: bool = False, facts: DriveFacts = DriveFacts()
+        self, folder: Path, *, with_ego_motion: bool, force: bool = False, facts: DriveFacts | None = None
     ) -> None:
-        self.folder, self._facts = folder, facts
+        self.folder, self._facts = folder, facts or DriveFacts()
         _make_room(folder, force)
         self._with_ego_motion, self._reference = with_ego_motion, "world" if with_ego_motion else "ego"
         self._rig: CameraRig | None = None
