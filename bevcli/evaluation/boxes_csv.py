@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
-from bevcli.parsing.csv_cells import cell_of
+from bevcli.parsing.csv_tables import cell_of
 from bevcli.sequences.files.box_json import boxes_to_json
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 from bevcli.sequences.files.incremental_json import GrowingFile

@@ -14,7 +14,7 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import rotation_from_quaternion, yaw_of_rotation
 from bevcli.parsing.files import open_regular
 from bevcli.sequences.files.box_json import boxes_from_json
-from bevcli.sequences.files.boxes_file import LARGEST_BYTES, BoxesFile, FrameBoxes
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 from bevcli.sequences.files.incremental_json import IncrementalJson, existing, read_entries
 
 MAX_BOXES = 500  # per sample, by the rules of the benchmark; the best by score are kept
@@ -39,7 +39,7 @@ class SubmissionWriter:
         """Add a frame, its boxes in the world frame. A frame without a sample token (no keyframe) is left out."""
         token = frame.extras.get("sample_token")
         if token is not None:
-            self.file.append(self._boxes(frame.boxes, token), f"frame {frame.stamp.index}", key=token)
+            self.file.add(self._boxes(frame.boxes, token), f"frame {frame.stamp.index}", key=token)
 
     def __enter__(self) -> Self:
         return self
@@ -130,7 +130,7 @@ def read_submission(path: Path) -> BoxesFile:
 
     A submission has no scenes, timestamps and ego poses.
     """
-    content = read_entries(path, _TAIL, LARGEST_BYTES)
+    content = read_entries(path, _TAIL)
     results = content.get("results") if isinstance(content, dict) else None
     if not isinstance(results, dict):
         raise InputError(f'{path}: "results" must be an object of sample tokens, as in a nuScenes submission')

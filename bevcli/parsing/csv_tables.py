@@ -2,17 +2,27 @@
 
 import csv
 import io
-from collections.abc import Iterable
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
 from bevcli.errors import InputError
-from bevcli.parsing.csv_cells import name_of
 from bevcli.parsing.documents import LARGEST_INTEGER
 from bevcli.parsing.files import read_text
 
 LARGEST_BYTES = 256 << 20
 LARGEST_NUMBER = 1e12  # in SI units, far beyond any position or motion of a vehicle
+_FORMULA = re.compile(r"'*[=+\-@\t\r]")  # a spreadsheet would compute a cell such as `=1+1` or `-1`
+
+
+def cell_of(name: str) -> str:
+    """The cell of a name from outside, with an apostrophe in front of what would be a formula."""
+    return f"'{name}" if _FORMULA.match(name) else name
+
+
+def name_of(cell: str) -> str:
+    """The name in a cell of `cell_of`."""
+    return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
 
 
 @dataclass(frozen=True)
@@ -49,47 +59,29 @@ class CsvRow:
         return value
 
 
-@dataclass(frozen=True)
-class CsvTable:
-    """A file's header and its rows in order."""
-
-    path: Path
-    columns: tuple[str, ...]
-    rows: tuple[CsvRow, ...]
-
-
-def read_csv(path: Path, required: Iterable[str], optional: Iterable[str] = ()) -> CsvTable:
-    """Read a CSV file with a header (UTF-8, separated by commas).
+def read_csv(path: Path, required: tuple[str, ...], optional: tuple[str, ...] = ()) -> tuple[CsvRow, ...]:
+    """The rows of a CSV file with a header (UTF-8, separated by commas), at least one.
 
     Raises InputError if the file cannot be read, a required column is missing, a column is unknown or repeated, a row
     has another number of cells than the header, or there are no rows.
     """
-    required = tuple(required)
-    lines = _lines(path)
-    if not lines:
-        raise InputError(f"{path}: the file is empty (expected a header with {', '.join(required)})")
-    columns = tuple(name_of(cell.strip()) for cell in lines[0][1])
-    _check_columns(path, columns, required, tuple(optional))
-    for line, cells in lines:
-        if any("\0" in cell for cell in cells):
-            raise InputError(f"{path}: line {line}: has a null byte (expected text; the file may be damaged)")
-    rows = tuple(_row(path, columns, line, cells) for line, cells in lines[1:])
-    if not rows:
-        raise InputError(f"{path}: the table has no rows below the header (expected at least one)")
-    return CsvTable(path, columns, rows)
-
-
-def _lines(path: Path) -> list[tuple[int, list[str]]]:
-    """Line number and cells of every line that is not blank."""
     text = read_text(path, LARGEST_BYTES).removeprefix("\ufeff")
     try:
         reader = csv.reader(io.StringIO(text, newline=""))
-        return [(reader.line_num, cells) for cells in reader if cells]
+        lines = [(reader.line_num, cells) for cells in reader if cells]
     except csv.Error as error:
         raise InputError(f"{path}: cannot be read as CSV ({error})") from None
+    if not lines:
+        raise InputError(f"{path}: the file is empty (expected a header with {', '.join(required)})")
+    columns = [name_of(cell.strip()) for cell in lines[0][1]]
+    _check_columns(path, columns, required, optional)
+    rows = tuple(_row(path, columns, line, cells) for line, cells in lines[1:])
+    if not rows:
+        raise InputError(f"{path}: the table has no rows below the header (expected at least one)")
+    return rows
 
 
-def _check_columns(path: Path, columns: tuple[str, ...], required: tuple[str, ...], optional: tuple[str, ...]) -> None:
+def _check_columns(path: Path, columns: list[str], required: tuple[str, ...], optional: tuple[str, ...]) -> None:
     missing = [name for name in required if name not in columns]
     if missing and len(columns) == 1:
         for character, name in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
@@ -97,16 +89,16 @@ def _check_columns(path: Path, columns: tuple[str, ...], required: tuple[str, ..
                 raise InputError(f"{path}: the columns are separated by {name} (expected commas): save it with commas")
     if missing:
         raise InputError(f'{path}: column "{missing[0]}" is missing (found: {", ".join(columns)})')
-    known = {*required, *optional}
-    unknown = [name for name in columns if name not in known]
-    if unknown:
-        raise InputError(f'{path}: unknown column "{unknown[0]}" (known: {", ".join((*required, *optional))})')
-    twice = [name for name in columns if columns.count(name) > 1]
-    if twice:
-        raise InputError(f'{path}: column "{twice[0]}" appears twice in the header')
+    for name in columns:
+        if name not in required and name not in optional:
+            raise InputError(f'{path}: unknown column "{name}" (known: {", ".join((*required, *optional))})')
+        if columns.count(name) > 1:
+            raise InputError(f'{path}: column "{name}" appears twice in the header')
 
 
-def _row(path: Path, columns: tuple[str, ...], line: int, cells: list[str]) -> CsvRow:
+def _row(path: Path, columns: list[str], line: int, cells: list[str]) -> CsvRow:
+    if any("\0" in cell for cell in cells):
+        raise InputError(f"{path}: line {line}: has a null byte (expected text; the file may be damaged)")
     if len(cells) != len(columns):
         raise InputError(f"{path}: line {line} has {len(cells)} cells (expected {len(columns)}, as in the header)")
     return CsvRow(path, line, {name: name_of(cell.strip()) for name, cell in zip(columns, cells, strict=True)})

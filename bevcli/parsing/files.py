@@ -33,12 +33,10 @@ def read_bytes(
             raise error(f"{path}: cannot be read ({failure.strerror})") from None
 
 
-def read_text(
-    path: Path, largest: int, *, missing: str = "the file is missing", error: type[BevcliError] = InputError
-) -> str:
+def read_text(path: Path, largest: int, *, error: type[BevcliError] = InputError) -> str:
     """The contents of a UTF-8 file, see `read_bytes`."""
     try:
-        return read_bytes(path, largest, missing=missing, error=error).decode()
+        return read_bytes(path, largest, error=error).decode()
     except UnicodeDecodeError as failure:
         raise error(f"{path}: cannot be read as text ({failure})") from None
 
@@ -71,14 +69,10 @@ def decompressed(kind: str, data: bytes, largest: int) -> bytes:
     kind: "zstd", "lz4", or "" for data that is not compressed.
     Raises ValueError for another kind, damaged data, or more than `largest` bytes. Data that is cut off may give less.
     """
-    if kind == "zstd":
-        found = _from_zstd(data, largest + 1)
-    elif kind == "lz4":
-        found = _from_lz4(data, largest + 1)
-    elif kind == "":
-        found = data
-    else:
+    kinds = {"zstd": _from_zstd, "lz4": _from_lz4, "": lambda data, largest: data}
+    if kind not in kinds:
         raise ValueError(f'unknown compression "{kind:.20}" (expected zstd, lz4 or none)')
+    found = kinds[kind](data, largest + 1)
     if len(found) > largest:
         raise ValueError(f"has more than {largest} bytes when it is decompressed")
     return found

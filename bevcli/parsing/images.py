@@ -65,19 +65,13 @@ def _jpeg_size(encoded: bytes) -> tuple[int, int] | None:
 
 
 def _is_cut_short(encoded: bytes) -> bool:
-    """True if the end of a JPEG or PNG is missing. OpenCV fills the missing part with grey, without an error."""
+    """True if the end of a JPEG or PNG is missing. OpenCV fills it with grey, and allocates what a chunk states."""
     if media_type_of(encoded) == "image/jpeg":
         return encoded.rfind(b"\xff\xd9") < encoded.rfind(b"\xff\xda")  # the end marker comes before the last scan
-    return not _has_whole_chunks(encoded)
-
-
-def _has_whole_chunks(encoded: bytes) -> bool:
-    """True if the chunks of a PNG lie within the file, up to its end marker. OpenCV allocates what a chunk states."""
     place = 8
-    while place + 12 <= len(encoded):
-        length = int.from_bytes(encoded[place : place + 4], "big")
+    while place + 12 <= len(encoded):  # a chunk of a PNG: length, kind, contents, checksum
         kind = encoded[place + 4 : place + 8]
-        place += 12 + length
+        place += 12 + int.from_bytes(encoded[place : place + 4], "big")
         if kind == b"IEND":
-            return place <= len(encoded)
-    return False
+            return place > len(encoded)
+    return True

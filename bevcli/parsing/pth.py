@@ -105,8 +105,7 @@ class PthFile:
 
 def read_pth(path: Path) -> PthFile:
     """The contents of a PyTorch file. Raises WeightsError."""
-    file = open_regular(path, missing="weights file not found", error=WeightsError)
-    with file:
+    with open_regular(path, missing="weights file not found", error=WeightsError) as file:
         try:
             start = file.read(4)
             file.seek(0)
@@ -318,15 +317,12 @@ def _damaged(path: Path, reason: str) -> WeightsError:
     )
 
 
-def read_safetensors(
-    path: Path, *, missing: str = "the file is missing", error: type[BevcliError] = InputError
-) -> tuple[dict[str, Tensor], dict[str, str]]:
+def read_safetensors(path: Path, *, error: type[BevcliError] = InputError) -> tuple[dict[str, Tensor], dict[str, str]]:
     """The tensors by name, on the CPU, and the metadata.
 
-    missing: text of the message for a file that is not there.
     error: kind of exception for a file that is missing, damaged or no regular file.
     """
-    open_regular(path, missing=missing, error=error).close()  # the library would wait for the writer of a pipe
+    open_regular(path, error=error).close()  # the library would wait for the writer of a pipe
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import Field, dataclass, fields
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 from bevcli.errors import BevcliError, InputError
-from bevcli.options import defaults, gather, option_of
+from bevcli.options import defaults, gather
 from bevcli.registry import entries, load
 from bevcli.sequences.options import FormatOptions, SequenceOptions
 
@@ -50,8 +51,7 @@ class Format:
     def open(self, path: Path, common: SequenceOptions, own: FormatOptions) -> Sequence:
         """A path of this format as a Sequence. Raises InputError."""
         opener = resolve_name(self.opener) if isinstance(self.opener, str) else self.opener
-        opened: Sequence = opener(path, common, own)
-        return opened
+        return opener(path, common, own)
 
 
 def formats() -> tuple[Format, ...]:
@@ -105,13 +105,13 @@ def is_drive(path: Path) -> bool:
     return any(one.recognises(path) for one in formats())
 
 
-def drives_in(root: Path, depth: int = ROOT_DEPTH) -> dict[str, Path]:
+def drives_in(root: Path) -> dict[str, Path]:
     """The drives below a folder that is no drive itself, such as the root of a data set, by name.
 
     The name of a drive is that of its folder or file; with the folders above it where two have the same.
     """
     known = formats()
-    found = {path.relative_to(root).as_posix(): path for path in _drives_below(root, known, depth)}
+    found = {path.relative_to(root).as_posix(): path for path in _drives_below(root, known, ROOT_DEPTH)}
     names = Counter(path.name for path in found.values())
     return {name if names[path.name] > 1 else path.name: path for name, path in found.items()}
 
@@ -120,26 +120,13 @@ def _drives_below(folder: Path, known: Iterable[Format], depth: int) -> Iterator
     if not folder.is_dir():
         return
     for path in sorted(folder.iterdir()):
-        try:
-            if path.name.startswith("."):
-                continue
+        if path.name.startswith("."):
+            continue
+        with suppress(OSError):  # a folder that this user may not read holds no drive of theirs
             if any(one.recognises(path) for one in known):
                 yield path
             elif depth > 1:
                 yield from _drives_below(path, known, depth - 1)
-        except OSError:  # a folder that this user may not read holds no drive of theirs
-            continue
-
-
-def format_options() -> dict[str, Field[Any]]:
-    """The options that not every format has, by name. Raises BevcliError where two formats define one differently."""
-    found: dict[str, Field[Any]] = {}
-    for one in formats():
-        for field in fields(one.options):
-            other = found.setdefault(field.name, field)
-            if option_of(other) != option_of(field):
-                raise BevcliError(f"{GROUP}: two formats define the option `{field.name}` differently: rename one")
-    return found
 
 
 def own_options(path: Path, chosen: Format, values: dict[str, Any]) -> FormatOptions:

@@ -19,12 +19,11 @@ from bevcli.geometry.ego_motion import GRAVITY, Kinematics
 from bevcli.geometry.transforms import Pose
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.parsing.images import decode_image, media_type_of, size_of_image
-from bevcli.sequences.video import VideoReader
+from bevcli.sequences.video import MOST_PIXELS, VideoReader
 from bevcli.waiting import result_within
 
 DECODING_THREADS = 6
 READING_TIMEOUT_S = 120.0
-MOST_PIXELS = 64 << 20  # of an image in a bag
 LARGEST_METADATA = 4 * MIB  # bytes of an image file beyond its pixels
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".webm", ".mov", ".m4v")
@@ -123,14 +122,12 @@ class ImageReader:
     def _read_one(self, source: Source, camera: Camera) -> CameraImage:
         if isinstance(source, ImageSource):
             self._check_place(source)
-        if isinstance(source, ImageSource) and source.video_index is None:
-            encoded, size = _read_file(source, camera)
-            self._check_size(source, camera, size)
-            image = _decode(source, encoded, size)
+            is_file = source.video_index is None
+            image = self._read_file(source, camera) if is_file else self._read_video(source, camera.name)
         else:
-            image = source.read() if isinstance(source, MessageSource) else self._read_video(source, camera.name)
-            height, width = image.pixels_bgr.shape[:2]
-            self._check_size(source, camera, (width, height))
+            image = source.read()
+        height, width = image.pixels_bgr.shape[:2]
+        self._check_size(source, camera, (width, height))
         self._fitting.add(camera.name)
         return image
 
@@ -157,6 +154,23 @@ class ImageReader:
             raise UnreadableImage(f"{source}: {found}")
         raise InputError(f"{source}: camera {camera.name}: {found}: use the calibration of this image size")
 
+    def _read_file(self, source: ImageSource, camera: Camera) -> CameraImage:
+        """An image file. Its size is checked by its header, before it is decoded."""
+        # An uncompressed image with four channels of 16 bits, and room for metadata.
+        largest = 8 * camera.width * camera.height + LARGEST_METADATA
+        try:
+            encoded = read_bytes(source.path, largest, missing="is missing")
+        except InputError as error:
+            raise UnreadableImage(str(error)) from None
+        size = size_of_image(encoded)
+        if size is None:
+            raise UnreadableImage(f"{source.path} is not a complete image (expected a JPEG or PNG)")
+        self._check_size(source, camera, size)
+        pixels = decode(encoded, size[0] * size[1])
+        if pixels is None:
+            raise UnreadableImage(f"{source.path} is not a complete image")
+        return CameraImage(source.timestamp_ns, pixels, encoded, media_type_of(encoded))
+
     def _read_video(self, source: ImageSource, camera: str) -> CameraImage:
         reader = self._videos.get(camera)
         if reader is None or reader.path != source.path:
@@ -168,31 +182,10 @@ class ImageReader:
             raise UnreadableImage(str(error)) from None
 
 
-def _read_file(source: ImageSource, camera: Camera) -> tuple[bytes, tuple[int, int]]:
-    """The contents of an image file, and (width, height) by its header, without decoding it."""
-    # An uncompressed image with four channels of 16 bits, and room for metadata.
-    largest = 8 * camera.width * camera.height + LARGEST_METADATA
-    try:
-        encoded = read_bytes(source.path, largest, missing="is missing")
-    except InputError as error:
-        raise UnreadableImage(str(error)) from None
-    size = size_of_image(encoded)
-    if size is None:
-        raise UnreadableImage(f"{source.path} is not a complete image (expected a JPEG or PNG)")
-    return encoded, size
-
-
-def decode(encoded: bytes) -> NDArray[np.uint8] | None:
-    """(H, W, 3) uint8 BGR of a JPEG or PNG; None for another format, a damaged one, or one of more than 64 MP."""
-    pixels = decode_image(encoded, DECODE_FLAGS, MOST_PIXELS)
+def decode(encoded: bytes, most_pixels: int = MOST_PIXELS) -> NDArray[np.uint8] | None:
+    """(H, W, 3) uint8 BGR of a JPEG or PNG; None for another format, a damaged one, or one of more pixels (64 MP)."""
+    pixels = decode_image(encoded, DECODE_FLAGS, most_pixels)
     return None if pixels is None else pixels.astype(np.uint8, copy=False)
-
-
-def _decode(source: ImageSource, encoded: bytes, size: tuple[int, int]) -> CameraImage:
-    pixels = decode_image(encoded, DECODE_FLAGS, size[0] * size[1])
-    if pixels is None:
-        raise UnreadableImage(f"{source.path} is not a complete image")
-    return CameraImage(source.timestamp_ns, pixels.astype(np.uint8, copy=False), encoded, media_type_of(encoded))
 
 
 @dataclass(frozen=True)

@@ -67,5 +67,4 @@ def open_writer(path: Path, sequence: Sequence, options: WriteOptions) -> DriveW
     if options.boxes is not None and not chosen.takes_boxes:
         raise InputError(f"`boxes`: {chosen.name} takes no boxes of a run: remove the option")
     opener = resolve_name(chosen.opener) if isinstance(chosen.opener, str) else chosen.opener
-    writer: DriveWriter = opener(path, sequence, options)
-    return writer
+    return opener(path, sequence, options)

@@ -1,7 +1,6 @@
 """Reads a video from front to back. It never seeks, because OpenCV's seeking is inexact in many codecs."""
 
 import contextlib
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -18,16 +17,8 @@ CONTAINERS = (
     (0, b"\x1a\x45\xdf\xa3"),
     (0, b"\x00\x00\x00\x01"), (0, b"\x00\x00\x01"), (0, b"DKIF"),
 )  # fmt: skip
-MOST_PIXELS = 1 << 26
+MOST_PIXELS = 1 << 26  # of an image in a video or a bag
 SMALLEST_IMAGE = 8  # bytes of a container for each of its images, at least
-
-
-@dataclass(frozen=True)
-class VideoFacts:
-    """Number of images and images per second of a video, as its container states them."""
-
-    count: int
-    rate_hz: float
 
 
 class VideoReader:
@@ -87,11 +78,11 @@ def open_capture(path: Path) -> cv2.VideoCapture:
     return capture
 
 
-def video_facts(path: Path) -> VideoFacts:
-    """Number of images and rate of a video. Raises InputError if it cannot be opened or does not state them."""
+def count_and_rate(path: Path) -> tuple[int, float]:
+    """Number of images and images per second, as the container states them. Raises InputError where it does not."""
     capture = open_capture(path)
     count, rate = float(capture.get(cv2.CAP_PROP_FRAME_COUNT)), float(capture.get(cv2.CAP_PROP_FPS))
     capture.release()
     if not 0 < count <= path.stat().st_size / SMALLEST_IMAGE or not 0.001 < rate < 10_000:
         raise InputError(f"{path} states {count:.0f} images at {rate:g} per second: list its images in frames.csv")
-    return VideoFacts(int(count), rate)
+    return int(count), rate

@@ -10,7 +10,7 @@ from recorded_drive import boxes_ahead
 from bevcli.evaluation.boxes_csv import write_csv
 from bevcli.frame import FrameStamp
 from bevcli.geometry.transforms import Pose
-from bevcli.parsing.csv_cells import cell_of, name_of
+from bevcli.parsing.csv_tables import cell_of, name_of
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 from bevcli.sequences.native.writer import NativeWriter
 from bevcli.sequences.open import open_sequence

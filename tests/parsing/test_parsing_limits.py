@@ -44,7 +44,7 @@ def test_integers_beyond_62_bits_are_refused_in_every_format(tmp_path, number):
     if len(number) < 200_000:
         refused(read_yaml, path)
     path.write_text(f"a\n{number}\n")
-    refused(lambda: read_csv(path, ["a"]).rows[0].integer("a"))
+    refused(lambda: read_csv(path, ("a",))[0].integer("a"))
 
 
 def test_long_fractions_and_the_largest_integers_are_read():

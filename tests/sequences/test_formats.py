@@ -16,7 +16,7 @@ from bevcli.errors import BevcliError, InputError
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.options import option_of
 from bevcli.sequences.files.calibration_file import write_calibration
-from bevcli.sequences.format import GROUP, format_of, format_options, formats, option_classes
+from bevcli.sequences.format import GROUP, format_of, formats, option_classes
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import RigOptions, SequenceOptions
 
@@ -100,8 +100,7 @@ def test_each_option_is_stated_once():
     for number, names in enumerate(own):
         for others in own[number + 1 :]:
             assert names & others <= shared
-    stated = [*fields(SequenceOptions), *format_options().values()]
-    assert all(option_of(field).help for field in stated)
+    assert all(option_of(field).help for kind in (SequenceOptions, *option_classes()) for field in fields(kind))
 
 
 def test_an_option_of_another_format_is_refused_by_name(drive):

@@ -1,13 +1,8 @@
-"""ground_truth.json and predictions.json ("bevcli-boxes/1"): boxes by frame.
+"""ground_truth.json and predictions.json ("bevcli-boxes/1"): boxes by frame, read whole, written frame by frame."""
 
-A file is read as a whole and written frame by frame.
-"""
-
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import msgspec
@@ -20,13 +15,11 @@ from bevcli.geometry.transforms import Pose, inverse
 from bevcli.parsing.documents import without_garbage_collection
 from bevcli.sequences.files.box_json import boxes_from_json, boxes_to_json
 from bevcli.sequences.files.class_names import ClassNames
-from bevcli.sequences.files.incremental_json import IncrementalJson, read_entries
+from bevcli.sequences.files.incremental_json import file_of_frames, read_frames, stamp_from_json, stamp_to_json
 from bevcli.sequences.files.json_fields import pose_from_json, pose_to_json
 
 FORMAT = "bevcli-boxes/1"
-LARGEST_BYTES = 4 << 30
 FRAMES_OF_REFERENCE = ("world", "ego", "bev")
-_TAIL = "]}"
 _FILE_KEYS = ("format", "frame_of_reference", "ego_from_bev", "frames")
 _FRAME_KEYS = ("frame", "scene", "timestamp_ns", "world_from_ego", "boxes")
 
@@ -89,21 +82,14 @@ def read_boxes(
     or two frames of a scene with the same time. The message names the file, the frame and the box.
     """
     with without_garbage_collection():
-        content = _load(path)
-        frame_of_reference = content.get("frame_of_reference")
-        if frame_of_reference not in FRAMES_OF_REFERENCE:
-            raise InputError(
-                f'{path}: "frame_of_reference" must be world, ego or bev, found {frame_of_reference!r:.40}'
-            )
-        if not isinstance(content.get("frames"), list):
-            raise InputError(f'{path}: "frames" is missing or not a list (expected one object per frame)')
-        stated = _stated_classes(content, path)
-        rows, names = content["frames"], ClassNames(class_map, classes or stated or NUSCENES_CLASSES)
-        frames = tuple(_frame(path, place, row, frame_of_reference, names) for place, row in enumerate(rows))
+        content = read_frames(path, FORMAT, "a boxes file", FRAMES_OF_REFERENCE)
+        reference, rows, stated = content["frame_of_reference"], content["frames"], _stated_classes(content, path)
+        names = ClassNames(class_map, classes or stated or NUSCENES_CLASSES)
+        frames = tuple(_frame(path, place, row, reference, names) for place, row in enumerate(rows))
     _check_unique(path, frames)
     ego_from_bev = content.get("ego_from_bev")
     return BoxesFile(
-        frame_of_reference,
+        reference,
         frames,
         None if ego_from_bev is None else pose_from_json(ego_from_bev, "ego_from_bev", str(path)),
         _others(content, _FILE_KEYS),
@@ -125,12 +111,7 @@ def _stated_classes(content: Mapping[str, Any], path: Path) -> dict[str, ObjectC
 
 def above_score(boxes: BoxesFile, score: float) -> BoxesFile:
     """The boxes with at least this score. Frames without scores keep all boxes."""
-
-    def kept(frame: FrameBoxes) -> FrameBoxes:
-        scores = frame.boxes.scores
-        return frame if scores is None else replace(frame, boxes=frame.boxes[scores >= score])
-
-    return replace(boxes, frames=tuple(map(kept, boxes.frames)))
+    return replace(boxes, frames=tuple(replace(frame, boxes=frame.boxes.scored(score)) for frame in boxes.frames))
 
 
 class BoxesWriter:
@@ -156,27 +137,20 @@ class BoxesWriter:
         head: dict[str, Any] = {"format": FORMAT, "frame_of_reference": frame_of_reference, **(extras or {})}
         if ego_from_bev is not None:
             head["ego_from_bev"] = pose_to_json(ego_from_bev)
-        self.file = IncrementalJson(path, json.dumps(head)[:-1] + ', "frames": [', _TAIL, resume_at)
+        self.file = file_of_frames(path, head, resume_at)
 
     def write(self, frame: FrameBoxes) -> None:
         """Append a frame. Its boxes must be in the file's frame of reference."""
-        row: dict[str, Any] = {
-            "frame": frame.stamp.index,
-            "scene": frame.stamp.scene,
-            "timestamp_ns": frame.stamp.timestamp_ns,
-            **frame.extras,
-        }
+        row = {**stamp_to_json(frame.stamp), **frame.extras}
         if frame.world_from_ego is not None:
             row["world_from_ego"] = pose_to_json(frame.world_from_ego)
         row["boxes"] = boxes_to_json(frame.boxes)
-        self.file.append(row, f"frame {frame.stamp.index}")
+        self.file.add(row, f"frame {frame.stamp.index}")
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.file.close()
 
 
@@ -188,42 +162,20 @@ def write_boxes(boxes: BoxesFile, path: Path) -> int:
     return sum(len(frame.boxes) for frame in boxes.frames)
 
 
-def _load(path: Path) -> dict[str, Any]:
-    missing = f'the file is missing (expected a boxes file, "format": "{FORMAT}")'
-    content = read_entries(path, _TAIL, LARGEST_BYTES, missing=missing)
-    found = content.get("format") if isinstance(content, dict) else type(content).__name__
-    if found != FORMAT:
-        raise InputError(f'{path}: is not a boxes file: "format" must be "{FORMAT}", found {found!r:.40}')
-    return content
-
-
 def _frame(path: Path, place: int, row: Any, frame_of_reference: str, class_names: ClassNames) -> FrameBoxes:
-    where = f"{path}: entry {place} of frames"
-    if not isinstance(row, dict):
-        raise InputError(f"{where}: expected an object, found {row!r:.40}")
-    index, timestamp_ns = _integer(row, "frame", where), _integer(row, "timestamp_ns", where)
-    where = f"{path}: frame {index}"
-    scene = row.get("scene", "")
-    if not isinstance(scene, str):
-        raise InputError(f"{where}: scene: expected a string, found {scene!r:.40}")
+    stamp = stamp_from_json(row, f"{path}: entry {place} of frames")
+    where = f"{path}: frame {stamp.index}"
     if "boxes" not in row:
         raise InputError(f'{where}: "boxes" is missing (expected a list, empty for a frame without boxes)')
     stated = row.get("world_from_ego")
     if stated is None and frame_of_reference == "world":
         raise InputError(f'{where}: "world_from_ego" is missing (required if "frame_of_reference" is "world")')
     return FrameBoxes(
-        FrameStamp(index, scene, timestamp_ns),
+        stamp,
         None if stated is None else pose_from_json(stated, "world_from_ego", where),
         boxes_from_json(row["boxes"], where, class_names),
         _others(row, _FRAME_KEYS),
     )
-
-
-def _integer(row: dict[str, Any], key: str, where: str) -> int:
-    value = row.get(key)
-    if type(value) is not int:
-        raise InputError(f'{where}: "{key}" must be an integer, found {value!r:.40}')
-    return value
 
 
 def _others(row: dict[str, Any], known: tuple[str, ...]) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ LARGEST_BYTES = 4 << 20
 KEYS = ("width", "height", "intrinsics", "distortion", "ego_from_camera")
 LARGEST_SIZE = 16384  # pixels of a side
 FOCAL_RANGE = (0.05, 50.0)  # focal length divided by image size, from extreme fisheye to extreme telephoto
+ORIGIN_LIMITS = {"latitude": 90.0, "longitude": 180.0, "heading_deg": 360.0}  # in the order of GeoOrigin's fields
 COEFFICIENT_COUNTS = {"brown_conrady": (4, 5, 8), "kannala_brandt": (4,)}
 
 
@@ -75,12 +76,16 @@ def draft_calibration(path: Path) -> RigDraft:
     return RigDraft(CameraRig(cameras, ego_from_bev, ego_from_bev_assumed=not given), tuple(report.findings), facts)
 
 
-def write_calibration(path: Path, rig: CameraRig, facts: DriveFacts | None = None, *, regular: bool = False) -> None:
+def write_calibration(path: Path, rig: CameraRig, facts: DriveFacts = DriveFacts(), *, regular: bool = False) -> None:
     """Write the rig so that `read_calibration` returns exactly the same numbers. Raises OutputError.
 
     A default `ego_from_bev` is left out, so that a reader also knows it as the default. regular: see `whole_file`.
     """
-    document: dict[str, Any] = {"format": FORMAT, **({} if facts is None else _facts_to_json(facts))}
+    document: dict[str, Any] = {"format": FORMAT}
+    if facts.rendered:
+        document["rendered"] = True
+    if facts.geo_origin is not None:
+        document["geo_origin"] = dict(zip(ORIGIN_LIMITS, astuple(facts.geo_origin), strict=True))
     if not rig.ego_from_bev_assumed:
         document["ego_from_bev"] = transform_to_json(rig.ego_from_bev)
     document["cameras"] = {camera.name: _camera_to_json(camera) for camera in rig.cameras}
@@ -125,30 +130,16 @@ def _parse_geo_origin(document: Mapping[str, Any], report: Report) -> GeoOrigin 
     if not isinstance(value, dict):
         report.error("wrong-shape", "geo_origin", "is not an object", expected=expected, found=value)
         return None
-    within = report.within("geo_origin")
-    limits = {"latitude": 90.0, "longitude": 180.0, "heading_deg": 360.0}
+    within, stated = report.within("geo_origin"), {"heading_deg": EAST_DEG, **value}
     numbers: list[float] = []
-    for name, limit in limits.items():
-        given = {name: [value[name]] if name in value else [EAST_DEG] if name == "heading_deg" else None}
-        number = parse_numbers(given, name, (1,), within)
+    for name, limit in ORIGIN_LIMITS.items():
+        number = parse_numbers({name: [stated[name]]} if name in stated else {}, name, (1,), within)
         if number is not None and abs(number[0]) > limit:
             wanted = f"degrees, -{limit:g} to {limit:g}"
-            within.error("wrong-size", name, "is out of range", expected=wanted, found=value[name])
+            within.error("wrong-size", name, "is out of range", expected=wanted, found=stated[name])
         elif number is not None:
             numbers.append(float(number[0]))
-    return GeoOrigin(*numbers) if len(numbers) == len(limits) else None
-
-
-def _facts_to_json(facts: DriveFacts) -> dict[str, Any]:
-    document: dict[str, Any] = {"rendered": True} if facts.rendered else {}
-    if facts.geo_origin is not None:
-        origin = facts.geo_origin
-        document["geo_origin"] = {
-            "latitude": origin.latitude_deg,
-            "longitude": origin.longitude_deg,
-            "heading_deg": origin.heading_deg,
-        }
-    return document
+    return GeoOrigin(*numbers) if len(numbers) == len(ORIGIN_LIMITS) else None
 
 
 def _camera_to_json(camera: Camera) -> dict[str, Any]:
@@ -188,9 +179,8 @@ def parse_camera(name: str, value: object, report: Report) -> Camera | None:
     distortion = parse_distortion(value, report)
     if width is None or height is None or intrinsics is None or ego_from_camera is None:
         return None
-    if not _are_plausible(intrinsics, width, height, report):
-        return None
-    return Camera(name, width, height, intrinsics, ego_from_camera, distortion)
+    is_plausible = _are_plausible(intrinsics, width, height, report)
+    return Camera(name, width, height, intrinsics, ego_from_camera, distortion) if is_plausible else None
 
 
 def is_file_name(name: str) -> bool:

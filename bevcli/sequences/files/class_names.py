@@ -60,16 +60,13 @@ class ClassNames:
             return boxes
         return replace(boxes, classes=np.array([names[name] for name in boxes.classes.tolist()]))
 
-    def others(self, counts: Mapping[str, int]) -> dict[str, int]:
-        """Number of boxes by class, for classes that are not among the known ones. counts: of the file's names."""
-        return {name: count for name, count in counts.items() if self[name] not in self.known}
-
     def note(self, counts: Mapping[str, int], where: str, use: str = "scored") -> tuple[str, ...]:
         """A note about boxes whose class is not known, if there are any.
 
-        where: the file or the side that has them. use: what is not done with them.
+        counts: number of boxes by the file's names. where: the file or the side that has them. use: what is not done
+        with them.
         """
-        others = self.others(counts)
+        others = {name: count for name, count in counts.items() if self[name] not in self.known}
         if not others:
             return ()
         named = ", ".join(f"{name} ({count})" for name, count in sorted(others.items()))
@@ -90,7 +87,4 @@ def read_class_map(path: Path) -> dict[str, str]:
 
 def count_classes(frames: Iterable[Boxes3D]) -> Counter[str]:
     """Number of boxes by class."""
-    counts: Counter[str] = Counter()
-    for boxes in frames:
-        counts.update(boxes.classes.tolist())
-    return counts
+    return Counter(name for boxes in frames for name in boxes.classes.tolist())

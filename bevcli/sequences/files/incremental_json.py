@@ -7,14 +7,18 @@ the tail and renames it. A partial file lacks its tail; `read_entries` adds it.
 import contextlib
 import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from bevcli.errors import InputError, OutputError
+from bevcli.frame import FrameStamp
 from bevcli.parsing.documents import parse_json
 from bevcli.parsing.files import read_bytes
 
 PARTIAL = ".partial"
+LARGEST_BYTES = 4 << 30
+_TAIL_OF_FRAMES = "]}"
 
 
 class GrowingFile:
@@ -75,39 +79,34 @@ def existing(path: Path) -> Path:
     return partial if partial.is_file() and not path.exists() else path
 
 
-def read_entries(path: Path, tail: str, largest: int, *, missing: str = "the file is missing") -> Any:
+def read_entries(path: Path, tail: str, *, missing: str = "the file is missing") -> Any:
     """The contents of an incremental JSON file. A partial file gets its tail, and loses an entry that was cut off.
 
-    largest: its largest size in bytes. missing: text of the message for a file that is not there.
-    Raises InputError.
+    missing: text of the message for a file that is not there. Raises InputError.
     """
     file = existing(path)
-    content = read_bytes(file, largest, missing=missing)
+    content = read_bytes(file, LARGEST_BYTES, missing=missing)
     if file.suffix == PARTIAL:
         if not content:
             raise InputError(f"{file}: is empty: the run ended before its first frame")
-        content = _without_cut_entry(content) + tail.encode()
+        content = _without_cut_entry(content, tail[:1].encode()) + tail.encode()
     return parse_json(content, path)
 
 
-def _without_cut_entry(content: bytes) -> bytes:
+def _without_cut_entry(content: bytes, closing: bytes) -> bytes:
+    """closing: the bracket after the last entry, of a list or of an object."""
     lines = content.rstrip(b",\n")
     kept, newline, last = lines.rpartition(b"\n")
-    if not newline or _is_entry(last):
-        return lines
-    return kept.rstrip(b",")
+    try:
+        if newline:
+            json.loads((b"[" if closing == b"]" else b"{") + last + closing)
+    except ValueError:
+        return kept.rstrip(b",")
+    return lines
 
 
-def _is_entry(line: bytes) -> bool:
-    for text in (line, b"{" + line + b"}"):  # an entry of a list, or a member of an object
-        with contextlib.suppress(ValueError):
-            json.loads(text)
-            return True
-    return False
-
-
-class IncrementalJson:
-    """Writes entries between a head and a tail, and keeps none of them in memory. `path` exists once it is closed."""
+class IncrementalJson(GrowingFile):
+    """Writes entries between a head and a tail, and keeps none of them in memory. `name` exists once it is closed."""
 
     def __init__(self, path: Path, head: str, tail: str, resume_at: int | None = None) -> None:
         """Creates the file. Head and tail together must be valid JSON.
@@ -115,25 +114,16 @@ class IncrementalJson:
         resume_at: the `size` of an earlier writer of this file: keep what it had written then, and go on.
         Raises OutputError if the file cannot be written.
         """
-        self.path = path
-        self._partial = partial_path(path)
+        partial = partial_path(path)
+        if resume_at is not None and not partial.exists() and path.exists():
+            _rename(path, partial)
+        super().__init__(partial, resume_at, name=path)
         self._tail = f"\n{tail}\n".encode()
-        self._separator = "\n"
-        self._is_closed = False
-        if resume_at is not None and not self._partial.exists() and path.exists():
-            _rename(path, self._partial)
-        self._file = GrowingFile(self._partial, resume_at, name=path)
         if resume_at is None:
-            self._file.append(head.encode())
-        elif resume_at > len(head.encode()):
-            self._separator = ",\n"
+            self.append(head.encode())
+        self._separator = ",\n" if self.size > len(head.encode()) else "\n"
 
-    @property
-    def size(self) -> int:
-        """Bytes of the head and the entries written so far. Pass it as `resume_at` to go on from here."""
-        return self._file.size
-
-    def append(self, entry: Any, name: str, key: str | None = None) -> None:
+    def add(self, entry: Any, name: str, key: str | None = None) -> None:
         """Write an entry.
 
         name: what the entry is, for error messages. key: its key, if the entries are members of an object.
@@ -143,27 +133,22 @@ class IncrementalJson:
             text = json.dumps(entry, allow_nan=False)
         except ValueError:
             raise OutputError(
-                f"{self.path}: {name}: a box or pose has a number that is not finite, so the model's output is "
+                f"{self.name}: {name}: a box or pose has a number that is not finite, so the model's output is "
                 'invalid: try `precision="fp32"`'
             ) from None
         member = text if key is None else f"{json.dumps(key)}: {text}"
-        self._file.append((self._separator + member).encode())
+        self.append((self._separator + member).encode())
         self._separator = ",\n"
 
     def close(self) -> None:
         """Completes the file and gives it its name. Raises OutputError; the partial file then keeps all entries."""
-        if self._is_closed:
+        if self._file.closed:
             return
-        self._is_closed = True
         try:
-            self._file.append(self._tail)
+            self.append(self._tail)
         finally:
-            self._file.close()
-        _rename(self._partial, self.path)
-
-    def is_deleted(self) -> bool:
-        """True if somebody has deleted the file that is being written."""
-        return self._file.is_deleted()
+            super().close()
+        _rename(self.path, self.name)
 
 
 def _rename(path: Path, to: Path) -> None:
@@ -171,3 +156,46 @@ def _rename(path: Path, to: Path) -> None:
         os.replace(path, to)
     except OSError as error:
         raise OutputError(f"{to}: cannot be written ({error.strerror})") from None
+
+
+def file_of_frames(path: Path, head: Mapping[str, Any], resume_at: int | None = None) -> IncrementalJson:
+    """A JSON object that is written frame by frame: the members of a head, and the list "frames"."""
+    return IncrementalJson(path, json.dumps(head)[:-1] + ', "frames": [', _TAIL_OF_FRAMES, resume_at)
+
+
+def read_frames(path: Path, form: str, kind: str, references: tuple[str, ...]) -> dict[str, Any]:
+    """The contents of a `file_of_frames`; the partial file of a writer that was killed is read, too.
+
+    form, references: the format that it must have, and the frames of reference that it may have. kind: of the file, for
+    messages. Raises InputError.
+    """
+    missing = f'the file is missing (expected {kind}, "format": "{form}")'
+    content = read_entries(path, _TAIL_OF_FRAMES, missing=missing)
+    found = content.get("format") if isinstance(content, dict) else type(content).__name__
+    if found != form:
+        raise InputError(f'{path}: is not {kind}: "format" must be "{form}", found {found!r:.40}')
+    reference = content.get("frame_of_reference")
+    if reference not in references:
+        known = f"{', '.join(references[:-1])} or {references[-1]}"
+        raise InputError(f'{path}: "frame_of_reference" must be {known}, found {reference!r:.40}')
+    if not isinstance(content.get("frames"), list):
+        raise InputError(f'{path}: "frames" is missing or not a list (expected one object per frame)')
+    return content
+
+
+def stamp_to_json(stamp: FrameStamp) -> dict[str, Any]:
+    """The first members of an entry of "frames"."""
+    return {"frame": stamp.index, "scene": stamp.scene, "timestamp_ns": stamp.timestamp_ns}
+
+
+def stamp_from_json(entry: Any, where: str) -> FrameStamp:
+    """The stamp of an entry of "frames", as `stamp_to_json` makes it. Raises InputError, which begins with `where`."""
+    if not isinstance(entry, dict):
+        raise InputError(f"{where}: expected an object, found {entry!r:.40}")
+    for key in ("frame", "timestamp_ns"):
+        if type(entry.get(key)) is not int:
+            raise InputError(f'{where}: "{key}" must be an integer, found {entry.get(key)!r:.40}')
+    scene = entry.get("scene", "")
+    if not isinstance(scene, str):
+        raise InputError(f"{where}: scene: expected a string, found {scene!r:.40}")
+    return FrameStamp(entry["frame"], scene, entry["timestamp_ns"])

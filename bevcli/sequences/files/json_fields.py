@@ -1,9 +1,6 @@
-"""Reads numbers from JSON objects and collects what is wrong as findings.
+"""Reads numbers from JSON and collects mistakes as findings: `run` stops at the first, `project-debug` shows all."""
 
-`bevcli run` stops at the first finding; `bevcli project-debug` shows all of them.
-"""
-
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -56,12 +53,17 @@ class Report:
         """Add an error for a missing key."""
         self.error("missing-key", name, "is missing", expected=expected)
 
-    def require(self, value: _Value | None, where: Path | str) -> _Value:
-        """The value that was read. Raises InputError with the first finding. where: start of the message."""
-        for finding in self.findings:
-            raise InputError(f"{where}: {finding.line}")
-        assert value is not None
-        return value
+
+def require(
+    parse: Callable[..., _Value | None], *arguments: Any, where: Path | str, camera: str | None = None
+) -> _Value:
+    """The value that `parse(*arguments, report)` reads. Raises InputError with the first finding, after `where`."""
+    report = Report(camera)
+    value = parse(*arguments, report)
+    for finding in report.findings:
+        raise InputError(f"{where}: {finding.line}")
+    assert value is not None
+    return value
 
 
 def parse_numbers(owner: Mapping[str, Any], name: str, shape: tuple[int, ...], report: Report) -> Array | None:
@@ -71,13 +73,11 @@ def parse_numbers(owner: Mapping[str, Any], name: str, shape: tuple[int, ...], r
     if value is None:
         report.missing(name, expected)
         return None
-    array = _array_of_numbers(value)
-    if array is None:
-        report.error("wrong-shape", name, "is not an array of numbers", expected=expected, found=value)
-        return None
-    if array.shape != shape:
-        found = "x".join(map(str, array.shape)) or value
-        report.error("wrong-shape", name, "has the wrong shape", expected=expected, found=found)
+    array = array_of_numbers(value)
+    if array is None or array.shape != shape:
+        message = "is not an array of numbers" if array is None else "has the wrong shape"
+        found = value if array is None else "x".join(map(str, array.shape)) or value
+        report.error("wrong-shape", name, message, expected=expected, found=found)
         return None
     if not (np.abs(array) < LARGEST_NUMBER).all():
         report.error("not-finite", name, "contains NaN or infinity", expected="finite numbers below 1e12", found=value)
@@ -85,12 +85,13 @@ def parse_numbers(owner: Mapping[str, Any], name: str, shape: tuple[int, ...], r
     return array
 
 
-def _array_of_numbers(value: object) -> Array | None:
+def array_of_numbers(value: object) -> Array | None:
+    """The float64 array of a number or of nested lists of numbers; None for anything else."""
     try:
         array = np.array(value)
     except (ValueError, OverflowError):  # rows of different lengths
         return None
-    return array.astype(np.float64) if array.dtype.kind in "iuf" else None
+    return array.astype(np.float64, copy=False) if array.dtype.kind in "iuf" else None
 
 
 def parse_transform(owner: Mapping[str, Any], name: str, report: Report) -> Array | None:
@@ -124,8 +125,7 @@ def pose_from_json(value: Any, name: str, where: str) -> Pose:
     name: the key of the value. where: start of an error message, such as "boxes.json: frame 3".
     Raises InputError for a transform that is missing or invalid.
     """
-    report = Report()
-    matrix = report.require(parse_transform({name: value}, name, report), where)
+    matrix = require(parse_transform, {name: value}, name, where=where)
     if "rotation_wxyz" not in value:
         return Pose.from_matrix(matrix)
     return Pose(matrix[:3, 3], np.array(value["rotation_wxyz"], dtype=np.float64))

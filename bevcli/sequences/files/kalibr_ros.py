@@ -10,7 +10,7 @@ from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.parsing.documents import read_json, read_yaml
 from bevcli.sequences.files.calibration_file import parse_camera
-from bevcli.sequences.files.json_fields import Report, parse_numbers, parse_transform, transform_to_json
+from bevcli.sequences.files.json_fields import parse_numbers, parse_transform, require, transform_to_json
 
 Fields = dict[str, Any]  # the fields of one camera, as in calibration.json
 YAML_SUFFIXES = (".yaml", ".yml")
@@ -32,30 +32,29 @@ def read_rig(intrinsics: Path | None, extrinsics: Path | None) -> CameraRig | No
         return None
     if intrinsics is None or extrinsics is None:
         raise InputError("`intrinsics` and `extrinsics` must be given together: pass both, or write a calibration.json")
-    cameras = dict(_read_intrinsics(intrinsics))
+    cameras = _read_intrinsics(intrinsics)
     document = _read_extrinsics(extrinsics)
     poses = _poses(document.get("cameras", {}), cameras, extrinsics)
     rig_cameras = tuple(_camera(name, fields, poses.get(name), extrinsics) for name, fields in cameras.items())
     if "ego_from_bev" not in document:
         return CameraRig(rig_cameras, default_ego_from_bev(), ego_from_bev_assumed=True)
-    report = Report()
-    return CameraRig(rig_cameras, report.require(parse_transform(document, "ego_from_bev", report), extrinsics))
+    return CameraRig(rig_cameras, require(parse_transform, document, "ego_from_bev", where=extrinsics))
 
 
-def _read_intrinsics(path: Path) -> Iterator[tuple[str, Fields]]:
-    """Name and fields of every camera in a file or in the files of a folder."""
+def _read_intrinsics(path: Path) -> dict[str, Fields]:
+    """The fields of every camera in a file or in the files of a folder, by name."""
     files = [path]
     if path.is_dir():
         files = [file for file in sorted(path.iterdir()) if file.suffix.lower() in YAML_SUFFIXES]
         if not files:
             raise InputError(f"{path}: the folder has no .yaml file (expected Kalibr or ROS intrinsics)")
-    seen: set[str] = set()
+    cameras: dict[str, Fields] = {}
     for file in files:
         for name, fields in _cameras_in(file):
-            if name in seen:
+            if name in cameras:
                 raise InputError(f"{file}: camera {name} is in another file too: keep one")
-            seen.add(name)
-            yield name, fields
+            cameras[name] = fields
+    return cameras
 
 
 def _cameras_in(path: Path) -> Iterator[tuple[str, Fields]]:
@@ -87,8 +86,7 @@ def _kalibr_fields(entry: Any, where: str) -> Fields:
         ),
     }
     if "T_cn_cnm1" in entry:
-        report = Report()
-        fields[CHAIN] = report.require(parse_numbers(entry, "T_cn_cnm1", (4, 4), report), where)
+        fields[CHAIN] = require(parse_numbers, entry, "T_cn_cnm1", (4, 4), where=where)
     return fields
 
 
@@ -112,8 +110,7 @@ def _data(document: Mapping[str, Any], name: str) -> Any:
 
 
 def _numbers(owner: Mapping[str, Any], name: str, count: int, where: str) -> list[float]:
-    report = Report()
-    return report.require(parse_numbers(owner, name, (count,), report), where).tolist()
+    return require(parse_numbers, owner, name, (count,), where=where).tolist()
 
 
 def _lens(model: object, coefficients: object, known: Mapping[str, str], where: str) -> Fields:
@@ -137,14 +134,12 @@ def _read_extrinsics(path: Path) -> Mapping[str, Any]:
 
 def _poses(stated: Mapping[str, Any], cameras: Mapping[str, Fields], path: Path) -> dict[str, Array]:
     """ego_from_camera (4, 4) by camera: as stated, otherwise along Kalibr's chain in the file's order."""
-    for name in stated:
-        if name not in cameras:
-            raise InputError(f"{path}: camera {name}: has no intrinsics (found those of {', '.join(cameras)})")
     poses: dict[str, Array] = {}
     for name, entry in stated.items():
-        report = Report(camera=name)
-        pose = parse_transform(entry if isinstance(entry, dict) else {}, "ego_from_camera", report)
-        poses[name] = report.require(pose, path)
+        if name not in cameras:
+            raise InputError(f"{path}: camera {name}: has no intrinsics (found those of {', '.join(cameras)})")
+        owner = entry if isinstance(entry, dict) else {}
+        poses[name] = require(parse_transform, owner, "ego_from_camera", where=path, camera=name)
     order = list(cameras)
     for earlier, name in pairwise(order):  # along the chain
         if name not in poses and earlier in poses and CHAIN in cameras[name]:
@@ -158,7 +153,6 @@ def _poses(stated: Mapping[str, Any], cameras: Mapping[str, Fields], path: Path)
 def _camera(name: str, fields: Fields, ego_from_camera: Array | None, path: Path) -> Camera:
     if ego_from_camera is None:
         raise InputError(f'{path}: camera {name}: "ego_from_camera" is missing: add the camera\'s pose')
-    report = Report(camera=name)
     own = {key: value for key, value in fields.items() if key != CHAIN}
-    camera = parse_camera(name, {**own, "ego_from_camera": transform_to_json(ego_from_camera)}, report)
-    return report.require(camera, path)
+    own["ego_from_camera"] = transform_to_json(ego_from_camera)
+    return require(parse_camera, name, own, where=path, camera=name)

@@ -1,6 +1,5 @@
 """map_lines.json ("bevcli-map-lines/1"): lines of the map by frame."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,13 +9,12 @@ import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp, Ground, MapLines
-from bevcli.sequences.files.incremental_json import IncrementalJson, read_entries
+from bevcli.sequences.files.incremental_json import file_of_frames, read_frames, stamp_from_json, stamp_to_json
+from bevcli.sequences.files.json_fields import array_of_numbers
 
 FORMAT = "bevcli-map-lines/1"
 TRUE_LINES = "ground_truth_lines.json"  # of a drive
-LARGEST_BYTES = 4 << 30
 DECIMALS = 3  # millimetres
-_TAIL = "]}"
 _FRAMES_OF_REFERENCE = ("world", "ego")
 
 
@@ -55,24 +53,22 @@ class LinesWriter:
     ) -> None:
         """extras: at least "classes". resume_at: `file.size` of an earlier writer of this file, to go on from there."""
         head = {"format": FORMAT, "frame_of_reference": frame_of_reference, **extras}
-        self.file = IncrementalJson(path, json.dumps(head)[:-1] + ', "frames": [', _TAIL, resume_at)
+        self.file = file_of_frames(path, head, resume_at)
 
     def write(self, ground: Ground, lines: MapLines | None) -> None:
         """Append a frame. lines: in the bev frame; None where the model was not run."""
-        stamp = ground.stamp
-        found: list[dict[str, Any]] = []
-        for place, points in enumerate(() if lines is None else lines.points):
-            assert lines is not None
-            line: dict[str, Any] = {"class": str(lines.classes[place])}
-            if lines.scores is not None:
-                line["score"] = float(lines.scores[place])
-            found.append(line | {"points": ground.points(points).round(DECIMALS).tolist()})
-        row = {"frame": stamp.index, "scene": stamp.scene, "timestamp_ns": stamp.timestamp_ns, "lines": found}
-        self.file.append(row, f"frame {stamp.index}")
+        found = [] if lines is None else [_line(ground, lines, place) for place in range(len(lines))]
+        self.file.add({**stamp_to_json(ground.stamp), "lines": found}, f"frame {ground.stamp.index}")
 
     def close(self) -> None:
         """Complete the file."""
         self.file.close()
+
+
+def _line(ground: Ground, lines: MapLines, place: int) -> dict[str, Any]:
+    score = {} if lines.scores is None else {"score": float(lines.scores[place])}
+    points = ground.points(lines.points[place]).round(DECIMALS)
+    return {"class": str(lines.classes[place]), **score, "points": points.tolist()}
 
 
 def read_lines(path: Path) -> LinesFile:
@@ -80,29 +76,19 @@ def read_lines(path: Path) -> LinesFile:
 
     Raises InputError, which names the frame and the line, where the file is missing or wrong.
     """
-    missing = f'the file is missing (expected lines of the map, "format": "{FORMAT}")'
-    content = read_entries(path, _TAIL, LARGEST_BYTES, missing=missing)
-    found = content.get("format") if isinstance(content, dict) else type(content).__name__
-    if found != FORMAT:
-        raise InputError(f'{path}: is not a file of map lines: "format" must be "{FORMAT}", found {found!r:.40}')
+    content = read_frames(path, FORMAT, "a file of map lines", _FRAMES_OF_REFERENCE)
     reference, classes, rows = (content.pop(key, None) for key in ("frame_of_reference", "classes", "frames"))
-    if reference not in _FRAMES_OF_REFERENCE:
-        raise InputError(f'{path}: "frame_of_reference" must be world or ego, found {reference!r:.40}')
     if not isinstance(classes, list) or not all(isinstance(name, str) for name in classes):
         raise InputError(f'{path}: "classes" must be a list of names, found {classes!r:.40}')
-    if not isinstance(rows, list):
-        raise InputError(f'{path}: "frames" is missing or not a list (expected one object per frame)')
     frames = tuple(_frame(f"{path}: entry {place} of frames", row) for place, row in enumerate(rows))
     content.pop("format")
     return LinesFile(reference, tuple(classes), frames, content)
 
 
 def _frame(where: str, row: Any) -> FrameLines:
-    if not isinstance(row, dict) or type(row.get("frame")) is not int or type(row.get("timestamp_ns")) is not int:
-        raise InputError(f'{where}: expected an object with the integers "frame" and "timestamp_ns", found {row!r:.60}')
-    scene, lines = row.get("scene", ""), row.get("lines")
-    if not isinstance(scene, str) or not isinstance(lines, list):
-        raise InputError(f'{where}: expected a text "scene" and a list "lines", found {row!r:.60}')
+    stamp, lines = stamp_from_json(row, where), row.get("lines")
+    if not isinstance(lines, list):
+        raise InputError(f'{where}: expected a list "lines", found {lines!r:.60}')
     for place, line in enumerate(lines):
         if not isinstance(line, dict) or not isinstance(line.get("class"), str):
             raise InputError(f'{where}: line {place}: expected an object with "class" and "points", found {line!r:.60}')
@@ -111,19 +97,16 @@ def _frame(where: str, row: Any) -> FrameLines:
     scores = None
     if any("score" in line for line in lines):
         scores = np.array([_score(line.get("score"), f"{where}: line {place}") for place, line in enumerate(lines)])
-    return FrameLines(FrameStamp(row["frame"], scene, row["timestamp_ns"]), MapLines(points, classes, scores))
+    return FrameLines(stamp, MapLines(points, classes, scores))
 
 
 def _points(values: Any, where: str) -> np.ndarray:
-    try:
-        points = np.asarray(values)
-    except ValueError:  # ragged lists
-        points = np.zeros(0)
-    if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2 or points.dtype.kind not in "iuf":
+    points = array_of_numbers(values)
+    if points is None or points.ndim != 2 or points.shape[1] != 3 or len(points) < 2:
         raise InputError(f"{where}: points: expected at least two points of x, y, z, found {values!r:.60}")
     if not np.isfinite(points).all():
         raise InputError(f"{where}: points: expected finite numbers, found {values!r:.60}")
-    return points.astype(np.float64)
+    return points
 
 
 def _score(value: Any, where: str) -> float:

@@ -38,9 +38,8 @@ class MapFolder:
     def load(self, frame: int) -> BevMap:
         """The map of a frame. Raises InputError if it is missing, unreadable or has an unknown bit."""
         path = map_path(self.path, frame)
-        if not path.is_file():
-            raise InputError(f"{path}: the map of frame {frame} is missing")
-        cells = decode_image(read_bytes(path, LARGEST_BYTES), cv2.IMREAD_UNCHANGED, LARGEST_CELLS)
+        encoded = read_bytes(path, LARGEST_BYTES, missing=f"the map of frame {frame} is missing")
+        cells = decode_image(encoded, cv2.IMREAD_UNCHANGED, LARGEST_CELLS)
         if cells is None or cells.ndim != 2 or cells.dtype != np.uint8:
             found = "an unreadable image" if cells is None else f"{cells.dtype} of shape {cells.shape}"
             raise InputError(f"{path}: expected an 8-bit image with one channel, found {found}")
@@ -69,7 +68,13 @@ def write_map(folder: Path, frame: int, bev_map: BevMap) -> None:
     other classes.
     """
     if not (folder / LEGEND).exists():
-        write_whole(folder / LEGEND, f"{json.dumps(_legend(bev_map), indent=1)}\n".encode(), parents=True, regular=True)
+        legend = {
+            "format": FORMAT,
+            "x_range_m": bev_map.x_range_m,
+            "y_range_m": bev_map.y_range_m,
+            "classes": {str(bit): name for name, bit in bev_map.classes.items()},
+        }
+        write_whole(folder / LEGEND, f"{json.dumps(legend, indent=1)}\n".encode(), parents=True, regular=True)
     _check_legend(open_maps(folder), bev_map)
     write_whole(map_path(folder, frame), cv2.imencode(".png", bev_map.cells)[1].tobytes(), regular=True)
 
@@ -91,15 +96,6 @@ def _check_legend(folder: MapFolder, bev_map: BevMap) -> None:
 def map_path(folder: Path, frame: int) -> Path:
     """The file of a frame's map in a folder of maps."""
     return folder / f"{frame:06d}.png"
-
-
-def _legend(bev_map: BevMap) -> dict[str, Any]:
-    return {
-        "format": FORMAT,
-        "x_range_m": list(bev_map.x_range_m),
-        "y_range_m": list(bev_map.y_range_m),
-        "classes": {str(bit): name for name, bit in bev_map.classes.items()},
-    }
 
 
 def _range(legend: dict[str, Any], key: str, path: Path) -> tuple[float, float]:

@@ -11,14 +11,12 @@ from typing import Any
 import numpy as np
 
 from bevcli.frame import FrameStamp, Ground, Plan
-from bevcli.parsing.csv_cells import cell_of
-from bevcli.parsing.csv_tables import CsvRow, read_csv
+from bevcli.parsing.csv_tables import CsvRow, cell_of, read_csv
 from bevcli.sequences.files.incremental_json import GrowingFile
 
 COLUMNS = (
     "frame", "scene", "timestamp_ns", "frame_of_reference", "command", "given", "seconds", "x", "y", "z",
 )  # fmt: skip
-FLAGS = {"true": True, "false": False}
 
 
 @dataclass(frozen=True)
@@ -45,9 +43,10 @@ class PlanWriter:
 
     def write(self, ground: Ground, plan: Plan | None) -> None:
         """Append a frame. plan: in the bev frame; None where the model was not run."""
+        if plan is None:
+            return
         stamp, rows = ground.stamp, []
-        for command, path in () if plan is None else zip(plan.commands, ground.points(plan.paths), strict=True):
-            assert plan is not None
+        for command, path in zip(plan.commands, ground.points(plan.paths), strict=True):
             given = "true" if command == plan.command else "false"
             head = (stamp.index, cell_of(stamp.scene), stamp.timestamp_ns, self._reference, cell_of(command), given)
             for seconds, point in zip(plan.times_s, path, strict=True):
@@ -66,7 +65,7 @@ class PlanWriter:
 
 def read_plans(path: Path) -> tuple[FramePlan, ...]:
     """The plans in plan.csv, in its order; frames without one are left out. Raises InputError."""
-    rows = read_csv(path, COLUMNS).rows
+    rows = read_csv(path, COLUMNS)
     of_frames = groupby(rows, key=lambda row: (row.cells["frame"], row.cells["scene"], row.cells["timestamp_ns"]))
     return tuple(_frame_plan(list(group)) for _, group in of_frames)
 
@@ -83,9 +82,9 @@ def _frame_plan(rows: list[CsvRow]) -> FramePlan:
         path = list(steps)
         if [row.number("seconds") for row in path] != times:
             raise path[0].error("seconds", "expected the same steps for every command of a frame")
-        if path[0].cells["given"] not in FLAGS:
+        if path[0].cells["given"] not in ("true", "false"):
             raise path[0].error("given", f'expected true or false, found "{path[0].cells["given"]:.40}"')
-        given = command if FLAGS[path[0].cells["given"]] else given
+        given = command if path[0].cells["given"] == "true" else given
         commands.append(command)
         paths.append([[row.number(axis) for axis in "xyz"] for row in path])
     return FramePlan(stamp, reference, Plan(tuple(commands), np.array(paths), np.array(times), given))

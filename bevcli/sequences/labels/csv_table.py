@@ -3,7 +3,7 @@
 import codecs
 import csv
 import io
-from collections.abc import Mapping
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -12,18 +12,17 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
-from bevcli.parsing.csv_cells import name_of
+from bevcli.parsing.csv_tables import CsvRow, name_of
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.sequences.labels.label_format import LabelFormat, LabelledFrame, Labels
 
 LARGEST_BYTES = 512 * MIB
-NUMBERS = ("x", "y", "z", "length", "width", "height", "yaw")
-OPTIONAL = (
-    "frame", "timestamp_ns", "frame_of_reference", "vx", "vy", "attribute", "instance", "visibility", "num_points",
-)  # fmt: skip
+SIZES = ("length", "width", "height")
+NUMBERS = ("x", "y", "z", *SIZES, "yaw")
+OPTIONAL_NUMBERS = ("vx", "vy", "visibility", "num_points")
+OPTIONAL = ("frame", "timestamp_ns", "frame_of_reference", "attribute", "instance", *OPTIONAL_NUMBERS)
 UNUSED = ("scene", "score", "track_score", "duplicate")  # of an export, without effect on ground truth
 SEPARATORS = {";": "semicolons", "\t": "tabs"}
-Row = Mapping[str, str]
 
 
 def read_csv_labels(path: Path) -> Labels:
@@ -35,41 +34,48 @@ def read_csv_labels(path: Path) -> Labels:
     text, found = _text(path)
     separator = max(",;\t", key=text.partition("\n")[0].count)
     columns, rows = _rows(path, text, separator)
-    table = _Table(path, rows, decimal_comma=separator != "," and any("," in (row["x"] or "") for _, row in rows))
     found += [f"columns separated by {SEPARATORS[separator]}"] if separator in SEPARATORS else []
-    found += ["decimal commas"] if table.decimal_comma else []
+    if separator != "," and any("," in row.cells["x"] for row in rows):
+        found.append("decimal commas")
+        for row in rows:
+            row.cells.update((name, row.cells[name].replace(",", ".")) for name in (*NUMBERS, *OPTIONAL_NUMBERS))
     notes = [f"found {', '.join(found)}"] if found else []
     others = [name for name in columns if name not in ("class", *NUMBERS, *OPTIONAL, *UNUSED)]
     notes += [f"columns without meaning here are ignored: {', '.join(others)}"] if others else []
-    return table.labels(columns, notes)
-
-
-def _rows(path: Path, text: str, separator: str) -> tuple[list[str], list[tuple[int, Row]]]:
-    """The columns, and each row with its line number."""
-    reader = csv.DictReader(io.StringIO(text, newline=""), delimiter=separator)
-    try:
-        columns = [name.strip().lower() for name in reader.fieldnames or ()]
-        reader.fieldnames = columns
-        _check_columns(path, columns)
-        rows: list[tuple[int, Row]] = [(reader.line_num, row) for row in reader]
-    except csv.Error as error:
-        raise InputError(f"{path}: is not a table ({error})") from None
-    for line, row in rows:
-        if None in row:
-            raise InputError(f"{path}: line {line}: has more cells than the {len(columns)} columns of the first line")
-    return columns, rows
+    if "frame_of_reference" not in columns:
+        notes.append('there is no column frame_of_reference: the boxes are taken to be in the "ego" frame')
+    moments, boxes = _moments(path, rows), _boxes(rows, columns)
+    frames = tuple(LabelledFrame(*moment, boxes[places]) for moment, places in moments.items())
+    return Labels(_frame_of_reference(path, rows), frames, lists_empty=False, notes=tuple(notes))
 
 
 def _text(path: Path) -> tuple[str, list[str]]:
     """The text, and the marks of a spreadsheet in it."""
-    content, found = read_bytes(path, LARGEST_BYTES), []
-    if content.startswith(codecs.BOM_UTF8):
-        content, found = content.removeprefix(codecs.BOM_UTF8), ["a byte order mark"]
+    content = read_bytes(path, LARGEST_BYTES)
     try:
-        text = content.decode()
+        text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(f'{path}: is not UTF-8: save it as "CSV UTF-8"') from None
+    found = ["a byte order mark"] if content.startswith(codecs.BOM_UTF8) else []
     return text, found + (["lines that end with CRLF"] if "\r\n" in text else [])
+
+
+def _rows(path: Path, text: str, separator: str) -> tuple[list[str], list[CsvRow]]:
+    """The columns, and the rows; cells that a row does not have are empty."""
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
+    try:
+        columns = [name.strip().lower() for name in next(reader, ())]
+        _check_columns(path, columns)
+        lines = [(reader.line_num, cells) for cells in reader if cells]
+    except csv.Error as error:
+        raise InputError(f"{path}: is not a table ({error})") from None
+    rows = []
+    for line, cells in lines:
+        if len(cells) > len(columns):
+            raise InputError(f"{path}: line {line}: has more cells than the {len(columns)} columns of the first line")
+        stated = zip_longest(columns, map(str.strip, cells), fillvalue="")
+        rows.append(CsvRow(path, line, {**dict.fromkeys(OPTIONAL, ""), **dict(stated)}))
+    return columns, rows
 
 
 def _check_columns(path: Path, columns: list[str]) -> None:
@@ -85,80 +91,54 @@ def _check_columns(path: Path, columns: list[str]) -> None:
         raise InputError(f"{path}: two columns have one name (found {', '.join(columns)})")
 
 
-class _Table:
-    """The rows of a file by line number. decimal_comma: of its numbers."""
+def _moments(path: Path, rows: list[CsvRow]) -> dict[tuple[int | None, int | None], list[int]]:
+    """Index and time of each frame -> the places of its rows."""
+    moments: dict[tuple[int | None, int | None], list[int]] = {}
+    for place, row in enumerate(rows):
+        index, time = (row.integer(name) if row.cells[name] else None for name in ("frame", "timestamp_ns"))
+        if index is None and time is None:
+            raise InputError(f"{path}: line {row.line}: has neither frame nor timestamp_ns")
+        moments.setdefault((index, time), []).append(place)
+    return moments
 
-    def __init__(self, path: Path, rows: list[tuple[int, Row]], *, decimal_comma: bool) -> None:
-        self.path, self.rows, self.decimal_comma = path, rows, decimal_comma
 
-    def labels(self, columns: list[str], notes: list[str]) -> Labels:
-        """The boxes by frame."""
-        frames: dict[tuple[int | None, int | None], list[int]] = {}
-        for place, (line, row) in enumerate(self.rows):
-            key = (self._integer(line, row, "frame"), self._integer(line, row, "timestamp_ns"))
-            if key == (None, None):
-                raise InputError(f"{self.path}: line {line}: has neither frame nor timestamp_ns")
-            frames.setdefault(key, []).append(place)
-        boxes, reference = self._boxes(columns), self._frame_of_reference()
-        if "frame_of_reference" not in columns:
-            notes = [*notes, 'there is no column frame_of_reference: the boxes are taken to be in the "ego" frame']
-        made = (LabelledFrame(index, time, boxes[places]) for (index, time), places in frames.items())
-        return Labels(reference, tuple(made), lists_empty=False, notes=tuple(notes))
+def _boxes(rows: list[CsvRow], columns: list[str]) -> Boxes3D:
+    numbers = np.array([[row.number(name) for name in NUMBERS] for row in rows]).reshape(-1, len(NUMBERS))
+    for row, sizes in zip(rows, numbers[:, 3:6], strict=True):
+        if min(sizes) <= 0:
+            column = SIZES[sizes.argmin()]
+            raise row.error(column, f'expected a number above 0, found "{row.cells[column]:.40}"')
+        if not row.cells["class"]:
+            raise row.error("class", "is empty (expected the name of a class)")
+    points = _optional(rows, "num_points")
+    return Boxes3D(
+        numbers[:, :3],
+        numbers[:, 3:6],
+        numbers[:, 6],
+        np.column_stack([_optional(rows, "vx"), _optional(rows, "vy")]).reshape(-1, 2),
+        _names(rows, "class"),
+        attributes=_names(rows, "attribute") if "attribute" in columns else None,
+        instances=_names(rows, "instance") if "instance" in columns else None,
+        visibilities=_optional(rows, "visibility") if "visibility" in columns else None,
+        num_points=np.where(np.isnan(points), -1, points).astype(np.int64) if "num_points" in columns else None,
+    )
 
-    def _boxes(self, columns: list[str]) -> Boxes3D:
-        numbers = np.array([[self._number(line, row, name) for name in NUMBERS] for line, row in self.rows])
-        numbers = numbers.reshape(-1, len(NUMBERS))
-        optional = {name: self._optional(name) for name in ("vx", "vy", "visibility", "num_points")}
-        points = np.where(np.isnan(optional["num_points"]), -1, optional["num_points"]).astype(np.int64)
-        return Boxes3D(
-            numbers[:, :3],
-            numbers[:, 3:6],
-            numbers[:, 6],
-            np.column_stack([optional["vx"], optional["vy"]]).reshape(-1, 2),
-            self._names("class"),
-            attributes=self._names("attribute") if "attribute" in columns else None,
-            instances=self._names("instance") if "instance" in columns else None,
-            visibilities=optional["visibility"] if "visibility" in columns else None,
-            num_points=points if "num_points" in columns else None,
-        )
 
-    def _frame_of_reference(self) -> Any:
-        stated = {(row.get("frame_of_reference") or "ego").strip() for _, row in self.rows} or {"ego"}
-        if len(stated) > 1 or not stated <= {"world", "ego", "bev"}:
-            found = ", ".join(sorted(stated))
-            raise InputError(
-                f"{self.path}: column frame_of_reference: expected world, ego or bev in all rows, found {found}"
-            )
-        return stated.pop()
+def _optional(rows: list[CsvRow], column: str) -> Array:
+    """(N,) numbers, NaN where a cell is empty."""
+    return np.array([row.number(column) if row.cells[column] else np.nan for row in rows])
 
-    def _names(self, column: str) -> Any:
-        names = [name_of((row.get(column) or "").strip()) for _, row in self.rows]
-        if column == "class" and "" in names:
-            raise InputError(f"{self.path}: line {self.rows[names.index('')][0]}: column class is empty")
-        return np.array(names, dtype=np.str_)
 
-    def _optional(self, column: str) -> Array:
-        """(N,) numbers, NaN where a cell is empty."""
-        cells = [(line, row) if (row.get(column) or "").strip() else None for line, row in self.rows]
-        return np.array([np.nan if cell is None else self._number(*cell, column) for cell in cells])
+def _names(rows: list[CsvRow], column: str) -> Any:
+    return np.array([name_of(row.cells[column]) for row in rows], dtype=np.str_)
 
-    def _number(self, line: int, row: Row, column: str) -> float:
-        cell = (row.get(column) or "").strip()
-        try:
-            value = float(cell.replace(",", ".") if self.decimal_comma else cell)
-        except ValueError:
-            value = np.nan
-        positive = column in ("length", "width", "height")
-        if not np.isfinite(value) or (positive and value <= 0):
-            kind = "a number above 0" if positive else "a number"
-            raise InputError(f'{self.path}: line {line}: column {column}: expected {kind}, found "{cell:.40}"')
-        return value
 
-    def _integer(self, line: int, row: Row, column: str) -> int | None:
-        cell = (row.get(column) or "").strip()
-        if cell and not cell.isdecimal():
-            raise InputError(f'{self.path}: line {line}: column {column}: expected an integer, found "{cell:.40}"')
-        return int(cell) if cell else None
+def _frame_of_reference(path: Path, rows: list[CsvRow]) -> Any:
+    stated = {row.cells["frame_of_reference"] or "ego" for row in rows} or {"ego"}
+    if len(stated) > 1 or not stated <= {"world", "ego", "bev"}:
+        found = ", ".join(sorted(stated))
+        raise InputError(f"{path}: column frame_of_reference: expected world, ego or bev in all rows, found {found}")
+    return stated.pop()
 
 
 FORMAT = LabelFormat(

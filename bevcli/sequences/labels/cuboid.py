@@ -7,9 +7,10 @@ import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.sequences.labels.label_format import LabelledFrame, Labels
 
 LARGEST_TILT_DEG = 5.0
-IN_EGO = 'the cuboids are taken to be in the "ego" frame: that of the point clouds that were labelled'
+_IN_EGO = 'the cuboids are taken to be in the "ego" frame: that of the point clouds that were labelled'
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,14 @@ class Cuboid:
             np.array([self.position]), np.array([self.size]), np.array([yaw]), np.full((1, 2), np.nan),
             np.array([self.kind]), instances=np.array([self.track]),
         )  # fmt: skip
+
+
+def labels_of_cuboids(frames: Sequence[tuple[int, list[Cuboid]]], *notes: str, lists_empty: bool) -> Labels:
+    """The labels of frames with their index and their cuboids, which are taken to be in the ego frame."""
+    boxes = ((index, Boxes3D.concatenate(one.box() for one in cuboids)) for index, cuboids in frames)
+    listed = tuple(LabelledFrame(index, None, of_frame) for index, of_frame in boxes)
+    tilts = (one.tilt_deg for _, cuboids in frames for one in cuboids)
+    return Labels("ego", listed, lists_empty, (_IN_EGO, *notes, *tilt_note(tilts)))
 
 
 def tilt_note(tilts_deg: Iterable[float]) -> tuple[str, ...]:

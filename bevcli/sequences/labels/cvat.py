@@ -5,12 +5,9 @@ from pathlib import Path
 import msgspec
 
 from bevcli.errors import InputError
-from bevcli.geometry.boxes import Boxes3D
-from bevcli.parsing.files import MIB, read_bytes
-from bevcli.sequences.labels.cuboid import IN_EGO, Cuboid, tilt_note
-from bevcli.sequences.labels.label_format import LabelFormat, LabelledFrame, Labels, starts_with
+from bevcli.sequences.labels.cuboid import Cuboid, labels_of_cuboids
+from bevcli.sequences.labels.label_format import LabelFormat, Labels, decoded, starts_with
 
-LARGEST_BYTES = 1024 * MIB
 CUBOID = "cuboid_3d"
 
 
@@ -55,23 +52,16 @@ def read_cvat_labels(path: Path) -> Labels:
 
     CVAT's cuboids are in the frame of the point cloud, which is taken to be the ego frame.
     """
-    try:
-        content = msgspec.json.decode(read_bytes(path, LARGEST_BYTES), type=_File)
-    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise InputError(f'{path}: is not a CVAT export "Datumaro 3D": {error}') from None
+    content = decoded(path, _File, 'a CVAT export "Datumaro 3D"')
     classes = [label.name for label in content.categories.label.labels]
-    tilts: list[float] = []
-    frames = tuple(_frame(path, item, classes, tilts) for item in content.items)
-    return Labels("ego", frames, lists_empty=True, notes=(IN_EGO, *tilt_note(tilts)))
+    return labels_of_cuboids([_frame(path, item, classes) for item in content.items], lists_empty=True)
 
 
-def _frame(path: Path, item: _Item, classes: list[str], tilts: list[float]) -> LabelledFrame:
+def _frame(path: Path, item: _Item, classes: list[str]) -> tuple[int, list[Cuboid]]:
     where = f"{path}: item {item.id:.40}"
     if item.attr.frame is None:
         raise InputError(f'{where}: "attr" has no "frame", the index of the frame')
-    cuboids = [_cuboid(where, one, classes) for one in item.annotations if one.type == CUBOID]
-    tilts += [one.tilt_deg for one in cuboids]
-    return LabelledFrame(item.attr.frame, None, Boxes3D.concatenate(one.box() for one in cuboids))
+    return item.attr.frame, [_cuboid(where, one, classes) for one in item.annotations if one.type == CUBOID]
 
 
 def _cuboid(where: str, one: _Annotation, classes: list[str]) -> Cuboid:

@@ -43,30 +43,33 @@ def _folder(path: Path, camera: Camera) -> Iterator[LabelledFrame]:
     for file in sorted(path.glob("*.txt")):
         if not file.stem.isdecimal():
             raise InputError(f"{file}: expected the index of a frame as its name, such as 000042.txt")
-        lines = enumerate(read_text(file, LARGEST_BYTES).splitlines(), 1)
-        boxes = [_box(f"{file}: line {number}", line.split(), "", camera) for number, line in lines if line.split()]
-        yield LabelledFrame(int(file.stem), None, Boxes3D.concatenate(box for box in boxes if box is not None))
+        boxes = Boxes3D.concatenate(_box(where, words, "", camera) for where, words in _lines(file))
+        yield LabelledFrame(int(file.stem), None, boxes)
 
 
 def _tracking_file(path: Path, camera: Camera) -> Iterator[LabelledFrame]:
     frames: dict[int, list[Boxes3D]] = {}
-    for number, line in enumerate(read_text(path, LARGEST_BYTES).splitlines(), 1):
-        words, where = line.split(), f"{path}: line {number}"
-        if not words:
-            continue
+    for where, words in _lines(path):
         if not words[0].isdecimal() or len(words) < 2:
-            raise InputError(f'{where}: expected the index of a frame and a track, found "{line:.40}"')
+            raise InputError(f'{where}: expected the index of a frame and a track, found "{" ".join(words):.40}"')
         box = _box(where, words[2:], words[1], camera)
-        if box is not None:
+        if len(box):
             frames.setdefault(int(words[0]), []).append(box)
     for index, boxes in frames.items():
         yield LabelledFrame(index, None, Boxes3D.concatenate(boxes))
 
 
-def _box(where: str, words: list[str], track: str, camera: Camera) -> Boxes3D | None:
-    """The box of a line in the ego frame; None for an area without labels."""
+def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
+    """Place and words of each line that is not blank."""
+    for number, line in enumerate(read_text(path, LARGEST_BYTES).splitlines(), 1):
+        if words := line.split():
+            yield f"{path}: line {number}", words
+
+
+def _box(where: str, words: list[str], track: str, camera: Camera) -> Boxes3D:
+    """The box of a line in the ego frame; none for an area without labels."""
     if words and words[0] == IGNORED:
-        return None
+        return Boxes3D.empty()
     try:
         height, width, length, x, y, z, rotation_y = (float(word) for word in words[8:15])
     except ValueError:

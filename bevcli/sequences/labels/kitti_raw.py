@@ -7,11 +7,10 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.geometry.boxes import Boxes3D
 from bevcli.parsing.documents import parse_xml
 from bevcli.parsing.files import MIB, read_bytes
-from bevcli.sequences.labels.cuboid import IN_EGO, Cuboid, tilt_note
-from bevcli.sequences.labels.label_format import LabelFormat, LabelledFrame, Labels, starts_with
+from bevcli.sequences.labels.cuboid import Cuboid, labels_of_cuboids
+from bevcli.sequences.labels.label_format import LabelFormat, Labels, starts_with
 
 LARGEST_BYTES = 32 * MIB  # a tree of elements takes thirty times as much
 CVAT_VERSION = "0"  # of the poses; KITTI's is 2
@@ -31,11 +30,9 @@ def read_tracklets(path: Path) -> Labels:
     for number, track in enumerate(tracks):
         for index, cuboid in _cuboids(f"{path}: tracklet {number}", track, str(number)):
             frames.setdefault(index, []).append(cuboid)
-    listed = [LabelledFrame(at, None, Boxes3D.concatenate(one.box() for one in frames[at])) for at in sorted(frames)]
-    cvat = any(map(_is_cvats, tracks))
     note = "the poses have CVAT's version: w, h and l are taken to be the sizes along x, y and z, tz to be the middle"
-    tilts = [one.tilt_deg for cuboids in frames.values() for one in cuboids]
-    return Labels("ego", tuple(listed), lists_empty=False, notes=(IN_EGO, *([note] if cvat else []), *tilt_note(tilts)))
+    notes = [note] if any(map(_is_cvats, tracks)) else []
+    return labels_of_cuboids(sorted(frames.items()), *notes, lists_empty=False)
 
 
 def _is_cvats(track: Element) -> bool:

@@ -3,17 +3,21 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
+
+import msgspec
 
 from bevcli.errors import InputError
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
+from bevcli.parsing.files import MIB, read_bytes
 from bevcli.registry import entries, load
 from bevcli.sequences.options import LabelOptions
 
 GROUP = "bevcli.label_formats"
 FIRST_BYTES = 4096
-FrameOfReference = Literal["world", "ego", "bev"]
+LARGEST_BYTES = 1024 * MIB
+_Struct = TypeVar("_Struct")
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,7 @@ class Labels:
         notes: what was assumed, for the user.
     """
 
-    frame_of_reference: FrameOfReference
+    frame_of_reference: Literal["world", "ego", "bev"]
     frames: tuple[LabelledFrame, ...]
     lists_empty: bool
     notes: tuple[str, ...] = ()
@@ -70,6 +74,14 @@ def starts_with(path: Path, ending: str, word: str) -> bool:
         return False
     with path.open("rb") as file:
         return word.encode() in file.read(FIRST_BYTES)
+
+
+def decoded(path: Path, kind: type[_Struct], name: str) -> _Struct:
+    """The contents of a JSON file as a struct. name: of the format, for the message. Raises InputError."""
+    try:
+        return msgspec.json.decode(read_bytes(path, LARGEST_BYTES), type=kind)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise InputError(f"{path}: is not {name}: {error}") from None
 
 
 def read_labels(path: Path, rig: CameraRig, options: LabelOptions) -> Labels:

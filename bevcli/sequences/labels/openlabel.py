@@ -3,20 +3,18 @@
 from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.parsing.files import MIB, read_bytes
 from bevcli.sequences.labels.cuboid import tilt_note
-from bevcli.sequences.labels.label_format import FrameOfReference, LabelFormat, LabelledFrame, Labels, starts_with
+from bevcli.sequences.labels.label_format import LabelFormat, LabelledFrame, Labels, decoded, starts_with
 
-LARGEST_BYTES = 1024 * MIB
 # Names of coordinate systems -> our frames; those with other names need a transform, which is not read.
-SYSTEMS: Mapping[str, FrameOfReference] = {
+SYSTEMS: Mapping[str, Literal["world", "ego", "bev"]] = {
     "world": "world", "odom": "world", "ego": "ego", "vehicle-iso8855": "ego", "bev": "bev",
 }  # fmt: skip
 
@@ -56,7 +54,6 @@ class _Frame(msgspec.Struct):
 
 class _Object(msgspec.Struct):
     type: str
-    name: str = ""
 
 
 class _Content(msgspec.Struct):
@@ -73,28 +70,16 @@ def read_openlabel(path: Path) -> Labels:
 
     Cuboids are in one of the coordinate systems world (or odom), ego (or vehicle-iso8855) or bev.
     """
-    try:
-        content = msgspec.json.decode(read_bytes(path, LARGEST_BYTES), type=_File).openlabel
-    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: is not OpenLABEL: {error}") from None
-    systems = {one.coordinate_system for _, _, one in _cuboids(content)} or {"ego"}
+    content = decoded(path, _File, "OpenLABEL").openlabel
+    found = [each for frame in content.frames.values() for each in frame.objects.values()]
+    systems = {one.coordinate_system for each in found for one in each.object_data.cuboid} or {"ego"}
     unknown = systems - SYSTEMS.keys()
     if unknown or len({SYSTEMS[name] for name in systems}) > 1:
-        found = ", ".join(sorted(systems))
-        raise InputError(f"{path}: expected all cuboids in one of {', '.join(SYSTEMS)}, found {found}")
+        stated = ", ".join(sorted(systems))
+        raise InputError(f"{path}: expected all cuboids in one of {', '.join(SYSTEMS)}, found {stated}")
     tilts: list[float] = []
     frames = tuple(_frame(path, content, number, frame, tilts) for number, frame in content.frames.items())
     return Labels(SYSTEMS[systems.pop()], frames, lists_empty=True, notes=tilt_note(tilts))
-
-
-def _cuboids(content: _Content) -> list[tuple[str, str, _Cuboid]]:
-    """Frame, object and cuboid of each cuboid."""
-    return [
-        (number, key, one)
-        for number, frame in content.frames.items()
-        for key, found in frame.objects.items()
-        for one in found.object_data.cuboid
-    ]
 
 
 def _frame(path: Path, content: _Content, number: str, frame: _Frame, tilts: list[float]) -> LabelledFrame:

@@ -1,7 +1,6 @@
 """A drive with the ground truth of a file of labels."""
 
 import math
-from collections import Counter
 from collections.abc import Collection, Mapping, Sequence as Items
 from dataclasses import replace
 from itertools import groupby, pairwise
@@ -12,6 +11,7 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.frame import DerivedSequence, Frame, FrameStamp, Sequence
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.sequences.files.class_names import count_classes
 from bevcli.sequences.labels.label_format import LabelledFrame, Labels, read_labels
 from bevcli.sequences.options import LabelOptions, UnlistedFrames
 from bevcli.sequences.selection import scenes_of
@@ -45,7 +45,7 @@ class WithLabels(DerivedSequence):
 
     @property
     def class_counts(self) -> Mapping[str, int]:
-        return Counter(name for boxes in self._boxes.values() for name in boxes.classes.tolist())
+        return count_classes(self._boxes.values())
 
     def ground_truth_frame(self, place: int) -> Frame:
         return self._labelled(self.sequence.ground_truth_frame(place), place)

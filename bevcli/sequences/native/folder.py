@@ -13,11 +13,11 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
 from bevcli.geometry.transforms import Array, Pose, apply, inverse
 from bevcli.parsing.files import is_there
-from bevcli.sequences.files.boxes_file import read_boxes
+from bevcli.sequences.files.boxes_file import BoxesFile, read_boxes
 from bevcli.sequences.files.calibration_file import read_rig_and_facts
 from bevcli.sequences.files.class_names import count_classes
 from bevcli.sequences.files.incremental_json import existing
-from bevcli.sequences.files.lines_file import TRUE_LINES, read_lines
+from bevcli.sequences.files.lines_file import TRUE_LINES, LinesFile, read_lines
 from bevcli.sequences.files.map_folder import open_maps
 from bevcli.sequences.images import FrameEntry, ImageReader, ImageSource, read_frame
 from bevcli.sequences.native.tables import check_times, read_ego_motion, read_frames_table
@@ -44,8 +44,7 @@ class FolderSequence(Sequence):
     ) -> None:
         if not path.is_dir():
             raise InputError(f"{path}: the sequence folder is missing")
-        self.path = path
-        self.name = path.resolve().name
+        self.path, self.name = path, path.resolve().name
         rig = own.rig() if rig is None else rig
         calibration = path / "calibration.json"
         self.rig, self.facts = read_rig_and_facts(calibration) if rig is None else (rig, DriveFacts())
@@ -150,25 +149,17 @@ def rig_notes(rig: CameraRig, source: str = "calibration.json") -> tuple[str, ..
 class FolderGroundTruth:
     """ground_truth.json and ground_truth_lines.json, read at once, and ground_truth_map/, read frame by frame.
 
-    Each may be missing.
-
-    is_read: whether they are read at all.
-
-    Attributes:
-        class_counts: number of boxes by class.
+    Each may be missing. is_read: whether they are read at all. class_counts: number of boxes by class.
     """
 
     def __init__(self, folder: Path, *, is_read: bool = True) -> None:
-        boxes_path, maps_path = folder / BOXES_FILE, folder / MAPS_FOLDER
-        has_boxes = is_read and is_there(existing(boxes_path))
-        self._boxes = read_boxes(boxes_path) if has_boxes else None
-        self.class_counts = count_classes(frame.boxes for frame in self._boxes.frames) if self._boxes else {}
-        self._frames = {frame.stamp.index: frame for frame in self._boxes.frames} if self._boxes else {}
-        self._maps = open_maps(maps_path) if is_read and maps_path.is_dir() else None
-        lines_path = folder / TRUE_LINES
-        has_lines = is_read and is_there(existing(lines_path))
-        self._lines = read_lines(lines_path) if has_lines else None
-        self._lines_of = {frame.stamp.index: frame.lines for frame in self._lines.frames} if self._lines else {}
+        boxes, lines, maps = folder / BOXES_FILE, folder / TRUE_LINES, folder / MAPS_FOLDER
+        self._boxes = read_boxes(boxes) if is_read and is_there(existing(boxes)) else BoxesFile("ego", ())
+        self._lines = read_lines(lines) if is_read and is_there(existing(lines)) else LinesFile("ego", (), ())
+        self._maps = open_maps(maps) if is_read and maps.is_dir() else None
+        self.class_counts = count_classes(frame.boxes for frame in self._boxes.frames)
+        self._boxes_of = {frame.stamp.index: frame for frame in self._boxes.frames}
+        self._lines_of = {frame.stamp.index: frame.lines for frame in self._lines.frames}
 
     def boxes(self, frame: int, world_from_ego: Pose | None, ego_from_bev: Array) -> Boxes3D | None:
         """A frame's boxes in the world frame; None if the file does not have the frame.
@@ -176,18 +167,15 @@ class FolderGroundTruth:
         world_from_ego: the sequence's pose at the frame's time. None without ego-motion: boxes are in the ego frame.
         ego_from_bev: (4, 4) of the rig, for a file in the bev frame that does not state its own.
         """
-        truth = self._frames.get(frame)
-        if truth is None or self._boxes is None:
+        truth = self._boxes_of.get(frame)
+        if truth is None:
             return None
-        if self._boxes.frame_of_reference == "world":
-            if world_from_ego:
-                return truth.boxes
-            own = truth.world_from_ego
-            return None if own is None else truth.boxes.transformed(inverse(own.matrix))
-        boxes = truth.boxes
-        if self._boxes.frame_of_reference == "bev":
-            stated = self._boxes.ego_from_bev
-            boxes = boxes.transformed(stated.matrix if stated else ego_from_bev)
+        if self._boxes.frame_of_reference == "world" and world_from_ego:
+            return truth.boxes
+        if self._boxes.frame_of_reference == "bev" and self._boxes.ego_from_bev is None:
+            boxes = truth.boxes.transformed(ego_from_bev)
+        else:
+            boxes = self._boxes.in_ego(truth)
         return boxes.transformed(world_from_ego.matrix) if world_from_ego else boxes
 
     def bev_map(self, frame: int) -> BevMap | None:
@@ -197,7 +185,7 @@ class FolderGroundTruth:
     def lines(self, frame: Frame) -> MapLines | None:
         """The true lines of a frame in its bev frame, None if there are none. The frame's pose is known."""
         lines = self._lines_of.get(frame.stamp.index)
-        if lines is None or self._lines is None:
+        if lines is None:
             return None
         reference_from_ego = frame.world_from_ego.matrix if self._lines.frame_of_reference == "world" else np.eye(4)
         bev_from_reference = inverse(reference_from_ego @ frame.rig.ego_from_bev)

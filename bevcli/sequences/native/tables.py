@@ -13,7 +13,7 @@ from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
 from bevcli.geometry.transforms import Array
-from bevcli.parsing.csv_tables import CsvRow, CsvTable, read_csv
+from bevcli.parsing.csv_tables import CsvRow, read_csv
 from bevcli.sequences.images import FrameEntry, ImageSource
 from bevcli.writing import whole_file
 
@@ -33,9 +33,16 @@ def read_frames_table(path: Path, cameras: Sequence[str]) -> tuple[FrameEntry, .
     Raises InputError for an invalid column or cell, a camera without a column, or times that do not increase in a
     scene.
     """
-    table = _read_columns(path, cameras)
-    entries = tuple(_entry(row, cameras, path.parent) for row in table.rows)
-    _check_numbers(table.rows, entries)
+    times = [f"{name}.timestamp_ns" for name in cameras]
+    rows = read_csv(path, ("frame", "timestamp_ns"), ("scene", *cameras, *times))
+    for name in cameras:
+        if name not in rows[0].cells:
+            raise InputError(
+                f"{path}: camera {name}: its column is missing (expected, because the calibration has the camera): "
+                f'add a column "{name}" (cells may be empty), or remove the camera from the calibration'
+            )
+    entries = tuple(_entry(row, cameras, path.parent) for row in rows)
+    _check_numbers(rows, entries)
     check_times(entries)
     return entries
 
@@ -49,18 +56,6 @@ def check_times(entries: Iterable[FrameEntry]) -> None:
                 f"{entry.origin}: timestamp_ns {stamp.timestamp_ns} is not later than the previous frame's "
                 f"({before.timestamp_ns}): sort the frames by time, or give them different scenes"
             )
-
-
-def _read_columns(path: Path, cameras: Sequence[str]) -> CsvTable:
-    times = [f"{name}.timestamp_ns" for name in cameras]
-    table = read_csv(path, ("frame", "timestamp_ns"), ("scene", *cameras, *times))
-    for name in cameras:
-        if name not in table.columns:
-            raise InputError(
-                f"{path}: camera {name}: its column is missing (expected, because the calibration has the camera): "
-                f'add a column "{name}" (cells may be empty), or remove the camera from the calibration'
-            )
-    return table
 
 
 def _entry(row: CsvRow, cameras: Sequence[str], folder: Path) -> FrameEntry:
@@ -95,54 +90,48 @@ def read_ego_motion(path: Path) -> EgoMotion:
     Raises InputError for an invalid column or cell, times that do not increase, or a quaternion without norm 1.
     """
     required = ("timestamp_ns", *TRANSLATION, *QUATERNION)
-    table = read_csv(path, required, (*ACCELERATION, *ANGULAR_RATE, *VELOCITY))
-    times = _times(table)
-    translations = _columns(table, TRANSLATION)
-    quaternions = np.stack([_quaternion(row) for row in table.rows])
+    rows = read_csv(path, required, (*ACCELERATION, *ANGULAR_RATE, *VELOCITY))
+    times = _times(rows)
+    translations = _columns(rows, TRANSLATION)
+    quaternions = np.stack([_quaternion(row) for row in rows])
     derived = derive_kinematics(times, translations, quaternions)
-    stated = [_group(table, names) for names in (ACCELERATION, ANGULAR_RATE, VELOCITY)]
+    stated = [_group(rows, names) for names in (ACCELERATION, ANGULAR_RATE, VELOCITY)]
     kinematics = [from_poses if own is None else own for own, from_poses in zip(stated, derived, strict=True)]
     return EgoMotion(times, translations, quaternions, *kinematics, velocities_are_stated=stated[2] is not None)
 
 
-def write_ego_motion(path: Path, ego_motion: EgoMotion) -> None:
+def write_ego_motion(path: Path, motion: EgoMotion) -> None:
     """Write all columns, so that `read_ego_motion` returns the same numbers. Raises OutputError."""
-    columns = (
-        ego_motion.translations,
-        ego_motion.quaternions,
-        ego_motion.accelerations,
-        ego_motion.angular_rates,
-        ego_motion.velocities,
-    )
+    columns = (motion.translations, motion.quaternions, motion.accelerations, motion.angular_rates, motion.velocities)
     numbers = np.concatenate(columns, axis=1)  # (T, 16)
     with whole_file(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["timestamp_ns", *TRANSLATION, *QUATERNION, *ACCELERATION, *ANGULAR_RATE, *VELOCITY])
-        for time, row in zip(ego_motion.timestamps_ns, numbers, strict=True):
+        for time, row in zip(motion.timestamps_ns, numbers, strict=True):
             writer.writerow([int(time), *(repr(float(value)) for value in row)])
 
 
-def _times(table: CsvTable) -> NDArray[np.int64]:
-    times = [row.integer("timestamp_ns") for row in table.rows]
-    for row, earlier, time in zip(table.rows[1:], times, times[1:], strict=False):
+def _times(rows: Sequence[CsvRow]) -> NDArray[np.int64]:
+    times = [row.integer("timestamp_ns") for row in rows]
+    for row, (earlier, time) in zip(rows[1:], pairwise(times), strict=True):
         if time <= earlier:
             raise row.error("timestamp_ns", f"{time} is not later than the previous row ({earlier}): sort the rows")
     return np.array(times, dtype=np.int64)
 
 
-def _columns(table: CsvTable, names: tuple[str, ...]) -> Array:
-    return np.array([[row.number(name) for name in names] for row in table.rows])
+def _columns(rows: Sequence[CsvRow], names: tuple[str, ...]) -> Array:
+    return np.array([[row.number(name) for name in names] for row in rows])
 
 
-def _group(table: CsvTable, names: tuple[str, ...]) -> Array | None:
+def _group(rows: Sequence[CsvRow], names: tuple[str, ...]) -> Array | None:
     """(T, 3) of three columns, None if the table has none of them. Raises InputError if it has only some."""
-    there = [name for name in names if name in table.columns]
+    there = [name for name in names if name in rows[0].cells]
     if there and len(there) < len(names):
         raise InputError(
-            f"{table.path}: expected all of the columns {', '.join(names)} or none (found only {', '.join(there)}): "
+            f"{rows[0].path}: expected all of the columns {', '.join(names)} or none (found only {', '.join(there)}): "
             "add the others, or remove all to derive them from the poses"
         )
-    return _columns(table, names) if there else None
+    return _columns(rows, names) if there else None
 
 
 def _quaternion(row: CsvRow) -> Array:

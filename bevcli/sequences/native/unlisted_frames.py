@@ -9,18 +9,16 @@ rate_hz = 24.0
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import is_there, read_text
 from bevcli.sequences.images import IMAGE_SUFFIXES, VIDEO_SUFFIXES, FrameEntry, ImageSource
-from bevcli.sequences.video import VideoFacts, video_facts
+from bevcli.sequences.video import count_and_rate
 
 FILE_NAME = "timing.toml"
 # A number in an image's name is a time in nanoseconds from this value on (hours after 1970), an index below it.
@@ -29,56 +27,55 @@ ASSUMED_RATE_HZ = 2.0  # rate of numbered images without timing.toml: the rate o
 
 
 @dataclass(frozen=True)
-class CameraTiming:
-    """Timing of one camera. offset_ns: its first image is this much later than the common start. rate_hz: its own."""
+class Timing:
+    """Timing of numbered images or of a video. start_ns: of the first image. rate_hz: None if not stated."""
 
-    offset_ns: int = 0
-    rate_hz: float | None = None
+    start_ns: int
+    rate_hz: float | None
 
 
 @dataclass(frozen=True)
-class Timing:
-    """Timing of numbered images or videos, see the top of this file. cameras: those that differ, by name."""
+class CameraVideo:
+    """The video of a camera: number of images, time of the first, images per second."""
 
-    start_ns: int = 0
-    rate_hz: float | None = None
-    cameras: Mapping[str, CameraTiming] = field(default_factory=dict)
+    path: Path
+    count: int
+    start_ns: int
+    rate_hz: float
 
-    def rate_of(self, camera: str) -> float | None:
-        """Images per second of one camera, None if not stated."""
-        own = self.cameras.get(camera, CameraTiming()).rate_hz
-        return self.rate_hz if own is None else own
+    def image(self, number: int) -> ImageSource:
+        """An image by its number, from 0."""
+        return ImageSource(self.path, self.start_ns + round(number * 1e9 / self.rate_hz), number)
 
-    def time_of(self, camera: str, number: int, rate_hz: float) -> int:
-        """Time in nanoseconds of a camera's image `number`, from 0."""
-        offset = self.cameras.get(camera, CameraTiming()).offset_ns
-        return self.start_ns + offset + round(number * 1e9 / rate_hz)
+    def nearest(self, time: int) -> ImageSource | None:
+        """The image nearest to a time in ns, None if it is more than half a period away."""
+        number = round((time - self.start_ns) * self.rate_hz / 1e9)
+        image = self.image(min(max(number, 0), self.count - 1))
+        return image if abs(image.timestamp_ns - time) <= 0.501e9 / self.rate_hz else None
 
 
-def read_timing(folder: Path, cameras: tuple[str, ...]) -> Timing:
-    """The folder's timing.toml, or the defaults if the file is missing.
+def read_timing(folder: Path, cameras: tuple[str, ...]) -> tuple[Timing, dict[str, Timing]]:
+    """The common timing in timing.toml, and that of each camera; the defaults if the file is missing.
 
     Raises InputError for broken TOML, an unknown key or camera, or an invalid value.
     """
     path = folder / FILE_NAME
-    if not is_there(path):
-        return Timing()
-    stated = parse_toml(read_text(path, TOML_BYTES), path)
+    stated = parse_toml(read_text(path, TOML_BYTES), path) if is_there(path) else {}
     _check_keys(path, "", stated, ("start_ns", "rate_hz", "cameras"))
     own = stated.get("cameras", {})
     if not isinstance(own, dict):
         raise InputError(f'{path}: "cameras": expected a table for each camera, such as [cameras.{cameras[0]}]')
     _check_keys(path, "cameras.", own, cameras)
-    by_camera = {name: _camera(path, name, table) for name, table in own.items()}
-    return Timing(_integer(path, "", stated, "start_ns"), _rate(path, "", stated), by_camera)
+    common = Timing(_integer(path, "", stated, "start_ns"), _rate(path, "", stated))
+    return common, {name: _camera(path, f"cameras.{name}", own.get(name, {}), common) for name in cameras}
 
 
-def _camera(path: Path, name: str, table: Any) -> CameraTiming:
-    where = f"cameras.{name}."
+def _camera(path: Path, where: str, table: Any, common: Timing) -> Timing:
     if not isinstance(table, dict):
-        raise InputError(f"{path}: cameras.{name}: expected a table, such as [cameras.{name}]")
-    _check_keys(path, where, table, ("offset_ns", "rate_hz"))
-    return CameraTiming(_integer(path, where, table, "offset_ns"), _rate(path, where, table))
+        raise InputError(f"{path}: {where}: expected a table, such as [{where}]")
+    _check_keys(path, f"{where}.", table, ("offset_ns", "rate_hz"))
+    offset_ns = _integer(path, f"{where}.", table, "offset_ns")
+    return Timing(common.start_ns + offset_ns, _rate(path, f"{where}.", table) or common.rate_hz)
 
 
 def _check_keys(path: Path, where: str, table: Mapping[str, Any], known: tuple[str, ...]) -> None:
@@ -108,33 +105,33 @@ def find_frames(folder: Path, cameras: tuple[str, ...]) -> tuple[tuple[FrameEntr
 
     Raises InputError if there is neither, or if the cameras' images do not have the same names.
     """
-    timing = read_timing(folder, cameras)
+    common, timings = read_timing(folder, cameras)
     if (folder / "images").is_dir():
-        return _from_names(folder, cameras, timing)
+        return _from_names(folder, common, timings)
     if (folder / "videos").is_dir():
-        return _from_videos(folder, cameras, timing)
+        return _from_videos(folder, timings)
     raise InputError(
         f"{folder}: frames.csv, images/ and videos/ are missing: add a frames.csv, "
         "images/CAMERA/TIMESTAMP.jpg, or videos/CAMERA.mp4"
     )
 
 
-def _from_names(folder: Path, cameras: tuple[str, ...], timing: Timing) -> tuple[tuple[FrameEntry, ...], str]:
-    images = {name: _numbered(folder / "images" / name) for name in cameras}
+def _from_names(folder: Path, common: Timing, timings: Mapping[str, Timing]) -> tuple[tuple[FrameEntry, ...], str]:
+    images = {name: _numbered(folder / "images" / name) for name in timings}
     numbers = _common_numbers(folder, images)
     are_times = numbers[0] >= SMALLEST_TIMESTAMP
-    rate = timing.rate_hz or ASSUMED_RATE_HZ
+    rate = common.rate_hz or ASSUMED_RATE_HZ
     entries = []
     for place, number in enumerate(numbers):
-        time = number if are_times else timing.time_of("", number - numbers[0], rate)
+        time = number if are_times else common.start_ns + round((number - numbers[0]) * 1e9 / rate)
         sources = {
-            name: ImageSource(found[number], time + timing.time_of(name, 0, rate) - timing.start_ns)
+            name: ImageSource(found[number], time + timings[name].start_ns - common.start_ns)
             for name, found in images.items()
         }
         stamp = FrameStamp(place if are_times else number, "", time)
         entries.append(FrameEntry(stamp, sources, {}, f"{folder / 'images'}: image {number}"))
     how = "timestamps from the image names" if are_times else f"numbered images at {rate:g} per second"
-    where = "" if are_times or timing.rate_hz else f" (assumed; set rate_hz in {FILE_NAME})"
+    where = "" if are_times or common.rate_hz else f" (assumed; set rate_hz in {FILE_NAME})"
     return tuple(entries), f"frames.csv is missing: found {len(numbers)} frames, {how}{where}"
 
 
@@ -169,44 +166,31 @@ def _common_numbers(folder: Path, images: Mapping[str, Mapping[int, Path]]) -> l
     return everywhere
 
 
-def _from_videos(folder: Path, cameras: tuple[str, ...], timing: Timing) -> tuple[tuple[FrameEntry, ...], str]:
+def _from_videos(folder: Path, timings: Mapping[str, Timing]) -> tuple[tuple[FrameEntry, ...], str]:
     """One frame for each image of the camera with the lowest rate, with the other cameras' nearest images."""
-    paths = {name: _video_of(folder / "videos", name) for name in cameras}
-    facts = {name: video_facts(path) for name, path in paths.items()}
-    rates = {name: timing.rate_of(name) or facts[name].rate_hz for name in cameras}
-    leading = min(cameras, key=lambda name: rates[name])  # the first of cameras with equal rates
+    videos = {name: _video_of(folder / "videos", name, timing) for name, timing in timings.items()}
+    name, leading = min(videos.items(), key=lambda item: item[1].rate_hz)  # the first of cameras with equal rates
     entries = []
-    for place in range(facts[leading].count):
-        time = timing.time_of(leading, place, rates[leading])
-        sources, dropped = {}, {}
-        for name in cameras:
-            source = _nearest(paths[name], facts[name], name, timing, rates[name], time)
-            if source is None:
-                dropped[name] = f"{paths[name].name} has no image within {500 / rates[name]:.0f} ms of {time} ns"
-            else:
-                sources[name] = source
-        entries.append(FrameEntry(FrameStamp(place, "", time), sources, dropped, f"{paths[leading]}#{place}"))
+    for place in range(leading.count):
+        time = leading.image(place).timestamp_ns
+        nearest = {camera: video.nearest(time) for camera, video in videos.items()}
+        sources = {camera: source for camera, source in nearest.items() if source is not None}
+        dropped = {
+            camera: f"{video.path.name} has no image within {500 / video.rate_hz:.0f} ms of {time} ns"
+            for camera, video in videos.items()
+            if nearest[camera] is None
+        }
+        entries.append(FrameEntry(FrameStamp(place, "", time), sources, dropped, f"{leading.path}#{place}"))
     has_timing = is_there(folder / FILE_NAME)
     stated = f"times from {FILE_NAME}" if has_timing else f"starting at time 0 (set start_ns in {FILE_NAME})"
-    note = f"frames.csv is missing: found {len(entries)} frames from {leading}, {rates[leading]:g} per second"
+    note = f"frames.csv is missing: found {len(entries)} frames from {name}, {leading.rate_hz:g} per second"
     return tuple(entries), f"{note}, {stated}"
 
 
-def _video_of(folder: Path, camera: str) -> Path:
+def _video_of(folder: Path, camera: str, timing: Timing) -> CameraVideo:
     found = [path for path in sorted(folder.glob(f"{camera}.*")) if path.suffix.lower() in VIDEO_SUFFIXES]
     if len(found) != 1:
         names = ", ".join(path.name for path in found) or "none"
         raise InputError(f"{folder}: camera {camera}: expected one video, such as {camera}.mp4, found {names}")
-    return found[0]
-
-
-def _nearest(
-    path: Path, facts: VideoFacts, camera: str, timing: Timing, rate_hz: float, time: int
-) -> ImageSource | None:
-    """The camera's image nearest to a time in ns, None if it is more than half a period away."""
-    first = timing.time_of(camera, 0, rate_hz)
-    number = int(np.clip(round((time - first) * rate_hz / 1e9), 0, facts.count - 1))
-    taken = timing.time_of(camera, number, rate_hz)
-    if abs(taken - time) > 0.501e9 / rate_hz:
-        return None
-    return ImageSource(path, taken, number)
+    count, rate_hz = count_and_rate(found[0])
+    return CameraVideo(found[0], count, timing.start_ns, timing.rate_hz or rate_hz)

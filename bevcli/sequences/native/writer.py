@@ -5,18 +5,18 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
-from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import cv2
 import numpy as np
 
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import LINE_CLASSES, CameraImage, DriveFacts, Frame, Ground, MapLines, Sequence
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig, same_rig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
 from bevcli.geometry.transforms import Pose
-from bevcli.parsing.csv_cells import cell_of
+from bevcli.parsing.csv_tables import cell_of
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.sequences.files.lines_file import TRUE_LINES, LinesWriter
@@ -33,8 +33,7 @@ SUFFIXES = {"image/jpeg": ".jpg", "image/png": ".png"}
 
 def write_native(folder: Path, sequence: Sequence, options: WriteOptions) -> "NativeWriter":
     """The writer of a sequence as a native folder; see `OutputFormat`."""
-    with_ego_motion = sequence.has_ego_motion
-    return NativeWriter(folder, with_ego_motion=with_ego_motion, force=options.force, facts=sequence.facts)
+    return NativeWriter(folder, with_ego_motion=sequence.has_ego_motion, force=options.force, facts=sequence.facts)
 
 
 class NativeWriter:
@@ -55,9 +54,9 @@ class NativeWriter:
     def __init__(
         self, folder: Path, *, with_ego_motion: bool, force: bool = False, facts: DriveFacts | None = None
     ) -> None:
-        self.folder, self._facts = folder, facts
+        self.folder, self._facts = folder, facts or DriveFacts()
         _make_room(folder, force)
-        self._with_ego_motion = with_ego_motion
+        self._with_ego_motion, self._reference = with_ego_motion, "world" if with_ego_motion else "ego"
         self._rig: CameraRig | None = None
         self._numbers: set[int] = set()
         self._motion: dict[int, tuple[Pose, Kinematics]] = {}
@@ -80,21 +79,19 @@ class NativeWriter:
         self._write_row(frame, cells)
         if self._with_ego_motion:
             self._store_motion(frame)
+        pose = frame.world_from_ego if self._with_ego_motion else None
         if frame.ground_truth is not None:
-            self._write_boxes(frame)
+            self._write_boxes(frame, frame.ground_truth, pose)
         if frame.ground_truth_map is not None:
             write_map(self.folder / MAPS_FOLDER, frame.stamp.index, frame.ground_truth_map)
-
         if frame.ground_truth_lines is not None:
-            self._write_lines(frame, frame.ground_truth_lines)
+            self._write_lines(Ground(frame.stamp, frame.rig.ego_from_bev, pose), frame.ground_truth_lines)
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._open.__exit__(kind, error, trace)
+    def __exit__(self, *error: Any) -> None:
+        self._open.__exit__(*error)
 
     def _finish(self, kind: type[BaseException] | None, *error: object) -> None:
         if kind is not None:
@@ -141,10 +138,10 @@ class NativeWriter:
     def _store_motion(self, frame: Frame) -> None:
         for name, image in frame.images.items():
             self._motion.setdefault(image.timestamp_ns, (frame.world_from_ego_at[name], frame.kinematics))
-        times = [frame.stamp.timestamp_ns, *(image.timestamp_ns for image in frame.images.values())]
         self._motion[frame.stamp.timestamp_ns] = (frame.world_from_ego, frame.kinematics)
-        first, last = self._scenes.get(frame.stamp.scene, (times[0], times[0]))
-        self._scenes[frame.stamp.scene] = (min(first, *times), max(last, *times))
+        times = [frame.stamp.timestamp_ns, *(image.timestamp_ns for image in frame.images.values())]
+        times += self._scenes.get(frame.stamp.scene, ())
+        self._scenes[frame.stamp.scene] = (min(times), max(times))
 
     def _check_scenes(self) -> None:
         """Raise InputError if scenes overlap in time: they share one ego_motion.csv."""
@@ -153,22 +150,17 @@ class NativeWriter:
             if start <= end:
                 raise InputError(f"scenes {earlier} and {later} overlap in time: convert scene by scene (`scene`)")
 
-    def _write_boxes(self, frame: Frame) -> None:
-        assert frame.ground_truth is not None
+    def _write_boxes(self, frame: Frame, boxes: Boxes3D, pose: Pose | None) -> None:
         if self._boxes is None:
-            frame_of_reference = "world" if self._with_ego_motion else "ego"
-            self._boxes = self._open.enter_context(BoxesWriter(self.folder / BOXES_FILE, frame_of_reference))
-        pose = frame.world_from_ego if self._with_ego_motion else None
+            self._boxes = self._open.enter_context(BoxesWriter(self.folder / BOXES_FILE, self._reference))
         extras = {"sample_token": frame.sample_token} if frame.sample_token else {}
-        self._boxes.write(FrameBoxes(frame.stamp, pose, frame.ground_truth, extras))
+        self._boxes.write(FrameBoxes(frame.stamp, pose, boxes, extras))
 
-    def _write_lines(self, frame: Frame, lines: MapLines) -> None:
+    def _write_lines(self, ground: Ground, lines: MapLines) -> None:
         if self._lines is None:
-            frame_of_reference = "world" if self._with_ego_motion else "ego"
-            self._lines = LinesWriter(self.folder / TRUE_LINES, frame_of_reference, {"classes": list(LINE_CLASSES)})
+            self._lines = LinesWriter(self.folder / TRUE_LINES, self._reference, {"classes": list(LINE_CLASSES)})
             self._open.callback(self._lines.close)
-        pose = frame.world_from_ego if self._with_ego_motion else None
-        self._lines.write(Ground(frame.stamp, frame.rig.ego_from_bev, pose), lines)
+        self._lines.write(ground, lines)
 
 
 def _make_room(folder: Path, force: bool) -> None:
