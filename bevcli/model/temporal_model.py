@@ -16,9 +16,8 @@ from bevcli.geometry.transforms import Pose
 from bevcli.model.box_coding import decode
 from bevcli.model.config import ModelConfig
 from bevcli.model.export_form import ExportForm
-from bevcli.model.scene_attention import SceneAttention
 from bevcli.model.segmentation import decode_maps
-from bevcli.model.step import ModelOutputs, PreparedFrame
+from bevcli.model.step import ModelOutputs, PreparedFrame, SceneAttention
 from bevcli.registry import entries, load
 
 Memory = Any  # a frozen dataclass of the model's own; whoever runs the model only passes it on

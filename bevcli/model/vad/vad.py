@@ -11,13 +11,17 @@ from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.config import ModelConfig
 from bevcli.model.network import STAGES, ConstantSelfAttention
 from bevcli.model.pillar_projection import PillarHits
-from bevcli.model.scene_attention import SceneAttention
-from bevcli.model.step import ModelOutputs
-from bevcli.model.truth import FrameTruth
+from bevcli.model.step import FrameTruth, ModelOutputs, SceneAttention
 from bevcli.model.vad.attention_layer import attention_weights
 from bevcli.model.vad.config import VADConfig
-from bevcli.model.vad.decoding import VADOutputs, decode_futures, decode_lines, decode_plan
-from bevcli.model.vad.explained import motion_attention, plan_attention
+from bevcli.model.vad.decoding import (
+    VADOutputs,
+    decode_futures,
+    decode_lines,
+    decode_plan,
+    motion_attention,
+    plan_attention,
+)
 from bevcli.model.vad.export import VADForm
 from bevcli.model.vad.line_decoder import LineDecoder, LineEncoder, LineOutputs
 from bevcli.model.vad.losses import head_losses
