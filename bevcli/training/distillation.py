@@ -13,7 +13,7 @@ from bevcli.checkpoints import load_weights
 from bevcli.model.kernels.choose import choose_kernels
 from bevcli.model.network import Network
 from bevcli.model.step import ClipInputs
-from bevcli.weights.local import weights_file
+from bevcli.weights.fetch import weights_file
 
 
 @dataclass(frozen=True)
