@@ -67,7 +67,7 @@ def modulated(image_features: FeatureMaps, factor: Tensor, shift: Tensor) -> Fea
 
 
 def ray_features(
-    image_from_bev: Tensor, level_shapes: tuple[tuple[int, int], ...], image_size: tuple[int, int], height_m: float
+    image_from_bev: Tensor, level_shapes: LevelShapes, image_size: tuple[int, int], height_m: float
 ) -> Tensor:
     """(K, S, RAY_FEATURES) float32: numbers of about 1 that describe the viewing rays of all cells of K images.
 

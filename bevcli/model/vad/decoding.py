@@ -42,7 +42,7 @@ class VADOutputs(ModelOutputs):
 
 def decode_futures(outputs: VADOutputs, config: VADConfig) -> Boxes3D:
     """The boxes of `bevcli.model.box_coding.decode`, with futures: the places of each object's centre in each mode."""
-    boxes = decode(outputs, config)[0]
+    boxes = decode(outputs, config)
     queries = best_boxes(outputs.class_logits[-1], outputs.box_codes[-1], config).query[0]
     offsets = _array(outputs.motion.offsets[0, queries])  # (K, M, T, 2)
     places = boxes.centers[:, None, None, :2] + offsets.cumsum(2)
@@ -88,11 +88,8 @@ def motion_attention(
 ) -> SceneAttention:
     """Attention of the object nearest to a place: the mean over its modes, the sum over modes of the others.
 
-    Args:
-        outputs: of the step.
-        weights: to modes of objects (1, Q·M, Q·M), and to lines (Q, M, N + 1), the last one of "no line".
-        config: of the model.
-        place: x and y, metres, bev frame.
+    weights: to modes of objects (1, Q·M, Q·M), and to lines (Q, M, N + 1), the last one of "no line". place: x and y,
+    metres, bev frame.
     """
     to_objects, to_lines = weights
     objects = _objects(outputs, config)

@@ -79,9 +79,7 @@ def line_losses(
 ) -> dict[str, Tensor]:
     """The weighted scalar losses of all decoder layers, divided by the number of matched lines of the batch.
 
-    Args:
-        targets: B.
-        extent_m: (2,) of the range in x and y.
+    targets: B. extent_m: (2,) of the range in x and y.
     """
     layers = zip(outputs.class_logits, outputs.points, strict=True)
     totals = torch.stack([_layer_loss(*layer, targets, weights, extent_m) for layer in layers]).sum(0)

@@ -44,16 +44,11 @@ def head_losses(
 
 
 def motion_losses(
-    outputs: MotionOutputs,
-    truths: Sequence[Boxes3D],
-    matches: Sequence[tuple[Tensor, Tensor]],
-    weights: LossWeights,
+    outputs: MotionOutputs, truths: Sequence[Boxes3D], matches: Sequence[tuple[Tensor, Tensor]], weights: LossWeights
 ) -> dict[str, Tensor]:
     """The weighted scalar losses, divided by the number of matched boxes whose next place is known.
 
-    Args:
-        truths: B.
-        matches: of each frame the queries that are matched to boxes, and the indices of these.
+    truths: B, each with one future. matches: as for `head_losses`.
     """
     mode_targets, counted = torch.zeros_like(outputs.mode_logits), torch.ones_like(outputs.mode_logits)
     errors, number = outputs.offsets.new_zeros(()), 0
