@@ -18,7 +18,7 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.export_form import ExportForm
 from bevcli.model.segmentation import decode_map
 from bevcli.model.step import ModelOutputs, PreparedFrame, SceneAttention
-from bevcli.registry import entries, load
+from bevcli.registry import load
 
 Memory = Any  # a frozen dataclass of the model's own; whoever runs the model only passes it on
 
@@ -131,11 +131,6 @@ class TemporalModel(nn.Module):
     def part_names(cls, config: ModelConfig) -> Iterable[tuple[str, ...]]:
         """The name of each part, then its modules, in the order of a frame's way; a model may lack some."""
         return ()
-
-
-def model_classes() -> list[type[TemporalModel]]:
-    """All registered models."""
-    return [load("bevcli.models", name) for name in entries("bevcli.models")]
 
 
 def model_class(config: ModelConfig) -> type[TemporalModel]:

@@ -12,7 +12,6 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.network import STAGES, ConstantSelfAttention
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.step import FrameTruth, ModelOutputs, SceneAttention
-from bevcli.model.vad.attention_layer import attention_weights
 from bevcli.model.vad.config import VADConfig
 from bevcli.model.vad.decoding import (
     VADOutputs,
@@ -25,7 +24,7 @@ from bevcli.model.vad.decoding import (
 from bevcli.model.vad.export import VADForm
 from bevcli.model.vad.line_decoder import LineDecoder, LineEncoder, LineOutputs
 from bevcli.model.vad.losses import head_losses
-from bevcli.model.vad.motion_head import MapTokens, MotionHead, MotionOutputs, line_positions
+from bevcli.model.vad.motion_head import MapTokens, MotionHead, MotionOutputs, attention_weights, line_positions
 from bevcli.model.vad.official_keys import NAMES, UNUSED
 from bevcli.model.vad.planner import Planner
 
