@@ -27,7 +27,7 @@ class TemporalModel(nn.Module):
     """A model with a memory between frames. A class registered under `bevcli.models` is built from its configuration.
 
     `step` decides a model's results; everything else has a default. The configuration says what the model needs of a
-    sequence: see `ModelConfig`. The `decode_…` read no weights: those of an exported file are its model's, too.
+    sequence: see `ModelConfig`. The methods `decode_…` read nothing but `config`, as an exported file has no more.
 
     Attributes:
         config_class: class of the configuration, which a TOML file fills in.
