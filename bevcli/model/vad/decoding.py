@@ -75,37 +75,36 @@ def decode_plan(outputs: VADOutputs, config: VADConfig) -> Plan:
     return Plan(config.commands, _array(outputs.plan[0]).cumsum(1), np.array(config.future_times_s))
 
 
-def plan_attention(outputs: VADOutputs, weights: Sequence[Tensor], config: VADConfig) -> SceneAttention:
-    """Attention of the planner. weights: to objects (1, 1, Q), and to lines (1, 1, N)."""
-    to_objects, to_lines = weights
-    paths = _paths(outputs.plan[0], np.zeros(2))
-    objects, lines = _objects(outputs, config), _lines(outputs, config)
-    return SceneAttention(objects, _array(to_objects[0, 0]), lines, _array(to_lines[0, 0]), paths)
-
-
-def motion_attention(
+def scene_attentions(
     outputs: VADOutputs, weights: Sequence[Tensor], config: VADConfig, place: tuple[float, float]
-) -> SceneAttention:
-    """Attention of the object nearest to a place: the mean over its modes, the sum over modes of the others.
+) -> dict[str, SceneAttention]:
+    """Attention of the planner, and of the object nearest to a place, to the objects and the lines.
 
-    weights: to modes of objects (1, Q·M, Q·M), and to lines (Q, M, N + 1), the last one of "no line". place: x and y,
-    metres, bev frame.
+    That of the object is the mean over its modes, the sum over modes of the others.
+
+    Args:
+        weights: of the planner to objects (1, 1, Q) and to lines (1, 1, N); of the motion head to modes of objects
+            (1, Q·M, Q·M) and to lines (Q, M, N + 1), the last one of "no line".
+        place: x and y, metres, bev frame.
     """
-    to_objects, to_lines = weights
-    objects = _objects(outputs, config)
+    plan_to_objects, plan_to_lines, to_objects, to_lines = weights
+    objects, lines = _objects(outputs, config), _lines(outputs, config)
+    paths = _paths(outputs.plan[0], np.zeros(2))
     attending = _nearest(objects, place)
     of_objects = to_objects[0].unflatten(0, (len(objects), -1))[attending].unflatten(-1, (len(objects), -1))
     of_lines = _array(to_lines[attending].mean(0))
-    return SceneAttention(
+    motion = SceneAttention(
         objects,
         _array(of_objects.sum(-1).mean(0)),
-        _lines(outputs, config),
+        lines,
         of_lines[:-1],
         _paths(outputs.motion.offsets[0, attending], objects.centers[attending, :2]),
         best=int(outputs.motion.mode_logits[0, attending].argmax()),
         no_line=float(of_lines[-1]),
         attending=attending,
     )
+    plan = SceneAttention(objects, _array(plan_to_objects[0, 0]), lines, _array(plan_to_lines[0, 0]), paths)
+    return {"plan": plan, "motion": motion}
 
 
 def _objects(outputs: VADOutputs, config: VADConfig) -> Boxes3D:
