@@ -41,18 +41,15 @@ class KeyReport:
     @property
     def fits(self) -> bool:
         """True where nothing differs."""
-        return not (self.missing or self.unexpected or self.misshapen)
+        return not any(vars(self).values())
 
     def describe(self) -> str:
         """All differing keys, on one line."""
-        return "; ".join(f"{len(keys)} {name}: {', '.join(keys)}" for name, keys in self._parts() if keys)
+        return "; ".join(f"{len(keys)} {name}: {', '.join(keys)}" for name, keys in vars(self).items() if keys)
 
     def summary(self) -> str:
         """The first differing key of each kind, on one line."""
-        return "; ".join(f"{len(keys)} {name}, such as {keys[0]}" for name, keys in self._parts() if keys)
-
-    def _parts(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
-        return ("missing", self.missing), ("unexpected", self.unexpected), ("misshapen", self.misshapen)
+        return "; ".join(f"{len(keys)} {name}, such as {keys[0]}" for name, keys in vars(self).items() if keys)
 
 
 @dataclass(frozen=True)
@@ -78,7 +75,7 @@ class Checkpoint:
     @cached_property
     def models(self) -> tuple[str, ...]:
         """Names of the known models that the state dict fits."""
-        return fitting_models(self.state)
+        return tuple(name for name in known_models() if compare(self.state, _expected_of(name)).fits)
 
     @property
     def parameters(self) -> int:
@@ -163,22 +160,15 @@ def bundled_weights(model: str) -> Path | None:
 
 def compare(state: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> KeyReport:
     """The differences between a state dict and the state dict of a model."""
-    shapes = {key: tuple(tensor.shape) for key, tensor in expected.items()}
-    found = {key: tuple(tensor.shape) for key, tensor in state.items()}
     return KeyReport(
-        missing=tuple(key for key in shapes if key not in found),
-        unexpected=tuple(key for key in found if key not in shapes),
+        missing=tuple(key for key in expected if key not in state),
+        unexpected=tuple(key for key in state if key not in expected),
         misshapen=tuple(
-            f"{key}: expected {shapes[key]}, found {found[key]}"
-            for key in shapes
-            if key in found and shapes[key] != found[key]
+            f"{key}: expected {tuple(tensor.shape)}, found {tuple(state[key].shape)}"
+            for key, tensor in expected.items()
+            if key in state and tensor.shape != state[key].shape
         ),
     )
-
-
-def fitting_models(state: Mapping[str, Tensor]) -> tuple[str, ...]:
-    """Names of the known models that a state dict fits."""
-    return tuple(name for name in known_models() if compare(state, _expected_of(name)).fits)
 
 
 @cache

@@ -15,10 +15,10 @@ import torch
 from typer.testing import CliRunner
 
 from bevcli.checkpoints import (
+    Checkpoint,
     compare,
     convert,
     expected_state,
-    fitting_models,
     load_weights,
     read_checkpoint,
     require_fit,
@@ -135,7 +135,8 @@ def test_weights_inspect_names_objects_that_were_not_read(tmp_path: Path) -> Non
 
 
 def test_a_state_dict_fits_its_own_model_alone() -> None:
-    assert fitting_models(from_official(official_state("small"))[0]) == ("small",)
+    state, _ = from_official(official_state("small"))
+    assert Checkpoint(Path("small.pth"), state, official=True).models == ("small",)
 
 
 def test_different_official_keys_stay_different() -> None:

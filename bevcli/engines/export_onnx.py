@@ -109,6 +109,11 @@ def metadata(
     """
     config, image, grid = form.config, form.config.image, form.config.bev_grid
     facts = {
+        "model": config.name,
+        "precision": "fp32",
+        "bevcli_version": __version__,
+        "resize": image.resize,
+        "can_bus_quaternion": config.ego_motion.can_bus_quaternion,
         "inputs": {port.name: port.meaning for port in form.inputs},
         "outputs": {port.name: port.meaning for port in outputs},
         "classes": config.classes,
@@ -132,14 +137,7 @@ def metadata(
         "bundled": bundled,
         **form.facts(),
     }
-    names = {
-        "model": config.name,
-        "precision": "fp32",
-        "bevcli_version": __version__,
-        "resize": image.resize,
-        "can_bus_quaternion": config.ego_motion.can_bus_quaternion,
-    }
-    return names | {key: json.dumps(value) for key, value in facts.items()}
+    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in facts.items()}
 
 
 def _document(proto: object, inputs: tuple[Port, ...], outputs: tuple[Port, ...]) -> None:

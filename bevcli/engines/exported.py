@@ -95,7 +95,8 @@ class ExportedModel(TemporalModel):
         super().__init__(metadata.config)
         self.file, self.engine, self.metadata = file, engine, metadata
         self._require(("images",), engine.input_shapes, "input")
-        self.form = model_class(self.config).export_form(self.config, self.cameras)
+        self.kind = model_class(self.config)
+        self.form = self.kind.export_form(self.config, self.cameras)
         self._require((port.name for port in self.form.outputs(decode=False)), engine.outputs, "output")
         with file.open("rb") as stream:
             digest = hashlib.file_digest(stream, "sha256").digest()
@@ -128,12 +129,15 @@ class ExportedModel(TemporalModel):
         return outputs, self.form.memory(prepared, memory, outputs.found)
 
     def decode_boxes(self, outputs: ModelOutputs) -> Boxes3D:
-        assert isinstance(outputs, ExportedOutputs)
-        return self.form.decode_boxes(self.form.model_outputs(outputs, outputs.found))
+        return self.kind.decode_boxes(self, self._outputs_of_model(outputs))
 
     def decode_results(self, outputs: ModelOutputs) -> tuple[FrameResult, ...]:
+        return self.kind.decode_results(self, self._outputs_of_model(outputs))
+
+    def _outputs_of_model(self, outputs: ModelOutputs) -> ModelOutputs:
+        """The outputs as the class of the model decodes them, which needs only the configuration of this one."""
         assert isinstance(outputs, ExportedOutputs)
-        return self.form.decode_results(self.form.model_outputs(outputs, outputs.found))
+        return self.form.model_outputs(outputs, outputs.found)
 
     def forward(self, feed: Mapping[str, Tensor]) -> ExportedOutputs:
         """The outputs of the file. feed: its inputs by name, see `ExportForm.feed`.

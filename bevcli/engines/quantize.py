@@ -29,7 +29,6 @@ def quantize(file: Path, images: Iterable[np.ndarray], out: Path) -> None:
     Args:
         file: of `bevcli export-onnx`.
         images: the input `images` of some frames, (1, N, H, W, 3) float32 each, for the ranges of the activations.
-        out: the file to write.
 
     Raises:
         BevcliError: the extra bevcli[onnx] is not installed.

@@ -14,7 +14,7 @@ from bevcli.explain.step_figure import StepFigure
 from bevcli.explain.trace import Trace
 from bevcli.frame import Plan
 from bevcli.geometry.transforms import Array
-from bevcli.model.scene_attention import SceneAttention
+from bevcli.model.step import SceneAttention
 
 WEIGHT_COLORS = LinearSegmentedColormap.from_list("weight", ["#d3d7de", "#f5b39a", ACCENT, "#6d0f23"])
 LISTED = 8  # rows of a table of weights

@@ -191,7 +191,7 @@ def _box_of(trace: Trace, layer: int, query: int) -> Boxes3D:
     """The box of one query after one decoder layer."""
     outputs, of_query = trace.outputs, (slice(layer, layer + 1), slice(None), slice(query, query + 1))
     one = ModelOutputs(outputs.bev, outputs.class_logits[of_query], outputs.box_codes[of_query])
-    return decode(one, trace.config)[0][:1]
+    return decode(one, trace.config)[:1]
 
 
 def _draw_code_table(axes: Axes, codes: Array, scores: Array, name: str) -> None:

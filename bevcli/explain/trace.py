@@ -18,8 +18,7 @@ from bevcli.inference.runner import BevState, Runner, StepOptions
 from bevcli.model.config import ModelConfig
 from bevcli.model.network import Network
 from bevcli.model.pillar_projection import project_pillars
-from bevcli.model.scene_attention import SceneAttention
-from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame
+from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame, SceneAttention
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.sequences.selection import scenes_of
 

@@ -50,18 +50,15 @@ class BestBoxes(NamedTuple):
         return places[:, :, None] - places[:, None]
 
 
-def decode(outputs: ModelOutputs, config: ModelConfig) -> list[Boxes3D]:
-    """The boxes with the best scores of the last decoder layer, by falling score, bev frame.
+def decode(outputs: ModelOutputs, config: ModelConfig) -> Boxes3D:
+    """The boxes with the best scores of the last decoder layer, by falling score, bev frame; of a batch of one.
 
-    One Boxes3D for each batch element, with at most config.decoder.max_boxes boxes. No box is removed: training matches
-    each object to one query. A query gives one box for each of its classes that is among the best scores.
+    There are at most config.decoder.max_boxes. No box is removed: training matches each object to one query. A query
+    gives one box for each of its classes that is among the best scores.
     """
-    classes = np.asarray(config.classes)
     best = best_boxes(outputs.class_logits[-1].detach(), outputs.box_codes[-1].detach(), config)
-    return [
-        boxes_of_codes(code.double().cpu().numpy(), classes[names.cpu().numpy()], score.double().cpu().numpy())
-        for code, names, score in zip(best.codes, best.label, best.scores, strict=True)
-    ]
+    codes, scores = (column[0].double().cpu().numpy() for column in (best.codes, best.scores))
+    return boxes_of_codes(codes, np.asarray(config.classes)[best.label[0].cpu().numpy()], scores)
 
 
 def best_boxes(class_logits: Tensor, box_codes: Tensor, config: ModelConfig) -> BestBoxes:

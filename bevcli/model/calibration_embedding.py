@@ -67,7 +67,7 @@ def modulated(image_features: FeatureMaps, factor: Tensor, shift: Tensor) -> Fea
 
 
 def ray_features(
-    image_from_bev: Tensor, level_shapes: tuple[tuple[int, int], ...], image_size: tuple[int, int], height_m: float
+    image_from_bev: Tensor, level_shapes: LevelShapes, image_size: tuple[int, int], height_m: float
 ) -> Tensor:
     """(K, S, RAY_FEATURES) float32: numbers of about 1 that describe the viewing rays of all cells of K images.
 
@@ -77,8 +77,7 @@ def ray_features(
     matrix = image_from_bev[:, :3, :3].float()
     rows = matrix.unbind(1)
     # The inverse by cross products, which ONNX has.
-    columns = [torch.linalg.cross(rows[1], rows[2]), torch.linalg.cross(rows[2], rows[0])]
-    columns.append(torch.linalg.cross(rows[0], rows[1]))
+    columns = [torch.linalg.cross(rows[i], rows[j]) for i, j in ((1, 2), (2, 0), (0, 1))]
     determinant = (rows[0] * columns[0]).sum(-1)
     bev_from_image = torch.stack(columns, dim=-1) / determinant[:, None, None]  # (K, 3, 3)
     center = -(bev_from_image * image_from_bev[:, None, :3, 3]).sum(-1)  # (K, 3)

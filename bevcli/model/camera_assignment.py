@@ -39,7 +39,6 @@ def assign_cameras(
     """Assigns each camera of a rig to a camera of the model: as `chosen`, else by name, else by viewing direction.
 
     Args:
-        rig: the cameras.
         model_cameras: the names of the model's cameras, in the order of their embeddings.
         chosen: camera of the rig -> camera of the model.
 

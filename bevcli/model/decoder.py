@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -55,6 +56,11 @@ class DecoderConfig:
             raise ValueError("fade_duplicates must be from 0 to 1")
         if not 0 <= self.merge_duplicates < math.inf:
             raise ValueError("merge_duplicates must be 0 or more, and finite")
+
+    @classmethod
+    def of_head(cls, head: Any, layers: int, queries: int) -> "DecoderConfig":
+        """The settings of the decoder layers in a head whose configuration has the other numbers under these names."""
+        return cls(layers, head.attention_heads, head.points, queries, head.feed_forward_width, head.dropout)
 
 
 @dataclass(frozen=True)

@@ -83,7 +83,7 @@ class DeformableAttention(nn.Module):
 
     def locations(self, reference_points: Tensor, offsets: Tensor, level_shapes: LevelShapes) -> Tensor:
         """Reference points plus predicted offsets; see `sampling_locations`."""
-        return sampling_locations(reference_points, offsets, level_shapes, self.level_sizes)
+        return sampling_locations(reference_points, offsets, self.level_sizes(level_shapes, offsets.device))
 
     def attend(self, query: Tensor, reference_points: Tensor, tokens: Tensor, level_shapes: LevelShapes) -> Tensor:
         """The attended values (B, Q, C) of queries that sample one map each.
@@ -190,22 +190,15 @@ def level_sizes(level_shapes: LevelShapes, device: torch.device) -> Tensor:
     return torch.tensor([(width, height) for height, width in level_shapes], dtype=torch.float32, device=device)
 
 
-def sampling_locations(
-    reference_points: Tensor,
-    offsets: Tensor,
-    level_shapes: LevelShapes,
-    sizes_of: Callable[[LevelShapes, torch.device], Tensor] = level_sizes,
-) -> Tensor:
+def sampling_locations(reference_points: Tensor, offsets: Tensor, sizes: Tensor) -> Tensor:
     """Reference points plus offsets: (..., L, P, 2) float32, x and y, 0 to 1 over a map.
 
     Args:
         reference_points: (..., L or 1, P or 1, 2) x and y, 0 to 1 over a map; up to 1e6 behind a camera.
         offsets: (..., L, P, 2) x and y in cells of each level.
-        level_shapes: (height, width) of each level.
-        sizes_of: makes the table of level sizes.
+        sizes: (L, 2) float32 width and height of each level, see `level_sizes`.
     """
-    sizes = sizes_of(level_shapes, offsets.device)[:, None]  # (L, 1, 2)
     # Broadcasting over a last axis of two elements takes several times as long as dividing full tensors.
-    sizes = sizes.expand(offsets.shape[-3:]).contiguous()
+    sizes = sizes[:, None].expand(offsets.shape[-3:]).contiguous()  # (L, P, 2)
     reference_points = reference_points.float().expand(*reference_points.shape[:-2], *offsets.shape[-2:]).contiguous()
     return reference_points + offsets.float() / sizes

@@ -76,9 +76,6 @@ def ego_motion_inputs(
         pose: world_from_ego, with the sign of the quaternion as stored.
         previous_pose: world_from_ego of the previous frame. None for a scene's first frame, which has neither
             translation nor rotation, and where config.first_frame is "original" for the first frame of the run.
-        kinematics: acceleration, angular rate and velocity.
-        grid: the BEV grid.
-        config: how ego-motion enters the model.
     """
     position = np.asarray(pose.translation, dtype=np.float64)
     yaw_deg = heading_deg(pose.quaternion)
@@ -112,8 +109,7 @@ def rotate_history(history: Tensor, rotation_deg: Tensor, grid: BevGrid, center:
     Args:
         history: (B, Y·X, C).
         rotation_deg: (B,); on the CPU it needs no wait for the history's device.
-        grid: the BEV grid.
-        center: centre of the rotation, see EgoMotionConfig.
+        center: see `EgoMotionConfig.history_rotation_center`.
     """
     rows, columns = grid.rows, grid.columns
     row, column = _source_cells(rotation_deg, grid, center, history.device)  # (B, Y, X) each

@@ -7,9 +7,6 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from bevcli.frame import FrameResult
-from bevcli.geometry.boxes import Boxes3D
-from bevcli.model.box_coding import decode
 from bevcli.model.config import ModelConfig
 from bevcli.model.segmentation import STUFF_CLASSES
 from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame
@@ -70,14 +67,6 @@ class ExportForm:
     def further_outputs(self, outputs: ModelOutputs) -> dict[str, Tensor]:
         """The outputs that only this model has, by their names in the file. outputs: as of `model_outputs`."""
         return {}
-
-    def decode_boxes(self, outputs: ModelOutputs) -> Boxes3D:
-        """As `TemporalModel.decode_boxes`, of `model_outputs`."""
-        return decode(outputs, self.config)[0]
-
-    def decode_results(self, outputs: ModelOutputs) -> tuple[FrameResult, ...]:
-        """As `TemporalModel.decode_results`, of `model_outputs`."""
-        return ()
 
     def memory(self, prepared: PreparedFrame, memory: Any, found: Mapping[str, Tensor]) -> Any:
         """The memory after a frame. memory: before it. found: the file's outputs by name."""

@@ -20,7 +20,6 @@ from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, split_offsets_and_mask
 from bevcli.model.encoder import SpatialCrossAttention
 from bevcli.model.kernels.choose import fold_batch_norms
-from bevcli.model.pillar_projection import PillarProjection
 
 
 class ExportedStep(nn.Module):
@@ -31,7 +30,10 @@ class ExportedStep(nn.Module):
     image_std: Tensor
 
     def __init__(self, model: Any, deformable_convolution: DeformableConvolution, slots: int, *, decode: bool) -> None:
-        """A copy of the model, with its parts replaced; the model itself stays unchanged. slots: see `slot_hits`."""
+        """A copy of the model, with its parts replaced; the model itself stays unchanged.
+
+        slots: K of `SlottedHits`, at most the number of cameras.
+        """
         super().__init__()
         self.network = copy.deepcopy(model).cpu().float().eval().requires_grad_(False)
         self.config, self.slots, self.decode = model.config, slots, decode
@@ -51,8 +53,21 @@ class ExportedStep(nn.Module):
         return self.network.image_features((planes - self.image_mean) / self.image_std, camera_index)
 
     def hits(self, image_from_bev: Tensor, has_image: Tensor) -> SlottedHits:
-        """The cameras that see each cell; arguments as for `Pillars.project`."""
-        return slot_hits(self.network.pillars.project(image_from_bev, self.image_size, has_image), self.slots)
+        """The cameras that see each cell, for a batch of one; arguments as for `Pillars.project`."""
+        projection = self.network.pillars.project(image_from_bev, self.image_size, has_image)
+        hit = projection.hit[0].float()  # (N, Y·X)
+        cells = hit.shape[1]
+        filled, camera = hit.t().topk(self.slots, dim=1)
+        place = camera * cells + torch.arange(cells)[:, None]  # index in N·Y·X
+        points = projection.reference_points[0].flatten(0, 1).index_select(0, place.flatten())
+        count = hit.sum(0)
+        return SlottedHits(
+            camera=camera,
+            filled=filled,
+            reference_points=points.unflatten(0, (cells, self.slots)),
+            cameras_per_cell=count.clamp(min=1)[:, None],
+            most_cameras=count.max()[None].long(),
+        )
 
     def outputs(self, bev: Tensor, most_cameras: Tensor) -> tuple[Tensor, ...]:
         """The outputs that all files have, in their order. bev: (1, Y·X, C). most_cameras: (1,), see `SlottedHits`."""
@@ -102,23 +117,6 @@ class SlottedHits:
     reference_points: Tensor
     cameras_per_cell: Tensor
     most_cameras: Tensor
-
-
-def slot_hits(projection: PillarProjection, slots: int) -> SlottedHits:
-    """The hits of one batch element. slots: K, at most the number of cameras."""
-    hit = projection.hit[0].float()  # (N, Y·X)
-    cells = hit.shape[1]
-    filled, camera = hit.t().topk(slots, dim=1)
-    place = camera * cells + torch.arange(cells)[:, None]  # index in N·Y·X
-    points = projection.reference_points[0].flatten(0, 1).index_select(0, place.flatten())
-    count = hit.sum(0)
-    return SlottedHits(
-        camera=camera,
-        filled=filled,
-        reference_points=points.unflatten(0, (cells, slots)),
-        cameras_per_cell=count.clamp(min=1)[:, None],
-        most_cameras=count.max()[None].long(),
-    )
 
 
 class SlottedSpatialCrossAttention(nn.Module):
@@ -185,12 +183,10 @@ class DeformConvOperator(nn.Module):
         )
 
 
-def replace_parts(part: nn.Module, deformable_convolution: DeformableConvolution) -> None:
+def replace_parts(network: nn.Module, deformable_convolution: DeformableConvolution) -> None:
     """Replaces, in place, the spatial cross-attentions and, for "operator", the deformable convolutions."""
-    for name, child in part.named_children():
-        if isinstance(child, SpatialCrossAttention):
-            setattr(part, name, SlottedSpatialCrossAttention(child))
-        elif isinstance(child, ModulatedDeformableConvolution) and deformable_convolution == "operator":
-            setattr(part, name, DeformConvOperator(child))
-        else:
-            replace_parts(child, deformable_convolution)
+    for name, module in list(network.named_modules()):
+        if isinstance(module, SpatialCrossAttention):
+            network.set_submodule(name, SlottedSpatialCrossAttention(module))
+        elif isinstance(module, ModulatedDeformableConvolution) and deformable_convolution == "operator":
+            network.set_submodule(name, DeformConvOperator(module))

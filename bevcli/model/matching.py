@@ -13,10 +13,7 @@ def focal_loss(logits: Tensor, targets: Tensor) -> Tensor:
     """Elementwise focal loss, not reduced. Positives (targets above 0) have weight ALPHA, negatives 1 - ALPHA.
 
     It is smallest where the probability is the target. Between 0 and 1 it is the quality focal loss (Li et al. 2020).
-
-    Args:
-        logits: any shape.
-        targets: the same shape, 0 to 1.
+    logits: any shape. targets: the same shape, 0 to 1.
     """
     distance = (targets - logits.sigmoid()).abs()
     weight = torch.where(targets > 0, ALPHA, 1 - ALPHA)
@@ -34,10 +31,7 @@ def focal_cost(logits: Tensor) -> Tensor:
 def hungarian_matching(costs: Tensor) -> tuple[Tensor, Tensor]:
     """The one-to-one assignment with the smallest sum of costs: (K,) int64 query and (K,) ground truth indices.
 
-    The K = min(Q, G) pairs are sorted by query.
-
-    Args:
-        costs: (Q, G) cost of assigning each query to each ground truth object. The result is on its device.
+    costs: (Q, G) of each query and ground truth. The K = min(Q, G) pairs are on their device, sorted by query.
     """
     finite = costs.detach().double().cpu().nan_to_num(UNUSABLE_COST, UNUSABLE_COST, -UNUSABLE_COST)
     queries, truths = (torch.as_tensor(indices, device=costs.device) for indices in linear_sum_assignment(finite))

@@ -18,19 +18,15 @@ from bevcli.model.image_tokens import ImageTokens
 from bevcli.model.pillar_projection import PillarHits, Pillars
 from bevcli.model.resnet import ResNet
 from bevcli.model.segmentation import SegmentationHead
-from bevcli.model.step import ClipInputs, ModelOutputs
+from bevcli.model.step import ClipInputs, FrameTruth, ModelOutputs
 from bevcli.model.temporal_model import TemporalModel, build_model
-from bevcli.model.truth import FrameTruth
 
 STAGES = {name: name for name in ("backbone", "neck", "encoder", "decoder", "segmentation_head")}
 CAMERA_EMBEDDING = "image_tokens.camera_embedding"  # the key of the tensor that has a row for each camera
 
 
 class Network(TemporalModel):
-    """The parts that the published models share, in the order of the paper's figure 2.
-
-    A subclass says how a frame goes through them, and which memory it leaves.
-    """
+    """The shared parts. A subclass says how a frame goes through them, and which memory it leaves."""
 
     stages: Mapping[str, str] = STAGES
     has_parts = True

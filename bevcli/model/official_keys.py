@@ -6,7 +6,8 @@ from typing import Any
 
 from torch import Tensor
 
-from bevcli.model.temporal_model import model_classes
+from bevcli.model.temporal_model import TemporalModel
+from bevcli.registry import entries, load
 
 _PREFIXES = ("img_backbone.", "img_neck.", "pts_bbox_head.")
 
@@ -56,7 +57,7 @@ def from_official(state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
     A key that no rule matches stays unchanged.
     """
     left_out = []
-    models = model_classes()
+    models: list[type[TemporalModel]] = [load("bevcli.models", name) for name in entries("bevcli.models")]
     for model in models:
         state, parts = model.without_training_parts(state)
         left_out += [parts] if parts else []

@@ -49,12 +49,9 @@ def describe_shapes(shapes: tuple[Shape, ...]) -> str:
     """Shapes in a few words: each one with its count, or where there are many, the number of tensors."""
     counts = Counter(shapes)
     if len(counts) > 4:
-        return f"{len(shapes)} tensors, {_text(min(counts, key=_size))} to {_text(max(counts, key=_size))}"
+        smallest, *_, largest = sorted(counts, key=lambda shape: (math.prod(shape), shape))
+        return f"{len(shapes)} tensors, {_text(smallest)} to {_text(largest)}"
     return ", ".join(_text(shape) if count == 1 else f"{count} of {_text(shape)}" for shape, count in counts.items())
-
-
-def _size(shape: Shape) -> tuple[int, Shape]:
-    return math.prod(shape), shape
 
 
 def _text(shape: Shape) -> str:

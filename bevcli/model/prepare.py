@@ -84,11 +84,7 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
 
 
 class PreparedModel(TemporalModel):
-    """A model that `prepare_for_inference` made. Autocast around it has no effect.
-
-    Attributes:
-        network: the model with its exchanged parts.
-    """
+    """A model that `prepare_for_inference` made, with its exchanged parts. Autocast around it has no effect."""
 
     def __init__(self, network: TemporalModel, precision: Precision) -> None:
         super().__init__(network.config)

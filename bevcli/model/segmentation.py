@@ -4,7 +4,7 @@ The head's location decoder gives thing queries a place, and its mask decoder tu
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from bevcli.frame import MAP_CLASSES, BevMap
+from bevcli.frame import BevMap, class_bits
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.decoder import DecoderConfig, DecoderLayer, branch, inverse_sigmoid
 from bevcli.model.deformable_attention import DeformableAttention
@@ -61,14 +61,7 @@ class SegmentationConfig:
 
     def location_decoder(self) -> DecoderConfig:
         """The location decoder's layers, which are those of the object decoder."""
-        return DecoderConfig(
-            layers=self.location_layers,
-            attention_heads=self.attention_heads,
-            points=self.points,
-            queries=self.thing_queries,
-            feed_forward_width=self.feed_forward_width,
-            dropout=self.dropout,
-        )
+        return DecoderConfig.of_head(self, self.location_layers, self.thing_queries)
 
 
 @dataclass(frozen=True)
@@ -134,8 +127,6 @@ class LocationDecoder(nn.Module):
         """Random weights.
 
         Args:
-            config: of the layers.
-            channels: C.
             bev_shape: rows and columns of the BEV map.
             branch_layers: linear layers of a location branch.
             refines_extent: whether a layer refines centre and extent of the layer before, and samples inside them;
@@ -224,23 +215,29 @@ class PanopticMap:
 
     def bev_map(self, grid: BevGrid) -> BevMap:
         """The classes without instances, rows from the largest y. grid: gives the ranges that the map covers."""
-        layers = dict(zip(STUFF_CLASSES, self.stuff, strict=True)) | {THING_CLASS: self.things >= 0}
-        cells = np.zeros(self.things.shape, dtype=np.uint8)
-        for name, layer in layers.items():
-            cells |= layer.astype(np.uint8) * np.uint8(MAP_CLASSES[name])
-        return BevMap(cells[::-1].copy(), grid.x_range_m, grid.y_range_m)
+        return map_of_layers([*self.stuff, self.things >= 0], (*STUFF_CLASSES, THING_CLASS), grid)
 
 
-def decode_maps(outputs: SegmentationOutputs, config: SegmentationConfig, grid: BevGrid) -> list[PanopticMap]:
-    """The masks of the last layer, merged to one map for each batch element, `map_scale` times as fine as the grid.
+def map_of_layers(layers: Sequence[NDArray[np.bool_]], classes: Sequence[str], grid: BevGrid) -> BevMap:
+    """The map of classes with the cells (rows, columns) each, rows from the smallest y."""
+    bits, cells = class_bits(classes), np.zeros(layers[0].shape, dtype=np.uint8)
+    for bit, layer in zip(bits.values(), layers, strict=True):
+        cells |= layer.astype(np.uint8) * np.uint8(bit)
+    return BevMap(cells[::-1].copy(), grid.x_range_m, grid.y_range_m, bits)
+
+
+def decode_map(outputs: SegmentationOutputs, config: SegmentationConfig, grid: BevGrid) -> PanopticMap:
+    """The masks of the last layer, for a batch of one, merged to one map, `map_scale` times as fine as the grid.
 
     The probability of a query in a cell is its class probability times its mask's value (MaskFormer, Cheng et al.
     2021). Panoptic SegFormer instead takes whole masks above 0.5. Focal loss gives small vehicles mask values that
     rarely reach 0.5, and on rendered drives that rule loses a sixth of the vehicles' IoU.
     """
-    masks = outputs.mask_logits[-1].detach().float().sigmoid().unflatten(-1, (grid.rows, grid.columns))
-    probabilities = masks * outputs.class_logits[-1].detach().float().sigmoid()[..., None, None]
-    return [_panoptic_map(element, config) for element in probabilities]
+    masks = outputs.mask_logits[-1, 0].detach().float().sigmoid().unflatten(-1, (grid.rows, grid.columns))
+    probabilities = masks * outputs.class_logits[-1, 0].detach().float().sigmoid()[..., None, None]
+    count = len(STUFF_CLASSES)
+    stuff = _upsampled(probabilities[:count], config.map_scale) > config.min_stuff
+    return PanopticMap(stuff.cpu().numpy(), assign_cells(probabilities[count:], config.min_thing, config.map_scale))
 
 
 def assign_cells(probabilities: Tensor, minimum: float, scale: int) -> NDArray[np.int64]:
@@ -257,12 +254,6 @@ def assign_cells(probabilities: Tensor, minimum: float, scale: int) -> NDArray[n
     winner = _upsampled(layers, scale).max(0).indices  # `argmax` takes nine times as long on a CPU
     queries: NDArray[np.int64] = torch.cat([candidates.new_full((1,), -1), candidates])[winner].cpu().numpy()
     return queries
-
-
-def _panoptic_map(probabilities: Tensor, config: SegmentationConfig) -> PanopticMap:
-    count = len(STUFF_CLASSES)
-    stuff = _upsampled(probabilities[:count], config.map_scale) > config.min_stuff
-    return PanopticMap(stuff.cpu().numpy(), assign_cells(probabilities[count:], config.min_thing, config.map_scale))
 
 
 def _upsampled(layers: Tensor, scale: int) -> Tensor:

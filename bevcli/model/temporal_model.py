@@ -16,10 +16,9 @@ from bevcli.geometry.transforms import Pose
 from bevcli.model.box_coding import decode
 from bevcli.model.config import ModelConfig
 from bevcli.model.export_form import ExportForm
-from bevcli.model.scene_attention import SceneAttention
-from bevcli.model.segmentation import decode_maps
-from bevcli.model.step import ModelOutputs, PreparedFrame
-from bevcli.registry import entries, load
+from bevcli.model.segmentation import decode_map
+from bevcli.model.step import ModelOutputs, PreparedFrame, SceneAttention
+from bevcli.registry import load
 
 Memory = Any  # a frozen dataclass of the model's own; whoever runs the model only passes it on
 
@@ -27,8 +26,8 @@ Memory = Any  # a frozen dataclass of the model's own; whoever runs the model on
 class TemporalModel(nn.Module):
     """A model with a memory between frames. A class registered under `bevcli.models` is built from its configuration.
 
-    `step` and `outputs` of a model decide its results; everything else has a default. The configuration says what the
-    model needs of a sequence: see `ModelConfig`.
+    `step` decides a model's results; everything else has a default. The configuration says what the model needs of a
+    sequence: see `ModelConfig`. The methods `decode_…` read nothing but `config`, as an exported file has no more.
 
     Attributes:
         config_class: class of the configuration, which a TOML file fills in.
@@ -70,14 +69,14 @@ class TemporalModel(nn.Module):
 
     def decode_boxes(self, outputs: ModelOutputs) -> Boxes3D:
         """The boxes, best score first, bev frame."""
-        return decode(outputs, self.config)[0]
+        return decode(outputs, self.config)
 
     def decode_map(self, outputs: ModelOutputs) -> BevMap | None:
         """The map of the ground, or None."""
         if outputs.segmentation is None:
             return None
         grid = self.config.bev_grid
-        return decode_maps(outputs.segmentation, self.config.segmentation, grid)[0].bev_map(grid)
+        return decode_map(outputs.segmentation, self.config.segmentation, grid).bev_map(grid)
 
     def decode_results(self, outputs: ModelOutputs) -> tuple[FrameResult, ...]:
         """The further results, of the types of `ModelConfig.results`."""
@@ -86,9 +85,7 @@ class TemporalModel(nn.Module):
     def scene_attentions(self, outputs: ModelOutputs, place: tuple[float, float]) -> Mapping[str, SceneAttention]:
         """Attention to objects and lines of the map by the attending part, for figures. {} for a model without such.
 
-        Args:
-            outputs: of a step of a batch of one.
-            place: x and y in metres, bev frame, of the object whose own attention is asked for.
+        outputs: of a batch of one. place: x and y in metres, bev frame, of the object whose attention is asked for.
         """
         return {}
 
@@ -134,11 +131,6 @@ class TemporalModel(nn.Module):
     def part_names(cls, config: ModelConfig) -> Iterable[tuple[str, ...]]:
         """The name of each part, then its modules, in the order of a frame's way; a model may lack some."""
         return ()
-
-
-def model_classes() -> list[type[TemporalModel]]:
-    """All registered models."""
-    return [load("bevcli.models", name) for name in entries("bevcli.models")]
 
 
 def model_class(config: ModelConfig) -> type[TemporalModel]:

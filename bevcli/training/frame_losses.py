@@ -31,7 +31,7 @@ from bevcli.training.detection_loss import (
 from bevcli.training.perspective_loss import PerspectiveHead, PerspectiveLossConfig, perspective_loss
 from bevcli.training.samples import Targets
 from bevcli.training.segmentation_loss import SegmentationLossConfig, segmentation_loss
-from bevcli.weights.local import weights_file
+from bevcli.weights.fetch import weights_file
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from bevcli.frame import Frame, MapLines, Plan, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.model.config import ModelConfig
-from bevcli.model.truth import FrameTruth
+from bevcli.model.step import FrameTruth
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.files.lines_file import TRUE_LINES
 from bevcli.training.detection_loss import boxes_inside

@@ -26,7 +26,7 @@ from bevcli.training.frame_losses import LossConfigs
 from bevcli.training.options import Log, TrainOptions
 from bevcli.training.samples import ClipConfig
 from bevcli.training.warm_start import WarmStart, warm_start
-from bevcli.weights.local import weights_file
+from bevcli.weights.fetch import weights_file
 
 
 @dataclass(frozen=True)

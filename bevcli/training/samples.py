@@ -20,8 +20,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose, inverse
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.config import ModelConfig
-from bevcli.model.step import ModelInputs, PreparedFrame, model_inputs
-from bevcli.model.truth import FrameTruth
+from bevcli.model.step import FrameTruth, ModelInputs, PreparedFrame, model_inputs
 from bevcli.sequences.selection import scenes_of
 from bevcli.synth.drives import Drives, InputShape
 from bevcli.training.augmentation import AugmentationConfig, augmented, mask_images

@@ -1,4 +1,4 @@
-"""`fetch_weights`: download weights by name, and check them before they get their final name."""
+"""Weights by name: `fetch_weights` downloads and checks them; `weights_file` finds what is on this machine."""
 
 import contextlib
 import hashlib
@@ -6,11 +6,11 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from bevcli.checkpoints import expected_state, read_checkpoint, require_fit
+from bevcli.checkpoints import bundled_weights, expected_state, read_checkpoint, require_fit
 from bevcli.config import load_config
 from bevcli.errors import BevcliError, OutputError, WeightsError
 from bevcli.published import own_table
-from bevcli.weights.cache import HASHES, Known, NamedWeights
+from bevcli.weights.cache import HASHES, Known, NamedWeights, named_weights
 from bevcli.weights.download import Report, download
 
 PARTIAL = ".partial-"  # before the name of a file that is being downloaded
@@ -51,8 +51,7 @@ def fetch_weights(
     """
     if weights.file is None:
         raise WeightsError(f"{weights.name}: {by_hand(weights)}")
-    here = None if force and weights.source.url else weights.here
-    if here is not None or weights.source.path is not None:
+    if weights.source.path is not None or (not force and weights.here is not None):
         return _check(weights, weights.file)
     partial = weights.file.with_name(PARTIAL + weights.file.name)
     try:
@@ -69,6 +68,24 @@ def fetch_weights(
     os.replace(partial, weights.file)
     _remove(partial)
     return FetchedWeights(weights.file, found.known, found.checked)
+
+
+def weights_file(path_or_name: Path) -> Path:
+    """The file at a path, or the weights of a model's name: those of the package, or downloaded ones.
+
+    Raises WeightsError for a name without a file on this machine.
+    """
+    name = str(path_or_name)
+    if path_or_name.suffix or path_or_name.is_file():
+        return path_or_name
+    bundled = bundled_weights(name)
+    if bundled is not None:
+        return bundled
+    named = named_weights(name)
+    if named.here is None:
+        how = by_hand(named) if named.file is None else f"are not there yet: run `bevcli weights fetch {name}`"
+        raise WeightsError(f"the weights of {name} {how}")
+    return named.here
 
 
 def by_hand(weights: NamedWeights) -> str:

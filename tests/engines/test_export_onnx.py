@@ -107,7 +107,7 @@ def test_decoded_boxes_equal_the_decoder_of_the_library(small_file):
     found: dict[str, np.ndarray] = {}
     exported.engine.register_forward_hook(lambda module, arguments, outputs: found.update(outputs))
     with torch.inference_mode():
-        [expected] = decode(step_of_file(exported, small_inputs()), model.config)
+        expected = decode(step_of_file(exported, small_inputs()), model.config)
     boxes, scores, classes = (found[name] for name in ("boxes", "scores", "classes"))
     np.testing.assert_allclose(scores[0], expected.scores, atol=1e-6)
     np.testing.assert_allclose(boxes[0, :, :3], expected.centers, atol=1e-5)

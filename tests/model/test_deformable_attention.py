@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from bevcli.model.deformable_attention import DeformableAttention, GridSampling, sampling_locations
+from bevcli.model.deformable_attention import DeformableAttention, GridSampling, level_sizes, sampling_locations
 
 SHAPES = ((4, 6), (2, 3))
 sample = GridSampling()
@@ -57,7 +57,7 @@ def test_gradients_reach_values_locations_and_weights() -> None:
 
 def test_offsets_are_cells_of_their_own_level() -> None:
     offsets = torch.ones(1, 2, 1, 2)
-    locations = sampling_locations(torch.full((1, 1, 1, 2), 0.5), offsets, SHAPES)
+    locations = sampling_locations(torch.full((1, 1, 1, 2), 0.5), offsets, level_sizes(SHAPES, offsets.device))
     expected = [[0.5 + 1 / 6, 0.5 + 1 / 4], [0.5 + 1 / 3, 0.5 + 1 / 2]]
     torch.testing.assert_close(locations[0, :, 0], torch.tensor(expected))
 

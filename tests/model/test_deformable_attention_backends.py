@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from bevcli.benchmark.versions import PaddedSampling
-from bevcli.model.deformable_attention import GridSampling, sampling_locations
+from bevcli.model.deformable_attention import GridSampling, level_sizes, sampling_locations
 from bevcli.model.kernels.choose import fastest_sampling, softmax_of_few
 from bevcli.model.kernels.compiled import CompiledSampling, sample_hits
 from bevcli.model.pillar_projection import PillarHits
@@ -46,7 +46,7 @@ def test_hits_are_sampled_to_the_bit_as_by_their_locations(depth):
     cells = torch.randperm(count, generator=random)
     hits = PillarHits(cells, points, counts, torch.ones(count))
     offsets = 3 * torch.randn(*weights.shape, 2, generator=random)
-    locations = sampling_locations(points[:, None, None], offsets[cells], shapes)
+    locations = sampling_locations(points[:, None, None], offsets[cells], level_sizes(shapes, offsets.device))
     expected = COMPILED(values, shapes, locations, weights[cells], counts)
     assert torch.equal(sample_hits(values, shapes, hits, offsets, weights), expected)
 

@@ -52,7 +52,7 @@ def test_bev_map_and_head_outputs_equal_the_originals(outputs_of: Outputs, step:
 
 @pytest.mark.parametrize("step", STEPS)
 def test_decoded_boxes_equal_the_originals(model: BEVFormer, outputs_of: Outputs, step: str) -> None:
-    boxes = decode(outputs_of(step), model.config)[0]
+    boxes = decode(outputs_of(step), model.config)
     expected, scores, labels = (KEPT[f"{step}_{name}"] for name in ("boxes", "scores", "labels"))
     np.testing.assert_allclose(boxes.scores, scores, atol=1e-4)
     row = original.match_boxes(boxes, expected, labels, model.config.classes)

@@ -130,7 +130,7 @@ def test_selected_things_and_masks_equal_the_originals(prepared: bool) -> None:
 @pytest.mark.parametrize("prepared", [False, True])
 def test_the_merged_map_equals_the_originals(prepared: bool) -> None:
     outputs = step(prepared).outputs
-    merged = merge_map(outputs, CONFIG, GRID)[0]
+    merged = merge_map(outputs, CONFIG, GRID)
     assert_same_cells(merged.things, np.unpackbits(KEPT["lane_bits"]).reshape(3, 200, 200))
     assert_same_cells(merged.stuff[0], np.unpackbits(KEPT["drivable_bits"]).reshape(200, 200))
     assert_same_cells(merged.instances, KEPT["ids"])

@@ -125,7 +125,7 @@ def outputs_of(*things: tuple[int, float, list[float]], stuff: list[float] | Non
 
 def layers(outputs: MapOutputs, cells: int) -> list[list[list[int]]]:
     """(classes, 1, cells) of the things in the merged map."""
-    merged = merge_map(outputs, SMALL, BevGrid(1, cells))[0]
+    merged = merge_map(outputs, SMALL, BevGrid(1, cells))
     return merged.things.astype(int).tolist()
 
 
@@ -151,7 +151,7 @@ def test_a_thing_that_is_covered_too_much_is_left_out() -> None:
 
 def test_dividers_take_no_cells_from_others() -> None:
     outputs = outputs_of((DIVIDER, 0.9, [ON, ON, ON, OFF]), (CROSSING, 0.8, [OFF, ON, ON, ON]))
-    merged = merge_map(outputs, SMALL, BevGrid(1, 4))[0]
+    merged = merge_map(outputs, SMALL, BevGrid(1, 4))
     assert merged.things.astype(int).tolist() == [[[1, 1, 1, 0]], [[0, 1, 1, 1]], [[0, 0, 0, 0]]]
     assert merged.instances.tolist() == [[1, 2, 2, 2]]
     assert merged.instance_labels == (DIVIDER, CROSSING)
@@ -167,7 +167,7 @@ def test_a_map_has_stuff_below_things_and_its_first_row_ahead() -> None:
     grid = BevGrid(3, 2, x_range_m=(-1, 1), y_range_m=(-1.5, 1.5))
     crossing = [OFF, OFF, OFF, OFF, ON, OFF]  # the first cell of the row that is furthest ahead
     outputs = outputs_of((CROSSING, 0.9, crossing), stuff=[ON, ON, OFF, OFF, ON, ON])
-    bev_map = merge_map(outputs, SMALL, grid)[0].bev_map(grid, SMALL)
+    bev_map = merge_map(outputs, SMALL, grid).bev_map(grid, SMALL)
     assert bev_map.classes == {"drivable_area": 1, "divider": 2, "pedestrian_crossing": 4, "contour": 8}
     # By 0.94 m further back: the next row.
     assert bev_map.layer("pedestrian_crossing").tolist() == [[False, False], [True, False], [False, False]]
@@ -179,7 +179,7 @@ def test_a_map_has_stuff_below_things_and_its_first_row_ahead() -> None:
 def test_things_are_moved_by_whole_cells(offset: tuple[float, float], column: int | None) -> None:
     grid = BevGrid(1, 4, x_range_m=(-2, 2), y_range_m=(-0.5, 0.5))
     config = MapHeadConfig(thing_offset_m=offset)
-    merged = merge_map(outputs_of((CONTOUR, 0.9, [OFF, OFF, ON, OFF])), config, grid)[0]
+    merged = merge_map(outputs_of((CONTOUR, 0.9, [OFF, OFF, ON, OFF])), config, grid)
     found = np.flatnonzero(merged.bev_map(grid, config).layer("contour")).tolist()
     assert found == ([] if column is None else [column])
 

@@ -17,7 +17,7 @@ from bevcli.model.segmentation import (
     SegmentationHead,
     SegmentationOutputs,
     assign_cells,
-    decode_maps,
+    decode_map,
 )
 
 BOTH = ("detection", "segmentation")
@@ -85,7 +85,7 @@ def test_a_finer_map_interpolates_between_the_cells() -> None:
 def test_a_probability_is_class_times_mask() -> None:
     masks, classes = torch.full((1, 1, 4, 1), 0.5).logit(), torch.tensor([0.9, 0.7, 0.7, 0.3]).logit()[None, None]
     outputs = SegmentationOutputs(masks, classes, torch.zeros(1, 1, 1, 4))
-    one = decode_maps(outputs, SegmentationConfig(map_scale=1, min_stuff=0.4, min_thing=0.2), BevGrid(1, 1))[0]
+    one = decode_map(outputs, SegmentationConfig(map_scale=1, min_stuff=0.4, min_thing=0.2), BevGrid(1, 1))
     assert (one.stuff.ravel().tolist(), one.things.tolist()) == ([True, False, False], [[-1]])
 
 
@@ -96,7 +96,7 @@ def test_a_bev_map_has_a_bit_a_class_and_its_first_row_ahead() -> None:
     logits[0, 0, 2, 1] = 9.0  # a crossing on it
     logits[0, 0, 4, [1, 4]] = 9.0  # a vehicle on both rows
     outputs = SegmentationOutputs(logits, torch.full((1, 1, 5), 9.0), torch.zeros(1, 1, 2, 4))
-    panoptic = decode_maps(outputs, SegmentationConfig(map_scale=1), grid)[0]
+    panoptic = decode_map(outputs, SegmentationConfig(map_scale=1), grid)
     assert panoptic.things.tolist() == [[-1, 1, -1], [-1, 1, -1]]
     bev_map = panoptic.bev_map(grid)
     assert bev_map.cells.tolist() == [[0, 8, 0], [1, 1 + 4 + 8, 1]]

@@ -145,7 +145,7 @@ def check_map(model: UniAD, outputs: UniADOutputs, expected: Mapping[str, Any]) 
     assert found is not None
     close(found.class_logits[0], expected["seg_cls"], 1e-3)
     close(found.locations[-1, 0], expected["seg_box"], 1e-4)
-    merged = merge_map(found, config.map_head, config.bev_grid)[0]
+    merged = merge_map(found, config.map_head, config.bev_grid)
     cells = (config.bev_grid.rows, config.bev_grid.columns)
     lanes = np.unpackbits(expected["lane_bits"])[: 3 * merged.things[0].size].reshape(3, *cells)
     drivable = np.unpackbits(expected["drivable_bits"])[: merged.stuff[0].size].reshape(cells)

@@ -120,7 +120,7 @@ def check_neck(levels: list[torch.Tensor], arrays: Any, prefix: str) -> None:
 
 
 def check_boxes(model: BEVFormerV2, outputs: Any, expected: np.ndarray, scores: np.ndarray, labels: np.ndarray) -> None:
-    boxes = decode(outputs, model.config)[0]
+    boxes = decode(outputs, model.config)
     np.testing.assert_allclose(boxes.scores, scores, atol=1e-4)
     rows = original.match_boxes(boxes, expected, labels, model.config.classes)
     np.testing.assert_allclose(boxes.centers[rows], expected[:, :3], atol=1e-2)

@@ -11,14 +11,20 @@ from torch import Tensor
 from bevcli.frame import MapLines
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.model.truth import FrameTruth
+from bevcli.model.step import FrameTruth
+from bevcli.model.vad.config import LossWeights
 from bevcli.model.vad.line_decoder import LineDecoderConfig, LineOutputs
 from bevcli.model.vad.line_loss import LineTargets, line_losses, line_targets
-from bevcli.model.vad.loss_weights import LossWeights
-from bevcli.model.vad.losses import path_losses
+from bevcli.model.vad.losses import (
+    Scene,
+    boundary_loss,
+    collision_loss,
+    crosses,
+    direction_loss,
+    motion_losses,
+    path_losses,
+)
 from bevcli.model.vad.motion_head import MotionOutputs
-from bevcli.model.vad.motion_loss import motion_losses
-from bevcli.model.vad.plan_loss import Scene, boundary_loss, collision_loss, crosses, direction_loss
 
 GRID = BevGrid(4, 4, (-10, 10), (-20, 20), (-2, 2))
 EXTENT_M = torch.tensor([20.0, 40.0])

@@ -20,7 +20,7 @@ from bevcli.inference.training_rigs import facts_notes, weights_facts
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.training.files import save_weights
 from bevcli.training.warm_start import WarmStart, warm_start
-from bevcli.weights.local import weights_file
+from bevcli.weights.fetch import weights_file
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
 

@@ -91,14 +91,7 @@ class MapHeadConfig:
 
     def transformer(self, layers: int) -> DecoderConfig:
         """Encoder or location decoder, whose layers are those of the object decoder."""
-        return DecoderConfig(
-            layers=layers,
-            attention_heads=self.attention_heads,
-            points=self.points,
-            queries=self.thing_queries,
-            feed_forward_width=self.feed_forward_width,
-            dropout=self.dropout,
-        )
+        return DecoderConfig.of_head(self, layers, self.thing_queries)
 
 
 @dataclass(frozen=True)
@@ -174,14 +167,9 @@ class MaskDecoder(nn.Module):
     """Layers of attention to the cells, and a mask for each query."""
 
     def __init__(self, channels: int, heads: int, layers: int, width: int, *, self_attention: bool) -> None:
-        """Random weights.
+        """Random weights. With self_attention, the queries of a layer attend to each other first.
 
-        Args:
-            channels: C.
-            heads: of all attentions.
-            layers: number of layers before the masks.
-            width: channels between the two linear layers of a feed-forward network.
-            self_attention: whether the queries of a layer attend to each other first.
+        width: channels between the two linear layers of a feed-forward network.
         """
         super().__init__()
         self.layers = nn.ModuleList(MaskLayer(channels, heads, width, self_attention) for _ in range(layers))

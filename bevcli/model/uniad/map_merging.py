@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bevcli.frame import BevMap, class_bits
+from bevcli.frame import BevMap
 from bevcli.geometry.bev_grid import BevGrid
+from bevcli.model.segmentation import map_of_layers
 from bevcli.model.uniad.map_head import MapHeadConfig, MapOutputs
 
 
@@ -38,42 +39,18 @@ class MergedMap:
         """
         (x, y), (size_x, size_y) = config.thing_offset_m, grid.cell_size_m
         things = _moved(self.things, rows=round(y / size_y), columns=round(x / size_x))
-        bits = class_bits(config.classes)
-        cells = np.zeros(self.instances.shape, dtype=np.uint8)
-        for bit, layer in zip(bits.values(), (*self.stuff, *things), strict=True):
-            cells |= layer.astype(np.uint8) * np.uint8(bit)
-        return BevMap(cells[::-1].copy(), grid.x_range_m, grid.y_range_m, bits)
+        return map_of_layers([*self.stuff, *things], config.classes, grid)
 
 
-def merge_map(outputs: MapOutputs, config: MapHeadConfig, grid: BevGrid) -> list[MergedMap]:
-    """One map for each batch element.
+def merge_map(outputs: MapOutputs, config: MapHeadConfig, grid: BevGrid) -> MergedMap:
+    """The map of a batch of one.
 
     A cell has a stuff class where its mask is larger than `config.min_mask`. Things are written by falling score, with
     the rules of the released code: see `_merge_things`.
     """
     found = (outputs.thing_masks, outputs.stuff_masks, outputs.scores)
-    columns = (*(each.detach().float() for each in found), outputs.labels)
-    return [
-        _merged(masks, stuff, scores, labels, config, grid)
-        for masks, stuff, scores, labels in zip(*columns, strict=True)
-    ]
-
-
-def thing_scores(masks: Tensor, scores: Tensor, min_mask: float) -> Tensor:
-    """Class score times the square of the mask's mean over its cells: (K,), 0 or larger.
-
-    The mean's denominator is the number of cells plus 1, so that an empty mask scores 0.
-    masks: (K, Y·X). scores: (K,) class scores. min_mask: a cell belongs to a mask where this is larger.
-    """
-    inside = masks > min_mask
-    mean = (masks * inside).sum(-1) / (inside.sum(-1) + 1)
-    return scores * mean**2
-
-
-def _merged(
-    masks: Tensor, stuff: Tensor, scores: Tensor, labels: Tensor, config: MapHeadConfig, grid: BevGrid
-) -> MergedMap:
-    shape = (grid.rows, grid.columns)
+    masks, stuff, scores = (each[0].detach().float() for each in found)
+    labels, shape = outputs.labels[0], (grid.rows, grid.columns)
     scores, order = thing_scores(masks, scores, config.min_mask).sort(descending=True)
     order = order[scores >= config.min_score]
     cells = (masks[order] > config.min_mask).unflatten(-1, shape).cpu().numpy()
@@ -85,6 +62,17 @@ def _merged(
         instance_labels=tuple(labels[order][kept].tolist()),
         instance_scores=tuple(scores[kept].tolist()),
     )
+
+
+def thing_scores(masks: Tensor, scores: Tensor, min_mask: float) -> Tensor:
+    """Class score times the square of the mask's mean over its cells: (K,), 0 or larger.
+
+    The mean's denominator is the number of cells plus 1, so that an empty mask scores 0.
+    masks: (K, Y·X). scores: (K,) class scores. min_mask: a cell belongs to a mask where this is larger.
+    """
+    inside = masks > min_mask
+    mean = (masks * inside).sum(-1) / (inside.sum(-1) + 1)
+    return scores * mean**2
 
 
 def _merge_things(

@@ -106,7 +106,6 @@ def with_tracks(
 
     Args:
         learned: (1, Q, …), the same in every frame.
-        tracks: K tracks.
         motion: since the frame of the tracks.
         heights: (K,) z of the reference points of the tracks, 0 to 1 over the range.
         grid: gives the range of the reference points.

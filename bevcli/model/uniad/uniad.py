@@ -222,7 +222,7 @@ class UniAD(BEVFormer):
     def decode_map(self, outputs: ModelOutputs) -> BevMap | None:
         assert isinstance(outputs, UniADOutputs)
         grid, head = self.config.bev_grid, self.config.map_head
-        return None if outputs.map is None else merge_map(outputs.map, head, grid)[0].bev_map(grid, head)
+        return None if outputs.map is None else merge_map(outputs.map, head, grid).bev_map(grid, head)
 
     def exchange_parts(self) -> None:
         """See `TemporalModel`: nothing is constant, because the tracks and the learned queries attend to each other."""

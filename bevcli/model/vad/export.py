@@ -5,14 +5,12 @@ from collections.abc import Iterator, Mapping
 import torch
 from torch import Tensor
 
-from bevcli.frame import FrameResult
-from bevcli.geometry.boxes import Boxes3D
 from bevcli.model.bevformer.bevformer import RecurrentForm, RecurrentStep
 from bevcli.model.export_form import Port, box_ports
 from bevcli.model.export_step import decode_boxes
 from bevcli.model.step import ModelOutputs
 from bevcli.model.vad.config import VADConfig
-from bevcli.model.vad.decoding import VADOutputs, decode_futures, decode_lines, decode_plan
+from bevcli.model.vad.decoding import VADOutputs
 from bevcli.model.vad.line_decoder import LineOutputs
 from bevcli.model.vad.motion_head import MotionOutputs
 
@@ -48,14 +46,6 @@ class VADForm(RecurrentForm):
     def further_outputs(self, outputs: ModelOutputs) -> dict[str, Tensor]:
         assert isinstance(outputs, VADOutputs)
         return _of_heads(outputs)
-
-    def decode_boxes(self, outputs: ModelOutputs) -> Boxes3D:
-        assert isinstance(outputs, VADOutputs)
-        return decode_futures(outputs, self.config)
-
-    def decode_results(self, outputs: ModelOutputs) -> tuple[FrameResult, ...]:
-        assert isinstance(outputs, VADOutputs)
-        return decode_lines(outputs, self.config), decode_plan(outputs, self.config)
 
 
 def _of_heads(outputs: VADOutputs) -> dict[str, Tensor]:

@@ -42,14 +42,7 @@ class LineDecoderConfig:
 
     def transformer(self) -> DecoderConfig:
         """The settings of the layers, which are those of the object decoder."""
-        return DecoderConfig(
-            layers=self.layers,
-            attention_heads=self.attention_heads,
-            points=self.points,
-            queries=self.lines * self.line_points,
-            feed_forward_width=self.feed_forward_width,
-            dropout=self.dropout,
-        )
+        return DecoderConfig.of_head(self, self.layers, queries=self.lines * self.line_points)
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from bevcli.frame import MapLines
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.transforms import Array
 from bevcli.model.matching import focal_cost, focal_loss, hungarian_matching
+from bevcli.model.vad.config import LossWeights
 from bevcli.model.vad.line_decoder import LineDecoderConfig, LineOutputs
-from bevcli.model.vad.loss_weights import LossWeights
 
 CLOSED_M = 0.01  # a line whose ends are so near to each other is closed
 SHORTEST_M = 0.5  # shorter rests of lines that the range cuts are left out
@@ -79,9 +79,7 @@ def line_losses(
 ) -> dict[str, Tensor]:
     """The weighted scalar losses of all decoder layers, divided by the number of matched lines of the batch.
 
-    Args:
-        targets: B.
-        extent_m: (2,) of the range in x and y.
+    targets: B. extent_m: (2,) of the range in x and y.
     """
     layers = zip(outputs.class_logits, outputs.points, strict=True)
     totals = torch.stack([_layer_loss(*layer, targets, weights, extent_m) for layer in layers]).sum(0)

@@ -1,5 +1,7 @@
 """The motion head of VAD: each object attends to all objects and to the lines around it; its futures come of that."""
 
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -7,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from bevcli.model.decoder import branch, class_branch
-from bevcli.model.vad.attention_layer import AttentionLayer
+from bevcli.model.feed_forward import FeedForward
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class MotionConfig:
         if min(counts) < 1 or self.step_s <= 0 or not 0 <= self.dropout < 1:
             raise ValueError("modes, steps, step_s, heads and width must be positive, dropout from 0 to below 1")
 
-    def attention(self, channels: int) -> AttentionLayer:
+    def attention(self, channels: int) -> "AttentionLayer":
         """An attention layer with these settings."""
         return AttentionLayer(channels, self.attention_heads, self.feed_forward_width, self.dropout)
 
@@ -130,6 +132,56 @@ class MotionHead(nn.Module):
         is_far = relative.norm(dim=-1) > self.config.max_line_distance
         masked = is_far | (lines.scores <= self.config.min_line_score)[:, None]
         return F.pad(relative, (0, 0, 0, 1), value=1.0), F.pad(masked, (0, 1), value=False)
+
+
+class AttentionLayer(nn.Module):
+    """Attention and a feed-forward network, each with a residual and a norm. Positions are not in the residual."""
+
+    def __init__(self, channels: int, heads: int, feed_forward_width: int, dropout: float) -> None:
+        super().__init__()
+        self.attention = nn.MultiheadAttention(channels, heads, dropout, batch_first=True)
+        self.feed_forward = FeedForward(channels, feed_forward_width, dropout)
+        self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(2))
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(
+        self, query: Tensor, query_position: Tensor, value: Tensor, key_position: Tensor, masked: Tensor | None = None
+    ) -> Tensor:
+        """The refined queries (B, Q, C).
+
+        Args:
+            query: (B, Q, C).
+            query_position: (B, Q or 1, C), position embedding of the queries.
+            value: (B, K, C), attended to.
+            key_position: (B, K, C), position embedding of the values.
+            masked: (B, K) bool, values that the queries of a batch element do not attend to. None for no such value.
+        """
+        attended, _ = self.attention(
+            query + query_position, value + key_position, value, key_padding_mask=masked, need_weights=False
+        )
+        query = self.norms[0](query + self.dropout(attended))
+        return self.norms[1](query + self.feed_forward(query))
+
+    def weights(
+        self, query: Tensor, query_position: Tensor, value: Tensor, key_position: Tensor, masked: Tensor | None = None
+    ) -> Tensor:
+        """The attention weights (B, Q, K) of `forward`, the mean over heads; each row sums to 1."""
+        _, weights = self.attention(query + query_position, value + key_position, value, key_padding_mask=masked)
+        return weights
+
+
+@contextmanager
+def attention_weights(*layers: AttentionLayer) -> Iterator[dict[AttentionLayer, Tensor]]:
+    """A dict that is filled with the `AttentionLayer.weights` of each call inside the context; the last call stays."""
+    found: dict[AttentionLayer, Tensor] = {}
+
+    def keep(layer: AttentionLayer, arguments: tuple[Tensor, ...]) -> None:
+        found[layer] = layer.weights(*arguments)
+
+    with ExitStack() as hooks:
+        for layer in layers:
+            hooks.enter_context(layer.register_forward_pre_hook(keep))
+        yield found
 
 
 def line_positions(points: Tensor) -> Tensor:

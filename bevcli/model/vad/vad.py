@@ -11,17 +11,13 @@ from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.config import ModelConfig
 from bevcli.model.network import STAGES, ConstantSelfAttention
 from bevcli.model.pillar_projection import PillarHits
-from bevcli.model.scene_attention import SceneAttention
-from bevcli.model.step import ModelOutputs
-from bevcli.model.truth import FrameTruth
-from bevcli.model.vad.attention_layer import attention_weights
+from bevcli.model.step import FrameTruth, ModelOutputs, SceneAttention
 from bevcli.model.vad.config import VADConfig
-from bevcli.model.vad.decoding import VADOutputs, decode_futures, decode_lines, decode_plan
-from bevcli.model.vad.explained import motion_attention, plan_attention
+from bevcli.model.vad.decoding import VADOutputs, decode_futures, decode_lines, decode_plan, scene_attentions
 from bevcli.model.vad.export import VADForm
 from bevcli.model.vad.line_decoder import LineDecoder, LineEncoder, LineOutputs
 from bevcli.model.vad.losses import head_losses
-from bevcli.model.vad.motion_head import MapTokens, MotionHead, MotionOutputs, line_positions
+from bevcli.model.vad.motion_head import MapTokens, MotionHead, MotionOutputs, attention_weights, line_positions
 from bevcli.model.vad.official_keys import NAMES, UNUSED
 from bevcli.model.vad.planner import Planner
 
@@ -77,14 +73,10 @@ class VAD(BEVFormer):
         """See `TemporalModel`. The heads run again: outputs have no attention weights."""
         assert isinstance(outputs, VADOutputs)
         planner, motion = self.planner, self.motion_head
-        of_plan, of_motion = ((head.agent_attention, head.line_attention) for head in (planner, motion))
-        with attention_weights(*of_plan, *of_motion) as found:
+        layers = (planner.agent_attention, planner.line_attention, motion.agent_attention, motion.line_attention)
+        with attention_weights(*layers) as found:
             self.detect(outputs.bev)
-        to_plan, to_motion = ([found[layer] for layer in layers] for layers in (of_plan, of_motion))
-        return {
-            "plan": plan_attention(outputs, to_plan, self.config),
-            "motion": motion_attention(outputs, to_motion, self.config, place),
-        }
+        return scene_attentions(outputs, [found[layer] for layer in layers], self.config, place)
 
     def head_losses(
         self, outputs: ModelOutputs, truths: Sequence[FrameTruth], matches: Sequence[tuple[Tensor, Tensor]]
