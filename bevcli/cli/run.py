@@ -47,9 +47,8 @@ def run(
     Ctrl-C or SIGTERM finish the current frame; a second one ends the program at once.
     """
     with fast_imports():
-        from bevcli.cli.engine_bar import in_engine_with_bar
         from bevcli.cli.fetching import fetch_if_asked
-        from bevcli.cli.progress import Progress
+        from bevcli.cli.progress import Progress, in_engine_with_bar
         from bevcli.cli.stop_signals import StopSignals
         from bevcli.inference.load import load_model
         from bevcli.rig.check_drive import CheckedDrive

@@ -89,12 +89,6 @@ def _run(trainer: "Trainer") -> None:
         progress.detail = f"step {trainer.done + 1}, loss {loss:.4g}"
         progress.advance()
 
-    def after_step() -> None:
-        """Catch up with a step of fewer updates."""
-        missing = (trainer.done - first) * updates - progress.done
-        if missing > 0:
-            progress.advance(missing)
-
     counts = f"{len(job.drives)} to train on, {len(job.held_out)} to evaluate on"
     say(f"{job.config.clips}; {steps} steps; drives: {counts}; output: {job.out}", err=True)
     for note in job.notes:
@@ -104,7 +98,7 @@ def _run(trainer: "Trainer") -> None:
     with Progress(steps * updates, "updates") as progress:
         with StopSignals("step") as signals:
             trainer.run(
-                after_step,
+                lambda: progress.reach((trainer.done - first) * updates),  # after a step of fewer updates
                 lambda step, scores: progress.message(f"step {step}: {scores}"),
                 signals.received,
                 after_update,

@@ -39,8 +39,7 @@ def validate(
     Each drive is run as by `bevcli run` and scored as by `bevcli eval`, which scores the files of a run that is done.
     `bevcli train` never uses rendered drives with seeds of 1000000 and above: keep them for this.
     """
-    from bevcli.cli.engine_bar import in_engine_with_bar
-    from bevcli.cli.progress import Progress
+    from bevcli.cli.progress import Progress, in_engine_with_bar
     from bevcli.inference.load import load_model
     from bevcli.inference.runner import Runner, StepOptions
     from bevcli.synth.drives import count_frames

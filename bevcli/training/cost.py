@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import torch
 
-from bevcli.duration import duration
+from bevcli.printing import duration
 from bevcli.training.job import TrainingConfig, TrainingJob
 from bevcli.training.trainer import Trainer
 
