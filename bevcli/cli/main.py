@@ -7,7 +7,6 @@ Exit codes: 0 success, 1 a mistake in the input, 2 a mistake in usage (click's o
 import io
 import os
 import sys
-from collections.abc import Iterator, Mapping
 from typing import Annotated, Any
 
 import typer
@@ -22,32 +21,18 @@ from bevcli.printing import one_line, say
 from bevcli.registry import entries, load
 
 
-class _Commands(Mapping[str, Any]):
-    """The commands of the entry points by name, each imported when it is asked for. loaded: further commands."""
-
-    def __init__(self, loaded: Mapping[str, Any]) -> None:
-        self._loaded = dict(loaded)
-
-    def __getitem__(self, name: str) -> Any:
-        if name not in self._loaded and name in entries(GROUP):
-            self._loaded[name] = click_command(name, load(GROUP, name))
-        return self._loaded[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter({**entries(GROUP), **self._loaded})
-
-    def __len__(self) -> int:
-        return len({**entries(GROUP), **self._loaded})
-
-
 class _Group(PlainGroup):
+    """The commands of the entry points, each imported when it is asked for, and further ones."""
+
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)
-        self.commands: Any = _Commands(self.commands)
+        self.commands: dict[str, Any] = {**dict.fromkeys(entries(GROUP)), **self.commands}
 
-    def list_commands(self, ctx: Any) -> list[str]:
-        """The names of all commands; imports none of them."""
-        return list(self.commands)
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """The command of this name, None for an unknown one."""
+        if cmd_name in self.commands and self.commands[cmd_name] is None:
+            self.commands[cmd_name] = click_command(cmd_name, load(GROUP, cmd_name))
+        return self.commands.get(cmd_name)
 
 
 def click_command(name: str, found: Any) -> Any:
