@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from bevcli.calibration.options import CalibrateFirstOptions
-from bevcli.cli.bridge import INPUT, Part, as_flags
+from bevcli.cli.bridge import InputDrive, Part, as_flags
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
 from bevcli.recording.options import RecordingOptions
@@ -25,11 +25,7 @@ PANEL = "Run"
 
 
 def run(
-    sequence: Annotated[
-        Path,
-        typer.Argument(help="Sequence folder (images or videos), nuScenes root, .mcap file or rosbag2 folder."),
-        INPUT,
-    ],
+    sequence: InputDrive,
     model: ModelOptions,
     run_options: RunOptions,
     recording: RecordingOptions,

@@ -4,9 +4,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bevcli.cli.bridge import INPUT_OR_NAME, OldArgument, Part, print_note
+from bevcli.cli.bridge import OldArgument, Part, model_option, print_note
 from bevcli.errors import InputError
-from bevcli.inference.options import ModelOptions, complete_model
+from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
 from bevcli.synth.options import DriveOptions
 from bevcli.training.options import ModelFileOptions, TrainOptions
@@ -20,15 +20,10 @@ PANEL = "Train"
 def train(
     model: Annotated[
         str,
-        typer.Option(
-            autocompletion=complete_model,
-            metavar="NAME|FILE",
-            help="A model name or a FILE.toml; required. Its training table holds the settings.",
-            rich_help_panel="Model",
-            show_default=False,
+        model_option(
+            "A model name or a FILE.toml; required. Its training table holds the settings.", show_default=False
         ),
         OldArgument,
-        INPUT_OR_NAME,
     ] = "",
     *,
     model_options: Annotated[ModelOptions, Part(only=("device",))],

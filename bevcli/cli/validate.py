@@ -3,10 +3,8 @@
 import json
 from typing import Annotated
 
-import typer
-
-from bevcli.cli.bridge import INPUT_OR_NAME, Json, OldArgument, Part
-from bevcli.inference.options import ModelOptions, complete_model
+from bevcli.cli.bridge import Json, OldArgument, Part, model_option
+from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
 from bevcli.runs.options import RunOptions
 from bevcli.synth.options import DriveOptions
@@ -18,14 +16,8 @@ PANEL = "Score"
 def validate(
     model: Annotated[
         str | None,
-        typer.Option(
-            autocompletion=complete_model,
-            metavar="NAME|FILE",
-            help="A model name, a FILE.toml or a FILE.onnx. Default: the model that WEIGHTS fit, else demo.",
-            rich_help_panel="Model",
-        ),
+        model_option("A model name, a FILE.toml or a FILE.onnx. Default: the model that WEIGHTS fit, else demo."),
         OldArgument,
-        INPUT_OR_NAME,
     ] = None,
     *,
     model_options: Annotated[ModelOptions, Part(only=("weights", "device", "engine", "precision", "calibrate_with"))],
