@@ -9,7 +9,7 @@ from bevcli.calibration.drawings import LINE, POINT
 from bevcli.calibration.evidence import Evidence, epipolar_piece
 from bevcli.geometry.cameras import CameraRig
 from bevcli.recording import entities
-from bevcli.recording.layout import Layout
+from bevcli.recording.blueprint import Layout
 from bevcli.rig.mounting import horizon
 from bevcli.rig.overlay import GROUND, HORIZON, ground_lines, visible_runs
 from bevcli.rig.recorded_rig import Lines, camera_views, log_image, log_lines, log_pose, rig_recording, rig_view

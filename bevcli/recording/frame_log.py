@@ -14,10 +14,9 @@ from bevcli.recording import entities, log_bev, log_boxes, log_cameras, log_stat
 from bevcli.recording.box_lines import box_labels
 from bevcli.recording.class_meshes import log_class_meshes
 from bevcli.recording.colors import EGO_COLOR, class_colors
-from bevcli.recording.ground_lines import future_lines, result_lines
+from bevcli.recording.ground_lines import future_lines, log_ground_lines, result_lines
 from bevcli.recording.log_bev import BevColors, BevImages
 from bevcli.recording.log_cameras import PosedCamera, VideoImages
-from bevcli.recording.log_ground import log_ground_lines
 from bevcli.recording.log_tracks import TrackHistory, TrackLog
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.recorded import WARNINGS, RecordedDrive, RecordedModel, weights_note

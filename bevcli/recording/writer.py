@@ -15,11 +15,10 @@ from bevcli.errors import OutputError, WaitError
 from bevcli.frame import Frame, Prediction
 from bevcli.geometry.object_classes import hex_of_color
 from bevcli.recording import entities, log_static
-from bevcli.recording.blueprint import LayoutFacts, recording_blueprint
+from bevcli.recording.blueprint import Layout, LayoutFacts, recording_blueprint
 from bevcli.recording.class_meshes import read_class_meshes
 from bevcli.recording.colors import Color
 from bevcli.recording.frame_log import FrameLog, FrameLogState
-from bevcli.recording.layout import Layout
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.recorded import RecordedDrive, RecordedModel, frame_rate_hz
 from bevcli.recording.rrd_file import RrdFile

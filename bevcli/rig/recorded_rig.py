@@ -13,9 +13,8 @@ from bevcli.errors import OutputError
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Array
 from bevcli.recording import entities, log_static
-from bevcli.recording.blueprint import camera_rows, flat_view
+from bevcli.recording.blueprint import Layout, camera_rows, flat_view
 from bevcli.recording.colors import BACKGROUND
-from bevcli.recording.layout import Layout
 from bevcli.rig.overlay import Pixels, visible_runs
 from bevcli.writing import whole_file
 

@@ -11,8 +11,8 @@ from matplotlib.colors import to_rgb
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Array, apply
 from bevcli.recording import entities
+from bevcli.recording.blueprint import Layout
 from bevcli.recording.colors import BACKGROUND
-from bevcli.recording.layout import Layout
 from bevcli.rig.coverage import Coverage
 from bevcli.rig.drawings import COUNT_COLORS
 from bevcli.rig.mounting import horizon

@@ -10,10 +10,10 @@ from bevcli.geometry.cameras import Camera
 from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array, Pose
 from bevcli.recording.colors import GROUND_TRUTH_COLOR, OTHER_COLOR
-from bevcli.recording.foxglove.messages import DELETE_ALL
 
 Fields = dict[str, Any]
 FONT_M = 0.6
+DELETE_ALL = 1  # SceneEntityDeletion.type
 LENSES = {4: "plumb_bob", 5: "plumb_bob", 8: "rational_polynomial"}  # number of Brown-Conrady coefficients
 
 
