@@ -68,10 +68,8 @@ def option(
     *, default: Any = MISSING, default_factory: Callable[[], Any] | Any = MISSING, help: str, **settings: Any
 ) -> Any:
     """A field of a dataclass of options. settings: of `Option`."""
-    metadata = {"option": Option(help, **settings)}
-    if default_factory is not MISSING:
-        return dataclasses.field(default_factory=default_factory, metadata=metadata)
-    return dataclasses.field(default=default, metadata=metadata)
+    kept: dict[str, Any] = {"default": default, "default_factory": default_factory}
+    return dataclasses.field(**kept, metadata={"option": Option(help, **settings)})
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(option, dataclasses.field))

@@ -11,7 +11,6 @@ import types
 from collections.abc import Callable, Iterable, Mapping
 from contextvars import ContextVar
 from dataclasses import MISSING, Field, dataclass
-from functools import partial
 from inspect import Parameter, Signature, signature
 from pathlib import Path
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
@@ -140,6 +139,7 @@ class _Flag:
             autocompletion=stated.complete,
             hidden=bool(stated.retired),
         )
+        info.reads = stated.reads
         annotation = Annotated[kind, info]
         return Parameter(self.field.name, Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
@@ -170,37 +170,29 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     parts: list[Parameter | _Flag] = []
     flags: dict[str, _Flag] = {}
     makers: dict[str, tuple[Callable[..., Any], dict[str, _Flag]]] = {}
-    inputs: dict[str, Callable[[Any], None]] = {}
     hints = get_type_hints(function, include_extras=True)
     for name, parameter in signature(function).parameters.items():
         make, found = _flags_of(hints[name])
-        if make is None:
-            parts.append(parameter.replace(kind=Parameter.KEYWORD_ONLY, annotation=hints[name]))
-            info = _info_in(hints[name])
-            if hasattr(info, "reads"):
-                inputs[name] = partial(_require, label=f"--{name}", reads=info.reads, names=info.autocompletion)
-            continue
         for twice in found.keys() & flags.keys():  # one of them is of another package
             raise BevcliError(f"command {function.__name__}: two options are named {twice}: rename one")
-        makers[name] = make, found
+        if make is None:
+            parts.append(parameter.replace(kind=Parameter.KEYWORD_ONLY, annotation=hints[name]))
+        else:
+            makers[name] = make, found
         flags |= found
         parts += found.values()
-        for option, flag in found.items():
-            if flag.option.reads is not None:
-                stated = flag.option
-                inputs[option] = partial(_require, label=flag.yes, reads=stated.reads, names=stated.complete)
 
     def called(**given: Any) -> None:
         before = _flags.set(flags)
         try:
-            for each in old:
-                each.move(given)
-            read = [(require, given[name]) for name, require in inputs.items()]
+            for earlier in old:
+                earlier.move(given)
+            read = [(given[name], *how) for name, how in inputs.items()]
             for parameter, (make, found) in makers.items():
                 values = {name: flag.value(given.pop(name)) for name, flag in found.items()}
                 given[parameter] = make(**{name: value for name, value in values.items() if value is not MISSING})
-            for require, value in read:  # before anything is imported that takes seconds
-                require(value)
+            for each in read:  # before anything is imported that takes seconds
+                _require(*each)
             function(**given)
         except BevcliError as error:
             error.args = (as_flags(str(error)), *error.args[1:])
@@ -210,29 +202,32 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
 
     called.__name__, called.__doc__, called.__module__ = function.__name__, function.__doc__, function.__module__
     parameters = [part.parameter(flags) if isinstance(part, _Flag) else part for part in parts]
-    spelled = [(each, text) for each in parameters if each.name in flags for text in flags[each.name].option.old]
-    old = [_Old(each, flags[each.name].yes, text) for each, text in spelled]
-    old += [_Old(each, f"--{each.name}") for each in parameters if OldArgument in get_args(each.annotation)]
+    spelled = {each.name: flags[each.name].yes if each.name in flags else f"--{each.name}" for each in parameters}
+    infos = {each.name: _info_in(each.annotation) for each in parameters}
+    inputs = {name: (spelled[name], info) for name, info in infos.items() if getattr(info, "reads", None)}
+    retired = [(each, text) for each in parameters if each.name in flags for text in flags[each.name].option.old]
+    retired += [(each, "") for each in parameters if OldArgument in get_args(each.annotation)]
+    old = [_Old(each, spelled[each.name], text) for each, text in retired]
     made = [*parameters, *(each.parameter for each in old)]
     called.__signature__ = Signature([_with_metavar(each) for each in made])  # type: ignore[attr-defined]
     return called
 
 
-def _require(value: Any, label: str, reads: Reads, names: Callable[[str], Iterable[str]] | None) -> None:
+def _require(value: Any, flag: str, info: Any) -> None:
     """Raise InputError for a path that does not exist, a pattern without matches, or an unknown name.
 
-    value: one or several, or None. label: for messages. names: those that may stand for a path.
+    value: one or several, or None. info: of typer, with `reads`.
     """
     for text in map(str, value if isinstance(value, list | tuple) else [value or ""]):
         if not text or "://" in text or _exists(Path(text)):
             continue
-        if reads == "path or name" and not Path(text).suffix and os.sep not in text:
-            known = [text] if names is None else list(names(""))
+        if info.reads == "path or name" and not Path(text).suffix and os.sep not in text:
+            known = [text] if info.autocompletion is None else list(info.autocompletion(""))
             if text not in known:
                 near = difflib.get_close_matches(text, known, n=1)
                 hint = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(known)}, or a file"
-                raise InputError(f"{label} {text}: is unknown: {hint}")
-        elif reads != "path or pattern" or not glob.has_magic(text):
+                raise InputError(f"{flag} {text}: is unknown: {hint}")
+        elif info.reads != "path or pattern" or not glob.has_magic(text):
             raise InputError(f"{text}: there is no such file or folder")
         elif next(glob.iglob(text), None) is None:
             raise InputError(f"{text}: nothing matches this pattern (expected drives)")

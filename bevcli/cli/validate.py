@@ -42,9 +42,8 @@ def validate(
 
     loaded = load_model(model, options=model_options)
     rig = None if options.rig is None else rig_for_drives(options.rig, model or loaded.name)
-    data = drive_options
-    drives = scored_drives(data, loaded.config, rig)
-    notes = check_scored_drives(data, drives, loaded.config)
+    drives = scored_drives(drive_options, loaded.config, rig)
+    notes = check_scored_drives(drive_options, drives, loaded.config)
     if loaded.choice is not None:
         loaded = in_engine_with_bar(loaded, drives.open(0))
         notes = (*notes, loaded.engine_note) if loaded.engine_note else notes
