@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -50,15 +51,7 @@ class FrameLogState:
 
 
 class FrameLog:
-    """Logs frames into a stream of rerun, in order.
-
-    Args:
-        stream: the recording's.
-        drive: the drive.
-        model: the model.
-        options: how much is logged.
-        resume: the state from which the log goes on.
-    """
+    """Logs frames into a stream of rerun, in order. resume: the state from which the log goes on."""
 
     def __init__(
         self,
@@ -77,14 +70,12 @@ class FrameLog:
         self._last: LastFrame | None = None
         self._early_events: list[tuple[str, str]] = []  # logged before the first frame
         self._pillars: Array | None = None
-        self._tracks = TrackLog(stream, self.classes)
+        self._tracks = TrackLog(stream, self.classes, None if resume is None else resume.tracks)
         self._video = VideoImages(stream) if options.images == "av1" else None
-        self._bev_images: BevImages[tuple[FrameStamp, Prediction]] | None = None
-        if options.bev != "none" and options.shows_internals:
-            self._bev_images = BevImages(options.bev)
+        draws_bev = options.bev != "none" and options.shows_internals
+        self._bev_images = BevImages(options.bev) if draws_bev else None  # stamps: (FrameStamp, Prediction)
         if resume is not None:
             self._origin, self._last = resume.origin, resume.last
-            self._tracks.go_on_from(resume.tracks)
             if self._bev_images is not None:
                 self._bev_images.colors = resume.colors
 
@@ -96,7 +87,7 @@ class FrameLog:
         colors = None if self._bev_images is None else self._bev_images.colors
         if self._origin is None or (self._bev_images is not None and colors is None):
             return None
-        return FrameLogState(self._origin, self._last, colors, self._tracks.state())
+        return FrameLogState(self._origin, self._last, colors, deepcopy(self._tracks.history))
 
     def finish(self) -> None:
         """Logs what waits for later frames."""
@@ -120,10 +111,7 @@ class FrameLog:
         self._last = LastFrame(frame.stamp.scene, frame.world_from_ego)
 
     def event(self, text: str, level: str = "INFO") -> None:
-        """Writes a line into the event log, at the newest frame; before the first frame, at the first one.
-
-        level: "INFO", "WARN" or "ERROR".
-        """
+        """See `Recording.event`."""
         if self._origin is None:
             self._early_events.append((text, level))
         else:

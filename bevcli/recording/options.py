@@ -13,11 +13,6 @@ Level = Literal["minimal", "standard", "full"]
 LEVELS: tuple[Level, ...] = ("minimal", "standard", "full")
 
 
-def parse_positions(texts: list[str]) -> tuple[tuple[float, float], ...]:
-    """Positions from texts "X,Y" in metres. Raises ValueError."""
-    return tuple(map(parse_position, texts))
-
-
 def parse_position(text: str) -> tuple[float, float]:
     """A position from a text "X,Y" in metres. Raises ValueError."""
     try:
@@ -54,7 +49,7 @@ class RecordingOptions:
         help="Show the image points that the BEV cell at X, Y (bev frame, metres) attends to. Repeatable.",
         flag="--probe",
         metavar="X,Y",
-        parse=parse_positions,
+        parse=lambda texts: tuple(map(parse_position, texts)),
         repeatable=True,
     )
     vehicle_mesh: Path | None = option(

@@ -3,8 +3,7 @@
 import importlib.util
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import cv2
 
@@ -60,11 +59,9 @@ class McapWriter:
         self._writer.start(profile="ros2", library="bevcli")
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *error: Any) -> None:
         if kind is not None:
-            self._open.__exit__(kind, error, trace)
+            self._open.__exit__(kind, *error)
             return
         with self._open:
             if self._rig is None:
