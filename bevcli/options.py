@@ -93,13 +93,6 @@ def option_of(field: Field[Any]) -> Option | None:
     return found
 
 
-def flag_of(field: Field[Any]) -> str:
-    """The spelling of a field on the command line, such as "--rate", "--track/--no-track"; --out is -o, too."""
-    stated = option_of(field)
-    short = " -o" if field.name == "out" else ""
-    return (stated.flag if stated else "") or f"--{field.name.replace('_', '-')}{short}"
-
-
 def gather(kind: type[_Options], given: _Options | None, changes: Mapping[str, Any]) -> _Options:
     """The options of a call that takes the dataclass or keywords: `given` or the defaults, with the changes.
 

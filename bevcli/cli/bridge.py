@@ -19,7 +19,7 @@ import typer
 
 from bevcli.errors import BevcliError, InputError
 from bevcli.inference.options import complete_model
-from bevcli.options import Option, Reads, defaults, flag_of, option_of
+from bevcli.options import Option, Reads, defaults, option_of
 from bevcli.printing import one_line, say
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
@@ -114,9 +114,15 @@ class _Flag:
     panel: str
 
     @property
+    def spellings(self) -> list[str]:
+        """Those on the command line, such as "--rate" or "--track/--no-track"; --out is -o, too."""
+        short = " -o" if self.field.name == "out" else ""
+        return (self.option.flag or f"--{self.field.name.replace('_', '-')}{short}").split()
+
+    @property
     def yes(self) -> str:
         """Spelling without that of the opposite."""
-        return flag_of(self.field).split()[0].partition("/")[0]
+        return self.spellings[0].partition("/")[0]
 
     def parameter(self, flags: Mapping[str, "_Flag"]) -> Parameter:
         """The parameter of a function, as typer reads it. flags: for the help text."""
@@ -130,7 +136,7 @@ class _Flag:
             if default is not Parameter.empty:
                 kind, default = kind | None, None
         info = typer.Option(
-            *flag_of(self.field).split(),
+            *self.spellings,
             help=_with_flags(stated.help, flags),
             rich_help_panel=self.panel,
             metavar=stated.metavar or None,
@@ -272,7 +278,7 @@ def _as_flag(flag: _Flag, value: str | None) -> str:
     except (ValueError, SyntaxError):
         literal = value
     if literal is False:
-        return flag_of(flag.field).split()[0].partition("/")[2] or f"no {flag.yes}"
+        return flag.spellings[0].partition("/")[2] or f"no {flag.yes}"
     if flag.kind is bool or flag.option.flag_value is not None:
         return flag.yes
     if isinstance(literal, dict):

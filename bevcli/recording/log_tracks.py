@@ -29,7 +29,7 @@ class TrackHistory:
     Attributes:
         scene: the scene of the last frame; a new scene has new tracks.
         times_ns: by track, the times of its positions.
-        positions: by track, positions (3,) in the recording's world.
+        positions: by track, positions (3,) in the recording's world, the oldest first.
         shown: the entities that show a track now, sorted.
         known: the entities that have their style.
     """
@@ -54,10 +54,6 @@ class TrackHistory:
             self.times_ns[name], self.positions[name] = times[len(times) - kept :], self.positions[name][-kept:]
             if not kept or stamp.timestamp_ns - times[-1] > LOST_S * 1e9:
                 del self.times_ns[name], self.positions[name]
-
-    def past(self, name: str) -> Array:
-        """(K, 3) the positions of a track, the oldest first."""
-        return np.array(self.positions.get(name, [])).reshape(-1, 3)
 
 
 def track_names(boxes: Boxes3D) -> list[str]:
@@ -89,7 +85,7 @@ class TrackLog:
             if not name:
                 continue
             entity = entities.track(str(boxes.classes[i]), name)
-            past = self.history.past(name)
+            past = np.array(self.history.positions[name])  # (K, 3)
             trail = [past] if len(past) > 1 else []
             own_colors = [(*colors[i], opacity) for opacity in (AHEAD_OPACITY, PAST_OPACITY, PAST_OPACITY)]
             self._log_style(entity, name, own_colors)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Literal
 
@@ -68,7 +69,7 @@ class RecordingOptions:
     def __post_init__(self) -> None:
         if self.level not in LEVELS:
             raise InputError(f'`level`: unknown level "{self.level}" (expected {", ".join(LEVELS)})')
-        if self.bev not in ("norm", "pca", "none") and self.channel is None:
+        if not re.fullmatch(r"norm|pca|none|channel:\d+", self.bev):
             raise InputError(f'`bev`: unknown image "{self.bev}" (expected norm, pca, channel:K or none)')
         if self.images not in ("jpeg", "av1"):
             raise InputError(f'`images`: unknown format "{self.images}" (expected jpeg or av1)')
@@ -78,12 +79,6 @@ class RecordingOptions:
             require_av('`images="av1"`')
         if self.vehicle_mesh is not None and not self.vehicle_mesh.is_file():
             raise InputError(f"`vehicle_mesh={self.vehicle_mesh}`: there is no such file")
-
-    @property
-    def channel(self) -> int | None:
-        """K of "channel:K", else None."""
-        kind, _, number = self.bev.partition(":")
-        return int(number) if kind == "channel" and number.isdecimal() else None
 
     @property
     def shows_internals(self) -> bool:

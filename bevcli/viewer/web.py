@@ -88,11 +88,6 @@ class WebViewer:
         """The address to open in a browser."""
         return f"http://{self.host}:{self.port}"
 
-    @property
-    def followers(self) -> int:
-        """The number of viewers that have begun to read a growing recording."""
-        return len(self._server.live_transfers)
-
     def serve(self) -> None:
         """Serves until `close` is called from another thread."""
         self._server.serve_forever(poll_interval=1.0)
