@@ -22,7 +22,7 @@ def page() -> str:
 def _command(name: str, command: Any) -> Iterator[str]:
     """The lines of a command, or of those of a group."""
     if hasattr(command, "commands"):
-        for each in command.commands:
+        for each in command.list_commands(None):
             yield from _command(f"{name} {each}", command.get_command(None, each))
         return
     shown = [each for each in command.params if not each.hidden]

@@ -1,4 +1,4 @@
-"""Writes a drive as an MCAP file of ROS 2 messages, with boxes as Foxglove scenes. The messages are dictionaries first."""
+"""Writes a drive as an MCAP file of ROS 2 messages, with boxes as Foxglove scenes."""
 
 import importlib.util
 from collections.abc import Mapping
