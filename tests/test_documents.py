@@ -70,10 +70,8 @@ def option_names(command: Any) -> set[str]:
 
 
 def options_of_all_commands(command: Any) -> set[str]:
-    parts = [
-        command.get_command(None, name)
-        for name in (command.list_commands(None) if hasattr(command, "commands") else ())
-    ]
+    names = command.list_commands(None) if hasattr(command, "commands") else ()
+    parts = [command.get_command(None, name) for name in names]
     return option_names(command).union(*map(options_of_all_commands, parts))
 
 
