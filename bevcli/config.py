@@ -15,13 +15,13 @@ from typing import Any, Literal, TypeVar
 import msgspec
 
 from bevcli.errors import ConfigError
-from bevcli.geometry.object_classes import ClassSettings, without_meshes
+from bevcli.geometry.object_classes import without_meshes
 from bevcli.model.config import ModelConfig
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import read_text
 from bevcli.published import read_sources
-from bevcli.registry import entries, load
+from bevcli.registry import entries, known_models, load
 
 T = TypeVar("T")
 
@@ -30,12 +30,6 @@ ARCHITECTURE = "architecture"
 
 TRACKING = "tracking"  # the table of a model's file with the parameters of the tracker
 TRAINING = "training"  # the table of a model's file with the settings of its training, which the model does not need
-
-
-def known_models() -> tuple[str, ...]:
-    """The names of the models whose TOML files come with the package."""
-    files = resources.files("bevcli").joinpath("configs").iterdir()
-    return tuple(sorted(Path(file.name).stem for file in files if file.name.endswith(".toml")))
 
 
 def load_config(name_or_path: str | Path) -> ModelConfig:
@@ -61,12 +55,9 @@ def config_of_table(table: dict[str, Any], file: str) -> ModelConfig:
     if not re.fullmatch(r"[\w][\w. +-]{0,99}", config.name):
         expected = "up to 100 letters, digits and - . + _, because it names folders"
         raise ConfigError(f'{file}: "name" is {config.name!r:.60} (expected {expected})')
-    return replace(config, class_settings=_with_meshes_of(config.class_settings, Path(file).parent))
-
-
-def _with_meshes_of(settings: Mapping[str, ClassSettings], folder: Path) -> dict[str, ClassSettings]:
-    """The settings of classes with the paths of their meshes from here, given those from a folder."""
-    return {name: replace(one, mesh=one.mesh and str(folder / one.mesh)) for name, one in settings.items()}
+    meshes = {name: one.mesh and str(Path(file).parent / one.mesh) for name, one in config.class_settings.items()}
+    settings_from_here = {name: replace(one, mesh=meshes[name]) for name, one in config.class_settings.items()}
+    return replace(config, class_settings=settings_from_here)
 
 
 def load_table(name_or_path: str | Path, table: str, kind: type[T]) -> T:

@@ -68,10 +68,8 @@ def option(
     *, default: Any = MISSING, default_factory: Callable[[], Any] | Any = MISSING, help: str, **settings: Any
 ) -> Any:
     """A field of a dataclass of options. settings: of `Option`."""
-    metadata = {"option": Option(help, **settings)}
-    if default_factory is not MISSING:
-        return dataclasses.field(default_factory=default_factory, metadata=metadata)
-    return dataclasses.field(default=default, metadata=metadata)
+    kept: dict[str, Any] = {"default": default, "default_factory": default_factory}
+    return dataclasses.field(**kept, metadata={"option": Option(help, **settings)})
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(option, dataclasses.field))
@@ -93,13 +91,6 @@ def option_of(field: Field[Any]) -> Option | None:
     """The option of a field; None for a field that is none."""
     found: Option | None = field.metadata.get("option")
     return found
-
-
-def flag_of(field: Field[Any]) -> str:
-    """The spelling of a field on the command line, such as "--rate", "--track/--no-track"; --out is -o, too."""
-    stated = option_of(field)
-    short = " -o" if field.name == "out" else ""
-    return (stated.flag if stated else "") or f"--{field.name.replace('_', '-')}{short}"
 
 
 def gather(kind: type[_Options], given: _Options | None, changes: Mapping[str, Any]) -> _Options:

@@ -34,3 +34,13 @@ def _escaped(char: str) -> str:
     """The character, or its escape if it could steer a terminal or cannot be seen."""
     shown = char.isprintable() or unicodedata.category(char) == "Zs"
     return char if shown else char.encode("unicode_escape").decode()
+
+
+def duration(seconds: float) -> str:
+    """Seconds in words: "8 s", "2 min 05 s", "1 h 12 min"."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"

@@ -5,7 +5,9 @@ used.
 """
 
 from functools import cache
+from importlib import resources
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import Any, Literal
 
 from bevcli.errors import BevcliError
@@ -16,7 +18,6 @@ Group = Literal[
     "bevcli.label_formats",
     "bevcli.drive_writers",
     "bevcli.box_formats",
-    "bevcli.label_formats",
     "bevcli.engines",
     "bevcli.commands",
 ]
@@ -51,3 +52,9 @@ def load(group: Group, name: str) -> Any:
         return known[name].load()
     except Exception as error:  # whatever a package of somebody else does
         raise BevcliError(f"entry point {group}: {name} = {known[name].value} cannot be imported: {error}") from error
+
+
+def known_models() -> tuple[str, ...]:
+    """The names of the models whose TOML files come with the package."""
+    files = resources.files("bevcli").joinpath("configs").iterdir()
+    return tuple(sorted(Path(file.name).stem for file in files if file.name.endswith(".toml")))

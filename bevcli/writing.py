@@ -54,11 +54,9 @@ def _mode_of_new_files(path: Path) -> int:
     return mode
 
 
-def write_whole(
-    path: Path, content: bytes, *, parents: bool = False, shared: bool = False, regular: bool = False
-) -> None:
-    """Write a file, so that readers see the old or the new contents; see `whole_file`."""
-    with whole_file(path, parents=parents, shared=shared, regular=regular) as unfinished:
+def write_whole(path: Path, content: bytes, **how: bool) -> None:
+    """Write a file, so that readers see the old or the new contents. how: of `whole_file`."""
+    with whole_file(path, **how) as unfinished:
         unfinished.write_bytes(content)
 
 

@@ -70,7 +70,9 @@ def option_names(command: Any) -> set[str]:
 
 
 def options_of_all_commands(command: Any) -> set[str]:
-    return option_names(command).union(*map(options_of_all_commands, getattr(command, "commands", {}).values()))
+    names = command.list_commands(None) if hasattr(command, "commands") else ()
+    parts = [command.get_command(None, name) for name in names]
+    return option_names(command).union(*map(options_of_all_commands, parts))
 
 
 # docs/extend.md adds a command of its own: tests/test_extend.py runs it.
@@ -80,8 +82,8 @@ def test_shown_commands_and_options_are_known(document: Path) -> None:
         words = shlex.split(line, comments=True)[1:]
         command = typer.main.get_command(app)
         while words and hasattr(command, "commands") and not words[0].startswith("-"):
-            assert words[0] in command.commands, line
-            command = command.commands[words.pop(0)]
+            assert words[0] in command.list_commands(None), line
+            command = command.get_command(None, words.pop(0))
         options = {word.partition("=")[0] for word in words if re.match(r"--?[a-z]", word)}
         assert options <= option_names(command), f"{line}: {options - option_names(command)}"
 

@@ -11,7 +11,7 @@ from source_code import ROOT, trees
 
 # From the lowest to the highest; names in one set may not import each other.
 LAYERS = (
-    {"_version", "duration", "findings", "printing"},
+    {"_version", "findings", "printing"},
     {"errors"},
     {"options", "registry"},
     {"parsing", "jit", "user_folders", "waiting", "writing"},

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from bevcli._version import __version__
 from bevcli.batch.job import RESULTS, SCORE_BINS, Record
-from bevcli.duration import duration
 from bevcli.inference.load import Model
+from bevcli.printing import duration
 
 WORST = 10  # drives in the table of the worst ones
 MOST_ERRORS = 50  # rows in the table of errors

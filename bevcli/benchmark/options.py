@@ -3,8 +3,9 @@
 from pathlib import Path
 from typing import Literal
 
-from bevcli.inference.options import complete_model, model_names
+from bevcli.inference.options import complete_model
 from bevcli.options import option, options
+from bevcli.registry import known_models
 
 
 @options()
@@ -14,7 +15,7 @@ class BenchOptions:
     model: str = option(
         reads="path or name",
         default="tiny",
-        help=f"{', '.join(model_names())}, a FILE.toml or a FILE.onnx.",
+        help=f"{', '.join(known_models())}, a FILE.toml or a FILE.onnx.",
         metavar="NAME|FILE",
         complete=complete_model,
     )

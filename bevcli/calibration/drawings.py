@@ -14,7 +14,7 @@ from bevcli.calibration.estimates import CameraEstimate, Verdict, change_text
 from bevcli.calibration.evidence import Evidence, ShownMatches, epipolar_piece
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.recording import entities
-from bevcli.recording.layout import Layout
+from bevcli.recording.blueprint import Layout
 from bevcli.rig.drawings import FAINT, INK, PAPER, save
 from bevcli.rig.mounting import horizon
 from bevcli.rig.overlay import GROUND, HORIZON, Pixels, draw_lines, ground_lines, visible_runs

@@ -30,7 +30,7 @@ def bench(
     from bevcli.benchmark.engines import compare_engines
     from bevcli.benchmark.measure import run_benchmark
     from bevcli.benchmark.result import write_table
-    from bevcli.cli.engine_bar import EngineBar
+    from bevcli.cli.progress import engine_bar
     from bevcli.config import load_config
     from bevcli.inference.load import choose_device, choose_precision
 
@@ -42,8 +42,8 @@ def bench(
     if options.engines:
         if model_options != ModelOptions() or options.against is not None or options.profile is not None:
             raise BevcliError("`engines` compares all of them on the CPU: leave out other options")
-        with EngineBar() as bar:
-            table = compare_engines(load_config(options.model), options.frames, bar.show)
+        with engine_bar() as show:
+            table = compare_engines(load_config(options.model), options.frames, show)
         say(json.dumps(table.as_data(), indent=1) if as_json else as_flags(table.text()))
         return
     exported = _exported(options, model_options, target)
@@ -56,7 +56,7 @@ def bench(
 def _exported(options: BenchOptions, model_options: ModelOptions, device: "torch.device") -> "Model | None":
     """The exported file, or a model with made-up weights in the engine that is asked for; None for PyTorch."""
     from bevcli.benchmark.made_up import MadeUpDrive, made_up_model
-    from bevcli.cli.engine_bar import in_engine_with_bar
+    from bevcli.cli.progress import in_engine_with_bar
     from bevcli.config import load_config
     from bevcli.engines.exported import SUFFIX
     from bevcli.inference.engine_choice import engine_choice

@@ -13,23 +13,39 @@ from contextvars import ContextVar
 from dataclasses import MISSING, Field, dataclass
 from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import typer
 
 from bevcli.errors import BevcliError, InputError
-from bevcli.options import Option, Reads, defaults, flag_of, option_of
+from bevcli.inference.options import complete_model
+from bevcli.options import Option, Reads, defaults, option_of
 from bevcli.printing import one_line, say
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
 
-# In an annotation of an argument, see `Option.reads`.
-INPUT: Reads = "path"
-INPUT_OR_NAME: Reads = "path or name"
-INPUT_OR_PATTERN: Reads = "path or pattern"
-
 _METAVARS = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
 _ARGUMENT = re.compile(r"`([a-z]\w*)(?:=([^`]*))?`")
+
+
+def input_argument(help: str, reads: Reads = "path", **settings: Any) -> Any:
+    """The argument, for typer, of what is read, see `Option.reads`. settings: of `typer.Argument`."""
+    info = typer.Argument(help=help, **settings)
+    info.reads = reads
+    return info
+
+
+_DRIVE = "Sequence folder (images or videos), nuScenes root, .mcap file or rosbag2 folder."
+InputDrive = Annotated[Path, input_argument(_DRIVE)]
+
+
+def model_option(help: str, panel: str | None = "Model", **settings: Any) -> Any:
+    """The option --model, for typer, of a command that does not take it as a field. settings: of `typer.Option`."""
+    info = typer.Option(
+        autocompletion=complete_model, metavar="NAME|FILE", help=help, rich_help_panel=panel, **settings
+    )
+    info.reads = "path or name"
+    return info
 
 
 @dataclass(frozen=True)
@@ -88,34 +104,6 @@ class _Old:
 
 
 @dataclass(frozen=True)
-class _Read:
-    """What is read. label: for messages. reads: see `Option`. names: those that may stand for a path."""
-
-    label: str
-    reads: Reads
-    names: Callable[[str], Iterable[str]] | None = None
-
-    def require(self, text: str) -> None:
-        """Raise InputError for a path that does not exist, a pattern without matches, or an unknown name."""
-        if "://" in text or _exists(Path(text)):
-            return
-        if self.reads == "path or name" and not Path(text).suffix and os.sep not in text:
-            self._require_name(text)
-        elif self.reads == "path or pattern" and glob.has_magic(text):
-            if next(glob.iglob(text), None) is None:
-                raise InputError(f"{text}: nothing matches this pattern (expected drives)")
-        else:
-            raise InputError(f"{text}: there is no such file or folder")
-
-    def _require_name(self, text: str) -> None:
-        known = None if self.names is None else list(self.names(""))
-        if known is not None and text not in known:
-            near = difflib.get_close_matches(text, known, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(known)}, or a file"
-            raise InputError(f"{self.label} {text}: is unknown: {hint}")
-
-
-@dataclass(frozen=True)
 class _Flag:
     """An option of a command. kind: type of the field. default: `Parameter.empty` for a required one."""
 
@@ -126,15 +114,15 @@ class _Flag:
     panel: str
 
     @property
-    def yes(self) -> str:
-        """Spelling without that of the opposite."""
-        return flag_of(self.field).split()[0].partition("/")[0]
+    def spellings(self) -> list[str]:
+        """Those on the command line, such as "--rate" or "--track/--no-track"; --out is -o, too."""
+        short = " -o" if self.field.name == "out" else ""
+        return (self.option.flag or f"--{self.field.name.replace('_', '-')}{short}").split()
 
     @property
-    def read(self) -> _Read | None:
-        """What it names that is read, if anything."""
-        reads = self.option.reads
-        return None if reads is None else _Read(self.yes, reads, self.option.complete)
+    def yes(self) -> str:
+        """Spelling without that of the opposite."""
+        return self.spellings[0].partition("/")[0]
 
     def parameter(self, flags: Mapping[str, "_Flag"]) -> Parameter:
         """The parameter of a function, as typer reads it. flags: for the help text."""
@@ -148,7 +136,7 @@ class _Flag:
             if default is not Parameter.empty:
                 kind, default = kind | None, None
         info = typer.Option(
-            *flag_of(self.field).split(),
+            *self.spellings,
             help=_with_flags(stated.help, flags),
             rich_help_panel=self.panel,
             metavar=stated.metavar or None,
@@ -157,6 +145,7 @@ class _Flag:
             autocompletion=stated.complete,
             hidden=bool(stated.retired),
         )
+        info.reads = stated.reads
         annotation = Annotated[kind, info]
         return Parameter(self.field.name, Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
@@ -185,41 +174,31 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     Arguments in backticks in a help text, and in a `BevcliError` of the function, become flags.
     """
     parts: list[Parameter | _Flag] = []
-    arguments: list[str] = []
     flags: dict[str, _Flag] = {}
-    makers: dict[str, tuple[Callable[..., Any], list[str]]] = {}
-    inputs: dict[str, _Read] = {}
+    makers: dict[str, tuple[Callable[..., Any], dict[str, _Flag]]] = {}
     hints = get_type_hints(function, include_extras=True)
-    for parameter in signature(function).parameters.values():
-        hint = hints[parameter.name]
-        make, found = _flags_of(hint)
+    for name, parameter in signature(function).parameters.items():
+        make, found = _flags_of(hints[name])
+        for twice in found.keys() & flags.keys():  # one of them is of another package
+            raise BevcliError(f"command {function.__name__}: two options are named {twice}: rename one")
         if make is None:
-            parts.append(parameter.replace(kind=Parameter.KEYWORD_ONLY, annotation=hint))
-            marks = get_args(hint)[1:]  # of an Annotated
-            if OldArgument in marks:
-                arguments.append(parameter.name)
-            for mark in (INPUT, INPUT_OR_NAME, INPUT_OR_PATTERN):
-                if mark in marks:
-                    names = getattr(marks[0], "autocompletion", None)
-                    inputs[parameter.name] = _Read(f"--{parameter.name}", mark, names)
-            continue
-        for name in found.keys() & flags.keys():  # one of them is of another package
-            raise BevcliError(f"command {function.__name__}: two options are named {name}: rename one")
-        makers[parameter.name] = make, list(found)
+            parts.append(parameter.replace(kind=Parameter.KEYWORD_ONLY, annotation=hints[name]))
+        else:
+            makers[name] = make, found
         flags |= found
-        inputs |= {name: flag.read for name, flag in found.items() if flag.read is not None}
         parts += found.values()
 
     def called(**given: Any) -> None:
         before = _flags.set(flags)
         try:
-            for each in old:
-                each.move(given)
-            paths = [(given[name], read) for name, read in inputs.items()]
-            for parameter, (make, names) in makers.items():
-                values = {name: flags[name].value(given.pop(name)) for name in names}
+            for earlier in old:
+                earlier.move(given)
+            read = [(given[name], *how) for name, how in inputs.items()]
+            for parameter, (make, found) in makers.items():
+                values = {name: flag.value(given.pop(name)) for name, flag in found.items()}
                 given[parameter] = make(**{name: value for name, value in values.items() if value is not MISSING})
-            _require_inputs(paths)
+            for each in read:  # before anything is imported that takes seconds
+                _require(*each)
             function(**given)
         except BevcliError as error:
             error.args = (as_flags(str(error)), *error.args[1:])
@@ -229,20 +208,35 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
 
     called.__name__, called.__doc__, called.__module__ = function.__name__, function.__doc__, function.__module__
     parameters = [part.parameter(flags) if isinstance(part, _Flag) else part for part in parts]
-    spelled = [(each, text) for each in parameters if each.name in flags for text in flags[each.name].option.old]
-    old = [_Old(each, flags[each.name].yes, text) for each, text in spelled]
-    old += [_Old(each, f"--{each.name}") for each in parameters if each.name in arguments]
+    spelled = {each.name: flags[each.name].yes if each.name in flags else f"--{each.name}" for each in parameters}
+    infos = {each.name: _info_in(each.annotation) for each in parameters}
+    inputs = {name: (spelled[name], info) for name, info in infos.items() if getattr(info, "reads", None)}
+    retired = [(each, text) for each in parameters if each.name in flags for text in flags[each.name].option.old]
+    retired += [(each, "") for each in parameters if OldArgument in get_args(each.annotation)]
+    old = [_Old(each, spelled[each.name], text) for each, text in retired]
     made = [*parameters, *(each.parameter for each in old)]
     called.__signature__ = Signature([_with_metavar(each) for each in made])  # type: ignore[attr-defined]
     return called
 
 
-def _require_inputs(given: Iterable[tuple[Any, _Read]]) -> None:
-    """Raise InputError for what does not exist, before anything is imported that takes seconds."""
-    for values, read in given:
-        for value in values if isinstance(values, list | tuple) else [values]:
-            if value is not None and str(value):
-                read.require(str(value))
+def _require(value: Any, flag: str, info: Any) -> None:
+    """Raise InputError for a path that does not exist, a pattern without matches, or an unknown name.
+
+    value: one or several, or None. info: of typer, with `reads`.
+    """
+    for text in map(str, value if isinstance(value, list | tuple) else [value or ""]):
+        if not text or "://" in text or _exists(Path(text)):
+            continue
+        if info.reads == "path or name" and not Path(text).suffix and os.sep not in text:
+            known = [text] if info.autocompletion is None else list(info.autocompletion(""))
+            if text not in known:
+                near = difflib.get_close_matches(text, known, n=1)
+                hint = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(known)}, or a file"
+                raise InputError(f"{flag} {text}: is unknown: {hint}")
+        elif info.reads != "path or pattern" or not glob.has_magic(text):
+            raise InputError(f"{text}: there is no such file or folder")
+        elif next(glob.iglob(text), None) is None:
+            raise InputError(f"{text}: nothing matches this pattern (expected drives)")
 
 
 def _exists(path: Path) -> bool:
@@ -284,7 +278,7 @@ def _as_flag(flag: _Flag, value: str | None) -> str:
     except (ValueError, SyntaxError):
         literal = value
     if literal is False:
-        return flag_of(flag.field).split()[0].partition("/")[2] or f"no {flag.yes}"
+        return flag.spellings[0].partition("/")[2] or f"no {flag.yes}"
     if flag.kind is bool or flag.option.flag_value is not None:
         return flag.yes
     if isinstance(literal, dict):
@@ -296,10 +290,8 @@ def _as_flag(flag: _Flag, value: str | None) -> str:
 
 def _flags_of(hint: Any) -> tuple[Callable[..., Any] | None, dict[str, _Flag]]:
     """The maker of a parameter's value, and its options by name; None for a parameter without options."""
-    part = Part()
-    if get_origin(hint) is Annotated:
-        hint, *extras = get_args(hint)
-        part = next((each for each in extras if isinstance(each, Part)), part)
+    hint, marks = _unmarked(hint)
+    part = next((each for each in marks if isinstance(each, Part)), Part())
     if part.classes is None and not dataclasses.is_dataclass(hint):
         return None, {}
     found: dict[str, _Flag] = {}
@@ -315,19 +307,24 @@ def _flags_of(hint: Any) -> tuple[Callable[..., Any] | None, dict[str, _Flag]]:
     return (dict if part.classes else hint), found
 
 
+def _unmarked(hint: Any) -> tuple[Any, tuple[Any, ...]]:
+    """The type in an annotation, and the marks of an Annotated."""
+    return (get_args(hint)[0], hint.__metadata__) if get_origin(hint) is Annotated else (hint, ())
+
+
+def _info_in(hint: Any) -> Any:
+    """The `typer.Argument` or `typer.Option` in an annotation, or None."""
+    return next((each for each in _unmarked(hint)[1] if isinstance(each, typer.models.ParameterInfo)), None)
+
+
 def _with_metavar(parameter: Parameter) -> Parameter:
     """The parameter with a name for its value in `--help`: that of an argument, else PATH, TEXT or the choices."""
-    whole: Any
-    whole, *marks = get_args(parameter.annotation) if get_origin(parameter.annotation) is Annotated else [None]
-    info = next((each for each in marks if isinstance(each, typer.models.ParameterInfo)), None)
-    if info is None or info.metavar is not None:
+    info, (whole, _) = copy.copy(_info_in(parameter.annotation)), _unmarked(parameter.annotation)
+    kind = whole
+    while get_origin(kind) in (list, tuple, Union, types.UnionType):
+        kind = get_args(kind)[0]
+    if info is None or info.metavar is not None or kind is bool:
         return parameter
-    kinds = [each for each in get_args(whole) if each is not type(None)] if get_origin(whole) is not Literal else []
-    kind = kinds[0] if kinds else whole
-    kind = get_args(kind)[0] if get_origin(kind) is list else kind
-    if kind is bool:
-        return parameter
-    info = copy.copy(info)
     if isinstance(info, typer.models.ArgumentInfo):
         info.metavar = parameter.name.upper()
     else:

@@ -3,10 +3,8 @@
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-
 from bevcli.calibration.options import CalibrateOptions, CalibrateOutputOptions
-from bevcli.cli.bridge import INPUT, Json, Part, as_flags
+from bevcli.cli.bridge import InputDrive, Json, Part, as_flags
 from bevcli.printing import say
 from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import SequenceOptions
@@ -15,11 +13,7 @@ PANEL = "Look"
 
 
 def calibrate(
-    sequence: Annotated[
-        Path,
-        typer.Argument(help="Sequence folder (images or videos), nuScenes root, .mcap file or rosbag2 folder."),
-        INPUT,
-    ],
+    sequence: InputDrive,
     options: CalibrateOptions,
     source: Annotated[SequenceOptions, Part(only=("frames", "scene", "rate_hz", "every", "allow_outside"))],
     format_options: Annotated[dict[str, Any], Part(classes=option_classes)],

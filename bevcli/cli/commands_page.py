@@ -22,8 +22,8 @@ def page() -> str:
 def _command(name: str, command: Any) -> Iterator[str]:
     """The lines of a command, or of those of a group."""
     if hasattr(command, "commands"):
-        for each in command.commands:
-            yield from _command(f"{name} {each}", command.commands[each])
+        for each in command.list_commands(None):
+            yield from _command(f"{name} {each}", command.get_command(None, each))
         return
     shown = [each for each in command.params if not each.hidden]
     arguments = [each for each in shown if each.param_type_name == "argument"]

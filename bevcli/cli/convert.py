@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from bevcli.cli.bridge import INPUT, Part
+from bevcli.cli.bridge import InputDrive, Part
 from bevcli.printing import say
 from bevcli.sequences.format import option_classes
 from bevcli.sequences.options import LabelOptions, SequenceOptions, WriteOptions
@@ -16,14 +16,7 @@ PANEL = "Start"
 
 
 def convert(
-    source: Annotated[
-        Path,
-        typer.Argument(
-            metavar="INPUT",
-            help="Sequence folder (images or videos), nuScenes root, .mcap file or rosbag2 folder.",
-        ),
-        INPUT,
-    ],
+    input: InputDrive,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="The folder or file to write.")],
     options: Annotated[SequenceOptions, Part(only=("strict", "scene", "ground_truth", "allow_outside", "class_map"))],
     labels: LabelOptions,
@@ -42,9 +35,9 @@ def convert(
     from bevcli.sequences.open import open_sequence
     from bevcli.sequences.output import GROUP, open_writer
 
-    if Path(os.path.realpath(source)).is_relative_to(os.path.realpath(out)):
+    if Path(os.path.realpath(input)).is_relative_to(os.path.realpath(out)):
         raise OutputError(f"{out}: contains the input: choose another path")
-    sequence = open_sequence(source, replace(options, ego_motion="optional"), **format_options)
+    sequence = open_sequence(input, replace(options, ego_motion="optional"), **format_options)
     if labels.labels is not None:
         sequence = WithLabels(sequence, labels.labels, labels)
     count = len(sequence.stamps)

@@ -4,9 +4,7 @@ import json
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-
-from bevcli.cli.bridge import INPUT, Json, Part, print_note
+from bevcli.cli.bridge import Json, Part, input_argument, print_note
 from bevcli.evaluation.options import EvaluationOptions
 from bevcli.printing import say
 from bevcli.sequences.format import option_classes
@@ -16,11 +14,9 @@ PANEL = "Score"
 
 
 def evaluate(
-    predictions: Annotated[
-        Path, typer.Argument(help="predictions.json, the folder of a run, or a results_nusc.json."), INPUT
-    ],
+    predictions: Annotated[Path, input_argument("predictions.json, the folder of a run, or a results_nusc.json.")],
     ground_truth: Annotated[
-        Path, typer.Argument(help="ground_truth.json, a sequence folder that contains one, or a nuScenes root."), INPUT
+        Path, input_argument("ground_truth.json, a sequence folder that contains one, or a nuScenes root.")
     ],
     source: Annotated[SequenceOptions, Part(only=("scene", "class_map"))],
     format_options: Annotated[dict[str, Any], Part(only=("version", "split"), classes=option_classes)],

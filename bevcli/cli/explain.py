@@ -3,9 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from bevcli.cli.bridge import INPUT, Part
+from bevcli.cli.bridge import Part, input_argument
 from bevcli.explain.options import ExplainOptions
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
@@ -17,7 +15,7 @@ PANEL = "Look"
 
 def explain(
     sequence: Annotated[
-        Path, typer.Argument(help="A sequence folder, a folder of videos (one per camera), or a nuScenes root."), INPUT
+        Path, input_argument("A sequence folder, a folder of videos (one per camera), or a nuScenes root.")
     ],
     model: Annotated[ModelOptions, Part(only=("model", "weights", "untrained", "device"))],
     options: ExplainOptions,

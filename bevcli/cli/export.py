@@ -3,9 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
-from bevcli.cli.bridge import INPUT
+from bevcli.cli.bridge import input_argument
 from bevcli.evaluation.options import ExportOptions
 from bevcli.printing import say
 
@@ -18,8 +16,7 @@ PANEL = "Score"
 def export(
     predictions: Annotated[
         Path,
-        typer.Argument(help="predictions.json, ground_truth.json, the folder of a run, or a recording (.rrd)."),
-        INPUT,
+        input_argument("predictions.json, ground_truth.json, the folder of a run, or a recording (.rrd)."),
     ],
     options: ExportOptions,
 ) -> None:

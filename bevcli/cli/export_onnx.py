@@ -4,11 +4,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from bevcli.cli.bridge import INPUT_OR_NAME, OldArgument, Part
+from bevcli.cli.bridge import OldArgument, Part, model_option
 from bevcli.engines.options import FileOptions, OnnxOptions
-from bevcli.inference.options import ModelOptions, complete_model
+from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
 
 PANEL = "Deploy"
@@ -17,15 +15,11 @@ PANEL = "Deploy"
 def export_onnx(
     model: Annotated[
         str | None,
-        typer.Option(
-            autocompletion=complete_model,
-            metavar="NAME|FILE",
-            help="tiny, small, base, demo, v2-t1-base, v2-t1, v2-t2, v2-t8, or a FILE.toml. Default: the model that "
-            "WEIGHTS fit, else demo.",
-            rich_help_panel="Model",
+        model_option(
+            "tiny, small, base, demo, v2-t1-base, v2-t1, v2-t2, v2-t8, or a FILE.toml. Default: the model that WEIGHTS "
+            "fit, else demo."
         ),
         OldArgument,
-        INPUT_OR_NAME,
     ] = None,
     *,
     model_options: Annotated[ModelOptions, Part(only=("weights", "untrained"))],

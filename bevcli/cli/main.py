@@ -6,8 +6,10 @@ Exit codes: 0 success, 1 a mistake in the input, 2 a mistake in usage (click's o
 
 import io
 import os
+import re
 import sys
-from collections.abc import Iterator, Mapping
+import traceback
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -15,39 +17,35 @@ import typer
 from bevcli._version import __version__
 from bevcli.cli.bridge import command
 from bevcli.cli.help_text import GROUP, PlainCommand, PlainGroup
-from bevcli.cli.system_errors import system_error
 from bevcli.errors import BevcliError, WaitError
 from bevcli.inference.cpu_settings import THREAD_SETTINGS, keep_freed_memory
-from bevcli.printing import one_line, say
+from bevcli.printing import one_line, reason_of, say
 from bevcli.registry import entries, load
 
-
-class _Commands(Mapping[str, Any]):
-    """The commands of the entry points by name, each imported when it is asked for. loaded: further commands."""
-
-    def __init__(self, loaded: Mapping[str, Any]) -> None:
-        self._loaded = dict(loaded)
-
-    def __getitem__(self, name: str) -> Any:
-        if name not in self._loaded and name in entries(GROUP):
-            self._loaded[name] = click_command(name, load(GROUP, name))
-        return self._loaded[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter({**entries(GROUP), **self._loaded})
-
-    def __len__(self) -> int:
-        return len({**entries(GROUP), **self._loaded})
+# Each library words it otherwise.
+NO_MEMORY = re.compile(
+    "map segment|out of memory|insufficient memory|bad_alloc|bad allocation|(?:cannot|can't|unable to) allocate"
+    "|start new thread",
+    re.I,
+)
+OURS = str(Path(__file__).parents[1])
 
 
 class _Group(PlainGroup):
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(**settings)
-        self.commands: Any = _Commands(self.commands)
+    """The commands of the entry points, each imported when it is asked for, and further ones."""
+
+    commands: dict[str, Any]
 
     def list_commands(self, ctx: Any) -> list[str]:
         """The names of all commands; imports none of them."""
+        self.commands = {**dict.fromkeys(entries(GROUP)), **self.commands}
         return list(self.commands)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """The command of this name, None for an unknown one."""
+        if cmd_name in self.list_commands(ctx) and self.commands[cmd_name] is None:
+            self.commands[cmd_name] = click_command(cmd_name, load(GROUP, cmd_name))
+        return self.commands.get(cmd_name)
 
 
 def click_command(name: str, found: Any) -> Any:
@@ -119,3 +117,30 @@ def run_app() -> None:
             raise
         say(f"error: {message}", err=True)
         os._exit(1)  # what Python does at its end needs memory too
+
+
+def system_error(error: Exception) -> str | None:
+    """The message for a lack of memory, or for a package that cannot be imported; None for any other error."""
+    reason = one_line(reason_of(error), 300)
+    if _lacks_memory(error):
+        return f"the system gives no more memory or threads: {reason}"
+    package = _failed_import(error)
+    if package:
+        return f"the package {package} cannot be imported: {reason}; check its installation and environment variables"
+    return None
+
+
+def _lacks_memory(error: BaseException | None) -> bool:
+    while error is not None:
+        if isinstance(error, MemoryError) or NO_MEMORY.search(str(error)):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+def _failed_import(error: Exception) -> str:
+    """The package of somebody else whose import has raised an error; "" for an error of anything else."""
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename.startswith(OURS)]
+    words = (frames[-1].line or "").split() if frames else []
+    package = words[1].partition(".")[0] if words[:1] in (["import"], ["from"]) else ""
+    return "" if package == "bevcli" else package

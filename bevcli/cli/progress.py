@@ -3,15 +3,18 @@
 import os
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, TextIO
 
 from bevcli.cli.bridge import as_flags
-from bevcli.duration import duration
-from bevcli.printing import one_line
+from bevcli.printing import duration, one_line
 
 if TYPE_CHECKING:
     import rich.progress
+
+    from bevcli.frame import Sequence
+    from bevcli.inference.load import Model
 
 LINES_ON_A_PIPE = 10  # about this many progress lines for a whole run
 SLOW_S = 2.0  # work whose units take longer also gets a line after the first one, and its pace in seconds
@@ -62,6 +65,11 @@ class Progress:
             print(self.state(), file=self.stream, flush=True)
             self._printed = time.perf_counter()
 
+    def reach(self, done: int) -> None:
+        """Adds units of work up to this number of them."""
+        if done > self.done:
+            self.advance(done - self.done)
+
     def skip(self, count: int) -> None:
         """Adds units of work that were done before: they do not count for the rate."""
         self.skipped = count
@@ -102,3 +110,35 @@ def _bar(stream: TextIO) -> "rich.progress.Progress":
         console=Console(file=stream),
         redirect_stdout=False,  # a command's results may be piped
     )
+
+
+@contextmanager
+def engine_bar() -> Iterator[Callable[[int, int, str], None]]:
+    """Shows the steps of exports to another engine: how many are done, of how many, and what is done now.
+
+    A bar starts with the first step of an export, because there may be none.
+    """
+    once = "once for these weights, number of cameras and image size"
+    bar: Progress | None = None
+    said = ""
+
+    def show(done: int, total: int, what: str) -> None:
+        nonlocal bar, said
+        if bar is None or done < bar.done:
+            shown.close()
+            bar = shown.enter_context(Progress(total, "steps", [f"{what}, {once}"]))
+        elif what != said and done < total:
+            bar.message(f"note: {what}")
+        said = what
+        bar.reach(done)
+
+    with ExitStack() as shown:
+        yield show
+
+
+def in_engine_with_bar(model: "Model", drive: "Sequence", parts: str = "") -> "Model":
+    """The model in the engine that the options choose, see `in_engine`."""
+    from bevcli.inference.in_engine import in_engine
+
+    with engine_bar() as show:
+        return in_engine(model, drive.rig, drive, parts=parts, report=show)

@@ -3,9 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from bevcli.cli.bridge import INPUT, Part
+from bevcli.cli.bridge import Part, input_argument
 from bevcli.engines.options import FileOptions, QuantizeOptions
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
@@ -14,7 +12,7 @@ PANEL = "Deploy"
 
 
 def quantize(
-    model: Annotated[Path, typer.Argument(metavar="FILE.onnx", help="A file of `bevcli export-onnx`."), INPUT],
+    model: Annotated[Path, input_argument("A file of `bevcli export-onnx`.", metavar="FILE.onnx")],
     model_options: Annotated[ModelOptions, Part(only=("engine",))],
     file: FileOptions,
     options: QuantizeOptions,

@@ -8,7 +8,7 @@ import typer
 
 from bevcli.errors import OutputError
 from bevcli.printing import say
-from bevcli.writing import whole_file
+from bevcli.writing import write_whole
 
 PANEL = "Start"
 NAME, NOTEBOOK = "street", "first_steps.ipynb"
@@ -33,15 +33,10 @@ def samples(
             say(f"{target}: exists already")
             continue
         try:
-            _copy(source / name, target)
+            if (source / name).is_dir():
+                shutil.copytree(source / name, target)
+            else:
+                write_whole(target, (source / name).read_bytes())
         except OSError as error:
             raise OutputError(f"{target}: cannot be written ({error.strerror or error})") from None
         say(f"{target}: copied; {advice}")
-
-
-def _copy(source: Path, target: Path) -> None:
-    if source.is_dir():
-        shutil.copytree(source, target)
-    else:
-        with whole_file(target) as unfinished:
-            shutil.copyfile(source, unfinished)

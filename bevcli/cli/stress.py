@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from bevcli.cli.bridge import INPUT, Json, Part, print_note
+from bevcli.cli.bridge import Json, Part, input_argument, print_note
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
 from bevcli.robustness.options import StressOptions, StressOutputOptions
@@ -20,8 +20,7 @@ PANEL = "Score"
 def stress(
     sequence: Annotated[
         list[Path] | None,
-        typer.Argument(help="Sequence folders with ground truth, or a nuScenes root. Or give --rendered SEEDS."),
-        INPUT,
+        input_argument("Sequence folders with ground truth, or a nuScenes root. Or give --rendered SEEDS."),
     ] = None,
     *,
     model: Annotated[ModelOptions, Part(without=("untrained",))],
@@ -38,9 +37,8 @@ def stress(
     The table has NDS and mAP by corruption and severity, and mRR, the share of the clean NDS that is left. No training
     of bevcli uses the five others. Ctrl-C or SIGTERM end the test after the current frame; `--resume` goes on with it.
     """
-    from bevcli.cli.engine_bar import in_engine_with_bar
     from bevcli.cli.fetching import fetch_if_asked
-    from bevcli.cli.progress import Progress
+    from bevcli.cli.progress import Progress, in_engine_with_bar
     from bevcli.cli.stop_signals import StopSignals
     from bevcli.errors import InputError
     from bevcli.inference.load import load_model

@@ -4,9 +4,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bevcli.cli.bridge import INPUT_OR_NAME, OldArgument, Part, print_note
+from bevcli.cli.bridge import OldArgument, Part, model_option, print_note
 from bevcli.errors import InputError
-from bevcli.inference.options import ModelOptions, complete_model
+from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
 from bevcli.synth.options import DriveOptions
 from bevcli.training.options import ModelFileOptions, TrainOptions
@@ -20,15 +20,10 @@ PANEL = "Train"
 def train(
     model: Annotated[
         str,
-        typer.Option(
-            autocompletion=complete_model,
-            metavar="NAME|FILE",
-            help="A model name or a FILE.toml; required. Its training table holds the settings.",
-            rich_help_panel="Model",
-            show_default=False,
+        model_option(
+            "A model name or a FILE.toml; required. Its training table holds the settings.", show_default=False
         ),
         OldArgument,
-        INPUT_OR_NAME,
     ] = "",
     *,
     model_options: Annotated[ModelOptions, Part(only=("device",))],
@@ -89,12 +84,6 @@ def _run(trainer: "Trainer") -> None:
         progress.detail = f"step {trainer.done + 1}, loss {loss:.4g}"
         progress.advance()
 
-    def after_step() -> None:
-        """Catch up with a step of fewer updates."""
-        missing = (trainer.done - first) * updates - progress.done
-        if missing > 0:
-            progress.advance(missing)
-
     counts = f"{len(job.drives)} to train on, {len(job.held_out)} to evaluate on"
     say(f"{job.config.clips}; {steps} steps; drives: {counts}; output: {job.out}", err=True)
     for note in job.notes:
@@ -104,7 +93,7 @@ def _run(trainer: "Trainer") -> None:
     with Progress(steps * updates, "updates") as progress:
         with StopSignals("step") as signals:
             trainer.run(
-                after_step,
+                lambda: progress.reach((trainer.done - first) * updates),  # after a step of fewer updates
                 lambda step, scores: progress.message(f"step {step}: {scores}"),
                 signals.received,
                 after_update,

@@ -3,10 +3,8 @@
 import json
 from typing import Annotated
 
-import typer
-
-from bevcli.cli.bridge import INPUT_OR_NAME, Json, OldArgument, Part
-from bevcli.inference.options import ModelOptions, complete_model
+from bevcli.cli.bridge import Json, OldArgument, Part, model_option
+from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
 from bevcli.runs.options import RunOptions
 from bevcli.synth.options import DriveOptions
@@ -18,14 +16,8 @@ PANEL = "Score"
 def validate(
     model: Annotated[
         str | None,
-        typer.Option(
-            autocompletion=complete_model,
-            metavar="NAME|FILE",
-            help="A model name, a FILE.toml or a FILE.onnx. Default: the model that WEIGHTS fit, else demo.",
-            rich_help_panel="Model",
-        ),
+        model_option("A model name, a FILE.toml or a FILE.onnx. Default: the model that WEIGHTS fit, else demo."),
         OldArgument,
-        INPUT_OR_NAME,
     ] = None,
     *,
     model_options: Annotated[ModelOptions, Part(only=("weights", "device", "engine", "precision", "calibrate_with"))],
@@ -39,8 +31,7 @@ def validate(
     Each drive is run as by `bevcli run` and scored as by `bevcli eval`, which scores the files of a run that is done.
     `bevcli train` never uses rendered drives with seeds of 1000000 and above: keep them for this.
     """
-    from bevcli.cli.engine_bar import in_engine_with_bar
-    from bevcli.cli.progress import Progress
+    from bevcli.cli.progress import Progress, in_engine_with_bar
     from bevcli.inference.load import load_model
     from bevcli.inference.runner import Runner, StepOptions
     from bevcli.synth.drives import count_frames
@@ -51,9 +42,8 @@ def validate(
 
     loaded = load_model(model, options=model_options)
     rig = None if options.rig is None else rig_for_drives(options.rig, model or loaded.name)
-    data = drive_options
-    drives = scored_drives(data, loaded.config, rig)
-    notes = check_scored_drives(data, drives, loaded.config)
+    drives = scored_drives(drive_options, loaded.config, rig)
+    notes = check_scored_drives(drive_options, drives, loaded.config)
     if loaded.choice is not None:
         loaded = in_engine_with_bar(loaded, drives.open(0))
         notes = (*notes, loaded.engine_note) if loaded.engine_note else notes

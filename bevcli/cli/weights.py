@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bevcli.cli.bridge import INPUT, INPUT_OR_NAME, Json, Part, command
+from bevcli.cli.bridge import Json, Part, command, input_argument, model_option
 from bevcli.cli.help_text import PlainCommand
 from bevcli.engines.options import FileOptions
-from bevcli.inference.options import ModelOptions, complete_model
+from bevcli.inference.options import ModelOptions
 from bevcli.printing import say
 
 if TYPE_CHECKING:
@@ -75,17 +75,15 @@ def fetch(
 @command
 def inspect(
     file: Annotated[
-        Path | None, typer.Argument(help="An official .pth as published, or a .safetensors.", show_default=False), INPUT
+        Path | None, input_argument("An official .pth as published, or a .safetensors.", show_default=False)
     ] = None,
     model: Annotated[
         str | None,
-        typer.Option(
-            help="List the parts of this model, such as tiny, base or v2-t2, or a FILE.toml; FILE must fit it.",
+        model_option(
+            "List the parts of this model, such as tiny, base or v2-t2, or a FILE.toml; FILE must fit it.",
+            panel=None,
             show_default=False,
-            autocompletion=complete_model,
-            metavar="NAME|FILE",
         ),
-        INPUT_OR_NAME,
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -121,7 +119,7 @@ def inspect(
 @weights_app.command(cls=PlainCommand)
 @command
 def convert(
-    source: Annotated[Path, typer.Argument(help="An official .pth as published, or a .safetensors."), INPUT],
+    source: Annotated[Path, input_argument("An official .pth as published, or a .safetensors.")],
     destination: Annotated[Path, typer.Argument(help="The .safetensors to write.")],
     options: Annotated[FileOptions, Part(only=("force",))],
 ) -> None:

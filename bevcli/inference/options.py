@@ -1,27 +1,19 @@
 """ModelOptions: a model, its weights, and the device that it runs on."""
 
-from importlib import resources
 from pathlib import Path
 from typing import Literal
 
 from bevcli.options import option, options
-from bevcli.registry import entries
+from bevcli.registry import entries, known_models
 
 AUTO, TORCH = "auto", "torch"  # values of `engine` beside the registered engines
-
-
-def model_names() -> list[str]:
-    """The known models."""
-    # Not of bevcli.config, which loads PyTorch: help and completion must be quick.
-    files = [file.name for file in resources.files("bevcli").joinpath("configs").iterdir()]
-    return sorted(file.removesuffix(".toml") for file in files if file.endswith(".toml"))
 
 
 def complete_model(incomplete: str) -> list[str]:
     """The known models and weights that start with a text, for completion in a shell."""
     from bevcli.published import read_sources
 
-    return sorted(name for name in {*model_names(), *read_sources()} if name.startswith(incomplete))
+    return sorted(name for name in {*known_models(), *read_sources()} if name.startswith(incomplete))
 
 
 def complete_engine(incomplete: str) -> list[str]:
@@ -36,7 +28,7 @@ class ModelOptions:
     model: str | Path | None = option(
         reads="path or name",
         default=None,
-        help=f"{', '.join(model_names())}, a name of `bevcli weights list`, a FILE.toml or a FILE.onnx of `bevcli "
+        help=f"{', '.join(known_models())}, a name of `bevcli weights list`, a FILE.toml or a FILE.onnx of `bevcli "
         "export-onnx`. Default: the model that WEIGHTS fit, else demo.",
         metavar="NAME|FILE",
         complete=complete_model,

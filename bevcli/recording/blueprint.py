@@ -13,7 +13,6 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.recording import entities
 from bevcli.recording.colors import BACKGROUND
 from bevcli.recording.ground_lines import KINDS
-from bevcli.recording.layout import Layout
 from bevcli.recording.log_static import legend_size
 
 SIDEWAYS = np.pi / 2 + 1e-6  # a camera that looks exactly sideways belongs to the front row
@@ -87,6 +86,29 @@ class LayoutFacts:
     legend_entries: int = 0
     grid: BevGrid | None = None
     follows: bool = False
+
+
+class Layout(rrb.Blueprint):
+    """Views in the middle, side panels collapsed.
+
+    rerun writes a blueprint into a stream in memory that refers to itself, so that its two threads and some MB stay as
+    long as the process. Call `free` once the blueprint has been sent.
+    """
+
+    def __init__(self, views: rrb.Container, time_panel: rrb.TimePanel) -> None:
+        panels = rrb.SelectionPanel(state="collapsed"), rrb.BlueprintPanel(state="collapsed")
+        super().__init__(views, time_panel, *panels, auto_views=False, auto_layout=False)
+        self._streams: list[rr.RecordingStream] = []
+
+    def _log_to_stream(self, stream: rr.RecordingStream) -> None:
+        """Called by rerun when the blueprint is sent."""
+        self._streams.append(stream)
+        super()._log_to_stream(stream)
+
+    def free(self) -> None:
+        """Frees what sending it took, with rerun's next `flush_and_cleanup_orphaned_recordings`."""
+        while self._streams:
+            self._streams.pop().disconnect()
 
 
 def recording_blueprint(rig: CameraRig, facts: LayoutFacts) -> Layout:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,10 +15,9 @@ from bevcli.recording import entities, log_bev, log_boxes, log_cameras, log_stat
 from bevcli.recording.box_lines import box_labels
 from bevcli.recording.class_meshes import log_class_meshes
 from bevcli.recording.colors import EGO_COLOR, class_colors
-from bevcli.recording.ground_lines import future_lines, result_lines
+from bevcli.recording.ground_lines import future_lines, log_ground_lines, result_lines
 from bevcli.recording.log_bev import BevColors, BevImages
 from bevcli.recording.log_cameras import PosedCamera, VideoImages
-from bevcli.recording.log_ground import log_ground_lines
 from bevcli.recording.log_tracks import TrackHistory, TrackLog
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.recorded import WARNINGS, RecordedDrive, RecordedModel, weights_note
@@ -51,15 +51,7 @@ class FrameLogState:
 
 
 class FrameLog:
-    """Logs frames into a stream of rerun, in order.
-
-    Args:
-        stream: the recording's.
-        drive: the drive.
-        model: the model.
-        options: how much is logged.
-        resume: the state from which the log goes on.
-    """
+    """Logs frames into a stream of rerun, in order. resume: the state from which the log goes on."""
 
     def __init__(
         self,
@@ -78,14 +70,12 @@ class FrameLog:
         self._last: LastFrame | None = None
         self._early_events: list[tuple[str, str]] = []  # logged before the first frame
         self._pillars: Array | None = None
-        self._tracks = TrackLog(stream, self.classes)
+        self._tracks = TrackLog(stream, self.classes, None if resume is None else resume.tracks)
         self._video = VideoImages(stream) if options.images == "av1" else None
-        self._bev_images: BevImages[tuple[FrameStamp, Prediction]] | None = None
-        if options.bev != "none" and options.shows_internals:
-            self._bev_images = BevImages(options.bev)
+        draws_bev = options.bev != "none" and options.shows_internals
+        self._bev_images = BevImages(options.bev) if draws_bev else None  # stamps: (FrameStamp, Prediction)
         if resume is not None:
             self._origin, self._last = resume.origin, resume.last
-            self._tracks.go_on_from(resume.tracks)
             if self._bev_images is not None:
                 self._bev_images.colors = resume.colors
 
@@ -97,7 +87,7 @@ class FrameLog:
         colors = None if self._bev_images is None else self._bev_images.colors
         if self._origin is None or (self._bev_images is not None and colors is None):
             return None
-        return FrameLogState(self._origin, self._last, colors, self._tracks.state())
+        return FrameLogState(self._origin, self._last, colors, deepcopy(self._tracks.history))
 
     def finish(self) -> None:
         """Logs what waits for later frames."""
@@ -121,10 +111,7 @@ class FrameLog:
         self._last = LastFrame(frame.stamp.scene, frame.world_from_ego)
 
     def event(self, text: str, level: str = "INFO") -> None:
-        """Writes a line into the event log, at the newest frame; before the first frame, at the first one.
-
-        level: "INFO", "WARN" or "ERROR".
-        """
+        """See `Recording.event`."""
         if self._origin is None:
             self._early_events.append((text, level))
         else:

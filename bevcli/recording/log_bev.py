@@ -1,7 +1,7 @@
 """Writes BEV maps into a recording: features as colours, segmentation, history weights, probed cells."""
 
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -14,7 +14,6 @@ from bevcli.geometry.transforms import Array, apply
 from bevcli.recording import entities
 from bevcli.recording.colors import BACKGROUND, Color, colormap, map_colors
 
-Stamp = TypeVar("Stamp")
 Features = NDArray[np.float32]
 FITTED_ON = 2  # frames
 CELLS_FOR_FIT = 4000  # of each frame, evenly spaced
@@ -66,7 +65,7 @@ def fit_colors(kind: str, features: Features) -> BevColors:
     return BevColors(mean, basis, low, high)
 
 
-class BevImages(Generic[Stamp]):
+class BevImages:
     """Takes the features of each frame; returns the images that are ready, each with the stamp of its frame.
 
     Attributes:
@@ -76,9 +75,9 @@ class BevImages(Generic[Stamp]):
     def __init__(self, kind: str) -> None:
         self.kind = kind
         self.colors: BevColors | None = None
-        self._waiting: list[tuple[Stamp, Features]] = []
+        self._waiting: list[tuple[Any, Features]] = []
 
-    def push(self, stamp: Stamp, features: Features) -> list[tuple[Stamp, NDArray[np.uint8]]]:
+    def push(self, stamp: Any, features: Features) -> list[tuple[Any, NDArray[np.uint8]]]:
         """Adds a frame; returns the images that are ready.
 
         features: (rows, columns, C); the first row has the smallest y. The images are (rows, columns, 3) uint8 RGB;
@@ -89,7 +88,7 @@ class BevImages(Generic[Stamp]):
             return []
         return self.finish()
 
-    def finish(self) -> list[tuple[Stamp, NDArray[np.uint8]]]:
+    def finish(self) -> list[tuple[Any, NDArray[np.uint8]]]:
         """The images that are not returned yet: that of the first frame, where there was no second one."""
         if not self._waiting:
             return []

@@ -189,13 +189,7 @@ def legend_entries(
     map_classes: Sequence[str] = (),
     lines: Sequence[tuple[str, Color]] = (),
 ) -> list[tuple[str, Color]]:
-    """The texts and colours of the legend.
-
-    Args:
-        classes: of the objects, with their colours.
-        map_classes: of the model's map; empty without one.
-        lines: of `line_entries`.
-    """
+    """The texts and colours of the legend: of objects, of map classes if there is a map, and of `line_entries`."""
     of_classes = [(name.replace("_", " "), color) for name, color in classes.items()]
     states = [("ground truth", GROUND_TRUTH_COLOR), ("missed, false", MISSED_COLOR), ("duplicate", DUPLICATE_COLOR)]
     maps = [(f"map: {name.replace('_', ' ')}", color) for name, color in map_colors(map_classes).items()]

@@ -29,7 +29,7 @@ class TrackHistory:
     Attributes:
         scene: the scene of the last frame; a new scene has new tracks.
         times_ns: by track, the times of its positions.
-        positions: by track, positions (3,) in the recording's world.
+        positions: by track, positions (3,) in the recording's world, the oldest first.
         shown: the entities that show a track now, sorted.
         known: the entities that have their style.
     """
@@ -55,10 +55,6 @@ class TrackHistory:
             if not kept or stamp.timestamp_ns - times[-1] > LOST_S * 1e9:
                 del self.times_ns[name], self.positions[name]
 
-    def past(self, name: str) -> Array:
-        """(K, 3) the positions of a track, the oldest first."""
-        return np.array(self.positions.get(name, [])).reshape(-1, 3)
-
 
 def track_names(boxes: Boxes3D) -> list[str]:
     """The identity of each box's track, "" for a box without one."""
@@ -68,25 +64,20 @@ def track_names(boxes: Boxes3D) -> list[str]:
 
 
 class TrackLog:
-    """Writes the tracks of each frame, and clears the entities of tracks without a box."""
+    """Writes the tracks of each frame, and clears the entities of tracks without a box.
 
-    def __init__(self, stream: rr.RecordingStream, classes: Mapping[str, Color]) -> None:
+    past: the tracks of an interrupted recording.
+    """
+
+    def __init__(self, stream: rr.RecordingStream, classes: Mapping[str, Color], past: TrackHistory | None) -> None:
         self._stream, self._classes = stream, classes
-        self._history = TrackHistory()
-
-    def state(self) -> TrackHistory:
-        """The state that `go_on_from` needs."""
-        return deepcopy(self._history)
-
-    def go_on_from(self, state: TrackHistory) -> None:
-        """Continues the tracks of an interrupted recording."""
-        self._history = deepcopy(state)
+        self.history = TrackHistory() if past is None else deepcopy(past)
 
     def log(self, boxes: Boxes3D, stamp: FrameStamp, bev_from_world: Array) -> None:
         """Writes the tracks of boxes in the recording's world. bev_from_world: (4, 4). Without tracks: nothing."""
         if boxes.instances is None:
             return
-        self._history.add(boxes, stamp)
+        self.history.add(boxes, stamp)
         ahead, outlines, colors = _ahead(boxes), _footprints(boxes), box_colors(boxes, self._classes)
         shown: set[str] = set()
         flat, flat_colors = [], []
@@ -94,7 +85,7 @@ class TrackLog:
             if not name:
                 continue
             entity = entities.track(str(boxes.classes[i]), name)
-            past = self._history.past(name)
+            past = np.array(self.history.positions[name])  # (K, 3)
             trail = [past] if len(past) > 1 else []
             own_colors = [(*colors[i], opacity) for opacity in (AHEAD_OPACITY, PAST_OPACITY, PAST_OPACITY)]
             self._log_style(entity, name, own_colors)
@@ -105,14 +96,14 @@ class TrackLog:
             flat_colors += own_colors[:: 2 if trail else 3]
         trails = rr.LineStrips2D(line_strips(flat, 2), colors=flat_colors or None, radii=THIN, draw_order=25)
         self._stream.log(entities.BEV_TRACKS, trails)
-        for entity in set(self._history.shown) - shown:
+        for entity in set(self.history.shown) - shown:
             self._stream.log(entity, rr.Clear(recursive=False))
-        self._history.shown = sorted(shown)
+        self.history.shown = sorted(shown)
 
     def _log_style(self, entity: str, name: str, colors: list[tuple[int, int, int, int]]) -> None:
         """Writes what does not change, once for each track: a message costs more bytes than its numbers."""
-        if entity not in self._history.known:
-            self._history.known.append(entity)
+        if entity not in self.history.known:
+            self.history.known.append(entity)
             style = rr.LineStrips3D.from_fields(colors=colors, radii=WIDTH)
             self._stream.log(entity, style, rr.AnyValues(track=name), static=True)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Literal
 
@@ -11,11 +12,6 @@ from bevcli.options import option, options
 Images = Literal["jpeg", "av1"]
 Level = Literal["minimal", "standard", "full"]
 LEVELS: tuple[Level, ...] = ("minimal", "standard", "full")
-
-
-def parse_positions(texts: list[str]) -> tuple[tuple[float, float], ...]:
-    """Positions from texts "X,Y" in metres. Raises ValueError."""
-    return tuple(map(parse_position, texts))
 
 
 def parse_position(text: str) -> tuple[float, float]:
@@ -54,7 +50,7 @@ class RecordingOptions:
         help="Show the image points that the BEV cell at X, Y (bev frame, metres) attends to. Repeatable.",
         flag="--probe",
         metavar="X,Y",
-        parse=parse_positions,
+        parse=lambda texts: tuple(map(parse_position, texts)),
         repeatable=True,
     )
     vehicle_mesh: Path | None = option(
@@ -73,7 +69,7 @@ class RecordingOptions:
     def __post_init__(self) -> None:
         if self.level not in LEVELS:
             raise InputError(f'`level`: unknown level "{self.level}" (expected {", ".join(LEVELS)})')
-        if self.bev not in ("norm", "pca", "none") and self.channel is None:
+        if not re.fullmatch(r"norm|pca|none|channel:\d+", self.bev):
             raise InputError(f'`bev`: unknown image "{self.bev}" (expected norm, pca, channel:K or none)')
         if self.images not in ("jpeg", "av1"):
             raise InputError(f'`images`: unknown format "{self.images}" (expected jpeg or av1)')
@@ -83,12 +79,6 @@ class RecordingOptions:
             require_av('`images="av1"`')
         if self.vehicle_mesh is not None and not self.vehicle_mesh.is_file():
             raise InputError(f"`vehicle_mesh={self.vehicle_mesh}`: there is no such file")
-
-    @property
-    def channel(self) -> int | None:
-        """K of "channel:K", else None."""
-        kind, _, number = self.bev.partition(":")
-        return int(number) if kind == "channel" and number.isdecimal() else None
 
     @property
     def shows_internals(self) -> bool:

@@ -17,13 +17,14 @@ from pathlib import Path
 import rerun as rr
 
 from bevcli.errors import OutputError, WaitError
+from bevcli.sequences.files.incremental_json import GrowingFile
 
 BLOCK = 1 << 20  # bytes
 HEADER = 12  # bytes at the beginning of an .rrd file
 TIMEOUT_S = 20.0
 
 
-class RrdFile:
+class RrdFile(GrowingFile):
     """Receives the bytes of a recording.
 
         file = RrdFile(path)
@@ -31,27 +32,15 @@ class RrdFile:
         file.opened()
 
     Attributes:
-        path: the .rrd file.
-        size: bytes in the file at the last `sync`; all frames up to then are readable.
+        synced: bytes in the file at the last `sync`; all frames up to then are readable.
     """
 
     def __init__(self, path: Path, resume_at: int | None = None) -> None:
-        """Creates the file, or cuts an earlier one to `resume_at` bytes and goes on from there.
-
-        resume_at: the `size` of an earlier RrdFile of the same recording.
-        Raises OutputError if the file cannot be written.
-        """
-        self.path = path
-        self.size = 0
+        """As a GrowingFile. resume_at: `synced` of an earlier RrdFile of the same recording."""
+        super().__init__(path, resume_at)
+        self.synced = self.size
         self._is_joined = resume_at is not None  # of several streams, so that the index of the last does not fit
-        self._error: OSError | None = None
-        try:
-            self._file = path.open("wb" if resume_at is None else "r+b", buffering=0)
-            if resume_at is not None:
-                self._file.truncate(resume_at)
-                self.size = self._file.seek(resume_at)
-        except OSError as error:
-            raise OutputError(f"{path}: the recording cannot be written ({error.strerror})") from None
+        self._error: OutputError | None = None
         self._pipe = -1
         self._busy = threading.Lock()
         self._block = memoryview(bytearray(BLOCK))  # allocated here, where a lack of memory can be told
@@ -86,7 +75,7 @@ class RrdFile:
                 raise self._no_answer()
             time.sleep(0.0005)
         self._raise_error()
-        self.size = self._file.tell()
+        self.synced = self.size
 
     def leave_out_index(self) -> None:
         """Call after the last `sync`, before rerun closes the sink: of several streams, the last has no index either.
@@ -105,16 +94,12 @@ class RrdFile:
         with self._file:
             if self._error is not None or self._is_joined:  # there may be a cut message
                 with contextlib.suppress(OSError):
-                    self._file.truncate(self.size)
+                    self._file.truncate(self.synced)
         self._raise_error()
-
-    def is_deleted(self) -> bool:
-        """True if somebody has deleted the file that is being written."""
-        return os.fstat(self._file.fileno()).st_nlink == 0
 
     def _raise_error(self) -> None:
         if self._error is not None:
-            raise OutputError(f"{self.path}: the recording cannot be written ({self._error.strerror})")
+            raise self._error
 
     def _no_answer(self) -> WaitError:
         return WaitError(f"{self.path}: the disk has not taken the recording for {TIMEOUT_S:.0f} s")
@@ -147,7 +132,7 @@ class RrdFile:
         rest = block[self._to_skip :]
         self._to_skip -= len(block) - len(rest)
         try:
-            while rest and self._error is None:
-                rest = rest[os.write(self._file.fileno(), rest) :]
-        except OSError as error:
+            if self._error is None:
+                self.append(rest)
+        except OutputError as error:
             self._error = error

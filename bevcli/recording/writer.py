@@ -15,11 +15,10 @@ from bevcli.errors import OutputError, WaitError
 from bevcli.frame import Frame, Prediction
 from bevcli.geometry.object_classes import hex_of_color
 from bevcli.recording import entities, log_static
-from bevcli.recording.blueprint import LayoutFacts, recording_blueprint
+from bevcli.recording.blueprint import Layout, LayoutFacts, recording_blueprint
 from bevcli.recording.class_meshes import read_class_meshes
 from bevcli.recording.colors import Color
 from bevcli.recording.frame_log import FrameLog, FrameLogState
-from bevcli.recording.layout import Layout
 from bevcli.recording.options import RecordingOptions
 from bevcli.recording.recorded import RecordedDrive, RecordedModel, frame_rate_hz
 from bevcli.recording.rrd_file import RrdFile
@@ -91,7 +90,6 @@ class Recording:
         # for a sink that hangs.
         threading.Thread(target=rr.bindings.flush_and_cleanup_orphaned_recordings, daemon=True).start()
         self._stream = rr.RecordingStream(APPLICATION, recording_id=self._recording_id)
-        self._file: RrdFile | None = None
         self._frames = 0
         frames = None if resume is None else resume.frames
         self._frame_log = FrameLog(self._stream, sequence, model, self.options, frames)
@@ -115,7 +113,7 @@ class Recording:
         self._layout = recording_blueprint(self.rig, facts)
         self._file = RrdFile(self.path, self._size)
         follows = replace(facts, follows=self._live is not None)
-        self._connect(self._file, recording_blueprint(self.rig, follows))
+        self._connect(recording_blueprint(self.rig, follows))
         if self._live is not None:
             self._live.open(self.path)
         log_static.log_scene(self._stream, self.rig, self._frame_log.classes, vehicle, grid)
@@ -145,19 +143,18 @@ class Recording:
         text = log_static.about_text(self.title, self.rig, self.options, untrained=untrained)
         self._stream.log(entities.RUN, rr.TextDocument(text, media_type="text/markdown"), facts, static=True)
 
-    def _connect(self, file: RrdFile, layout: Layout | None) -> None:
+    def _connect(self, layout: Layout | None) -> None:
         """Makes rerun write a new stream into the file. Raises OutputError."""
         try:
-            self._stream.set_sinks(file.sink(), default_blueprint=layout)
+            self._stream.set_sinks(self._file.sink(), default_blueprint=layout)
         except RuntimeError as error:
             raise OutputError(f"{self.path}: the recording cannot be written ({error})") from error
         finally:
-            file.opened()
+            self._file.opened()
             if layout is not None:
                 layout.free()
 
     def __exit__(self, *error: object) -> None:
-        assert self._file is not None
         try:
             self._frame_log.finish()
             if self._live is not None:  # who opens the file later sees it from the first frame on
@@ -174,23 +171,19 @@ class Recording:
     def state(self) -> RecordingState | None:
         """The state from which a later Recording goes on; None as long as it cannot be resumed."""
         frames = self._frame_log.state()
-        if frames is None or self._file is None:
-            return None
-        return RecordingState(self._recording_id, self._file.size, frames)
+        return None if frames is None else RecordingState(self._recording_id, self._file.synced, frames)
 
     def is_deleted(self) -> bool:
         """True if somebody has deleted the file that is being written."""
-        return self._file is not None and self._file.is_deleted()
+        return self._file.is_deleted()
 
     def log(self, frame: Frame, prediction: Prediction) -> None:
         """Writes one frame: images, shown boxes, ground truth, curves, events and the model's internals."""
         self._frame_log.log(frame, prediction)
         self._flush()
         self._frames += 1
-        # A new stream frees the index of the one before.
         if self._frames % INDEXED_FRAMES == 0:
-            assert self._file is not None
-            self._connect(self._file, None)
+            self._connect(None)  # a new stream frees the index of the one before
 
     def event(self, text: str, level: str = "INFO") -> None:
         """Writes a line into the event log, at the newest frame; before the first frame, at the first one.
@@ -208,7 +201,6 @@ class Recording:
             raise WaitError(f"{self.path}: the recording could not be closed within {FLUSH_TIMEOUT_S:.0f} s")
 
     def _flush(self) -> None:
-        assert self._file is not None
         try:
             self._stream.flush(timeout_sec=FLUSH_TIMEOUT_S)
             self._file.sync()

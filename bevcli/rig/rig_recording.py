@@ -14,9 +14,8 @@ from bevcli.errors import OutputError
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Array, apply
 from bevcli.recording import entities, log_static
-from bevcli.recording.blueprint import camera_rows, flat_view
+from bevcli.recording.blueprint import Layout, camera_rows, flat_view
 from bevcli.recording.colors import BACKGROUND
-from bevcli.recording.layout import Layout
 from bevcli.rig import overlay
 from bevcli.rig.coverage import Coverage
 from bevcli.rig.drawings import COUNT_COLORS

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from bevcli._version import __version__
-from bevcli.duration import duration
 from bevcli.frame import Frame, Prediction
 from bevcli.inference.load import Model
+from bevcli.printing import duration
 from bevcli.rig.check_drive import CheckedDrive
 from bevcli.runs.folder import SUMMARY
 from bevcli.runs.options import RunOptions

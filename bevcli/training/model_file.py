@@ -15,10 +15,10 @@ from typing import Any
 import torch
 
 from bevcli.config import config_of_table, read_model_file
-from bevcli.duration import duration
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import Sequence
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
+from bevcli.printing import duration
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import SequenceOptions
 from bevcli.synth.options import DriveOptions

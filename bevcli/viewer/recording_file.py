@@ -48,12 +48,7 @@ MESSAGE_KINDS = (1, 2, 3)  # facts of the recording, data, and the choice of a b
 
 @dataclass(frozen=True)
 class RecordingFile:
-    """The file to read a recording from.
-
-    Attributes:
-        path: the user's file, or its repaired copy.
-        repaired: whether it is a repaired copy.
-    """
+    """The file to read a recording from: the user's, or its repaired copy."""
 
     path: Path
     repaired: bool
@@ -64,7 +59,6 @@ def open_recording(path: Path) -> Iterator[RecordingFile]:
     """The recording at a path. If its last message is cut: a repaired copy, which is deleted when the context ends.
 
     path: the recording, or the output folder of `bevcli run`.
-
     Raises InputError if the file is missing, is not a recording, was cut off before its first frame, or is damaged.
     """
     path = recording_in(path)

@@ -94,18 +94,11 @@ class RecordingReader:
     def _rows(self) -> Iterator[tuple[str, int | None, Row]]:
         for chunk in self.chunks():
             batch = chunk.to_record_batch()
-            names = [name for name in batch.schema.names if ":" in name or name in OWN_COMPONENTS]
+            names = [field.name for field in batch.schema if (field.metadata or {}).get(b"rerun:kind") == b"data"]
             timed = entities.FRAME_TIMELINE in batch.schema.names
             for i in range(batch.num_rows):
                 frame = batch.column(entities.FRAME_TIMELINE)[i].as_py() if timed else None
                 yield chunk.entity_path.strip("/"), frame, {n: batch.column(n)[i] for n in names}
-
-
-OWN_COMPONENTS = frozenset(
-    ("score", "velocity_x", "velocity_y", "name", "scene", "timestamp_ns", "pose", "origin")
-    + ("title", "untrained", "note", "class_names", "class_colors", "camera_names", "map_classes")
-    + ("line_names", "line_colors", "track", "seconds")
-)
 
 
 def _apply(state: dict[str, Row], entity: str, row: Row) -> None:

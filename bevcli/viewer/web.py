@@ -9,7 +9,6 @@ import ipaddress
 import os
 import re
 import socket
-import stat
 import sys
 import threading
 import time
@@ -23,6 +22,7 @@ from typing import Any, BinaryIO
 from urllib.parse import parse_qs, quote, urlsplit
 
 from bevcli.errors import OutputError
+from bevcli.parsing.files import open_regular
 from bevcli.printing import say
 from bevcli.viewer.native import LOOPBACK, display_is_there, free_port, start_viewer, stop
 
@@ -79,7 +79,7 @@ class WebViewer:
         *,
         ended: threading.Event | None = None,
     ) -> None:
-        handler = partial(_Handler, assets, _open_regular(recording), ended)
+        handler = partial(_Handler, assets, open_regular(recording, error=OutputError), ended)
         self.host, self.port = host, free_port(port, host)
         self._server = _Server((host, self.port), handler)
 
@@ -87,11 +87,6 @@ class WebViewer:
     def address(self) -> str:
         """The address to open in a browser."""
         return f"http://{self.host}:{self.port}"
-
-    @property
-    def followers(self) -> int:
-        """The number of viewers that have begun to read a growing recording."""
-        return len(self._server.live_transfers)
 
     def serve(self) -> None:
         """Serves until `close` is called from another thread."""
@@ -227,17 +222,6 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
 
 
-def _open_regular(path: Path) -> BinaryIO:
-    """The opened file, closed when nobody reads it any more. Raises OutputError where it is no regular file."""
-    try:
-        file = open(path, "rb", buffering=0, opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
-    except OSError as error:
-        raise OutputError(f"{path}: the recording cannot be read ({error.strerror})") from None
-    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-        raise OutputError(f"{path}: is no file (expected a recording)")
-    return file
-
-
 def _is_own_name(host: str) -> bool:
     """True if a Host header names this machine: an IP address, localhost or the machine's own name.
 
@@ -272,34 +256,27 @@ class LiveView:
     """A viewer in a window; without a display in the browser, at an address that is printed to stderr.
 
     It reads the recording's own file while it grows, through the server above. Writing never waits for it.
+
+    Attributes:
+        server: serves the recording; None before `open`.
     """
 
     def __init__(self) -> None:
         self._ended = threading.Event()
-        self._web: WebViewer | None = None
-
-    @property
-    def address(self) -> str:
-        """The address to open in a browser; empty before `open`."""
-        return "" if self._web is None else self._web.address
-
-    @property
-    def followers(self) -> int:
-        """The number of viewers that have begun to read the recording."""
-        return 0 if self._web is None else self._web.followers
+        self.server: WebViewer | None = None
 
     def open(self, recording: Path) -> None:
         """Starts the viewer. A window stays open after the run until the user closes it."""
         in_window = display_is_there()
-        self._web = WebViewer({} if in_window else web_viewer_assets(), recording, ended=self._ended)
-        threading.Thread(target=self._web.serve, daemon=True).start()
+        self.server = WebViewer({} if in_window else web_viewer_assets(), recording, ended=self._ended)
+        threading.Thread(target=self.server.serve, daemon=True).start()
         if in_window:
-            start_viewer("--bind", LOOPBACK, "--port", "auto", f"{self._web.address}{RECORDING}")
+            start_viewer("--bind", LOOPBACK, "--port", "auto", f"{self.server.address}{RECORDING}")
         else:
-            say(f"live view: {self.address}", err=True)
+            say(f"live view: {self.server.address}", err=True)
 
     def close(self) -> None:
         """Sends the rest of the recording, and stops the server. A window stays open."""
         self._ended.set()
-        if self._web is not None:
-            self._web.close()
+        if self.server is not None:
+            self.server.close()

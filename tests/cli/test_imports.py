@@ -4,13 +4,13 @@ import gc
 
 import pytest
 
-from bevcli.cli.imports import fast_imports
+from bevcli.parsing.documents import without_garbage_collection
 
 
 def test_collection_goes_on_after_imports_and_errors():
-    with fast_imports():
+    with without_garbage_collection():
         assert not gc.isenabled()
     assert gc.isenabled()
-    with pytest.raises(ImportError), fast_imports():
+    with pytest.raises(ImportError), without_garbage_collection():
         raise ImportError
     assert gc.isenabled()

@@ -12,9 +12,8 @@ def commands(found=None, name=""):
     found = typer.main.get_command(app) if found is None else found
     if not hasattr(found, "commands"):
         return {name.strip(): found}
-    return {
-        key: each for part in found.commands for key, each in commands(found.commands[part], f"{name} {part}").items()
-    }
+    parts = [commands(found.get_command(None, part), f"{name} {part}") for part in found.list_commands(None)]
+    return {key: each for part in parts for key, each in part.items()}
 
 
 def shown(command):

@@ -10,7 +10,7 @@ from bevcli.recording.options import RecordingOptions
 
 @pytest.mark.parametrize("bev", ["norm", "pca", "none", "channel:0", "channel:17"])
 def test_known_kinds_of_bev_images(bev):
-    assert RecordingOptions(bev=bev).channel == (int(bev[8:]) if ":" in bev else None)
+    assert RecordingOptions(bev=bev).bev == bev
 
 
 @pytest.mark.parametrize("wrong", [{"bev": "channel"}, {"bev": "channel:-1"}, {"bev": "heat"}, {"level": "most"}])

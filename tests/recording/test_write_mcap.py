@@ -1,5 +1,6 @@
 """`bevcli convert --format mcap`: read back by the mcap library with its ROS 2 decoder, and by the reader of bags."""
 
+import sys
 from pathlib import Path
 
 import cv2
@@ -10,7 +11,7 @@ from mcap_ros2.decoder import DecoderFactory
 from memory_drive import MemorySequence
 from recorded_drive import with_truth
 
-from bevcli.errors import InputError, OutputError
+from bevcli.errors import BevcliError, InputError, OutputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig, Distortion
@@ -148,3 +149,11 @@ def test_left_out_fields_are_zero_or_empty():
     definition = messages.definition("foxglove_msgs/SceneUpdate")
     assert definition.count("MSG: foxglove_msgs/") == 12
     assert messages.encode("foxglove_msgs/SceneUpdate", {})[4:] == bytes(8)  # two empty lists
+
+
+def test_without_rosbags_the_error_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    for name in [name for name in sys.modules if name.startswith(("rosbags.", "bevcli.recording.foxglove."))]:
+        monkeypatch.delitem(sys.modules, name)
+    with pytest.raises(BevcliError, match=r"pip install .*bevcli\[ros\]"):
+        open_writer(tmp_path / "drive.mcap", Truthful(), WriteOptions(form="mcap"))

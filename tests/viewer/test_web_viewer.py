@@ -174,7 +174,7 @@ def live_view(tmp_path, monkeypatch):
 
 def test_a_live_view_sends_what_is_appended(live_view):
     view, file = live_view
-    with urllib.request.urlopen(view.address + "/recording.rrd", timeout=5) as answer:
+    with urllib.request.urlopen(view.server.address + "/recording.rrd", timeout=5) as answer:
         assert answer.read(4) == b"RRF2"
         file.write(b" frame 1")
         assert answer.read(8) == b" frame 1"
@@ -185,7 +185,7 @@ def test_a_live_view_sends_what_is_appended(live_view):
 
 def test_another_site_reads_nothing_of_a_live_view(live_view):
     view, _ = live_view
-    address = urlsplit(view.address)
+    address = urlsplit(view.server.address)
     for method, path in (("GET", "/recording.rrd"), ("POST", "/recording.rrd"), ("POST", "/proxy")):
         connection = http.client.HTTPConnection(address.hostname, address.port, timeout=5)
         connection.request(method, path, headers={"Host": "evil.example", "Origin": "http://evil.example"})

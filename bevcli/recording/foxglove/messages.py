@@ -34,7 +34,6 @@ SHORT = {
     "VECTOR": "geometry_msgs/Vector3",
     **{name: f"foxglove_msgs/{name}" for name in FOXGLOVE},
 }
-DELETE_ALL = 1  # SceneEntityDeletion.type
 NAME, ARRAY, SEQUENCE = 2, 3, 4  # kinds of fields in rosbags
 
 

@@ -43,7 +43,7 @@ class GrowingFile:
         except OSError as error:
             raise self._failure(error) from None
 
-    def append(self, content: bytes) -> None:
+    def append(self, content: bytes | memoryview) -> None:
         """Writes a piece. Raises OutputError; the file then is as before."""
         try:
             rest = memoryview(content)
