@@ -63,8 +63,7 @@ def _exported(options: BenchOptions, model_options: ModelOptions, device: "torch
     from bevcli.inference.in_engine import CALIBRATION_FRAMES
     from bevcli.inference.load import Model, load_model
 
-    parts = "" if options.against is None else "`against`"
-    parts = parts if options.profile is None else "`profile`"
+    parts = " and ".join(f"`{name}`" for name in ("against", "profile") if getattr(options, name) is not None)
     if options.model.endswith(SUFFIX):
         found = load_model(options.model, options=model_options)
         if parts:

@@ -77,7 +77,7 @@ def engine_choice(options: ModelOptions, config: ModelConfig, device: torch.devi
     if engine in (None, TORCH) and precision != "int8":
         return None
     if engine in (None, AUTO):
-        if precision == "int8" and options.device not in ("auto", "cpu"):
+        if precision == "int8" and str(options.device) not in ("auto", "cpu"):
             raise BevcliError(f"`precision=int8`: runs on the CPU: leave out `device={options.device}`")
         if precision not in (None, "fp32", "int8") or (precision is None and device.type != "cpu"):
             return None

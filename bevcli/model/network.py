@@ -26,7 +26,10 @@ CAMERA_EMBEDDING = "image_tokens.camera_embedding"  # the key of the tensor that
 
 
 class Network(TemporalModel):
-    """The shared parts. A subclass says how a frame goes through them, and which memory it leaves."""
+    """The parts that the published models share, in the order of the paper's figure 2.
+
+    A subclass says how a frame goes through them, and which memory it leaves.
+    """
 
     stages: Mapping[str, str] = STAGES
     has_parts = True

@@ -120,20 +120,21 @@ def folder_lock(out: Path) -> Iterator[None]:
     """
     if (out / OWN).is_symlink():
         raise OutputError(f"{out / OWN}: is a link (expected a folder): remove it")
-    try:
-        (out / OWN).mkdir(parents=True, exist_ok=True)
-        lock = _locked(out / OWN / "lock", out)
-        held = None if sys.platform == "win32" else _locked_folder(out)
-    except OSError as error:
-        raise OutputError(f"{out}: cannot be written ({error.strerror})") from None
-    try:
+    with contextlib.ExitStack() as stack:
+        try:
+            (out / OWN).mkdir(parents=True, exist_ok=True)
+            lock = stack.enter_context(_locked(out / OWN / "lock", out))
+            stack.callback(_remove, lock.name)
+            if sys.platform != "win32":
+                stack.callback(os.close, _locked_folder(out))
+        except OSError as error:
+            raise OutputError(f"{out}: cannot be written ({error.strerror})") from None
         yield
-    finally:
-        with contextlib.suppress(OSError):
-            os.unlink(lock.name)
-        lock.close()
-        if held is not None:
-            os.close(held)
+
+
+def _remove(path: str) -> None:
+    with contextlib.suppress(OSError):
+        os.unlink(path)
 
 
 def _locked_folder(out: Path) -> int:

@@ -14,10 +14,10 @@ from bevcli.evaluation.detection_scores import DetectionScores
 from bevcli.evaluation.scores_report import scores_table, scores_to_dict
 from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmentation
 from bevcli.evaluation.tracking.scoring import TrackingScores, evaluate_tracking
-from bevcli.frame import MAP_CLASSES, Frame, Prediction
+from bevcli.frame import MAP_CLASSES, Frame, FrameStamp, Prediction
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.object_classes import ObjectClass
-from bevcli.geometry.transforms import inverse
+from bevcli.geometry.transforms import Array, inverse
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner
 from bevcli.inference.tracking import TrackerConfig, track
@@ -113,7 +113,7 @@ def validate(
     predictions: list[Boxes3D] = []
     truths: list[Boxes3D] = []
     maps = []
-    tracks: list[tuple[int, Frame, Boxes3D, Boxes3D]] = []
+    tracks: list[tuple[FrameStamp, Array, Boxes3D, Boxes3D]] = []
     of_drives: list[DriveScores] = []
     for index in range(len(drives)):
         sequence, first = drives.open(index), len(truths)
@@ -124,7 +124,10 @@ def validate(
         for frame, prediction, _ in steps:
             if frame.ground_truth is not None:
                 if tracker is not None:
-                    tracks.append((index, frame, prediction.boxes_world, frame.ground_truth))
+                    # Scenes of different drives may share a name.
+                    stamp = replace(frame.stamp, scene=f"{index} {frame.stamp.scene}")
+                    place = frame.world_from_ego.translation[:2]
+                    tracks.append((stamp, place, prediction.boxes_world, frame.ground_truth))
                 predicted, truth = boxes_ego(frame, frame.ground_truth, prediction, classes)
                 predictions.append(predicted)
                 truths.append(truth)
@@ -164,13 +167,12 @@ def boxes_ego(
     return predicted, ground_truth.transformed(inverse(frame.world_from_ego.matrix))
 
 
-def _score_tracks(frames: list[tuple[int, Frame, Boxes3D, Boxes3D]], config: TrackingConfig) -> TrackingScores:
-    """Tracking scores. frames: index of the drive, frame, and predicted and ground truth boxes in the world frame."""
+def _score_tracks(frames: list[tuple[FrameStamp, Array, Boxes3D, Boxes3D]], config: TrackingConfig) -> TrackingScores:
+    """Tracking scores. frames: stamp, place of the vehicle, and predicted and ground truth boxes in the world frame."""
     return evaluate_tracking(
         [predicted for *_, predicted, _ in frames],
         [truth for *_, truth in frames],
-        # Scenes of different drives may share a name.
-        [replace(frame.stamp, scene=f"{drive} {frame.stamp.scene}") for drive, frame, *_ in frames],
+        [stamp for stamp, *_ in frames],
         config,
-        np.array([frame.world_from_ego.translation[:2] for _, frame, *_ in frames]).reshape(-1, 2),
+        np.array([place for _, place, *_ in frames]).reshape(-1, 2),
     )

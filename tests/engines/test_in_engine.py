@@ -171,6 +171,10 @@ def test_options_that_exclude_each_other_are_one_line(options, message):
         load_model(**{"model": "demo", "untrained": True, "device": "cpu", **options})
 
 
+def test_the_device_may_be_a_device_of_torch():
+    assert load_model("demo", precision="int8", device=torch.device("cpu")).choice is not None
+
+
 def test_what_cannot_be_exported_runs_in_torch_with_auto():
     assert EngineChoice("auto", "fp32").resolve(load_config("uniad-track-map")) == "torch"
 

@@ -396,3 +396,16 @@ def test_a_deleted_lock_admits_no_second_run(model, tmp_path):
 
     run_all(model, out, after_frame=start_another)
     assert refused == list(range(FRAMES))
+
+
+def test_a_refused_run_leaves_no_lock(model, tmp_path):
+    out, left = tmp_path / "out", []
+
+    def start_another(frame, prediction):
+        (out / ".bevcli" / "lock").unlink(missing_ok=True)
+        with pytest.raises(OutputError, match="in use by another run"):
+            run_all(model, out, resume=True)
+        left.extend(out.glob(".bevcli/lock"))
+
+    run_all(model, out, after_frame=start_another)
+    assert left == []

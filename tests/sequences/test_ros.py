@@ -15,6 +15,7 @@ from bags import (
     drive_messages,
     header,
     odometry,
+    quaternion,
     transform,
     write_json_mcap,
     write_mcap,
@@ -163,6 +164,14 @@ def test_missing_poses_and_extrinsics_are_named(tmp_path: Path, native: Sequence
         open_sequence(path)
     assert "/odom (nav_msgs/Odometry)" in str(found.value)
     assert "\n" not in str(found.value)
+
+
+def test_a_first_pose_without_a_rotation_is_an_error(tmp_path: Path, native: Sequence, motion: EgoMotion) -> None:
+    messages = messages_of(native, motion)
+    first = next(fields for topic, *_, fields in messages if topic == "/odom")
+    first["pose"]["pose"]["orientation"] = quaternion(np.zeros(4))
+    with pytest.raises(InputError, match=r"/odom: message 0 is not a pose"):
+        open_sequence(write_mcap(tmp_path / "bag.mcap", messages))
 
 
 def test_files_beside_the_bag_replace_its_calibration_and_poses(

@@ -173,15 +173,20 @@ def _reaches(times: list[int], timestamp_ns: int, sign: int) -> bool:
     return len(beyond) > MARGIN and sign * (beyond[-1] - timestamp_ns) >= MARGIN * KINEMATICS_STEP_NS
 
 
+def read_pose(bag: Bag, topic: str, index: int) -> Transform:
+    """The pose of a message, see `pose_of`. Raises InputError for a message without one."""
+    try:
+        return pose_of(bag.message(topic, index))
+    except (AttributeError, ValueError) as error:
+        raise InputError(f"{bag.path}: {topic}: message {index} is not a pose ({error})") from None
+
+
 def motion_from_poses(bag: Bag, topic: str, child_from_ego: Array | None) -> BagEgoMotion:
     """Poses of a topic with Odometry or poses. child_from_ego: (4, 4) from the frame of the poses, None: the same."""
     times = capture_times(bag, topic)
 
     def read(index: int) -> dict[str, list[Sample]]:
-        try:
-            found = pose_of(bag.message(topic, index))
-        except (AttributeError, ValueError) as error:
-            raise InputError(f"{bag.path}: {topic}: message {index} is not a pose ({error})") from None
+        found = read_pose(bag, topic, index)
         return {topic: [(found.timestamp_ns or int(times[index]), found.parent_from_child)]}
 
     return BagEgoMotion(times, read, (topic,), f"{bag.path}: {topic}", child_from_ego)

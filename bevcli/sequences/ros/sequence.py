@@ -28,11 +28,12 @@ from bevcli.sequences.ros.ego_motion import (
     is_static,
     motion_from_poses,
     motion_from_transforms,
+    read_pose,
     sampled_transforms,
 )
 from bevcli.sequences.ros.format import BagOptions, is_ros_bag
 from bevcli.sequences.ros.images import BagVideo, bag_image
-from bevcli.sequences.ros.messages import CameraInfo, camera_info_of, frame_of, pose_of
+from bevcli.sequences.ros.messages import CameraInfo, camera_info_of, frame_of
 from bevcli.sequences.ros.topics import CameraTopics, StatedTopics, TopicFinder, read_topics_file
 
 # Usual names of the frame of the vehicle, and of the world.
@@ -139,7 +140,7 @@ class _VehicleReader:
         """The frame of the vehicle: the one that a pose topic names, a usual name, or the root of all cameras."""
         above = [self._tree.path_up(frame) for frame in camera_frames]
         pose = self._finder.pose_topic()
-        named = pose_of(self._bag.message(pose, 0)).child if pose else ""
+        named = read_pose(self._bag, pose, 0).child if pose else ""
         for name in (named, *EGO_FRAMES):
             if name and name in self._tree.frames:
                 return name
@@ -189,7 +190,7 @@ class _VehicleReader:
         ego_frame = self.ego_frame or next((name for name in EGO_FRAMES if name in self._tree.frames), EGO_FRAMES[0])
         topic = self._finder.pose_topic()
         if topic is not None:
-            child = pose_of(self._bag.message(topic, 0)).child
+            child = read_pose(self._bag, topic, 0).child
             is_other = child not in ("", ego_frame)
             child_from_ego = self._tree.between(child, ego_frame) if is_other else None
             note = f'{topic} has poses of "{child}", which are taken as those of "{ego_frame}"'
