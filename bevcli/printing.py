@@ -2,6 +2,7 @@
 
 import sys
 import unicodedata
+from collections.abc import Collection, Sequence
 
 LONGEST_MESSAGE = 1000  # characters
 
@@ -34,6 +35,15 @@ def _escaped(char: str) -> str:
     """The character, or its escape if it could steer a terminal or cannot be seen."""
     shown = char.isprintable() or unicodedata.category(char) == "Zs"
     return char if shown else char.encode("unicode_escape").decode()
+
+
+def aligned(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> str:
+    """Rows as aligned columns. left: indices of the columns that are aligned to the left, all others to the right."""
+    columns = []
+    for place, column in enumerate(zip(*rows, strict=True)):
+        pad, width = str.ljust if place in left else str.rjust, max(map(len, column))
+        columns.append([pad(cell, width) for cell in column])
+    return "\n".join("  ".join(row).rstrip() for row in zip(*columns, strict=True))
 
 
 def duration(seconds: float) -> str:

@@ -1,8 +1,6 @@
 """The benchmark: times every stage, and compares with the plain version and with the machine's peak throughput."""
 
 import contextlib
-import resource
-import sys
 import tempfile
 import time
 from collections import defaultdict
@@ -20,7 +18,7 @@ from bevcli.benchmark.result import BenchmarkResult
 from bevcli.benchmark.versions import Version, compare_with_plain
 from bevcli.frame import Frame, Prediction
 from bevcli.inference.background import write_behind
-from bevcli.inference.engine_choice import describe_machine
+from bevcli.inference.engine_choice import describe_machine, peak_memory
 from bevcli.inference.load import Model
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import BevState
@@ -51,7 +49,7 @@ def run_benchmark(
     timed, run = first + WARM_UP_FRAMES, first + WARM_UP_FRAMES + options.frames
     drive = MadeUpDrive(run + 2 * RUNS * max(options.frames, RUN_FRAMES))
     stages = _time_stages(fast, drive, first, range(timed, run))
-    frame_s, peak = tuple(fast.seconds), _peak_memory(device)
+    frame_s, peak = tuple(fast.seconds), peak_memory(device)
     run_frame_s, run_over_model = _time_runs(fast, drive, run, max(options.frames, MIN_RUN_FRAMES))
     preprocessor = Preprocessor(config)
     prepared = preprocessor(drive.load(0))
@@ -148,11 +146,3 @@ def _recording(drive: MadeUpDrive, fast: Version) -> Iterator[Recording]:
     folder = tempfile.TemporaryDirectory(prefix="bevcli-bench-")
     with folder, Recording(Path(folder.name) / "recording.rrd", drive, Model(fast.runner.model)) as recording:
         yield recording
-
-
-def _peak_memory(device: torch.device) -> int:
-    """Peak memory in bytes: of the whole process on a CPU, of tensors on a GPU."""
-    if device.type == "cuda":
-        return torch.cuda.max_memory_allocated(device)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else 1024 * peak

@@ -13,12 +13,12 @@ from matplotlib.patches import Ellipse
 from bevcli.calibration.estimates import CameraEstimate, Verdict, change_text
 from bevcli.calibration.evidence import Evidence, ShownMatches, epipolar_piece
 from bevcli.geometry.cameras import Camera, CameraRig
-from bevcli.recording import entities
+from bevcli.recording import entities, log_cameras
 from bevcli.recording.blueprint import Layout
 from bevcli.rig.drawings import FAINT, INK, PAPER, save
 from bevcli.rig.mounting import horizon
 from bevcli.rig.overlay import GROUND, HORIZON, Pixels, draw_lines, ground_lines, visible_runs
-from bevcli.rig.rig_recording import Lines, camera_views, log_image, log_lines, log_pose, rig_recording, rig_view
+from bevcli.rig.rig_recording import Lines, camera_views, log_image, log_lines, rig_recording, rig_view
 
 ROW_INCHES, WIDTH_INCHES = 2.9, 15.0
 POINT, LINE = (255, 120, 90), (110, 200, 255)  # RGB
@@ -117,7 +117,7 @@ def _log_image(stream: rr.RecordingStream, evidence: Evidence, index: int) -> No
 def _log_camera(stream: rr.RecordingStream, evidence: Evidence, index: int, *, measured: bool) -> None:
     """Pose, epipolar lines, ground grid and horizon by one of the two calibrations."""
     camera, matches = evidence.camera(index, measured=measured), evidence.matches(index, measured=measured)
-    log_pose(stream, camera, static=False)
+    stream.log(entities.camera(camera.name), log_cameras.transform(camera.ego_from_camera))
     motion = matches.camera_b_from_camera_a
     pieces = [
         piece

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from bevcli.geometry.transforms import Array
-from bevcli.rig.rig_report import aligned
+from bevcli.printing import aligned
 
 Triple = tuple[float, float, float]
 HEADER = (
@@ -94,7 +94,7 @@ class RigEstimate:
 
 def table(cameras: Items[CameraEstimate]) -> str:
     """One row a camera."""
-    return "\n".join(aligned([HEADER, *map(_row, cameras)], left={0, 9}))
+    return aligned([HEADER, *map(_row, cameras)], left=(0, 9))
 
 
 def rig_text(whole: RigEstimate, cameras: Items[CameraEstimate]) -> str:

@@ -51,7 +51,7 @@ def _write(recording: Path, read_from: Path, options: ViewOptions) -> None:
     if options.video is not None:
         count, rate = frame_rate(read_from)
         with Progress(count, "frames") as progress:
-            write_video(read_from, options.video, progress.advance)
+            write_video(read_from, options.video, count, rate, progress.advance)
         say(f"{options.video}: {count} frames, {rate:.3g} per second")
     if options.export is not None:
         frames, boxes = export_boxes(read_from, options.export)

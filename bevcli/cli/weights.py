@@ -11,7 +11,7 @@ from bevcli.cli.bridge import Json, Part, command, input_argument, model_option
 from bevcli.cli.help_text import PlainCommand
 from bevcli.engines.options import FileOptions
 from bevcli.inference.options import ModelOptions
-from bevcli.printing import say
+from bevcli.printing import aligned, say
 
 if TYPE_CHECKING:
     from bevcli.checkpoints import Checkpoint
@@ -154,9 +154,7 @@ def _named_as_text(found: "list[NamedWeights]") -> str:
         source = each.source.url or each.source.source or f"by hand: {each.source.page}"
         place = source if each.here is None else f"here: {each.here}"
         rows.append((each.name, each.model, scores, size, each.source.licence, place))
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    cells = [[text.ljust(width) for text, width in zip(row, widths, strict=True)] for row in rows]
-    return "\n".join("  ".join(row).rstrip() for row in cells)
+    return aligned(rows, left=range(6))
 
 
 def _as_data(checkpoint: "Checkpoint") -> dict[str, object]:

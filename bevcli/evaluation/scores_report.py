@@ -1,7 +1,7 @@
 """Scores as a dict for JSON, with the key names of the nuScenes devkit, and as a table for the terminal."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from bevcli.evaluation.config import ERRORS, DetectionConfig
@@ -11,6 +11,7 @@ from bevcli.evaluation.map_lines import THRESHOLDS_M
 from bevcli.evaluation.planning import PlanScores
 from bevcli.evaluation.segmentation import SegmentationScores
 from bevcli.evaluation.tracking.scoring import METRICS, TrackingScores
+from bevcli.printing import aligned
 
 _ERROR_HEADS = ("ATE m", "ASE", "AOE rad", "AVE m/s", "AAE")
 
@@ -138,13 +139,6 @@ def _visibilities(detection: DetectionScores) -> str:
 def _maps(segmentation: SegmentationScores) -> str:
     rows = [("map class", "IoU"), *((name, _number(iou)) for name, iou in segmentation.iou.items())]
     return f"{aligned(rows)}\n({segmentation.frame_count} maps)"
-
-
-def aligned(rows: Sequence[Sequence[str]]) -> str:
-    """Rows as aligned columns, the first to the left, the others to the right."""
-    first, *others = (max(map(len, column)) for column in zip(*rows, strict=True))
-    lines = ("  ".join([row[0].ljust(first), *map(str.rjust, row[1:], others)]) for row in rows)
-    return "\n".join(map(str.rstrip, lines))
 
 
 def _number(value: float, digits: int = 3) -> str:

@@ -5,6 +5,7 @@ The times of engines on this machine, as `bevcli bench --engines` has measured t
 
 import hashlib
 import platform
+import sys
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -115,6 +116,15 @@ def describe_machine(device: torch.device) -> str:
     name = names[0] if names else platform.processor() or platform.machine()
     capability = torch.backends.cpu.get_cpu_capability()
     return f"{name} ({capability}), {torch.get_num_threads()} threads, PyTorch {torch.__version__}"
+
+
+def peak_memory(device: torch.device) -> int:
+    """Peak memory in bytes: of the whole process on a CPU, of tensors on a GPU."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def fastest_engine(config: ModelConfig, precision: str) -> str | None:

@@ -10,15 +10,10 @@ AUTO, TORCH = "auto", "torch"  # values of `engine` beside the registered engine
 
 
 def complete_model(incomplete: str) -> list[str]:
-    """The known models and weights that start with a text, for completion in a shell."""
+    """The known models and weights, for completion in a shell: typer keeps those that start with the text."""
     from bevcli.published import read_sources
 
-    return sorted(name for name in {*known_models(), *read_sources()} if name.startswith(incomplete))
-
-
-def complete_engine(incomplete: str) -> list[str]:
-    """The known engines that start with a text, for completion in a shell."""
-    return [name for name in (AUTO, TORCH, *entries("bevcli.engines")) if name.startswith(incomplete)]
+    return sorted({*known_models(), *read_sources()})
 
 
 @options("Model")
@@ -57,7 +52,7 @@ class ModelOptions:
         "the fastest one by `bevcli bench --engines`, else torch (openvino with int8). A named model is exported once. "
         "Default: torch; onnxruntime for a FILE.onnx.",
         metavar="auto|torch|NAME",
-        complete=complete_engine,
+        complete=lambda incomplete: [AUTO, TORCH, *entries("bevcli.engines")],
     )
     precision: Literal["fp32", "bf16", "fp16", "int8"] | None = option(
         default=None,

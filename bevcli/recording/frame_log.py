@@ -130,7 +130,7 @@ class FrameLog:
         pose = self._moved_to_origin(frame.world_from_ego.matrix)
         self._stream.log(
             entities.EGO,
-            _transform(pose),
+            log_cameras.transform(pose),
             rr.AnyValues(scene=frame.stamp.scene, timestamp_ns=frame.stamp.timestamp_ns, pose=pose.ravel()),
         )
         if self._has_ego_motion:
@@ -158,7 +158,7 @@ class FrameLog:
             for c in frame.rig.cameras
         )
         for posed in cameras:
-            self._stream.log(entities.camera(posed.name), _transform(posed.world_from_camera))
+            self._stream.log(entities.camera(posed.name), log_cameras.transform(posed.world_from_camera))
             image = frame.images.get(posed.name)
             if self._video is None:
                 log_cameras.log_image(self._stream, posed, image)
@@ -267,7 +267,3 @@ class FrameLog:
         for posed in cameras if attention.probes else ():
             samples = [p.cameras[posed.name] for p in attention.probes if posed.name in p.cameras]
             log_cameras.log_samples(self._stream, posed, samples)
-
-
-def _transform(parent_from_entity: Array) -> rr.Transform3D:
-    return rr.Transform3D(translation=parent_from_entity[:3, 3], mat3x3=parent_from_entity[:3, :3])

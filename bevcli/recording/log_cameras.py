@@ -43,6 +43,11 @@ class PosedCamera:
         return inverse(self.world_from_camera)
 
 
+def transform(parent_from_entity: Array) -> rr.Transform3D:
+    """The pose (4, 4) of an entity in its parent, for a recording."""
+    return rr.Transform3D(translation=parent_from_entity[:3, 3], mat3x3=parent_from_entity[:3, :3])
+
+
 def log_image(stream: rr.RecordingStream, posed: PosedCamera, image: CameraImage | None) -> None:
     """Writes the encoded image. Without an image, the one of the frame before is cleared."""
     if image is None:

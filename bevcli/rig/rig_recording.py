@@ -13,7 +13,7 @@ from matplotlib.colors import to_rgb
 from bevcli.errors import OutputError
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Array, apply
-from bevcli.recording import entities, log_static
+from bevcli.recording import entities, log_cameras, log_static
 from bevcli.recording.blueprint import Layout, camera_rows, flat_view
 from bevcli.recording.colors import BACKGROUND
 from bevcli.rig import overlay
@@ -78,7 +78,7 @@ def _log_scene(stream: rr.RecordingStream, rig: CameraRig, coverage: Coverage) -
 
 
 def _log_camera(stream: rr.RecordingStream, camera: Camera, ego_from_bev: Array, pixels: Pixels | None) -> None:
-    log_pose(stream, camera, static=True)
+    stream.log(entities.camera(camera.name), log_cameras.transform(camera.ego_from_camera), static=True)
     if pixels is not None:
         log_image(stream, camera.name, pixels)
     points = overlay.pillars_in(camera, ego_from_bev)
@@ -115,12 +115,6 @@ def rig_recording(path: Path, application: str, rig: CameraRig, layout: Layout) 
             layout.free()
         log_static.log_scene(stream, rig, {})
         yield stream
-
-
-def log_pose(stream: rr.RecordingStream, camera: Camera, *, static: bool) -> None:
-    """Writes where a camera is on the vehicle."""
-    pose = rr.Transform3D(translation=camera.ego_from_camera[:3, 3], mat3x3=camera.ego_from_camera[:3, :3])
-    stream.log(entities.camera(camera.name), pose, static=static)
 
 
 def log_image(stream: rr.RecordingStream, name: str, pixels: Pixels) -> None:

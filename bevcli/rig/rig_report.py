@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 from bevcli.findings import SEVERITIES, Finding, errors_of
 from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.printing import aligned
 from bevcli.rig.bev_checks import check_bev_frame
 from bevcli.rig.coverage import Coverage, Measure, check_coverage, check_measures, coverage_of, measures_of
 from bevcli.rig.lens_checks import check_lenses
@@ -113,16 +114,16 @@ def report_text(name: str, rig: CameraRig, report: RigReport) -> str:
     coverage = report.coverage
     once = 1 - coverage.unseen - coverage.overlap
     seen = f"{coverage.unseen:.1%} of the cells seen by no camera, {once:.1%} by one, {coverage.overlap:.1%} by more"
-    parts = [f"{name}: {len(rig.cameras)} cameras", "", *_rig_lines(rig, coverage), "", f"BEV grid: {seen}"]
+    parts = [f"{name}: {len(rig.cameras)} cameras", "", _cameras(rig, coverage), "", f"BEV grid: {seen}"]
     parts += ["", *_finding_lines(report.findings)]
     if report.measures:
         rows = [("compared with nuScenes", "this rig", "nuScenes", "")]
         rows += [(m.name, m.value, m.reference, "" if m.is_near else "far") for m in report.measures]
-        parts += ["", *aligned(rows, left={0, 3})]
+        parts += ["", aligned(rows, left=(0, 3))]
     return "\n".join(parts)
 
 
-def _rig_lines(rig: CameraRig, coverage: Coverage) -> list[str]:
+def _cameras(rig: CameraRig, coverage: Coverage) -> str:
     header = ("camera", "image", "FOV", "yaw", "pitch", "roll", "x", "y", "height", "lens", "sees")
     rows = []
     for camera in rig.cameras:
@@ -133,7 +134,7 @@ def _rig_lines(rig: CameraRig, coverage: Coverage) -> list[str]:
         lens = camera.distortion.model if camera.distortion else "pinhole"
         seen = f"{coverage.shares[camera.name]:.0%}"
         rows.append((camera.name, size, fov, *angles, f"{x:.2f}", f"{y:.2f}", f"{z:.2f} m", lens, seen))
-    return aligned([header, *rows], left={0, 9})
+    return aligned([header, *rows], left=(0, 9))
 
 
 def _finding_lines(findings: Sequence[Finding]) -> list[str]:
@@ -152,15 +153,3 @@ def _finding_lines(findings: Sequence[Finding]) -> list[str]:
                 text = f"{word + ':':<9} {value}"
                 lines += textwrap.wrap(text, WIDTH, initial_indent=INDENT, subsequent_indent=INDENT * 2)
     return lines
-
-
-def aligned(rows: Sequence[Sequence[str]], left: set[int]) -> list[str]:
-    """Rows as aligned columns. left: indices of the columns that are aligned to the left, all others to the right."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join(
-            cell.ljust(width) if place in left else cell.rjust(width)
-            for place, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]

@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bevcli.evaluation.plots import BLUES, GRID_COLOR, titled_figure
-from bevcli.evaluation.scores_report import aligned
 from bevcli.frame import Frame, Sequence
 from bevcli.geometry.transforms import inverse
+from bevcli.printing import aligned
 from bevcli.recording.box_lines import lines_in_image
 from bevcli.robustness.conditions import Condition, Corruption, Group, Shown
 from bevcli.robustness.options import StressOptions

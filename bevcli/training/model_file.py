@@ -3,7 +3,6 @@
 import contextlib
 import json
 import re
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
@@ -18,6 +17,7 @@ from bevcli.config import config_of_table, read_model_file
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import Sequence
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
+from bevcli.inference.engine_choice import peak_memory
 from bevcli.printing import duration
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import SequenceOptions
@@ -176,19 +176,10 @@ def measure_cost(job: TrainingJob, longest_s: float = LONGEST_S) -> Cost:
     spans = [later - earlier for earlier, later in pairwise(times)]
     update_s = sum(spans[1:]) / len(spans[1:]) if len(spans) > 1 else spans[0]
     reading_s = max(spans[0] - update_s, 0.0)
-    return Cost(job.config, _machine(job.device), update_s, reading_s, _peak_bytes(job.device))
+    return Cost(job.config, _machine(job.device), update_s, reading_s, peak_memory(job.device))
 
 
 def _machine(device: torch.device) -> str:
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     return f"{device.type}, {torch.get_num_threads()} threads"
-
-
-def _peak_bytes(device: torch.device) -> int:
-    """The largest memory so far: of a GPU's tensors, or of this process."""
-    if device.type == "cuda":
-        return torch.cuda.max_memory_allocated(device)
-    import resource
-
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

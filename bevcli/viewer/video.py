@@ -21,15 +21,14 @@ H264_QUALITY = 21  # x264's crf
 SLOWEST, FASTEST = 1.0, 30.0  # frames a second
 
 
-def write_video(recording: Path, video: Path, on_frame: Callable[[], None] = lambda: None) -> int:
-    """Writes the video; returns the number of frames. on_frame: called after each frame.
+def write_video(recording: Path, video: Path, count: int, rate: float, on_frame: Callable[[], None]) -> None:
+    """Writes the video. count, rate: of `frame_rate`. on_frame: called after each frame.
 
     Raises InputError if the path does not end in .mp4 or .webm or the recording has no frames, OutputError if the video
     cannot be written.
     """
     if video.suffix.lower() not in FOURCC:
         raise InputError(f"{video}: the file must end in .mp4 or .webm")
-    count, rate = frame_rate(recording)
     if not count:
         raise InputError(f"{recording}: the recording has no frames")
     encoder = _h264 if video.suffix.lower() == ".mp4" and has_av() else _vp9
@@ -39,7 +38,6 @@ def write_video(recording: Path, video: Path, on_frame: Callable[[], None] = lam
                 write(image)
                 on_frame()
         _check_complete(unfinished, count)
-    return count
 
 
 def _check_complete(video: Path, count: int) -> None:

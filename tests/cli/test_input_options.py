@@ -50,7 +50,11 @@ def test_static_takes_precedence_over_no_temporal(mini_model):
 
 def test_model_names_are_completed():
     assert complete_model("") == sorted({*known_models(), "tiny-fp16"})
-    assert complete_model("ti") == ["tiny", "tiny-fp16"]
+
+
+def test_a_shell_is_given_the_names_that_start_with_the_text():
+    words = {"_BEVCLI_COMPLETE": "complete_bash", "COMP_WORDS": "bevcli run x --model ti", "COMP_CWORD": "4"}
+    assert CliRunner().invoke(app, [], prog_name="bevcli", env=words).output.split() == ["tiny", "tiny-fp16"]
 
 
 @pytest.mark.parametrize("name", ["cuda:", "gpu", "cuda:x"])

@@ -113,7 +113,7 @@ def test_a_video_that_does_not_fit_is_an_error(drive, tmp_path, ending):
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
     try:
         with pytest.raises(OutputError, match="cannot be written"):
-            write_video(drive[1], path)
+            write_video(drive[1], path, 3, 2.0, lambda: None)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert path.read_text() == "old"

@@ -21,6 +21,7 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import read_text
+from bevcli.printing import aligned
 from bevcli.sequences.ros.bag import Bag
 from bevcli.sequences.ros.messages import KINDS, Kind, frame_of
 
@@ -155,10 +156,8 @@ class TopicFinder:
         rows += [("transforms", name) for name in self.of_kind("transforms") if name != pose]
         used = {name for _, name in rows}
         rows += [("not used", name) for name in self._bag.topics if name not in used]
-        lines = [(role, name, *self._facts(name)) for role, name in rows]
-        widths = [max(len(line[column]) for line in lines) for column in range(3)]
-        text = ["  ".join(cell.ljust(width) for cell, width in zip(line, (*widths, 0), strict=True)) for line in lines]
-        return "topics:\n" + "\n".join("  " + line.rstrip() for line in text)
+        lines = [(f"  {role}", name, *self._facts(name)) for role, name in rows]
+        return "topics:\n" + aligned(lines, left=range(4))
 
     def _facts(self, name: str) -> tuple[str, str]:
         times = self._bag.times(name)
