@@ -158,8 +158,8 @@ class NativeWriter:
 
     def _write_lines(self, ground: Ground, lines: MapLines) -> None:
         if self._lines is None:
-            self._lines = LinesWriter(self.folder / TRUE_LINES, self._reference, {"classes": list(LINE_CLASSES)})
-            self._open.callback(self._lines.close)
+            writer = LinesWriter(self.folder / TRUE_LINES, self._reference, {"classes": list(LINE_CLASSES)})
+            self._lines = self._open.enter_context(writer)
         self._lines.write(ground, lines)
 
 
