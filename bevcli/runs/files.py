@@ -267,8 +267,8 @@ class RunFiles:
             name = write.file_name
             path, resume_at = self._out / name, None if self._resume is None else self._resume.results[name]
             self._folder.add(path)
-            writer = write(path, self._reference, {**extras, "classes": list(names)}, resume_at)
-            self._results[kind] = self._stack.enter_context(writer)
+            self._results[kind] = write(path, self._reference, {**extras, "classes": list(names)}, resume_at)
+            self._stack.callback(self._results[kind].close)
 
     def _open_submission(self, resume_at: int | None = None) -> SubmissionWriter:
         self._folder.add(self._out / SUBMISSION)
