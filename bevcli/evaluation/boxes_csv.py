@@ -5,7 +5,7 @@ import io
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from bevcli.parsing.csv_tables import cell_of
 from bevcli.sequences.files.box_json import boxes_to_json
@@ -20,15 +20,15 @@ COLUMNS = (
 NAMES = ("scene", "class", "attribute", "instance")
 
 
-class CsvWriter:
+class CsvWriter(GrowingFile):
     """`with CsvWriter(path) as writer: writer.write(frame, "world")`; the file is complete after every frame.
 
     Metres and radians; a cell is empty where a value is unknown. Raises OutputError where the file cannot be written.
     """
 
     def __init__(self, path: Path, resume_at: int | None = None, *, name: Path | None = None) -> None:
-        """resume_at: `file.size` of an earlier writer of this file, to go on from there. name: for errors."""
-        self.file = GrowingFile(path, resume_at, name=name)
+        """resume_at: `size` of an earlier writer of this file, to go on from there. name: for errors."""
+        super().__init__(path, resume_at, name)
         if resume_at is None:
             self._append([dict(zip(COLUMNS, COLUMNS, strict=True))])
 
@@ -42,13 +42,7 @@ class CsvWriter:
         text = io.StringIO()
         cells = [row | {name: cell_of(row[name]) for name in NAMES if row.get(name)} for row in rows]
         csv.DictWriter(text, COLUMNS, lineterminator="\n").writerows(cells)
-        self.file.append(text.getvalue().encode())
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.file.close()
+        self.append(text.getvalue().encode())
 
 
 def write_csv(boxes: BoxesFile, path: Path) -> int:

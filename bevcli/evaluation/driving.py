@@ -90,9 +90,9 @@ def evaluate_driving(
     predictions: a folder, or a file in it. Raises InputError where a side lacks what is asked for.
     """
     folder = predictions if predictions.is_dir() else predictions.parent
-    lines = _lines(folder / LinesWriter.name, truth, pairs) if "map" in asked else None
+    lines = _lines(folder / LinesWriter.file_name, truth, pairs) if "map" in asked else None
     motion = _motion(found, truth, pairs) if "motion" in asked else None
-    plan, notes = _plan(folder / PlanWriter.name, found, truth, pairs) if "plan" in asked else (None, ())
+    plan, notes = _plan(folder / PlanWriter.file_name, found, truth, pairs) if "plan" in asked else (None, ())
     return DrivingScores(lines, motion, plan, notes)
 
 

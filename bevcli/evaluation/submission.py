@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,28 +24,22 @@ _TAIL = "}}"
 _PEEK_BYTES = 2048  # the kind of a file can be read from its beginning
 
 
-class SubmissionWriter:
+class SubmissionWriter(IncrementalJson):
     """`with SubmissionWriter(path) as writer: writer.write(frame)`; the file gets its name when the writer is closed.
 
-    resume_at: `file.size` of an earlier writer of this file, to go on from there.
+    resume_at: `size` of an earlier writer of this file, to go on from there.
     Raises OutputError where the file cannot be written.
     """
 
     def __init__(self, path: Path, resume_at: int | None = None, *, tracking: bool = False) -> None:
         self._boxes = tracking_submission_boxes if tracking else submission_boxes
-        self.file = IncrementalJson(path, json.dumps({"meta": META})[:-1] + ', "results": {', _TAIL, resume_at)
+        super().__init__(path, json.dumps({"meta": META})[:-1] + ', "results": {', _TAIL, resume_at)
 
     def write(self, frame: FrameBoxes) -> None:
         """Add a frame, its boxes in the world frame. A frame without a sample token (no keyframe) is left out."""
         token = frame.extras.get("sample_token")
         if token is not None:
-            self.file.add(self._boxes(frame.boxes, token), f"frame {frame.stamp.index}", key=token)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.file.close()
+            self.add(self._boxes(frame.boxes, token), f"frame {frame.stamp.index}", key=token)
 
 
 def submission_boxes(boxes: Boxes3D, sample_token: str) -> list[dict[str, Any]]:

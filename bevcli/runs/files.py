@@ -225,10 +225,10 @@ class RunFiles:
         recording = self._recording.state()
         if recording is None:
             return None
-        tracks, submission = (None if file is None else file.file.size for file in (self._tracks, self._submission))
+        tracks, submission = (None if file is None else file.size for file in (self._tracks, self._submission))
         frames = tuple(self._map_frames), tuple(self._bev_frames)
-        results = {writer.name: writer.file.size for writer in self._results.values()}
-        state = FilesState(recording, self._boxes.file.size, tracks, submission, results, {}, *frames)
+        results = {writer.file_name: writer.size for writer in self._results.values()}
+        state = FilesState(recording, self._boxes.size, tracks, submission, results, {}, *frames)
         return replace(state, kept=dict(self._kept(state)))
 
     def _kept(self, state: FilesState) -> Iterator[tuple[str, Kept]]:
@@ -264,7 +264,8 @@ class RunFiles:
         """Open the file of each type of further results that the model has."""
         for kind, names in self._model.config.results.items():
             write = RESULT_WRITERS[kind]
-            path, resume_at = self._out / write.name, None if self._resume is None else self._resume.results[write.name]
+            name = write.file_name
+            path, resume_at = self._out / name, None if self._resume is None else self._resume.results[name]
             self._folder.add(path)
             self._results[kind] = write(path, self._reference, {**extras, "classes": list(names)}, resume_at)
             self._stack.callback(self._results[kind].close)
@@ -275,15 +276,15 @@ class RunFiles:
         return self._submission
 
     def _check_that_files_exist(self) -> None:
-        deleted = [self._recording.is_deleted(), self._boxes.file.is_deleted()]
-        deleted += [writer.file.is_deleted() for writer in self._results.values()]
-        if any(deleted) or (self._tracks is not None and self._tracks.file.is_deleted()):
+        deleted = [self._recording.is_deleted(), self._boxes.is_deleted()]
+        deleted += [writer.is_deleted() for writer in self._results.values()]
+        if any(deleted) or (self._tracks is not None and self._tracks.is_deleted()):
             raise OutputError(f"{self._out}: the files of this run were deleted while it was writing them")
 
     def written(self) -> tuple[Path, ...]:
         """The files and folders that exist so far."""
         paths = [self._out / name for name in (RECORDING, PREDICTIONS, TRACKS, SUBMISSION, SEGMENTATION, CALIBRATION)]
-        paths += [self._out / writer.name for writer in self._results.values()]
+        paths += [self._out / writer.file_name for writer in self._results.values()]
         return tuple(path for path in (*paths, self._options.save_bev) if path is not None and path.exists())
 
 

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, TypeAlias
 
@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import BevMap, CameraImage, Frame, FrameStamp
+from bevcli.frame import BevMap, CameraImage, Frame, FrameStamp, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.ego_motion import GRAVITY, Kinematics
 from bevcli.geometry.transforms import Pose
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.parsing.images import decode_image, media_type_of, size_of_image
+from bevcli.sequences.options import SequenceOptions
 from bevcli.sequences.video import MOST_PIXELS, VideoReader
 from bevcli.waiting import result_within
 
@@ -254,3 +255,24 @@ def read_frame(
         ground_truth=ground_truth,
         ground_truth_map=ground_truth_map,
     )
+
+
+class ListedSequence(Sequence):
+    """Base of a `Sequence` of a folder whose frames are entries: a subclass calls `_list`, and has `_frame`."""
+
+    def _list(self, entries: tuple[FrameEntry, ...], folder: Path, common: SequenceOptions) -> None:
+        self._entries, self.stamps = entries, tuple(entry.stamp for entry in entries)
+        self._images = ImageReader(strict=common.strict, inside=None if common.allow_outside else folder)
+
+    def image_files(self, place: int) -> tuple[Path, ...]:
+        return self._entries[place].image_files
+
+    def ground_truth_frame(self, place: int) -> Frame:
+        return self._frame(place, replace(self._entries[place], sources={}))
+
+    def load(self, place: int) -> Frame:
+        return self._frame(place, self._entries[place])
+
+    def _frame(self, place: int, entry: FrameEntry) -> Frame:
+        """The frame at a place, of its entry or of one without images."""
+        raise NotImplementedError

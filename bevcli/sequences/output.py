@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Protocol, Self
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
-from bevcli.errors import InputError
+from bevcli.errors import InputError, OutputError
 from bevcli.registry import entries, load
 from bevcli.sequences.options import WriteOptions
+from bevcli.writing import remove_parts, whole_folder, write_whole
 
 if TYPE_CHECKING:
-    from bevcli.frame import Frame, Sequence
+    from bevcli.frame import CameraImage, Frame, Sequence
 
 GROUP = "bevcli.drive_writers"
+SUFFIXES = {"image/jpeg": ".jpg", "image/png": ".png"}
 
 
 class DriveWriter(Protocol):
@@ -30,6 +33,55 @@ class DriveWriter(Protocol):
     def __enter__(self) -> Self: ...
 
     def __exit__(self, *error: object) -> None: ...
+
+
+class FolderWriter:
+    """Base of a `DriveWriter` of a folder: a subclass has `write` and `_finish`. After an error, its parts are deleted.
+
+    Attributes:
+        folder: that is written.
+    """
+
+    def __init__(self, folder: Path, parts: Collection[str], *, force: bool, can_replace: bool = True) -> None:
+        """Make room in the folder.
+
+        parts: names of the files and folders that are written, and that `force` removes; others are kept.
+        can_replace: whether what is there may be replaced.
+        Raises OutputError if the folder has files that are not to be replaced, or it cannot be written.
+        """
+        if folder.exists() and not folder.is_dir():
+            raise OutputError(f"{folder}: is a file (expected a folder to write)")
+        if folder.is_dir() and any(folder.iterdir()):
+            if not (force and can_replace):
+                way = ", or pass `force=True` to replace it" if can_replace else ""
+                raise OutputError(f"{folder}: exists already: choose another folder{way}")
+            remove_parts(folder, parts)
+        self.folder, self._open = folder, ExitStack()
+        self._open.enter_context(whole_folder(folder, parts))
+        self._open.push(self._close)  # once the files that a subclass opens are closed
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._open.__exit__(*error)
+
+    def _close(self, kind: type[BaseException] | None, *error: object) -> None:
+        if kind is None:
+            self._finish()
+
+    def _finish(self) -> None:
+        """Write what needs all frames."""
+
+    def _write_image(self, name: str, image: CameraImage) -> str:
+        """Write an image file as it was read, or else a PNG; returns its path relative to the folder, with suffix."""
+        import cv2
+
+        encoded, suffix = image.encoded, SUFFIXES.get(image.media_type or "")
+        if encoded is None or suffix is None:
+            encoded, suffix = cv2.imencode(".png", image.pixels_bgr)[1].tobytes(), ".png"
+        write_whole(self.folder / f"{name}{suffix}", encoded, parents=True)
+        return f"{name}{suffix}"
 
 
 @dataclass(frozen=True)

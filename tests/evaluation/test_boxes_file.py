@@ -89,7 +89,7 @@ def test_a_writer_that_was_killed_leaves_its_finished_frames(tmp_path: Path, fra
     writer = BoxesWriter(tmp_path / "predictions.json", "world", {"model": "tiny"})
     for index in range(frames):
         writer.write(frame(index, some_boxes()))
-    size = writer.file.size
+    size = writer.size
     writer.write(frame(frames, some_boxes()))
     partial = tmp_path / "predictions.json.partial"
     os.truncate(partial, size + cut)  # the kernel had taken so many bytes of the last frame
@@ -106,7 +106,7 @@ def test_a_resumed_file_equals_one_that_was_written_at_once(tmp_path: Path) -> N
         with BoxesWriter(path, "world") as writer:
             for index in range(first):
                 writer.write(frame(index, some_boxes()))
-            size = writer.file.size
+            size = writer.size
             writer.write(frame(first, some_boxes()))
         with BoxesWriter(path, "world", resume_at=size) as writer:
             for index in range(first, 3):
@@ -126,7 +126,7 @@ def test_a_full_disk_keeps_the_frames_before_it(tmp_path: Path) -> None:
                 writer.write(frame(index, some_boxes()))
                 written += 1
         assert len(read_boxes(path).frames) == written
-        writer.file.close()  # the end still fits
+        writer.close()  # the end still fits
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert len(json.loads(path.read_bytes())["frames"]) == written > 0

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import Frame, FrameStamp, Sequence
+from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_ego_from_bev
 from bevcli.geometry.ego_motion import EgoMotion, motion_of_keyframes
@@ -20,7 +20,7 @@ from bevcli.sequences.argoverse2.feather import QUATERNION, TRANSLATION, Feather
 from bevcli.sequences.argoverse2.format import Argoverse2Options
 from bevcli.sequences.files.calibration_file import LARGEST_SIZE
 from bevcli.sequences.files.class_names import ClassNames, count_classes
-from bevcli.sequences.images import FrameEntry, ImageReader, ImageSource, read_frame
+from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, read_frame
 from bevcli.sequences.native.folder import rig_notes
 from bevcli.sequences.options import SequenceOptions
 from bevcli.sequences.tracks import with_track_velocities
@@ -59,7 +59,7 @@ CLASS_OF_CATEGORY = {
 Times = NDArray[np.int64]
 
 
-class Argoverse2Sequence(Sequence):
+class Argoverse2Sequence(ListedSequence):
     """A log of the Argoverse 2 sensor dataset: a frame for each time that has boxes, 10 per second.
 
     A log without boxes has a frame for each image of the front camera. Each camera contributes its nearest image.
@@ -79,11 +79,10 @@ class Argoverse2Sequence(Sequence):
         annotated = (path / ANNOTATIONS).exists()
         names = ClassNames.of_format(CLASS_OF_CATEGORY, common.class_map)
         truth = _read_annotations(path / ANNOTATIONS, self.ego_motion, own, names) if annotated else {}
-        self._entries, notes = _entries(path, self.rig, images, np.array(sorted(truth), dtype=np.int64))
-        self.stamps = tuple(entry.stamp for entry in self._entries)
+        entries, notes = _entries(path, self.rig, images, np.array(sorted(truth), dtype=np.int64))
+        self._list(entries, path, common)
         self._truth = truth if common.ground_truth else {}
         self.notes = (*rig_notes(self.rig, "an Argoverse 2 log"), *notes)
-        self._images = ImageReader(strict=common.strict, inside=None if common.allow_outside else path)
 
     @property
     def input_files(self) -> tuple[Path, ...]:
@@ -94,17 +93,11 @@ class Argoverse2Sequence(Sequence):
     def class_counts(self) -> Mapping[str, int]:
         return count_classes(self._truth.values())
 
-    def image_files(self, place: int) -> tuple[Path, ...]:
-        return self._entries[place].image_files
-
     def ground_truth_frame(self, place: int) -> Frame:
-        entry = self._entries[place]
-        return self._frame(FrameEntry(entry.stamp, {}, {}, entry.origin))
+        entry = self._entries[place]  # its reasons for missing images are left out: `strict` refuses them
+        return self._frame(place, FrameEntry(entry.stamp, {}, {}, entry.origin))
 
-    def load(self, place: int) -> Frame:
-        return self._frame(self._entries[place])
-
-    def _frame(self, entry: FrameEntry) -> Frame:
+    def _frame(self, place: int, entry: FrameEntry) -> Frame:
         truth = self._truth.get(entry.stamp.timestamp_ns)
         return read_frame(entry, self.rig, self._images, self.ego_motion, truth)
 

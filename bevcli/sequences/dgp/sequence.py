@@ -6,13 +6,13 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.frame import Frame, FrameStamp, Sequence
+from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.ego_motion import motion_of_keyframes
 from bevcli.geometry.transforms import Array, yaw_of_rotation
 from bevcli.sequences.dgp.records import Record, Sample, poses, read_record, read_samples
 from bevcli.sequences.files.class_names import ClassNames, count_classes
-from bevcli.sequences.images import FrameEntry, ImageReader, ImageSource, read_frame
+from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, read_frame
 from bevcli.sequences.native.folder import rig_notes
 from bevcli.sequences.options import FormatOptions, SequenceOptions
 from bevcli.sequences.tracks import with_track_velocities
@@ -31,7 +31,7 @@ CLASS_OF_NAME = {
 }
 
 
-class DgpSequence(Sequence):
+class DgpSequence(ListedSequence):
     """The samples of a DGP scene. Point clouds are not read, only the boxes that are annotated in them.
 
     The ego frame is DDAD's: below the rear axle, on the ground. Raises InputError.
@@ -46,18 +46,16 @@ class DgpSequence(Sequence):
         self.path, self.name = path, path.resolve().name
         scene, self._outside = read_record(_scene_file(path)), common.allow_outside
         samples, tenfold = read_samples(path, scene)
-        self._entries = tuple(self._entry(index, sample) for index, sample in enumerate(samples))
+        self._list(tuple(self._entry(index, sample) for index, sample in enumerate(samples)), path, common)
         self._rigs = tuple(sample.rig() for sample in samples)
         self.rig = self._rigs[0]
         if any(rig.names != self.rig.names for rig in self._rigs):
             raise InputError(
                 f"{scene.where}: the samples have different cameras (expected {', '.join(self.rig.names)})"
             )
-        self.stamps = tuple(entry.stamp for entry in self._entries)
         self.ego_motion = motion_of_keyframes(poses(samples, keys=True), poses(samples, keys=False))
         self._truth = self._read_truth(scene, samples, common.class_map) if common.ground_truth else {}
         self.notes = (*rig_notes(self.rig, "a DGP scene"), *((TENFOLD,) if tenfold else ()))
-        self._images = ImageReader(strict=common.strict, inside=None if common.allow_outside else path)
 
     @property
     def input_files(self) -> tuple[Path, ...]:
@@ -67,16 +65,6 @@ class DgpSequence(Sequence):
     @property
     def class_counts(self) -> Mapping[str, int]:
         return count_classes(self._truth.values())
-
-    def image_files(self, place: int) -> tuple[Path, ...]:
-        return self._entries[place].image_files
-
-    def ground_truth_frame(self, place: int) -> Frame:
-        entry = self._entries[place]
-        return self._frame(place, FrameEntry(entry.stamp, {}, {}, entry.origin))
-
-    def load(self, place: int) -> Frame:
-        return self._frame(place, self._entries[place])
 
     def _frame(self, place: int, entry: FrameEntry) -> Frame:
         return read_frame(entry, self._rigs[place], self._images, self.ego_motion, self._truth.get(place))

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import msgspec
 
@@ -15,7 +15,7 @@ from bevcli.geometry.transforms import Pose, inverse
 from bevcli.parsing.documents import without_garbage_collection
 from bevcli.sequences.files.box_json import boxes_from_json, boxes_to_json
 from bevcli.sequences.files.class_names import ClassNames
-from bevcli.sequences.files.incremental_json import file_of_frames, read_frames, stamp_from_json, stamp_to_json
+from bevcli.sequences.files.incremental_json import FileOfFrames, read_frames, stamp_from_json, stamp_to_json
 from bevcli.sequences.files.json_fields import pose_from_json, pose_to_json
 
 FORMAT = "bevcli-boxes/1"
@@ -114,7 +114,7 @@ def above_score(boxes: BoxesFile, score: float) -> BoxesFile:
     return replace(boxes, frames=tuple(replace(frame, boxes=frame.boxes.scored(score)) for frame in boxes.frames))
 
 
-class BoxesWriter:
+class BoxesWriter(FileOfFrames):
     """Writes a boxes file frame by frame.
 
     The file gets its name when the writer is closed; until then `read_boxes` reads all finished frames from its partial
@@ -132,12 +132,12 @@ class BoxesWriter:
         ego_from_bev: Pose | None = None,
         resume_at: int | None = None,
     ) -> None:
-        """resume_at: `file.size` of an earlier writer of this file, to go on from there."""
+        """resume_at: `size` of an earlier writer of this file, to go on from there."""
         assert frame_of_reference in FRAMES_OF_REFERENCE
         head: dict[str, Any] = {"format": FORMAT, "frame_of_reference": frame_of_reference, **(extras or {})}
         if ego_from_bev is not None:
             head["ego_from_bev"] = pose_to_json(ego_from_bev)
-        self.file = file_of_frames(path, head, resume_at)
+        super().__init__(path, head, resume_at)
 
     def write(self, frame: FrameBoxes) -> None:
         """Append a frame. Its boxes must be in the file's frame of reference."""
@@ -145,13 +145,7 @@ class BoxesWriter:
         if frame.world_from_ego is not None:
             row["world_from_ego"] = pose_to_json(frame.world_from_ego)
         row["boxes"] = boxes_to_json(frame.boxes)
-        self.file.add(row, f"frame {frame.stamp.index}")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.file.close()
+        self.add(row, f"frame {frame.stamp.index}")
 
 
 def write_boxes(boxes: BoxesFile, path: Path) -> int:

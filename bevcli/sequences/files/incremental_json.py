@@ -9,7 +9,7 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import FrameStamp
@@ -23,6 +23,8 @@ _TAIL_OF_FRAMES = "]}"
 
 class GrowingFile:
     """A file that gets each piece whole or not at all, also on a full disk, and that can be resumed.
+
+    It is closed by `close`, or at the end of a `with` block.
 
     Attributes:
         path: where it is.
@@ -59,6 +61,12 @@ class GrowingFile:
     def close(self) -> None:
         """Closes the file."""
         self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
 
     def is_deleted(self) -> bool:
         """True if somebody has deleted the file while it is written."""
@@ -158,13 +166,15 @@ def _rename(path: Path, to: Path) -> None:
         raise OutputError(f"{to}: cannot be written ({error.strerror})") from None
 
 
-def file_of_frames(path: Path, head: Mapping[str, Any], resume_at: int | None = None) -> IncrementalJson:
+class FileOfFrames(IncrementalJson):
     """A JSON object that is written frame by frame: the members of a head, and the list "frames"."""
-    return IncrementalJson(path, json.dumps(head)[:-1] + ', "frames": [', _TAIL_OF_FRAMES, resume_at)
+
+    def __init__(self, path: Path, head: Mapping[str, Any], resume_at: int | None = None) -> None:
+        super().__init__(path, json.dumps(head)[:-1] + ', "frames": [', _TAIL_OF_FRAMES, resume_at)
 
 
 def read_frames(path: Path, form: str, kind: str, references: tuple[str, ...]) -> dict[str, Any]:
-    """The contents of a `file_of_frames`; the partial file of a writer that was killed is read, too.
+    """The contents of a `FileOfFrames`; the partial file of a writer that was killed is read, too.
 
     form, references: the format that it must have, and the frames of reference that it may have. kind: of the file, for
     messages. Raises InputError.

@@ -9,7 +9,7 @@ import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp, Ground, MapLines
-from bevcli.sequences.files.incremental_json import file_of_frames, read_frames, stamp_from_json, stamp_to_json
+from bevcli.sequences.files.incremental_json import FileOfFrames, read_frames, stamp_from_json, stamp_to_json
 from bevcli.sequences.files.json_fields import array_of_numbers
 
 FORMAT = "bevcli-map-lines/1"
@@ -43,26 +43,22 @@ class LinesFile:
     extras: Mapping[str, Any] = field(default_factory=dict)
 
 
-class LinesWriter:
+class LinesWriter(FileOfFrames):
     """Writes map_lines.json frame by frame, as `BoxesWriter` writes boxes. Raises OutputError."""
 
-    name = "map_lines.json"
+    file_name = "map_lines.json"
 
     def __init__(
         self, path: Path, frame_of_reference: str, extras: Mapping[str, Any], resume_at: int | None = None
     ) -> None:
-        """extras: at least "classes". resume_at: `file.size` of an earlier writer of this file, to go on from there."""
+        """extras: at least "classes". resume_at: `size` of an earlier writer of this file, to go on from there."""
         head = {"format": FORMAT, "frame_of_reference": frame_of_reference, **extras}
-        self.file = file_of_frames(path, head, resume_at)
+        super().__init__(path, head, resume_at)
 
     def write(self, ground: Ground, lines: MapLines | None) -> None:
         """Append a frame. lines: in the bev frame; None where the model was not run."""
         found = [] if lines is None else [_line(ground, lines, place) for place in range(len(lines))]
-        self.file.add({**stamp_to_json(ground.stamp), "lines": found}, f"frame {ground.stamp.index}")
-
-    def close(self) -> None:
-        """Complete the file."""
-        self.file.close()
+        self.add({**stamp_to_json(ground.stamp), "lines": found}, f"frame {ground.stamp.index}")
 
 
 def _line(ground: Ground, lines: MapLines, place: int) -> dict[str, Any]:

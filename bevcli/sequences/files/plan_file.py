@@ -28,16 +28,17 @@ class FramePlan:
     plan: Plan
 
 
-class PlanWriter:
+class PlanWriter(GrowingFile):
     """Writes plan.csv frame by frame; the file is complete after every frame. Raises OutputError."""
 
-    name = "plan.csv"
+    file_name = "plan.csv"
 
     def __init__(
         self, path: Path, frame_of_reference: str, extras: Mapping[str, Any], resume_at: int | None = None
     ) -> None:
-        """resume_at: `file.size` of an earlier writer of this file, to go on from there. extras: not used."""
-        self.file, self._reference = GrowingFile(path, resume_at), frame_of_reference
+        """resume_at: `size` of an earlier writer of this file, to go on from there. extras: not used."""
+        super().__init__(path, resume_at)
+        self._reference = frame_of_reference
         if resume_at is None:
             self._append([COLUMNS])
 
@@ -56,11 +57,7 @@ class PlanWriter:
     def _append(self, rows: list[tuple[Any, ...]]) -> None:
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows(rows)
-        self.file.append(text.getvalue().encode())
-
-    def close(self) -> None:
-        """Close the file."""
-        self.file.close()
+        self.append(text.getvalue().encode())
 
 
 def read_plans(path: Path) -> tuple[FramePlan, ...]:

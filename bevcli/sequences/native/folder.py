@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.frame import BevMap, DriveFacts, Frame, MapLines, Sequence
+from bevcli.frame import BevMap, DriveFacts, Frame, MapLines
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
@@ -19,7 +19,7 @@ from bevcli.sequences.files.class_names import count_classes
 from bevcli.sequences.files.incremental_json import existing
 from bevcli.sequences.files.lines_file import TRUE_LINES, LinesFile, read_lines
 from bevcli.sequences.files.map_folder import open_maps
-from bevcli.sequences.images import FrameEntry, ImageReader, ImageSource, read_frame
+from bevcli.sequences.images import FrameEntry, ImageSource, ListedSequence, read_frame
 from bevcli.sequences.native.tables import check_times, read_ego_motion, read_frames_table
 from bevcli.sequences.native.unlisted_frames import find_frames
 from bevcli.sequences.options import EgoMotionUse, RigOptions, SequenceOptions
@@ -28,7 +28,7 @@ BOXES_FILE = "ground_truth.json"
 MAPS_FOLDER = "ground_truth_map"
 
 
-class FolderSequence(Sequence):
+class FolderSequence(ListedSequence):
     """A native sequence folder as a `Sequence`.
 
     rig: used in place of the rig of `own` and of calibration.json, if given.
@@ -48,19 +48,18 @@ class FolderSequence(Sequence):
         rig = own.rig() if rig is None else rig
         calibration = path / "calibration.json"
         self.rig, self.facts = read_rig_and_facts(calibration) if rig is None else (rig, DriveFacts())
-        self._entries, notes = _read_entries(path, self.rig)
-        self.stamps = tuple(entry.stamp for entry in self._entries)
+        entries, notes = _read_entries(path, self.rig)
+        self._list(entries, path, common)
         if not common.allow_outside:
-            _check_paths(path, self._entries)
+            _check_paths(path, entries)
         file = own.ego_motion_file or path / "ego_motion.csv"
         self.ego_motion, motion_notes = _read_motion(file, common.ego_motion)
         if self.ego_motion is not None:
             advice = "set start_ns in timing.toml" if notes else "add ego-motion, or remove the frame"
-            _check_coverage(file, self.ego_motion, self._entries, advice)
+            _check_coverage(file, self.ego_motion, entries, advice)
         self.has_ego_motion = self.ego_motion is not None
         self._truth = FolderGroundTruth(path, is_read=common.ground_truth)
         self.notes = (*rig_notes(self.rig), *notes, *motion_notes)
-        self._images = ImageReader(strict=common.strict, inside=None if common.allow_outside else path)
 
     @property
     def class_counts(self) -> Mapping[str, int]:
@@ -71,16 +70,7 @@ class FolderSequence(Sequence):
         """Tables and videos: the files in the folder itself. A run can be resumed only if they are the same."""
         return tuple(sorted(path for path in self.path.iterdir() if path.is_file()))
 
-    def image_files(self, place: int) -> tuple[Path, ...]:
-        return self._entries[place].image_files
-
-    def ground_truth_frame(self, place: int) -> Frame:
-        return self._frame(replace(self._entries[place], sources={}))
-
-    def load(self, place: int) -> Frame:
-        return self._frame(self._entries[place])
-
-    def _frame(self, entry: FrameEntry) -> Frame:
+    def _frame(self, place: int, entry: FrameEntry) -> Frame:
         stamp = entry.stamp
         pose = self.ego_motion.pose_at(stamp.timestamp_ns) if self.ego_motion else None
         boxes = self._truth.boxes(stamp.index, pose, self.rig.ego_from_bev)

@@ -2,16 +2,13 @@
 
 import csv
 from collections.abc import Mapping
-from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Self
 
-import cv2
 import numpy as np
 
 from bevcli.errors import InputError, OutputError
-from bevcli.frame import LINE_CLASSES, CameraImage, DriveFacts, Frame, Ground, MapLines, Sequence
+from bevcli.frame import LINE_CLASSES, DriveFacts, Frame, Ground, MapLines, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig, same_rig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
@@ -24,11 +21,10 @@ from bevcli.sequences.files.map_folder import write_map
 from bevcli.sequences.native.folder import BOXES_FILE, MAPS_FOLDER
 from bevcli.sequences.native.tables import write_ego_motion
 from bevcli.sequences.options import WriteOptions
-from bevcli.writing import remove_parts, whole_folder, write_whole
+from bevcli.sequences.output import FolderWriter
 
 # The files that the writer creates and `force` removes. Other files in the folder are kept.
 PARTS = ("calibration.json", "frames.csv", "ego_motion.csv", "images", BOXES_FILE, MAPS_FOLDER, TRUE_LINES)
-SUFFIXES = {"image/jpeg": ".jpg", "image/png": ".png"}
 
 
 def write_native(folder: Path, sequence: Sequence, options: WriteOptions) -> "NativeWriter":
@@ -36,7 +32,7 @@ def write_native(folder: Path, sequence: Sequence, options: WriteOptions) -> "Na
     return NativeWriter(folder, with_ego_motion=sequence.has_ego_motion, force=options.force, facts=sequence.facts)
 
 
-class NativeWriter:
+class NativeWriter(FolderWriter):
     """Writes a native sequence folder frame by frame.
 
         with NativeWriter(folder, with_ego_motion=True) as writer:
@@ -54,8 +50,8 @@ class NativeWriter:
     def __init__(
         self, folder: Path, *, with_ego_motion: bool, force: bool = False, facts: DriveFacts | None = None
     ) -> None:
-        self.folder, self._facts = folder, facts or DriveFacts()
-        _make_room(folder, force)
+        super().__init__(folder, PARTS, force=force)
+        self._facts = facts or DriveFacts()
         self._with_ego_motion, self._reference = with_ego_motion, "world" if with_ego_motion else "ego"
         self._rig: CameraRig | None = None
         self._numbers: set[int] = set()
@@ -63,9 +59,6 @@ class NativeWriter:
         self._scenes: dict[str, tuple[int, int]] = {}  # first and last time of each scene, ns
         self._boxes: BoxesWriter | None = None
         self._lines: LinesWriter | None = None
-        self._open = ExitStack()
-        self._open.enter_context(whole_folder(folder, PARTS))
-        self._open.push(self._finish)  # once the files below are closed
         try:
             table = self._open.enter_context((folder / "frames.csv").open("w", newline="", encoding="utf-8"))
         except OSError as error:
@@ -75,7 +68,8 @@ class NativeWriter:
     def write(self, frame: Frame) -> None:
         """Write a frame and its images."""
         self._check(frame)
-        cells = {name: self._write_image(frame.stamp.index, name, p) for name, p in frame.images.items()}
+        number = f"{frame.stamp.index:06d}"
+        cells = {name: self._write_image(f"images/{name}/{number}", image) for name, image in frame.images.items()}
         self._write_row(frame, cells)
         if self._with_ego_motion:
             self._store_motion(frame)
@@ -87,15 +81,7 @@ class NativeWriter:
         if frame.ground_truth_lines is not None:
             self._write_lines(Ground(frame.stamp, frame.rig.ego_from_bev, pose), frame.ground_truth_lines)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        self._open.__exit__(*error)
-
-    def _finish(self, kind: type[BaseException] | None, *error: object) -> None:
-        if kind is not None:
-            return
+    def _finish(self) -> None:
         if self._rig is None:
             raise OutputError(f"{self.folder}: no frame was written (expected at least one)")
         if self._with_ego_motion:
@@ -118,15 +104,6 @@ class NativeWriter:
         if stamp.index in self._numbers:
             raise InputError(f"frame {stamp.index} ({stamp.scene}): its index occurred before: renumber the frames")
         self._numbers.add(stamp.index)
-
-    def _write_image(self, number: int, camera: str, image: CameraImage) -> str:
-        """Write an image; returns its path relative to the folder."""
-        encoded, suffix = image.encoded, SUFFIXES.get(image.media_type or "", ".png")
-        if encoded is None or image.media_type not in SUFFIXES:
-            encoded = cv2.imencode(".png", image.pixels_bgr)[1].tobytes()
-        name = f"images/{camera}/{number:06d}{suffix}"
-        write_whole(self.folder / name, encoded, parents=True)
-        return name
 
     def _write_row(self, frame: Frame, cells: Mapping[str, str]) -> None:
         names = frame.rig.names
@@ -158,18 +135,9 @@ class NativeWriter:
 
     def _write_lines(self, ground: Ground, lines: MapLines) -> None:
         if self._lines is None:
-            self._lines = LinesWriter(self.folder / TRUE_LINES, self._reference, {"classes": list(LINE_CLASSES)})
-            self._open.callback(self._lines.close)
+            writer = LinesWriter(self.folder / TRUE_LINES, self._reference, {"classes": list(LINE_CLASSES)})
+            self._lines = self._open.enter_context(writer)
         self._lines.write(ground, lines)
-
-
-def _make_room(folder: Path, force: bool) -> None:
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(f"{folder}: is a file (expected a folder to write)")
-    if folder.is_dir() and any(folder.iterdir()):
-        if not force:
-            raise OutputError(f"{folder}: exists already: choose another folder, or pass `force=True` to replace it")
-        remove_parts(folder, PARTS)
 
 
 def _ego_motion(rows: Mapping[int, tuple[Pose, Kinematics]]) -> EgoMotion:
