@@ -168,8 +168,9 @@ def test_published_models_equal_ours_over_a_real_drive(name, shared, tmp_path):
     drive = open_sequence(shared / "data" / "nuscenes-scene-0103", rate_hz=2.0, frames=slice(0, 4))
     model = Model(original.rule_model(name, "both"))
     export_onnx(model.network, tmp_path / "model.onnx")
-    # Rounding: in small, the logits of both differ by 2.5e-3 or more from those of the model in float64.
-    agree(tmp_path / "model.onnx", model, drive, logits={"tiny": 1e-3, "small": 3e-3, "base": 2e-3}[name])
+    # Rounding: in small, the logits of both differ by 2.5e-3 or more from those of the model in float64; in base, they
+    # differ by 2.4e-3 from each other.
+    agree(tmp_path / "model.onnx", model, drive, logits={"tiny": 1e-3, "small": 3e-3, "base": 3e-3}[name])
 
 
 def agree(file: Path, model: Model, drive, logits: float = 1e-3) -> None:
