@@ -12,9 +12,10 @@ from bevcli.benchmark.measure import WARM_UP_FRAMES
 from bevcli.benchmark.versions import Version, difference, largest_differences
 from bevcli.engines.engine import installed_engines
 from bevcli.errors import BevcliError
-from bevcli.inference.engine_choice import EngineChoice, describe_machine, remember_speeds
+from bevcli.inference.engine_choice import EngineChoice, remember_speeds
 from bevcli.inference.in_engine import CALIBRATION_FRAMES, Report, in_engine
 from bevcli.inference.load import Model
+from bevcli.inference.machine import describe_machine
 from bevcli.inference.options import TORCH
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.config import ModelConfig

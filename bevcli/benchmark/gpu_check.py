@@ -27,8 +27,8 @@ from bevcli.benchmark.result import markdown_table, measure
 from bevcli.benchmark.versions import Version, difference, largest_differences, textbook_version
 from bevcli.config import known_models, load_config
 from bevcli.errors import BevcliError
-from bevcli.inference.engine_choice import describe_machine
 from bevcli.inference.load import choose_device
+from bevcli.inference.machine import describe_machine
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.prepare import Precision, prepare_for_inference
 from bevcli.printing import say

@@ -18,8 +18,8 @@ from bevcli.benchmark.result import BenchmarkResult
 from bevcli.benchmark.versions import Version, compare_with_plain
 from bevcli.frame import Frame, Prediction
 from bevcli.inference.background import write_behind
-from bevcli.inference.engine_choice import describe_machine, peak_memory
 from bevcli.inference.load import Model
+from bevcli.inference.machine import describe_machine, peak_memory
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import BevState
 from bevcli.model.config import ModelConfig

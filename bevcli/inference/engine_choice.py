@@ -4,8 +4,6 @@ The times of engines on this machine, as `bevcli bench --engines` has measured t
 """
 
 import hashlib
-import platform
-import sys
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -18,6 +16,7 @@ import torch
 from bevcli.engines.engine import Engine, installed_engines, require
 from bevcli.engines.file_cache import engines_folder
 from bevcli.errors import BevcliError, InputError
+from bevcli.inference.machine import describe_machine
 from bevcli.inference.options import AUTO, TORCH, ModelOptions
 from bevcli.model.config import ModelConfig
 from bevcli.model.temporal_model import model_class
@@ -104,27 +103,6 @@ def _can_export(config: ModelConfig) -> bool:
     except BevcliError:
         return False
     return True
-
-
-def describe_machine(device: torch.device) -> str:
-    """Name of the processor or GPU, number of threads and PyTorch's version."""
-    if device.type == "cuda":
-        return f"{torch.cuda.get_device_name(device)}, PyTorch {torch.__version__}"
-    cpu = Path("/proc/cpuinfo")
-    lines = cpu.read_text().splitlines() if cpu.is_file() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    name = names[0] if names else platform.processor() or platform.machine()
-    capability = torch.backends.cpu.get_cpu_capability()
-    return f"{name} ({capability}), {torch.get_num_threads()} threads, PyTorch {torch.__version__}"
-
-
-def peak_memory(device: torch.device) -> int:
-    """Peak memory in bytes: of the whole process on a CPU, of tensors on a GPU."""
-    if device.type == "cuda":
-        return torch.cuda.max_memory_allocated(device)
-    import resource
-
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def fastest_engine(config: ModelConfig, precision: str) -> str | None:

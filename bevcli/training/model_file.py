@@ -17,7 +17,7 @@ from bevcli.config import config_of_table, read_model_file
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import Sequence
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
-from bevcli.inference.engine_choice import peak_memory
+from bevcli.inference.machine import peak_memory
 from bevcli.printing import duration
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import SequenceOptions
