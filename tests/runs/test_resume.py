@@ -385,27 +385,25 @@ def test_nothing_is_deleted_or_written_through_links(model, interrupted):
     assert [path.name for path in elsewhere.rglob("*")] == ["maps", "000000.png"]
 
 
-def test_a_deleted_lock_admits_no_second_run(model, tmp_path):
-    out, refused = tmp_path / "out", []
+def run_beside_refused_runs(model, out, after_refusal):
+    """A run into a folder whose lock is deleted before each of the runs that it refuses, one a frame."""
 
     def start_another(frame, prediction):
         (out / ".bevcli" / "lock").unlink(missing_ok=True)
         with pytest.raises(OutputError, match="in use by another run"):
             run_all(model, out, resume=True)
-        refused.append(frame.stamp.index)
+        after_refusal(frame)
 
     run_all(model, out, after_frame=start_another)
+
+
+def test_a_deleted_lock_admits_no_second_run(model, tmp_path):
+    refused = []
+    run_beside_refused_runs(model, tmp_path / "out", lambda frame: refused.append(frame.stamp.index))
     assert refused == list(range(FRAMES))
 
 
 def test_a_refused_run_leaves_no_lock(model, tmp_path):
     out, left = tmp_path / "out", []
-
-    def start_another(frame, prediction):
-        (out / ".bevcli" / "lock").unlink(missing_ok=True)
-        with pytest.raises(OutputError, match="in use by another run"):
-            run_all(model, out, resume=True)
-        left.extend(out.glob(".bevcli/lock"))
-
-    run_all(model, out, after_frame=start_another)
+    run_beside_refused_runs(model, out, lambda frame: left.extend(out.glob(".bevcli/lock")))
     assert left == []
