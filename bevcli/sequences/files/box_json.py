@@ -1,31 +1,50 @@
-"""Conversion between Boxes3D and JSON, one object per box. All boxes of a frame are checked at once, for speed."""
+"""Conversion between Boxes3D and JSON, one object per box."""
 
 import math
+import operator
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any, get_args
 
+import msgspec
 import numpy as np
+from msgspec import UNSET, Meta, Struct, UnsetType, field
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
 from bevcli.sequences.files.class_names import ClassNames
-from bevcli.sequences.files.json_fields import array_of_numbers
 
-KEYS = frozenset((
-    "class", "center", "size_lwh", "yaw", "velocity", "score", "attribute", "instance", "track_score", "duplicate",
-    "visibility", "num_points", "futures", "future_times_s", "future_scores",
-))  # fmt: skip
-# Keys of optional columns: type, value where a box has none, and a text for messages.
-PLAIN: dict[str, tuple[Any, Any, str]] = {
-    "attribute": (str, "", "a string"),
-    "instance": (str, "", "a string"),
-    "duplicate": (bool, False, "true or false"),
-    "num_points": (int, -1, "an integer, 0 or more"),
-}
 FUTURE_DECIMALS = 3  # millimetres
 _OWN_NAMES = ClassNames()
+_Vector = Annotated[tuple[float, float, float], Meta(description="3 numbers")]
+_Share = Annotated[float, Meta(ge=0, le=1, description="0 to 1")]
+_ShareOrNaN = Annotated[float, Meta(description="0 to 1")]  # its range is checked by column
+_Text = Annotated[str, Meta(description="a string")]
+_Mode = Annotated[list[tuple[float, float] | None], Meta(min_length=1)]
+_Futures = Annotated[list[_Mode], Meta(min_length=1, description="modes of points [x, y] or null")]
+_Numbers = Annotated[list[float], Meta(description="a list of numbers")]
+_Count = Annotated[int, Meta(ge=0, description="an integer, 0 or more")]
+
+
+class _Box(Struct, forbid_unknown_fields=True):
+    """A box in JSON. futures: M modes of T steps, each x and y; null if unknown."""
+
+    name: Annotated[str, Meta(min_length=1, description="a name")] = field(name="class")
+    center: _Vector
+    size_lwh: _Vector
+    yaw: Annotated[float, Meta(description="a number")]
+    velocity: Annotated[tuple[float | None, float | None], Meta(description="2 numbers")] | None = None
+    score: _Share | UnsetType = UNSET
+    attribute: _Text | UnsetType | None = UNSET
+    instance: _Text | UnsetType | None = UNSET
+    track_score: _ShareOrNaN | UnsetType | None = UNSET
+    duplicate: Annotated[bool, Meta(description="true or false")] | UnsetType = UNSET
+    visibility: _ShareOrNaN | UnsetType | None = UNSET
+    num_points: _Count | UnsetType = UNSET
+    futures: _Futures | None = None
+    future_times_s: _Numbers = []
+    future_scores: _Numbers | None = None
 
 
 def boxes_from_json(objects: Any, where: str, class_names: ClassNames = _OWN_NAMES) -> Boxes3D:
@@ -39,22 +58,32 @@ def boxes_from_json(objects: Any, where: str, class_names: ClassNames = _OWN_NAM
         raise InputError(f'{where}: "boxes" must be a list, found {objects!r:.40}')
     if not objects:
         return Boxes3D.empty()
-    _check_keys(objects, where)
+    try:
+        rows = msgspec.convert(objects, list[_Box])
+    except msgspec.ValidationError:
+        place, mistake = next(filter(operator.itemgetter(1), enumerate(map(_mistake, objects))))
+        raise InputError(f"{where}: box {place}: {mistake}") from None
     boxes = Boxes3D(
-        centers=_numbers([box["center"] for box in objects], 3, where, "center"),
-        sizes_lwh=_numbers([box["size_lwh"] for box in objects], 3, where, "size_lwh"),
-        yaws=_numbers([box["yaw"] for box in objects], 1, where, "yaw"),
-        velocities=_velocities([box.get("velocity") for box in objects], where),
-        classes=np.array([class_names[box["class"]] for box in objects]),
-        scores=_shares(objects, "score", where, required=True),
-        attributes=_plain(objects, "attribute", where),
-        instances=_plain(objects, "instance", where),
-        track_scores=_shares(objects, "track_score", where),
-        duplicates=_plain(objects, "duplicate", where),
-        visibilities=_shares(objects, "visibility", where),
-        num_points=_plain(objects, "num_points", where),
-        **_futures_from_json(objects, where),
+        centers=np.array([row.center for row in rows]),
+        sizes_lwh=np.array([row.size_lwh for row in rows]),
+        yaws=np.array([row.yaw for row in rows]),
+        velocities=np.array([row.velocity or (None, None) for row in rows], dtype=np.float64),
+        classes=np.array([class_names[row.name] for row in rows]),
+        scores=_column(rows, "score", None),
+        attributes=_column(rows, "attribute", ""),
+        instances=_column(rows, "instance", ""),
+        track_scores=_column(rows, "track_score", math.nan),
+        duplicates=_column(rows, "duplicate", False),
+        visibilities=_column(rows, "visibility", math.nan),
+        num_points=_column(rows, "num_points", -1),
+        **_futures(rows, where),
     )
+    without = [place for place, row in enumerate(rows) if row.score is UNSET]
+    if 0 < len(without) < len(rows):
+        raise InputError(f'{where}: box {without[0]}: "score" is missing (other boxes of the frame have one)')
+    for key, shares in (("track_score", boxes.track_scores), ("visibility", boxes.visibilities)):
+        if shares is not None:
+            _require(((shares >= 0) & (shares <= 1)) | np.isnan(shares), shares, where, key, "0 to 1")
     for key, column in (("center", boxes.centers), ("size_lwh", boxes.sizes_lwh), ("yaw", boxes.yaws)):
         _require(np.isfinite(column), column, where, key, "finite numbers")
     _require(boxes.sizes_lwh > 0, boxes.sizes_lwh, where, "size_lwh", "numbers above 0")
@@ -93,74 +122,41 @@ def boxes_to_json(boxes: Boxes3D) -> list[dict[str, Any]]:
     return objects
 
 
-def _check_keys(objects: Sequence[Any], where: str) -> None:
-    for place, box in enumerate(objects):
-        if not isinstance(box, dict):
-            raise InputError(f"{where}: box {place}: expected an object, found {box!r:.40}")
-        for key in ("class", "center", "size_lwh", "yaw"):
-            if key not in box:
-                raise InputError(f'{where}: box {place}: "{key}" is missing (found: {", ".join(box)})')
-        if not isinstance(box["class"], str) or not box["class"]:
-            raise InputError(f"{where}: box {place}: class: expected a name, found {box['class']!r:.40}")
-        if not KEYS.issuperset(box):
-            unknown = next(key for key in box if key not in KEYS)
-            raise InputError(f'{where}: box {place}: unknown key "{unknown}" (known: {", ".join(sorted(KEYS))})')
+def _mistake(box: Any) -> str:
+    """The first mistake in the object of a box, "" if it is right."""
+    if not isinstance(box, dict):
+        return f"expected an object, found {box!r:.40}"
+    fields = {each.encode_name: each for each in msgspec.structs.fields(_Box)}
+    for key in (key for key, each in fields.items() if each.required and key not in box):
+        return f'"{key}" is missing (found: {", ".join(box)})'
+    for key, value in box.items():
+        if key not in fields:
+            return f'unknown key "{key}" (known: {", ".join(sorted(fields))})'
+        try:
+            msgspec.convert(value, fields[key].type)
+        except msgspec.ValidationError:
+            return f"{key}: expected {_description(fields[key].type)}, found {value!r:.60}"
+    return ""
 
 
-def _numbers(values: list[Any], width: int, where: str, key: str) -> Array:
-    """(N, width) float64, or (N,) for width 1. The caller has replaced allowed nulls by NaN."""
-    array = array_of_numbers(values)
-    if array is not None and array.shape == ((len(values),) if width == 1 else (len(values), width)):
-        return array
-    expected = "a number" if width == 1 else f"{width} numbers"
-    for place, value in enumerate(values):
-        entries = value if isinstance(value, list) and width > 1 else [value]
-        if len(entries) != width or not all(type(entry) in (int, float) for entry in entries):
-            raise InputError(f"{where}: box {place}: {key}: expected {expected}, found {value!r:.60}")
-    return np.asarray(values, dtype=np.float64)  # integers too large for int64
+def _description(kind: Any) -> str:
+    """The description in a type, or in one of the types of a union."""
+    notes = [note for one in (kind, *get_args(kind)) for note in getattr(one, "__metadata__", ())]
+    return str(notes[0].description)
+
+
+def _column(rows: Sequence[_Box], name: str, missing: Any) -> NDArray[Any] | None:
+    """An optional column; None where no box has it. missing: the value of a box that has none."""
+    values = [getattr(row, name) for row in rows]
+    if values.count(UNSET) == len(values):
+        return None
+    return np.array([missing if value is UNSET or value is None else value for value in values])
 
 
 def _require(good: NDArray[np.bool_], column: Array, where: str, key: str, expected: str) -> None:
     if not good.all():
         place = int(np.argmin(good.reshape(len(good), -1).all(axis=1)))
         raise InputError(f"{where}: box {place}: {key}: expected {expected}, found {column[place].tolist()}")
-
-
-def _velocities(values: list[Any], where: str) -> Array:
-    with_nan = [
-        [math.nan if number is None else number for number in value] if isinstance(value, list) else value
-        for value in ([None, None] if value is None else value for value in values)
-    ]
-    return _numbers(with_nan, 2, where, "velocity")
-
-
-def _shares(objects: Sequence[dict[str, Any]], key: str, where: str, *, required: bool = False) -> Array | None:
-    """An optional column of numbers from 0 to 1, NaN where a box has none.
-
-    required: whether every box must have one if any has.
-    """
-    if not any(key in box for box in objects):
-        return None
-    for place, box in enumerate(objects if required else ()):
-        if key not in box:
-            raise InputError(f'{where}: box {place}: "{key}" is missing (other boxes of the frame have one)')
-    values = [box.get(key) for box in objects]
-    numbers = _numbers([math.nan if v is None and not required else v for v in values], 1, where, key)
-    good = ((numbers >= 0) & (numbers <= 1)) | (np.isnan(numbers) & (not required))
-    _require(good, numbers, where, key, "0 to 1")
-    return numbers
-
-
-def _plain(objects: Sequence[dict[str, Any]], key: str, where: str) -> NDArray[Any] | None:
-    """An optional column of texts, flags or counts, with a default where a box has none."""
-    if not any(key in box for box in objects):
-        return None
-    kind, default, expected = PLAIN[key]
-    values: list[Any] = [default if kind is str and not box.get(key) else box.get(key, default) for box in objects]
-    for place, value in enumerate(values):
-        if type(value) is not kind or (kind is int and key in objects[place] and value < 0):
-            raise InputError(f"{where}: box {place}: {key}: expected {expected}, found {value!r:.40}")
-    return np.array(values)
 
 
 def _add_futures(objects: Sequence[dict[str, Any]], boxes: Boxes3D) -> None:
@@ -178,42 +174,22 @@ def _add_futures(objects: Sequence[dict[str, Any]], boxes: Boxes3D) -> None:
             box["future_scores"] = boxes.future_scores[place].tolist()
 
 
-def _futures_from_json(objects: Sequence[dict[str, Any]], where: str) -> dict[str, Array]:
+def _futures(rows: Sequence[_Box], where: str) -> dict[str, Array]:
     """The columns `futures` and `future_scores` of Boxes3D, none where no box has them."""
-    found = {place: _future(box, f"{where}: box {place}") for place, box in enumerate(objects) if "futures" in box}
-    if not found:
+    having = {place: row for place, row in enumerate(rows) if row.futures}
+    if not having:
         return {}
-    shape = next(iter(found.values())).shape
-    futures, scores = np.full((len(objects), *shape), np.nan), np.full((len(objects), shape[0]), np.nan)
-    for place, future in found.items():
-        if future.shape != shape:
+    first = next(iter(having.values()))
+    modes, steps = len(first.futures or ()), len(first.future_times_s)
+    futures, scores = np.full((len(rows), modes, steps, 3), np.nan), np.full((len(rows), modes), np.nan)
+    for place, row in having.items():
+        counts = [len(mode) for mode in row.futures or ()]
+        if counts != [steps] * modes or len(row.future_times_s) != steps or len(row.future_scores or counts) != modes:
             raise InputError(
-                f"{where}: box {place}: futures: {future.shape[0]} modes of {future.shape[1]} steps (expected "
-                f"{shape[0]} of {shape[1]}, as in the other boxes of the frame)"
+                f"{where}: box {place}: futures: {len(counts)} modes of {counts[0]} steps (expected {modes} of "
+                f"{steps}, as in the other boxes of the frame, with a score for each mode and a time for each step)"
             )
-        futures[place] = future
-        if "future_scores" in (box := objects[place]):
-            scores[place] = _array(box["future_scores"], shape[:1], f"{where}: box {place}: future_scores")
-    has_scores = any("future_scores" in box for box in objects)
-    return {"futures": futures, **({"future_scores": scores} if has_scores else {})}
-
-
-def _future(box: dict[str, Any], where: str) -> Array:
-    """(M, T, 3) of one box."""
-    times, modes = box.get("future_times_s"), box["futures"]
-    if not isinstance(times, list) or not isinstance(modes, list) or not times or not modes:
-        raise InputError(f'{where}: expected lists "futures" and "future_times_s", found {modes!r:.40}, {times!r:.40}')
-    filled = [
-        [[math.nan] * 2 if point is None else point for point in mode] if isinstance(mode, list) else mode
-        for mode in modes
-    ]
-    places = _array(filled, (len(modes), len(times), 2), f"{where}: futures")
-    seconds = _array(times, (len(times),), f"{where}: future_times_s")[:, None]
-    return np.concatenate([np.broadcast_to(seconds, (*places.shape[:2], 1)), places], axis=-1)
-
-
-def _array(values: Any, shape: tuple[int, ...], where: str) -> Array:
-    found = array_of_numbers(values)
-    if found is None or found.shape != shape:
-        raise InputError(f"{where}: expected {' x '.join(map(str, shape))} numbers, found {values!r:.60}")
-    return found
+        futures[place, ..., 0] = row.future_times_s
+        futures[place, ..., 1:] = [[point or (np.nan, np.nan) for point in mode] for mode in row.futures or ()]
+        scores[place] = row.future_scores or np.nan
+    return {"futures": futures, **({"future_scores": scores} if any(row.future_scores for row in rows) else {})}
