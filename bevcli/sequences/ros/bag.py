@@ -3,11 +3,11 @@
 import importlib.util
 import re
 import threading
-from collections.abc import Iterator, Sequence as Indices
+from collections.abc import Callable, Iterator, Sequence as Indices
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 SPLIT_NUMBER = re.compile(r"_\d+$")  # rosbag2 numbers the files of a recording: drive_0.mcap, drive_1.mcap
 LARGEST_MESSAGE = 256 * MIB  # bytes after decompression
 PACKAGES = ("mcap", "rosbags", "google.protobuf")
+_Value = TypeVar("_Value")
 
 
 @contextmanager
@@ -75,6 +76,14 @@ class Bag:
         except Exception as error:  # the decoders of the packages raise errors of many types for broken bytes
             reason = reason_of(error)
             raise InputError(f"{self.path}: {topic}: message {index} cannot be decoded ({reason:.200})") from None
+
+    def read(self, topic: str, index: int, parse: Callable[[Any], _Value], kind: str) -> _Value:
+        """The value that `parse` makes of a message. Raises InputError also if it is not `kind`, such as "a pose"."""
+        message = self.message(topic, index)
+        try:
+            return parse(message)
+        except (AttributeError, ValueError) as error:
+            raise InputError(f"{self.path}: {topic}: message {index} is not {kind} ({error})") from None
 
     def _bytes(self, topic: str, index: int) -> bytes:
         for file in self._files:

@@ -3,7 +3,7 @@
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache, reduce
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,13 +65,8 @@ class TransformTree:
 
 def read_transforms(bag: Bag, topic: str, indices: Iterable[int]) -> list[Transform]:
     """The transforms of some messages of a topic. Raises InputError if one is broken."""
-    found: list[Transform] = []
-    for index in indices:
-        try:
-            found += transforms_of(bag.message(topic, index))
-        except (AttributeError, ValueError) as error:
-            raise InputError(f"{bag.path}: {topic}: message {index} is not a transform ({error})") from None
-    return found
+    messages = (bag.read(topic, index, lambda message: [*transforms_of(message)], "a transform") for index in indices)
+    return list(chain.from_iterable(messages))
 
 
 def is_static(topic: str) -> bool:
@@ -173,20 +168,12 @@ def _reaches(times: list[int], timestamp_ns: int, sign: int) -> bool:
     return len(beyond) > MARGIN and sign * (beyond[-1] - timestamp_ns) >= MARGIN * KINEMATICS_STEP_NS
 
 
-def read_pose(bag: Bag, topic: str, index: int) -> Transform:
-    """The pose of a message, see `pose_of`. Raises InputError for a message without one."""
-    try:
-        return pose_of(bag.message(topic, index))
-    except (AttributeError, ValueError) as error:
-        raise InputError(f"{bag.path}: {topic}: message {index} is not a pose ({error})") from None
-
-
 def motion_from_poses(bag: Bag, topic: str, child_from_ego: Array | None) -> BagEgoMotion:
     """Poses of a topic with Odometry or poses. child_from_ego: (4, 4) from the frame of the poses, None: the same."""
     times = capture_times(bag, topic)
 
     def read(index: int) -> dict[str, list[Sample]]:
-        found = read_pose(bag, topic, index)
+        found = bag.read(topic, index, pose_of, "a pose")
         return {topic: [(found.timestamp_ns or int(times[index]), found.parent_from_child)]}
 
     return BagEgoMotion(times, read, (topic,), f"{bag.path}: {topic}", child_from_ego)

@@ -14,8 +14,8 @@ from typing import Any, Literal
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.geometry.cameras import Distortion
-from bevcli.geometry.transforms import Array, Pose
+from bevcli.geometry.cameras import Camera, Distortion
+from bevcli.geometry.transforms import Array, Pose, rigid
 from bevcli.parsing.documents import parse_json
 from bevcli.sequences.files.calibration_file import COEFFICIENT_COUNTS
 
@@ -133,28 +133,6 @@ class Transform:
     parent_from_child: Pose
 
 
-@dataclass(frozen=True)
-class CameraInfo:
-    """The intrinsics of a camera.
-
-    Attributes:
-        frame: name of the camera's optical frame.
-        width, height: of the image, pixels.
-        intrinsics: (3, 3) of the image as it was taken, pixels.
-        distortion: of the image as it was taken; None without.
-        rectified_intrinsics: (3, 3) of the rectified image, pixels. None if they are not stated.
-        rectified_from_camera: (3, 3) rotation from the camera's frame to the one of the rectified image.
-    """
-
-    frame: str
-    width: int
-    height: int
-    intrinsics: Array
-    distortion: Distortion | None
-    rectified_intrinsics: Array | None
-    rectified_from_camera: Array
-
-
 def timestamp_ns(message: Any) -> int:
     """The time that a message states, ns; 0 if it states none."""
     header = getattr(message, "header", None)
@@ -196,27 +174,27 @@ def pose_of(message: Any) -> Transform:
     return Transform(frame_of(message), child, timestamp_ns(message), _pose(inner.position, inner.orientation))
 
 
-def camera_info_of(message: Any, where: str) -> CameraInfo:
-    """The intrinsics in a CameraInfo or CameraCalibration. where: start of an error message.
+def camera_of(message: Any, name: str, ego_from_camera: Array, *, rectified: bool, where: str) -> Camera:
+    """The camera of a CameraInfo or CameraCalibration.
 
-    Raises InputError if they are not set or have an unknown distortion model.
+    ego_from_camera: (4, 4) of the optical frame, metres. rectified: lens distortion was removed from the images. where:
+    start of an error message.
+    Raises InputError if the intrinsics are not set or have an unknown distortion model.
     """
     binning = [max(1, int(getattr(message, name, 1) or 1)) for name in ("binning_x", "binning_y")]
+    width, height = int(message.width) // binning[0], int(message.height) // binning[1]
     scale = np.diag([1 / binning[0], 1 / binning[1], 1.0])
     intrinsics = scale @ _matrix(_first(message, "k", "K"), 3, 3)
     if not (intrinsics[0, 0] > 0 and intrinsics[1, 1] > 0):
         raise InputError(f"{where}: the camera is not calibrated (K is zero): pass `calibration=FILE`")
+    lens = _distortion(str(message.distortion_model), [float(d) for d in _first(message, "d", "D")], where)
     projection = _matrix(_first(message, "p", "P"), 3, 4)
     rotation = _matrix(_first(message, "r", "R"), 3, 3)
-    return CameraInfo(
-        frame_of(message),
-        int(message.width) // binning[0],
-        int(message.height) // binning[1],
-        intrinsics,
-        _distortion(str(message.distortion_model), [float(d) for d in _first(message, "d", "D")], where),
-        scale @ projection[:, :3] if projection[0, 0] > 0 else None,
-        rotation if abs(np.linalg.det(rotation) - 1) < 1e-3 else np.eye(3),
-    )
+    if rectified and projection[0, 0] > 0:
+        rectified_from_camera = rotation if abs(np.linalg.det(rotation) - 1) < 1e-3 else np.eye(3)
+        ego_from_camera = ego_from_camera @ rigid((0, 0, 0), rectified_from_camera.T)
+        return Camera(name, width, height, scale @ projection[:, :3], ego_from_camera)
+    return Camera(name, width, height, intrinsics, ego_from_camera, None if rectified else lens)
 
 
 def _distortion(model: str, coefficients: list[float], where: str) -> Distortion | None:

@@ -12,7 +12,7 @@ from bevcli.errors import InputError
 from bevcli.frame import DriveFacts, Frame, FrameStamp, Sequence
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
-from bevcli.geometry.transforms import Array, rigid
+from bevcli.geometry.transforms import Array
 from bevcli.parsing.files import is_there
 from bevcli.sequences.files.calibration_file import read_rig_and_facts
 from bevcli.sequences.images import FrameEntry, ImageReader, Source, read_frame
@@ -28,12 +28,11 @@ from bevcli.sequences.ros.ego_motion import (
     is_static,
     motion_from_poses,
     motion_from_transforms,
-    read_pose,
     sampled_transforms,
 )
 from bevcli.sequences.ros.format import BagOptions, is_ros_bag
 from bevcli.sequences.ros.images import BagVideo, bag_image
-from bevcli.sequences.ros.messages import CameraInfo, camera_info_of, frame_of
+from bevcli.sequences.ros.messages import camera_of, frame_of, pose_of
 from bevcli.sequences.ros.topics import CameraTopics, StatedTopics, TopicFinder, read_topics_file
 
 # Usual names of the frame of the vehicle, and of the world.
@@ -117,30 +116,34 @@ class _VehicleReader:
 
     def rig(self) -> CameraRig:
         """The cameras, in order of their names as found. Raises InputError if intrinsics or extrinsics are missing."""
-        infos = {one.camera: self._info(one) for one in self._finder.cameras}
-        frames = {name: self._stated.frames.get(name) or info.frame for name, info in infos.items()}
+        cameras = self._finder.cameras
+        frames = {one.camera: self._stated.frames.get(one.camera) or self._frame_of(one) for one in cameras}
         self.ego_frame = self.ego_frame or self._find_ego_frame(list(frames.values()))
-        cameras = [
-            self._camera(one, infos[one.camera], self._ego_from(frames[one.camera], one.camera))
-            for one in self._finder.cameras
-        ]
-        return CameraRig(tuple(cameras), default_ego_from_bev(), ego_from_bev_assumed=True)
+        found = tuple(self._camera(one, self._ego_from(frames[one.camera], one.camera)) for one in cameras)
+        return CameraRig(found, default_ego_from_bev(), ego_from_bev_assumed=True)
 
-    def _info(self, topics: CameraTopics) -> CameraInfo:
+    def _frame_of(self, topics: CameraTopics) -> str:
+        """The optical frame that the images name, or else the calibration."""
+        named = (
+            self._bag.read(topic, 0, frame_of, "an image or a calibration")
+            for topic in (topics.images, topics.calibration)
+            if topic
+        )
+        return next(filter(None, named), "")
+
+    def _camera(self, topics: CameraTopics, ego_from_camera: Array) -> Camera:
         assert topics.calibration is not None
         where = f"{self._bag.path}: {topics.calibration}"
-        try:
-            info = camera_info_of(self._bag.message(topics.calibration, 0), where)
-        except (AttributeError, ValueError) as error:
-            raise InputError(f"{where}: is not a calibration ({error})") from None
-        frame = frame_of(self._bag.message(topics.images, 0)) or info.frame
-        return replace(info, frame=frame)
+        parse = partial(
+            camera_of, name=topics.camera, ego_from_camera=ego_from_camera, rectified=topics.is_rectified, where=where
+        )
+        return self._bag.read(topics.calibration, 0, parse, "a calibration")
 
     def _find_ego_frame(self, camera_frames: list[str]) -> str:
         """The frame of the vehicle: the one that a pose topic names, a usual name, or the root of all cameras."""
         above = [self._tree.path_up(frame) for frame in camera_frames]
         pose = self._finder.pose_topic()
-        named = read_pose(self._bag, pose, 0).child if pose else ""
+        named = self._bag.read(pose, 0, pose_of, "a pose").child if pose else ""
         for name in (named, *EGO_FRAMES):
             if name and name in self._tree.frames:
                 return name
@@ -169,13 +172,6 @@ class _VehicleReader:
             )
         return found
 
-    def _camera(self, topics: CameraTopics, info: CameraInfo, ego_from_camera: Array) -> Camera:
-        if topics.is_rectified and info.rectified_intrinsics is not None:
-            ego_from_camera = ego_from_camera @ rigid((0, 0, 0), info.rectified_from_camera.T)
-            return Camera(topics.camera, info.width, info.height, info.rectified_intrinsics, ego_from_camera)
-        lens = None if topics.is_rectified else info.distortion
-        return Camera(topics.camera, info.width, info.height, info.intrinsics, ego_from_camera, lens)
-
     def motion(
         self, use: EgoMotionUse, file: Path | None
     ) -> tuple[EgoMotion | BagEgoMotion | None, str, tuple[str, ...]]:
@@ -190,7 +186,7 @@ class _VehicleReader:
         ego_frame = self.ego_frame or next((name for name in EGO_FRAMES if name in self._tree.frames), EGO_FRAMES[0])
         topic = self._finder.pose_topic()
         if topic is not None:
-            child = read_pose(self._bag, topic, 0).child
+            child = self._bag.read(topic, 0, pose_of, "a pose").child
             is_other = child not in ("", ego_frame)
             child_from_ego = self._tree.between(child, ego_frame) if is_other else None
             note = f'{topic} has poses of "{child}", which are taken as those of "{ego_frame}"'
