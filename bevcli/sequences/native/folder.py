@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.frame import BevMap, DriveFacts, Frame, MapLines
+from bevcli.frame import DriveFacts, Frame, MapLines
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
-from bevcli.geometry.transforms import Array, Pose, apply, inverse
+from bevcli.geometry.transforms import Pose, apply, inverse
 from bevcli.parsing.files import is_there
 from bevcli.sequences.files.boxes_file import BoxesFile, read_boxes
 from bevcli.sequences.files.calibration_file import read_rig_and_facts
@@ -58,25 +58,59 @@ class FolderSequence(ListedSequence):
             advice = "set start_ns in timing.toml" if notes else "add ego-motion, or remove the frame"
             _check_coverage(file, self.ego_motion, entries, advice)
         self.has_ego_motion = self.ego_motion is not None
-        self._truth = FolderGroundTruth(path, is_read=common.ground_truth)
+        self._read_truth(is_read=common.ground_truth)
         self.notes = (*rig_notes(self.rig), *notes, *motion_notes)
+
+    def _read_truth(self, *, is_read: bool) -> None:
+        """Read ground_truth.json and ground_truth_lines.json; maps are read frame by frame. Each may be missing."""
+        boxes, lines, maps = (self.path / name for name in (BOXES_FILE, TRUE_LINES, MAPS_FOLDER))
+        self._boxes = read_boxes(boxes) if is_read and is_there(existing(boxes)) else BoxesFile("ego", ())
+        self._lines = read_lines(lines) if is_read and is_there(existing(lines)) else LinesFile("ego", (), ())
+        self._maps = open_maps(maps) if is_read and maps.is_dir() else None
+        self._class_counts = count_classes(frame.boxes for frame in self._boxes.frames)
+        self._boxes_of = {frame.stamp.index: frame for frame in self._boxes.frames}
+        self._lines_of = {frame.stamp.index: frame.lines for frame in self._lines.frames}
 
     @property
     def class_counts(self) -> Mapping[str, int]:
-        return self._truth.class_counts
+        return self._class_counts
 
     @property
     def input_files(self) -> tuple[Path, ...]:
-        """Tables and videos: the files in the folder itself. A run can be resumed only if they are the same."""
+        # Tables and videos, but no images, which are in folders.
         return tuple(sorted(path for path in self.path.iterdir() if path.is_file()))
 
     def _frame(self, place: int, entry: FrameEntry) -> Frame:
-        stamp = entry.stamp
-        pose = self.ego_motion.pose_at(stamp.timestamp_ns) if self.ego_motion else None
-        boxes = self._truth.boxes(stamp.index, pose, self.rig.ego_from_bev)
-        bev_map = self._truth.bev_map(stamp.index)
+        index, time = entry.stamp.index, entry.stamp.timestamp_ns
+        boxes = self._true_boxes(index, self.ego_motion.pose_at(time) if self.ego_motion else None)
+        bev_map = self._maps.load(index) if self._maps and self._maps.has(index) else None
         frame = read_frame(entry, self.rig, self._images, self.ego_motion, boxes, bev_map)
-        return replace(frame, ground_truth_lines=self._truth.lines(frame) if self.has_ego_motion else None)
+        return replace(frame, ground_truth_lines=self._true_lines(frame) if self.has_ego_motion else None)
+
+    def _true_boxes(self, index: int, world_from_ego: Pose | None) -> Boxes3D | None:
+        """A frame's boxes in the world frame, or without pose in the ego frame; None if the file lacks the frame.
+
+        Boxes in the bev frame of a file that does not state its pose are in the bev frame of the rig.
+        """
+        truth, reference = self._boxes_of.get(index), self._boxes.frame_of_reference
+        if truth is None:
+            return None
+        if reference == "world" and world_from_ego:
+            return truth.boxes
+        if reference == "bev" and self._boxes.ego_from_bev is None:
+            boxes = truth.boxes.transformed(self.rig.ego_from_bev)
+        else:
+            boxes = self._boxes.in_ego(truth)
+        return boxes.transformed(world_from_ego.matrix) if world_from_ego else boxes
+
+    def _true_lines(self, frame: Frame) -> MapLines | None:
+        """The true lines of a frame in its bev frame, None if there are none. The frame's pose is known."""
+        lines = self._lines_of.get(frame.stamp.index)
+        if lines is None:
+            return None
+        reference_from_ego = frame.world_from_ego.matrix if self._lines.frame_of_reference == "world" else np.eye(4)
+        bev_from_reference = inverse(reference_from_ego @ frame.rig.ego_from_bev)
+        return replace(lines, points=tuple(apply(bev_from_reference, points)[:, :2] for points in lines.points))
 
 
 def _read_entries(path: Path, rig: CameraRig) -> tuple[tuple[FrameEntry, ...], tuple[str, ...]]:
@@ -134,49 +168,3 @@ def rig_notes(rig: CameraRig, source: str = "calibration.json") -> tuple[str, ..
     if not rig.ego_from_bev_assumed:
         return ()
     return (f'{source} has no "ego_from_bev": the default is used, a level frame at (0.94, 0, 1.84) m in ego',)
-
-
-class FolderGroundTruth:
-    """ground_truth.json and ground_truth_lines.json, read at once, and ground_truth_map/, read frame by frame.
-
-    Each may be missing. is_read: whether they are read at all. class_counts: number of boxes by class.
-    """
-
-    def __init__(self, folder: Path, *, is_read: bool = True) -> None:
-        boxes, lines, maps = folder / BOXES_FILE, folder / TRUE_LINES, folder / MAPS_FOLDER
-        self._boxes = read_boxes(boxes) if is_read and is_there(existing(boxes)) else BoxesFile("ego", ())
-        self._lines = read_lines(lines) if is_read and is_there(existing(lines)) else LinesFile("ego", (), ())
-        self._maps = open_maps(maps) if is_read and maps.is_dir() else None
-        self.class_counts = count_classes(frame.boxes for frame in self._boxes.frames)
-        self._boxes_of = {frame.stamp.index: frame for frame in self._boxes.frames}
-        self._lines_of = {frame.stamp.index: frame.lines for frame in self._lines.frames}
-
-    def boxes(self, frame: int, world_from_ego: Pose | None, ego_from_bev: Array) -> Boxes3D | None:
-        """A frame's boxes in the world frame; None if the file does not have the frame.
-
-        world_from_ego: the sequence's pose at the frame's time. None without ego-motion: boxes are in the ego frame.
-        ego_from_bev: (4, 4) of the rig, for a file in the bev frame that does not state its own.
-        """
-        truth = self._boxes_of.get(frame)
-        if truth is None:
-            return None
-        if self._boxes.frame_of_reference == "world" and world_from_ego:
-            return truth.boxes
-        if self._boxes.frame_of_reference == "bev" and self._boxes.ego_from_bev is None:
-            boxes = truth.boxes.transformed(ego_from_bev)
-        else:
-            boxes = self._boxes.in_ego(truth)
-        return boxes.transformed(world_from_ego.matrix) if world_from_ego else boxes
-
-    def bev_map(self, frame: int) -> BevMap | None:
-        """A frame's map, None if there is none."""
-        return self._maps.load(frame) if self._maps and self._maps.has(frame) else None
-
-    def lines(self, frame: Frame) -> MapLines | None:
-        """The true lines of a frame in its bev frame, None if there are none. The frame's pose is known."""
-        lines = self._lines_of.get(frame.stamp.index)
-        if lines is None:
-            return None
-        reference_from_ego = frame.world_from_ego.matrix if self._lines.frame_of_reference == "world" else np.eye(4)
-        bev_from_reference = inverse(reference_from_ego @ frame.rig.ego_from_bev)
-        return replace(lines, points=tuple(apply(bev_from_reference, points)[:, :2] for points in lines.points))
