@@ -205,11 +205,6 @@ class FrameEntry:
     dropped: Mapping[str, str]
     origin: str
 
-    @property
-    def image_files(self) -> tuple[Path, ...]:
-        """The image files and videos of the frame."""
-        return tuple(source.path for source in self.sources.values() if isinstance(source, ImageSource))
-
 
 class Motion(Protocol):
     """The vehicle's poses over time, such as `EgoMotion`."""
@@ -265,7 +260,8 @@ class ListedSequence(Sequence):
         self._images = ImageReader(strict=common.strict, inside=None if common.allow_outside else folder)
 
     def image_files(self, place: int) -> tuple[Path, ...]:
-        return self._entries[place].image_files
+        sources = self._entries[place].sources.values()
+        return tuple(source.path for source in sources if isinstance(source, ImageSource))
 
     def ground_truth_frame(self, place: int) -> Frame:
         return self._frame(place, replace(self._entries[place], sources={}))
