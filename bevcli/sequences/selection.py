@@ -27,15 +27,12 @@ class Selection(DerivedSequence):
         self.notes = (*sequence.notes, *notes)
 
     def image_files(self, place: int) -> tuple[Path, ...]:
-        """Those of the frame at position `place` of the selection."""
         return self.sequence.image_files(self._indices[place])
 
     def ground_truth_frame(self, place: int) -> Frame:
-        """The frame at position `place` of the selection, for scoring."""
         return self.sequence.ground_truth_frame(self._indices[place])
 
     def load(self, place: int) -> Frame:
-        """The frame at position `place` of the selection, with decoded images."""
         return self.sequence.load(self._indices[place])
 
 
@@ -43,7 +40,6 @@ class WithoutGroundTruth(DerivedSequence):
     """A sequence without its ground truth."""
 
     def load(self, place: int) -> Frame:
-        """The frame at a place, without boxes and map."""
         return replace(super().load(place), ground_truth=None, ground_truth_map=None, ground_truth_lines=None)
 
 
@@ -66,7 +62,6 @@ class WithClassNames(DerivedSequence):
         return self._renamed(self.sequence.ground_truth_frame(place))
 
     def load(self, place: int) -> Frame:
-        """The frame at a place, with the names of known classes."""
         return self._renamed(self.sequence.load(place))
 
     def _renamed(self, frame: Frame) -> Frame:

@@ -86,7 +86,6 @@ class Argoverse2Sequence(ListedSequence):
 
     @property
     def input_files(self) -> tuple[Path, ...]:
-        """The tables."""
         return tuple(sorted((*self.path.glob("*.feather"), *self.path.glob("calibration/*.feather"))))
 
     @property

@@ -59,7 +59,6 @@ class DgpSequence(ListedSequence):
 
     @property
     def input_files(self) -> tuple[Path, ...]:
-        """The scene and its calibrations."""
         return tuple(sorted((*self.path.glob("scene_*.json"), *self.path.glob("calibration/*.json"))))
 
     @property

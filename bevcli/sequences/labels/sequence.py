@@ -51,7 +51,6 @@ class WithLabels(DerivedSequence):
         return self._labelled(self.sequence.ground_truth_frame(place), place)
 
     def load(self, place: int) -> Frame:
-        """The frame at a place, with the boxes of the file."""
         return self._labelled(self.sequence.load(place), place)
 
     def _labelled(self, frame: Frame, place: int) -> Frame:

@@ -66,7 +66,6 @@ class NativeWriter(FolderWriter):
         self._rows = csv.writer(table, lineterminator="\n")
 
     def write(self, frame: Frame) -> None:
-        """Write a frame and its images."""
         self._check(frame)
         number = f"{frame.stamp.index:06d}"
         cells = {name: self._write_image(f"images/{name}/{number}", image) for name, image in frame.images.items()}

@@ -91,7 +91,6 @@ class TableSequence(Sequence):
 
     @property
     def input_files(self) -> tuple[Path, ...]:
-        """The tables. A run can be resumed only if they are the same."""
         return tuple(sorted(self.tables.glob("*.json")))
 
     @property

@@ -82,7 +82,6 @@ class RosSequence(Sequence):
 
     @property
     def input_files(self) -> tuple[Path, ...]:
-        """The files of the bag."""
         return self._bag.file_paths
 
     def load(self, place: int) -> Frame:
