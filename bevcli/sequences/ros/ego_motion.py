@@ -43,17 +43,13 @@ class TransformTree:
         """Names of all frames, sorted."""
         return sorted({*self._parents, *(parent for parent, _ in self._parents.values())})
 
-    def path_up(self, frame: str) -> list[str]:
-        """A frame and its ancestors, the root last."""
-        return list(self._up(frame))
-
     def between(self, a: str, b: str) -> Array | None:
         """(4, 4) a_from_b in metres, None if the tree does not connect the frames."""
-        up_a, up_b = self._up(a), self._up(b)
+        up_a, up_b = self.up(a), self.up(b)
         common = next((frame for frame in up_b if frame in up_a), None)
         return None if common is None else inverse(up_a[common]) @ up_b[common]
 
-    def _up(self, frame: str) -> dict[str, Array]:
+    def up(self, frame: str) -> dict[str, Array]:
         """(4, 4) ancestor_from_frame of a frame and of its ancestors, the root last."""
         found = {frame: rigid()}
         while frame in self._parents and self._parents[frame][0] not in found:

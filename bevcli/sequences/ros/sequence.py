@@ -140,7 +140,7 @@ class _VehicleReader:
 
     def _find_ego_frame(self, camera_frames: list[str]) -> str:
         """The frame of the vehicle: the one that a pose topic names, a usual name, or the root of all cameras."""
-        above = [self._tree.path_up(frame) for frame in camera_frames]
+        above = [self._tree.up(frame) for frame in camera_frames]
         pose = self._finder.pose_topic()
         named = self._bag.read(pose, 0, pose_of, "a pose").child if pose else ""
         for name in (named, *EGO_FRAMES):
@@ -206,7 +206,7 @@ class _VehicleReader:
 
     def _moving_path(self, ego_frame: str) -> list[str]:
         """Frames from the vehicle's to the world's, with links that move; a single one if there are none."""
-        path = self._tree.path_up(ego_frame)
+        path = list(self._tree.up(ego_frame))
         if self._stated.world_frame in path:
             path = path[: path.index(self._stated.world_frame) + 1]
         moving = [place for place, frame in enumerate(path[:-1]) if frame in self._moving]
