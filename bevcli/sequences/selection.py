@@ -116,7 +116,7 @@ def select_rate(sequence: Sequence, rate_hz: float) -> Sequence:
     slowest = np.inf
     for indices in scenes_of(stamps):
         times = np.array([stamps[index].timestamp_ns for index in indices], dtype=np.int64)
-        ratio = _median_rate_hz(times) / rate_hz
+        ratio = float(1e9 / np.median(np.diff(times))) / rate_hz if len(times) > 1 else np.inf
         slowest = min(slowest, ratio)
         chosen = _nearest_to_clock(times, rate_hz) if ratio > FASTEST_RATIO else range(len(indices))
         kept += [indices[position] for position in chosen]
@@ -127,11 +127,6 @@ def scenes_of(stamps: Indices[FrameStamp]) -> Iterator[list[int]]:
     """The indices of each scene: a run of consecutive frames with the same scene name."""
     for _, indices in groupby(range(len(stamps)), key=lambda index: stamps[index].scene):
         yield list(indices)
-
-
-def _median_rate_hz(times_ns: np.ndarray) -> float:
-    """Frames per second from the median gap of times (T,) int64 ns; infinite for a single frame."""
-    return float(1e9 / np.median(np.diff(times_ns))) if len(times_ns) > 1 else np.inf
 
 
 def _nearest_to_clock(times_ns: np.ndarray, rate_hz: float) -> list[int]:

@@ -33,8 +33,11 @@ def read_rig(intrinsics: Path | None, extrinsics: Path | None) -> CameraRig | No
     if intrinsics is None or extrinsics is None:
         raise InputError("`intrinsics` and `extrinsics` must be given together: pass both, or write a calibration.json")
     cameras = _read_intrinsics(intrinsics)
-    document = _read_extrinsics(extrinsics)
-    poses = _poses(document.get("cameras", {}), cameras, extrinsics)
+    document = read_json(extrinsics)
+    if not isinstance(document, dict) or not isinstance(document.get("cameras"), dict):
+        expected = '{"cameras": {"cam0": {"ego_from_camera": ...}}}'
+        raise InputError(f'{extrinsics}: "cameras" is missing (expected {expected})')
+    poses = _poses(document["cameras"], cameras, extrinsics)
     rig_cameras = tuple(_camera(name, fields, poses.get(name), extrinsics) for name, fields in cameras.items())
     if "ego_from_bev" not in document:
         return CameraRig(rig_cameras, default_ego_from_bev(), ego_from_bev_assumed=True)
@@ -121,15 +124,6 @@ def _lens(model: object, coefficients: object, known: Mapping[str, str], where: 
     if not any(coefficients):
         return {"model": "none"}
     return {"model": known[model], "coefficients": coefficients}
-
-
-def _read_extrinsics(path: Path) -> Mapping[str, Any]:
-    document = read_json(path)
-    if not isinstance(document, dict) or not isinstance(document.get("cameras"), dict):
-        raise InputError(
-            f'{path}: "cameras" is missing (expected {{"cameras": {{"cam0": {{"ego_from_camera": ...}}}}}})'
-        )
-    return document
 
 
 def _poses(stated: Mapping[str, Any], cameras: Mapping[str, Fields], path: Path) -> dict[str, Array]:

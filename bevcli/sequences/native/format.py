@@ -1,7 +1,5 @@
 """The native sequence folder as an input format."""
 
-from pathlib import Path
-
 from bevcli.sequences.format import Format
 from bevcli.sequences.options import RigOptions
 from bevcli.sequences.output import OutputFormat
@@ -9,16 +7,10 @@ from bevcli.sequences.output import OutputFormat
 # Any of these makes a folder a native sequence, so that an incomplete one gets an error that names the missing file.
 MARKERS = ("calibration.json", "frames.csv", "ego_motion.csv", "images", "videos")
 
-
-def is_native_folder(path: Path) -> bool:
-    """True if a folder contains any part of a native sequence."""
-    return any((path / part).exists() for part in MARKERS)
-
-
 FORMAT = Format(
     name="a sequence folder",
     expected="calibration.json, frames.csv, ego_motion.csv, images or videos",
-    recognises=is_native_folder,
+    recognises=lambda path: any((path / part).exists() for part in MARKERS),
     opener="bevcli.sequences.native.folder:FolderSequence",
     options=RigOptions,
     precedence=-10,
