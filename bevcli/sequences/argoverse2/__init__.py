@@ -1,4 +1,4 @@
 """Logs of the Argoverse 2 sensor dataset.
 
-format: the format and its own options. feather: its tables. sequence: Argoverse2Sequence, one log as a Sequence.
+format: the format and its own options. sequence: its tables, and Argoverse2Sequence, one log as a Sequence.
 """
