@@ -16,6 +16,16 @@ from bevcli.geometry.transforms import Array
 from bevcli.sequences.files.class_names import ClassNames
 
 FUTURE_DECIMALS = 3  # millimetres
+# Optional members: column of Boxes3D, and the value of a box that has none.
+OPTIONAL: dict[str, tuple[str, Any]] = {
+    "score": ("scores", None),
+    "attribute": ("attributes", ""),
+    "instance": ("instances", ""),
+    "track_score": ("track_scores", math.nan),
+    "duplicate": ("duplicates", False),
+    "visibility": ("visibilities", math.nan),
+    "num_points": ("num_points", -1),
+}
 _OWN_NAMES = ClassNames()
 _Vector = Annotated[tuple[float, float, float], Meta(description="3 numbers")]
 _Share = Annotated[float, Meta(ge=0, le=1, description="0 to 1")]
@@ -69,13 +79,7 @@ def boxes_from_json(objects: Any, where: str, class_names: ClassNames = _OWN_NAM
         yaws=np.array([row.yaw for row in rows]),
         velocities=np.array([row.velocity or (None, None) for row in rows], dtype=np.float64),
         classes=np.array([class_names[row.name] for row in rows]),
-        scores=_column(rows, "score", None),
-        attributes=_column(rows, "attribute", ""),
-        instances=_column(rows, "instance", ""),
-        track_scores=_column(rows, "track_score", math.nan),
-        duplicates=_column(rows, "duplicate", False),
-        visibilities=_column(rows, "visibility", math.nan),
-        num_points=_column(rows, "num_points", -1),
+        **{name: _column(rows, key, unknown) for key, (name, unknown) in OPTIONAL.items()},
         **_futures(rows, where),
     )
     without = [place for place, row in enumerate(rows) if row.score is UNSET]
@@ -104,19 +108,12 @@ def boxes_to_json(boxes: Boxes3D) -> list[dict[str, Any]]:
         "velocity": velocities,
     }
     objects = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-    optional = (
-        ("score", boxes.scores, lambda value: True),
-        ("attribute", boxes.attributes, lambda value: value != ""),
-        ("instance", boxes.instances, lambda value: value != ""),
-        ("track_score", boxes.track_scores, lambda value: not math.isnan(value)),
-        ("duplicate", boxes.duplicates, lambda value: value),
-        ("visibility", boxes.visibilities, lambda value: not math.isnan(value)),
-        ("num_points", boxes.num_points, lambda value: value >= 0),
-    )
-    for key, column, known in optional:
+    for key, (name, unknown) in OPTIONAL.items():
+        column = getattr(boxes, name)
         if column is not None:
-            for box, value in zip(objects, column.tolist(), strict=True):
-                if known(value):
+            known = ~np.isnan(column) if isinstance(unknown, float) else column != unknown
+            for box, value, is_known in zip(objects, column.tolist(), known.tolist(), strict=True):
+                if is_known:
                     box[key] = value
     _add_futures(objects, boxes)
     return objects
@@ -145,12 +142,12 @@ def _description(kind: Any) -> str:
     return str(notes[0].description)
 
 
-def _column(rows: Sequence[_Box], name: str, missing: Any) -> NDArray[Any] | None:
-    """An optional column; None where no box has it. missing: the value of a box that has none."""
-    values = [getattr(row, name) for row in rows]
+def _column(rows: Sequence[_Box], key: str, unknown: Any) -> NDArray[Any] | None:
+    """An optional column; None where no box has it."""
+    values = [getattr(row, key) for row in rows]
     if values.count(UNSET) == len(values):
         return None
-    return np.array([missing if value is UNSET or value is None else value for value in values])
+    return np.array([unknown if value is UNSET or value is None else value for value in values])
 
 
 def _require(good: NDArray[np.bool_], column: Array, where: str, key: str, expected: str) -> None:
