@@ -14,7 +14,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.csv_tables import CsvRow, name_of
 from bevcli.parsing.files import MIB, read_bytes
-from bevcli.sequences.labels.label_format import LabelFormat, LabelledFrame, Labels
+from bevcli.sequences.labels.label_format import LabelFormat, LabelledFrame, Labels, Moment
 
 LARGEST_BYTES = 512 * MIB
 SIZES = ("length", "width", "height")
@@ -91,9 +91,9 @@ def _check_columns(path: Path, columns: list[str]) -> None:
         raise InputError(f"{path}: two columns have one name (found {', '.join(columns)})")
 
 
-def _moments(path: Path, rows: list[CsvRow]) -> dict[tuple[int | None, int | None], list[int]]:
+def _moments(path: Path, rows: list[CsvRow]) -> dict[Moment, list[int]]:
     """Index and time of each frame -> the places of its rows."""
-    moments: dict[tuple[int | None, int | None], list[int]] = {}
+    moments: dict[Moment, list[int]] = {}
     for place, row in enumerate(rows):
         index, time = (row.integer(name) if row.cells[name] else None for name in ("frame", "timestamp_ns"))
         if index is None and time is None:

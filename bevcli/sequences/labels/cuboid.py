@@ -7,64 +7,47 @@ import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.sequences.labels.label_format import LabelledFrame, Labels
+from bevcli.sequences.labels.label_format import FrameOfReference, LabelledFrame, Labels, Moment
 
 LARGEST_TILT_DEG = 5.0
-_IN_EGO = 'the cuboids are taken to be in the "ego" frame: that of the point clouds that were labelled'
+IN_EGO = 'the cuboids are taken to be in the "ego" frame: that of the point clouds that were labelled'
 
 
 @dataclass(frozen=True)
 class Cuboid:
-    """A cuboid.
+    """A cuboid. box: the upright box with its heading. tilt_deg: angle between its vertical and that of the frame."""
 
-    Attributes:
-        kind: name of the class.
-        track: identity, "" for none.
-        position: (3,) of the middle, metres.
-        rotation: (3,) angles about x, y and z, radians: Rx Ry Rz.
-        size: (3,) length, width and height, metres.
+    box: Boxes3D
+    tilt_deg: float
+
+
+def cuboid_of(
+    where: str, kind: str, track: str, position: Sequence[float], rotation: Sequence[float], size: Sequence[float]
+) -> Cuboid:
+    """A cuboid of numbers from a file, of unknown velocity. Raises InputError.
+
+    kind: name of the class. track: identity, "" for none. position: (3,) of the middle, metres. rotation: (3,) angles
+    about x, y and z, radians: Rx Ry Rz. size: (3,) length, width and height, metres.
     """
-
-    kind: str
-    track: str
-    position: Sequence[float]
-    rotation: Sequence[float]
-    size: Sequence[float]
-
-    @staticmethod
-    def checked(
-        where: str, kind: str, track: str, position: Sequence[float], rotation: Sequence[float], size: Sequence[float]
-    ) -> "Cuboid":
-        """A cuboid of numbers from a file. Raises InputError."""
-        numbers = position, rotation, size
-        if [len(each) for each in numbers] != [3, 3, 3] or not (np.isfinite(numbers).all() and min(size) > 0):
-            raise InputError(f"{where}: expected three numbers each of position, rotation and size, sizes above 0")
-        return Cuboid(kind, track, *numbers)
-
-    @property
-    def tilt_deg(self) -> float:
-        """Angle between the cuboid's vertical and that of the frame, degrees."""
-        return float(np.degrees(np.arccos(np.prod(np.cos(self.rotation[:2])))))
-
-    def box(self) -> Boxes3D:
-        """The upright box with the cuboid's heading, of unknown velocity."""
-        (sx, sy, sz), (cx, cy, cz) = np.sin(self.rotation), np.cos(self.rotation)
-        yaw = np.arctan2(cx * sz + sx * sy * cz, cy * cz)
-        return Boxes3D(
-            np.array([self.position]), np.array([self.size]), np.array([yaw]), np.full((1, 2), np.nan),
-            np.array([self.kind]), instances=np.array([self.track]),
-        )  # fmt: skip
+    numbers = position, rotation, size
+    if [len(each) for each in numbers] != [3, 3, 3] or not (np.isfinite(numbers).all() and min(size) > 0):
+        raise InputError(f"{where}: expected three numbers each of position, rotation and size, sizes above 0")
+    (sx, sy, sz), (cx, cy, cz) = np.sin(rotation), np.cos(rotation)
+    yaw = np.arctan2(cx * sz + sx * sy * cz, cy * cz)
+    box = Boxes3D(
+        np.array([position]), np.array([size]), np.array([yaw]), np.full((1, 2), np.nan), np.array([kind]),
+        instances=np.array([track]),
+    )  # fmt: skip
+    return Cuboid(box, float(np.degrees(np.arccos(cx * cy))))
 
 
-def labels_of_cuboids(frames: Sequence[tuple[int, list[Cuboid]]], *notes: str, lists_empty: bool) -> Labels:
-    """The labels of frames with their index and their cuboids, which are taken to be in the ego frame."""
-    boxes = ((index, Boxes3D.concatenate(one.box() for one in cuboids)) for index, cuboids in frames)
-    listed = tuple(LabelledFrame(index, None, of_frame) for index, of_frame in boxes)
-    tilts = (one.tilt_deg for _, cuboids in frames for one in cuboids)
-    return Labels("ego", listed, lists_empty, (_IN_EGO, *notes, *tilt_note(tilts)))
-
-
-def tilt_note(tilts_deg: Iterable[float]) -> tuple[str, ...]:
-    """A note about cuboids that are not upright, if there are any."""
-    tilted = sum(tilt > LARGEST_TILT_DEG for tilt in tilts_deg)
-    return (f"{tilted} cuboids are tilted by more than {LARGEST_TILT_DEG:g}°: their boxes are upright",) * bool(tilted)
+def labels_of_cuboids(
+    reference: FrameOfReference, frames: Iterable[tuple[Moment, list[Cuboid]]], *notes: str, lists_empty: bool
+) -> Labels:
+    """The labels of frames with their cuboids, and a note about tilted ones."""
+    listed = list(frames)
+    tilted = sum(one.tilt_deg > LARGEST_TILT_DEG for _, cuboids in listed for one in cuboids)
+    if tilted:
+        notes = (*notes, f"{tilted} cuboids are tilted by more than {LARGEST_TILT_DEG:g}°: their boxes are upright")
+    labelled = (LabelledFrame(*moment, Boxes3D.concatenate(one.box for one in cuboids)) for moment, cuboids in listed)
+    return Labels(reference, tuple(labelled), lists_empty, notes)

@@ -5,8 +5,8 @@ from pathlib import Path
 import msgspec
 
 from bevcli.errors import InputError
-from bevcli.sequences.labels.cuboid import Cuboid, labels_of_cuboids
-from bevcli.sequences.labels.label_format import LabelFormat, Labels, decoded, starts_with
+from bevcli.sequences.labels.cuboid import IN_EGO, Cuboid, cuboid_of, labels_of_cuboids
+from bevcli.sequences.labels.label_format import LabelFormat, Labels, Moment, decoded, starts_with
 
 CUBOID = "cuboid_3d"
 
@@ -54,14 +54,15 @@ def read_cvat_labels(path: Path) -> Labels:
     """
     content = decoded(path, _File, 'a CVAT export "Datumaro 3D"')
     classes = [label.name for label in content.categories.label.labels]
-    return labels_of_cuboids([_frame(path, item, classes) for item in content.items], lists_empty=True)
+    frames = (_frame(path, item, classes) for item in content.items)
+    return labels_of_cuboids("ego", frames, IN_EGO, lists_empty=True)
 
 
-def _frame(path: Path, item: _Item, classes: list[str]) -> tuple[int, list[Cuboid]]:
+def _frame(path: Path, item: _Item, classes: list[str]) -> tuple[Moment, list[Cuboid]]:
     where = f"{path}: item {item.id:.40}"
     if item.attr.frame is None:
         raise InputError(f'{where}: "attr" has no "frame", the index of the frame')
-    return item.attr.frame, [_cuboid(where, one, classes) for one in item.annotations if one.type == CUBOID]
+    return (item.attr.frame, None), [_cuboid(where, one, classes) for one in item.annotations if one.type == CUBOID]
 
 
 def _cuboid(where: str, one: _Annotation, classes: list[str]) -> Cuboid:
@@ -69,7 +70,7 @@ def _cuboid(where: str, one: _Annotation, classes: list[str]) -> Cuboid:
         raise InputError(f'{where}: label_id is {one.label_id} (expected 0 to {len(classes) - 1}, from "categories")')
     track = one.attributes.get("track_id")
     name, identity = classes[one.label_id], "" if track is None else str(track)
-    return Cuboid.checked(where, name, identity, one.position, one.rotation, one.scale)
+    return cuboid_of(where, name, identity, one.position, one.rotation, one.scale)
 
 
 FORMAT = LabelFormat(

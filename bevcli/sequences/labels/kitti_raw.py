@@ -9,7 +9,7 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.parsing.documents import parse_xml
 from bevcli.parsing.files import MIB, read_bytes
-from bevcli.sequences.labels.cuboid import Cuboid, labels_of_cuboids
+from bevcli.sequences.labels.cuboid import IN_EGO, Cuboid, cuboid_of, labels_of_cuboids
 from bevcli.sequences.labels.label_format import LabelFormat, Labels, starts_with
 
 LARGEST_BYTES = 32 * MIB  # a tree of elements takes thirty times as much
@@ -32,7 +32,8 @@ def read_tracklets(path: Path) -> Labels:
             frames.setdefault(index, []).append(cuboid)
     note = "the poses have CVAT's version: w, h and l are taken to be the sizes along x, y and z, tz to be the middle"
     notes = [note] if any(map(_is_cvats, tracks)) else []
-    return labels_of_cuboids(sorted(frames.items()), *notes, lists_empty=False)
+    listed = (((index, None), frames[index]) for index in sorted(frames))
+    return labels_of_cuboids("ego", listed, IN_EGO, *notes, lists_empty=False)
 
 
 def _is_cvats(track: Element) -> bool:
@@ -51,7 +52,7 @@ def _cuboids(where: str, track: Element, number: str) -> Iterator[tuple[int, Cub
         position, rotation = _numbers(where, pose, "tx", "ty", "tz"), _numbers(where, pose, "rx", "ry", "rz")
         if not is_cvats:
             position[2] += size[2] / 2
-        yield int(first) + place, Cuboid.checked(where, kind, number, position, rotation, size)
+        yield int(first) + place, cuboid_of(where, kind, number, position, rotation, size)
 
 
 def _numbers(where: str, element: Element, *names: str) -> list[float]:

@@ -17,6 +17,8 @@ from bevcli.sequences.options import LabelOptions
 GROUP = "bevcli.label_formats"
 FIRST_BYTES = 4096
 LARGEST_BYTES = 1024 * MIB
+FrameOfReference = Literal["world", "ego", "bev"]
+Moment = tuple[int | None, int | None]  # index and time of a frame, ns, as in LabelledFrame
 _Struct = TypeVar("_Struct")
 
 
@@ -47,7 +49,7 @@ class Labels:
         notes: what was assumed, for the user.
     """
 
-    frame_of_reference: Literal["world", "ego", "bev"]
+    frame_of_reference: FrameOfReference
     frames: tuple[LabelledFrame, ...]
     lists_empty: bool
     notes: tuple[str, ...] = ()

@@ -3,18 +3,18 @@
 from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.sequences.labels.cuboid import tilt_note
-from bevcli.sequences.labels.label_format import LabelFormat, LabelledFrame, Labels, decoded, starts_with
+from bevcli.sequences.labels.cuboid import Cuboid, labels_of_cuboids
+from bevcli.sequences.labels.label_format import FrameOfReference, LabelFormat, Labels, Moment, decoded, starts_with
 
 # Names of coordinate systems -> our frames; those with other names need a transform, which is not read.
-SYSTEMS: Mapping[str, Literal["world", "ego", "bev"]] = {
+SYSTEMS: Mapping[str, FrameOfReference] = {
     "world": "world", "odom": "world", "ego": "ego", "vehicle-iso8855": "ego", "bev": "bev",
 }  # fmt: skip
 
@@ -77,39 +77,39 @@ def read_openlabel(path: Path) -> Labels:
     if unknown or len({SYSTEMS[name] for name in systems}) > 1:
         stated = ", ".join(sorted(systems))
         raise InputError(f"{path}: expected all cuboids in one of {', '.join(SYSTEMS)}, found {stated}")
-    tilts: list[float] = []
-    frames = tuple(_frame(path, content, number, frame, tilts) for number, frame in content.frames.items())
-    return Labels(SYSTEMS[systems.pop()], frames, lists_empty=True, notes=tilt_note(tilts))
+    frames = (_frame(path, content, number, frame) for number, frame in content.frames.items())
+    return labels_of_cuboids(SYSTEMS[systems.pop()], frames, lists_empty=True)
 
 
-def _frame(path: Path, content: _Content, number: str, frame: _Frame, tilts: list[float]) -> LabelledFrame:
+def _frame(path: Path, content: _Content, number: str, frame: _Frame) -> tuple[Moment, list[Cuboid]]:
     where = f"{path}: frame {number:.20}"
     if not number.isdecimal():
         raise InputError(f"{where}: expected a number")
-    boxes = []
+    cuboids = []
     for key, found in frame.objects.items():
         if found.object_data.cuboid and key not in content.objects:
             raise InputError(f'{where}: object {key:.40} is not among "objects"')
-        boxes += [_box(where, key, content.objects[key].type, one, tilts) for one in found.object_data.cuboid]
-    return LabelledFrame(int(number), _time_ns(where, frame.frame_properties.timestamp), Boxes3D.concatenate(boxes))
+        cuboids += [_cuboid(where, key, content.objects[key].type, one) for one in found.object_data.cuboid]
+    return (int(number), _time_ns(where, frame.frame_properties.timestamp)), cuboids
 
 
-def _box(where: str, key: str, kind: str, cuboid: _Cuboid, tilts: list[float]) -> Boxes3D:
-    """One box. Its rotation is a quaternion x, y, z, w, or three angles about x, y and z."""
+def _cuboid(where: str, key: str, kind: str, cuboid: _Cuboid) -> Cuboid:
+    """One cuboid. Its rotation is a quaternion x, y, z, w, or three angles about x, y and z."""
     values = np.array(cuboid.val, dtype=float)
     if values.shape not in ((10,), (9,)) or not np.isfinite(values).all() or not (values[-3:] > 0).all():
         raise InputError(f"{where}: object {key:.40}: expected a cuboid of 10 or 9 numbers with sizes above 0")
     x, y, z, w = values[3:7] if len(values) == 10 else _quaternion(*values[3:6])
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    tilts.append(float(np.degrees(np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1)))))
+    tilt_deg = float(np.degrees(np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1))))
     numbers = {one.name: one.val for one in cuboid.attributes.num if isinstance(one.val, int | float)}
     texts = {one.name: str(one.val) for one in cuboid.attributes.text}
     velocity = [numbers.get("vx", np.nan), numbers.get("vy", np.nan)]
-    return Boxes3D(
+    box = Boxes3D(
         values[None, :3], values[None, -3:], np.array([yaw]), np.array([velocity]), np.array([kind]),
         attributes=np.array([texts.get("attribute", "")]), instances=np.array([key]),
         visibilities=np.array([float(numbers.get("visibility", np.nan))]),
     )  # fmt: skip
+    return Cuboid(box, tilt_deg)
 
 
 def _quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
