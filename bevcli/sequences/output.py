@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import TYPE_CHECKING, Protocol
 
 from bevcli.errors import InputError, OutputError
 from bevcli.registry import entries, load
@@ -21,7 +21,7 @@ GROUP = "bevcli.drive_writers"
 SUFFIXES = {"image/jpeg": ".jpg", "image/png": ".png"}
 
 
-class DriveWriter(Protocol):
+class DriveWriter(AbstractContextManager["DriveWriter"], Protocol):
     """Writes a drive frame by frame: `with writer: writer.write(frame)`. What it writes is valid after the block only.
 
     After an error in the block, nothing under the final name opens as a drive.
@@ -30,13 +30,11 @@ class DriveWriter(Protocol):
     def write(self, frame: Frame) -> None:
         """Write a frame and its images. Raises InputError for one that the format cannot hold, and OutputError."""
 
-    def __enter__(self) -> Self: ...
 
-    def __exit__(self, *error: object) -> None: ...
-
-
-class FolderWriter:
+class FolderWriter(ExitStack):
     """Base of a `DriveWriter` of a folder: a subclass has `write` and `_finish`. After an error, its parts are deleted.
+
+    Files that a subclass enters into the stack are closed before `_finish`.
 
     Attributes:
         folder: that is written.
@@ -56,15 +54,10 @@ class FolderWriter:
                 way = ", or pass `force=True` to replace it" if can_replace else ""
                 raise OutputError(f"{folder}: exists already: choose another folder{way}")
             remove_parts(folder, parts)
-        self.folder, self._open = folder, ExitStack()
-        self._open.enter_context(whole_folder(folder, parts))
-        self._open.push(self._close)  # once the files that a subclass opens are closed
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        self._open.__exit__(*error)
+        super().__init__()
+        self.folder = folder
+        self.enter_context(whole_folder(folder, parts))
+        self.push(self._close)
 
     def _close(self, kind: type[BaseException] | None, *error: object) -> None:
         if kind is None:

@@ -60,7 +60,7 @@ class NativeWriter(FolderWriter):
         self._boxes: BoxesWriter | None = None
         self._lines: LinesWriter | None = None
         try:
-            table = self._open.enter_context((folder / "frames.csv").open("w", newline="", encoding="utf-8"))
+            table = self.enter_context((folder / "frames.csv").open("w", newline="", encoding="utf-8"))
         except OSError as error:
             raise OutputError(f"{folder / 'frames.csv'}: cannot be written ({error.strerror})") from None
         self._rows = csv.writer(table, lineterminator="\n")
@@ -128,14 +128,14 @@ class NativeWriter(FolderWriter):
 
     def _write_boxes(self, frame: Frame, boxes: Boxes3D, pose: Pose | None) -> None:
         if self._boxes is None:
-            self._boxes = self._open.enter_context(BoxesWriter(self.folder / BOXES_FILE, self._reference))
+            self._boxes = self.enter_context(BoxesWriter(self.folder / BOXES_FILE, self._reference))
         extras = {"sample_token": frame.sample_token} if frame.sample_token else {}
         self._boxes.write(FrameBoxes(frame.stamp, pose, boxes, extras))
 
     def _write_lines(self, ground: Ground, lines: MapLines) -> None:
         if self._lines is None:
             writer = LinesWriter(self.folder / TRUE_LINES, self._reference, {"classes": list(LINE_CLASSES)})
-            self._lines = self._open.enter_context(writer)
+            self._lines = self.enter_context(writer)
         self._lines.write(ground, lines)
 
 
