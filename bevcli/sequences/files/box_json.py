@@ -171,7 +171,7 @@ def _add_futures(objects: Sequence[dict[str, Any]], boxes: Boxes3D) -> None:
             box["future_scores"] = boxes.future_scores[place].tolist()
 
 
-def _futures(rows: Sequence[_Box], where: str) -> dict[str, Array]:
+def _futures(rows: Sequence[_Box], where: str) -> dict[str, Any]:
     """The columns `futures` and `future_scores` of Boxes3D, none where no box has them."""
     having = {place: row for place, row in enumerate(rows) if row.futures}
     if not having:
