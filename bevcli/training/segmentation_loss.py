@@ -134,21 +134,6 @@ class SegmentationLossConfig:
 
 
 @dataclass(frozen=True)
-class SegmentationLoss:
-    """Weighted scalar losses, summed over the layers.
-
-    Attributes:
-        classes: () focal loss of the classes.
-        masks: () dice and focal loss of the masks.
-        locations: () L1 loss of the things' locations.
-    """
-
-    classes: Tensor
-    masks: Tensor
-    locations: Tensor
-
-
-@dataclass(frozen=True)
 class _Assignment:
     """The K queries of one batch element that have a target mask, T of them things.
 
@@ -167,8 +152,8 @@ class _Assignment:
 
 def segmentation_loss(
     outputs: SegmentationOutputs, targets: Sequence[SegmentationTargets], config: SegmentationLossConfig
-) -> SegmentationLoss:
-    """The loss of all layers for B frames. Things are matched once, by the outputs of the last layer.
+) -> dict[str, Tensor]:
+    """The weighted losses of all layers for B frames. Things are matched once, by the outputs of the last layer.
 
     The losses of things are divided by the number of things in the batch, those of stuff by the number of stuff masks,
     so that many vehicles do not outweigh the road. A frame without a map trains no stuff query.
@@ -188,7 +173,7 @@ def segmentation_loss(
         masks = masks + (losses * shares[assigned.queries]).sum()
         errors = outputs.locations[:, element, assigned.things] - assigned.locations
         locations = locations + config.location_weight * errors.abs().sum() / max(things, 1)
-    return SegmentationLoss(classes, masks, locations)
+    return {"map classes": classes, "masks": masks, "locations": locations}
 
 
 def matching_costs(
