@@ -1,6 +1,8 @@
 """The nuScenes detection score: AP, mAP, true-positive errors and NDS of boxes. Reads no files."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -8,7 +10,6 @@ from numpy.typing import ArrayLike
 from bevcli.evaluation.config import ERRORS, DetectionConfig
 from bevcli.evaluation.detection_scores import (
     ClassScores,
-    DetectionScores,
     RangeScores,
     ScoreTable,
     VisibilityRecall,
@@ -17,6 +18,58 @@ from bevcli.evaluation.detection_scores import (
 from bevcli.evaluation.matching import ClassMatches, ScoredBoxes, gather, match_class
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, wrap_angle
+
+
+@dataclass(frozen=True)
+class DetectionScores:
+    """The scores of the boxes of some frames. Each table is computed when it is first asked for.
+
+    Attributes:
+        frame_count: number of frames.
+        matches: by class, the matching.
+        unmeasured: names of errors that are left out, because no ground truth has the quantity.
+        config: parameters of the matching and of the score.
+    """
+
+    frame_count: int
+    matches: tuple[ClassMatches, ...] = field(repr=False)
+    unmeasured: tuple[str, ...]
+    config: DetectionConfig
+
+    @cached_property
+    def overall(self) -> ScoreTable:
+        """All classes, as in the devkit."""
+        return self._table(self.matches)
+
+    @cached_property
+    def by_range(self) -> tuple[RangeScores, ...]:
+        """Rings around the ego vehicle, nearest first."""
+        return tuple(self._within(*ends) for ends in self.config.range_bins_m)
+
+    @cached_property
+    def by_visibility(self) -> tuple[VisibilityRecall, ...]:
+        """Ranges of visibility; empty where ground truth has no visibilities."""
+        stated = [part for part in self.matches if not np.isnan(_visibilities(part)).all()]
+        bins = self.config.visibility_bins if stated else ()
+        return tuple(_visibility_recall(stated, self.config.error_row, *ends) for ends in bins)
+
+    @property
+    def prediction_count(self) -> int:
+        """Number of predictions inside the ranges of their classes."""
+        return sum(scores.prediction_count for scores in self.overall.classes.values())
+
+    @property
+    def ground_truth_count(self) -> int:
+        """Number of ground truths inside the ranges of their classes."""
+        return sum(scores.ground_truth_count for scores in self.overall.classes.values())
+
+    def _table(self, matches: Sequence[ClassMatches]) -> ScoreTable:
+        scores = {part.name: _score_class(part, self.config, self.unmeasured) for part in matches}
+        return ScoreTable(scores, self.config.mean_ap_weight)
+
+    def _within(self, low: float, high: float) -> RangeScores:
+        parts = [part.within(low, high) for part in self.matches]
+        return RangeScores(low, high, self._table([part for part in parts if part.truth_counts.any()]))
 
 
 def evaluate_detections(
@@ -45,33 +98,7 @@ def evaluate_detections(
     ego = np.zeros((len(predictions), 2)) if ego_xy is None else np.asarray(ego_xy, dtype=np.float64)
     truth, found = (_with_points(gather(side, ego)) for side in (ground_truth, predictions))
     matches = tuple(match_class(name, truth, found, config) for name in config.class_ranges_m)
-    return score_matches(len(predictions), matches, _unmeasured(truth.boxes), config)
-
-
-def score_matches(
-    frame_count: int, matches: tuple[ClassMatches, ...], unmeasured: tuple[str, ...], config: DetectionConfig
-) -> DetectionScores:
-    """The scores of a matching, by class.
-
-    unmeasured: names of errors that are left out, because no ground truth has the quantity. config: of the matching.
-    """
-
-    def table(parts: Sequence[ClassMatches]) -> ScoreTable:
-        scores = {part.name: _score_class(part, config, unmeasured) for part in parts}
-        return ScoreTable(scores, config.mean_ap_weight)
-
-    def within(low: float, high: float) -> RangeScores:
-        parts = [part.within(low, high) for part in matches]
-        return RangeScores(low, high, table([part for part in parts if part.truth_counts.any()]))
-
-    return DetectionScores(
-        frame_count=frame_count,
-        overall=table(matches),
-        by_range=tuple(within(*ends) for ends in config.range_bins_m),
-        by_visibility=_recall_by_visibility(matches, config),
-        unmeasured=unmeasured,
-        matches=matches,
-    )
+    return DetectionScores(len(predictions), matches, _unmeasured(truth.boxes), config)
 
 
 def _with_points(boxes: ScoredBoxes) -> ScoredBoxes:
@@ -88,7 +115,7 @@ def _score_class(part: ClassMatches, config: DetectionConfig, unmeasured: tuple[
         distance: recall_curve(matched[counts] >= 0, scores[counts], truth_count)
         for distance, matched, counts in zip(config.distances_m, part.matched, part.counts, strict=True)
     }
-    row = config.distances_m.index(config.error_distance_m)
+    row = config.error_row
     hits = np.flatnonzero(part.counts[row] & (part.matched[row] >= 0))
     truths = part.ground_truth.boxes[part.matched[row][hits]]
     one = config.classes[part.name]
@@ -141,13 +168,6 @@ def _unmeasured(truth: Boxes3D) -> tuple[str, ...]:
     assert truth.attributes is not None
     unknown = {"vel_err": np.isnan(truth.velocities).any(axis=1), "attr_err": truth.attributes == ""}
     return tuple(name for name, each in unknown.items() if each.all())
-
-
-def _recall_by_visibility(matches: Sequence[ClassMatches], config: DetectionConfig) -> tuple[VisibilityRecall, ...]:
-    """Recall in each bin; empty where ground truth has no visibilities."""
-    stated = [part for part in matches if not np.isnan(_visibilities(part)).all()]
-    row = config.distances_m.index(config.error_distance_m)
-    return tuple(_visibility_recall(stated, row, *ends) for ends in config.visibility_bins if stated)
 
 
 def _visibility_recall(matches: Sequence[ClassMatches], row: int, low: float, high: float) -> VisibilityRecall:

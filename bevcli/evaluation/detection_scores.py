@@ -1,4 +1,4 @@
-"""The result of scoring detections; precision and errors as functions of recall as in nuScenes devkit 1.2.0."""
+"""Scores of detections by class; precision and errors as functions of recall as in nuScenes devkit 1.2.0."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.evaluation.config import ERRORS, DetectionConfig
-from bevcli.evaluation.matching import ClassMatches
 from bevcli.geometry.transforms import Array
 
 RECALLS = np.linspace(0, 1, 101)
@@ -168,37 +167,6 @@ class VisibilityRecall:
     def mean_recall(self) -> float:
         """The mean recall over the classes; NaN without any."""
         return known_mean(self.recalls.values())
-
-
-@dataclass(frozen=True)
-class DetectionScores:
-    """The scores of detections.
-
-    Attributes:
-        frame_count: number of frames.
-        overall: all classes, as in the devkit.
-        by_range: rings around the ego vehicle, nearest first.
-        by_visibility: ranges of visibility; empty where ground truth has no visibilities.
-        unmeasured: names of errors that cannot be measured, because no ground truth has the quantity.
-        matches: by class, the matching, for plots.
-    """
-
-    frame_count: int
-    overall: ScoreTable
-    by_range: tuple[RangeScores, ...]
-    by_visibility: tuple[VisibilityRecall, ...]
-    unmeasured: tuple[str, ...]
-    matches: tuple[ClassMatches, ...] = field(repr=False)
-
-    @property
-    def prediction_count(self) -> int:
-        """Number of predictions inside the ranges of their classes."""
-        return sum(scores.prediction_count for scores in self.overall.classes.values())
-
-    @property
-    def ground_truth_count(self) -> int:
-        """Number of ground truths inside the ranges of their classes."""
-        return sum(scores.ground_truth_count for scores in self.overall.classes.values())
 
 
 def known_mean(values: Iterable[float]) -> float:

@@ -8,12 +8,11 @@ from statistics import median
 from typing import Any
 
 from bevcli.evaluation.config import DetectionConfig, TrackingConfig
-from bevcli.evaluation.detection import evaluate_detections
-from bevcli.evaluation.detection_scores import DetectionScores
+from bevcli.evaluation.detection import DetectionScores, evaluate_detections
 from bevcli.evaluation.driving import DrivingScores, Scored, evaluate_driving
 from bevcli.evaluation.inputs import ScoredInput, open_ground_truth, open_predictions, without_cycles_in_racks
 from bevcli.evaluation.pairing import FramePairs, pair_frames
-from bevcli.evaluation.scores_report import driving_tables, driving_to_dict, finite, scores_table, scores_to_dict
+from bevcli.evaluation.scores_report import FrameScores, driving_tables, driving_to_dict, finite
 from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmentation
 from bevcli.evaluation.tracking.scoring import TrackingScores, evaluate_tracking
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
@@ -27,38 +26,24 @@ OWN_CLASSES = (
 )
 
 
-@dataclass(frozen=True)
-class Scores:
+@dataclass(frozen=True, kw_only=True)
+class Scores(FrameScores):
     """The result of `evaluate`.
 
     Attributes:
         pairs: the frames that were scored.
-        config: the parameters of the detection score.
-        detection: the scores of the boxes.
-        segmentation: the scores of the maps; None where predictions or ground truth have none.
-        tracking: the scores of the tracks; None if they were not asked for.
         driving: the scores of lines of the map, forecasts and planned paths that were asked for.
-        notes: what was assumed or left out, one line each.
     """
 
     pairs: FramePairs
-    config: DetectionConfig
-    detection: DetectionScores
-    segmentation: SegmentationScores | None
-    tracking: TrackingScores | None
-    notes: tuple[str, ...]
     driving: DrivingScores = field(default_factory=DrivingScores)
 
     def to_dict(self) -> dict[str, Any]:
-        """All scores as a dict for JSON, with the devkit's key names; undefined numbers are None."""
-        scores = scores_to_dict(self.detection, self.config, self.segmentation, self.notes, self.tracking)
-        return scores | finite(driving_to_dict(self.driving))
+        return super().to_dict() | finite(driving_to_dict(self.driving))
 
     def table(self) -> str:
-        """The scores as text for a terminal."""
         frames = f"{self.detection.frame_count} frames, matched by {self.pairs.matched_by}"
-        parts = [frames, scores_table(self.detection, self.segmentation, self.tracking), *driving_tables(self.driving)]
-        return "\n\n".join(parts)
+        return "\n\n".join([frames, super().table(), *driving_tables(self.driving)])
 
     def write_plots(self, folder: Path | str) -> list[Path]:
         """Write plots as PNG files into a folder, made where it is missing; return their paths. Raises OutputError."""
@@ -67,7 +52,7 @@ class Scores:
         figures = {
             "precision_recall.png": plots.draw_precision_recall(self.detection),
             "errors_by_range.png": plots.draw_errors_by_range(self.detection),
-            "misses_and_false_alarms.png": plots.draw_bev_sheet(self.detection, self.config, self.pairs),
+            "misses_and_false_alarms.png": plots.draw_bev_sheet(self.detection, self.pairs),
         }
         return plots.save_figures(figures, Path(folder))
 
@@ -126,7 +111,8 @@ def evaluate(
     drives = evaluate_driving(driving, Path(predictions), found, truth, pairs)
     limits = _range_notes(max_range, model_range, pairs)
     notes = (*pairs.notes, *map_notes, *_class_notes(pairs, classes), *limits, *_detection_notes(detection))
-    return Scores(pairs, config, detection, segmentation, tracks, (*notes, *track_notes, *drives.notes), drives)
+    notes = (*notes, *track_notes, *drives.notes)
+    return Scores(detection, segmentation, tracks, notes, pairs=pairs, driving=drives)
 
 
 def _range_notes(max_range: float | None, model_range: float | None, pairs: FramePairs) -> Iterator[str]:

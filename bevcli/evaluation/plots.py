@@ -13,8 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
 
-from bevcli.evaluation.config import ERRORS, DetectionConfig
-from bevcli.evaluation.detection_scores import RECALLS, ClassScores, DetectionScores
+from bevcli.evaluation.config import ERRORS
+from bevcli.evaluation.detection import DetectionScores
+from bevcli.evaluation.detection_scores import RECALLS, ClassScores
 from bevcli.evaluation.matching import ClassMatches, ScoredBoxes
 from bevcli.evaluation.pairing import FramePairs
 from bevcli.geometry.transforms import Array, apply, inverse
@@ -131,14 +132,14 @@ class _Outcome(NamedTuple):
     false: ScoredBoxes
 
 
-def draw_bev_sheet(detection: DetectionScores, config: DetectionConfig, pairs: FramePairs) -> Figure:
+def draw_bev_sheet(detection: DetectionScores, pairs: FramePairs) -> Figure:
     """Draw all missed ground truths and false positives as dots, and below them the frames with most, as boxes.
 
     Each class is cut at the score with the largest F1 at the error distance: an application would keep these boxes. The
     vehicle's forward direction is up.
     """
-    row = config.distances_m.index(config.error_distance_m)
-    outcomes = {matches.name: _best_outcome(matches, row) for matches in detection.matches}
+    config = detection.config
+    outcomes = {matches.name: _best_outcome(matches, config.error_row) for matches in detection.matches}
     threshold = f"largest F1 of each class at {config.error_distance_m:g} m"
     subtitle = f"score threshold: {threshold}; forward is up, rings every 10 m"
     figure = titled_figure((12, 10), "Missed ground truth and false positives, seen from above", subtitle)

@@ -2,10 +2,12 @@
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
-from bevcli.evaluation.config import ERRORS, DetectionConfig
-from bevcli.evaluation.detection_scores import DetectionScores, ScoreTable
+from bevcli.evaluation.config import ERRORS
+from bevcli.evaluation.detection import DetectionScores
+from bevcli.evaluation.detection_scores import ScoreTable
 from bevcli.evaluation.driving import DrivingScores
 from bevcli.evaluation.map_lines import THRESHOLDS_M
 from bevcli.evaluation.planning import PlanScores
@@ -16,16 +18,42 @@ from bevcli.printing import aligned
 _ERROR_HEADS = ("ATE m", "ASE", "AOE rad", "AVE m/s", "AAE")
 
 
-def scores_to_dict(
-    detection: DetectionScores,
-    config: DetectionConfig,
-    segmentation: SegmentationScores | None = None,
-    notes: tuple[str, ...] = (),
-    tracking: TrackingScores | None = None,
-) -> dict[str, Any]:
-    """All scores as a dict for JSON; undefined numbers are None. docs/scoring.md explains the keys."""
-    present = detection.overall.of_classes_with_ground_truth()
-    content = {
+@dataclass(frozen=True)
+class FrameScores:
+    """The scores of the boxes, maps and tracks of some frames.
+
+    Attributes:
+        detection: the scores of the boxes.
+        segmentation: the scores of the maps; None where predictions or ground truth have none.
+        tracking: the scores of the tracks; None if they were not asked for.
+        notes: what was assumed or left out, one line each.
+    """
+
+    detection: DetectionScores
+    segmentation: SegmentationScores | None = None
+    tracking: TrackingScores | None = None
+    notes: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """All scores as a dict for JSON; undefined numbers are None. docs/scoring.md explains the keys."""
+        return finite(_content(self))
+
+    def table(self) -> str:
+        """The scores of boxes by class, range and visibility, and those of maps and tracks, as text for a terminal."""
+        parts = [_classes(self.detection), _ranges(self.detection)]
+        if self.detection.by_visibility:
+            parts.append(_visibilities(self.detection))
+        if self.segmentation is not None:
+            parts.append(_maps(self.segmentation))
+        if self.tracking is not None:
+            parts.append(_tracks(self.tracking))
+        return "\n\n".join(parts)
+
+
+def _content(scores: FrameScores) -> dict[str, Any]:
+    detection, segmentation = scores.detection, scores.segmentation
+    present, config = detection.overall.of_classes_with_ground_truth(), detection.config
+    return {
         **_table_to_dict(detection.overall),
         "classes_with_ground_truth": {
             "classes": list(present.classes),
@@ -51,7 +79,7 @@ def scores_to_dict(
         "map_frames": 0 if segmentation is None else segmentation.frame_count,
         "ground_truth_boxes": detection.ground_truth_count,
         "prediction_boxes": detection.prediction_count,
-        "notes": list(notes),
+        "notes": list(scores.notes),
         "cfg": {
             "class_range": dict(config.class_ranges_m),
             "dist_ths": list(config.distances_m),
@@ -60,23 +88,8 @@ def scores_to_dict(
             "min_precision": config.min_precision,
             "mean_ap_weight": config.mean_ap_weight,
         },
-        **({} if tracking is None else {"tracking": _tracking_to_dict(tracking)}),
+        **({} if scores.tracking is None else {"tracking": _tracking_to_dict(scores.tracking)}),
     }
-    return finite(content)
-
-
-def scores_table(
-    detection: DetectionScores, segmentation: SegmentationScores | None, tracking: TrackingScores | None
-) -> str:
-    """Detection scores by class, range and visibility, and those of maps and tracks, as text for a terminal."""
-    parts = [_classes(detection), _ranges(detection)]
-    if detection.by_visibility:
-        parts.append(_visibilities(detection))
-    if segmentation is not None:
-        parts.append(_maps(segmentation))
-    if tracking is not None:
-        parts.append(_tracks(tracking))
-    return "\n\n".join(parts)
 
 
 def _table_to_dict(table: ScoreTable) -> dict[str, Any]:
