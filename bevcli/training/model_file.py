@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from bevcli.config import config_of_table, read_model_file
+from bevcli.config import load_config
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import Sequence
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
@@ -50,8 +50,7 @@ def write_model_file(
     if path.suffix != ".toml" or path.exists():
         raise OutputError(f"{path}: " + ("exists already" if path.exists() else "expected a name that ends in .toml"))
     name = re.sub(r"[^\w. +-]", "-", path.stem).lstrip("-. +")[:100] or "model"
-    base = config_of_table(*read_model_file(PRESETS[preset].model))
-    facts = look_at(_open_drives(data), base.bev_frame)
+    facts = look_at(_open_drives(data), load_config(PRESETS[preset][0]).bev_frame)
     table = model_table(name, preset, facts)
     lines = [f"Model {name} for {len(facts.drives)} drives, preset {preset}.", *_facts_lines(facts, table)]
     with tempfile.TemporaryDirectory() as folder:
