@@ -32,28 +32,11 @@ class StepFigure:
 
     Attributes:
         step: its name, the end of the file's name.
-        draw: draws it. The title is in the figure.
-        left_out: why it cannot be drawn of a trace, "" where it can.
+        draw: draws it, with its title, or says why it cannot be drawn of a trace.
     """
 
     step: str
-    draw: Callable[[Trace], Figure]
-    left_out: Callable[[Trace], str] = lambda trace: ""
-
-
-@dataclass(frozen=True)
-class FigureFile:
-    """One figure.
-
-    Attributes:
-        step: its name, `StepFigure.step`.
-        path: the file that was written; None where the figure was left out.
-        left_out: why it was left out, "" where it was written.
-    """
-
-    step: str
-    path: Path | None
-    left_out: str = ""
+    draw: Callable[[Trace], Figure | str]
 
 
 def figures_of(config: ModelConfig) -> tuple[StepFigure, ...]:
@@ -73,9 +56,10 @@ def check_figures(config: ModelConfig, folder: Path, *, force: bool) -> None:
 
 def write_figures(
     trace: Trace, folder: Path, image_format: ImageFormat = "png", *, untrained: bool = False
-) -> Iterator[FigureFile]:
-    """Writes `ARCHITECTURE-STEP.png` (or .jpg) per step into a folder, which is created; yields each file when written.
+) -> Iterator[tuple[str, Path | str]]:
+    """Writes `ARCHITECTURE-STEP.png` (or .jpg) per step into a folder, which is created.
 
+    Yields the name of each step with the file, when it is written, or with the reason why its figure is left out.
     untrained: whether the weights are random; then every figure is labelled UNTRAINED.
     Figures that the folder holds are replaced, also those of the other format.
     Raises OutputError when the folder or a file cannot be written.
@@ -85,20 +69,19 @@ def write_figures(
     except OSError as error:
         raise OutputError(f"{folder}: the folder for the figures cannot be made: {error.strerror}") from error
     for step in figures_of(trace.config):
-        reason = step.left_out(trace)
+        figure = step.draw(trace)
         paths = _paths(trace.config, step, folder)
         for ending, earlier in paths.items():
-            if reason or ending != image_format:
+            if isinstance(figure, str) or ending != image_format:
                 earlier.unlink(missing_ok=True)
-        if reason:
-            yield FigureFile(step.step, None, reason)
+        if isinstance(figure, str):
+            yield step.step, figure
             continue
-        figure = step.draw(trace)
         if untrained:
             figure.text(0.985, 0.985, "UNTRAINED", color=ACCENT, fontsize=17, fontweight="bold", ha="right", va="top")
         with whole_file(paths[image_format]) as unfinished:
             figure.savefig(unfinished, format=image_format, **SAVING[image_format])
-        yield FigureFile(step.step, paths[image_format])
+        yield step.step, paths[image_format]
 
 
 def _paths(config: ModelConfig, figure: StepFigure, folder: Path) -> dict[ImageFormat, Path]:
