@@ -49,7 +49,7 @@ class DetectionScores:
     @cached_property
     def by_visibility(self) -> tuple[VisibilityRecall, ...]:
         """Ranges of visibility; empty where ground truth has no visibilities."""
-        stated = [part for part in self.matches if not np.isnan(_visibilities(part)).all()]
+        stated = [part for part in self.matches if not np.isnan(part.ground_truth.column("visibilities")).all()]
         bins = self.config.visibility_bins if stated else ()
         return tuple(_visibility_recall(stated, self.config.error_row, *ends) for ends in bins)
 
@@ -98,28 +98,26 @@ def evaluate_detections(
     ego = np.zeros((len(predictions), 2)) if ego_xy is None else np.asarray(ego_xy, dtype=np.float64)
     truth, found = (_with_points(gather(side, ego)) for side in (ground_truth, predictions))
     matches = tuple(match_class(name, truth, found, config) for name in config.class_ranges_m)
-    return DetectionScores(len(predictions), matches, _unmeasured(truth.boxes), config)
+    return DetectionScores(len(predictions), matches, _unmeasured(truth), config)
 
 
 def _with_points(boxes: ScoredBoxes) -> ScoredBoxes:
     # On both sides, as in the devkit: then ground truth used as predictions has a perfect score.
-    assert boxes.boxes.num_points is not None
-    return boxes[boxes.boxes.num_points != 0]
+    return boxes[boxes.column("num_points") != 0]
 
 
 def _score_class(part: ClassMatches, config: DetectionConfig, unmeasured: tuple[str, ...]) -> ClassScores:
     truth_count = int(part.truth_counts.sum())
-    scores = part.predictions.boxes.scores
-    assert scores is not None
+    scores = part.predictions.column("scores")
     curves = {
         distance: recall_curve(matched[counts] >= 0, scores[counts], truth_count)
         for distance, matched, counts in zip(config.distances_m, part.matched, part.counts, strict=True)
     }
     row = config.error_row
     hits = np.flatnonzero(part.counts[row] & (part.matched[row] >= 0))
-    truths = part.ground_truth.boxes[part.matched[row][hits]]
+    truths = part.ground_truth[part.matched[row][hits]]
     one = config.classes[part.name]
-    errors = _true_positive_errors(truths, part.predictions.boxes[hits], symmetric=one.symmetric)
+    errors = _true_positive_errors(truths, part.predictions[hits], symmetric=one.symmetric)
     curve = curves[config.error_distance_m]
     undefined = {*one.undefined_errors, *unmeasured}
     return ClassScores(
@@ -135,7 +133,7 @@ def _score_class(part: ClassMatches, config: DetectionConfig, unmeasured: tuple[
     )
 
 
-def _true_positive_errors(truth: Boxes3D, found: Boxes3D, *, symmetric: bool) -> dict[str, Array]:
+def _true_positive_errors(truths: ScoredBoxes, predictions: ScoredBoxes, *, symmetric: bool) -> dict[str, Array]:
     """The five errors of M matched pairs of one class, each (M,), by the devkit's names.
 
     trans_err: distance of the centres on the ground, metres.
@@ -144,36 +142,32 @@ def _true_positive_errors(truth: Boxes3D, found: Boxes3D, *, symmetric: bool) ->
     vel_err: m/s; NaN where ground truth has no velocity.
     attr_err: 0 for the right attribute, 1 for a wrong one; NaN where ground truth has none.
     """
+    truth, found, attributes = truths.boxes, predictions.boxes, truths.column("attributes")
     offsets = found.centers[:, :2] - truth.centers[:, :2]
     intersection = np.minimum(truth.sizes_lwh, found.sizes_lwh).prod(axis=1)
     union = truth.sizes_lwh.prod(axis=1) + found.sizes_lwh.prod(axis=1) - intersection
     half_turns = 2 if symmetric else 1
     turn = wrap_angle(half_turns * (truth.yaws - found.yaws)) / half_turns
-    assert truth.attributes is not None
-    assert found.attributes is not None
     errors = (
         np.hypot(offsets[:, 0], offsets[:, 1]),
         1 - intersection / union,
         np.abs(turn),
         np.linalg.norm(found.velocities - truth.velocities, axis=1),
-        np.where(truth.attributes == "", np.nan, truth.attributes != found.attributes),
+        np.where(attributes == "", np.nan, attributes != predictions.column("attributes")),
     )
     return dict(zip(ERRORS, errors, strict=True))
 
 
-def _unmeasured(truth: Boxes3D) -> tuple[str, ...]:
+def _unmeasured(truth: ScoredBoxes) -> tuple[str, ...]:
     """The errors whose quantity no ground truth has."""
-    if not len(truth):
-        return ()
-    assert truth.attributes is not None
-    unknown = {"vel_err": np.isnan(truth.velocities).any(axis=1), "attr_err": truth.attributes == ""}
-    return tuple(name for name, each in unknown.items() if each.all())
+    unknown = {"vel_err": np.isnan(truth.boxes.velocities).any(axis=1), "attr_err": truth.column("attributes") == ""}
+    return tuple(name for name, each in unknown.items() if len(truth) and each.all())
 
 
 def _visibility_recall(matches: Sequence[ClassMatches], row: int, low: float, high: float) -> VisibilityRecall:
     counts = {}
     for part in matches:
-        visibility = _visibilities(part)
+        visibility = part.ground_truth.column("visibilities")
         inside = (visibility >= low) & (visibility < (high if high < 1 else np.inf))
         counts[part.name] = (int(part.found(row)[inside].sum()), int(inside.sum()))
     return VisibilityRecall(
@@ -183,8 +177,3 @@ def _visibility_recall(matches: Sequence[ClassMatches], row: int, low: float, hi
         found_count=sum(found for found, _ in counts.values()),
         recalls={name: found / total for name, (found, total) in counts.items() if total},
     )
-
-
-def _visibilities(part: ClassMatches) -> Array:
-    assert part.ground_truth.boxes.visibilities is not None
-    return part.ground_truth.boxes.visibilities

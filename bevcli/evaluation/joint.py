@@ -58,8 +58,7 @@ def _merged(parts: Sequence[ClassMatches]) -> ClassMatches:
     moved = [np.where(p.matched < 0, -1, p.matched + start) for p, start in zip(parts, starts, strict=False)]
     # Of equal scores the later one is first, as in `descending_scores`: the last drive comes first.
     predictions = _concatenated([part.predictions for part in parts[::-1]])
-    assert predictions.boxes.scores is not None
-    order = np.argsort(-predictions.boxes.scores, kind="stable")
+    order = np.argsort(-predictions.column("scores"), kind="stable")
     return ClassMatches(
         parts[0].name,
         _concatenated([part.ground_truth for part in parts]),

@@ -41,7 +41,13 @@ class ScoredBoxes:
 
     def __getitem__(self, selection: NDArray[Any]) -> ScoredBoxes:
         """The boxes selected by a mask (N,) bool or by indices."""
-        return ScoredBoxes(self.boxes[selection], self.frames[selection], self.ranges_m[selection])
+        return ScoredBoxes(*(column[selection] for column in vars(self).values()))
+
+    def column(self, name: str) -> NDArray[Any]:
+        """An optional column of the boxes."""
+        values: NDArray[Any] | None = getattr(self.boxes, name)
+        assert values is not None
+        return values
 
 
 def gather(frames: Sequence[Boxes3D], ego_xy: Array) -> ScoredBoxes:
@@ -110,8 +116,7 @@ def match_class(
     limit = config.class_ranges_m[name]
     truth = ground_truth[(ground_truth.boxes.classes == name) & (ground_truth.ranges_m < limit)]
     found = predictions[(predictions.boxes.classes == name) & (predictions.ranges_m < limit)]
-    assert found.boxes.scores is not None
-    found = found[descending_scores(found.boxes.scores)]
+    found = found[descending_scores(found.column("scores"))]
     matched = match_greedily(truth, found, config.distances_m)
     return ClassMatches(name, truth, found, matched, np.ones(len(truth), bool), np.ones(matched.shape, bool))
 

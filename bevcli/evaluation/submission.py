@@ -1,17 +1,18 @@
 """Predictions as a nuScenes submission for detection (results_nusc.json) or tracking, read and written."""
 
 import json
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
-from bevcli.geometry.transforms import rotation_from_quaternion, yaw_of_rotation
+from bevcli.geometry.transforms import Array, rotation_from_quaternion, yaw_of_rotation
 from bevcli.parsing.files import open_regular
 from bevcli.sequences.files.box_json import boxes_from_json
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
@@ -19,6 +20,9 @@ from bevcli.sequences.files.incremental_json import IncrementalJson, existing, r
 
 MAX_BOXES = 500  # per sample, by the rules of the benchmark; the best by score are kept
 TRACKED = tuple(name for name, one in NUSCENES_CLASSES.items() if one.tracked)
+# The keys that the submissions for a task do not share, and the columns of `Boxes3D` that they hold.
+DETECTION = {"detection_name": "classes", "detection_score": "scores", "attribute_name": "attributes"}
+TRACKING = {"tracking_id": "instances", "tracking_name": "classes", "tracking_score": "track_scores"}
 META = {"use_camera": True, "use_lidar": False, "use_radar": False, "use_map": False, "use_external": False}
 _TAIL = "}}"
 _PEEK_BYTES = 2048  # the kind of a file can be read from its beginning
@@ -48,12 +52,10 @@ def submission_boxes(boxes: Boxes3D, sample_token: str) -> list[dict[str, Any]]:
     boxes: in the world frame, with scores. Missing attributes follow from class and speed. An unknown velocity is
     written as 0.
     """
-    assert boxes.scores is not None or not len(boxes)
-    best = boxes if boxes.scores is None else boxes[np.argsort(-boxes.scores, kind="stable")[:MAX_BOXES]]
-    attributes = attributes_by_speed(best) if best.attributes is None else best.attributes
-    scores = np.zeros(0) if best.scores is None else best.scores
-    names = ("detection_name", "detection_score", "attribute_name")
-    return _objects(best, sample_token, names, (best.classes, scores, attributes))
+    if not len(boxes):
+        return []
+    attributes = attributes_by_speed(boxes) if boxes.attributes is None else boxes.attributes
+    return _objects(replace(boxes, attributes=attributes), sample_token, DETECTION, boxes.scores)
 
 
 def tracking_submission_boxes(boxes: Boxes3D, sample_token: str) -> list[dict[str, Any]]:
@@ -64,26 +66,23 @@ def tracking_submission_boxes(boxes: Boxes3D, sample_token: str) -> list[dict[st
     if boxes.instances is None or boxes.track_scores is None:
         return []
     tracked = boxes[(boxes.instances != "") & np.isin(boxes.classes, TRACKED)]
-    assert tracked.instances is not None
-    assert tracked.track_scores is not None
-    best = np.argsort(-tracked.track_scores, kind="stable")[:MAX_BOXES]
-    columns = (tracked.instances[best], tracked.classes[best], tracked.track_scores[best])
-    return _objects(tracked[best], sample_token, ("tracking_id", "tracking_name", "tracking_score"), columns)
+    return _objects(tracked, sample_token, TRACKING, tracked.track_scores)
 
 
-def _objects(
-    boxes: Boxes3D, sample_token: str, names: tuple[str, ...], columns: tuple[NDArray[Any], ...]
-) -> list[dict[str, Any]]:
-    """The keys that detection and tracking submissions share, and those of `names`, with a column each."""
-    none = np.zeros(len(boxes))
-    shared = {
-        "translation": boxes.centers,
-        "size": boxes.sizes_lwh[:, [1, 0, 2]],
-        "rotation": np.stack([np.cos(boxes.yaws / 2), none, none, np.sin(boxes.yaws / 2)], axis=-1),
-        "velocity": np.nan_to_num(boxes.velocities, nan=0.0),
+def _objects(boxes: Boxes3D, sample_token: str, own: Mapping[str, str], scores: Array | None) -> list[dict[str, Any]]:
+    """The best boxes by descending score. own: keys of the task, and their columns."""
+    assert scores is not None
+    best = boxes[np.argsort(-scores, kind="stable")[:MAX_BOXES]]
+    none = np.zeros(len(best))
+    columns = {
+        "translation": best.centers,
+        "size": best.sizes_lwh[:, [1, 0, 2]],
+        "rotation": np.stack([np.cos(best.yaws / 2), none, none, np.sin(best.yaws / 2)], axis=-1),
+        "velocity": np.nan_to_num(best.velocities, nan=0.0),
+        **{key: getattr(best, column) for key, column in own.items()},
     }
-    rows = zip(*(column.tolist() for column in (*shared.values(), *columns)), strict=True)
-    return [{"sample_token": sample_token, **dict(zip((*shared, *names), row, strict=True))} for row in rows]
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    return [{"sample_token": sample_token, **dict(zip(columns, row, strict=True))} for row in rows]
 
 
 def write_submission(boxes: BoxesFile, path: Path, *, tracking: bool = False) -> int:
@@ -145,17 +144,16 @@ def _frame_from_json(index: int, token: str, rows: Any, path: Path) -> FrameBoxe
 def _box_object(row: Any, where: str) -> dict[str, Any]:
     """A box of a submission with the keys of a boxes file, whose reader checks the values."""
     tracking = isinstance(row, dict) and "tracking_id" in row
-    own = ("tracking_name", "tracking_score") if tracking else ("detection_name", "detection_score", "attribute_name")
+    own = TRACKING if tracking else DETECTION
     needed = ("translation", "size", "rotation", "velocity", *own)
     missing = [key for key in needed if not isinstance(row, dict) or key not in row]
     if missing:
         raise InputError(f'{where}: "{missing[0]}" is missing')
-    size, extras = row["size"], {"attribute": row.get("attribute_name")}
+    size, extras = row["size"], {"score": row.get("detection_score"), "attribute": row.get("attribute_name")}
     if tracking:
-        extras = {"instance": row["tracking_id"], "track_score": row["tracking_score"]}
+        extras = dict.fromkeys(("score", "track_score"), row["tracking_score"]) | {"instance": row["tracking_id"]}
     return {
-        "class": row[own[0]],
-        "score": row[own[1]],
+        "class": row["tracking_name" if tracking else "detection_name"],
         **extras,
         "center": row["translation"],
         "size_lwh": [size[1], size[0], size[2]] if isinstance(size, list) and len(size) == 3 else size,
