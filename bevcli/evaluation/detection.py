@@ -8,13 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bevcli.evaluation.config import ERRORS, DetectionConfig
-from bevcli.evaluation.detection_scores import (
-    ClassScores,
-    RangeScores,
-    ScoreTable,
-    VisibilityRecall,
-    recall_curve,
-)
+from bevcli.evaluation.detection_scores import ClassScores, ScoreTable, recall_curve
 from bevcli.evaluation.matching import ClassMatches, ScoredBoxes, gather, match_class
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, wrap_angle
@@ -42,34 +36,28 @@ class DetectionScores:
         return self._table(self.matches)
 
     @cached_property
-    def by_range(self) -> tuple[RangeScores, ...]:
-        """Rings around the ego vehicle, nearest first."""
-        return tuple(self._within(*ends) for ends in self.config.range_bins_m)
+    def by_range(self) -> dict[tuple[float, float], ScoreTable]:
+        """By the radii of rings around the ego vehicle, nearest first, the classes that have ground truth there."""
+        bins = {ends: [part.within(*ends) for part in self.matches] for ends in self.config.range_bins_m}
+        return {ends: self._table_of_present(matches) for ends, matches in bins.items()}
 
     @cached_property
-    def by_visibility(self) -> tuple[VisibilityRecall, ...]:
-        """Ranges of visibility; empty where ground truth has no visibilities."""
-        stated = [part for part in self.matches if not np.isnan(part.ground_truth.column("visibilities")).all()]
-        bins = self.config.visibility_bins if stated else ()
-        return tuple(_visibility_recall(stated, self.config.error_row, *ends) for ends in bins)
+    def by_visibility(self) -> dict[tuple[float, float], ScoreTable]:
+        """By the ends of ranges of visibility, the classes that have such ground truth, without false positives.
 
-    @property
-    def prediction_count(self) -> int:
-        """Number of predictions inside the ranges of their classes."""
-        return sum(scores.prediction_count for scores in self.overall.classes.values())
+        Empty where ground truth has no visibilities.
+        """
+        if all(np.isnan(part.ground_truth.column("visibilities")).all() for part in self.matches):
+            return {}
+        bins = {ends: [part.visible(*ends) for part in self.matches] for ends in self.config.visibility_bins}
+        return {ends: self._table_of_present(matches) for ends, matches in bins.items()}
 
-    @property
-    def ground_truth_count(self) -> int:
-        """Number of ground truths inside the ranges of their classes."""
-        return sum(scores.ground_truth_count for scores in self.overall.classes.values())
+    def _table_of_present(self, matches: Sequence[ClassMatches]) -> ScoreTable:
+        return self._table([part for part in matches if part.truth_counts.any()])
 
     def _table(self, matches: Sequence[ClassMatches]) -> ScoreTable:
         scores = {part.name: _score_class(part, self.config, self.unmeasured) for part in matches}
         return ScoreTable(scores, self.config.mean_ap_weight)
-
-    def _within(self, low: float, high: float) -> RangeScores:
-        parts = [part.within(low, high) for part in self.matches]
-        return RangeScores(low, high, self._table([part for part in parts if part.truth_counts.any()]))
 
 
 def evaluate_detections(
@@ -162,18 +150,3 @@ def _unmeasured(truth: ScoredBoxes) -> tuple[str, ...]:
     """The errors whose quantity no ground truth has."""
     unknown = {"vel_err": np.isnan(truth.boxes.velocities).any(axis=1), "attr_err": truth.column("attributes") == ""}
     return tuple(name for name, each in unknown.items() if len(truth) and each.all())
-
-
-def _visibility_recall(matches: Sequence[ClassMatches], row: int, low: float, high: float) -> VisibilityRecall:
-    counts = {}
-    for part in matches:
-        visibility = part.ground_truth.column("visibilities")
-        inside = (visibility >= low) & (visibility < (high if high < 1 else np.inf))
-        counts[part.name] = (int(part.found(row)[inside].sum()), int(inside.sum()))
-    return VisibilityRecall(
-        low,
-        high,
-        ground_truth_count=sum(total for _, total in counts.values()),
-        found_count=sum(found for found, _ in counts.values()),
-        recalls={name: found / total for name, (found, total) in counts.items() if total},
-    )

@@ -104,6 +104,21 @@ class ScoreTable:
     mean_ap_weight: float
 
     @property
+    def ground_truth_count(self) -> int:
+        """Number of ground truths."""
+        return sum(scores.ground_truth_count for scores in self.classes.values())
+
+    @property
+    def prediction_count(self) -> int:
+        """Number of predictions."""
+        return sum(scores.prediction_count for scores in self.classes.values())
+
+    @property
+    def mean_recall(self) -> float:
+        """The mean recall over the classes that have ground truth; NaN without any."""
+        return known_mean(scores.recall for scores in self.classes.values())
+
+    @property
     def mean_ap(self) -> float:
         """mAP: the mean over the classes."""
         return known_mean(scores.mean_ap for scores in self.classes.values())
@@ -128,45 +143,6 @@ class ScoreTable:
         """The table of only those classes that have ground truth."""
         kept = {name: scores for name, scores in self.classes.items() if scores.ground_truth_count}
         return ScoreTable(kept, self.mean_ap_weight)
-
-
-@dataclass(frozen=True)
-class RangeScores:
-    """Scores in a ring around the ego vehicle.
-
-    Attributes:
-        low_m: inner radius, included, metres.
-        high_m: outer radius, excluded, metres.
-        table: the classes that have ground truth in the ring.
-    """
-
-    low_m: float
-    high_m: float
-    table: ScoreTable
-
-
-@dataclass(frozen=True)
-class VisibilityRecall:
-    """Recall at the error distance of ground truth in a range of visibility.
-
-    Attributes:
-        low: lower end, included, 0 to 1.
-        high: upper end, excluded unless it is 1.
-        ground_truth_count: number of ground truths in the range.
-        found_count: number of those that are found.
-        recalls: by class, recall of the classes with such ground truth, 0 to 1.
-    """
-
-    low: float
-    high: float
-    ground_truth_count: int
-    found_count: int
-    recalls: Mapping[str, float]
-
-    @property
-    def mean_recall(self) -> float:
-        """The mean recall over the classes; NaN without any."""
-        return known_mean(self.recalls.values())
 
 
 def known_mean(values: Iterable[float]) -> float:

@@ -195,7 +195,7 @@ def _class_notes(pairs: FramePairs, classes: Mapping[str, ObjectClass]) -> Itera
 
 
 def _detection_notes(detection: DetectionScores) -> Iterator[str]:
-    if not detection.prediction_count:
+    if not detection.overall.prediction_count:
         yield "the predictions contain no box within the class ranges: every score is 0"
     classes = detection.overall.classes
     absent = [name for name, scores in classes.items() if not scores.ground_truth_count]

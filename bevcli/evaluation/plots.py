@@ -78,20 +78,20 @@ def draw_precision_recall(detection: DetectionScores) -> Figure:
 
 def draw_errors_by_range(detection: DetectionScores) -> Figure:
     """AP and the five true-positive errors by distance from the ego vehicle, for each class and their mean."""
-    bins = [part for part in detection.by_range if part.table.classes]
+    bins = {ends: table for ends, table in detection.by_range.items() if table.classes}
     subtitle = "thick: mean of the classes; no point where nothing was found"
     figure = titled_figure((15, 8.5), "AP and errors by range", subtitle)
     panels = figure.subplots(2, 3, sharex=True)
-    middles = [(part.low_m + part.high_m) / 2 for part in bins]
+    middles = [sum(ends) / 2 for ends in bins]
     for axes, error in zip(panels.flat, (None, *ERRORS), strict=True):
         for name, color in plot_colors(detection.overall.classes).items():
-            values = [_value(part.table.classes.get(name), error) for part in bins]
+            values = [_value(table.classes.get(name), error) for table in bins.values()]
             axes.plot(middles, values, color=color, linewidth=1, marker=".", label=name, alpha=0.8)
-        means = [part.table.mean_ap if error is None else part.table.errors[error] for part in bins]
+        means = [table.mean_ap if error is None else table.errors[error] for table in bins.values()]
         axes.plot(middles, means, color="black", linewidth=2.5, marker="o", label="mean")
         axes.set_title("AP" if error is None else _ERROR_TITLES[error], fontsize=11)
         axes.set_ylim(bottom=0)
-        axes.set_xticks(sorted({end for part in bins for end in (part.low_m, part.high_m)}))
+        axes.set_xticks(sorted({end for ends in bins for end in ends}))
         axes.grid(color=GRID_COLOR)
     for axes in panels[-1]:
         axes.set_xlabel("distance from the ego vehicle (m)")

@@ -61,24 +61,24 @@ def _content(scores: FrameScores) -> dict[str, Any]:
             "nd_score": present.nd_score,
         },
         "by_range": [
-            {"from_m": part.low_m, "to_m": part.high_m, **_table_to_dict(part.table)} for part in detection.by_range
+            {"from_m": low, "to_m": high, **_table_to_dict(table)} for (low, high), table in detection.by_range.items()
         ],
         "recall_by_visibility": [
             {
-                "from": part.low,
-                "to": part.high,
-                "recall": part.mean_recall,
-                "ground_truth_boxes": part.ground_truth_count,
-                "found_boxes": part.found_count,
-                "label_recalls": dict(part.recalls),
+                "from": low,
+                "to": high,
+                "recall": table.mean_recall,
+                "ground_truth_boxes": table.ground_truth_count,
+                "found_boxes": table.prediction_count,
+                "label_recalls": {name: one.recall for name, one in table.classes.items()},
             }
-            for part in detection.by_visibility
+            for (low, high), table in detection.by_visibility.items()
         ],
         "iou": None if segmentation is None else dict(segmentation.iou),
         "frames": detection.frame_count,
         "map_frames": 0 if segmentation is None else segmentation.frame_count,
-        "ground_truth_boxes": detection.ground_truth_count,
-        "prediction_boxes": detection.prediction_count,
+        "ground_truth_boxes": detection.overall.ground_truth_count,
+        "prediction_boxes": detection.overall.prediction_count,
         "notes": list(scores.notes),
         "cfg": {
             "class_range": dict(config.class_ranges_m),
@@ -126,26 +126,26 @@ def _classes(detection: DetectionScores) -> str:
         numbers = (scores.mean_ap, *scores.aps.values(), scores.recall, *(scores.errors[error] for error in ERRORS))
         rows.append((name, str(scores.ground_truth_count), *map(_number, numbers)))
     means = [_number(table.errors[name]) for name in ERRORS]
-    rows.append(("all", str(detection.ground_truth_count), _number(table.mean_ap), *[""] * len(distances), "", *means))
+    rows.append(("all", str(table.ground_truth_count), _number(table.mean_ap), *[""] * len(distances), "", *means))
     return f"{aligned(rows)}\n\nmAP {_number(table.mean_ap)}   NDS {_number(table.nd_score)}"
 
 
 def _ranges(detection: DetectionScores) -> str:
     bins = detection.by_range
-    rows = [("AP by range", *(f"{part.low_m:g}-{part.high_m:g} m" for part in bins))]
+    rows = [("AP by range", *(f"{low:g}-{high:g} m" for low, high in bins))]
     for name in detection.overall.classes:
-        found = [part.table.classes.get(name) for part in bins]
+        found = [table.classes.get(name) for table in bins.values()]
         rows.append((name, *(_number(scores.mean_ap) if scores else "-" for scores in found)))
-    rows.append(("mAP", *(_number(part.table.mean_ap) for part in bins)))
-    rows.append(("NDS", *(_number(part.table.nd_score) for part in bins)))
+    rows.append(("mAP", *(_number(table.mean_ap) for table in bins.values())))
+    rows.append(("NDS", *(_number(table.nd_score) for table in bins.values())))
     return aligned(rows)
 
 
 def _visibilities(detection: DetectionScores) -> str:
     rows = [("visibility", "boxes", "found", "recall, mean over classes")]
-    for part in detection.by_visibility:
-        percent = f"{100 * part.low:.0f}-{100 * part.high:.0f} %"
-        rows.append((percent, str(part.ground_truth_count), str(part.found_count), _number(part.mean_recall)))
+    for (low, high), table in detection.by_visibility.items():
+        counts = (str(table.ground_truth_count), str(table.prediction_count))
+        rows.append((f"{100 * low:.0f}-{100 * high:.0f} %", *counts, _number(table.mean_recall)))
     return aligned(rows)
 
 
