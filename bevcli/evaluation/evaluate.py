@@ -103,14 +103,14 @@ def evaluate(
     model_range = _model_range_m(found, pairs, classes) if max_range is None else None
     limit = max_range if model_range is None else model_range
     config = DetectionConfig.of(classes).for_frames(limit, ego_pose_known=pairs.ego_pose_known)
-    predicted = _with_attributes(pairs.predictions, classes)
-    detection = evaluate_detections(predicted, pairs.ground_truth, config, pairs.ego_xy)
+    predicted, true = ([frame.boxes for frame in side] for side in (pairs.predictions, pairs.ground_truth))
+    detection = evaluate_detections(_with_attributes(predicted, classes), true, config, pairs.ego_xy)
     segmentation, map_notes = _score_maps(found, truth, pairs)
     tracked = TrackingConfig.of(classes).for_frames(limit, ego_pose_known=pairs.ego_pose_known)
     tracks, track_notes = _score_tracks(pairs, tracked) if tracking else (None, [])
     drives = evaluate_driving(driving, Path(predictions), found, truth, pairs)
     limits = _range_notes(max_range, model_range, pairs)
-    notes = (*pairs.notes, *map_notes, *_class_notes(pairs, classes), *limits, *_detection_notes(detection))
+    notes = (*pairs.notes, *map_notes, *_class_notes(predicted, true, classes), *limits, *_detection_notes(detection))
     notes = (*notes, *track_notes, *drives.notes)
     return Scores(detection, segmentation, tracks, notes, pairs=pairs, driving=drives)
 
@@ -127,8 +127,9 @@ def _range_notes(max_range: float | None, model_range: float | None, pairs: Fram
 
 def _score_tracks(pairs: FramePairs, config: TrackingConfig) -> tuple[TrackingScores, list[str]]:
     """The scores of the tracks, and notes about what differs from nuScenes."""
-    stamps = pairs.ground_truth_stamps
-    scores = evaluate_tracking(pairs.predictions, pairs.ground_truth, stamps, config, pairs.ego_xy)
+    stamps = [frame.stamp for frame in pairs.ground_truth]
+    predicted, true = ([frame.boxes for frame in side] for side in (pairs.predictions, pairs.ground_truth))
+    scores = evaluate_tracking(predicted, true, stamps, config, pairs.ego_xy)
     notes = []
     if pairs.frame_of_reference != "world":
         notes.append(
@@ -160,9 +161,9 @@ def _score_maps(
         missing = "predictions" if found is None else "ground truth"
         return None, [f"maps are not scored: the {missing} have none"] if found or true else []
     indices = [
-        (one.index, other.index)
-        for one, other in zip(pairs.prediction_stamps, pairs.ground_truth_stamps, strict=True)
-        if found.has(one.index) and true.has(other.index)
+        (one.stamp.index, other.stamp.index)
+        for one, other in zip(pairs.predictions, pairs.ground_truth, strict=True)
+        if found.has(one.stamp.index) and true.has(other.stamp.index)
     ]
     left_out = len(pairs.predictions) - len(indices)
     notes = [f"{left_out} of {len(pairs.predictions)} frames lack a map on one side: left out"] if left_out else []
@@ -186,11 +187,13 @@ def _model_range_m(predictions: ScoredInput, pairs: FramePairs, classes: Mapping
     return float(stated)
 
 
-def _class_notes(pairs: FramePairs, classes: Mapping[str, ObjectClass]) -> Iterator[str]:
+def _class_notes(
+    predicted: Sequence[Boxes3D], true: Sequence[Boxes3D], classes: Mapping[str, ObjectClass]
+) -> Iterator[str]:
     """Name the classes on each side that are not scored."""
     if not are_nuscenes(classes):
         yield OWN_CLASSES
-    for side, frames in (("the ground truth", pairs.ground_truth), ("the predictions", pairs.predictions)):
+    for side, frames in (("the ground truth", true), ("the predictions", predicted)):
         yield from ClassNames(classes=classes).note(count_classes(frames), side)
 
 

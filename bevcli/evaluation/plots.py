@@ -220,7 +220,7 @@ def _draw_frame(axes: Axes, frame: int, outcomes: Iterable[_Outcome], pairs: Fra
             _draw_boxes(axes, part, ego_from_reference, color, style)
         counts += [len(part) for part in parts]
     _draw_ground(axes, radius)
-    stamp = pairs.ground_truth_stamps[frame]
+    stamp = pairs.ground_truth[frame].stamp
     scene = f"{stamp.scene} " if stamp.scene else ""
     axes.set_title(f"{scene}frame {stamp.index}\n{counts[1]} missed, {counts[2]} false positives", fontsize=10)
 
