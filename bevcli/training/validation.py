@@ -10,7 +10,7 @@ import numpy as np
 
 from bevcli.evaluation.config import DetectionConfig, TrackingConfig
 from bevcli.evaluation.detection import evaluate_detections
-from bevcli.evaluation.scores_report import FrameScores
+from bevcli.evaluation.scores_report import FrameScores, finite
 from bevcli.evaluation.segmentation import evaluate_segmentation
 from bevcli.evaluation.tracking.scoring import TrackingScores, evaluate_tracking
 from bevcli.frame import MAP_CLASSES, Frame, FrameStamp, Prediction
@@ -38,10 +38,6 @@ class DriveScores:
     cameras: int
     mean_ap: float
     nd_score: float
-
-    def to_dict(self) -> dict[str, str | int | float | None]:
-        """For JSON, which has no NaN."""
-        return {name: None if value != value else value for name, value in vars(self).items()}
 
 
 @dataclass(frozen=True)
@@ -72,7 +68,7 @@ class Validation(FrameScores):
         return ", ".join(f"{name} {value:.3f}" for name, value in self.summary().items() if not math.isnan(value))
 
     def to_dict(self) -> dict[str, Any]:
-        return super().to_dict() | ({"drives": [drive.to_dict() for drive in self.drives]} if self.drives else {})
+        return super().to_dict() | (finite({"drives": [vars(drive) for drive in self.drives]}) if self.drives else {})
 
     def table(self) -> str:
         scores = super().table()
