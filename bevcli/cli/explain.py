@@ -30,7 +30,7 @@ def explain(
     docs/bevformer.md explains the steps with these figures. For VAD two more figures show the objects and the map lines
     that its plan, and the motion of the object nearest to --cell, attended to: see docs/vad.md.
     """
-    from bevcli.explain.step_figure import check_figures, write_figures
+    from bevcli.explain.figure_files import check_figures, write_figures
     from bevcli.explain.trace import trace
     from bevcli.inference.load import load_model
     from bevcli.sequences.open import open_sequence

@@ -8,7 +8,6 @@ from matplotlib.figure import Figure
 
 from bevcli.explain import drawing
 from bevcli.explain.drawing import ACCENT, FAINT, GREY, INK, SECOND
-from bevcli.explain.step_figure import StepFigure
 from bevcli.explain.trace import Trace
 from bevcli.frame import Plan
 from bevcli.geometry.transforms import Array
@@ -147,4 +146,4 @@ def _draw_rows(axes: Axes, top: float, kind: str, rows: list[ROW]) -> None:
           color=GREY)  # fmt: skip
 
 
-FIGURES = (StepFigure("plan-attention", plan_attention), StepFigure("motion-attention", motion_attention))
+FIGURES: dict[str, drawing.Draw] = {"plan-attention": plan_attention, "motion-attention": motion_attention}

@@ -26,6 +26,7 @@ from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.recording.colors import Color, map_colors
 from bevcli.recording.log_bev import fit_colors
 
+Draw = Callable[[Trace], Figure | str]  # the figure of one step, with its title, or why it cannot be drawn of a trace
 Rect = tuple[float, float, float, float]  # left, bottom (in an image: top), width, height
 INK, GREY, FAINT = "#1f2430", "#6b7280", "#d7dae0"
 ACCENT, SECOND, THIRD, PALE = "#e4572e", "#1769aa", "#2a9d5c", "#9aa0ab"

@@ -12,7 +12,6 @@ from bevcli.explain.bev_figures import bev_queries, can_bus, encoder_layers, rec
 from bevcli.explain.camera_figures import image_features, pillars, spatial_attention
 from bevcli.explain.drawing import ACCENT, GREY, INK, LEAST_SCORE, SECOND
 from bevcli.explain.head_figures import box_code, decoder, segmentation
-from bevcli.explain.step_figure import StepFigure
 from bevcli.explain.trace import Trace
 
 HEIGHT = 7.7  # inches
@@ -123,17 +122,17 @@ def _arrow(canvas: Axes, start: tuple[float, float], end: tuple[float, float], c
 
 
 # In the order of the model.
-FIGURES = (
-    StepFigure("overview", overview),
-    StepFigure("image-features", image_features),
-    StepFigure("bev-queries", bev_queries),
-    StepFigure("can-bus", can_bus),
-    StepFigure("pillars", pillars),
-    StepFigure("spatial-attention", spatial_attention),
-    StepFigure("temporal-attention", temporal_attention),
-    StepFigure("encoder-layers", encoder_layers),
-    StepFigure("recurrence", recurrence),
-    StepFigure("decoder", decoder),
-    StepFigure("box-code", box_code),
-    StepFigure("segmentation", segmentation),
-)
+FIGURES: dict[str, drawing.Draw] = {
+    "overview": overview,
+    "image-features": image_features,
+    "bev-queries": bev_queries,
+    "can-bus": can_bus,
+    "pillars": pillars,
+    "spatial-attention": spatial_attention,
+    "temporal-attention": temporal_attention,
+    "encoder-layers": encoder_layers,
+    "recurrence": recurrence,
+    "decoder": decoder,
+    "box-code": box_code,
+    "segmentation": segmentation,
+}

@@ -11,11 +11,11 @@ from command_line import command
 from memory_drive import MemorySequence, make_rig
 
 from bevcli.errors import InputError, OutputError
-from bevcli.explain import step_figure as figures
+from bevcli.explain import figure_files as figures
 from bevcli.explain.drawing import project_bev
+from bevcli.explain.figure_files import check_figures, figures_of, write_figures
 from bevcli.explain.head_figures import reference_points
 from bevcli.explain.overview import FIGURES
-from bevcli.explain.step_figure import check_figures, figures_of, write_figures
 from bevcli.explain.trace import cell_at, trace
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner
@@ -24,7 +24,7 @@ from bevcli.model.pillar_projection import project_pillars
 SAMPLE = Path(__file__).parents[2] / "samples/street"
 CPU = torch.device("cpu")
 HISTORY_FIGURES = {"temporal-attention", "recurrence"}
-STEPS = [figure.step for figure in FIGURES]
+STEPS = [*FIGURES]
 
 
 def explain(*arguments) -> subprocess.CompletedProcess:
@@ -39,7 +39,7 @@ def write_all(folder: Path, *options: str) -> None:
 
 
 def draw_only(monkeypatch, *steps: str) -> None:
-    monkeypatch.setattr(figures, "figures_of", lambda _: [figure for figure in FIGURES if figure.step in steps])
+    monkeypatch.setattr(figures, "figures_of", lambda _: {step: FIGURES[step] for step in STEPS if step in steps})
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +130,7 @@ def test_the_first_frame_of_a_scene_has_no_figures_of_history(mini_model):
     sequence = MemorySequence(4, make_rig({"FRONT": 0.0, "BACK": 180.0}), scenes="aabb")
     traced = trace(mini_model, CPU, sequence, 2, (0.0, -5.0))
     assert traced.prediction.started_anew
-    left_out = {figure.step for figure in figures_of(mini_model.config) if isinstance(figure.draw(traced), str)}
+    left_out = {step for step, draw in figures_of(mini_model.config).items() if isinstance(draw(traced), str)}
     assert left_out == HISTORY_FIGURES | {"segmentation"}
 
 
