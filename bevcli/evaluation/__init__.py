@@ -9,7 +9,7 @@ Input:
 
 Metrics; they read no files:
     config              all parameters of the detection and the tracking score
-    detection           boxes of many frames -> AP, mAP, true-positive errors, NDS; the result is in `detection_scores`
+    detection           boxes of many frames -> AP, mAP, true-positive errors, NDS
     matching            the boxes of many frames as one array, and their greedy matching, the devkit's rule
     tracking            AMOTA and the numbers that come with it
     segmentation        IoU of BEV maps

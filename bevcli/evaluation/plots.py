@@ -14,8 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
 
 from bevcli.evaluation.config import ERRORS
-from bevcli.evaluation.detection import DetectionScores
-from bevcli.evaluation.detection_scores import RECALLS, ClassScores
+from bevcli.evaluation.detection import RECALLS, ClassScores, DetectionScores
 from bevcli.evaluation.matching import ClassMatches, ScoredBoxes
 from bevcli.evaluation.pairing import FramePairs
 from bevcli.geometry.transforms import Array, apply, inverse
@@ -121,7 +120,8 @@ def _value(scores: ClassScores | None, error: str | None) -> float:
 
 WORST_FRAMES = 4
 MAX_DOTS = 1500
-_MISSED, _FALSE, _FOUND = "#d62728", "#ff9d1e", "#3a9a4b"
+# Colour and style of the outlines, in the order of `_Outcome`.
+_OUTLINES = {"found": ("#3a9a4b", "-"), "missed": ("#d62728", "-"), "false positive": ("#ff9d1e", "--")}
 
 
 class _Outcome(NamedTuple):
@@ -175,8 +175,7 @@ def _legend(missed: Mapping[str, ScoredBoxes], false: Mapping[str, ScoredBoxes])
         Line2D([], [], color=colors[name], marker="o", ls="", label=f"{name} {len(part)} / {len(false[name])}")
         for name, part in missed.items()
     ]
-    outlines = ((_FOUND, "found"), (_MISSED, "missed"), (_FALSE, "false positive"))
-    return dots + [Line2D([], [], color=color, label=label) for color, label in outlines]
+    return dots + [Line2D([], [], color=color, label=label) for label, (color, _) in _OUTLINES.items()]
 
 
 def _radius(detection: DetectionScores) -> float:
@@ -216,7 +215,7 @@ def _draw_frame(axes: Axes, frame: int, outcomes: Iterable[_Outcome], pairs: Fra
     counts = np.zeros(3, dtype=int)
     for outcome in outcomes:
         parts = [part[part.frames == frame] for part in outcome]
-        for part, color, style in zip(parts, (_FOUND, _MISSED, _FALSE), ("-", "-", "--"), strict=True):
+        for part, (color, style) in zip(parts, _OUTLINES.values(), strict=True):
             _draw_boxes(axes, part, ego_from_reference, color, style)
         counts += [len(part) for part in parts]
     _draw_ground(axes, radius)

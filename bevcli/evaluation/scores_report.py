@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bevcli.evaluation.config import ERRORS
-from bevcli.evaluation.detection import DetectionScores
-from bevcli.evaluation.detection_scores import ScoreTable
+from bevcli.evaluation.detection import DetectionScores, ScoreTable
 from bevcli.evaluation.driving import DrivingScores
 from bevcli.evaluation.map_lines import THRESHOLDS_M
 from bevcli.evaluation.planning import PlanScores
