@@ -32,10 +32,6 @@ class DetectionTargets:
     labels: Tensor
     codes: Tensor
 
-    def to(self, device: torch.device) -> DetectionTargets:
-        """A copy on a device."""
-        return DetectionTargets(self.labels.to(device), self.codes.to(device))
-
 
 def detection_targets(boxes: Boxes3D, config: ModelConfig) -> DetectionTargets:
     """The `box_targets` of the boxes (ground truth, bev frame) with a centre inside the BEV grid."""

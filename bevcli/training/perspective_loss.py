@@ -276,8 +276,7 @@ class PerspectiveLossConfig:
     rotation_weight: float = 0.25
 
     def __post_init__(self) -> None:
-        weights = (self.class_weight, self.offset_weight, self.depth_weight, self.size_weight, self.rotation_weight)
-        if min(self.weight, self.layers, *weights) < 0:
+        if min(vars(self).values()) < 0:
             raise ValueError("layers and the weights must not be negative")
 
 

@@ -39,11 +39,6 @@ class SegmentationTargets:
     things: Tensor
     locations: Tensor
 
-    def to(self, device: torch.device) -> SegmentationTargets:
-        """A copy on a device."""
-        stuff = None if self.stuff is None else self.stuff.to(device)
-        return SegmentationTargets(stuff, self.things.to(device), self.locations.to(device))
-
 
 def segmentation_targets(
     boxes: Boxes3D,
@@ -129,7 +124,7 @@ class SegmentationLossConfig:
     pixel_weight: float = 10.0
 
     def __post_init__(self) -> None:
-        if min(self.class_weight, self.location_weight, self.dice_weight, self.pixel_weight) < 0:
+        if min(vars(self).values()) < 0:
             raise ValueError("the weights must not be negative")
 
 
