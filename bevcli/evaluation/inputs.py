@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from bevcli.errors import InputError
+from bevcli.evaluation.formats.nuscenes import is_submission, read_submission
 from bevcli.evaluation.pairing import FramePairs
-from bevcli.evaluation.submission import is_submission, read_submission
 from bevcli.frame import LINE_CLASSES, FrameStamp, Ground, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
