@@ -224,14 +224,12 @@ def evaluate_detections(
     assert len(predictions) == len(ground_truth)
     config = config or DetectionConfig()
     ego = np.zeros((len(predictions), 2)) if ego_xy is None else np.asarray(ego_xy, dtype=np.float64)
-    truth, found = (_with_points(gather(side, ego)) for side in (ground_truth, predictions))
+    # Boxes without points are left out on both sides, as in the devkit: then ground truth used as predictions has a
+    # perfect score.
+    sides = (gather(side, ego) for side in (ground_truth, predictions))
+    truth, found = (side[side.column("num_points") != 0] for side in sides)
     matches = tuple(match_class(name, truth, found, config) for name in config.class_ranges_m)
     return DetectionScores(len(predictions), matches, _unmeasured(truth), config)
-
-
-def _with_points(boxes: ScoredBoxes) -> ScoredBoxes:
-    # On both sides, as in the devkit: then ground truth used as predictions has a perfect score.
-    return boxes[boxes.column("num_points") != 0]
 
 
 def _score_class(part: ClassMatches, config: DetectionConfig, unmeasured: tuple[str, ...]) -> ClassScores:

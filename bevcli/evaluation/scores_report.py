@@ -224,7 +224,7 @@ def driving_to_dict(scores: DrivingScores) -> dict[str, Any]:
         content["plan"] = {
             "averaged_up_to_horizon": _horizons(plan, plan.averaged, plan.collisions),
             "at_horizon": _horizons(plan, plan.at, plan.collisions_with_vehicles),
-            "frames": plan.frame_count,
+            "frames": len(plan.distances_m),
         }
     return content
 
@@ -259,4 +259,4 @@ def driving_tables(scores: DrivingScores) -> Iterator[str]:
             cells = [[_number(factor * value) for value in of[name].values()] for of in (averaged, at)]
             rows.append((f"{name} {unit}", *cells[0], "", *cells[1]))
         explained = "left: mean up to the horizon (ST-P3, VAD); right: at the horizon, vehicles only (UniAD)"
-        yield f"{aligned(rows)}\n({plan.frame_count} paths; {explained})"
+        yield f"{aligned(rows)}\n({len(plan.distances_m)} paths; {explained})"

@@ -168,17 +168,13 @@ def measure_cost(job: TrainingJob, longest_s: float = LONGEST_S) -> Cost:
 
     config = replace(job.config, steps=10**6, evaluate_every=10**6, checkpoint_every=10**6)
     config = replace(config, clips=replace(config.clips, in_turn=1, short_share=0.0))
+    machine = f"{job.device.type}, {torch.get_num_threads()} threads"
     if job.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(job.device)
+        machine = torch.cuda.get_device_name(job.device)
     with contextlib.suppress(_EnoughMeasured):
         Trainer(replace(job, config=config)).run(after_update=after_update)
     spans = [later - earlier for earlier, later in pairwise(times)]
     update_s = sum(spans[1:]) / len(spans[1:]) if len(spans) > 1 else spans[0]
     reading_s = max(spans[0] - update_s, 0.0)
-    return Cost(job.config, _machine(job.device), update_s, reading_s, peak_memory(job.device))
-
-
-def _machine(device: torch.device) -> str:
-    if device.type == "cuda":
-        return torch.cuda.get_device_name(device)
-    return f"{device.type}, {torch.get_num_threads()} threads"
+    return Cost(job.config, machine, update_s, reading_s, peak_memory(job.device))
