@@ -178,8 +178,8 @@ class DetectionScores:
     @cached_property
     def by_range(self) -> dict[tuple[float, float], ScoreTable]:
         """By the radii of rings around the ego vehicle, nearest first, the classes that have ground truth there."""
-        bins = {ends: [part.within(*ends) for part in self.matches] for ends in self.config.range_bins_m}
-        return {ends: self._table_of_present(matches) for ends, matches in bins.items()}
+        bins = self.config.range_bins_m
+        return {ends: self._table_of_present(part.within(*ends) for part in self.matches) for ends in bins}
 
     @cached_property
     def by_visibility(self) -> dict[tuple[float, float], ScoreTable]:
@@ -189,10 +189,10 @@ class DetectionScores:
         """
         if all(np.isnan(part.ground_truth.column("visibilities")).all() for part in self.matches):
             return {}
-        bins = {ends: [part.visible(*ends) for part in self.matches] for ends in self.config.visibility_bins}
-        return {ends: self._table_of_present(matches) for ends, matches in bins.items()}
+        bins = self.config.visibility_bins
+        return {ends: self._table_of_present(part.visible(*ends) for part in self.matches) for ends in bins}
 
-    def _table_of_present(self, matches: Sequence[ClassMatches]) -> ScoreTable:
+    def _table_of_present(self, matches: Iterable[ClassMatches]) -> ScoreTable:
         return self._table([part for part in matches if part.truth_counts.any()])
 
     def _table(self, matches: Sequence[ClassMatches]) -> ScoreTable:
