@@ -7,7 +7,7 @@ from typing import Any
 from bevcli.evaluation.known_mistakes import known_mistakes
 
 VALIDATION_FRAMES = 6019  # of the nuScenes validation split
-# By the name of a score: its key in `scores_to_dict`, and its unit.
+# By the name of a score: its key in `FrameScores.to_dict`, and its unit.
 SCORES = {
     "NDS": ("nd_score", "%"),
     "mAP": ("mean_ap", "%"),

@@ -7,7 +7,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pyarrow as pa
@@ -23,7 +23,6 @@ from bevcli.errors import OutputError
 from bevcli.evaluation.config import ERRORS, DetectionConfig
 from bevcli.evaluation.evaluate import OWN_CLASSES
 from bevcli.evaluation.joint import DriveMatches, score_jointly
-from bevcli.evaluation.scores_report import scores_to_dict
 from bevcli.frame import MAP_CLASSES
 from bevcli.geometry.object_classes import are_nuscenes
 from bevcli.inference.load import Model
@@ -256,11 +255,10 @@ def joint_metrics(out: Storage, records: Sequence[Record], model: ModelConfig) -
         matches = list(pool.map(lambda record: _read_matches(out, record), scored))
     range_m = model.bev_grid.nearest_side_m
     config = DetectionConfig.of(model.object_classes).cut_at(range_m)
-    detection, segmentation = score_jointly(matches, config)
     notes = [f"{len(scored)} drives are scored together; nothing beyond {range_m:g} m is scored"]
     if not are_nuscenes(model.object_classes):
         notes.append(OWN_CLASSES)
-    return {"drives": len(scored), **scores_to_dict(detection, config, segmentation, tuple(notes))}
+    return {"drives": len(scored), **replace(score_jointly(matches, config), notes=tuple(notes)).to_dict()}
 
 
 def _read_matches(out: Storage, record: Record) -> DriveMatches:

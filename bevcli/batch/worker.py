@@ -207,7 +207,7 @@ def _score_columns(scores: Scores) -> Record:
     if scores.segmentation is not None:
         numbers |= {f"iou_{name}": value for name, value in scores.segmentation.iou.items()}
     defined = {name: None if np.isnan(value) else round(value, 6) for name, value in numbers.items()}
-    return {**defined, "ground_truth_boxes": scores.detection.ground_truth_count}
+    return {**defined, "ground_truth_boxes": scores.detection.overall.ground_truth_count}
 
 
 def _fetched(drive: Drive, job: Job, inputs: Path) -> Path:

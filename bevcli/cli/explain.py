@@ -30,7 +30,7 @@ def explain(
     docs/bevformer.md explains the steps with these figures. For VAD two more figures show the objects and the map lines
     that its plan, and the motion of the object nearest to --cell, attended to: see docs/vad.md.
     """
-    from bevcli.explain.step_figure import check_figures, write_figures
+    from bevcli.explain.figure_files import check_figures, write_figures
     from bevcli.explain.trace import trace
     from bevcli.inference.load import load_model
     from bevcli.sequences.open import open_sequence
@@ -46,5 +46,5 @@ def explain(
         say("note: the weights are UNTRAINED (random): the figures only show how data flows", err=True)
     x, y = traced.cell_center
     say(f"frame {traced.frame.stamp.index}, BEV cell at x {x:.2f} m, y {y:.2f} m (bev frame)")
-    for figure in write_figures(traced, out, options.image_format, untrained=loaded.untrained):
-        say(f"{figure.step}: left out, {figure.left_out}" if figure.path is None else str(figure.path))
+    for step, written in write_figures(traced, out, options.image_format, untrained=loaded.untrained):
+        say(f"{step}: left out, {written}" if isinstance(written, str) else written)

@@ -64,6 +64,11 @@ class DetectionConfig(ClassRanges):
     range_bins_m: tuple[tuple[float, float], ...] = ((0, 10), (10, 20), (20, 30), (30, 40), (40, 50))
     visibility_bins: tuple[tuple[float, float], ...] = ((0.0, 0.4), (0.4, 0.6), (0.6, 0.8), (0.8, 1.0))
 
+    @property
+    def error_row(self) -> int:
+        """Index of the matching distance for true-positive errors and recall."""
+        return self.distances_m.index(self.error_distance_m)
+
     @classmethod
     def of(cls, classes: Mapping[str, ObjectClass]) -> Self:
         """The score of these classes, each within its range."""

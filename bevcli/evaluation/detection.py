@@ -1,22 +1,203 @@
-"""The nuScenes detection score: AP, mAP, true-positive errors and NDS of boxes. Reads no files."""
+"""The nuScenes detection score, as of devkit 1.2.0: AP, mAP, true-positive errors and NDS of boxes. Reads no files."""
 
-from collections.abc import Sequence
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from bevcli.evaluation.config import ERRORS, DetectionConfig
-from bevcli.evaluation.detection_scores import (
-    ClassScores,
-    DetectionScores,
-    RangeScores,
-    ScoreTable,
-    VisibilityRecall,
-    recall_curve,
-)
 from bevcli.evaluation.matching import ClassMatches, ScoredBoxes, gather, match_class
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, wrap_angle
+
+RECALLS = np.linspace(0, 1, 101)
+
+
+@dataclass(frozen=True)
+class RecallCurve:
+    """One class at one matching distance.
+
+    Attributes:
+        precision: (101,), at RECALLS; 0 beyond the largest recall reached.
+        score: (101,), the score threshold at RECALLS; 0 beyond the largest recall reached.
+    """
+
+    precision: Array
+    score: Array
+
+    def average_precision(self, config: DetectionConfig) -> float:
+        """AP: the mean precision in excess of min_precision over recalls above min_recall, scaled to 0 to 1."""
+        above = self.precision[round(100 * config.min_recall) + 1 :] - config.min_precision
+        return float(np.mean(np.maximum(above, 0))) / (1 - config.min_precision)
+
+    def mean_error(self, config: DetectionConfig, scores: Array, errors: Array) -> float:
+        """The running mean of an error, averaged over recalls from min_recall to the largest reached; 1 if none.
+
+        scores: (M,), of the M true positives, descending. errors: (M,), their errors; NaN is ignored.
+        """
+        first, last = round(100 * config.min_recall) + 1, int(np.flatnonzero(self.score).max(initial=0))
+        if last < first:
+            return 1.0
+        along = np.interp(self.score[::-1], scores[::-1], _running_mean(errors)[::-1])[::-1]
+        return float(np.mean(along[first : last + 1]))
+
+
+def recall_curve(found: NDArray[np.bool_], scores: Array, ground_truth_count: int) -> RecallCurve:
+    """The curve of P predictions.
+
+    found: (P,), bool, whether the prediction is a true positive. scores: (P,), descending.
+    """
+    if not found.any():
+        return RecallCurve(np.zeros_like(RECALLS), np.zeros_like(RECALLS))
+    true_positives = np.cumsum(found).astype(np.float64)
+    precision = true_positives / np.arange(1, len(found) + 1)
+    recall = true_positives / ground_truth_count
+    return RecallCurve(*(np.interp(RECALLS, recall, values, right=0) for values in (precision, scores)))
+
+
+def _running_mean(values: Array) -> Array:
+    known = ~np.isnan(values)
+    if not known.any():
+        return np.ones(len(values))  # as in the devkit
+    counts = np.cumsum(known)
+    return np.divide(np.nancumsum(values), counts, out=np.zeros(len(values)), where=counts > 0)
+
+
+@dataclass(frozen=True)
+class ClassScores:
+    """The scores of one class.
+
+    Attributes:
+        ground_truth_count: number of ground truths.
+        prediction_count: number of predictions.
+        recall: share of ground truth that is found at the error distance, 0 to 1; NaN without ground truth.
+        aps: by matching distance in metres, average precision, 0 to 1.
+        errors: by the devkit's names, mean true-positive errors; NaN where undefined.
+        curves: by matching distance in metres.
+    """
+
+    ground_truth_count: int
+    prediction_count: int
+    recall: float
+    aps: Mapping[float, float]
+    errors: Mapping[str, float]
+    curves: Mapping[float, RecallCurve] = field(repr=False)
+
+    @property
+    def mean_ap(self) -> float:
+        """AP averaged over the matching distances."""
+        return known_mean(self.aps.values())
+
+
+@dataclass(frozen=True)
+class ScoreTable:
+    """The scores of several classes and their means; the means are NaN without any class.
+
+    Attributes:
+        classes: by name.
+        mean_ap_weight: weight of mAP in NDS.
+    """
+
+    classes: Mapping[str, ClassScores]
+    mean_ap_weight: float
+
+    @property
+    def ground_truth_count(self) -> int:
+        """Number of ground truths."""
+        return sum(scores.ground_truth_count for scores in self.classes.values())
+
+    @property
+    def prediction_count(self) -> int:
+        """Number of predictions."""
+        return sum(scores.prediction_count for scores in self.classes.values())
+
+    @property
+    def mean_recall(self) -> float:
+        """The mean recall over the classes that have ground truth; NaN without any."""
+        return known_mean(scores.recall for scores in self.classes.values())
+
+    @property
+    def mean_ap(self) -> float:
+        """mAP: the mean over the classes."""
+        return known_mean(scores.mean_ap for scores in self.classes.values())
+
+    @property
+    def errors(self) -> dict[str, float]:
+        """The mean of each error over the classes for which it is defined; NaN without any."""
+        return {name: known_mean(scores.errors[name] for scores in self.classes.values()) for name in ERRORS}
+
+    @property
+    def error_scores(self) -> dict[str, float]:
+        """Each error as a score: 1 - error, at least 0."""
+        return {name: value if math.isnan(value) else max(0.0, 1 - value) for name, value in self.errors.items()}
+
+    @property
+    def nd_score(self) -> float:
+        """NDS, the nuScenes detection score: the weighted mean of mAP and of all defined error scores."""
+        known = [score for score in self.error_scores.values() if not math.isnan(score)]
+        return (self.mean_ap_weight * self.mean_ap + sum(known)) / (self.mean_ap_weight + len(known))
+
+    def of_classes_with_ground_truth(self) -> ScoreTable:
+        """The table of only those classes that have ground truth."""
+        kept = {name: scores for name, scores in self.classes.items() if scores.ground_truth_count}
+        return ScoreTable(kept, self.mean_ap_weight)
+
+
+def known_mean(values: Iterable[float]) -> float:
+    """The mean of the values that are not NaN; NaN without any."""
+    known = [value for value in values if not math.isnan(value)]
+    return sum(known) / len(known) if known else math.nan
+
+
+@dataclass(frozen=True)
+class DetectionScores:
+    """The scores of the boxes of some frames. Each table is computed when it is first asked for.
+
+    Attributes:
+        frame_count: number of frames.
+        matches: by class, the matching.
+        unmeasured: names of errors that are left out, because no ground truth has the quantity.
+        config: parameters of the matching and of the score.
+    """
+
+    frame_count: int
+    matches: tuple[ClassMatches, ...] = field(repr=False)
+    unmeasured: tuple[str, ...]
+    config: DetectionConfig
+
+    @cached_property
+    def overall(self) -> ScoreTable:
+        """All classes, as in the devkit."""
+        return self._table(self.matches)
+
+    @cached_property
+    def by_range(self) -> dict[tuple[float, float], ScoreTable]:
+        """By the radii of rings around the ego vehicle, nearest first, the classes that have ground truth there."""
+        bins = self.config.range_bins_m
+        return {ends: self._table_of_present(part.within(*ends) for part in self.matches) for ends in bins}
+
+    @cached_property
+    def by_visibility(self) -> dict[tuple[float, float], ScoreTable]:
+        """By the ends of ranges of visibility, the classes that have such ground truth, without false positives.
+
+        Empty where ground truth has no visibilities.
+        """
+        if all(np.isnan(part.ground_truth.column("visibilities")).all() for part in self.matches):
+            return {}
+        bins = self.config.visibility_bins
+        return {ends: self._table_of_present(part.visible(*ends) for part in self.matches) for ends in bins}
+
+    def _table_of_present(self, matches: Iterable[ClassMatches]) -> ScoreTable:
+        return self._table([part for part in matches if part.truth_counts.any()])
+
+    def _table(self, matches: Sequence[ClassMatches]) -> ScoreTable:
+        scores = {part.name: _score_class(part, self.config, self.unmeasured) for part in matches}
+        return ScoreTable(scores, self.config.mean_ap_weight)
 
 
 def evaluate_detections(
@@ -43,56 +224,26 @@ def evaluate_detections(
     assert len(predictions) == len(ground_truth)
     config = config or DetectionConfig()
     ego = np.zeros((len(predictions), 2)) if ego_xy is None else np.asarray(ego_xy, dtype=np.float64)
-    truth, found = (_with_points(gather(side, ego)) for side in (ground_truth, predictions))
+    # Boxes without points are left out on both sides, as in the devkit: then ground truth used as predictions has a
+    # perfect score.
+    sides = (gather(side, ego) for side in (ground_truth, predictions))
+    truth, found = (side[side.column("num_points") != 0] for side in sides)
     matches = tuple(match_class(name, truth, found, config) for name in config.class_ranges_m)
-    return score_matches(len(predictions), matches, _unmeasured(truth.boxes), config)
-
-
-def score_matches(
-    frame_count: int, matches: tuple[ClassMatches, ...], unmeasured: tuple[str, ...], config: DetectionConfig
-) -> DetectionScores:
-    """The scores of a matching, by class.
-
-    unmeasured: names of errors that are left out, because no ground truth has the quantity. config: of the matching.
-    """
-
-    def table(parts: Sequence[ClassMatches]) -> ScoreTable:
-        scores = {part.name: _score_class(part, config, unmeasured) for part in parts}
-        return ScoreTable(scores, config.mean_ap_weight)
-
-    def within(low: float, high: float) -> RangeScores:
-        parts = [part.within(low, high) for part in matches]
-        return RangeScores(low, high, table([part for part in parts if part.truth_counts.any()]))
-
-    return DetectionScores(
-        frame_count=frame_count,
-        overall=table(matches),
-        by_range=tuple(within(*ends) for ends in config.range_bins_m),
-        by_visibility=_recall_by_visibility(matches, config),
-        unmeasured=unmeasured,
-        matches=matches,
-    )
-
-
-def _with_points(boxes: ScoredBoxes) -> ScoredBoxes:
-    # On both sides, as in the devkit: then ground truth used as predictions has a perfect score.
-    assert boxes.boxes.num_points is not None
-    return boxes[boxes.boxes.num_points != 0]
+    return DetectionScores(len(predictions), matches, _unmeasured(truth), config)
 
 
 def _score_class(part: ClassMatches, config: DetectionConfig, unmeasured: tuple[str, ...]) -> ClassScores:
     truth_count = int(part.truth_counts.sum())
-    scores = part.predictions.boxes.scores
-    assert scores is not None
+    scores = part.predictions.column("scores")
     curves = {
         distance: recall_curve(matched[counts] >= 0, scores[counts], truth_count)
         for distance, matched, counts in zip(config.distances_m, part.matched, part.counts, strict=True)
     }
-    row = config.distances_m.index(config.error_distance_m)
+    row = config.error_row
     hits = np.flatnonzero(part.counts[row] & (part.matched[row] >= 0))
-    truths = part.ground_truth.boxes[part.matched[row][hits]]
+    truths = part.ground_truth[part.matched[row][hits]]
     one = config.classes[part.name]
-    errors = _true_positive_errors(truths, part.predictions.boxes[hits], symmetric=one.symmetric)
+    errors = _true_positive_errors(truths, part.predictions[hits], symmetric=one.symmetric)
     curve = curves[config.error_distance_m]
     undefined = {*one.undefined_errors, *unmeasured}
     return ClassScores(
@@ -108,7 +259,7 @@ def _score_class(part: ClassMatches, config: DetectionConfig, unmeasured: tuple[
     )
 
 
-def _true_positive_errors(truth: Boxes3D, found: Boxes3D, *, symmetric: bool) -> dict[str, Array]:
+def _true_positive_errors(truths: ScoredBoxes, predictions: ScoredBoxes, *, symmetric: bool) -> dict[str, Array]:
     """The five errors of M matched pairs of one class, each (M,), by the devkit's names.
 
     trans_err: distance of the centres on the ground, metres.
@@ -117,54 +268,23 @@ def _true_positive_errors(truth: Boxes3D, found: Boxes3D, *, symmetric: bool) ->
     vel_err: m/s; NaN where ground truth has no velocity.
     attr_err: 0 for the right attribute, 1 for a wrong one; NaN where ground truth has none.
     """
+    truth, found, attributes = truths.boxes, predictions.boxes, truths.column("attributes")
     offsets = found.centers[:, :2] - truth.centers[:, :2]
     intersection = np.minimum(truth.sizes_lwh, found.sizes_lwh).prod(axis=1)
     union = truth.sizes_lwh.prod(axis=1) + found.sizes_lwh.prod(axis=1) - intersection
     half_turns = 2 if symmetric else 1
     turn = wrap_angle(half_turns * (truth.yaws - found.yaws)) / half_turns
-    assert truth.attributes is not None
-    assert found.attributes is not None
     errors = (
         np.hypot(offsets[:, 0], offsets[:, 1]),
         1 - intersection / union,
         np.abs(turn),
         np.linalg.norm(found.velocities - truth.velocities, axis=1),
-        np.where(truth.attributes == "", np.nan, truth.attributes != found.attributes),
+        np.where(attributes == "", np.nan, attributes != predictions.column("attributes")),
     )
     return dict(zip(ERRORS, errors, strict=True))
 
 
-def _unmeasured(truth: Boxes3D) -> tuple[str, ...]:
+def _unmeasured(truth: ScoredBoxes) -> tuple[str, ...]:
     """The errors whose quantity no ground truth has."""
-    if not len(truth):
-        return ()
-    assert truth.attributes is not None
-    unknown = {"vel_err": np.isnan(truth.velocities).any(axis=1), "attr_err": truth.attributes == ""}
-    return tuple(name for name, each in unknown.items() if each.all())
-
-
-def _recall_by_visibility(matches: Sequence[ClassMatches], config: DetectionConfig) -> tuple[VisibilityRecall, ...]:
-    """Recall in each bin; empty where ground truth has no visibilities."""
-    stated = [part for part in matches if not np.isnan(_visibilities(part)).all()]
-    row = config.distances_m.index(config.error_distance_m)
-    return tuple(_visibility_recall(stated, row, *ends) for ends in config.visibility_bins if stated)
-
-
-def _visibility_recall(matches: Sequence[ClassMatches], row: int, low: float, high: float) -> VisibilityRecall:
-    counts = {}
-    for part in matches:
-        visibility = _visibilities(part)
-        inside = (visibility >= low) & (visibility < (high if high < 1 else np.inf))
-        counts[part.name] = (int(part.found(row)[inside].sum()), int(inside.sum()))
-    return VisibilityRecall(
-        low,
-        high,
-        ground_truth_count=sum(total for _, total in counts.values()),
-        found_count=sum(found for found, _ in counts.values()),
-        recalls={name: found / total for name, (found, total) in counts.items() if total},
-    )
-
-
-def _visibilities(part: ClassMatches) -> Array:
-    assert part.ground_truth.boxes.visibilities is not None
-    return part.ground_truth.boxes.visibilities
+    unknown = {"vel_err": np.isnan(truth.boxes.velocities).any(axis=1), "attr_err": truth.column("attributes") == ""}
+    return tuple(name for name, each in unknown.items() if len(truth) and each.all())

@@ -92,7 +92,7 @@ def evaluate_driving(
     folder = predictions if predictions.is_dir() else predictions.parent
     lines = _lines(folder / LinesWriter.file_name, truth, pairs) if "map" in asked else None
     motion = _motion(found, truth, pairs) if "motion" in asked else None
-    plan, notes = _plan(folder / PlanWriter.file_name, found, truth, pairs) if "plan" in asked else (None, ())
+    plan, notes = _plan(folder / PlanWriter.file_name, truth, pairs) if "plan" in asked else (None, ())
     return DrivingScores(lines, motion, plan, notes)
 
 
@@ -117,7 +117,7 @@ def _lines(file: Path, truth: ScoredInput, pairs: FramePairs) -> LineScores:
             f"{true.frame_of_reference} frame (expected the same)"
         )
     found_of, true_of = ({frame.stamp: frame.lines for frame in side.frames} for side in (found, true))
-    stamps = zip(pairs.prediction_stamps, pairs.ground_truth_stamps, strict=True)
+    stamps = [(one.stamp, other.stamp) for one, other in zip(pairs.predictions, pairs.ground_truth, strict=True)]
     lines = [(found_of[one], true_of[other]) for one, other in stamps if one in found_of and other in true_of]
     if not lines:
         raise InputError("`map`: no frame has both predicted and true lines")
@@ -129,26 +129,24 @@ def _motion(found: ScoredInput, truth: ScoredInput, pairs: FramePairs) -> dict[s
     drives, times = _drives(truth, pairs, "motion"), _times(pairs.predictions)
     ranges = [found.boxes.extras.get(key, [-np.inf, np.inf]) for key in ("x_range_m", "y_range_m")]
     low, high = np.array(ranges, dtype=np.float64).T
-    of_stamp = {frame.stamp: frame for frame in found.boxes.frames}
 
     def inside(boxes: Boxes3D, bev_from_world: Array) -> Boxes3D:
         centers = apply(bev_from_world, boxes.centers)[:, :2]
         return boxes[((centers >= low) & (centers <= high)).all(1)]
 
-    def scored(place: int) -> tuple[Boxes3D, Boxes3D]:
-        ego_from_bev = ego_from_bev_of(of_stamp[pairs.prediction_stamps[place]])
-        bev_from_world = inverse(pairs.reference_from_ego[place] @ ego_from_bev)
-        true = with_true_futures(pairs.ground_truth[place], pairs.ground_truth_stamps[place], drives, times)
-        return inside(pairs.predictions[place], bev_from_world), inside(true, bev_from_world)
+    def scored(predicted: FrameBoxes, true: FrameBoxes, world_from_ego: Array) -> tuple[Boxes3D, Boxes3D]:
+        bev_from_world = inverse(world_from_ego @ ego_from_bev_of(predicted))
+        with_futures = with_true_futures(true.boxes, true.stamp, drives, times)
+        return inside(predicted.boxes, bev_from_world), inside(with_futures, bev_from_world)
 
-    return evaluate_motion(map(scored, range(len(pairs.predictions))))
+    return evaluate_motion(map(scored, pairs.predictions, pairs.ground_truth, pairs.reference_from_ego))
 
 
-def _times(predictions: Sequence[Boxes3D]) -> Array:
+def _times(predictions: Sequence[FrameBoxes]) -> Array:
     """(T,) seconds of the steps of the predicted futures."""
-    for boxes in predictions:
-        if boxes.futures is not None and len(boxes):
-            return np.asarray(boxes.futures[0, 0, :, 0])
+    for frame in predictions:
+        if frame.boxes.futures is not None and len(frame.boxes):
+            return np.asarray(frame.boxes.futures[0, 0, :, 0])
     raise InputError('`motion`: the predictions have no "futures" (expected those of a model that forecasts)')
 
 
@@ -160,18 +158,19 @@ def ego_from_bev_of(frame: FrameBoxes) -> Array:
     return pose_from_json(stated, "ego_from_bev", f"frame {frame.stamp.index}").matrix
 
 
-def _plan(file: Path, found: ScoredInput, truth: ScoredInput, pairs: FramePairs) -> tuple[PlanScores, tuple[str, ...]]:
+def _plan(file: Path, truth: ScoredInput, pairs: FramePairs) -> tuple[PlanScores, tuple[str, ...]]:
     drives, frames, left_out, guessed, times = _drives(truth, pairs, "plan"), [], 0, 0, np.zeros(0)
     plans = {planned.stamp: planned for planned in read_plans(file)}
-    of_stamp = {frame.stamp: frame for frame in found.boxes.frames}
-    stamps = zip(pairs.prediction_stamps, pairs.ground_truth_stamps, pairs.reference_from_ego, strict=True)
-    for stamp, true_stamp, world_from_ego in stamps:
-        if stamp not in plans:
+    for predicted, true, world_from_ego in zip(
+        pairs.predictions, pairs.ground_truth, pairs.reference_from_ego, strict=True
+    ):
+        if predicted.stamp not in plans:
             continue
-        if plans[stamp].frame_of_reference != "world":
+        planned = plans[predicted.stamp]
+        if planned.frame_of_reference != "world":
             raise InputError(f"{file}: `plan`: needs paths in the world frame (found the ego frame)")
-        plan, ego_from_bev = plans[stamp].plan, ego_from_bev_of(of_stamp[stamp])
-        later = [frame for seconds in plan.times_s if (frame := drives.after(true_stamp, seconds)) is not None]
+        plan, ego_from_bev = planned.plan, ego_from_bev_of(predicted)
+        later = [frame for seconds in plan.times_s if (frame := drives.after(true.stamp, seconds)) is not None]
         if len(later) < len(plan.times_s):
             left_out += 1
             continue

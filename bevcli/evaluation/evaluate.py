@@ -8,12 +8,11 @@ from statistics import median
 from typing import Any
 
 from bevcli.evaluation.config import DetectionConfig, TrackingConfig
-from bevcli.evaluation.detection import evaluate_detections
-from bevcli.evaluation.detection_scores import DetectionScores
+from bevcli.evaluation.detection import DetectionScores, evaluate_detections
 from bevcli.evaluation.driving import DrivingScores, Scored, evaluate_driving
 from bevcli.evaluation.inputs import ScoredInput, open_ground_truth, open_predictions, without_cycles_in_racks
 from bevcli.evaluation.pairing import FramePairs, pair_frames
-from bevcli.evaluation.scores_report import driving_tables, driving_to_dict, finite, scores_table, scores_to_dict
+from bevcli.evaluation.scores_report import FrameScores, driving_tables, driving_to_dict, finite
 from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmentation
 from bevcli.evaluation.tracking.scoring import TrackingScores, evaluate_tracking
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
@@ -27,38 +26,24 @@ OWN_CLASSES = (
 )
 
 
-@dataclass(frozen=True)
-class Scores:
+@dataclass(frozen=True, kw_only=True)
+class Scores(FrameScores):
     """The result of `evaluate`.
 
     Attributes:
         pairs: the frames that were scored.
-        config: the parameters of the detection score.
-        detection: the scores of the boxes.
-        segmentation: the scores of the maps; None where predictions or ground truth have none.
-        tracking: the scores of the tracks; None if they were not asked for.
         driving: the scores of lines of the map, forecasts and planned paths that were asked for.
-        notes: what was assumed or left out, one line each.
     """
 
     pairs: FramePairs
-    config: DetectionConfig
-    detection: DetectionScores
-    segmentation: SegmentationScores | None
-    tracking: TrackingScores | None
-    notes: tuple[str, ...]
     driving: DrivingScores = field(default_factory=DrivingScores)
 
     def to_dict(self) -> dict[str, Any]:
-        """All scores as a dict for JSON, with the devkit's key names; undefined numbers are None."""
-        scores = scores_to_dict(self.detection, self.config, self.segmentation, self.notes, self.tracking)
-        return scores | finite(driving_to_dict(self.driving))
+        return super().to_dict() | finite(driving_to_dict(self.driving))
 
     def table(self) -> str:
-        """The scores as text for a terminal."""
         frames = f"{self.detection.frame_count} frames, matched by {self.pairs.matched_by}"
-        parts = [frames, scores_table(self.detection, self.segmentation, self.tracking), *driving_tables(self.driving)]
-        return "\n\n".join(parts)
+        return "\n\n".join([frames, super().table(), *driving_tables(self.driving)])
 
     def write_plots(self, folder: Path | str) -> list[Path]:
         """Write plots as PNG files into a folder, made where it is missing; return their paths. Raises OutputError."""
@@ -67,7 +52,7 @@ class Scores:
         figures = {
             "precision_recall.png": plots.draw_precision_recall(self.detection),
             "errors_by_range.png": plots.draw_errors_by_range(self.detection),
-            "misses_and_false_alarms.png": plots.draw_bev_sheet(self.detection, self.config, self.pairs),
+            "misses_and_false_alarms.png": plots.draw_bev_sheet(self.detection, self.pairs),
         }
         return plots.save_figures(figures, Path(folder))
 
@@ -118,15 +103,16 @@ def evaluate(
     model_range = _model_range_m(found, pairs, classes) if max_range is None else None
     limit = max_range if model_range is None else model_range
     config = DetectionConfig.of(classes).for_frames(limit, ego_pose_known=pairs.ego_pose_known)
-    predicted = _with_attributes(pairs.predictions, classes)
-    detection = evaluate_detections(predicted, pairs.ground_truth, config, pairs.ego_xy)
+    predicted, true = ([frame.boxes for frame in side] for side in (pairs.predictions, pairs.ground_truth))
+    detection = evaluate_detections(_with_attributes(predicted, classes), true, config, pairs.ego_xy)
     segmentation, map_notes = _score_maps(found, truth, pairs)
     tracked = TrackingConfig.of(classes).for_frames(limit, ego_pose_known=pairs.ego_pose_known)
     tracks, track_notes = _score_tracks(pairs, tracked) if tracking else (None, [])
     drives = evaluate_driving(driving, Path(predictions), found, truth, pairs)
     limits = _range_notes(max_range, model_range, pairs)
-    notes = (*pairs.notes, *map_notes, *_class_notes(pairs, classes), *limits, *_detection_notes(detection))
-    return Scores(pairs, config, detection, segmentation, tracks, (*notes, *track_notes, *drives.notes), drives)
+    notes = (*pairs.notes, *map_notes, *_class_notes(predicted, true, classes), *limits, *_detection_notes(detection))
+    notes = (*notes, *track_notes, *drives.notes)
+    return Scores(detection, segmentation, tracks, notes, pairs=pairs, driving=drives)
 
 
 def _range_notes(max_range: float | None, model_range: float | None, pairs: FramePairs) -> Iterator[str]:
@@ -141,8 +127,9 @@ def _range_notes(max_range: float | None, model_range: float | None, pairs: Fram
 
 def _score_tracks(pairs: FramePairs, config: TrackingConfig) -> tuple[TrackingScores, list[str]]:
     """The scores of the tracks, and notes about what differs from nuScenes."""
-    stamps = pairs.ground_truth_stamps
-    scores = evaluate_tracking(pairs.predictions, pairs.ground_truth, stamps, config, pairs.ego_xy)
+    stamps = [frame.stamp for frame in pairs.ground_truth]
+    predicted, true = ([frame.boxes for frame in side] for side in (pairs.predictions, pairs.ground_truth))
+    scores = evaluate_tracking(predicted, true, stamps, config, pairs.ego_xy)
     notes = []
     if pairs.frame_of_reference != "world":
         notes.append(
@@ -174,9 +161,9 @@ def _score_maps(
         missing = "predictions" if found is None else "ground truth"
         return None, [f"maps are not scored: the {missing} have none"] if found or true else []
     indices = [
-        (one.index, other.index)
-        for one, other in zip(pairs.prediction_stamps, pairs.ground_truth_stamps, strict=True)
-        if found.has(one.index) and true.has(other.index)
+        (one.stamp.index, other.stamp.index)
+        for one, other in zip(pairs.predictions, pairs.ground_truth, strict=True)
+        if found.has(one.stamp.index) and true.has(other.stamp.index)
     ]
     left_out = len(pairs.predictions) - len(indices)
     notes = [f"{left_out} of {len(pairs.predictions)} frames lack a map on one side: left out"] if left_out else []
@@ -200,16 +187,18 @@ def _model_range_m(predictions: ScoredInput, pairs: FramePairs, classes: Mapping
     return float(stated)
 
 
-def _class_notes(pairs: FramePairs, classes: Mapping[str, ObjectClass]) -> Iterator[str]:
+def _class_notes(
+    predicted: Sequence[Boxes3D], true: Sequence[Boxes3D], classes: Mapping[str, ObjectClass]
+) -> Iterator[str]:
     """Name the classes on each side that are not scored."""
     if not are_nuscenes(classes):
         yield OWN_CLASSES
-    for side, frames in (("the ground truth", pairs.ground_truth), ("the predictions", pairs.predictions)):
+    for side, frames in (("the ground truth", true), ("the predictions", predicted)):
         yield from ClassNames(classes=classes).note(count_classes(frames), side)
 
 
 def _detection_notes(detection: DetectionScores) -> Iterator[str]:
-    if not detection.prediction_count:
+    if not detection.overall.prediction_count:
         yield "the predictions contain no box within the class ranges: every score is 0"
     classes = detection.overall.classes
     absent = [name for name, scores in classes.items() if not scores.ground_truth_count]

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from bevcli.errors import InputError
+from bevcli.evaluation.formats.nuscenes import is_submission, read_submission
 from bevcli.evaluation.pairing import FramePairs
-from bevcli.evaluation.submission import is_submission, read_submission
 from bevcli.frame import LINE_CLASSES, FrameStamp, Ground, Sequence
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
@@ -95,20 +95,22 @@ def without_cycles_in_racks(pairs: FramePairs, bicycle_racks: Mapping[str, Boxes
     if not bicycle_racks:
         return pairs
     assert pairs.frame_of_reference == "world"
-    racks = [bicycle_racks.get(token or "", Boxes3D.empty()) for token in pairs.sample_tokens]
+    tokens = [frame.extras.get("sample_token", "") for frame in pairs.ground_truth]
+    racks = [bicycle_racks.get(token, Boxes3D.empty()) for token in tokens]
     found, true = (tuple(map(_outside, side, racks)) for side in (pairs.predictions, pairs.ground_truth))
     return replace(pairs, predictions=found, ground_truth=true)
 
 
-def _outside(boxes: Boxes3D, racks: Boxes3D) -> Boxes3D:
+def _outside(frame: FrameBoxes, racks: Boxes3D) -> FrameBoxes:
+    boxes = frame.boxes
     cycles = np.isin(boxes.classes, ("bicycle", "motorcycle"))
     if not len(racks) or not cycles.any():
-        return boxes
+        return frame
     inside = np.zeros(len(boxes), dtype=bool)
     for center, size, yaw in zip(racks.centers, racks.sizes_lwh, racks.yaws, strict=True):
         rack_from_world = np.linalg.inv(rigid(center, rotation_about_z(float(yaw))))
         inside |= (np.abs(apply(rack_from_world, boxes.centers)) <= size / 2).all(axis=1)
-    return boxes[~(cycles & inside)]
+    return replace(frame, boxes=boxes[~(cycles & inside)])
 
 
 def _maps_next_to(file: Path, name: str) -> MapFolder | None:

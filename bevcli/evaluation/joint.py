@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from bevcli.evaluation.config import DetectionConfig
-from bevcli.evaluation.detection import score_matches
-from bevcli.evaluation.detection_scores import DetectionScores
-from bevcli.evaluation.evaluate import Scores
+from bevcli.evaluation.detection import DetectionScores
 from bevcli.evaluation.matching import ClassMatches, ScoredBoxes, with_all_columns
+from bevcli.evaluation.scores_report import FrameScores
 from bevcli.evaluation.segmentation import SegmentationScores
 from bevcli.geometry.boxes import Boxes3D
 
@@ -33,15 +32,13 @@ class DriveMatches:
     segmentation: SegmentationScores | None
 
     @staticmethod
-    def of(scores: Scores) -> DriveMatches:
+    def of(scores: FrameScores) -> DriveMatches:
         """The part of the scores of a drive."""
         found = scores.detection
         return DriveMatches(found.frame_count, found.matches, found.unmeasured, scores.segmentation)
 
 
-def score_jointly(
-    drives: Sequence[DriveMatches], config: DetectionConfig
-) -> tuple[DetectionScores, SegmentationScores | None]:
+def score_jointly(drives: Sequence[DriveMatches], config: DetectionConfig) -> FrameScores:
     """The scores over all frames of the drives: AP of all boxes together, not a mean of the drives' scores.
 
     drives: at least one. config: the parameters with which every drive was matched.
@@ -50,9 +47,9 @@ def score_jointly(
     measured = [set(drive.unmeasured) for drive in drives if any(len(part.ground_truth) for part in drive.matches)]
     unmeasured = set.intersection(*measured) if measured else set()
     names = tuple(name for name in ("vel_err", "attr_err") if name in unmeasured)
-    detection = score_matches(sum(drive.frame_count for drive in drives), matches, names, config)
+    detection = DetectionScores(sum(drive.frame_count for drive in drives), matches, names, config)
     maps = [drive.segmentation for drive in drives if drive.segmentation is not None]
-    return detection, _merged_maps(maps) if maps else None
+    return FrameScores(detection, _merged_maps(maps) if maps else None)
 
 
 def _merged(parts: Sequence[ClassMatches]) -> ClassMatches:
@@ -61,8 +58,7 @@ def _merged(parts: Sequence[ClassMatches]) -> ClassMatches:
     moved = [np.where(p.matched < 0, -1, p.matched + start) for p, start in zip(parts, starts, strict=False)]
     # Of equal scores the later one is first, as in `descending_scores`: the last drive comes first.
     predictions = _concatenated([part.predictions for part in parts[::-1]])
-    assert predictions.boxes.scores is not None
-    order = np.argsort(-predictions.boxes.scores, kind="stable")
+    order = np.argsort(-predictions.column("scores"), kind="stable")
     return ClassMatches(
         parts[0].name,
         _concatenated([part.ground_truth for part in parts]),

@@ -18,7 +18,7 @@ def known_mistakes(metrics: Mapping[str, Any], *, temporal: bool = True) -> list
     """One line for each mistake whose pattern the scores have.
 
     Args:
-        metrics: of `scores_to_dict`. Only classes with ground truth that are found count.
+        metrics: of `FrameScores.to_dict`. Only classes with ground truth that are found count.
         temporal: whether the model was run with history.
     """
     aps: Mapping[str, float | None] = metrics["mean_dist_aps"]

@@ -41,7 +41,13 @@ class ScoredBoxes:
 
     def __getitem__(self, selection: NDArray[Any]) -> ScoredBoxes:
         """The boxes selected by a mask (N,) bool or by indices."""
-        return ScoredBoxes(self.boxes[selection], self.frames[selection], self.ranges_m[selection])
+        return ScoredBoxes(*(column[selection] for column in vars(self).values()))
+
+    def column(self, name: str) -> NDArray[Any]:
+        """An optional column of the boxes."""
+        values: NDArray[Any] | None = getattr(self.boxes, name)
+        assert values is not None
+        return values
 
 
 def gather(frames: Sequence[Boxes3D], ego_xy: Array) -> ScoredBoxes:
@@ -88,19 +94,27 @@ class ClassMatches:
 
         A true positive counts where its ground truth is, a false positive where it is itself, so that no pair is split.
         """
-        truth_inside, prediction_inside = (
-            (side.ranges_m >= low_m) & (side.ranges_m < high_m) for side in (self.ground_truth, self.predictions)
-        )
-        counts = np.broadcast_to(prediction_inside, self.matched.shape).copy()
-        is_match = self.matched >= 0
-        counts[is_match] = truth_inside[self.matched[is_match]]
-        return replace(self, truth_counts=truth_inside, counts=counts)
+        sides = (self.ground_truth, self.predictions)
+        return self._scored(*((side.ranges_m >= low_m) & (side.ranges_m < high_m) for side in sides))
 
-    def found(self, row: int) -> NDArray[np.bool_]:
-        """(G,), which ground truths are matched. row: index of the matching distance."""
-        found = np.zeros(len(self.ground_truth), dtype=bool)
-        found[self.matched[row][self.matched[row] >= 0]] = True
-        return found
+    def visible(self, low: float, high: float) -> ClassMatches:
+        """The same matching, scored only for ground truth with a visibility from low to below high, or up to 1.
+
+        A false positive has no visibility and counts nowhere.
+        """
+        visibility = self.ground_truth.column("visibilities")
+        inside = (visibility >= low) & (visibility < (high if high < 1 else np.inf))
+        return self._scored(inside, np.zeros(len(self.predictions), dtype=bool))
+
+    def _scored(self, truths: NDArray[np.bool_], false_positives: NDArray[np.bool_]) -> ClassMatches:
+        """The same matching, scored only for these ground truths and false positives.
+
+        truths: (G,). false_positives: (P,), which predictions count where they match nothing.
+        """
+        counts = np.broadcast_to(false_positives, self.matched.shape).copy()
+        is_match = self.matched >= 0
+        counts[is_match] = truths[self.matched[is_match]]
+        return replace(self, truth_counts=truths, counts=counts)
 
 
 def match_class(
@@ -110,8 +124,7 @@ def match_class(
     limit = config.class_ranges_m[name]
     truth = ground_truth[(ground_truth.boxes.classes == name) & (ground_truth.ranges_m < limit)]
     found = predictions[(predictions.boxes.classes == name) & (predictions.ranges_m < limit)]
-    assert found.boxes.scores is not None
-    found = found[descending_scores(found.boxes.scores)]
+    found = found[descending_scores(found.column("scores"))]
     matched = match_greedily(truth, found, config.distances_m)
     return ClassMatches(name, truth, found, matched, np.ones(len(truth), bool), np.ones(matched.shape, bool))
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.transforms import Array, Pose, inverse
@@ -19,25 +18,19 @@ class FramePairs:
 
     Attributes:
         frame_of_reference: of all boxes, "world", "ego" or "bev".
-        predictions: F sets of boxes.
-        ground_truth: F sets of boxes.
+        predictions: F frames, without boxes where only the ground truth has the frame.
+        ground_truth: F frames.
         reference_from_ego: (F, 4, 4), pose of the ego vehicle in the frame of reference.
         ego_pose_known: whether each frame has an ego pose on at least one side.
-        prediction_stamps: F stamps of the predictions' frames.
-        ground_truth_stamps: F stamps of the ground truth's frames.
-        sample_tokens: F tokens of the ground truth's frames, None where unknown.
         matched_by: the key by which frames were paired.
         notes: messages for the user, one line each.
     """
 
     frame_of_reference: str
-    predictions: tuple[Boxes3D, ...]
-    ground_truth: tuple[Boxes3D, ...]
+    predictions: tuple[FrameBoxes, ...]
+    ground_truth: tuple[FrameBoxes, ...]
     reference_from_ego: Array
     ego_pose_known: bool
-    prediction_stamps: tuple[FrameStamp, ...]
-    ground_truth_stamps: tuple[FrameStamp, ...]
-    sample_tokens: tuple[str | None, ...]
     matched_by: str
     notes: tuple[str, ...]
 
@@ -86,9 +79,6 @@ def pair_frames(predictions: BoxesFile, ground_truth: BoxesFile, *, count_missin
         ),
         reference_from_ego=np.stack([_reference_from_ego(reference, pose, ego_from_bev) for pose in poses]),
         ego_pose_known=all(pose is not None for pose in poses),
-        prediction_stamps=tuple(prediction.stamp for prediction, _ in pairs),
-        ground_truth_stamps=tuple(true.stamp for _, true in pairs),
-        sample_tokens=tuple(true.extras.get("sample_token") for _, true in pairs),
         matched_by=key,
         notes=notes,
     )
@@ -130,9 +120,9 @@ def _common_frame_of_reference(one: BoxesFile, other: BoxesFile) -> str:
     return "bev" if references == {"bev"} and not (one.ego_from_bev and other.ego_from_bev) else "ego"
 
 
-def _transformed(frame: FrameBoxes, file: BoxesFile, reference: str, world_from_ego: Pose | None) -> Boxes3D:
+def _transformed(frame: FrameBoxes, file: BoxesFile, reference: str, world_from_ego: Pose | None) -> FrameBoxes:
     if file.frame_of_reference == reference:
-        return frame.boxes
+        return frame
     ego_from_boxes = np.eye(4)
     if file.frame_of_reference == "bev":
         if file.ego_from_bev is None:
@@ -142,13 +132,13 @@ def _transformed(frame: FrameBoxes, file: BoxesFile, reference: str, world_from_
             )
         ego_from_boxes = file.ego_from_bev.matrix
     if reference == "ego":
-        return frame.boxes.transformed(ego_from_boxes)
+        return replace(frame, boxes=frame.boxes.transformed(ego_from_boxes))
     if world_from_ego is None:
         raise InputError(
             f"frame {frame.stamp.index}: boxes in the {file.frame_of_reference} frame cannot be transformed to the "
             'world frame: "world_from_ego" is missing in predictions and ground truth'
         )
-    return frame.boxes.transformed(world_from_ego.matrix @ ego_from_boxes)
+    return replace(frame, boxes=frame.boxes.transformed(world_from_ego.matrix @ ego_from_boxes))
 
 
 def _reference_from_ego(reference: str, world_from_ego: Pose | None, ego_from_bev: Pose | None) -> Array:

@@ -57,10 +57,6 @@ class PlanScores:
     collisions_with_vehicles: NDArray[np.bool_]
     step_s: float
 
-    @property
-    def frame_count(self) -> int:
-        return len(self.distances_m)
-
     def averaged(self, values: NDArray[np.generic], seconds: float) -> float:
         """The mean over all steps up to a horizon, as ST-P3 and VAD state it. values: an attribute."""
         return float(values[:, : self._steps(seconds)].mean())

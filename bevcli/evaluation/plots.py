@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
 
-from bevcli.evaluation.config import ERRORS, DetectionConfig
-from bevcli.evaluation.detection_scores import RECALLS, ClassScores, DetectionScores
+from bevcli.evaluation.config import ERRORS
+from bevcli.evaluation.detection import RECALLS, ClassScores, DetectionScores
 from bevcli.evaluation.matching import ClassMatches, ScoredBoxes
 from bevcli.evaluation.pairing import FramePairs
 from bevcli.geometry.transforms import Array, apply, inverse
@@ -77,20 +77,20 @@ def draw_precision_recall(detection: DetectionScores) -> Figure:
 
 def draw_errors_by_range(detection: DetectionScores) -> Figure:
     """AP and the five true-positive errors by distance from the ego vehicle, for each class and their mean."""
-    bins = [part for part in detection.by_range if part.table.classes]
+    bins = {ends: table for ends, table in detection.by_range.items() if table.classes}
     subtitle = "thick: mean of the classes; no point where nothing was found"
     figure = titled_figure((15, 8.5), "AP and errors by range", subtitle)
     panels = figure.subplots(2, 3, sharex=True)
-    middles = [(part.low_m + part.high_m) / 2 for part in bins]
+    middles = [sum(ends) / 2 for ends in bins]
     for axes, error in zip(panels.flat, (None, *ERRORS), strict=True):
         for name, color in plot_colors(detection.overall.classes).items():
-            values = [_value(part.table.classes.get(name), error) for part in bins]
+            values = [_value(table.classes.get(name), error) for table in bins.values()]
             axes.plot(middles, values, color=color, linewidth=1, marker=".", label=name, alpha=0.8)
-        means = [part.table.mean_ap if error is None else part.table.errors[error] for part in bins]
+        means = [table.mean_ap if error is None else table.errors[error] for table in bins.values()]
         axes.plot(middles, means, color="black", linewidth=2.5, marker="o", label="mean")
         axes.set_title("AP" if error is None else _ERROR_TITLES[error], fontsize=11)
         axes.set_ylim(bottom=0)
-        axes.set_xticks(sorted({end for part in bins for end in (part.low_m, part.high_m)}))
+        axes.set_xticks(sorted({end for ends in bins for end in ends}))
         axes.grid(color=GRID_COLOR)
     for axes in panels[-1]:
         axes.set_xlabel("distance from the ego vehicle (m)")
@@ -120,7 +120,8 @@ def _value(scores: ClassScores | None, error: str | None) -> float:
 
 WORST_FRAMES = 4
 MAX_DOTS = 1500
-_MISSED, _FALSE, _FOUND = "#d62728", "#ff9d1e", "#3a9a4b"
+# Colour and style of the outlines, in the order of `_Outcome`.
+_OUTLINES = {"found": ("#3a9a4b", "-"), "missed": ("#d62728", "-"), "false positive": ("#ff9d1e", "--")}
 
 
 class _Outcome(NamedTuple):
@@ -131,14 +132,14 @@ class _Outcome(NamedTuple):
     false: ScoredBoxes
 
 
-def draw_bev_sheet(detection: DetectionScores, config: DetectionConfig, pairs: FramePairs) -> Figure:
+def draw_bev_sheet(detection: DetectionScores, pairs: FramePairs) -> Figure:
     """Draw all missed ground truths and false positives as dots, and below them the frames with most, as boxes.
 
     Each class is cut at the score with the largest F1 at the error distance: an application would keep these boxes. The
     vehicle's forward direction is up.
     """
-    row = config.distances_m.index(config.error_distance_m)
-    outcomes = {matches.name: _best_outcome(matches, row) for matches in detection.matches}
+    config = detection.config
+    outcomes = {matches.name: _best_outcome(matches, config.error_row) for matches in detection.matches}
     threshold = f"largest F1 of each class at {config.error_distance_m:g} m"
     subtitle = f"score threshold: {threshold}; forward is up, rings every 10 m"
     figure = titled_figure((12, 10), "Missed ground truth and false positives, seen from above", subtitle)
@@ -174,8 +175,7 @@ def _legend(missed: Mapping[str, ScoredBoxes], false: Mapping[str, ScoredBoxes])
         Line2D([], [], color=colors[name], marker="o", ls="", label=f"{name} {len(part)} / {len(false[name])}")
         for name, part in missed.items()
     ]
-    outlines = ((_FOUND, "found"), (_MISSED, "missed"), (_FALSE, "false positive"))
-    return dots + [Line2D([], [], color=color, label=label) for color, label in outlines]
+    return dots + [Line2D([], [], color=color, label=label) for label, (color, _) in _OUTLINES.items()]
 
 
 def _radius(detection: DetectionScores) -> float:
@@ -215,11 +215,11 @@ def _draw_frame(axes: Axes, frame: int, outcomes: Iterable[_Outcome], pairs: Fra
     counts = np.zeros(3, dtype=int)
     for outcome in outcomes:
         parts = [part[part.frames == frame] for part in outcome]
-        for part, color, style in zip(parts, (_FOUND, _MISSED, _FALSE), ("-", "-", "--"), strict=True):
+        for part, (color, style) in zip(parts, _OUTLINES.values(), strict=True):
             _draw_boxes(axes, part, ego_from_reference, color, style)
         counts += [len(part) for part in parts]
     _draw_ground(axes, radius)
-    stamp = pairs.ground_truth_stamps[frame]
+    stamp = pairs.ground_truth[frame].stamp
     scene = f"{stamp.scene} " if stamp.scene else ""
     axes.set_title(f"{scene}frame {stamp.index}\n{counts[1]} missed, {counts[2]} false positives", fontsize=10)
 

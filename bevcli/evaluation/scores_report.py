@@ -2,10 +2,11 @@
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
-from bevcli.evaluation.config import ERRORS, DetectionConfig
-from bevcli.evaluation.detection_scores import DetectionScores, ScoreTable
+from bevcli.evaluation.config import ERRORS
+from bevcli.evaluation.detection import DetectionScores, ScoreTable
 from bevcli.evaluation.driving import DrivingScores
 from bevcli.evaluation.map_lines import THRESHOLDS_M
 from bevcli.evaluation.planning import PlanScores
@@ -16,16 +17,42 @@ from bevcli.printing import aligned
 _ERROR_HEADS = ("ATE m", "ASE", "AOE rad", "AVE m/s", "AAE")
 
 
-def scores_to_dict(
-    detection: DetectionScores,
-    config: DetectionConfig,
-    segmentation: SegmentationScores | None = None,
-    notes: tuple[str, ...] = (),
-    tracking: TrackingScores | None = None,
-) -> dict[str, Any]:
-    """All scores as a dict for JSON; undefined numbers are None. docs/scoring.md explains the keys."""
-    present = detection.overall.of_classes_with_ground_truth()
-    content = {
+@dataclass(frozen=True)
+class FrameScores:
+    """The scores of the boxes, maps and tracks of some frames.
+
+    Attributes:
+        detection: the scores of the boxes.
+        segmentation: the scores of the maps; None where predictions or ground truth have none.
+        tracking: the scores of the tracks; None if they were not asked for.
+        notes: what was assumed or left out, one line each.
+    """
+
+    detection: DetectionScores
+    segmentation: SegmentationScores | None = None
+    tracking: TrackingScores | None = None
+    notes: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """All scores as a dict for JSON; undefined numbers are None. docs/scoring.md explains the keys."""
+        return finite(_content(self))
+
+    def table(self) -> str:
+        """The scores of boxes by class, range and visibility, and those of maps and tracks, as text for a terminal."""
+        parts = [_classes(self.detection), _ranges(self.detection)]
+        if self.detection.by_visibility:
+            parts.append(_visibilities(self.detection))
+        if self.segmentation is not None:
+            parts.append(_maps(self.segmentation))
+        if self.tracking is not None:
+            parts.append(_tracks(self.tracking))
+        return "\n\n".join(parts)
+
+
+def _content(scores: FrameScores) -> dict[str, Any]:
+    detection, segmentation = scores.detection, scores.segmentation
+    present, config = detection.overall.of_classes_with_ground_truth(), detection.config
+    return {
         **_table_to_dict(detection.overall),
         "classes_with_ground_truth": {
             "classes": list(present.classes),
@@ -33,25 +60,25 @@ def scores_to_dict(
             "nd_score": present.nd_score,
         },
         "by_range": [
-            {"from_m": part.low_m, "to_m": part.high_m, **_table_to_dict(part.table)} for part in detection.by_range
+            {"from_m": low, "to_m": high, **_table_to_dict(table)} for (low, high), table in detection.by_range.items()
         ],
         "recall_by_visibility": [
             {
-                "from": part.low,
-                "to": part.high,
-                "recall": part.mean_recall,
-                "ground_truth_boxes": part.ground_truth_count,
-                "found_boxes": part.found_count,
-                "label_recalls": dict(part.recalls),
+                "from": low,
+                "to": high,
+                "recall": table.mean_recall,
+                "ground_truth_boxes": table.ground_truth_count,
+                "found_boxes": table.prediction_count,
+                "label_recalls": {name: one.recall for name, one in table.classes.items()},
             }
-            for part in detection.by_visibility
+            for (low, high), table in detection.by_visibility.items()
         ],
         "iou": None if segmentation is None else dict(segmentation.iou),
         "frames": detection.frame_count,
         "map_frames": 0 if segmentation is None else segmentation.frame_count,
-        "ground_truth_boxes": detection.ground_truth_count,
-        "prediction_boxes": detection.prediction_count,
-        "notes": list(notes),
+        "ground_truth_boxes": detection.overall.ground_truth_count,
+        "prediction_boxes": detection.overall.prediction_count,
+        "notes": list(scores.notes),
         "cfg": {
             "class_range": dict(config.class_ranges_m),
             "dist_ths": list(config.distances_m),
@@ -60,23 +87,8 @@ def scores_to_dict(
             "min_precision": config.min_precision,
             "mean_ap_weight": config.mean_ap_weight,
         },
-        **({} if tracking is None else {"tracking": _tracking_to_dict(tracking)}),
+        **({} if scores.tracking is None else {"tracking": _tracking_to_dict(scores.tracking)}),
     }
-    return finite(content)
-
-
-def scores_table(
-    detection: DetectionScores, segmentation: SegmentationScores | None, tracking: TrackingScores | None
-) -> str:
-    """Detection scores by class, range and visibility, and those of maps and tracks, as text for a terminal."""
-    parts = [_classes(detection), _ranges(detection)]
-    if detection.by_visibility:
-        parts.append(_visibilities(detection))
-    if segmentation is not None:
-        parts.append(_maps(segmentation))
-    if tracking is not None:
-        parts.append(_tracks(tracking))
-    return "\n\n".join(parts)
 
 
 def _table_to_dict(table: ScoreTable) -> dict[str, Any]:
@@ -113,26 +125,26 @@ def _classes(detection: DetectionScores) -> str:
         numbers = (scores.mean_ap, *scores.aps.values(), scores.recall, *(scores.errors[error] for error in ERRORS))
         rows.append((name, str(scores.ground_truth_count), *map(_number, numbers)))
     means = [_number(table.errors[name]) for name in ERRORS]
-    rows.append(("all", str(detection.ground_truth_count), _number(table.mean_ap), *[""] * len(distances), "", *means))
+    rows.append(("all", str(table.ground_truth_count), _number(table.mean_ap), *[""] * len(distances), "", *means))
     return f"{aligned(rows)}\n\nmAP {_number(table.mean_ap)}   NDS {_number(table.nd_score)}"
 
 
 def _ranges(detection: DetectionScores) -> str:
     bins = detection.by_range
-    rows = [("AP by range", *(f"{part.low_m:g}-{part.high_m:g} m" for part in bins))]
+    rows = [("AP by range", *(f"{low:g}-{high:g} m" for low, high in bins))]
     for name in detection.overall.classes:
-        found = [part.table.classes.get(name) for part in bins]
+        found = [table.classes.get(name) for table in bins.values()]
         rows.append((name, *(_number(scores.mean_ap) if scores else "-" for scores in found)))
-    rows.append(("mAP", *(_number(part.table.mean_ap) for part in bins)))
-    rows.append(("NDS", *(_number(part.table.nd_score) for part in bins)))
+    rows.append(("mAP", *(_number(table.mean_ap) for table in bins.values())))
+    rows.append(("NDS", *(_number(table.nd_score) for table in bins.values())))
     return aligned(rows)
 
 
 def _visibilities(detection: DetectionScores) -> str:
     rows = [("visibility", "boxes", "found", "recall, mean over classes")]
-    for part in detection.by_visibility:
-        percent = f"{100 * part.low:.0f}-{100 * part.high:.0f} %"
-        rows.append((percent, str(part.ground_truth_count), str(part.found_count), _number(part.mean_recall)))
+    for (low, high), table in detection.by_visibility.items():
+        counts = (str(table.ground_truth_count), str(table.prediction_count))
+        rows.append((f"{100 * low:.0f}-{100 * high:.0f} %", *counts, _number(table.mean_recall)))
     return aligned(rows)
 
 
@@ -212,7 +224,7 @@ def driving_to_dict(scores: DrivingScores) -> dict[str, Any]:
         content["plan"] = {
             "averaged_up_to_horizon": _horizons(plan, plan.averaged, plan.collisions),
             "at_horizon": _horizons(plan, plan.at, plan.collisions_with_vehicles),
-            "frames": plan.frame_count,
+            "frames": len(plan.distances_m),
         }
     return content
 
@@ -247,4 +259,4 @@ def driving_tables(scores: DrivingScores) -> Iterator[str]:
             cells = [[_number(factor * value) for value in of[name].values()] for of in (averaged, at)]
             rows.append((f"{name} {unit}", *cells[0], "", *cells[1]))
         explained = "left: mean up to the horizon (ST-P3, VAD); right: at the horizon, vehicles only (UniAD)"
-        yield f"{aligned(rows)}\n({plan.frame_count} paths; {explained})"
+        yield f"{aligned(rows)}\n({len(plan.distances_m)} paths; {explained})"

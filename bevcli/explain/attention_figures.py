@@ -1,7 +1,5 @@
 """Figures of a model that plans: the objects and the lines of the map that its plan, and one object's motion, used."""
 
-from functools import partial
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
@@ -10,7 +8,6 @@ from matplotlib.figure import Figure
 
 from bevcli.explain import drawing
 from bevcli.explain.drawing import ACCENT, FAINT, GREY, INK, SECOND
-from bevcli.explain.step_figure import StepFigure
 from bevcli.explain.trace import Trace
 from bevcli.frame import Plan
 from bevcli.geometry.transforms import Array
@@ -23,9 +20,11 @@ SURE = 0.5  # lines with a lower score are dashed
 ROW = tuple[float, str, float | None, Array | None]  # weight, name, score, place
 
 
-def plan_attention(trace: Trace) -> Figure:
+def plan_attention(trace: Trace) -> Figure | str:
     """The objects and lines by the planner's attention, and the planned paths."""
-    attention = trace.attentions["plan"]
+    attention = _attention("plan", trace)
+    if attention is None:
+        return "the frame has no plan"
     plan = next(result for result in trace.prediction.results if isinstance(result, Plan))
     chosen = plan.commands.index(plan.command) if plan.command else None
     told = f"command {plan.command} (thick path)" if plan.command else f"paths of {', '.join(plan.commands)}"
@@ -39,9 +38,11 @@ def plan_attention(trace: Trace) -> Figure:
     )
 
 
-def motion_attention(trace: Trace) -> Figure:
+def motion_attention(trace: Trace) -> Figure | str:
     """The objects and lines by the attention of one object, and its futures."""
-    attention = trace.attentions["motion"]
+    attention = _attention("motion", trace)
+    if attention is None:
+        return "the frame has no motion"
     assert attention.attending is not None
     box = attention.objects[[attention.attending]]
     assert box.scores is not None
@@ -54,6 +55,10 @@ def motion_attention(trace: Trace) -> Figure:
         "the one with the best score is thick.\nWeights are the mean over its modes. It attends to the lines near it "
         'with a score above a threshold, and to an entry "no line".',
     )
+
+
+def _attention(part: str, trace: Trace) -> SceneAttention | None:
+    return trace.attentions.get(part) if trace.prediction.results else None
 
 
 def _figure(trace: Trace, attention: SceneAttention, chosen: int | None, title: str, subtitle: str) -> Figure:
@@ -141,11 +146,4 @@ def _draw_rows(axes: Axes, top: float, kind: str, rows: list[ROW]) -> None:
           color=GREY)  # fmt: skip
 
 
-def _left_out(part: str, trace: Trace) -> str:
-    return "" if part in trace.attentions and trace.prediction.results else f"the frame has no {part}"
-
-
-FIGURES = (
-    StepFigure("plan-attention", plan_attention, partial(_left_out, "plan")),
-    StepFigure("motion-attention", motion_attention, partial(_left_out, "motion")),
-)
+FIGURES: dict[str, drawing.Draw] = {"plan-attention": plan_attention, "motion-attention": motion_attention}

@@ -43,8 +43,10 @@ def bev_queries(trace: Trace) -> Figure:
     return figure
 
 
-def temporal_attention(trace: Trace) -> Figure:
+def temporal_attention(trace: Trace) -> Figure | str:
     """The history map before and after the alignment, the current map, and the weight of history per cell."""
+    if trace.prediction.started_anew:
+        return f"the frame has no history ({trace.prediction.started_anew})"
     assert trace.aligned_history is not None
     assert trace.prediction.attention is not None
     (_, before), (_, now) = trace.recent[-2:]
@@ -114,8 +116,10 @@ def encoder_layers(trace: Trace) -> Figure:
     return figure
 
 
-def recurrence(trace: Trace) -> Figure:
+def recurrence(trace: Trace) -> Figure | str:
     """The last frames: the front image, the BEV map, and the boxes."""
+    if len(trace.recent) == 1:
+        return "there is no earlier frame"
     recent = [(frame, prediction) for frame, prediction in trace.recent if prediction.bev is not None]
     colors = drawing.feature_colors([trace.cell_map(p.bev) for _, p in recent if p.bev is not None])
     front = min(trace.frame.rig.cameras, key=lambda camera: abs(camera.yaw)).name

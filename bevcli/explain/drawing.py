@@ -26,12 +26,12 @@ from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.recording.colors import Color, map_colors
 from bevcli.recording.log_bev import fit_colors
 
+Draw = Callable[[Trace], Figure | str]  # the figure of one step, with its title, or why it cannot be drawn of a trace
 Rect = tuple[float, float, float, float]  # left, bottom (in an image: top), width, height
 INK, GREY, FAINT = "#1f2430", "#6b7280", "#d7dae0"
 ACCENT, SECOND, THIRD, PALE = "#e4572e", "#1769aa", "#2a9d5c", "#9aa0ab"
 WIDTH_INCHES, DPI = 14.0, 100
 LEAST_SCORE = 0.3  # boxes below this are not drawn
-LEAST_VISIBILITY = 0.2  # ground truth below this is not drawn
 MARK_M = 1.5  # least side of the square around the followed cell
 VEHICLE_M = (4.6, 1.9)  # length and width of the drawn vehicle
 MAP_COLORS: dict[str, Color] = {
@@ -177,30 +177,19 @@ def outline_boxes(
         axes.plot(*zip(center, nose, strict=True), color=color, lw=width, zorder=6, path_effects=effects)
 
 
-def ground_truth_in_bev(frame: Frame) -> Boxes3D | None:
-    """The ground truth boxes in the bev frame, without the mostly hidden ones, where the sequence has any."""
-    truth = frame.ground_truth
-    if truth is None:
-        return None
-    if truth.visibilities is not None:
-        truth = truth[~(truth.visibilities < LEAST_VISIBILITY)]  # unknown visibility is NaN and stays
-    return truth.transformed(inverse(frame.world_from_ego.matrix @ frame.rig.ego_from_bev))
-
-
-def rgb_image(frame: Frame, camera: str) -> NDArray[np.uint8] | None:
-    """(H, W, 3) RGB, None where the image is missing."""
+def rgb_image(frame: Frame, camera: str) -> NDArray[np.uint8]:
+    """(H, W, 3) RGB; grey where the image is missing."""
+    size = frame.rig[camera]
     image = frame.images.get(camera)
-    return None if image is None else image.pixels_bgr[..., ::-1]
+    return np.full((size.height, size.width, 3), 225, np.uint8) if image is None else image.pixels_bgr[..., ::-1]
 
 
 def show_camera(axes: Axes, frame: Frame, name: str, title: str | None = None) -> None:
     """A camera's image with its name; a grey field where the image is missing."""
     camera = frame.rig[name]
-    image = rgb_image(frame, name)
-    if image is None:
-        image = np.full((camera.height, camera.width, 3), 225, np.uint8)
+    if name not in frame.images:
         axes.text(camera.width / 2, camera.height / 2, "no image", ha="center", color=GREY, fontsize=13)
-    axes.imshow(image, interpolation="antialiased")
+    axes.imshow(rgb_image(frame, name), interpolation="antialiased")
     axes.set(xlim=(0, camera.width), ylim=(camera.height, 0))
     bare(axes)
     axes.set_title(name if title is None else title, fontsize=12, color=INK, loc="left", pad=5)

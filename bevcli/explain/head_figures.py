@@ -13,10 +13,12 @@ from bevcli.explain.drawing import ACCENT, FAINT, GREY, INK, LEAST_SCORE, PALE, 
 from bevcli.explain.trace import Trace
 from bevcli.frame import MAP_CLASSES
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.transforms import Array
+from bevcli.geometry.transforms import Array, inverse
 from bevcli.model.box_coding import decode
 from bevcli.model.segmentation import STUFF_CLASSES, THING_CLASS
 from bevcli.model.step import ModelOutputs
+
+LEAST_VISIBILITY = 0.2  # ground truth below this is not drawn
 
 
 def decoder(trace: Trace) -> Figure:
@@ -73,12 +75,11 @@ def box_code(trace: Trace) -> Figure:
     return figure
 
 
-def segmentation(trace: Trace) -> Figure:
+def segmentation(trace: Trace) -> Figure | str:
     """The probability of each map class per BEV cell, the merged map, and the ground truth."""
-    assert trace.prediction.segmentation is not None
-    assert trace.outputs.segmentation is not None
-    grid = trace.grid
-    outputs = trace.outputs.segmentation
+    grid, outputs = trace.grid, trace.outputs.segmentation
+    if outputs is None:
+        return f"model {trace.config.name} has no segmentation head"
     masks = outputs.mask_logits[-1, 0].float().sigmoid() * outputs.class_logits[-1, 0].float().sigmoid()[:, None]
     stuff = STUFF_CLASSES
     layers = torch.cat([masks[: len(stuff)], masks[len(stuff) :].amax(0, keepdim=True)])
@@ -151,11 +152,14 @@ def _draw_boxes(axes: Axes, trace: Trace) -> None:
 
 
 def _draw_truth(axes: Axes, trace: Trace, width: float) -> list[Line2D]:
-    """Draws the ground truth, if there is any; returns its line for the legend."""
-    truth = drawing.ground_truth_in_bev(trace.frame)
+    """Draws the ground truth, if there is any, without mostly hidden boxes; returns its line for the legend."""
+    frame, truth = trace.frame, trace.frame.ground_truth
     if truth is None:
         return []
-    drawing.outline_boxes(axes, truth, PALE, width=width, style="--")
+    if truth.visibilities is not None:
+        truth = truth[~(truth.visibilities < LEAST_VISIBILITY)]  # unknown visibility is NaN and stays
+    in_bev = truth.transformed(inverse(frame.world_from_ego.matrix @ frame.rig.ego_from_bev))
+    drawing.outline_boxes(axes, in_bev, PALE, width=width, style="--")
     return axes.plot([], [], "--", color=PALE, label="ground truth")
 
 

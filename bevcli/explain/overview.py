@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
@@ -13,7 +12,6 @@ from bevcli.explain.bev_figures import bev_queries, can_bus, encoder_layers, rec
 from bevcli.explain.camera_figures import image_features, pillars, spatial_attention
 from bevcli.explain.drawing import ACCENT, GREY, INK, LEAST_SCORE, SECOND
 from bevcli.explain.head_figures import box_code, decoder, segmentation
-from bevcli.explain.step_figure import StepFigure
 from bevcli.explain.trace import Trace
 
 HEIGHT = 7.7  # inches
@@ -61,8 +59,7 @@ def _images_and_features(figure: Figure, trace: Trace) -> None:
     for place, name in enumerate(names):
         bottom = 0.79 - 0.127 * (place + 1)
         axes = figure.add_axes((0.012, bottom, 0.125, 0.118))
-        image = drawing.rgb_image(trace.frame, name)
-        axes.imshow(np.full((9, 16, 3), 225, np.uint8) if image is None else image, aspect="auto")
+        axes.imshow(drawing.rgb_image(trace.frame, name), aspect="auto")
         drawing.bare(axes)
         drawing.show_lengths(figure.add_axes((0.265, bottom, 0.125, 0.118)), trace, lengths, place, aspect="auto")
     figure.text(0.012, 0.8, f"{len(trace.frame.rig.cameras)} cameras", fontsize=12.5, color=INK)
@@ -124,31 +121,18 @@ def _arrow(canvas: Axes, start: tuple[float, float], end: tuple[float, float], c
     canvas.add_patch(FancyArrowPatch(start, end, color=color, **style))
 
 
-def _without_history(trace: Trace) -> str:
-    reason = trace.prediction.started_anew
-    return f"the frame has no history ({reason})" if reason else ""
-
-
-def _without_earlier_frame(trace: Trace) -> str:
-    return "" if len(trace.recent) > 1 else "there is no earlier frame"
-
-
-def _without_segmentation(trace: Trace) -> str:
-    return f"model {trace.config.name} has no segmentation head" if trace.outputs.segmentation is None else ""
-
-
 # In the order of the model.
-FIGURES = (
-    StepFigure("overview", overview),
-    StepFigure("image-features", image_features),
-    StepFigure("bev-queries", bev_queries),
-    StepFigure("can-bus", can_bus),
-    StepFigure("pillars", pillars),
-    StepFigure("spatial-attention", spatial_attention),
-    StepFigure("temporal-attention", temporal_attention, _without_history),
-    StepFigure("encoder-layers", encoder_layers),
-    StepFigure("recurrence", recurrence, _without_earlier_frame),
-    StepFigure("decoder", decoder),
-    StepFigure("box-code", box_code),
-    StepFigure("segmentation", segmentation, _without_segmentation),
-)
+FIGURES: dict[str, drawing.Draw] = {
+    "overview": overview,
+    "image-features": image_features,
+    "bev-queries": bev_queries,
+    "can-bus": can_bus,
+    "pillars": pillars,
+    "spatial-attention": spatial_attention,
+    "temporal-attention": temporal_attention,
+    "encoder-layers": encoder_layers,
+    "recurrence": recurrence,
+    "decoder": decoder,
+    "box-code": box_code,
+    "segmentation": segmentation,
+}

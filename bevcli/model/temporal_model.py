@@ -35,7 +35,7 @@ class TemporalModel(nn.Module):
         official_names: patterns of key names in the released weights file, and ours; see `from_official`.
         stages: name of a submodule -> stage of the step that ends with it, for the times of a run.
         has_parts: the network has the parts of `bevcli.model.network.Network`, which probes and figures look into.
-        figures: of `bevcli explain`, as texts "module:attribute", each of a list of `StepFigure`. () for none.
+        figures: of `bevcli explain`, as texts "module:attribute", each of a dict of functions by step. () for none.
         config: of the model.
     """
 

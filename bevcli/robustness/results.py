@@ -9,7 +9,7 @@ from typing import Any, Self
 import msgspec
 
 from bevcli.errors import InputError
-from bevcli.evaluation.detection_scores import known_mean
+from bevcli.evaluation.detection import known_mean
 from bevcli.evaluation.scores_report import finite
 from bevcli.parsing.documents import read_json
 from bevcli.robustness.conditions import CLEAN, CORRUPTIONS, Corruption, Group

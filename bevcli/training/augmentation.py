@@ -3,6 +3,7 @@
 Boxes and maps stay as they are.
 """
 
+from collections import defaultdict
 from dataclasses import dataclass, replace
 
 import cv2
@@ -12,10 +13,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bevcli.frame import CameraImage, Frame
-from bevcli.geometry.cameras import Camera, CameraRig, camera_pose_noise
+from bevcli.geometry.cameras import CameraRig, camera_pose_noise
 from bevcli.geometry.transforms import Array
 from bevcli.synth import corruptions
-from bevcli.synth.corruptions import ImageCorruption, Pixels
+from bevcli.synth.corruptions import ImageCorruption
 
 MAX_BRIGHTNESS = 32.0  # added to pixel values of 0 to 255
 CONTRAST_RANGE = SATURATION_RANGE = (0.5, 1.5)  # factors
@@ -77,7 +78,7 @@ class ImageVariation:
 
     def __init__(self, config: AugmentationConfig, random: np.random.Generator) -> None:
         self._config, self._random = config, random
-        self._tables: dict[str, NDArray[np.uint8]] = {}
+        self._tables = defaultdict[str, NDArray[np.uint8]](self._table)  # by camera
         stops = random.uniform(-1, 1) * config.exposure if config.exposure else 0.0
         self._clip_stops = stops / 2  # half of the change is common to all cameras
         self._noise = max(0.0, random.uniform(-1, 1)) * config.noise if config.noise else 0.0
@@ -92,8 +93,6 @@ class ImageVariation:
         return replace(frame, images={name: self._changed(name, frame.images[name]) for name in names})
 
     def _changed(self, name: str, image: CameraImage) -> CameraImage:
-        if name not in self._tables:
-            self._tables[name] = self._table()
         pixels = cv2.LUT(image.pixels_bgr, self._tables[name])
         if self._noise:
             noise = self._random.standard_normal(pixels.shape, dtype=np.float32) * np.float32(self._noise)
@@ -144,16 +143,14 @@ class BadConditions:
         images = {}
         for name, image in frame.images.items():
             if self._order[name] >= lost:
-                images[name] = replace(image, pixels_bgr=self._corrupted(image.pixels_bgr))
+                pixels = image.pixels_bgr
+                if self._corruption is not None:
+                    corrupt, level = self._corruption
+                    pixels = corrupt(pixels, level, self._random)
+                images[name] = replace(image, pixels_bgr=pixels)
             elif self._black:
                 images[name] = replace(image, pixels_bgr=np.zeros_like(image.pixels_bgr))
         return replace(frame, images=images)
-
-    def _corrupted(self, pixels_bgr: Pixels) -> Pixels:
-        if self._corruption is None:
-            return pixels_bgr
-        corrupt, level = self._corruption
-        return corrupt(pixels_bgr, level, self._random)
 
 
 class CalibrationVariation:
@@ -162,8 +159,7 @@ class CalibrationVariation:
     def __init__(self, config: AugmentationConfig, random: np.random.Generator) -> None:
         noisy = config.calibration_share > 0 and random.random() < config.calibration_share
         self._level = random.uniform(0, config.calibration_noise) if noisy else 0.0
-        self._random = random
-        self._noise: dict[str, Array] = {}
+        self._noise = defaultdict[str, Array](lambda: camera_pose_noise(self._level, random))  # by camera
         self._noisy: tuple[CameraRig, CameraRig] | None = None  # a rig as it was read, and with noise
 
     def __call__(self, frame: Frame) -> Frame:
@@ -171,14 +167,12 @@ class CalibrationVariation:
         if not self._level:
             return frame
         if self._noisy is None or self._noisy[0] is not frame.rig:
-            cameras = tuple(self._with_noise(camera) for camera in frame.rig.cameras)
+            cameras = tuple(
+                replace(camera, ego_from_camera=camera.ego_from_camera @ self._noise[camera.name])
+                for camera in frame.rig.cameras
+            )
             self._noisy = (frame.rig, replace(frame.rig, cameras=cameras))
         return replace(frame, rig=self._noisy[1])
-
-    def _with_noise(self, camera: Camera) -> Camera:
-        if camera.name not in self._noise:
-            self._noise[camera.name] = camera_pose_noise(self._level, self._random)
-        return replace(camera, ego_from_camera=camera.ego_from_camera @ self._noise[camera.name])
 
 
 def distort_images(frame: Frame, probability: float, random: np.random.Generator) -> Frame:

@@ -32,10 +32,6 @@ class DetectionTargets:
     labels: Tensor
     codes: Tensor
 
-    def to(self, device: torch.device) -> DetectionTargets:
-        """A copy on a device."""
-        return DetectionTargets(self.labels.to(device), self.codes.to(device))
-
 
 def detection_targets(boxes: Boxes3D, config: ModelConfig) -> DetectionTargets:
     """The `box_targets` of the boxes (ground truth, bev frame) with a centre inside the BEV grid."""
@@ -90,27 +86,16 @@ class DetectionLossConfig:
             raise ValueError("the weights and quality_m must not be negative")
 
 
-@dataclass(frozen=True)
-class DetectionLoss:
-    """Weighted scalar losses, summed over the decoder layers where there are several.
-
-    Attributes:
-        classes: () focal loss of the classes.
-        boxes: () L1 loss of the box codes.
-    """
-
-    classes: Tensor
-    boxes: Tensor
-
-
 def detection_loss(
     class_logits: Tensor,
     box_codes: Tensor,
     targets: Sequence[DetectionTargets],
     config: DetectionLossConfig,
     groups: int = 1,
-) -> DetectionLoss:
-    """The loss of L decoder layers. Each layer is matched anew; losses are divided by the matched boxes of the batch.
+) -> dict[str, Tensor]:
+    """The weighted losses of classes and boxes, summed over L decoder layers.
+
+    Each layer is matched anew; losses are divided by the matched boxes of the batch.
 
     Args:
         class_logits: (L, B, groups · Q, classes).
@@ -125,7 +110,7 @@ def detection_loss(
         for layer in zip(logits, codes, strict=True)
     ]
     classes, boxes = torch.stack(layers).sum(0) / groups
-    return DetectionLoss(classes, boxes)
+    return {"classes": classes, "boxes": boxes}
 
 
 def layer_matches(

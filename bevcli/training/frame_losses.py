@@ -21,7 +21,6 @@ from bevcli.model.kernels.choose import choose_kernels
 from bevcli.model.network import Network
 from bevcli.model.step import ClipInputs, ModelInputs, ModelOutputs
 from bevcli.training.detection_loss import (
-    DetectionLoss,
     DetectionLossConfig,
     DetectionTargets,
     assigned_loss,
@@ -79,7 +78,7 @@ def dense_loss(
     targets: Sequence[DetectionTargets],
     config: DenseLossConfig,
     detection: DetectionLossConfig,
-) -> DetectionLoss:
+) -> dict[str, Tensor]:
     """Focal loss of all cells and L1 loss of the positive ones, divided by the number of positive cells.
 
     bev: (B, Y·X, C). targets: B. detection: the weights of classes and boxes, as in the detection loss.
@@ -87,7 +86,7 @@ def dense_loss(
     logits, codes = head(bev)
     positives = [_positive_cells(head.centers, truth.codes[:, :2], config.reach_m) for truth in targets]
     classes, boxes = config.weight * assigned_loss(logits, codes, targets, positives, detection)
-    return DetectionLoss(classes, boxes)
+    return {"cell classes": classes, "cell boxes": boxes}
 
 
 def _positive_cells(cells: Tensor, objects: Tensor, reach_m: float) -> tuple[Tensor, Tensor]:
@@ -210,14 +209,12 @@ class FrameLosses:
         taught: (B, Y·X, C), the BEV map of the teacher.
         """
         logits, codes, weights = outputs.class_logits, outputs.box_codes, self.configs.detection_loss
-        detection = detection_loss(logits, codes, targets.detection, weights, self._query_groups)
-        losses = {"classes": detection.classes, "boxes": detection.boxes}
+        losses = detection_loss(logits, codes, targets.detection, weights, self._query_groups)
         if self._dense_head is not None:
             bev, config = outputs.bev.float(), self.configs.dense_loss
-            dense = dense_loss(self._dense_head, bev, targets.detection, config, weights)
-            losses |= {"cell classes": dense.classes, "cell boxes": dense.boxes}
+            losses |= dense_loss(self._dense_head, bev, targets.detection, config, weights)
         if self._perspective_head is not None:
-            perspective = perspective_loss(
+            losses |= perspective_loss(
                 self._perspective_head,
                 [features.float() for features in self._feature_maps],
                 inputs.image_from_bev,
@@ -226,7 +223,6 @@ class FrameLosses:
                 targets.perspective,
                 self.configs.perspective_loss,
             )
-            losses |= {"perspective classes": perspective.classes, "perspective boxes": perspective.boxes}
         if taught is not None:
             difference = nn.functional.mse_loss(outputs.bev.float(), taught)
             losses |= {"distillation": self.configs.distillation_loss.weight * difference}
@@ -234,6 +230,5 @@ class FrameLosses:
             matches = layer_matches(logits[-1], codes[-1], targets.detection, weights)
             losses |= self._head_losses(outputs, targets.truths, matches)
         if outputs.segmentation is not None:
-            maps = segmentation_loss(outputs.segmentation, targets.segmentation, self.configs.segmentation_loss)
-            losses |= {"map classes": maps.classes, "masks": maps.masks, "locations": maps.locations}
+            losses |= segmentation_loss(outputs.segmentation, targets.segmentation, self.configs.segmentation_loss)
         return losses

@@ -8,7 +8,7 @@ from bevcli.errors import InputError
 from bevcli.evaluation.driving import LATE_S, Drives, followed, with_true_futures
 from bevcli.frame import Frame, MapLines, Plan, Sequence
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.transforms import Array, apply, inverse
+from bevcli.geometry.transforms import apply, inverse
 from bevcli.model.config import ModelConfig
 from bevcli.model.step import FrameTruth
 from bevcli.sequences.files.boxes_file import FrameBoxes
@@ -41,13 +41,9 @@ def frame_truth(frame: Frame, sequence: Sequence, place: int, config: ModelConfi
         if there is not None and there.world_from_ego is not None:
             driven[step] = apply(bev_from_world, (there.world_from_ego.matrix @ frame.rig.ego_from_bev)[:3, 3])[:2]
     boxes = boxes_inside(boxes.transformed(bev_from_world), config)
-    return FrameTruth(boxes, NO_LINES if lines is None else lines, driven, _command(driven, config))
-
-
-def _command(driven: Array, config: ModelConfig) -> str:
-    """The command that the known part of a path follows, "" for none."""
     known, commands = driven[np.isfinite(driven).all(-1)], config.results.get(Plan, ())
-    return followed(known, commands) if len(known) and commands else ""
+    command = followed(known, commands) if len(known) and commands else ""
+    return FrameTruth(boxes, NO_LINES if lines is None else lines, driven, command)
 
 
 def _frames_until(sequence: Sequence, place: int, seconds: float) -> Iterator[FrameBoxes]:

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from bevcli.config import config_of_table, read_model_file
+from bevcli.config import load_config
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import Sequence
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
@@ -50,8 +50,7 @@ def write_model_file(
     if path.suffix != ".toml" or path.exists():
         raise OutputError(f"{path}: " + ("exists already" if path.exists() else "expected a name that ends in .toml"))
     name = re.sub(r"[^\w. +-]", "-", path.stem).lstrip("-. +")[:100] or "model"
-    base = config_of_table(*read_model_file(PRESETS[preset].model))
-    facts = look_at(_open_drives(data), base.bev_frame)
+    facts = look_at(_open_drives(data), load_config(PRESETS[preset][0]).bev_frame)
     table = model_table(name, preset, facts)
     lines = [f"Model {name} for {len(facts.drives)} drives, preset {preset}.", *_facts_lines(facts, table)]
     with tempfile.TemporaryDirectory() as folder:
@@ -169,17 +168,13 @@ def measure_cost(job: TrainingJob, longest_s: float = LONGEST_S) -> Cost:
 
     config = replace(job.config, steps=10**6, evaluate_every=10**6, checkpoint_every=10**6)
     config = replace(config, clips=replace(config.clips, in_turn=1, short_share=0.0))
+    machine = f"{job.device.type}, {torch.get_num_threads()} threads"
     if job.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(job.device)
+        machine = torch.cuda.get_device_name(job.device)
     with contextlib.suppress(_EnoughMeasured):
         Trainer(replace(job, config=config)).run(after_update=after_update)
     spans = [later - earlier for earlier, later in pairwise(times)]
     update_s = sum(spans[1:]) / len(spans[1:]) if len(spans) > 1 else spans[0]
     reading_s = max(spans[0] - update_s, 0.0)
-    return Cost(job.config, _machine(job.device), update_s, reading_s, peak_memory(job.device))
-
-
-def _machine(device: torch.device) -> str:
-    if device.type == "cuda":
-        return torch.cuda.get_device_name(device)
-    return f"{device.type}, {torch.get_num_threads()} threads"
+    return Cost(job.config, machine, update_s, reading_s, peak_memory(job.device))

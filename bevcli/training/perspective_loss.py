@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from bevcli.geometry.boxes import BOX_EDGES
 from bevcli.model.matching import focal_loss
 from bevcli.model.pillar_projection import project_points
-from bevcli.training.detection_loss import DetectionLoss, DetectionTargets
+from bevcli.training.detection_loss import DetectionTargets
 
 BOX_NUMBERS = 8  # offset x, offset y, log depth, log length, log width, log height, sin, cos
 MAX_HALF_EXTENT = 8.0  # strides; a box with a larger half extent goes to a coarser level, as in FCOS (64 at stride 8)
@@ -276,8 +276,7 @@ class PerspectiveLossConfig:
     rotation_weight: float = 0.25
 
     def __post_init__(self) -> None:
-        weights = (self.class_weight, self.offset_weight, self.depth_weight, self.size_weight, self.rotation_weight)
-        if min(self.weight, self.layers, *weights) < 0:
+        if min(vars(self).values()) < 0:
             raise ValueError("layers and the weights must not be negative")
 
 
@@ -289,7 +288,7 @@ def perspective_loss(
     image_size: tuple[int, int],
     targets: Sequence[DetectionTargets],
     config: PerspectiveLossConfig,
-) -> DetectionLoss:
+) -> dict[str, Tensor]:
     """Focal loss of all pixels and L1 loss of the positive ones, both divided by the number of positive pixels.
 
     Args:
@@ -319,4 +318,4 @@ def perspective_loss(
     weights = [config.offset_weight] * 2 + [config.depth_weight] + [config.size_weight] * 3
     weights += [config.rotation_weight] * 2
     box_error = (errors * errors.new_tensor(weights)).sum() / count
-    return DetectionLoss(config.weight * classes, config.weight * box_error)
+    return {"perspective classes": config.weight * classes, "perspective boxes": config.weight * box_error}

@@ -7,7 +7,7 @@ import copy
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence as Items
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -115,34 +115,23 @@ def _boxes_bev(frame: Frame, bev_frame: BevFrameConfig) -> Boxes3D:
     return ground_truth_boxes(replace(frame, rig=rig))
 
 
-@dataclass(frozen=True)
-class PresetSettings:
-    """A preset.
-
-    Attributes:
-        model: the known model whose file it starts from.
-        changes: keys of its tables with new values; None removes a key.
-    """
-
-    model: str
-    changes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-
-
+Changes = Mapping[str, Mapping[str, Any]]  # of a model's file: keys of its tables with new values; None removes a key
 # The demo model on smaller images and shorter clips, for a training that starts from its weights. The rate and the
 # average are those with which docs/fine-tune.md was measured.
-_QUICK: Mapping[str, Mapping[str, Any]] = {
+_QUICK: Changes = {
     "image": {"size": [384, 216], "focal_px": None, "max_pixels": None},
     "training": {"steps": 75, "evaluate_every": 15, "checkpoint_every": 5},
     "training.clips": {"frames": 8, "batch": 2, "in_turn": 2},
     "training.optimizer": {"learning_rate": 2e-4, "warm_up_steps": 10, "average": 0.99},
     "training.perspective_loss": {"weight": 0.0},
 }
-_ONE_CLIP: Mapping[str, Mapping[str, Any]] = {"training.clips": {"batch": 1}}  # as published, on each of eight GPUs
-PRESETS: Mapping[Preset, PresetSettings] = {
-    "quick": PresetSettings("demo", _QUICK),
-    "demo": PresetSettings("demo"),
-    "tiny": PresetSettings("tiny", _ONE_CLIP),
-    "base": PresetSettings("base", _ONE_CLIP),
+_ONE_CLIP: Changes = {"training.clips": {"batch": 1}}  # as published, on each of eight GPUs
+# The known model whose file a preset starts from, and the changes.
+PRESETS: Mapping[Preset, tuple[str, Changes]] = {
+    "quick": ("demo", _QUICK),
+    "demo": ("demo", {}),
+    "tiny": ("tiny", _ONE_CLIP),
+    "base": ("base", _ONE_CLIP),
 }
 
 
@@ -152,9 +141,9 @@ def model_table(name: str, preset: Preset, facts: DataFacts) -> dict[str, Any]:
     The number of BEV cells and all layers are those of the preset's model, so that its weights fit, except those of
     its classes and cameras. The settings are for a training that starts from these weights. name: of the new model.
     """
-    chosen = PRESETS[preset]
-    table = copy.deepcopy(read_model_file(chosen.model)[0])
-    for path, changes in chosen.changes.items():
+    model, changes_by_table = PRESETS[preset]
+    table = copy.deepcopy(read_model_file(model)[0])
+    for path, changes in changes_by_table.items():
         _change(table, path, changes)
     known = [each for each in NUSCENES_CLASSES if each in facts.class_counts]
     own = [each for each in facts.class_counts if each not in NUSCENES_CLASSES]  # the most frequent first

@@ -6,8 +6,8 @@ As in the paper, the last frame of a clip is trained on; the others are its hist
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -153,10 +153,13 @@ class Targets:
 
     def to(self, device: torch.device) -> Targets:
         """A copy on a device."""
-        detection, perspective = (
-            tuple(one.to(device) for one in targets) for targets in (self.detection, self.perspective)
-        )
-        return Targets(detection, perspective, tuple(one.to(device) for one in self.segmentation), self.truths)
+        parts = {name: getattr(self, name) for name in ("detection", "perspective", "segmentation")}
+        return replace(self, **{name: tuple(_moved(one, device) for one in part) for name, part in parts.items()})
+
+
+def _moved(targets: Any, device: torch.device) -> Any:
+    """A copy of a dataclass of tensors, or None, on a device."""
+    return replace(targets, **{name: None if x is None else x.to(device) for name, x in vars(targets).items()})
 
 
 @dataclass(frozen=True)

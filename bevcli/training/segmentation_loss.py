@@ -39,11 +39,6 @@ class SegmentationTargets:
     things: Tensor
     locations: Tensor
 
-    def to(self, device: torch.device) -> SegmentationTargets:
-        """A copy on a device."""
-        stuff = None if self.stuff is None else self.stuff.to(device)
-        return SegmentationTargets(stuff, self.things.to(device), self.locations.to(device))
-
 
 def segmentation_targets(
     boxes: Boxes3D,
@@ -129,66 +124,35 @@ class SegmentationLossConfig:
     pixel_weight: float = 10.0
 
     def __post_init__(self) -> None:
-        if min(self.class_weight, self.location_weight, self.dice_weight, self.pixel_weight) < 0:
+        if min(vars(self).values()) < 0:
             raise ValueError("the weights must not be negative")
-
-
-@dataclass(frozen=True)
-class SegmentationLoss:
-    """Weighted scalar losses, summed over the layers.
-
-    Attributes:
-        classes: () focal loss of the classes.
-        masks: () dice and focal loss of the masks.
-        locations: () L1 loss of the things' locations.
-    """
-
-    classes: Tensor
-    masks: Tensor
-    locations: Tensor
-
-
-@dataclass(frozen=True)
-class _Assignment:
-    """The K queries of one batch element that have a target mask, T of them things.
-
-    Attributes:
-        queries: (K,) indices of the queries, stuff first.
-        masks: (K, Y·X) their target masks.
-        things: (T,) indices of the matched thing queries, counted from the first thing query.
-        locations: (T, 4) their target locations.
-    """
-
-    queries: Tensor
-    masks: Tensor
-    things: Tensor
-    locations: Tensor
 
 
 def segmentation_loss(
     outputs: SegmentationOutputs, targets: Sequence[SegmentationTargets], config: SegmentationLossConfig
-) -> SegmentationLoss:
-    """The loss of all layers for B frames. Things are matched once, by the outputs of the last layer.
+) -> dict[str, Tensor]:
+    """The weighted losses of all layers for B frames. Things are matched once, by the outputs of the last layer.
 
     The losses of things are divided by the number of things in the batch, those of stuff by the number of stuff masks,
     so that many vehicles do not outweigh the road. A frame without a map trains no stuff query.
     """
     assignments = [_assign(outputs, element, truth, config) for element, truth in enumerate(targets)]
-    things = sum(len(assigned.things) for assigned in assignments)
-    stuff = sum(len(assigned.queries) for assigned in assignments) - things
+    things = sum(len(locations) for *_, locations in assignments)
+    stuff = sum(len(queries) for queries, *_ in assignments) - things
     shares = outputs.class_logits.new_full(outputs.class_logits.shape[-1:], 1 / max(things, 1))  # (Q,)
     shares[: len(STUFF_CLASSES)] = 1 / max(stuff, 1)
     classes = config.class_weight * (_class_losses(outputs.class_logits, assignments, targets) * shares).sum()
     masks, locations = classes.new_zeros(()), classes.new_zeros(())
-    for element, assigned in enumerate(assignments):
-        logits = outputs.mask_logits[:, element, assigned.queries]  # (M, K, Y·X)
-        truth = assigned.masks.expand_as(logits)
+    for element, (queries, target_masks, target_locations) in enumerate(assignments):
+        logits = outputs.mask_logits[:, element, queries]  # (M, K, Y·X)
+        truth = target_masks.expand_as(logits)
         losses = config.dice_weight * dice_loss(logits, truth)
         losses = losses + config.pixel_weight * focal_loss(logits, truth).mean(-1)
-        masks = masks + (losses * shares[assigned.queries]).sum()
-        errors = outputs.locations[:, element, assigned.things] - assigned.locations
+        masks = masks + (losses * shares[queries]).sum()
+        of_things = queries[len(queries) - len(target_locations) :] - len(STUFF_CLASSES)  # from the first thing query
+        errors = outputs.locations[:, element, of_things] - target_locations
         locations = locations + config.location_weight * errors.abs().sum() / max(things, 1)
-    return SegmentationLoss(classes, masks, locations)
+    return {"map classes": classes, "masks": masks, "locations": locations}
 
 
 def matching_costs(
@@ -226,23 +190,27 @@ def _dice(overlap: Tensor, sums: Tensor) -> Tensor:
 
 def _assign(
     outputs: SegmentationOutputs, element: int, truth: SegmentationTargets, config: SegmentationLossConfig
-) -> _Assignment:
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The K queries of a batch element that have a target mask, (K,) stuff first, then T things; and their targets.
+
+    These are the masks (K, Y·X), and of the things the locations (T, 4).
+    """
     things, objects = hungarian_matching(matching_costs(outputs, element, truth, config))
     queries, masks = things + len(STUFF_CLASSES), truth.things[objects]
     if truth.stuff is not None:
         present = truth.stuff.any(-1)
         queries = torch.cat([present.nonzero()[:, 0], queries])
         masks = torch.cat([truth.stuff[present], masks])
-    return _Assignment(queries, masks, things, truth.locations[objects])
+    return queries, masks, truth.locations[objects]
 
 
 def _class_losses(
-    class_logits: Tensor, assignments: Sequence[_Assignment], targets: Sequence[SegmentationTargets]
+    class_logits: Tensor, assignments: Sequence[tuple[Tensor, ...]], targets: Sequence[SegmentationTargets]
 ) -> Tensor:
     """(M, B, Q) focal losses of class_logits (M, B, Q), 0 for the stuff queries of a frame without a map."""
     class_targets, trained = torch.zeros_like(class_logits), torch.ones_like(class_logits)
-    for element, (assigned, truth) in enumerate(zip(assignments, targets, strict=True)):
-        class_targets[:, element, assigned.queries] = 1
+    for element, ((queries, *_), truth) in enumerate(zip(assignments, targets, strict=True)):
+        class_targets[:, element, queries] = 1
         if truth.stuff is None:
             trained[:, element, : len(STUFF_CLASSES)] = 0
     return focal_loss(class_logits, class_targets) * trained

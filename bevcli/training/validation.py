@@ -10,9 +10,8 @@ import numpy as np
 
 from bevcli.evaluation.config import DetectionConfig, TrackingConfig
 from bevcli.evaluation.detection import evaluate_detections
-from bevcli.evaluation.detection_scores import DetectionScores
-from bevcli.evaluation.scores_report import scores_table, scores_to_dict
-from bevcli.evaluation.segmentation import SegmentationScores, evaluate_segmentation
+from bevcli.evaluation.scores_report import FrameScores, finite
+from bevcli.evaluation.segmentation import evaluate_segmentation
 from bevcli.evaluation.tracking.scoring import TrackingScores, evaluate_tracking
 from bevcli.frame import MAP_CLASSES, Frame, FrameStamp, Prediction
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
@@ -40,27 +39,15 @@ class DriveScores:
     mean_ap: float
     nd_score: float
 
-    def to_dict(self) -> dict[str, str | int | float | None]:
-        """For JSON, which has no NaN."""
-        return {name: None if value != value else value for name, value in vars(self).items()}
-
 
 @dataclass(frozen=True)
-class Validation:
+class Validation(FrameScores):
     """Scores over all frames of several drives.
 
     Attributes:
-        config: the settings of the detection metrics.
-        detection: AP, errors and NDS.
-        segmentation: IoU by class; None if the model or the drives have no maps.
-        tracking: AMOTA and the metrics that come with it; None without a tracker.
         drives: the scores of each drive alone; empty if they were not asked for.
     """
 
-    config: DetectionConfig
-    detection: DetectionScores
-    segmentation: SegmentationScores | None
-    tracking: TrackingScores | None = None
     drives: tuple[DriveScores, ...] = ()
 
     def summary(self) -> dict[str, float]:
@@ -81,13 +68,10 @@ class Validation:
         return ", ".join(f"{name} {value:.3f}" for name, value in self.summary().items() if not math.isnan(value))
 
     def to_dict(self) -> dict[str, Any]:
-        """All scores for JSON; undefined numbers are None."""
-        content = scores_to_dict(self.detection, self.config, self.segmentation, tracking=self.tracking)
-        return content | ({"drives": [drive.to_dict() for drive in self.drives]} if self.drives else {})
+        return super().to_dict() | (finite({"drives": [vars(drive) for drive in self.drives]}) if self.drives else {})
 
     def table(self) -> str:
-        """The scores as text for a terminal."""
-        scores = scores_table(self.detection, self.segmentation, self.tracking)
+        scores = super().table()
         return f"{scores}\n\n{drives_table(self.drives)}" if self.drives else scores
 
 
@@ -113,7 +97,7 @@ def validate(
     predictions: list[Boxes3D] = []
     truths: list[Boxes3D] = []
     maps = []
-    tracks: list[tuple[FrameStamp, Array, Boxes3D, Boxes3D]] = []
+    tracks: list[tuple[Boxes3D, Boxes3D, FrameStamp, Array]] = []
     of_drives: list[DriveScores] = []
     for index in range(len(drives)):
         sequence, first = drives.open(index), len(truths)
@@ -127,7 +111,7 @@ def validate(
                     # Scenes of different drives may share a name.
                     stamp = replace(frame.stamp, scene=f"{index} {frame.stamp.scene}")
                     place = frame.world_from_ego.translation[:2]
-                    tracks.append((stamp, place, prediction.boxes_world, frame.ground_truth))
+                    tracks.append((prediction.boxes_world, frame.ground_truth, stamp, place))
                 predicted, truth = boxes_ego(frame, frame.ground_truth, prediction, classes)
                 predictions.append(predicted)
                 truths.append(truth)
@@ -139,11 +123,10 @@ def validate(
             table = table.of_classes_with_ground_truth()
             of_drives.append(DriveScores(sequence.name, len(sequence.rig.cameras), table.mean_ap, table.nd_score))
     return Validation(
-        config,
         evaluate_detections(predictions, truths, config),
         evaluate_segmentation(maps) if maps else None,
         None if tracker is None else _score_tracks(tracks, TrackingConfig.of(classes).cut_at(range_m)),
-        tuple(of_drives),
+        drives=tuple(of_drives),
     )
 
 
@@ -167,12 +150,7 @@ def boxes_ego(
     return predicted, ground_truth.transformed(inverse(frame.world_from_ego.matrix))
 
 
-def _score_tracks(frames: list[tuple[FrameStamp, Array, Boxes3D, Boxes3D]], config: TrackingConfig) -> TrackingScores:
-    """Tracking scores. frames: stamp, place of the vehicle, and predicted and ground truth boxes in the world frame."""
-    return evaluate_tracking(
-        [predicted for *_, predicted, _ in frames],
-        [truth for *_, truth in frames],
-        [stamp for stamp, *_ in frames],
-        config,
-        np.array([place for _, place, *_ in frames]).reshape(-1, 2),
-    )
+def _score_tracks(frames: list[tuple[Boxes3D, Boxes3D, FrameStamp, Array]], config: TrackingConfig) -> TrackingScores:
+    """Tracking scores. frames: predicted and ground truth boxes in the world frame, stamp, and place of the vehicle."""
+    found, true, stamps, places = zip(*frames, strict=True) if frames else ((),) * 4
+    return evaluate_tracking(found, true, stamps, config, np.array(places).reshape(-1, 2))

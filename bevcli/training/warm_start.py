@@ -76,14 +76,13 @@ class NamedRows:
 
     Attributes:
         part: the rows in words.
-        names: of the model's rows.
-        source: of the file's rows; empty if the file does not name them.
-        starts: the rows of the file that each row of the model starts from, as their mean; none for a new one.
+        source: names of the file's rows; empty if the file does not name them.
+        starts: name of each row of the model -> the rows of the file that it starts from, as their mean; none for a new
+            one.
         remark: on rows that start from one of another name.
     """
 
     part: str
-    names: tuple[str, ...]
     source: tuple[str, ...]
     starts: Starts
     remark: str = ""
@@ -95,35 +94,27 @@ class NamedRows:
     def filled(self, found: Tensor, own: Tensor) -> Tensor:
         """The model's tensor, with the rows that the file has for its names."""
         filled = own.clone()
-        for index, name in enumerate(self.names):
-            if self.starts[name]:
-                filled[index] = found[[self.source.index(each) for each in self.starts[name]]].float().mean(0)
+        for index, origins in enumerate(self.starts.values()):
+            if origins:
+                filled[index] = found[[self.source.index(each) for each in origins]].float().mean(0)
         return filled
 
-    @property
-    def loaded(self) -> tuple[str, ...]:
-        """Rows of the model that start from rows of the file."""
-        return tuple(name for name in self.names if self.starts[name])
+    def count(self, start: WarmStart, size: int) -> None:
+        """Count the rows, of so many numbers each."""
+        loaded = {name: origins for name, origins in self.starts.items() if origins}
+        new = [name for name in self.starts if name not in loaded]
+        taken = {each for origins in loaded.values() for each in origins}
+        unused = [name for name in self.source if name not in taken]
+        start.count("loaded", self.part, self._origins(loaded), size * len(loaded))
+        start.count("new", self.part, f"not in the file: {', '.join(new)}", size * len(new))
+        start.count("unused", self.part, f"not in the model: {', '.join(unused)}", size * len(unused))
 
-    @property
-    def new(self) -> tuple[str, ...]:
-        """Rows of the model that keep their initial values."""
-        return tuple(name for name in self.names if not self.starts[name])
-
-    @property
-    def unused(self) -> tuple[str, ...]:
-        """Rows of the file that no row starts from."""
-        taken = {each for starts in self.starts.values() for each in starts}
-        return tuple(name for name in self.source if name not in taken)
-
-    def origins(self) -> str:
+    def _origins(self, loaded: Starts) -> str:
         """The loaded rows in words: each with the row that it starts from, if that has another name."""
-        texts = [name if self.starts[name] == (name,) else f"{name} from {self._origin(name)}" for name in self.loaded]
-        renamed = any(self.starts[name] != (name,) for name in self.loaded)
+        renamed = {name: origins for name, origins in loaded.items() if origins != (name,)}
+        origin_of = {name: one if not others else "the mean of all" for name, (one, *others) in renamed.items()}
+        texts = [f"{name} from {origin_of[name]}" if name in origin_of else name for name in loaded]
         return ", ".join(texts) + (self.remark if renamed else "")
-
-    def _origin(self, name: str) -> str:
-        return self.starts[name][0] if len(self.starts[name]) == 1 else "the mean of all"
 
 
 def warm_start(file: Path, model: Network, model_file: str, rig: Callable[[], CameraRig]) -> WarmStart:
@@ -152,7 +143,8 @@ def warm_start(file: Path, model: Network, model_file: str, rig: Callable[[], Ca
         if key not in own:
             start.count("unused", _part(key), "not in the model", tensor.numel(), key)
         elif key in rows and rows[key].fit(tensor, own[key]):
-            own[key] = _named(start, rows[key], tensor, own[key])
+            rows[key].count(start, own[key][0].numel())
+            own[key] = rows[key].filled(tensor, own[key])
         else:
             own[key] = _whole(start, key, tensor, own[key], reasons.get(key, ""))
     for key in (key for key in own if key not in state):
@@ -160,15 +152,6 @@ def warm_start(file: Path, model: Network, model_file: str, rig: Callable[[], Ca
     _require_share(start)
     model.load_state_dict(own)
     return start
-
-
-def _named(start: WarmStart, rows: NamedRows, found: Tensor, own: Tensor) -> Tensor:
-    """A tensor with rows by name."""
-    size = own[0].numel()
-    start.count("loaded", rows.part, rows.origins(), size * len(rows.loaded))
-    start.count("new", rows.part, f"not in the file: {', '.join(rows.new)}", size * len(rows.new))
-    start.count("unused", rows.part, f"not in the model: {', '.join(rows.unused)}", size * len(rows.unused))
-    return rows.filled(found, own)
 
 
 def _whole(start: WarmStart, key: str, found: Tensor, own: Tensor, reason: str) -> Tensor:
@@ -206,10 +189,10 @@ def named_rows(checkpoint: Checkpoint, model: Network, rig: Callable[[], CameraR
     """
     config = model.config
     classes, cameras = _names(checkpoint, config, "classes"), _names(checkpoint, config, "cameras")
-    rows = dict.fromkeys(model.class_keys, NamedRows("class rows", config.classes, classes, _likes(config, classes)))
+    rows = dict.fromkeys(model.class_keys, NamedRows("class rows", classes, _likes(config, classes)))
     if model.image_tokens.camera_embedding is not None:
         starts, remark = _views(config.cameras, cameras, rig), "; by heading where it is known; all are trained"
-        rows[CAMERA_EMBEDDING] = NamedRows("camera embeddings", config.cameras, cameras, starts, remark)
+        rows[CAMERA_EMBEDDING] = NamedRows("camera embeddings", cameras, starts, remark)
     return rows
 
 

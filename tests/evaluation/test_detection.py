@@ -9,8 +9,7 @@ import pytest
 from random_boxes import as_predictions, random_truth
 
 from bevcli.evaluation.config import DetectionConfig
-from bevcli.evaluation.detection import evaluate_detections
-from bevcli.evaluation.detection_scores import DetectionScores
+from bevcli.evaluation.detection import DetectionScores, evaluate_detections
 from bevcli.evaluation.matching import descending_scores, gather, match_greedily
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import rigid, rotation_about_z
@@ -100,13 +99,13 @@ def test_perfect_predictions_score_one() -> None:
     scores = evaluate_detections(as_predictions(truth, 2), truth)
     assert scores.overall.mean_ap == pytest.approx(1)
     assert scores.overall.nd_score == pytest.approx(1)
-    assert all(part.mean_recall == 1 for part in scores.by_visibility)
+    assert all(part.mean_recall == 1 for part in scores.by_visibility.values())
 
 
 def test_no_predictions_score_zero() -> None:
     truth = random_truth(1)
     scores = evaluate_detections([Boxes3D.empty()] * len(truth), truth)
-    assert scores.prediction_count == 0
+    assert scores.overall.prediction_count == 0
     assert (scores.overall.mean_ap, scores.overall.nd_score) == (0, 0)
     assert set(scores.overall.errors.values()) == {1.0}
 
@@ -147,18 +146,18 @@ def test_what_is_beyond_the_range_of_its_class_does_not_count() -> None:
     cut = evaluate_detections([cars([0, 35], [0.5, 0.9])], [cars([0, 40])], DetectionConfig().cut_at(32))
     assert numbers(cut) == pytest.approx(numbers(near), nan_ok=True)
     unlimited = evaluate_detections([cars([0, 51], [0.5, 0.9])], [cars([0])], DetectionConfig().unlimited())
-    assert unlimited.prediction_count == 2
+    assert unlimited.overall.prediction_count == 2
 
 
 def test_the_ego_vehicle_is_where_ranges_start() -> None:
-    assert evaluate_detections([cars([60], [0.5])], [cars([60])], ego_xy=[[30.0, 0.0]]).ground_truth_count == 1
-    assert evaluate_detections([cars([60], [0.5])], [cars([60])]).ground_truth_count == 0
+    assert evaluate_detections([cars([60], [0.5])], [cars([60])], ego_xy=[[30.0, 0.0]]).overall.ground_truth_count == 1
+    assert evaluate_detections([cars([60], [0.5])], [cars([60])]).overall.ground_truth_count == 0
 
 
 def test_ground_truth_without_points_is_left_out() -> None:
     truth = replace(cars([0, 20, 30]), num_points=np.array([3, 0, -1]))
     scores = evaluate_detections([cars([0], [0.5])], [truth])
-    assert scores.ground_truth_count == 2
+    assert scores.overall.ground_truth_count == 2
 
 
 def test_ground_truth_given_as_predictions_is_perfect() -> None:
@@ -179,9 +178,9 @@ def test_an_error_without_ground_truth_is_left_out_of_nds() -> None:
 def test_each_box_counts_in_one_range_bin() -> None:
     truth = random_truth(8)
     scores = evaluate_detections(as_predictions(truth, 9, noise_m=0.5, false_per_frame=20), truth)
-    counts = [sum(c.ground_truth_count for c in part.table.classes.values()) for part in scores.by_range]
-    assert sum(counts) == scores.ground_truth_count
-    found = sum(c.recall * c.ground_truth_count for part in scores.by_range for c in part.table.classes.values())
+    counts = [sum(c.ground_truth_count for c in part.classes.values()) for part in scores.by_range.values()]
+    assert sum(counts) == scores.overall.ground_truth_count
+    found = sum(c.recall * c.ground_truth_count for part in scores.by_range.values() for c in part.classes.values())
     assert found == pytest.approx(
         sum(c.recall * c.ground_truth_count for c in scores.overall.classes.values() if c.ground_truth_count)
     )
@@ -189,7 +188,7 @@ def test_each_box_counts_in_one_range_bin() -> None:
 
 def test_a_pair_across_the_border_of_bins_is_not_split() -> None:
     scores = evaluate_detections([cars([10.4], [0.9])], [cars([9.6])])
-    bins = {part.low_m: part.table for part in scores.by_range}
+    bins = {low: table for (low, _), table in scores.by_range.items()}
     assert bins[0].classes["car"].aps[1.0] == pytest.approx(1)
     assert not bins[10].classes
 
@@ -197,9 +196,9 @@ def test_a_pair_across_the_border_of_bins_is_not_split() -> None:
 def test_recall_by_visibility_counts_at_two_metres() -> None:
     truth = replace(cars([0, 10, 20, 30, 40]), visibilities=np.array([0.1, 0.39, 0.4, 1.0, np.nan]))
     scores = evaluate_detections([cars([1.9, 22.1, 30], [0.9, 0.8, 0.1])], [truth])
-    found = {part.low: (part.found_count, part.ground_truth_count) for part in scores.by_visibility}
+    found = {low: (part.prediction_count, part.ground_truth_count) for (low, _), part in scores.by_visibility.items()}
     assert found == {0.0: (1, 2), 0.4: (0, 1), 0.6: (0, 0), 0.8: (1, 1)}
-    assert evaluate_detections([cars([0], [0.9])], [cars([0])]).by_visibility == ()
+    assert evaluate_detections([cars([0], [0.9])], [cars([0])]).by_visibility == {}
 
 
 @pytest.mark.parametrize("seed", range(5))

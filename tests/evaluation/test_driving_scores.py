@@ -111,6 +111,17 @@ def test_errors_are_those_of_the_predictions(tmp_path: Path) -> None:
     assert plan["at_horizon"]["collision"]["3s"] == 1
 
 
+def test_objects_of_frames_without_predictions_are_not_found(tmp_path: Path) -> None:
+    found = write(tmp_path / "found", car, path(1.0), LINE, ("predictions.json", "map_lines.json"))
+    truth = write(tmp_path / "truth", car, path(1.0), LINE, ("ground_truth.json", "ground_truth_lines.json"))
+    content = json.loads((found / "predictions.json").read_text())
+    del content["frames"][0]
+    (found / "predictions.json").write_text(json.dumps(content))
+    scores = evaluate(found, truth, count_missing=True, driving=["motion"]).driving.motion
+    assert scores is not None
+    assert (scores["car"].truths, scores["car"].hits) == (4, 3)
+
+
 def test_missing_files_are_named(tmp_path: Path) -> None:
     found = write(tmp_path / "found", car, path(1.0), LINE, ("predictions.json", "map_lines.json"))
     truth = write(tmp_path / "truth", car, path(1.0), LINE, ("ground_truth.json", "other.json"))

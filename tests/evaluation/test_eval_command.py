@@ -209,7 +209,7 @@ def test_bicycles_in_a_bicycle_rack_are_left_out() -> None:
     frame = FrameBoxes(FrameStamp(0, "s", 0), Pose.identity(), boxes, {"sample_token": "t"})
     file = BoxesFile("world", (frame,))
     pairs = without_cycles_in_racks(pair_frames(file, file), {"t": rack})
-    for kept in (pairs.predictions[0], pairs.ground_truth[0]):
+    for kept in (pairs.predictions[0].boxes, pairs.ground_truth[0].boxes):
         np.testing.assert_array_equal(kept.centers, [places[1], places[3], places[4]])
 
 

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError, OutputError
-from bevcli.evaluation.boxes_csv import write_csv
+from bevcli.evaluation.formats.csv_table import write_csv
 from bevcli.evaluation.formats.kitti import kitti_labels, write_kitti
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D

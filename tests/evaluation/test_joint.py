@@ -9,7 +9,7 @@ from random_boxes import as_predictions, random_truth
 from bevcli.evaluation.config import DetectionConfig
 from bevcli.evaluation.detection import evaluate_detections
 from bevcli.evaluation.joint import DriveMatches, score_jointly
-from bevcli.evaluation.scores_report import scores_to_dict
+from bevcli.evaluation.scores_report import FrameScores
 from bevcli.evaluation.segmentation import evaluate_segmentation
 from bevcli.frame import BevMap
 from bevcli.geometry.boxes import Boxes3D
@@ -31,7 +31,7 @@ def matches_of(truth, predictions):
 
 
 def assert_same(one, other):
-    one, other = (scores_to_dict(scores, CONFIG) for scores in (one, other))
+    one, other = (FrameScores(scores).to_dict() for scores in (one, other))
     assert one["frames"] == other["frames"]
     for key in ("mean_ap", "nd_score", "tp_errors", "label_aps", "label_tp_errors", "label_recalls", "by_range"):
         assert flat(one[key]) == pytest.approx(flat(other[key]), nan_ok=True), key
@@ -49,11 +49,11 @@ def flat(value):
 def test_joint_scores_equal_those_of_all_frames_together():
     drives = [drive_of(1, 4, 0.3), drive_of(2, 7, 1.5), drive_of(3, 2, 0.8)]
     truth, predictions = ([frame for drive in drives for frame in drive[side]] for side in range(2))
-    joint, maps = score_jointly([matches_of(*drive) for drive in drives], CONFIG)
-    assert_same(joint, evaluate_detections(predictions, truth, CONFIG))
-    assert maps is None
+    joint = score_jointly([matches_of(*drive) for drive in drives], CONFIG)
+    assert_same(joint.detection, evaluate_detections(predictions, truth, CONFIG))
+    assert joint.segmentation is None
     means = np.mean([evaluate_detections(p, t, CONFIG).overall.mean_ap for t, p in drives])
-    assert abs(joint.overall.mean_ap - means) > 0.01  # which is not the mean of the drives
+    assert abs(joint.detection.overall.mean_ap - means) > 0.01  # which is not the mean of the drives
 
 
 def test_drives_without_boxes_on_one_side_count_too():
@@ -61,9 +61,9 @@ def test_drives_without_boxes_on_one_side_count_too():
     empty = [Boxes3D.empty()] * 3
     unseen = [replace(Boxes3D.empty(), scores=np.zeros(0))] * 3
     drives = [(truth, predictions), (empty, predictions), (truth, unseen)]
-    joint, _ = score_jointly([matches_of(*drive) for drive in drives], CONFIG)
+    joint = score_jointly([matches_of(*drive) for drive in drives], CONFIG)
     assert_same(
-        joint,
+        joint.detection,
         evaluate_detections([*predictions, *predictions, *unseen], [*truth, *empty, *truth], CONFIG),
     )
 
@@ -72,7 +72,7 @@ def test_matches_of_a_drive_are_the_same_after_a_file(tmp_path):
     before = matches_of(*drive_of(4, 3, 0.5))
     save_state(tmp_path / "matches.safetensors", before)
     after = load_state(tmp_path / "matches.safetensors", DriveMatches)
-    assert_same(score_jointly([after], CONFIG)[0], score_jointly([before], CONFIG)[0])
+    assert_same(score_jointly([after], CONFIG).detection, score_jointly([before], CONFIG).detection)
 
 
 def test_joint_iou_sums_cells():
@@ -82,7 +82,7 @@ def test_joint_iou_sums_cells():
     one = evaluate_segmentation([(map_of([[1, 1]]), map_of([[1, 0]]))])  # road: 1 of 2 cells
     other = evaluate_segmentation([(map_of([[1, 1]]), map_of([[1, 1]]))] * 3)  # road: 6 of 6 cells
     drives = [replace(matches_of(*drive_of(1, 1, 0.1)), segmentation=maps) for maps in (one, other, None)]
-    _, maps = score_jointly(drives, CONFIG)
+    maps = score_jointly(drives, CONFIG).segmentation
     assert maps.iou["drivable_road"] == 7 / 8
     assert np.isnan(maps.iou["vehicle"])
     assert maps.frame_count == 4

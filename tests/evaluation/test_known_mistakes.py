@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bevcli.evaluation.config import ERRORS, DetectionConfig
+from bevcli.evaluation.config import ERRORS
 from bevcli.evaluation.detection import evaluate_detections
 from bevcli.evaluation.known_mistakes import known_mistakes
-from bevcli.evaluation.scores_report import scores_to_dict
+from bevcli.evaluation.scores_report import FrameScores
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 
@@ -42,8 +42,7 @@ def scored(truth: Boxes3D, **changes: object) -> dict:
     rng = np.random.default_rng(1)
     boxes = replace(truth, scores=rng.uniform(0.1, 1, len(truth)), **changes)
     boxes = replace(boxes, sizes_lwh=1.1 * boxes.sizes_lwh, velocities=0.9 * boxes.velocities)
-    config = DetectionConfig()
-    return scores_to_dict(evaluate_detections([boxes], [truth], config), config)
+    return FrameScores(evaluate_detections([boxes], [truth])).to_dict()
 
 
 def test_good_boxes_show_no_mistake(truth):

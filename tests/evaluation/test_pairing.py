@@ -45,7 +45,8 @@ def boxes_file(frames: list[Boxes3D], reference: str = "ego", **stamps: Any) -> 
 
 
 def nds(pairs: FramePairs) -> float:
-    return evaluate_detections(pairs.predictions, pairs.ground_truth, None, pairs.ego_xy).overall.nd_score
+    found, true = ([frame.boxes for frame in side] for side in (pairs.predictions, pairs.ground_truth))
+    return evaluate_detections(found, true, None, pairs.ego_xy).overall.nd_score
 
 
 @pytest.mark.parametrize("one", ["world", "ego", "bev"])
@@ -100,7 +101,7 @@ def test_frames_of_one_side_are_left_out_or_counted_with_a_note() -> None:
         "2 of 4 ground-truth frames have no prediction: left out (`count_missing=True` counts them)",
     )
     counted = pair_frames(half, boxes_file(TRUTH), count_missing=True)
-    assert [len(boxes) for boxes in counted.predictions[2:]] == [0, 0]
+    assert [len(frame.boxes) for frame in counted.predictions[2:]] == [0, 0]
     assert "count as missed" in counted.notes[0]
     more = pair_frames(boxes_file(PREDICTIONS), boxes_file(TRUTH[:1]))
     assert more.notes == ("3 of 4 predicted frames have no ground truth: left out",)

@@ -1,6 +1,7 @@
 """The figures of attention of a model that plans, and the weights that they show."""
 
 from copy import deepcopy
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,10 +9,10 @@ import torch
 from memory_drive import MemorySequence
 
 from bevcli.errors import InputError
-from bevcli.explain import step_figure as figures
+from bevcli.explain import figure_files as figures
 from bevcli.explain.attention_figures import FIGURES
+from bevcli.explain.figure_files import figures_of, write_figures
 from bevcli.explain.overview import FIGURES as OF_BEVFORMER
-from bevcli.explain.step_figure import figures_of, write_figures
 from bevcli.explain.trace import Trace, trace
 from bevcli.model.vad.vad import VAD
 
@@ -61,9 +62,9 @@ def test_the_plan_attends_to_the_line_that_weights_force(mini_vad: VAD):
 
 
 def test_the_figures_of_attention_are_written(of_vad: Trace, tmp_path, monkeypatch):
-    assert figures_of(of_vad.config) == (*OF_BEVFORMER, *FIGURES)
+    assert figures_of(of_vad.config) == OF_BEVFORMER | FIGURES
     monkeypatch.setattr(figures, "figures_of", lambda _: FIGURES)
-    assert all(file.path for file in write_figures(of_vad, tmp_path, "jpg"))
+    assert all(isinstance(file, Path) for _, file in write_figures(of_vad, tmp_path, "jpg"))
     assert {path.name for path in tmp_path.iterdir()} == {"vad-plan-attention.jpg", "vad-motion-attention.jpg"}
 
 

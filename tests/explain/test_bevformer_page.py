@@ -149,6 +149,6 @@ def test_named_classes_and_functions_are_in_the_linked_files():
 
 def test_every_figure_of_the_command_is_shown():
     shown = re.findall(r"\]\(images/bevformer-([\w-]+)\.jpg\)", TEXT)
-    assert shown == [figure.step for figure in FIGURES]
+    assert shown == [*FIGURES]
     sizes = {step: (PAGE.parent / f"images/bevformer-{step}.jpg").stat().st_size for step in shown}
     assert all(20_000 < size < 250_000 for size in sizes.values()), sizes

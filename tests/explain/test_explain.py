@@ -11,11 +11,11 @@ from command_line import command
 from memory_drive import MemorySequence, make_rig
 
 from bevcli.errors import InputError, OutputError
-from bevcli.explain import step_figure as figures
+from bevcli.explain import figure_files as figures
 from bevcli.explain.drawing import project_bev
+from bevcli.explain.figure_files import check_figures, figures_of, write_figures
 from bevcli.explain.head_figures import reference_points
 from bevcli.explain.overview import FIGURES
-from bevcli.explain.step_figure import check_figures, figures_of, write_figures
 from bevcli.explain.trace import cell_at, trace
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner
@@ -24,7 +24,7 @@ from bevcli.model.pillar_projection import project_pillars
 SAMPLE = Path(__file__).parents[2] / "samples/street"
 CPU = torch.device("cpu")
 HISTORY_FIGURES = {"temporal-attention", "recurrence"}
-STEPS = [figure.step for figure in FIGURES]
+STEPS = [*FIGURES]
 
 
 def explain(*arguments) -> subprocess.CompletedProcess:
@@ -39,7 +39,7 @@ def write_all(folder: Path, *options: str) -> None:
 
 
 def draw_only(monkeypatch, *steps: str) -> None:
-    monkeypatch.setattr(figures, "figures_of", lambda _: [figure for figure in FIGURES if figure.step in steps])
+    monkeypatch.setattr(figures, "figures_of", lambda _: {step: FIGURES[step] for step in STEPS if step in steps})
 
 
 @pytest.fixture(scope="module")
@@ -121,10 +121,8 @@ def test_a_cell_that_is_no_pair_of_numbers_is_a_usage_error():
 def test_a_model_without_segmentation_leaves_one_figure_out(mini_model, tmp_path, monkeypatch):
     draw_only(monkeypatch, "temporal-attention", "recurrence", "segmentation")
     traced = trace(mini_model, CPU, MemorySequence(3), 2, None)
-    left_out = [file for file in write_figures(traced, tmp_path, "jpg") if file.path is None]
-    assert [(file.step, file.left_out) for file in left_out] == [
-        ("segmentation", "model mini has no segmentation head")
-    ]
+    left_out = [(step, found) for step, found in write_figures(traced, tmp_path, "jpg") if isinstance(found, str)]
+    assert left_out == [("segmentation", "model mini has no segmentation head")]
     assert {path.suffix for path in tmp_path.iterdir()} == {".jpg"}
 
 
@@ -132,7 +130,7 @@ def test_the_first_frame_of_a_scene_has_no_figures_of_history(mini_model):
     sequence = MemorySequence(4, make_rig({"FRONT": 0.0, "BACK": 180.0}), scenes="aabb")
     traced = trace(mini_model, CPU, sequence, 2, (0.0, -5.0))
     assert traced.prediction.started_anew
-    left_out = {figure.step for figure in figures_of(mini_model.config) if figure.left_out(traced)}
+    left_out = {step for step, draw in figures_of(mini_model.config).items() if isinstance(draw(traced), str)}
     assert left_out == HISTORY_FIGURES | {"segmentation"}
 
 
@@ -142,7 +140,7 @@ def test_figures_of_random_weights_are_labelled(mini_model, tmp_path, monkeypatc
     corners = []
     for untrained in (False, True):
         written = list(write_figures(traced, tmp_path, "jpg", untrained=untrained))
-        images = [cv2.imread(str(file.path)) for file in written if file.path is not None]
+        images = [cv2.imread(str(file)) for _, file in written]
         corners.append([(image[:40, -250:] < 250).any() for image in images])
     assert not any(corners[0])
     assert all(corners[1])
@@ -151,7 +149,9 @@ def test_figures_of_random_weights_are_labelled(mini_model, tmp_path, monkeypatc
 def test_a_cell_that_no_camera_sees_still_gives_figures(mini_model, tmp_path):
     traced = trace(mini_model, CPU, MemorySequence(2, make_rig({"FRONT": 0.0})), 1, (0.0, -20.0))
     assert not traced.visible[:, traced.cell_index].any()
-    assert len([file for file in write_figures(traced, tmp_path, "jpg") if file.path]) == len(FIGURES) - 1
+    assert (
+        len([file for _, file in write_figures(traced, tmp_path, "jpg") if isinstance(file, Path)]) == len(FIGURES) - 1
+    )
 
 
 def test_the_traced_frame_is_predicted_as_in_a_run(mini_model):

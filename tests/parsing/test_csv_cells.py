@@ -7,7 +7,7 @@ import pytest
 from memory_drive import MemorySequence, make_rig
 from recorded_drive import boxes_ahead
 
-from bevcli.evaluation.boxes_csv import write_csv
+from bevcli.evaluation.formats.csv_table import write_csv
 from bevcli.frame import FrameStamp
 from bevcli.geometry.transforms import Pose
 from bevcli.parsing.csv_tables import cell_of, name_of

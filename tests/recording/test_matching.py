@@ -47,7 +47,7 @@ def evaluated(predicted, truth):
     row = DetectionConfig().distances_m.index(2.0)
     for part in scores.matches:
         centers["predicted"] += part.predictions.boxes.centers[part.matched[row] >= 0].tolist()
-        centers["truth"] += part.ground_truth.boxes.centers[part.found(row)].tolist()
+        centers["truth"] += part.ground_truth.boxes.centers[part.matched[row][part.matched[row] >= 0]].tolist()
     return (
         [center in centers["predicted"] for center in predicted.centers.tolist()],
         [center in centers["truth"] for center in truth.centers.tolist()],

@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError
-from bevcli.evaluation.boxes_csv import write_csv
 from bevcli.evaluation.formats import kitti_raw as tracklet_export
+from bevcli.evaluation.formats.csv_table import write_csv
 from bevcli.evaluation.formats.kitti import write_kitti
 from bevcli.evaluation.formats.openlabel import openlabel
 from bevcli.evaluation.options import ExportOptions

@@ -28,11 +28,11 @@ def test_cells_in_reach_are_positives_of_the_nearest_object() -> None:
     config, weights = DenseLossConfig(weight=2.0, reach_m=1.0), DetectionLossConfig(box_weight=0.5)
     loss = dense_loss(zero_head(), torch.zeros(1, 16, 2), [truth], config, weights)
     # Two cells are positives: (1, 1) without an error, (1, 3) with half a metre.
-    assert loss.boxes.item() == pytest.approx(2.0 * 0.5 * 0.5 / 2)
+    assert loss["cell boxes"].item() == pytest.approx(2.0 * 0.5 * 0.5 / 2)
 
 
 def test_a_frame_without_objects_has_negatives_only() -> None:
     nothing = DetectionTargets(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 10))
     loss = dense_loss(zero_head(), torch.zeros(1, 16, 2), [nothing], DenseLossConfig(1.0), DetectionLossConfig())
-    assert loss.boxes.item() == 0
-    assert loss.classes.item() > 0
+    assert loss["cell boxes"].item() == 0
+    assert loss["cell classes"].item() > 0

@@ -72,7 +72,7 @@ def test_a_slow_drive_keeps_its_rate_and_a_fast_one_is_thinned() -> None:
 def test_every_preset_gives_a_model_with_its_own_layers(preset: str, tmp_path: Path) -> None:
     facts = look_at([TrueDrive(6)], FRAME)
     (tmp_path / "m.toml").write_text(_toml(model_table("m", preset, facts)))
-    config, base = load_config(tmp_path / "m.toml"), load_config(PRESETS[preset].model)
+    config, base = load_config(tmp_path / "m.toml"), load_config(PRESETS[preset][0])
     assert (config.encoder, config.decoder, config.backbone) == (base.encoder, base.decoder, base.backbone)
     assert (config.bev_grid.rows, config.channels) == (base.bev_grid.rows, base.channels)
 

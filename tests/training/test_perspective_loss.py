@@ -17,7 +17,7 @@ from bevcli.model.fpn import FPNConfig
 from bevcli.model.image_tokens import ImageTokensConfig
 from bevcli.model.resnet import ResNetConfig
 from bevcli.training.augmentation import AugmentationConfig
-from bevcli.training.detection_loss import DetectionLoss, DetectionTargets
+from bevcli.training.detection_loss import DetectionTargets
 from bevcli.training.frame_losses import FrameLosses
 from bevcli.training.job import TrainingConfig
 from bevcli.training.perspective_loss import (
@@ -60,7 +60,7 @@ def loss_of(
     *,
     has_image: torch.Tensor | None = None,
     targets: tuple[DetectionTargets, ...] | None = None,
-) -> DetectionLoss:
+) -> dict[str, torch.Tensor]:
     inputs = data.inputs[0]
     truth = data.targets[0].perspective if targets is None else targets
     seen = inputs.has_image if has_image is None else has_image
@@ -86,9 +86,9 @@ def test_backbone_and_head_learn_the_depths_of_boxes() -> None:
         maps = model.neck(model.backbone(images))
         loss = loss_of(head, maps, data)
         optimizer.zero_grad()
-        (loss.classes + loss.boxes).backward()
+        sum(loss.values()).backward()
         optimizer.step()
-        totals.append((loss.classes + loss.boxes).item())
+        totals.append(sum(loss.values()).item())
     assert totals[-1] < totals[0] / 10
 
     logits, boxes = head(maps)
@@ -124,16 +124,16 @@ def test_the_backbone_receives_a_gradient_that_is_not_zero() -> None:
 def test_every_parameter_of_the_head_receives_a_gradient() -> None:
     data, head = batch(), make_head(layers=2)
     loss = loss_of(head, random_maps(4), data)
-    (loss.classes + loss.boxes).backward()
+    sum(loss.values()).backward()
     assert all(parameter.grad.any() for parameter in head.parameters())
 
 
 def test_images_without_boxes_have_no_box_loss() -> None:
     data, head = batch(), make_head()
     loss = loss_of(head, random_maps(4), data, targets=(NOTHING, NOTHING))
-    assert loss.boxes == 0
-    assert loss.classes > 0
-    loss.boxes.backward()
+    assert loss["perspective boxes"] == 0
+    assert loss["perspective classes"] > 0
+    loss["perspective boxes"].backward()
     assert not any(parameter.grad is not None and parameter.grad.any() for parameter in head.parameters())
 
 
@@ -147,7 +147,7 @@ def test_a_camera_without_an_image_contributes_nothing() -> None:
     assert loss_of(head, changed, data, has_image=first_only) == loss
     assert loss_of(head, changed, data) != loss_of(head, maps, data)
     none = loss_of(head, maps, data, has_image=torch.zeros(2, 2, dtype=torch.bool))
-    assert (none.classes, none.boxes) == (0, 0)
+    assert (none["perspective classes"], none["perspective boxes"]) == (0, 0)
 
 
 def test_ignored_pixels_have_no_class_loss() -> None:
@@ -166,7 +166,7 @@ def test_ignored_pixels_have_no_class_loss() -> None:
             logits, boxes = head(features)
             return torch.where(pixels[:, None], 9.0, logits), boxes
 
-        return loss_of(high, maps, data, has_image=only_front, targets=(truck,)).classes
+        return loss_of(high, maps, data, has_image=only_front, targets=(truck,))["perspective classes"]
 
     nowhere = torch.zeros_like(ignored)
     assert head_with_high_logits(ignored) == head_with_high_logits(nowhere)
@@ -189,21 +189,24 @@ def test_a_batch_has_its_frames_mean_loss_by_positive_pixel() -> None:
             len(perspective_targets(matrix, truth, locations, inputs.image_size).locations)
             for matrix in inputs.image_from_bev[frame]
         )
-        total, count = total + positives * (part.classes + part.boxes).item(), count + positives
-    assert (whole.classes + whole.boxes).item() == pytest.approx(total / count, rel=1e-4)
+        total, count = total + positives * sum(part.values()).item(), count + positives
+    assert sum(whole.values()).item() == pytest.approx(total / count, rel=1e-4)
 
 
 def test_each_weight_scales_its_part() -> None:
     data, head, maps = batch(), make_head(), random_maps(4)
     full = loss_of(head, maps, data, replace(WEIGHTS, weight=3.0))
     once = loss_of(head, maps, data)
-    torch.testing.assert_close(full.classes, 3 * once.classes)
-    torch.testing.assert_close(full.boxes, 3 * once.boxes)
+    torch.testing.assert_close(full["perspective classes"], 3 * once["perspective classes"])
+    torch.testing.assert_close(full["perspective boxes"], 3 * once["perspective boxes"])
     names = ("offset_weight", "depth_weight", "size_weight", "rotation_weight")
     no_boxes = dict.fromkeys(names, 0.0)
-    parts = [loss_of(head, maps, data, replace(WEIGHTS, **no_boxes | {n: getattr(WEIGHTS, n)})).boxes for n in names]
+    parts = [
+        loss_of(head, maps, data, replace(WEIGHTS, **no_boxes | {n: getattr(WEIGHTS, n)}))["perspective boxes"]
+        for n in names
+    ]
     assert all(part > 0 for part in parts)
-    torch.testing.assert_close(sum(parts), once.boxes)
+    torch.testing.assert_close(sum(parts), once["perspective boxes"])
 
 
 def test_boxes_outside_the_grid_are_detected_too() -> None:

@@ -65,10 +65,10 @@ def scored_tracks(
     """
     places = time_order(stamps)
     given = gather([frames[place] for place in places], ego_xy[places])
-    assert given.boxes.instances is not None
+    instances = given.column("instances")
     limits = np.array([ranges_m.get(name, -1.0) for name in given.boxes.classes.tolist()])
-    kept = (given.ranges_m < limits) & (given.boxes.num_points != 0) & (given.boxes.instances != "")
-    rows, names = given.frames[kept], given.boxes.instances[kept]
+    kept = (given.ranges_m < limits) & (given.boxes.num_points != 0) & (instances != "")
+    rows, names = given.frames[kept], instances[kept]
     scores = np.concatenate([_scores(frames[place]) for place in places])[kept]
     ordered = [stamps[place] for place in places]
     _, scenes = np.unique([stamp.scene for stamp in ordered], return_inverse=True)

@@ -1,18 +1,12 @@
-"""StepFigure: the figure of one step of a model; and the files of all figures of a model, which lists its own.
+"""The files of all figures of a model, which lists its own: see `TemporalModel.figures`."""
 
-See `TemporalModel.figures`.
-"""
-
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
 
-from matplotlib.figure import Figure
-
 from bevcli.errors import OutputError
-from bevcli.explain.drawing import ACCENT
+from bevcli.explain.drawing import ACCENT, Draw
 from bevcli.explain.options import ImageFormat
 from bevcli.explain.trace import Trace
 from bevcli.model.config import ModelConfig
@@ -26,44 +20,14 @@ SAVING: dict[ImageFormat, dict[str, Any]] = {
 }
 
 
-@dataclass(frozen=True)
-class StepFigure:
-    """The figure of one step.
-
-    Attributes:
-        step: its name, the end of the file's name.
-        draw: draws it. The title is in the figure.
-        left_out: why it cannot be drawn of a trace, "" where it can.
-    """
-
-    step: str
-    draw: Callable[[Trace], Figure]
-    left_out: Callable[[Trace], str] = lambda trace: ""
-
-
-@dataclass(frozen=True)
-class FigureFile:
-    """One figure.
-
-    Attributes:
-        step: its name, `StepFigure.step`.
-        path: the file that was written; None where the figure was left out.
-        left_out: why it was left out, "" where it was written.
-    """
-
-    step: str
-    path: Path | None
-    left_out: str = ""
-
-
-def figures_of(config: ModelConfig) -> tuple[StepFigure, ...]:
-    """The figures of a model, in the order of its steps."""
-    return tuple(figure for listed in model_class(config).figures for figure in resolve_name(listed))
+def figures_of(config: ModelConfig) -> dict[str, Draw]:
+    """The figures of a model by the name of the step, the end of the file's name, in the order of the steps."""
+    return {step: draw for listed in model_class(config).figures for step, draw in resolve_name(listed).items()}
 
 
 def check_figures(config: ModelConfig, folder: Path, *, force: bool) -> None:
     """Raises OutputError where a folder holds figures of the model already and may not lose them. force: it may."""
-    paths = [path for figure in figures_of(config) for path in _paths(config, figure, folder).values()]
+    paths = [path for step in figures_of(config) for path in _paths(config, step, folder).values()]
     found = [] if force else [path for path in paths if path.exists()]
     if found:
         raise OutputError(
@@ -73,9 +37,10 @@ def check_figures(config: ModelConfig, folder: Path, *, force: bool) -> None:
 
 def write_figures(
     trace: Trace, folder: Path, image_format: ImageFormat = "png", *, untrained: bool = False
-) -> Iterator[FigureFile]:
-    """Writes `ARCHITECTURE-STEP.png` (or .jpg) per step into a folder, which is created; yields each file when written.
+) -> Iterator[tuple[str, Path | str]]:
+    """Writes `ARCHITECTURE-STEP.png` (or .jpg) per step into a folder, which is created.
 
+    Yields the name of each step with the file, when it is written, or with the reason why its figure is left out.
     untrained: whether the weights are random; then every figure is labelled UNTRAINED.
     Figures that the folder holds are replaced, also those of the other format.
     Raises OutputError when the folder or a file cannot be written.
@@ -84,23 +49,22 @@ def write_figures(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{folder}: the folder for the figures cannot be made: {error.strerror}") from error
-    for step in figures_of(trace.config):
-        reason = step.left_out(trace)
+    for step, draw in figures_of(trace.config).items():
+        figure = draw(trace)
         paths = _paths(trace.config, step, folder)
         for ending, earlier in paths.items():
-            if reason or ending != image_format:
+            if isinstance(figure, str) or ending != image_format:
                 earlier.unlink(missing_ok=True)
-        if reason:
-            yield FigureFile(step.step, None, reason)
+        if isinstance(figure, str):
+            yield step, figure
             continue
-        figure = step.draw(trace)
         if untrained:
             figure.text(0.985, 0.985, "UNTRAINED", color=ACCENT, fontsize=17, fontweight="bold", ha="right", va="top")
         with whole_file(paths[image_format]) as unfinished:
             figure.savefig(unfinished, format=image_format, **SAVING[image_format])
-        yield FigureFile(step.step, paths[image_format])
+        yield step, paths[image_format]
 
 
-def _paths(config: ModelConfig, figure: StepFigure, folder: Path) -> dict[ImageFormat, Path]:
-    stem = f"{config.architecture.lower()}-{figure.step}"
+def _paths(config: ModelConfig, step: str, folder: Path) -> dict[ImageFormat, Path]:
+    stem = f"{config.architecture.lower()}-{step}"
     return {ending: folder / f"{stem}.{ending}" for ending in SAVING}
