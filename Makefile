@@ -62,7 +62,7 @@ bench: $(DEVELOPER)
 	$(BIN)/bevcli bench --table docs/speed.md
 
 gpu-check: $(DEVELOPER)
-	$(BIN)/python -m bevcli.benchmark.gpu_check --device $(or $(DEVICE),auto)
+	$(BIN)/python tests/benchmark/gpu_check.py --device $(or $(DEVICE),auto)
 
 fuzz: $(DEVELOPER)
 	OMP_NUM_THREADS=1 BEVCLI_FUZZ_CASES=$${BEVCLI_FUZZ_CASES:-150} BEVCLI_FUZZ_SHARE=$${BEVCLI_FUZZ_SHARE:-1} \

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 
+import gpu_check
 import pytest
 import torch
-
-from bevcli.benchmark import gpu_check
 
 CPU = torch.device("cpu")
 

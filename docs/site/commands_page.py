@@ -1,4 +1,4 @@
-"""The page docs/commands.md: `python -m bevcli.cli.commands_page > docs/commands.md`."""
+"""Generate the page docs/commands.md: `python docs/site/commands_page.py > docs/commands.md`."""
 
 from collections.abc import Iterator
 from typing import Any, get_args
@@ -10,7 +10,7 @@ from bevcli.cli.main import app
 HEAD = """# Commands
 
 The options of every command by the panels of `--help`. A value in brackets is the default. This page is generated:
-`python -m bevcli.cli.commands_page > docs/commands.md`.
+`python docs/site/commands_page.py > docs/commands.md`.
 """
 
 
