@@ -24,6 +24,7 @@ from bevcli.model.temporal_model import TemporalModel
 
 Memory = TypeVar("Memory")
 
+
 @dataclass(frozen=True)
 class RunnerState(Generic[Memory]):
     """The state of a run between two frames.
