@@ -3,7 +3,7 @@
 import contextlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence as Items
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any, Generic, Literal, TypeVar
 
@@ -13,7 +13,7 @@ from bevcli.frame import Frame, FrameStamp, NewStart, Prediction, Sequence, Star
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.inference.attention import AttentionProbe, attention_view, probe_cells
 from bevcli.inference.background import read_ahead
-from bevcli.inference.commands import Commands
+from bevcli.inference.commands import Commands, with_command
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.stage_clock import StageClock
 from bevcli.inference.tracking import TrackerConfig, TrackerState, track, without_identities
@@ -58,7 +58,7 @@ class StepOptions:
     temporal: bool = True
     ask_attention: bool = False
     probes: tuple[tuple[float, float], ...] = ()
-    commands: Commands = field(default_factory=Commands)
+    commands: Commands = ()
     track: bool = True
     tracker: TrackerConfig | None = None
 
@@ -117,7 +117,8 @@ class Runner:
             if self.config.has_tracks and not self.tracks:
                 boxes = without_identities(boxes)
             self.clock.mark("box_decoding")
-            results = self.options.commands.given_to(self.model.decode_results(found), frame.stamp.index)
+            results = self.model.decode_results(found)
+            results = with_command(results, self.options.commands, frame.stamp.index)
             segmentation = self.model.decode_map(found)
             if segmentation is not None:
                 self.clock.mark("map_merging")

@@ -75,7 +75,7 @@ def run_into_folder(
     if force and resume:
         raise OutputError("`force` and `resume` exclude each other: pass one of them")
     with RunFolder(out, force=force, resume=resume) as folder:
-        facts = run_facts(model, sequence, options) | {"commands": str(asked.commands.since)}
+        facts = run_facts(model, sequence, options) | {"commands": str(asked.commands)}
         memory = model_class(model.config).memory_type
         state = saved_state(folder, facts, RunState[memory]) if resume else None  # type: ignore[valid-type]
         if resume and state is None and folder.has_files():
