@@ -21,7 +21,7 @@ from torch import Tensor
 from bevcli._version import __version__
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import Sequence
-from bevcli.inference.load import Model
+from bevcli.inference.load import Model, hash_of
 from bevcli.inference.runner import Memory, RunnerState
 from bevcli.inference.transfer import tensors_in
 from bevcli.parsing.files import read_bytes
@@ -173,7 +173,7 @@ def short_hash(hexdigest: str) -> str:
 def save_state(path: Path, state: object) -> None:
     """Write a state. The file is replaced at once, so that it is whole at every moment. Raises OutputError."""
     tensors = _tensors_of(state)
-    write_whole(path, save(tensors, {"format": FORMAT, "sha256": _hash(tensors)}), regular=True)
+    write_whole(path, save(tensors, {"format": FORMAT, "sha256": hash_of(sorted(tensors.items()))}), regular=True)
 
 
 def load_state(path: Path, kind: type[Loaded]) -> Loaded:
@@ -188,7 +188,7 @@ def load_state(path: Path, kind: type[Loaded]) -> Loaded:
             f'{path}: is not a state file of this version: "format" must be "{FORMAT}", '
             f'found "{metadata.get("format", ""):.40}"'
         )
-    if _TREE not in tensors or metadata.get("sha256") != _hash(tensors):
+    if _TREE not in tensors or metadata.get("sha256") != hash_of(sorted(tensors.items())):
         raise InputError(f"{path}: the state cannot be read: the file is damaged")
 
     def decoded(expected: type, found: Any) -> Any:
@@ -205,7 +205,7 @@ def load_state(path: Path, kind: type[Loaded]) -> Loaded:
 
 def digest(tree: object) -> str:
     """The hash of a tree that `save_state` could write."""
-    return _hash(_tensors_of(tree))
+    return hash_of(sorted(_tensors_of(tree).items()))
 
 
 def _tensors_of(tree: object) -> dict[str, Tensor]:
@@ -226,16 +226,6 @@ def _tensors_of(tree: object) -> dict[str, Tensor]:
 
     text = msgspec.msgpack.encode(tree, enc_hook=encoded)
     return tensors | {_TREE: torch.frombuffer(bytearray(text), dtype=torch.uint8)}
-
-
-def _hash(tensors: dict[str, Tensor]) -> str:
-    """SHA-256 of names, types, shapes and numbers."""
-    found = hashlib.sha256()
-    for name in sorted(tensors):
-        tensor = tensors[name]
-        found.update(f"{name}{tensor.dtype}{list(tensor.shape)}".encode())
-        found.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
-    return found.hexdigest()
 
 
 def _strings(content: Any, dtype: str) -> np.ndarray:
