@@ -201,6 +201,10 @@ def with_memory(**changes):
     return with_runner(lambda runner: replace(runner, memory=replace(runner.memory, **changes)))
 
 
+def with_size(name, size):
+    return lambda state: replace(state, files=replace(state.files, sizes={**state.files.sizes, name: size}))
+
+
 def with_times(**changes):
     def change(state):
         for name, value in changes.items():
@@ -216,8 +220,8 @@ def with_times(**changes):
         with_memory(bev=torch.zeros(1, 3, 2)),
         with_memory(bev=torch.zeros(0)),
         with_memory(pose=Pose(np.zeros(1), np.zeros((2, 2)))),
-        lambda state: replace(state, files=replace(state.files, predictions=1 << 63)),
-        lambda state: replace(state, files=replace(state.files, tracks=-1)),
+        with_size("predictions.json", 1 << 63),
+        with_size("tracks.csv", -1),
         with_runner(lambda it: replace(it, tracks=replace(it.tracks, tracks=replace(it.tracks.tracks, frames=NINE)))),
         with_times(count=-1),
         with_times(total_s=float("nan")),
